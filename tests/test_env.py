@@ -325,11 +325,11 @@ class RobustnessTest(WithEnv):
             env = self.make(faulty)
             env.variation.set_fault_scale(scale)
             env.reset()
-            kept = env.variation.lasting()
-            for name in ("_commands.delay", "_poses.delay", "_proprio.delay", "_lost_actions", "_tracker._bias"):
+            kept = env.variation.lasting
+            for name in ("commands.delay", "poses.delay", "proprio.delay", "lost_actions", "tracker.bias"):
                 self.assertEqual(bool(kept[name].any()), scale > 0, name)
-            self.assertLessEqual(float(kept["_poses.delay"].max()), scale * 6.0)
-            self.assertLessEqual(float(kept["_pushes.probability"].max()), scale * 0.02)
+            self.assertLessEqual(float(kept["poses.delay"].max()), scale * 6.0)
+            self.assertLessEqual(float(kept["pushes.probability"].max()), scale * 0.02)
             if not scale:
                 for action in self.actions(6):
                     seen = env.step(action)[0]["policy"][:, :3]

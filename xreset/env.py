@@ -399,8 +399,8 @@ class ManipulationEnv:
     @property
     def _lasting(self) -> dict[str, Tensor]:
         """Buffers that carry each world from step to step, in addition to the engine's state."""
-        seen = {} if self.vision is None else self.vision.lasting()
-        return {name: getattr(self, name) for name in _LASTING} | self.variation.lasting() | seen
+        seen = {} if self.vision is None else self.vision.lasting
+        return {name: getattr(self, name) for name in _LASTING} | self.variation.lasting | seen
 
     # Parts
 

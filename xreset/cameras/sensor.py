@@ -33,6 +33,7 @@ class Cameras:
         fov_scale: [N, C] factor on the field of view.
         noise_scale: [N] factor on the errors of depth.
         image: [N, C, H, W] newest image with its errors [m]; 0 where a pixel sees nothing.
+        view: [N, ...] what the policy gets of the newest images: :attr:`VisionConfig.view_shape`.
     """
 
     def __init__(self, scene: SceneSpec, object_index: Tensor, config: VisionConfig, *, scale: float = 1.0) -> None:
@@ -98,12 +99,7 @@ class Cameras:
         self.noise_scale = torch.ones(worlds, device=device)
         self.image = torch.zeros(worlds, count, *size, device=device)
         self._believed = torch.zeros(worlds, count, 4, 4, device=device)
-        self._view = torch.zeros(worlds, *config.view_shape, device=device)
-
-    def lasting(self) -> dict[str, Tensor]:
-        """Return the buffers that carry each world from step to step, by name."""
-        names = ("shift", "turn", "fov_scale", "noise_scale", "image", "_view")
-        return {f"cameras.{name}": getattr(self, name) for name in names}
+        self.view = torch.zeros(worlds, *config.view_shape, device=device)
 
     def aim(self, state: State, goal_pos: Tensor, goal_quat: Tensor, due: Tensor) -> None:
         """Put bodies and cameras where they are.
@@ -160,8 +156,8 @@ class Cameras:
             for image, mask in zip(images, is_object, strict=False):
                 clouds.append(self._points(image, mask, generator))
             view = torch.stack(clouds, dim=1)
-        self._view.copy_(torch.where(due, view, self._view))
-        return self._view
+        self.view.copy_(torch.where(due, view, self.view))
+        return self.view
 
     def picture(self, world: int, width: int) -> np.ndarray:
         """Return the newest images of a world side by side, [h, width, 3] uint8: near is bright, nothing is black.

@@ -27,10 +27,6 @@ class DelayLine:
         self.delay = torch.zeros(like.shape[0], *([like.shape[1]] if by_column else []), device=like.device)
         """[N] steps, or [N, D]."""
 
-    def lasting(self, name: str) -> dict[str, Tensor]:
-        """Return both buffers by name, for a snapshot."""
-        return {f"{name}.values": self.values, f"{name}.delay": self.delay}
-
     def fill(self, fresh: Tensor, value: Tensor) -> None:
         """Make a value [N, D] the whole past of the worlds of a mask [N]."""
         self.values.copy_(torch.where(fresh[:, None, None], value[:, None], self.values))

@@ -10,7 +10,7 @@ from torch import Tensor
 from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
 from xreset.physics import Backend, State
 from xreset.task.config import PushConfig
-from xreset.task.randomization import sample_offset, sample_range
+from xreset.task.randomization import Drawn, sample_offset, sample_range
 
 
 class Pushes:
@@ -22,11 +22,12 @@ class Pushes:
         gate: [N] bool, whether the reward's gate was open after the last step.
     """
 
-    def __init__(self, backend: Backend, config: PushConfig, is_arm: Tensor) -> None:
-        """Allocate; ``is_arm`` [J] bool."""
+    def __init__(self, faults: Drawn, backend: Backend, config: PushConfig, is_arm: Tensor) -> None:
+        """Allocate, and have the probabilities drawn with the other ``faults``; ``is_arm`` [J] bool."""
         self.config = config
         n = backend.num_worlds
         device = backend.device
+        low, high = (log(limit) for limit in config.probability)
         scene = backend.scene
         self._control_dt = scene.control_dt
         self._inertia = torch.stack([torch.as_tensor(o.inertia / o.mass, dtype=torch.float32) for o in scene.objects])
@@ -35,16 +36,13 @@ class Pushes:
         effort_over_stiffness = [joint.drive.effort / joint.drive.kp for joint in scene.robot.joints]
         self._largest_offset = torch.where(is_arm, torch.tensor(effort_over_stiffness, device=device), 0.0)
         self._largest_offset *= config.arm_torque
-        self.probability = torch.zeros(n, device=device)
+        self._probability = faults.keep(
+            "pushes.probability", faults.zeros(), lambda generator: sample_range(n, (low, high), generator).exp()
+        )
         """[N] of a push in a control step."""
-        self.force = torch.zeros(n, 3, device=device)
-        self.torque = torch.zeros(n, 3, device=device)
-        self.gate = torch.zeros(n, dtype=torch.bool, device=device)
-
-    def draw(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Draw a probability for every world; return the values [N] and the buffer that they belong to."""
-        low, high = self.config.probability
-        return sample_range(len(self.probability), (log(low), log(high)), generator).exp(), self.probability
+        self.force = faults.zeros(3)
+        self.torque = faults.zeros(3)
+        self.gate = faults.keep("pushes.gate", faults.zeros().bool())
 
     def act(self, state: State, mass: Tensor, inertia_scale: Tensor | float, generator: torch.Generator) -> Tensor:
         """Set force and torque on the object for this step, and return offsets [N, J] of the joints' targets.
@@ -57,7 +55,7 @@ class Pushes:
         """
         c = self.config
         n = len(mass)
-        happens = torch.rand(n, 3, generator=generator, device=generator.device) < self.probability[:, None]
+        happens = torch.rand(n, 3, generator=generator, device=generator.device) < self._probability[:, None]
         if c.moves_object:
             allowed = happens[:, :2] if c.when == "always" else happens[:, :2] & self.gate[:, None]
             velocity = sample_offset(n, (0.0, c.object_velocity), generator) * allowed[:, :1]

@@ -1,13 +1,53 @@
-"""Physical parameters that are drawn at each reset (the paper's Table IX), as pure functions."""
+"""What is drawn at each reset: buffers, and physical parameters (the paper's Table IX) as pure functions."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
 from xreset.task.config import RandomizationConfig
+from xreset.task.latency import DelayLine
+
+Sample = Callable[[torch.Generator], Tensor]
+"""Draws new values of a buffer, as many as it has."""
+
+
+class Drawn:
+    """Buffers of N worlds, some of which are drawn again when an episode begins, in the order in which they were made.
+
+    Attributes:
+        lasting: all buffers by name, for a snapshot.
+    """
+
+    def __init__(self, num_worlds: int, device: torch.device) -> None:
+        """Begin with none."""
+        self.num_worlds = num_worlds
+        self.device = device
+        self.lasting: dict[str, Tensor] = {}
+        self._samples: list[tuple[Sample, Tensor]] = []
+
+    def zeros(self, *shape: int) -> Tensor:
+        """[N, ...] zeros that do not last."""
+        return torch.zeros(self.num_worlds, *shape, device=self.device)
+
+    def keep(self, name: str, buffer: Tensor, sample: Sample | None = None) -> Tensor:
+        """Add a buffer [N, ...], and return it; ``sample`` None: it is not drawn."""
+        self.lasting[name] = buffer
+        if sample is not None:
+            self._samples.append((sample, buffer))
+        return buffer
+
+    def delay_line(self, name: str, line: DelayLine, sample: Sample | None) -> DelayLine:
+        """Add a delay line whose delays are drawn, and return it."""
+        self.keep(f"{name}.values", line.values)
+        self.keep(f"{name}.delay", line.delay, sample)
+        return line
+
+    def draw(self, generator: torch.Generator) -> list[tuple[Tensor, Tensor]]:
+        """Draw for every world; return pairs of the drawn values [N, ...] and the buffer that they belong to."""
+        return [(sample(generator).view_as(buffer), buffer) for sample, buffer in self._samples]
 
 
 def pair_friction(material: Tensor, c: RandomizationConfig, link: Tensor | float | None = None) -> Tensor:

@@ -2,57 +2,46 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
 from xreset.geometry.rotations import quat_from_axis_angle, quat_multiply
 from xreset.task.config import RandomizationConfig, TrackerConfig
 from xreset.task.latency import DelayLine
-from xreset.task.randomization import sample_range
+from xreset.task.randomization import Drawn, sample_range
 
 
 class Tracker:
     """Fixed buffers of N worlds. What is off costs nothing and draws no random number."""
 
-    def __init__(self, num_worlds: int, config: RandomizationConfig, device: torch.device) -> None:
-        """Allocate."""
+    def __init__(self, faults: Drawn, config: RandomizationConfig) -> None:
+        """Allocate, and have what lasts for an episode drawn with the other ``faults``."""
         self._config = config
         c = config.tracker if config.enabled else TrackerConfig()
-
-        def zeros(*shape: int) -> Tensor:
-            return torch.zeros(num_worlds, *shape, device=device)
-
-        self._delays: DelayLine | None = None
-        if config.draws("observation_latency"):
-            self._delays = DelayLine(zeros(7), config.observation_latency[1])
-        self._bias = zeros(6) if c.has_errors else None
         self._limits = torch.tensor(
             [[c.position_bias] * 3 + [c.rotation_bias] * 3, [c.position_noise] * 3 + [c.rotation_noise] * 3],
-            device=device,
+            device=faults.device,
         )
-        self._wait = zeros() if c.skips_steps else None
-        self._last = zeros(7) if c.skips_steps else None
+        self._delays: DelayLine | None = None
+        if config.draws("observation_latency"):
+            self._delays = faults.delay_line(
+                "poses",
+                DelayLine(faults.zeros(7), config.observation_latency[1]),
+                partial(sample_range, faults.num_worlds, config.observation_latency),
+            )
+        self._bias: Tensor | None = None
+        if c.has_errors:
+            zero = faults.zeros(6)
+            self._bias = faults.keep("tracker.bias", zero, lambda g: self._limits[0] * _symmetric(zero, g))
+        self._wait: Tensor | None = None
+        if c.skips_steps:
+            self._wait = faults.keep("tracker.wait", faults.zeros())
+            self._last = faults.keep("tracker.last", faults.zeros(7))
         self._tracker = c
         self.fault_scale: Tensor | float = 1.0
         """[] factor on errors and losses of single poses; those of an episode are scaled where they are drawn."""
-
-    def lasting(self) -> dict[str, Tensor]:
-        """Return all buffers by name, for a snapshot."""
-        lasting = {} if self._delays is None else self._delays.lasting("_poses")
-        for name in ("_bias", "_wait", "_last"):
-            if (value := getattr(self, name)) is not None:
-                lasting[f"_tracker.{name}"] = value
-        return lasting
-
-    def draw(self, generator: torch.Generator) -> list[tuple[Tensor, Tensor]]:
-        """Draw for every world; return pairs of the drawn values [N, ...] and the buffer that they belong to."""
-        drawn = []
-        if self._delays is not None:
-            count = len(self._delays.delay)
-            drawn.append((sample_range(count, self._config.observation_latency, generator), self._delays.delay))
-        if self._bias is not None:
-            drawn.append((self._limits[0] * _symmetric(self._bias, generator), self._bias))
-        return drawn
 
     def observe(self, pos: Tensor, quat: Tensor, fresh: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Return position [N, 3] and orientation [N, 4] as they are observed.
@@ -67,7 +56,7 @@ class Tracker:
             error = self._bias + self.fault_scale * self._limits[1] * _symmetric(self._bias, generator)
             pos = pos + error[:, :3]
             quat = quat_multiply(quat_from_axis_angle(error[:, 3:]), quat)
-        if self._wait is not None and self._last is not None:
+        if self._wait is not None:
             arrives = fresh | (self._wait <= 0)
             pose = torch.where(arrives[:, None], torch.cat((pos, quat), dim=-1), self._last)
             self._last.copy_(pose)

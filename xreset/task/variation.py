@@ -5,7 +5,7 @@ All are drawn again with every episode.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -16,6 +16,7 @@ from xreset.task.config import RandomizationConfig
 from xreset.task.latency import DelayLine
 from xreset.task.pushes import Pushes
 from xreset.task.randomization import (
+    Drawn,
     own_friction,
     sample_drives,
     sample_friction,
@@ -33,6 +34,7 @@ class Variation:
             episode.
         force_gain: [N, 1, 1] factor on the observed forces; None: 1.
         pushes: pushes on object and arm; None: there are none.
+        lasting: all buffers by name, for a snapshot.
         fault_scale: [] factor on delays, lost actions, faults of the tracker and the probability of pushes; None: 1.
     """
 
@@ -46,106 +48,89 @@ class Variation:
         Raises:
             CapabilityError: the engine cannot set a parameter that is drawn.
         """
-        self._backend = backend
-        self._config = config
-        self._is_arm = is_arm
-        objects = backend.scene.objects
-        device = backend.device
-        joints = len(is_arm)
-        self._nominal_mass = torch.tensor([o.mass for o in objects], device=device)[backend.object_index]
-        self._own_friction = own_friction([o.friction for o in objects], config).to(device)[backend.object_index]
+        scene = backend.scene
+        n = backend.num_worlds
+        c = config
+        mass = torch.tensor([o.mass for o in scene.objects], device=backend.device)[backend.object_index]
+        offset = own_friction([o.friction for o in scene.objects], c).to(backend.device)[backend.object_index]
 
-        def zeros(*shape: int) -> Tensor:
-            return torch.zeros(backend.num_worlds, *shape, device=device)
+        def friction(generator: torch.Generator) -> Tensor:
+            drawn = sample_friction(n, c, generator) + offset
+            return drawn.clamp(min=0.05)  # slippery, not negative
 
-        self.parameters = {"friction": zeros(3), "object_mass": zeros()}
-        if config.scales_drives:
-            self.parameters["drives"] = zeros(3, joints)
-        for name, shape in (("torsional_friction", ()), ("object_inertia", ()), ("object_com", (3,))):
-            if config.draws(name):
-                self.parameters[name] = zeros(*shape)
-        push = config.push
-        pushed = config.draws("push")
-        needed = [*self.parameters, *(["object_wrench"] if pushed and push.moves_object else [])]
+        def torsional(generator: torch.Generator) -> Tensor:
+            return scene.friction.torsional * sample_range(n, c.torsional_friction, generator)
+
+        mass_scale = c.mass_scale if c.enabled else (1.0, 1.0)
+        self._physical = Drawn(n, backend.device)
+        self.parameters: dict[str, Tensor] = {}
+        for name, shape, is_drawn, sample in (
+            ("friction", (3,), True, friction),
+            ("object_mass", (), True, lambda generator: mass * sample_range(n, mass_scale, generator)),
+            ("drives", (3, len(is_arm)), c.scales_drives, partial(sample_drives, is_arm, n, c)),
+            ("torsional_friction", (), c.draws("torsional_friction"), torsional),
+            ("object_inertia", (), c.draws("object_inertia"), partial(sample_range, n, c.object_inertia)),
+            ("object_com", (3,), c.draws("object_com"), partial(sample_offset, n, c.object_com)),
+        ):
+            if is_drawn:
+                self.parameters[name] = self._physical.keep(name, self._physical.zeros(*shape), sample)
+        pushed = c.draws("push")
+        needed = [*self.parameters, *(["object_wrench"] if pushed and c.push.moves_object else [])]
         missing = [name.replace("_", " ") for name in needed if name not in backend.capabilities]
         if missing:
             raise CapabilityError(
                 f"The backend {backend.name!r} cannot set {', '.join(missing)} in each world, which this task draws. "
                 "Leave these ranges of task.randomization at their defaults, or use another backend."
             )
-        self.force_gain = zeros(1, 1) + 1 if config.draws("force_gain") else None
-        self._commands = None
-        if config.draws("action_latency", "hand_latency"):
-            hand_latency = config.hand_latency or (0.0, 0.0)
-            longest = max(config.action_latency[1], hand_latency[1])
-            self._commands = DelayLine(zeros(joints), longest, by_column=config.hand_latency is not None)
-        self._proprio = (
-            DelayLine(zeros(proprio_width), config.proprio_latency[1]) if config.draws("proprio_latency") else None
-        )
-        self._lost_actions = zeros(1) if config.draws("lost_actions") else None
-        self._tracker = Tracker(backend.num_worlds, config, device)
+        self.force_gain: Tensor | None = None
+        if c.draws("force_gain"):
+            self.force_gain = self._physical.keep(
+                "force_gain",
+                self._physical.zeros(1, 1),
+                partial(sample_range, n, c.force_gain),
+            )
+        faults = Drawn(n, backend.device)
+        self._faults = faults
+        self._commands: DelayLine | None = None
+        if c.draws("action_latency", "hand_latency"):
+
+            def delay(generator: torch.Generator) -> Tensor:
+                of_arm = sample_range(n, c.action_latency, generator)
+                if c.hand_latency is None:
+                    return of_arm
+                of_hand = sample_range(n, c.hand_latency, generator)
+                return torch.where(is_arm, of_arm[:, None], of_hand[:, None])
+
+            longest = max(c.action_latency[1], (c.hand_latency or (0.0, 0.0))[1])
+            line = DelayLine(faults.zeros(len(is_arm)), longest, by_column=c.hand_latency is not None)
+            self._commands = faults.delay_line("commands", line, delay)
+        self._tracker = Tracker(faults, c)
+        self._proprio: DelayLine | None = None
+        if c.draws("proprio_latency"):
+            line = DelayLine(faults.zeros(proprio_width), c.proprio_latency[1])
+            self._proprio = faults.delay_line("proprio", line, partial(sample_range, n, c.proprio_latency))
+        self._lost_actions: Tensor | None = None
+        if c.draws("lost_actions"):
+            self._lost_actions = faults.keep(
+                "lost_actions",
+                faults.zeros(1),
+                partial(sample_range, n, c.lost_actions),
+            )
+        self.pushes = Pushes(faults, backend, c.push, is_arm) if pushed else None
         self.fault_scale: Tensor | None = None
-        self.pushes = Pushes(backend, push, is_arm) if pushed else None
+        self.lasting = self._physical.lasting | faults.lasting
 
     def set_fault_scale(self, scale: float) -> None:
         """Set the factor on all faults of a real loop. The first call must come before the first step."""
         if self.fault_scale is None:
-            self.fault_scale = torch.ones((), device=self._backend.device)
+            self.fault_scale = torch.ones((), device=self._faults.device)
             self._tracker.fault_scale = self.fault_scale
         self.fault_scale.fill_(scale)
 
-    def lasting(self) -> dict[str, Tensor]:
-        """Return all buffers by name, for a snapshot."""
-        lasting = {f"_parameters.{name}": value for name, value in self.parameters.items()}
-        if self.force_gain is not None:
-            lasting["_force_gain"] = self.force_gain
-        if self._commands is not None:
-            lasting |= self._commands.lasting("_commands")
-        if self._proprio is not None:
-            lasting |= self._proprio.lasting("_proprio")
-        if self._lost_actions is not None:
-            lasting["_lost_actions"] = self._lost_actions
-        if self.pushes is not None:
-            lasting |= {"_pushes.probability": self.pushes.probability, "_pushes.gate": self.pushes.gate}
-        return lasting | self._tracker.lasting()
-
     def draw(self, generator: torch.Generator) -> list[tuple[Tensor, Tensor]]:
         """Draw for every world; return pairs of the drawn values [N, ...] and the buffer that they belong to."""
-        c = self._config
-        n = self._backend.num_worlds
-        mass_scale = c.mass_scale if c.enabled else (1.0, 1.0)
-
-        def friction() -> Tensor:
-            drawn = sample_friction(n, c, generator) + self._own_friction
-            return drawn.clamp(min=0.05)  # slippery, not negative
-
-        samples: dict[str, Callable[[], Tensor]] = {
-            "friction": friction,
-            "object_mass": lambda: self._nominal_mass * sample_range(n, mass_scale, generator),
-            "drives": lambda: sample_drives(self._is_arm, n, c, generator),
-            "torsional_friction": lambda: (
-                self._backend.scene.friction.torsional * sample_range(n, c.torsional_friction, generator)
-            ),
-            "object_inertia": lambda: sample_range(n, c.object_inertia, generator),
-            "object_com": lambda: sample_offset(n, c.object_com, generator),
-        }
-        drawn = [(samples[name](), kept) for name, kept in self.parameters.items()]
-        if self.force_gain is not None:
-            drawn.append((sample_range(n, c.force_gain, generator).view(-1, 1, 1), self.force_gain))
-        faults: list[tuple[Tensor, Tensor]] = []
-        if self._commands is not None:
-            delay = sample_range(n, c.action_latency, generator)
-            if c.hand_latency is not None:
-                hand_delay = sample_range(n, c.hand_latency, generator)
-                delay = torch.where(self._is_arm, delay[:, None], hand_delay[:, None])
-            faults.append((delay, self._commands.delay))
-        faults += self._tracker.draw(generator)
-        if self._proprio is not None:
-            faults.append((sample_range(n, c.proprio_latency, generator), self._proprio.delay))
-        if self._lost_actions is not None:
-            faults.append((sample_range(n, c.lost_actions, generator)[:, None], self._lost_actions))
-        if self.pushes is not None:
-            faults.append(self.pushes.draw(generator))
+        drawn = self._physical.draw(generator)
+        faults = self._faults.draw(generator)
         if self.fault_scale is not None:
             faults = [(value * self.fault_scale, kept) for value, kept in faults]
         return drawn + faults

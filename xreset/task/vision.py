@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
@@ -10,7 +12,7 @@ from xreset.errors import XResetError
 from xreset.physics import Backend, State
 from xreset.task.config import TaskConfig
 from xreset.task.latency import DelayLine
-from xreset.task.randomization import sample_offset, sample_range
+from xreset.task.randomization import Drawn, sample_offset, sample_range
 
 
 class Vision:
@@ -18,43 +20,39 @@ class Vision:
 
     Attributes:
         cameras: the cameras.
+        lasting: all buffers by name, for a snapshot.
+        draw: :meth:`xreset.task.randomization.Drawn.draw`.
     """
 
     def __init__(self, backend: Backend, task: TaskConfig) -> None:
         """Allocate, and start the renderer; errors as of :class:`~xreset.cameras.sensor.Cameras`."""
         self._backend = backend
-        self._config = task.randomization
-        self._latency = task.vision.latency
-        self.cameras = Cameras(backend.scene, backend.object_index, task.vision, scale=task.observation.cloud_scale)
-        longest = self._latency + (self._config.camera_latency[1] if self._config.enabled else 0.0)
-        values = torch.zeros(backend.num_worlds, torch.Size(task.vision.view_shape).numel(), device=backend.device)
-        self._delay = DelayLine(values, longest) if round(longest) else None
-        if self._delay is not None:
-            self._delay.delay.fill_(round(self._latency))
+        c = task.randomization
+        vision = task.vision
+        cameras = Cameras(backend.scene, backend.object_index, vision, scale=task.observation.cloud_scale)
+        self.cameras = cameras
+        drawn = Drawn(backend.num_worlds, backend.device)
+        for name, buffer, sample in (
+            ("camera_shift", cameras.shift, partial(sample_offset, cameras.fov_scale.numel(), c.camera_shift)),
+            ("camera_turn", cameras.turn, partial(sample_offset, cameras.fov_scale.numel(), c.camera_turn)),
+            ("camera_fov", cameras.fov_scale, partial(sample_range, cameras.fov_scale.numel(), c.camera_fov)),
+            ("camera_noise", cameras.noise_scale, partial(sample_range, backend.num_worlds, c.camera_noise)),
+        ):
+            drawn.keep(name, buffer, sample if c.draws(name) else None)
+        drawn.keep("images", cameras.image)
+        drawn.keep("views", cameras.view)
+        longest = vision.latency + (c.camera_latency[1] if c.enabled else 0.0)
+        self._delay: DelayLine | None = None
+        if round(longest):
 
-    def lasting(self) -> dict[str, Tensor]:
-        """Return all buffers by name, for a snapshot."""
-        lasting = self.cameras.lasting()
-        if self._delay is not None:
-            lasting |= self._delay.lasting("_views")
-        return lasting
+            def age(generator: torch.Generator) -> Tensor:
+                return (vision.latency + sample_range(backend.num_worlds, c.camera_latency, generator)).round()
 
-    def draw(self, generator: torch.Generator) -> list[tuple[Tensor, Tensor]]:
-        """Draw for every world; return pairs of the drawn values [N, ...] and the buffer that they belong to."""
-        c = self._config
-        cameras = self.cameras
-        worlds, count = cameras.fov_scale.shape
-        drawn = []
-        for name, buffer in (("camera_shift", cameras.shift), ("camera_turn", cameras.turn)):
-            if c.draws(name):
-                drawn.append((sample_offset(worlds * count, getattr(c, name), generator).view_as(buffer), buffer))
-        for name, buffer in (("camera_fov", cameras.fov_scale), ("camera_noise", cameras.noise_scale)):
-            if c.draws(name):
-                drawn.append((sample_range(buffer.numel(), getattr(c, name), generator).view_as(buffer), buffer))
-        if self._delay is not None and c.draws("camera_latency"):
-            age = self._latency + sample_range(worlds, c.camera_latency, generator)
-            drawn.append((age.round(), self._delay.delay))
-        return drawn
+            line = DelayLine(cameras.view.flatten(1), longest)
+            line.delay.fill_(round(vision.latency))
+            self._delay = drawn.delay_line("delayed_views", line, age if c.draws("camera_latency") else None)
+        self.lasting = drawn.lasting
+        self.draw = drawn.draw
 
     def aim(self, state: State, goal_pos: Tensor, goal_quat: Tensor, episode_step: Tensor) -> None:
         """Put bodies and cameras where they are; arguments as of :meth:`Cameras.aim`, and control steps [N] since each

@@ -73,7 +73,7 @@ class MadeTest(unittest.TestCase):
     def test_what_cannot_be_is_refused(self):
         for error, message, options in (
             (GoalError, "banana: the goal is .* cm inside the table", {"poses": [(0.5, 0.3, 0.0, 1, 0, 0, 0)]}),
-            (GoalError, r"cannot reach 1 of 1 goals .* own_000 at \(1.9,", {"poses": [(1.9, 0.3, 0.3, 1, 0, 0, 0)]}),
+            (GoalError, r"cannot reach 1 of 1 goals .* own_000", {"poses": [(1.9, 0.3, 0.3, 1, 0, 0, 0)]}),
             (GoalError, "is not a pose", {"poses": [(0.5, 0.3, 0.2)]}),
             (GoalError, "Unknown family 'turn'. Choose from: lift, ", {"families": ["turn"]}),
             (ObjectError, "Unknown object 'teapot'", {"objects": ["teapot"]}),
@@ -120,7 +120,9 @@ class UsedTest(unittest.TestCase):
         self.assertEqual((goals.robot, goals.joint_names), ("ur7e-sharpa", self.robot.joint_names))
         far = toy_goals(load_robot("openarm"))
         far.goal_pos[2] = (1.9, 0.3, 0.3)
-        with self.assertRaisesRegex(GoalError, "1 of 4 goals are out of the reach of ur7e-sharpa, such as .*lift_002"):
+        with self.assertRaisesRegex(
+            GoalError, "1 of 2 goals of 010_potted_meat_can are out of the reach of ur7e-sharpa, such as .*lift_002"
+        ):
             load_inputs(far, robot=self.robot)
 
     def test_what_does_not_fit_is_refused(self):

@@ -182,6 +182,5 @@ def _check(inputs: Inputs) -> None:
     if isinstance(data, Retargeted):
         check_retargeted(inputs.name, data, inputs.robot)
     if isinstance(data, ResetBank):
-        robot = {"name": data.robot, "joint_names": data.joint_names, "fingerprint": data.robot_fingerprint}
-        check_robot(inputs.name, "reset bank", inputs.robot, **robot)
+        check_robot(inputs.name, "reset bank", data, inputs.robot)
         check_objects(inputs.name, data, inputs.objects)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -181,9 +182,9 @@ def read_actions(path: str | Path, robot: RobotSpec | str | None, objects: Calla
     """
     a = read_npz(path, SCHEMA, _FIELDS, what="an action sequence", check=_check)
     spec = robot if isinstance(robot, RobotSpec) else load_robot(robot or str(a["robot"]))
-    names = tuple(a["joint_names"].tolist())
-    fingerprint = str(a["robot_fingerprint"])
-    check_robot(path, "action sequence", spec, name=str(a["robot"]), joint_names=names, fingerprint=fingerprint)
+    made_for = {name: a[name].tolist() for name in ("robot", "robot_fingerprint")}
+    made_for["joint_names"] = tuple(a["joint_names"].tolist())
+    check_robot(path, "action sequence", SimpleNamespace(**made_for), spec)
     thing = objects(str(a["object_name"]))
     if thing.source != str(a["object_source"]):
         raise FileFormatError(

@@ -121,6 +121,16 @@ class ResetBank:
         return replace(self, **changes)
 
 
+def no_states(robot: RobotSpec) -> dict[str, Any]:
+    """Return the fields of a bank of a robot that hold no states, all without a default."""
+    return {
+        "robot": robot.name,
+        "robot_fingerprint": robot.fingerprint,
+        "joint_names": robot.joint_names,
+        "joint_pos": np.zeros((0, len(robot.joints)), np.float32),
+    }
+
+
 def starts_and_goals(motions: ObjectMotions, robot: RobotSpec, sources: Mapping[str, str] | None = None) -> ResetBank:
     """Return a bank of demonstrations or trajectories without states; ``sources`` maps objects to where their geometry
     came from."""
@@ -129,9 +139,7 @@ def starts_and_goals(motions: ObjectMotions, robot: RobotSpec, sources: Mapping[
     object_names = tuple(sorted({*map(str, motions.object_name)}))
     sources = sources or {}
     return ResetBank(
-        robot=robot.name,
-        robot_fingerprint=robot.fingerprint,
-        joint_names=robot.joint_names,
+        **no_states(robot),
         sequence_name=np.asarray(motions.sequence_name),
         sequence_object=np.asarray(motions.object_name),
         start_pos=start_pos.astype(np.float32),
@@ -140,7 +148,6 @@ def starts_and_goals(motions: ObjectMotions, robot: RobotSpec, sources: Mapping[
         goal_quat_wxyz=goal_quat.astype(np.float32),
         object_names=object_names,
         object_sources=tuple(sources.get(name, "") for name in object_names),
-        joint_pos=np.zeros((0, len(robot.joints)), np.float32),
     )
 
 
@@ -161,24 +168,26 @@ def read_bank(path: str | Path, *, robot: RobotSpec | None = None) -> ResetBank:
     """
     bank = read_record(ResetBank, path, SCHEMA, what="a reset bank", check=bank_problem)
     if robot is not None:
-        check_robot(
-            path, "reset bank", robot, name=bank.robot, joint_names=bank.joint_names, fingerprint=bank.robot_fingerprint
-        )
+        check_robot(path, "reset bank", bank, robot)
     return bank
 
 
-def check_robot(
-    path: str | Path, what: str, robot: RobotSpec, *, name: str, joint_names: tuple[str, ...], fingerprint: str
-) -> None:
-    """Refuse a file that was made for another robot, or for another version of this robot; ``FileFormatError``."""
-    if name != robot.name or joint_names != robot.joint_names:
+def check_robot(path: str | Path, what: str, data: Any, robot: RobotSpec) -> None:
+    """Refuse data that were made for another robot, or for another version of this robot; ``FileFormatError``.
+
+    Args:
+        data: anything with ``robot``, ``robot_fingerprint`` and ``joint_names``.
+    """
+    if data.robot != robot.name or data.joint_names != robot.joint_names:
         raise FileFormatError(
-            f"{path} is a {what} for the robot {name!r} with {len(joint_names)} joints; "
-            f"{robot.name!r} has {len(robot.joints)}. Make it again with --robot {robot.name}, or use --robot {name}."
+            f"{path} is a {what} for the robot {data.robot!r} with {len(data.joint_names)} joints; "
+            f"{robot.name!r} has {len(robot.joints)}. Make it again with --robot {robot.name}, or use --robot "
+            f"{data.robot}."
         )
-    if fingerprint != robot.fingerprint:
+    if not robot.has_fingerprint(data.robot_fingerprint):
         raise FileFormatError(
-            f"{path} is a {what} for another version of {name!r}: its URDF or robot.toml has changed. Make it again."
+            f"{path} is a {what} for another version of {data.robot!r}: its URDF or robot.toml has changed. Make it "
+            "again."
         )
 
 
@@ -188,8 +197,7 @@ _TOLERANCE = 1e-4
 
 def check_retargeted(path: str | Path, data: Retargeted, robot: RobotSpec) -> None:
     """Refuse trajectories of another robot, or with joints outside this robot's limits; ``FileFormatError``."""
-    made_for = {"name": data.robot, "joint_names": data.joint_names, "fingerprint": data.robot_fingerprint}
-    check_robot(path, "retargeted file", robot, **made_for)
+    check_robot(path, "retargeted file", data, robot)
     tree = robot_tree(robot)
     lower = np.array([tree.joint(name).lower for name in data.joint_names])
     upper = np.array([tree.joint(name).upper for name in data.joint_names])

@@ -15,6 +15,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Annotated
@@ -28,8 +29,8 @@ from xreset.description import load_robot
 from xreset.errors import FileFormatError, GoalError
 from xreset.objects.catalogue import load_objects, object_names
 from xreset.objects.rest import rest_height, resting_orientation
-from xreset.records import Field, read_record, write_record
-from xreset.resets.bank import ResetBank, bank_problem, check_objects
+from xreset.records import Field, read_record, schema_of, write_record
+from xreset.resets.bank import ResetBank, bank_problem, check_objects, no_states
 from xreset.resets.config import GoalConfig
 from xreset.resets.reach import Reach
 from xreset.resets.settle import settle_starts
@@ -40,7 +41,8 @@ OWN = "own"
 FAMILIES = ("lift", "yaw", "tilt-x", "tilt-y", "random")
 """Families of goals that are drawn; goals of the family :data:`OWN` are given."""
 _MIDDLE = tuple(sum(span) / 2 for span in WORKSPACE)
-_TURN_AXES = {"yaw": (0.0, 0.0, 1.0), "tilt-x": (1.0, 0.0, 0.0), "tilt-y": (0.0, 1.0, 0.0)}
+_Z = (0.0, 0.0, 1.0)
+_TURN_AXES = {"yaw": _Z, "tilt-x": (1.0, 0.0, 0.0), "tilt-y": (0.0, 1.0, 0.0)}
 _START_SEED = 42
 _GOAL_SEED = 71
 """The published paper's seed bases of its start and goal offsets."""
@@ -78,11 +80,6 @@ class _Episode:
     goal: np.ndarray
     goal_turn: Rotation
 
-    @property
-    def name(self) -> str:
-        """Name of the sequence."""
-        return f"{self.obj.name}/{self.family}_{self.number:03d}"
-
 
 def make_goals(
     objects: Iterable[str] | None = None,
@@ -117,43 +114,32 @@ def make_goals(
         families = () if poses else FAMILIES
     if unknown := [family for family in families if family not in FAMILIES]:
         raise GoalError(f"Unknown family {unknown[0]!r}. Choose from: {', '.join(FAMILIES)}.")
-    folder = Path(meshes) if meshes else None
-    specs = load_objects(objects or object_names(folder), folder)
+    specs = load_objects(objects or object_names(meshes), meshes)
     spec = robot if isinstance(robot, RobotSpec) else load_robot(robot)
     own = [_own_pose(pose) for pose in poses]
     for obj in specs:
         for pos, quat in own:
-            _check_above_table(obj, pos, quat, f"{obj.name}: ")
+            _check_above_table(obj.name, rest_height(obj, quat) - pos[2])
     rests = _resting_poses(specs, spec, upright=config.upright)
     reach = Reach(spec)
-    wanted = list(product(families, range(config.per_family)))
-    wanted += product([OWN], range(len(own)))
-    found: list[_Episode] = []
+    wanted = [*product(families, range(config.per_family)), *product([OWN], range(len(own)))]
+    episodes: list[_Episode] = []
     for obj in specs:
-
-        def draw(family: str, number: int, attempt: int, obj: ObjectSpec = obj) -> _Episode:
-            episode = _draw(obj, rests[obj.name], family, number, attempt, config)
-            if family != OWN:
-                return episode
-            pos, quat = own[number]
-            turn = Rotation.from_quat(quat, scalar_first=True)
-            return replace(episode, goal=_center(obj, pos, turn), goal_turn=turn)
-
-        done = len(found)
-        found += _reached(
-            reach, wanted, draw, lambda count, done=done: progress(done + count, len(wanted) * len(specs))
+        done = len(episodes)
+        found = _reached(
+            reach,
+            wanted,
+            partial(_draw, obj, rests[obj.name], own, config),
+            lambda count, done=done: progress(done + count, len(wanted) * len(specs)),
         )
-        missing = len(wanted) - (len(found) - done)
-        if missing:
-            kept = {(e.family, e.number) for e in found[done:]}
-            family, number = next(item for item in wanted if item not in kept)
-            place = f" at ({', '.join(f'{x:g}' for x in own[number][0])})" if family == OWN else ""
+        if missing := [f"{family}_{number:03d}" for family, number in wanted if (family, number) not in found]:
             raise GoalError(
-                f"{spec.name} cannot reach {missing} of {len(wanted)} goals of {obj.name}, such as "
-                f"{family}_{number:03d}{place}: no grasp holds the object both at its start and there. "
-                "Lower the lift or the angle, leave out the family, or move the goal."
+                f"{spec.name} cannot reach {len(missing)} of {len(wanted)} goals of {obj.name}, such as {missing[0]}: "
+                "no grasp holds the object both at its start and there. Lower the lift or the angle, leave out the "
+                "family, or move the goal."
             )
-    return _goal_set(spec, found)
+        episodes += [found[item] for item in wanted]
+    return _goal_set(spec, episodes)
 
 
 def write_goals(path: str | Path, goals: GoalSet, config: GoalConfig | None = None) -> None:
@@ -178,19 +164,17 @@ def with_goals(bank: ResetBank, goals: GoalSet) -> ResetBank:
             f"Make the goal set again: xreset goals --robot {bank.robot}."
         )
     sources = dict(zip(bank.object_names, bank.object_sources, strict=True))
-    added = dict(zip(goals.object_names, goals.object_sources, strict=True))
-    for name in sorted(sources.keys() & added.keys()):
-        if sources[name] != added[name]:
+    for name, source in zip(goals.object_names, goals.object_sources, strict=True):
+        if sources.setdefault(name, source) != source:
             raise FileFormatError(
                 f"The bank and the goal set were made with different meshes of {name}. Make one again."
             )
-    names = tuple(sorted(sources | added))
-    per_sequence = (
-        "sequence_name", "sequence_object", "start_pos", "start_quat_wxyz", "goal_pos", "goal_quat_wxyz",
-    )  # fmt: skip
-    joined = {name: np.concatenate((getattr(bank, name), getattr(goals, name))) for name in per_sequence}
-    joined |= {"object_names": names, "object_sources": tuple((sources | added)[name] for name in names)}
-    return replace(bank, **joined)
+    joined = {}
+    for name, field in schema_of(ResetBank).items():
+        if field.shape[:1] == ("S",):
+            joined[name] = np.concatenate((getattr(bank, name), getattr(goals, name)))
+    names = tuple(sorted(sources))
+    return replace(bank, **joined, object_names=names, object_sources=tuple(sources[name] for name in names))
 
 
 def checked_goals(where: str, goals: GoalSet, robot: RobotSpec, objects: Sequence[ObjectSpec]) -> GoalSet:
@@ -207,38 +191,33 @@ def checked_goals(where: str, goals: GoalSet, robot: RobotSpec, objects: Sequenc
         GoalError: a start is not on the table, or a goal is inside it or out of reach.
     """
     check_objects(where, goals, tuple(objects))
-    episodes = []
+    reach = None if robot.has_fingerprint(goals.robot_fingerprint) else Reach(robot)
     for obj in objects:
-        for i in np.flatnonzero(goals.sequence_object == obj.name):
-            name = f"{where}: {goals.sequence_name[i]}: "
-            gap = goals.start_pos[i, 2] - rest_height(obj, goals.start_quat_wxyz[i])
+        rows = np.flatnonzero(goals.sequence_object == obj.name)
+        gaps = goals.start_pos[rows, 2] - rest_height(obj, goals.start_quat_wxyz[rows])
+        depths = rest_height(obj, goals.goal_quat_wxyz[rows]) - goals.goal_pos[rows, 2]
+        for row, gap, depth in zip(rows, gaps, depths, strict=True):
+            name = f"{where}: {goals.sequence_name[row]}"
             if abs(gap) > _FLOATING:
                 side = "above" if gap > 0 else "inside"
-                raise GoalError(f"{name}the object starts {100 * abs(gap):.1f} cm {side} the table, expected at rest.")
-            _check_above_table(obj, goals.goal_pos[i], goals.goal_quat_wxyz[i], name)
-            start_turn = Rotation.from_quat(goals.start_quat_wxyz[i], scalar_first=True)
-            goal_turn = Rotation.from_quat(goals.goal_quat_wxyz[i], scalar_first=True)
-            episode = _Episode(
-                obj=obj,
-                family=str(goals.family[i]),
-                number=int(i),
-                start=_center(obj, goals.start_pos[i], start_turn),
-                start_turn=start_turn,
-                goal=_center(obj, goals.goal_pos[i], goal_turn),
-                goal_turn=goal_turn,
+                raise GoalError(
+                    f"{name}: the object starts {100 * abs(gap):.1f} cm {side} the table, expected at rest."
+                )
+            _check_above_table(name, depth)
+        if reach is None or not len(rows):
+            continue
+        start_turns = Rotation.from_quat(goals.start_quat_wxyz[rows], scalar_first=True)
+        goal_turns = Rotation.from_quat(goals.goal_quat_wxyz[rows], scalar_first=True)
+        start = goals.start_pos[rows] + start_turns.apply(obj.com)
+        goal = goals.goal_pos[rows] + goal_turns.apply(obj.com)
+        held = reach.holds(start, goal, goal_turns * start_turns.inv())
+        if not held.all():
+            raise GoalError(
+                f"{where}: {int((~held).sum())} of {len(held)} goals of {obj.name} are out of the reach of "
+                f"{robot.name}, such as {goals.sequence_name[rows[held.argmin()]]}. Move them, or make a goal set for "
+                f"this robot: xreset goals --robot {robot.name}."
             )
-            episodes.append(episode)
-    if robot.has_fingerprint(goals.robot_fingerprint) or not episodes:
-        return goals
-    held = _held(Reach(robot), episodes)
-    if not held.all():
-        raise GoalError(
-            f"{where}: {int((~held).sum())} of {len(held)} goals are out of the reach of {robot.name}, such as "
-            f"{goals.sequence_name[episodes[held.argmin()].number]}. Move them, or make a goal set for this robot: "
-            f"xreset goals --robot {robot.name}."
-        )
-    changes = {"robot": robot.name, "robot_fingerprint": robot.fingerprint, "joint_names": robot.joint_names}
-    return replace(goals, joint_pos=np.zeros((0, len(robot.joints)), np.float32), **changes)
+    return goals if reach is None else replace(goals, **no_states(robot))
 
 
 # Drawing --------------------------------------------------------------------------------------------------------------
@@ -253,28 +232,16 @@ def _own_pose(pose: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
     return values[:3], values[3:] / length
 
 
-def _check_above_table(obj: ObjectSpec, pos: np.ndarray, quat: np.ndarray, name: str) -> None:
-    depth = rest_height(obj, quat) - pos[2]
+def _check_above_table(name: str, depth: float) -> None:
     if depth > _INSIDE:
-        raise GoalError(f"{name}the goal is {100 * depth:.1f} cm inside the table. Raise it by as much.")
+        raise GoalError(f"{name}: the goal is {100 * depth:.1f} cm inside the table. Raise it by as much.")
 
 
-def _center(obj: ObjectSpec, pos: np.ndarray, turn: Rotation) -> np.ndarray:
-    """[3] centre of mass of an object whose mesh frame is at a pose."""
-    return pos + turn.apply(obj.com)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Rest:
-    """A resting pose."""
-
-    height: float
-    """Of the centre of mass [m]."""
-    turn: Rotation
-
-
-def _resting_poses(objects: Sequence[ObjectSpec], robot: RobotSpec, *, upright: bool) -> dict[str, list[_Rest]]:
-    """Return the resting poses of each object; one that is more likely is listed more often.
+def _resting_poses(
+    objects: Sequence[ObjectSpec], robot: RobotSpec, *, upright: bool
+) -> dict[str, list[tuple[float, Rotation]]]:
+    """Return the resting poses of each object: height of the centre of mass [m], and orientation. A pose that is more
+    likely is listed more often.
 
     Raises:
         GoalError: an object does not come to rest.
@@ -283,62 +250,74 @@ def _resting_poses(objects: Sequence[ObjectSpec], robot: RobotSpec, *, upright: 
     listed: dict[str, list[int]] = {}
     for obj in objects:
         random = np.random.default_rng(zlib.crc32(obj.name.encode()))
-        directions = np.array([[0.0, 0.0, 1.0]]) if upright else random.normal(size=(_DIRECTIONS, 3))
+        directions = np.array([_Z]) if upright else random.normal(size=(_DIRECTIONS, 3))
         ups: dict[int, np.ndarray] = {}
         listed[obj.name] = []
         for direction in directions:
             quat = resting_orientation(obj, direction / np.linalg.norm(direction))
             turn = Rotation.from_quat(quat, scalar_first=True)
-            up = turn.inv().apply((0.0, 0.0, 1.0))
+            up = turn.inv().apply(_Z)
             known = [row for row, other in ups.items() if other @ up > _SAME_POSE]
             listed[obj.name].append(known[0] if known else len(episodes))
             if not known:
                 ups[len(episodes)] = up
-                center = _center(obj, np.array([*_MIDDLE, rest_height(obj, quat)]), turn)
+                center = np.array([*_MIDDLE, rest_height(obj, quat)]) + turn.apply(obj.com)
                 place = {"start": center, "start_turn": turn, "goal": center, "goal_turn": turn}
                 episodes.append(_Episode(obj=obj, family="rest", number=len(episodes), **place))
     settled, at_rest = settle_starts(_goal_set(robot, episodes), robot, objects)
-    rests: dict[str, list[_Rest]] = {}
+    rests = {}
     for obj in objects:
-        rests[obj.name] = []
-        for row in listed[obj.name]:
-            if at_rest[row]:
-                turn = Rotation.from_quat(settled.start_quat_wxyz[row], scalar_first=True)
-                rests[obj.name].append(_Rest(height=_center(obj, settled.start_pos[row], turn)[2], turn=turn))
-        if not rests[obj.name]:
+        rows = [row for row in listed[obj.name] if at_rest[row]]
+        if not rows:
             raise GoalError(f"{obj.name} does not come to rest on the table: it rolls or falls over in MuJoCo.")
+        turns = Rotation.from_quat(settled.start_quat_wxyz[rows], scalar_first=True)
+        heights = settled.start_pos[rows, 2] + turns.apply(obj.com)[:, 2]
+        rests[obj.name] = list(zip(heights, turns, strict=True))
     return rests
 
 
 def _draw(
-    obj: ObjectSpec, rests: Sequence[_Rest], family: str, number: int, attempt: int, config: GoalConfig
+    obj: ObjectSpec,
+    rests: Sequence[tuple[float, Rotation]],
+    own: Sequence[tuple[np.ndarray, np.ndarray]],
+    config: GoalConfig,
+    family: str,
+    number: int,
+    attempt: int,
 ) -> _Episode:
     """Draw a start and a goal; nothing else decides what is drawn."""
     key = [config.seed, zlib.crc32(f"{obj.name} {family}".encode()), number, attempt]
     random = np.random.default_rng(key)
-    rest = rests[int(random.integers(len(rests)))]
+    height, turn = rests[int(random.integers(len(rests)))]
     (x, y), (goal_x, goal_y) = random.uniform(*np.transpose(WORKSPACE), size=(2, 2))
-    place = np.array([x, y, rest.height])
-    heading = _about_z(random.uniform(0.0, 2.0 * np.pi)) * rest.turn
-    goal = place + np.array([0.0, 0.0, config.lift])
-    turn = Rotation.identity()
-    if family == "random":
-        goal = np.array([goal_x, goal_y, rest.height + random.uniform(*LIFT)])
-        axis = random.normal(size=3)
-        turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * random.uniform(0.0, np.pi))
-    elif family in _TURN_AXES:
-        side = random.choice((-1.0, 1.0))
-        turn = Rotation.from_rotvec(side * np.radians(config.angle) * np.array(_TURN_AXES[family]))
+    place = np.array([x, y, height])
+    heading = _about_z(random.uniform(0.0, 2.0 * np.pi)) * turn
     at_start = np.random.default_rng([_START_SEED, *key]).uniform(-1.0, 1.0, 3)  # x, y, yaw
     at_goal = np.random.default_rng([_GOAL_SEED, *key]).uniform(-1.0, 1.0, 4)  # x, y, z, yaw
+    if family == OWN:
+        pos, quat = own[number]
+        goal_turn = Rotation.from_quat(quat, scalar_first=True)
+        goal = pos + goal_turn.apply(obj.com)
+    else:
+        goal = place + np.array([0.0, 0.0, config.lift])
+        turn = Rotation.identity()
+        if family == "random":
+            goal = np.array([goal_x, goal_y, height + random.uniform(*LIFT)])
+            axis = random.normal(size=3)
+            turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * random.uniform(0.0, np.pi))
+        elif family in _TURN_AXES:
+            side = random.choice((-1.0, 1.0))
+            turn = Rotation.from_rotvec(side * np.radians(config.angle) * np.array(_TURN_AXES[family]))
+        goal += np.array([config.goal_xy, config.goal_xy, config.goal_z]) * at_goal[:3]
+        goal_turn = _about_z(np.radians(config.goal_yaw) * at_goal[3]) * turn * heading
     return _Episode(
         obj=obj,
         family=family,
         number=number,
         start=place + np.array([config.start_xy, config.start_xy, 0.0]) * at_start,
         start_turn=_about_z(np.radians(config.start_yaw) * at_start[2]) * heading,
-        goal=goal + np.array([config.goal_xy, config.goal_xy, config.goal_z]) * at_goal[:3],
-        goal_turn=_about_z(np.radians(config.goal_yaw) * at_goal[3]) * turn * heading,
+        goal=goal,
+        goal_turn=goal_turn,
     )
 
 
@@ -351,31 +330,21 @@ def _reached(
     wanted: Sequence[tuple[str, int]],
     draw: Callable[[str, int, int], _Episode],
     progress: Callable[[int], None],
-) -> list[_Episode]:
+) -> dict[tuple[str, int], _Episode]:
     """Return an episode for each (family, number), drawn again until its goal is above the table and can be reached;
     those that never can are missing."""
     found: dict[tuple[str, int], _Episode] = {}
     for attempt in range(_DRAWS):
-        left = [item for item in wanted if item not in found]
-        if not left:
-            break
-        drawn = [draw(family, number, attempt) for family, number in left]
+        drawn = [draw(*item, attempt) for item in wanted if item not in found]
         drawn = [
             e for e in drawn if e.goal[2] >= rest_height(e.obj, _quat(e.goal_turn)) + e.goal_turn.apply(e.obj.com)[2]
         ]
         if drawn:
-            held = _held(reach, drawn)
+            turns = Rotation.concatenate([e.goal_turn * e.start_turn.inv() for e in drawn])
+            held = reach.holds(np.stack([e.start for e in drawn]), np.stack([e.goal for e in drawn]), turns)
             found |= {(e.family, e.number): e for e, holds in zip(drawn, held, strict=True) if holds}
         progress(len(found))
-    return [found[item] for item in wanted if item in found]
-
-
-def _held(reach: Reach, episodes: Sequence[_Episode]) -> np.ndarray:
-    """[N] bool: whether the robot can hold the object at the start and at the goal of N episodes."""
-    turns = [e.goal_turn * e.start_turn.inv() for e in episodes]
-    start = np.stack([e.start for e in episodes])
-    goal = np.stack([e.goal for e in episodes])
-    return reach.holds(start, goal, Rotation.concatenate(turns))
+    return found
 
 
 def _quat(turn: Rotation) -> np.ndarray:
@@ -385,23 +354,16 @@ def _quat(turn: Rotation) -> np.ndarray:
 def _goal_set(robot: RobotSpec, episodes: Sequence[_Episode]) -> GoalSet:
     """Return the episodes as a goal set, with the poses of mesh frames."""
     sources = {e.obj.name: e.obj.source for e in episodes}
-    names = sorted(sources)
-
-    def pos(center: np.ndarray, turn: Rotation, obj: ObjectSpec) -> np.ndarray:
-        return center - turn.apply(obj.com)
-
+    names = tuple(sorted(sources))
     return GoalSet(
-        robot=robot.name,
-        robot_fingerprint=robot.fingerprint,
-        joint_names=robot.joint_names,
-        joint_pos=np.zeros((0, len(robot.joints)), np.float32),
-        sequence_name=np.array([e.name for e in episodes]),
+        **no_states(robot),
+        sequence_name=np.array([f"{e.obj.name}/{e.family}_{e.number:03d}" for e in episodes]),
         sequence_object=np.array([e.obj.name for e in episodes]),
         family=np.array([e.family for e in episodes]),
-        start_pos=np.array([pos(e.start, e.start_turn, e.obj) for e in episodes], np.float32),
+        start_pos=np.array([e.start - e.start_turn.apply(e.obj.com) for e in episodes], np.float32),
         start_quat_wxyz=np.array([_quat(e.start_turn) for e in episodes], np.float32),
-        goal_pos=np.array([pos(e.goal, e.goal_turn, e.obj) for e in episodes], np.float32),
+        goal_pos=np.array([e.goal - e.goal_turn.apply(e.obj.com) for e in episodes], np.float32),
         goal_quat_wxyz=np.array([_quat(e.goal_turn) for e in episodes], np.float32),
-        object_names=tuple(names),
+        object_names=names,
         object_sources=tuple(sources[name] for name in names),
     )

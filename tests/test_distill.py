@@ -117,8 +117,8 @@ class DistillTest(unittest.TestCase):
             before = read_checkpoint(latest_checkpoint(out))
             resume(out, iterations=3)
         after = read_checkpoint(latest_checkpoint(out))
-        self.assertEqual((before["iteration"], after["iteration"]), (2, 3))
-        steps = [{int(s["step"]) for s in c["optimizer_state_dict"]["state"].values()} for c in (before, after)]
+        self.assertEqual((before.iteration, after.iteration), (2, 3))
+        steps = [{int(s["step"]) for s in c.optimizer_state_dict["state"].values()} for c in (before, after)]
         self.assertEqual(2 * max(steps[1]), 3 * max(steps[0]))
 
     def test_the_student_learns_the_teachers_actions(self):

@@ -43,14 +43,6 @@ Number = Annotated[float, Rule("a finite number of at most 1e9", lambda x: abs(x
 """A number of a robot's description: stiffnesses reach 1e5, everything else is far smaller."""
 
 
-@dataclass(frozen=True)
-class Only:
-    """The value that another field must have for this field to have an effect, in its annotation."""
-
-    field: str
-    choice: str
-
-
 class Checked:
     """Base of dataclasses that obey the rules of their fields: making one that does not raises ``ValueError``, which
     names every field."""
@@ -66,29 +58,6 @@ class Checked:
 
 class Options:
     """Base of dataclasses whose fields are options of a command, shown and checked as if they were its own."""
-
-
-def without_effect(settings: Any, defaults: Any, path: tuple[str, ...] = ()) -> list[str]:
-    """Return a sentence for each changed setting that has no effect with the other settings.
-
-    Args:
-        defaults: settings of the same class.
-        path: names of the fields that lead to the settings.
-    """
-    sentences = []
-    for name, marks in _marks(type(settings)).items():
-        value = getattr(settings, name)
-        default = getattr(defaults, name)
-        if is_dataclass(value) and type(value) is type(default):
-            sentences += without_effect(value, default, (*path, name))
-        for mark in marks:
-            if isinstance(mark, Only) and value != default and getattr(settings, mark.field) != mark.choice:
-                where = ".".join((*path, name))
-                sentences.append(
-                    f"{where} is {value}, which means something where {mark.field} is {mark.choice}; "
-                    f"it is {getattr(settings, mark.field)}"
-                )
-    return sentences
 
 
 @cache

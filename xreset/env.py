@@ -308,8 +308,7 @@ class ManipulationEnv:
         self._reset_mask[worlds] = True
         if start is not None:
             self._new_start[worlds] = start
-        observed: dict[str, Any] = dict(self._observations.items())
-        lasting = self._lasting | observed
+        lasting = self._lasting
         before = {name: value.clone() for name, value in lasting.items()}
         self._sample_resets(start is None)
         self._write_resets()
@@ -372,35 +371,23 @@ class ManipulationEnv:
 
     def snapshot(self) -> dict[str, Tensor]:
         """Return the state of all worlds on the CPU, without random numbers and warm starts, for :meth:`restore`."""
-        state = self.backend.state()
-        values = {f"state.{f.name}": getattr(state, f.name) for f in fields(state)}
-        values |= {f"env.{name}": value for name, value in self._lasting.items()}
-        values |= {f"observed.{name}": self._observations[name] for name in set(self._observations.keys())}
+        values = self._lasting | vars(self.backend.state())
         return {name: value.to("cpu", copy=True) for name, value in values.items()}
 
-    def restore(self, snapshot: dict[str, Tensor]) -> bool:
-        """Continue from a snapshot.
-
-        Returns:
-            False, and nothing is changed, if the snapshot is of another number of worlds or of another task.
-        """
-        expected = {name: value.shape for name, value in self.snapshot().items()}
-        if {name: value.shape for name, value in snapshot.items()} != expected:
-            return False
+    def restore(self, snapshot: dict[str, Tensor]) -> None:
+        """Continue from a snapshot of the same task with as many worlds."""
         for name, value in self._lasting.items():
-            value.copy_(snapshot[f"env.{name}"])
+            value.copy_(snapshot[name])
         self._reset_mask.fill_(True)
-        self._set_worlds(State(**{f.name: snapshot[f"state.{f.name}"] for f in fields(State)}).to(self.device))
+        self._set_worlds(State(**{f.name: snapshot[f.name] for f in fields(State)}).to(self.device))
         self._reset_mask.zero_()
-        for name in set(self._observations.keys()):
-            self._observations[name].copy_(snapshot[f"observed.{name}"])
-        return True
 
     @property
-    def _lasting(self) -> dict[str, Tensor]:
+    def _lasting(self) -> dict[str, Any]:
         """Buffers that carry each world from step to step, in addition to the engine's state."""
         seen = {} if self.vision is None else self.vision.lasting
-        return {name: getattr(self, name) for name in _LASTING} | self.variation.lasting | seen
+        own = {name: getattr(self, name) for name in _LASTING}
+        return own | self.variation.lasting | seen | dict(self._observations.items())
 
     # Parts
 

@@ -76,11 +76,7 @@ class Run:
         from xreset.learning.checkpoint import read_checkpoint
 
         content = read_checkpoint(latest_checkpoint(self.folder))
-        return Lift(
-            iteration=int(content["iteration"]),
-            env_steps=int(content["env_steps"]),
-            minutes=float(content["elapsed"]) / 60,
-        )
+        return Lift(iteration=content.iteration, env_steps=content.env_steps, minutes=content.elapsed / 60)
 
     def left(self) -> str:
         """Return how far an unfinished training has come, in words; empty if it is finished."""

@@ -5,6 +5,8 @@ Shape letters: N worlds, C cameras, H x W pixels, B bodies, P points.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 import trimesh
@@ -73,20 +75,15 @@ class Cameras:
         self.rays = RayCaster(surfaces, torch.cat((fixed, held), dim=1), count, size, device)
         self._goal_rays = RayCaster(objects, object_index[:, None], count, size, device) if config.goal_image else None
 
-        def tensor(values: list[float] | np.ndarray) -> Tensor:
+        def tensor(values: Any) -> Tensor:
             return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=device)
 
-        def column(values: list[float]) -> Tensor:
-            return tensor(values).view(-1, 1, 1)
-
-        noise = [c.noise for c in config.cameras]
-        self._near = column([c.near for c in config.cameras])
-        self._far = column([c.far for c in config.cameras])
-        self._spread = column([n.spread for n in noise])
-        self._step = column([n.step for n in noise])
-        self._holes = column([n.holes for n in noise])
-        self._edges = column([n.edges for n in noise])
-        self._edge = column([n.edge for n in noise])
+        rows = []
+        for camera in config.cameras:
+            noise = camera.noise
+            rows.append((camera.near, camera.far, noise.spread, noise.step, noise.holes, noise.edges, noise.edge))
+        columns = tensor(rows).T[..., None, None]
+        self._near, self._far, self._spread, self._step, self._holes, self._edges, self._edge = columns
         self._half_fov = tensor([c.fov / 2 for c in config.cameras])
         self._mounted = tensor(np.stack([mounted_pose(c) for c in config.cameras]))
         y, x = torch.meshgrid(*(torch.arange(n, device=device) + 0.5 - n / 2 for n in size), indexing="ij")

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from xreset.checks import without_effect
 from xreset.cli._common import Objects
 from xreset.errors import RunError
 from xreset.learning import train as training
@@ -70,8 +69,6 @@ def train(
         return
     if goals is None and (robot is None or resets is None):
         raise RunError("A new run needs --robot and --resets, or --goals. To continue the run in --out, add --resume.")
-    if sentences := without_effect(config, starting_config(like)):
-        raise RunError(f"--config.{'; --config.'.join(sentences)}. Omit it, or change the other one.")
     note = dropped_terms(like)
     if note and not config.task.reward.own:
         print(note, file=sys.stderr)

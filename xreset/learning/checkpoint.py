@@ -3,59 +3,62 @@
 from __future__ import annotations
 
 import io
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from xreset.errors import RunError
+from xreset.checks import NotNegative, from_dict
+from xreset.errors import FileFormatError, RunError
 from xreset.files import atomic_write
 from xreset.text import shown
 
-_KINDS: dict[str, type | tuple[type, ...]] = {
-    "actor_state_dict": dict,
-    "critic_state_dict": dict,
-    "optimizer_state_dict": dict,
-    "iteration": int,
-    "env_steps": int,
-    "elapsed": (int, float),
-    "learning_rate": (int, float),
-}
-"""Entries of a checkpoint."""
+
+@dataclass(frozen=True, kw_only=True)
+class Checkpoint:
+    """State of a training."""
+
+    actor_state_dict: dict[str, Any]
+    critic_state_dict: dict[str, Any]
+    optimizer_state_dict: dict[str, Any]
+    iteration: NotNegative[int]
+    """Iterations done."""
+    env_steps: NotNegative[int]
+    """Control steps of all worlds of all processes."""
+    elapsed: NotNegative[float]
+    """Time of all iterations [s]."""
+    learning_rate: NotNegative[float]
 
 
-def write_checkpoint(path: Path, content: dict[str, Any]) -> None:
+def write_checkpoint(path: Path, content: Checkpoint) -> None:
     """Write a file that :func:`read_checkpoint` reads; it appears whole or not at all."""
     buffer = io.BytesIO()
-    torch.save(content, buffer)
+    torch.save(vars(content), buffer)
     with atomic_write(path) as file:
         file.write(buffer.getbuffer())
 
 
-def read_checkpoint(path: Path, device: str | torch.device = "cpu") -> dict[str, Any]:
+def read_checkpoint(path: Path, device: str | torch.device = "cpu") -> Checkpoint:
     """Read a checkpoint.
 
     Raises:
-        RunError: the file is damaged or not a checkpoint.
+        FileFormatError: the file is damaged or not a checkpoint.
     """
     try:
         content = torch.load(path, map_location=device, weights_only=True)
     except torch.OutOfMemoryError:
         raise
     except Exception as error:  # torch's own message advises to load without care
-        raise RunError(
+        raise FileFormatError(
             f"{path} cannot be read as a checkpoint: it is damaged, or holds more than tensors and plain values. "
             "Move it away to continue from the one before. Do not use it elsewhere if you do not know where it is from."
         ) from error
-    for key, kind in _KINDS.items():
-        value = content.get(key) if isinstance(content, dict) else None
-        is_number = isinstance(value, int | float)
-        if not isinstance(value, kind) or isinstance(value, bool) or (is_number and not 0 <= value < math.inf):
-            raise RunError(f"{path} is not a checkpoint of xreset: its {key} is {shown(value)}.")
-    return {key: content[key] for key in _KINDS}
+    if isinstance(content, dict):  # earlier versions wrote more
+        content = {f.name: content[f.name] for f in fields(Checkpoint) if f.name in content}
+    return from_dict(Checkpoint, content, str(path))
 
 
 @contextmanager

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from xreset.checks import Checked, NotNegative, Only, Positive, Rule, Share
+from xreset.checks import Checked, NotNegative, Positive, Rule, Share
 from xreset.learning.schedules import ScheduleConfig
 from xreset.task.config import TaskConfig
 
@@ -67,7 +67,7 @@ class PpoConfig(Checked):
     schedule: Literal["adaptive", "fixed"] = "adaptive"
     """``adaptive``: the rate is divided (multiplied) by 1.5 where the policy moved more than twice (less than half)
     ``desired_kl``."""
-    desired_kl: Annotated[Positive[float], Only("schedule", "adaptive")] = 0.01
+    desired_kl: Positive[float] = 0.01
     clip: Positive[float] = 0.2
     entropy: NotNegative[float] = 0.005
     bounds_loss: NotNegative[float] = 0.0

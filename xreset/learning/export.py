@@ -107,7 +107,7 @@ def export_checkpoint(out: Path, checkpoint: Path, policy: Path) -> None:
     shapes = observation_shapes(info.contract, str(out))
     example = TensorDict({name: torch.zeros(1, *shape) for name, shape in shapes.items()}, batch_size=[1])
     actor = actor_class(example, {"actor": list(shapes)}, "actor", len(info.contract["joint_names"]), **options)
-    actor.load_state_dict(read_checkpoint(checkpoint)["actor_state_dict"])
+    actor.load_state_dict(read_checkpoint(checkpoint).actor_state_dict)
     export_onnx(actor, policy, info.contract, checkpoint=checkpoint)
 
 

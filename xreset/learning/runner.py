@@ -17,7 +17,7 @@ from tensordict import TensorDict
 
 from xreset.env import ManipulationEnv
 from xreset.errors import RunError
-from xreset.learning.checkpoint import must_fit, read_checkpoint, write_checkpoint
+from xreset.learning.checkpoint import Checkpoint, must_fit, read_checkpoint, write_checkpoint
 from xreset.learning.config import TrainConfig, rsl_rl_config
 from xreset.learning.distributed import Processes
 from xreset.learning.faults import FaultBudget
@@ -158,23 +158,24 @@ class TrainingRunner(OnPolicyRunner):
         """Write ``checkpoints/ITERATION.pt``, in the main process."""
         if not self.processes.is_main:
             return
-        content = self.alg.save() | {
-            "iteration": self.iteration,
-            "env_steps": self.env_steps,
-            "elapsed": self.elapsed,
-            "learning_rate": self.alg.learning_rate,
-        }
+        content = Checkpoint(
+            **self.alg.save(),
+            iteration=self.iteration,
+            env_steps=self.env_steps,
+            elapsed=self.elapsed,
+            learning_rate=self.alg.learning_rate,
+        )
         write_checkpoint(self.folder / "checkpoints" / f"{self.iteration:06d}.pt", content)
 
     def load_checkpoint(self, path: Path) -> None:
         """Continue from a checkpoint: models, optimizer and counters. Episodes begin again."""
         content = read_checkpoint(path, self.device)
         with must_fit(path):
-            self.alg.load(content, None, strict=True)
-            self.alg.learning_rate = float(content["learning_rate"])
-            self.iteration = content["iteration"]
-            self.env_steps = content["env_steps"]
-            self.elapsed = float(content["elapsed"])
+            self.alg.load(vars(content), None, strict=True)
+        self.alg.learning_rate = content.learning_rate
+        self.iteration = content.iteration
+        self.env_steps = content.env_steps
+        self.elapsed = content.elapsed
 
     def load_networks(self, path: Path) -> None:
         """Start with the actor and the critic of another run's checkpoint, with normalization and standard deviation.
@@ -184,9 +185,9 @@ class TrainingRunner(OnPolicyRunner):
         """
         content = read_checkpoint(path, self.device)
         with must_fit(path):
-            self.alg.load(content, {"actor": True, "critic": True}, strict=True)
+            self.alg.load(vars(content), {"actor": True, "critic": True}, strict=True)
         if self.train_config.ppo.schedule == "adaptive":
-            self.alg.learning_rate = content["learning_rate"]
+            self.alg.learning_rate = content.learning_rate
 
     def _check_faults(self, budget: FaultBudget) -> None:
         """End the run if too many worlds broke. Every process comes to the same result."""

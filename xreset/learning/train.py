@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import re
 import sys
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -270,16 +270,17 @@ def _run(out: Path, info: RunInfo, inputs: Inputs, *, minutes: float, resumed: b
     if not minutes > 0:
         raise RunError(f"--minutes is {minutes}, expected more than 0.")
     processes = Processes.of_environment()
-    precision = torch.get_float32_matmul_precision()
-    with ExitStack() as undo:
-        undo.callback(torch.set_float32_matmul_precision, precision)
+    with ExitStack() as stack:
+        stack.callback(torch.set_float32_matmul_precision, torch.get_float32_matmul_precision())
         if not torch.distributed.is_initialized():
-            undo.callback(leave)
+            stack.callback(leave)
         if processes.is_main:
-            undo.enter_context(claim_folder(out))
-            undo.enter_context(claim_folder(out / "checkpoints"))
+            stack.enter_context(claim_folder(out))
+            stack.enter_context(claim_folder(out / "checkpoints"))
         try:
-            _train(processes, out, info, inputs, seconds=60 * minutes, resumed=resumed, wandb=wandb)
+            runner = stack.enter_context(_runner(processes, out, info, inputs, resumed=resumed))
+            runner.wandb = wandb
+            runner.learn(info.config.iterations, init_at_random_ep_len=True, seconds=60 * minutes)
         except (MemoryError, RuntimeError) as error:
             if isinstance(error, RuntimeError) and not _NO_MEMORY.search(str(error)):
                 raise
@@ -288,19 +289,17 @@ def _run(out: Path, info: RunInfo, inputs: Inputs, *, minutes: float, resumed: b
                 f"{info.num_envs} worlds on {info.device} need more memory than there is; {state}. "
                 "Start with fewer (--num-envs), or smaller minibatches (--config.ppo.minibatch-size), in another --out."
             ) from error
+        if processes.is_main:
+            actor = cast(PointNetLstmModel, runner.alg.get_policy())
+            export_onnx(actor, out / "policy.onnx", info.contract, checkpoint=latest_checkpoint(out))
 
 
-def _train(
-    processes: Processes,
-    out: Path,
-    info: RunInfo,
-    inputs: Inputs,
-    *,
-    seconds: float,
-    resumed: bool,
-    wandb: str | None,
-) -> None:
-    config = info.config
+@contextmanager
+def _runner(
+    processes: Processes, out: Path, info: RunInfo, inputs: Inputs, *, resumed: bool
+) -> Iterator[TrainingRunner]:
+    """Yield a run's runner, which has read the checkpoint that it continues from, or the networks that it begins
+    with."""
     device = processes.device(info.device)
     begin = latest_checkpoint(out) if resumed and checkpoints(out) else None
     # a run that continues draws other numbers than it began with
@@ -309,28 +308,22 @@ def _train(
         torch.cuda.set_device(device)
     torch.manual_seed(seed)
     scene = (inputs.robot, inputs.objects, inputs.bank)
-    with make_env(*scene, config.task, engine=info.backend, num_envs=info.num_envs, device=device, seed=seed) as env:
+    task = info.config.task
+    with make_env(*scene, task, engine=info.backend, num_envs=info.num_envs, device=device, seed=seed) as env:
         if env.vision is not None:
             env.vision.check_sees_objects()
-        runner = TrainingRunner(env, config, out, teacher=out / TEACHER if info.teacher else None)
-        runner.wandb = wandb
+        runner = TrainingRunner(env, info.config, out, teacher=out / TEACHER if info.teacher else None)
         if begin is not None:
             runner.load_checkpoint(begin)
         elif info.weights is not None:
             runner.load_networks(Path(info.weights))
         if processes.is_main:
             # before the first checkpoint a killed run leaves nothing worth keeping; files without a run are of others
-            if not runner.iteration and (out / "run.json").is_file():
+            if begin is None and (out / "run.json").is_file():
                 for events in out.glob("events.out.tfevents.*"):
                     events.unlink()
             write_run(out, info)
-            if resumed and runner.iteration:
-                print(f"continuing after iteration {runner.iteration}", flush=True)
-            elif resumed:
-                print("there is no checkpoint yet: starting from the beginning", flush=True)
-        runner.learn(config.iterations, init_at_random_ep_len=True, seconds=seconds)
-        if processes.is_main:
-            actor = runner.alg.get_policy()
-            export_onnx(
-                cast(PointNetLstmModel, actor), out / "policy.onnx", info.contract, checkpoint=latest_checkpoint(out)
-            )
+            if resumed:
+                done = f"continuing after iteration {runner.iteration}"
+                print(done if begin else "there is no checkpoint yet: starting from the beginning", flush=True)
+        yield runner

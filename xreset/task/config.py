@@ -10,7 +10,7 @@ from math import isfinite
 from typing import Annotated, Any, ClassVar, Literal
 
 from xreset.cameras.config import VisionConfig
-from xreset.checks import Checked, Finite, NotNegative, Only, Positive, Range, Rule, Share
+from xreset.checks import Checked, Finite, NotNegative, Positive, Range, Rule, Share
 
 PositiveRange = Annotated[Range, Rule("factors above 0", lambda x: x[0] > 0)]
 
@@ -38,13 +38,13 @@ class ActionConfig(Checked):
     target, as for the arm, so that a policy that does nothing keeps a grasp. With absolute targets a new policy opens
     the hand in every demonstrated grasp, and learns to hold before it can learn to lift. In-hand manipulation is
     commonly learned with relative targets (Qi et al. 2022, In-Hand Object Rotation via Rapid Motor Adaptation)."""
-    hand_step: Annotated[Positive[float], Only("hand", "relative")] = 0.05
+    hand_step: Positive[float] = 0.05
     """Largest change of a hand joint's target per control step [rad]: 3 rad/s at 60 Hz. Joints that slide move 4 cm
     for every radian."""
-    hand_lead: Annotated[Positive[float], Only("hand", "relative")] = 0.4
+    hand_lead: Positive[float] = 0.4
     """Largest distance from a hand joint to its target [rad]. It limits how hard the joint presses: drives of the
     Sharpa hand reach their effort limits at 0.3 to 0.7."""
-    hand_zero: Annotated[Literal["middle", "home"], Only("hand", "absolute")] = "middle"
+    hand_zero: Literal["middle", "home"] = "middle"
     """Target of a hand joint under action 0: the middle of its limits, or the robot's home pose, from which -1 and +1
     lead to the limits along two slopes. A new policy's mean is 0: with ``middle`` it half closes the hand at once and
     meets the object with its knuckles. Not in the paper."""
@@ -80,7 +80,7 @@ class ObservationConfig(Checked):
     ``cloud_history`` frames (the draft of the paper). ``paired``: the position of every point, its position at the
     goal, and the goal's minus the present one, in this frame only (the published paper). It shows the pose error point
     by point."""
-    cloud_history: Annotated[Positive[int], Only("cloud", "history")] = 5
+    cloud_history: Positive[int] = 5
     """Frames of cloud history, oldest first."""
     rotation: Literal["quaternion", "matrix", "to_goal"] = "quaternion"
     """``quaternion``: a quaternion with w >= 0, which jumps where w is 0. ``matrix``: the first two columns of the
@@ -165,7 +165,7 @@ class RewardConfig(Checked):
     published paper)."""
     success_position: Positive[float] = 0.02
     """[m] (section V)"""
-    success_rotation: Annotated[Positive[float], Only("success_shape", "pose")] = 0.2617993877991494
+    success_rotation: Positive[float] = 0.2617993877991494
     """[rad], 15 degrees (section V)"""
     action: Finite[float] = -0.005
     action_rate: Finite[float] = -0.005
@@ -178,9 +178,9 @@ class RewardConfig(Checked):
     presses an object down from above pushes with both in one direction; a hand that holds it does not. ``near``:
     fingertips and palm are near the object, whether or not they touch it (the published paper). ``grasp`` is paid for
     ``any``."""
-    near_tips: Annotated[Positive[float], Only("contact", "near")] = 0.6
+    near_tips: Positive[float] = 0.6
     """Largest sum of the fingertips' distances to the object [m] (the published paper)."""
-    near_palm: Annotated[Positive[float], Only("contact", "near")] = 0.2
+    near_palm: Positive[float] = 0.2
     """Largest distance of the palm to the object [m] (the published paper)."""
     contact_threshold: NotNegative[float] = 0.1
     """Force [N] from which a finger counts as in contact. Not in the paper."""

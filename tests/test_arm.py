@@ -8,7 +8,6 @@ import tempfile
 import unittest
 from itertools import product
 from pathlib import Path
-from unittest import mock
 
 import numpy as np
 import torch
@@ -18,14 +17,15 @@ from xreset import robots
 from xreset.description import DESCRIPTION
 from xreset.description import load_robot as load
 from xreset.errors import RobotError
-from xreset.geometry.rotations import quat_multiply
+from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.rotations import matrix_to_quat, quat_multiply
 from xreset.plugins import robot_folder
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import splice, spread_over, track
 from xreset.retarget.validity import Thresholds, classify
 from xreset.robot_tools.check import check
-from xreset.robot_tools.placement import Finalist, PlaceConfig, Placement, Reach, Search, write_placement
+from xreset.robot_tools.placement import Finalist, PlaceConfig, Reach, Search, write_placement
 
 try:
     from xreset.robot_tools import place as placing
@@ -33,9 +33,7 @@ except ImportError as error:
     raise unittest.SkipTest(str(error)) from error
 
 assert_close = torch.testing.assert_close
-CONFIG = PlaceConfig(
-    x=(0.2, 0.7), y=(0.4, 0.8), z=(0.4, 0.7), frames=10, final_frames=20, candidates=8, rounds=2, elite=1
-)
+CONFIG = PlaceConfig(x=(0.2, 0.7), y=(0.4, 0.8), z=(0.4, 0.7), frames=10, candidates=8, rounds=2, elite=1)
 NOWHERE = np.zeros((0, 3))
 
 
@@ -53,106 +51,87 @@ class PlaceTest(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
         cls.robot = robots.load("openarm")
-        cls.own = Placement(pos=cls.robot.base_pos, quat=cls.robot.base_quat)
-        cls.far = Placement(pos=(0.45, 0.6, 3.0), quat=cls.robot.base_quat)
+        cls.lost = dataclasses.replace(cls.robot, base_pos=(0.45, 0.6, 3.0))
         cls.wrists = wrists_around_home(cls.robot, 40)
-
-    def reach(self, placement: Placement, *worst: float) -> Reach:
-        return placing.reach(self.robot, placement, self.wrists, CONFIG, *worst)
+        cls.reached = placing.reach(cls.robot, cls.wrists)
 
     def test_reach_of_poses_within_reach_and_out_of_it(self):
-        here = self.reach(self.own)
-        self.assertGreater(here.reached, 0.95)
-        self.assertGreater(here.dexterity, 0.1)
-        self.assertEqual(self.reach(self.far), Reach(reached=0.0, dexterity=0.0))
+        self.assertGreater(self.reached.reached, 0.95)
+        self.assertGreater(self.reached.dexterity, 0.1)
+        self.assertEqual(placing.reach(self.lost, self.wrists), Reach(reached=0.0, dexterity=0.0))
 
     def test_reach_moves_with_the_scene(self):
         """Turned about the vertical together, base and wrists keep their reach; the table's top is everywhere at the
         same height."""
         turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=FLOAT)
-        half = np.sqrt(0.5)
-        quat = torch.tensor([half, 0, 0, half], dtype=FLOAT)
+        quat = matrix_to_quat(turn)
         moved = dataclasses.replace(
             self.wrists,
             root_pos=self.wrists.root_pos @ turn.T,
             root_quat=quat_multiply(quat.expand_as(self.wrists.root_quat), self.wrists.root_quat),
         )
-        base = torch.tensor(self.own.pos, dtype=FLOAT)
-        there = Placement(
-            pos=tuple((turn @ base).tolist()),
-            quat=tuple(quat_multiply(quat, torch.tensor(self.own.quat, dtype=FLOAT)).tolist()),
+        there = dataclasses.replace(
+            self.robot,
+            base_pos=tuple((turn @ torch.tensor(self.robot.base_pos, dtype=FLOAT)).tolist()),
+            base_quat=tuple(quat_multiply(quat, torch.tensor(self.robot.base_quat, dtype=FLOAT)).tolist()),
         )
-        here = self.reach(self.own)
-        self.assertAlmostEqual(placing.reach(self.robot, there, moved, CONFIG).reached, here.reached, delta=0.03)
+        self.assertAlmostEqual(placing.reach(there, moved).reached, self.reached.reached, delta=0.03)
 
     def test_a_robot_that_stands_wrong_is_moved_to_where_it_reaches(self):
-        lost = dataclasses.replace(self.robot, base_pos=self.far.pos)
         seen = []
         avoid = self.wrists.root_pos[:, 0].numpy()
-        found = placing.place(lost, [self.wrists], avoid, CONFIG, lambda done, best: seen.append((done, best.rank)))
-        self.assertEqual((found.own.reach.reached, found.own.followed), (0.0, 0.0))
+        found = placing.place(
+            self.lost, [self.wrists], avoid, CONFIG, lambda done, best: seen.append((done, best.rank))
+        )
+        own = found.finalists[-1]
+        self.assertEqual((own.robot, own.reach.reached, own.followed), (self.lost, 0.0, 0.0))
         self.assertGreater(found.best.reach.reached, 0.2)
         # Every path is one frame long here.
         self.assertAlmostEqual(found.best.followed, found.best.reach.reached, delta=0.2)
         self.assertEqual(found.frames, 40)
-        self.assertGreaterEqual(np.linalg.norm(avoid - found.best.placement.pos, axis=1).min(), CONFIG.clear)
+        self.assertGreaterEqual(np.linalg.norm(avoid - found.best.robot.base_pos, axis=1).min(), CONFIG.clear)
         self.assertEqual(seen, sorted(seen))  # the best yet never gets worse
         self.assertEqual(found.best.home_rule, "the joints as they were")  # home held the hand three metres up
-        np.testing.assert_allclose(found.home, lost.home[lost.arm_indices])
-        self.assertIn(found.own, found.finalists)
+        self.assertEqual(found.best.robot.joints, self.lost.joints)
 
     def test_a_placement_that_keeps_home_is_preferred(self):
-        def home(robot, placement):
-            homes.append(placement)
-            return (None, "") if len(homes) == 2 else (tuple(robot.home[robot.arm_indices]), "test")
-
-        homes = []
-        lost = dataclasses.replace(self.robot, base_pos=(0.45, 0.6, 3.0))
-        with mock.patch.object(placing, "_home", home):
-            config = dataclasses.replace(CONFIG, elite=2, candidates=16, rounds=1)
-            found = placing.place(lost, [self.wrists], np.zeros((0, 3)), config)
-        self.assertEqual(len(homes), 3)
-        self.assertEqual(found.best.placement, homes[2])
-        self.assertIsNone(next(one for one in found.finalists if one.placement == homes[1]).home)
+        chosen = []
+        for rule in ("", "test"):
+            chosen.append(Finalist(robot=self.robot, reach=self.reached, followed=0.5, home_rule=rule))
+        self.assertIs(Search(finalists=tuple(chosen), frames=1).best, chosen[1])
 
     def test_the_same_seed_finds_the_same_in_any_number_of_processes(self):
         small = dataclasses.replace(CONFIG, candidates=2, rounds=2)
         first, second = (placing.place(self.robot, [self.wrists], NOWHERE, small, processes=n) for n in (1, 2))
-        self.assertEqual((first.best, first.own), (second.best, second.own))
+        self.assertEqual(first, second)
 
     def test_a_process_that_is_killed_is_an_error(self):
         with self.assertRaisesRegex(RobotError, "was killed; is there memory"), placing._mapper(2) as each:
             list(each(os._exit, [9]))
 
     def test_a_candidate_that_cannot_come_in_is_given_up(self):
-        whole = self.reach(self.own)
-        self.assertEqual(self.reach(self.own, whole.rank[0]).rank[0], whole.rank[0])
-        given_up = self.reach(self.far, whole.rank[0])
+        least = self.reached.rank[0]
+        self.assertEqual(placing.reach(self.robot, self.wrists, least).rank[0], least)
         # What was tried fails, what was not counts as reached.
-        self.assertEqual(given_up.reached, 1 - placing._FIRST / 40)
-        self.assertLess(given_up.rank[0], whole.rank[0])
+        self.assertEqual(placing.reach(self.lost, self.wrists, least).reached, 1 - placing._FIRST / 40)
 
     def test_without_a_round_the_own_placement_is_measured(self):
         found = placing.place(self.robot, [self.wrists], NOWHERE, dataclasses.replace(CONFIG, rounds=0))
-        self.assertEqual((found.best, found.best.placement), (found.own, self.own))
-        np.testing.assert_array_equal(found.home, self.robot.home[self.robot.arm_indices])
+        self.assertEqual([finalist.robot for finalist in found.finalists], [self.robot])
 
     def test_home_holds_the_hand_where_it_did(self):
-        near = Placement(pos=(0.46, 0.61, 0.56), quat=self.robot.base_quat)
-        home, rule = placing._home(self.robot, near)
+        near = dataclasses.replace(self.robot, base_pos=(0.46, 0.61, 0.56))
+        placed, rule = placing._with_home(near, self.robot)
         self.assertEqual(rule, "the hand where it was")
-        moved = dataclasses.replace(self.robot, base_pos=near.pos)
-        q = torch.tensor(self.robot.home)
-        before = ArmModel(self.robot).kinematics.link_poses(q, ["palm"])
-        q[self.robot.arm_indices] = torch.tensor(home, dtype=q.dtype)
-        assert_close(ArmModel(moved).kinematics.link_poses(q, ["palm"]), before, atol=5e-3, rtol=0)
+        before, after = (
+            Kinematics(spec).link_poses(torch.tensor(spec.home), ["palm"]) for spec in (self.robot, placed)
+        )
+        assert_close(after, before, atol=5e-3, rtol=0)
 
-    def test_nothing_to_reach_is_an_error(self):
+    def test_a_search_without_wrists_or_without_room_ends(self):
         none = self.wrists[torch.arange(0)]
         with self.assertRaisesRegex(RobotError, "no frame to reach"):
             placing.place(self.robot, [none], NOWHERE, CONFIG)
-
-    def test_a_search_without_room_ends(self):
         avoid = self.wrists.root_pos.numpy().reshape(-1, 3)
         with self.assertRaisesRegex(RobotError, "no place in the searched ranges is 9 m away.*Lower --search.clear"):
             placing.place(self.robot, [self.wrists], avoid, dataclasses.replace(CONFIG, clear=9.0))
@@ -160,19 +139,15 @@ class PlaceTest(unittest.TestCase):
     def test_parameters_of_a_placement_come_back(self):
         rng = np.random.default_rng(0)
         for _ in range(20):
-            angles = (rng.uniform(-180, 180), rng.uniform(0, 180), rng.uniform(-180, 180))
-            placement = placing._placement(np.array([*rng.uniform(-1, 1, 3), *angles]))
-            again = placing._placement(placing._parameters(placement))
-            np.testing.assert_allclose(again.pos, placement.pos)
-            self.assertAlmostEqual(abs(np.dot(again.quat, placement.quat)), 1.0, places=9)
+            parameters = rng.uniform((-1, -1, -1, -180, 0, -180), (1, 1, 1, 180, 180, 180))
+            placed = placing._placed(self.robot, parameters)
+            np.testing.assert_allclose(placing._parameters(placed), parameters, atol=1e-6)
 
     def test_single_frames_are_those_that_the_hand_follows(self):
-        path = ArmTargets(**{name: value.view(2, 20, *value.shape[2:]) for name, value in vars(self.wrists).items()})
-        error = torch.zeros(2, 20, dtype=FLOAT)
-        error[0, 3] = 0.05
-        annotated = torch.ones(2, 20, dtype=torch.bool)
-        annotated[1, 19] = False
-        frames = placing.single_frames([dataclasses.replace(path, hand_error=error, annotated=annotated)], 0.03)
+        path = self.wrists.map(lambda x: x.view(2, 20, *x.shape[2:]))
+        path.hand_error[0, 3] = 0.05
+        path.annotated[1, 19] = False
+        frames = placing.single_frames([path], 0.03)
         self.assertEqual(frames.root_pos.shape, (38, 1, 3))
         assert_close(frames.root_pos[3], self.wrists.root_pos[4])
 
@@ -270,65 +245,52 @@ class WritePlacementTest(unittest.TestCase):
         self.folder = Path(self.enterContext(tempfile.TemporaryDirectory())) / "arm"
         shutil.copytree(robot_folder("openarm"), self.folder)
         self.file = self.folder / DESCRIPTION
-        best = Finalist(
-            placement=Placement(pos=(0.1, 0.2, 0.3), quat=(0.6, 0.0, 0.8, 0.0)),
-            reach=Reach(reached=0.9123, dexterity=0.5),
-            followed=0.8765,
-            home=tuple(np.linspace(-0.3, 0.4, 7)),
+        self.robot = load(self.folder)
+        joints = list(self.robot.joints)
+        for index, home in enumerate(np.linspace(-0.3, 0.4, 7)):
+            joints[index] = dataclasses.replace(joints[index], home=float(home))
+        moved = dataclasses.replace(
+            self.robot, base_pos=(0.1, 0.2, 0.3), base_quat=(0.6, 0.0, 0.8, 0.0), joints=tuple(joints)
         )
-        own = Finalist(
-            placement=Placement(pos=(0.45, 0.60, 0.55), quat=(0.38268343, 0.92387953, 0.0, 0.0)),
-            reach=Reach(reached=0.8, dexterity=0.5),
-            followed=0.75,
-            home=(0.0,) * 7,
-        )
-        self.found = Search(finalists=(best, own), own=own, frames=321)
+        reach = Reach(reached=0.9123, dexterity=0.5)
+        self.best = Finalist(robot=moved, reach=reach, followed=0.8765, home_rule="the hand where it was")
+        self.own = Finalist(robot=self.robot, reach=reach, followed=0.75, home_rule="as described")
+
+    def write(self, *finalists: Finalist, command: str = "x") -> None:
+        write_placement(self.file, self.robot, Search(finalists=finalists, frames=321), command)
 
     def lines(self) -> list[str]:
         """Lines of the description without the figure of its placement."""
         return [line for line in self.file.read_text().splitlines() if not line.startswith("placement")]
 
     def test_the_description_reads_back(self):
-        before = load(self.folder)
         for _ in range(2):  # the second one replaces the first
-            write_placement(self.file, before, self.found, 'xreset robots place openarm --demos "my demos.npz"')
+            self.write(self.best, self.own, command='xreset robots place openarm --demos "my demos.npz"')
             after = load(self.folder)
-            self.assertEqual(Placement(pos=after.base_pos, quat=after.base_quat), self.found.best.placement)
-            np.testing.assert_allclose(after.home[after.arm_indices], self.found.home, atol=1e-3)
-            np.testing.assert_allclose(after.home[after.hand_indices], before.home[before.hand_indices])
+            self.assertEqual(after.base_pos, self.best.robot.base_pos)
+            self.assertEqual(after.base_quat, self.best.robot.base_quat)
+            np.testing.assert_allclose(after.home, self.best.robot.home, atol=1e-3)
             stated = after.placement
             self.assertEqual((stated.reached, stated.followed, stated.frames), (0.912, 0.876, 321))
-            self.assertIn('"my demos.npz"', after.placement.command)
-        self.assertEqual([joint.drive for joint in after.joints], [joint.drive for joint in before.joints])
+            self.assertIn('"my demos.npz"', stated.command)
+        self.assertEqual([joint.drive for joint in after.joints], [joint.drive for joint in self.robot.joints])
 
     def test_where_the_own_placement_is_best_only_its_figure_is_written(self):
-        before = load(self.folder)
         lines = self.lines()
-        write_placement(self.file, before, dataclasses.replace(self.found, finalists=(self.found.own,)), r"a \\g<1> \b")
+        self.write(self.own, self.best, command=r"a \\g<1> \b")
         after = load(self.folder)
-        self.assertEqual(after.fingerprint, before.fingerprint)
+        self.assertEqual(after.fingerprint, self.robot.fingerprint)
         self.assertEqual((after.placement.followed, after.placement.command), (0.75, r"a \\g<1> \b"))
         self.assertEqual(self.lines(), lines)
-
-    def test_the_figure_is_no_part_of_the_fingerprint(self):
-        before = load(self.folder)
-        stated = dataclasses.replace(before, placement=None).fingerprint
-        lines = self.lines()
-        figure = "placement = { reached = 0.5, followed = 0.4, frames = 3, command = 'x' }"
-        lines.insert(lines.index("[base]") + 1, figure)
-        self.file.write_text("\n".join(lines))
-        self.assertEqual(load(self.folder).fingerprint, stated)
-        findings = [finding.message for finding in check(self.folder) if finding.topic == "placement"]
-        self.assertEqual(findings, ["reaches 50.0% and follows 40.0% of 3 frames, says robot.toml: x"])
+        message = "reaches 91.2% and follows 75.0% of 321 frames, says robot.toml"
+        self.assertIn(message, [finding.message.split(":")[0] for finding in check(self.folder)])
 
     def test_refusals(self):
-        robot = load(self.folder)
-        homeless = tuple(dataclasses.replace(finalist, home=None) for finalist in self.found.finalists)
         with self.assertRaisesRegex(RobotError, r"no placement has a home. Put base.pos = \[0.1, 0.2, 0.3\]"):
-            write_placement(self.file, robot, dataclasses.replace(self.found, finalists=homeless), "x")
+            self.write(dataclasses.replace(self.best, home_rule=""))
         self.file.write_text(self.file.read_text().replace("pos = [", "position = ["))
         with self.assertRaisesRegex(RobotError, "edit it by hand"):
-            write_placement(self.file, robot, self.found, "x")
+            self.write(self.best)
 
 
 if __name__ == "__main__":

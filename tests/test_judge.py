@@ -22,7 +22,6 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.resets.bank import write_bank
 from xreset.resets.config import SqueezeConfig
 from xreset.robot_tools import judge as judging
-from xreset.spec import SceneSpec
 
 
 def bank():
@@ -48,18 +47,18 @@ class Judge(unittest.TestCase):
                 self.assertEqual((rows["brick"].tried, rows["brick"].hold, rows["brick"].lift), (3, held, held))
                 self.assertEqual((rows["all"].arm_fails, rows["all"].turn), (3, 0))  # its arm cannot turn that way
                 self.assertEqual(found.kept, [])
-                rise = np.diff([moment["object_pos"][2] for moment in found.shots["brick"]])
+                rise = np.diff(found.shots["brick"][:, -5])  # of the object's z
                 self.assertEqual(bool(rise[1] > 0.08), held > 0, rise)
 
     def test_the_arm_raises_and_turns_the_palm(self):
-        program = judging._Program(SceneSpec(robot=load_robot("ur7e-sharpa"), objects=()))
-        home = torch.as_tensor(program.scene.robot.home)[None]
-        palm = program.kinematics.link_poses(home, [program.scene.robot.palm])[:, 0]
+        kinematics = Kinematics(load_robot("ur7e-sharpa"))
+        home = torch.as_tensor(kinematics.robot.home)[None]
+        palm = kinematics.link_poses(home, ["palm"])[:, 0]
         for turn in (0.0, judging.TURN):
             with self.subTest(turn=turn):
-                path, error = program.path(home, palm, rise=judging.HEIGHT, turn=turn)
+                path, error = judging.arm_path(kinematics, home, palm, rise=judging.HEIGHT, turn=turn)
                 self.assertLess(float(error), 1.0)
-                end = Kinematics(program.scene.robot).link_poses(path[-1], [program.scene.robot.palm])[:, 0]
+                end = kinematics.link_poses(path[-1], ["palm"])[:, 0]
                 relative = torch.linalg.inv(palm[0]) @ end[0]
                 self.assertAlmostEqual(float(end[0, 2, 3] - palm[0, 2, 3]), judging.HEIGHT, delta=0.005)
                 self.assertAlmostEqual(float(torch.atan2(relative[2, 1], relative[2, 2])), turn, delta=0.03)
@@ -74,21 +73,16 @@ class Judge(unittest.TestCase):
             judging.judge(replace(bank(), joint_pos=wide), robot(), (brick(),))
 
     def test_command(self):
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
-            write_bank(folder / "bank.npz", bank(), config={}, inputs={})
-            words = ["robots", "judge", "bank.npz", "--robot", "gripper", "--backend", "mujoco", "--squeeze.force", "4"]
-            words += ["--json", str(folder / "judge.json"), "--picture", str(folder / "judge.png")]
-            words[2] = str(folder / words[2])
-            with (
-                mock.patch("xreset.inputs.load_robot", return_value=robot()),
-                mock.patch("xreset.inputs.load_objects", return_value=(brick(),)),
-                redirect_stdout(io.StringIO()) as output,
-            ):
-                main(words)
-            self.assertRegex(output.getvalue(), r"brick +│ 3 +│ 3, 3, 0")
-            self.assertEqual(json.loads((folder / "judge.json").read_text())["rows"][0]["lift"], 3)
-            self.assertEqual(Image.open(folder / "judge.png").size[0], 4 * judging._TILE[0])
+        folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
+        self.enterContext(mock.patch("xreset.inputs.load_robot", return_value=robot()))
+        self.enterContext(mock.patch("xreset.inputs.load_objects", return_value=(brick(),)))
+        write_bank(folder / "bank.npz", bank(), config={}, inputs={})
+        words = f"--robot gripper --backend mujoco --squeeze.force 4 --json {folder}/judge.json --picture {folder}/judge.png"
+        with redirect_stdout(io.StringIO()) as output:
+            main(["robots", "judge", str(folder / "bank.npz"), *words.split()])
+        self.assertRegex(output.getvalue(), r"brick +│ 3 +│ 3, 3, 0")
+        self.assertEqual(json.loads((folder / "judge.json").read_text())["rows"][0]["lift"], 3)
+        self.assertEqual(Image.open(folder / "judge.png").size[0], 4 * judging._TILE[0])
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -137,19 +137,17 @@ def place(
         found = places.place(spec, paths, avoid, search, report, processes or min(workers.usable_cores(), 8))
     table = Table("", "follows", "reaches", "dexterity", "base.pos", "base.quat", "home", title="placements")
     for finalist in found.finalists:
-        titles = [title for title, one in (("as described", found.own), ("best", found.best)) if one is finalist]
         table.add_row(
-            ", ".join(titles) or "runner-up",
+            "best" if finalist is found.best else "runner-up",
             f"{finalist.followed:.1%}",
             f"{finalist.reach.reached:.1%}",
             f"{finalist.reach.dexterity:.3f}",
-            f"[{_digits(finalist.placement.pos)}]",
-            f"[{_digits(finalist.placement.quat)}]",
+            f"[{_digits(finalist.robot.base_pos)}]",
+            f"[{_digits(finalist.robot.base_quat)}]",
             finalist.home_rule or "not found",
         )
     console.print(table)
-    if found.home is not None:
-        console.print(f"arm at home in the best: {', '.join(f'{v:.3f}' for v in found.home)}")
+    console.print(f"arm at home in the best: {_digits(found.best.robot.home[spec.arm_indices])}")
     console.print(f"of {found.frames} annotated frames of {chosen.num_sequences} sequences")
     if write:
         file = description.robot_folder(robot) / description.DESCRIPTION
@@ -213,7 +211,7 @@ def judge(
         console.print(f"wrote {picture}")
 
 
-def _digits(values: Sequence[float]) -> str:
+def _digits(values: Iterable[float]) -> str:
     return ", ".join(f"{value:.4f}" for value in values)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -24,16 +24,6 @@ _CLEAR = 0.10
 _DIGITS = 4
 
 
-@dataclass(frozen=True, kw_only=True)
-class Home:
-    """Arm joints that hold the hand."""
-
-    joints: tuple[float, ...]
-    """[rad or m], within the limits."""
-    moved: str
-    """Where the hand is instead of the wanted place; empty if it is there."""
-
-
 def table_clearance(robot: RobotSpec, q: Tensor) -> Tensor:
     """[B] lowest height of the robot's moving shapes above the table [m], at joint positions [B, J]."""
     kinematics = Kinematics(robot)
@@ -42,9 +32,15 @@ def table_clearance(robot: RobotSpec, q: Tensor) -> Tensor:
     return height_above_table(points, torch.tensor(support.radii), TableSpec()).amin(dim=-1)
 
 
-def reach_near(robot: RobotSpec, T_world_root: np.ndarray) -> Home | None:
-    """Return arm joints that hold the hand's root at a pose [4, 4], or at the nearest pose beside it; None if the arm
-    reaches none of them. A pose with 10 cm of room above the table is preferred."""
+def hold_near(robot: RobotSpec, T_world_root: np.ndarray) -> tuple[RobotSpec, str] | None:
+    """Return the robot with a home that holds the hand's root at a pose [4, 4], or at the nearest pose beside it.
+
+    A pose with 10 cm of room above the table is preferred.
+
+    Returns:
+        The robot, and where the hand is instead of the wanted pose (empty if it is there); or None if the arm reaches
+        no pose.
+    """
     model = ArmModel(robot)
     steps = torch.tensor(list(product(_STEPS, _STEPS, _STEPS)), dtype=torch.float64)
     steps = steps[steps.norm(dim=1).argsort(stable=True)]
@@ -69,8 +65,15 @@ def reach_near(robot: RobotSpec, T_world_root: np.ndarray) -> Home | None:
             rounded = torch.clamp(torch.round(joints[index, 0] * 10**_DIGITS), *inside) / 10**_DIGITS
             step = (100 * steps[rows][index]).tolist()
             moved = f", moved by ({', '.join(f'{value:.0f}' for value in step)}) cm" if any(step) else ""
-            home = Home(joints=tuple(rounded.tolist()), moved=moved)
+            home = (_with_arm_at(robot, rounded.tolist()), moved)
             if height[index] > _CLEAR:
                 return home
             low = low or home
     return low
+
+
+def _with_arm_at(robot: RobotSpec, positions: list[float]) -> RobotSpec:
+    joints = [*robot.joints]
+    for index, position in zip(robot.arm_indices, positions, strict=True):
+        joints[index] = replace(joints[index], home=position)
+    return replace(robot, joints=tuple(joints))

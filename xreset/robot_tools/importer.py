@@ -28,7 +28,7 @@ from xreset.geometry.urdf import RobotTree
 from xreset.geometry.urdf_writer import axes, pose, roll_pitch_yaw
 from xreset.robot_tools.draft import description_text, draft_spec
 from xreset.robot_tools.fingers import Hand, find_hand
-from xreset.robot_tools.homes import reach_near
+from xreset.robot_tools.homes import hold_near
 from xreset.robot_tools.sources import Source, bare, combined, last_link, read_source, renamed
 from xreset.spec import DriveSpec, RobotSpec, SceneSpec
 
@@ -244,18 +244,16 @@ def _with_arm_home(spec: RobotSpec, T_hand_palm: np.ndarray, notes: list[str]) -
     """Return the robot whose arm at home holds the palm over the table, looking down."""
     T_world_palm = axes(x=(0, -1, 0), z=(0, 0, -1))  # fingers away from the person
     T_world_palm[:3, 3] = _HOME_PALM
-    found = reach_near(spec, T_world_palm @ np.linalg.inv(T_hand_palm))
+    found = hold_near(spec, T_world_palm @ np.linalg.inv(T_hand_palm))
     if found is None:
         notes.append(
             "the arm does not reach over the table from where it stands: `xreset robots place` finds a better place "
             "and home"
         )
         return spec
-    notes.append(f"home: the palm over the table, looking down{found.moved}; fingers bent a little")
-    joints = [*spec.joints]
-    for index, position in zip(spec.arm_indices, found.joints, strict=True):
-        joints[index] = replace(joints[index], home=position)
-    return replace(spec, joints=tuple(joints))
+    held, moved = found
+    notes.append(f"home: the palm over the table, looking down{moved}; fingers bent a little")
+    return held
 
 
 def _with_drives(spec: RobotSpec, source: Source, notes: list[str]) -> RobotSpec:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -41,8 +42,6 @@ SCHEMA = "xreset-judge/1"
 PHASES = ("hold", "lift", "turn")
 LIFT = 0.01
 """Height of the object's origin above the demonstration's start from which a state is lifted [m]."""
-SECONDS = 1.0
-"""Time for which a state must hold the object [s]."""
 HEIGHT = 0.10
 """How far the arm raises the hand [m]."""
 TURN = float(np.pi / 4)
@@ -53,8 +52,9 @@ ANGLE = float(np.pi / 4)
 """Largest change of its orientation in the palm's frame [rad]."""
 _CLOSE_STEPS = 15
 """Control steps without weight."""
-_MOVE_SECONDS = 0.75
-_REST_SECONDS = 0.25
+_MOVE_STEPS = 45
+_REST_STEPS = 15
+"""Control steps in which a phase moves the arm and lets it rest, a second together."""
 _WAYPOINTS = 15
 _ITERATIONS = 3
 _REACHED = (0.02, 0.15)
@@ -89,23 +89,15 @@ class Judgement:
     """For each engine one for each object, and their sum."""
     without: tuple[str, ...]
     """Objects of which the bank has no lifted grasp."""
-    shots: dict[str, list[dict[str, np.ndarray]]]
-    """Object -> the best state's ``joint_pos``, ``object_pos`` and ``object_quat`` at the start and after each phase,
-    in the first engine."""
-
-    def share(self, backend: str, object_name: str, phase: str) -> float:
-        """Return the share of an object's states that pass a phase."""
-        row = next(row for row in self.rows if (row.backend, row.object_name) == (backend, object_name))
-        return getattr(row, phase) / row.tried
+    shots: dict[str, np.ndarray]
+    """Object -> [1 + P, J + 7] joint positions, position and orientation of the object in its best state, at the start
+    and after each phase in the first engine."""
 
     @property
     def kept(self) -> list[str]:
         """Objects of which at least half of the states pass all phases in every engine."""
-        least = {row.object_name: 1.0 for row in self.rows if row.object_name != "all"}
-        for row in self.rows:
-            if row.object_name in least:
-                least[row.object_name] = min(least[row.object_name], row.turn / row.tried)
-        return [name for name, share in least.items() if share >= 0.5]
+        lost = {row.object_name for row in self.rows if row.turn < row.tried / 2}
+        return [name for name in self.shots if name not in lost]
 
     def as_dict(self) -> dict[str, Any]:
         """Return what a JSON file holds."""
@@ -150,18 +142,15 @@ def judge(
     squeeze = squeeze or SqueezeConfig(force=5.0, reach=0.01)
     height = bank.object_pos[:, 2] - bank.start_pos[bank.sequence_index, 2]
     lifted = np.flatnonzero(bank.post_contact & (height > LIFT))
-    used = tuple(spec for spec in objects if spec.name in set(bank.object_name[lifted].tolist()))
-    if not used:
+    if not len(lifted):
         raise RobotError(
             f"robot {robot.name!r}: the bank has no state in which an object is in the air. Look at the reasons of "
             "xreset resets and xreset retarget."
         )
-    names = [spec.name for spec in used]
     object_name = bank.object_name[lifted]
-    index = np.array([names.index(name) for name in object_name.tolist()])
     arrays = (bank.joint_pos, bank.object_pos, bank.object_quat_wxyz)
-    fingers = fingers_of(robot, used, object_name, *(array[lifted] for array in arrays))
-    chosen = _tightest(fingers, index, bank.sequence_index[lifted], states, squeeze.reach)
+    fingers = fingers_of(robot, objects, object_name, *(array[lifted] for array in arrays))
+    chosen = _tightest(fingers, object_name, bank.sequence_index[lifted], states, squeeze.reach)
     if not len(chosen):
         raise RobotError(
             f"robot {robot.name!r}: in no lifted state are the thumb and another finger within "
@@ -170,41 +159,39 @@ def judge(
         )
     targets = squeeze_targets(robot, fingers, bank.joint_pos[lifted], squeeze)[chosen]
     rows = lifted[chosen]
-    index = index[chosen]
-    present = sorted(set(index.tolist()))
-    used = tuple(used[i] for i in present)
+    object_name = object_name[chosen]
+    used = [spec for spec in objects if spec.name in object_name]
     names = [spec.name for spec in used]
-    index = np.searchsorted(present, index)
-    scene = SceneSpec(robot=robot, objects=used)
+    scene = SceneSpec(robot=robot, objects=tuple(used))
+    index = np.array([names.index(name) for name in object_name.tolist()])
     joint_pos, object_pos, object_quat = (torch.as_tensor(array[rows], dtype=torch.float32) for array in arrays)
     start = State.at_rest(joint_pos, object_pos, object_quat, torch.as_tensor(targets))
-    program = _Program(scene)
-    ends = {}
+    moments = torch.cat((joint_pos, object_pos, object_quat), dim=1)[:, None].numpy()
+    judged = []
+    shots: dict[str, np.ndarray] = {}
     for number, name in enumerate(backends):
         table = probe(
-            name, scene, index, start, program.play, gravity=0.0, steps=_CLOSE_STEPS, num_envs=num_envs, device=device,
+            name, scene, index, start, partial(_play, Kinematics(robot)), gravity=0.0, steps=_CLOSE_STEPS,
+            num_envs=num_envs, device=device,
             progress=lambda done, number=number: progress(number * len(rows) + done, len(backends) * len(rows)),
         )  # fmt: skip
-        ends[name] = program.read(table, start)
-    judged = []
-    for name in backends:
-        groups = {label: index == i for i, label in enumerate(names)}
-        groups["all"] = np.ones(len(rows), dtype=bool)
-        passed = ends[name].passed
-        for label, mine in groups.items():
+        reached = table[:, 0] > 0
+        passed = table[:, 1 : 1 + len(PHASES)] > 0
+        later = table[:, 1 + len(PHASES) :].reshape(len(table), len(PHASES), -1)
+        groups = {label: np.flatnonzero(object_name == label) for label in names}
+        for label, mine in {**groups, "all": np.arange(len(rows))}.items():
             counts = dict(zip(PHASES, passed[mine].sum(axis=0).tolist(), strict=True))
-            fails = int((~ends[name].reached[mine]).sum())
-            judged.append(Judged(backend=name, object_name=label, tried=int(mine.sum()), arm_fails=fails, **counts))
-    first = ends[backends[0]]
-    shots = {}
-    for i, label in enumerate(names):
-        mine = np.flatnonzero(index == i)
-        shots[label] = first.moments(int(mine[first.passed[mine].sum(axis=1).argmax()]))
+            fails = int((~reached[mine]).sum())
+            judged.append(Judged(backend=name, object_name=label, tried=len(mine), arm_fails=fails, **counts))
+        if not shots:
+            for label, mine in groups.items():
+                best = mine[passed[mine].sum(axis=1).argmax()]
+                shots[label] = np.concatenate((moments[best], later[best]))
     without = sorted({*bank.object_names} - set(names))
     return Judgement(robot=robot.name, rows=tuple(judged), without=tuple(without), shots=shots)
 
 
-def _tightest(fingers: Fingers, index: np.ndarray, sequence: np.ndarray, count: int, reach: float) -> np.ndarray:
+def _tightest(fingers: Fingers, objects: np.ndarray, sequence: np.ndarray, count: int, reach: float) -> np.ndarray:
     """Return rows of the states that grasp most tightly, ``count`` of each object, from its sequences in turn."""
     thumb = fingers.gap[:, fingers.finger == 0].amin(dim=-1)
     other = fingers.gap[:, fingers.finger != 0].amin(dim=-1)
@@ -214,172 +201,121 @@ def _tightest(fingers: Fingers, index: np.ndarray, sequence: np.ndarray, count: 
         mine = np.flatnonzero(sequence == number)
         rank[mine[np.argsort(gap[mine], kind="stable")]] = np.arange(len(mine))
     chosen = []
-    for number in np.unique(index):
-        mine = np.flatnonzero((index == number) & (gap < reach))
+    for name in np.unique(objects):
+        mine = np.flatnonzero((objects == name) & (gap < reach))
         chosen += mine[np.lexsort((gap[mine], rank[mine]))][:count].tolist()
     return np.array(sorted(chosen), dtype=np.int64)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Ends:
-    """Where states [M] are at the start and after each phase."""
-
-    joint_pos: np.ndarray
-    """[M, 1 + P, J]"""
-    object_pos: np.ndarray
-    """[M, 1 + P, 3]"""
-    object_quat: np.ndarray
-    """[M, 1 + P, 4]"""
-    passed: np.ndarray
-    """[M, P] bool"""
-    reached: np.ndarray
-    """[M] bool: whether the arm can raise and turn the hand."""
-
-    def moments(self, row: int) -> list[dict[str, np.ndarray]]:
-        """Return where a state is at the start and after each phase."""
-        moments = []
-        for i in range(len(PHASES) + 1):
-            moment = (self.joint_pos[row, i], self.object_pos[row, i], self.object_quat[row, i])
-            moments.append(dict(zip(("joint_pos", "object_pos", "object_quat"), moment, strict=True)))
-        return moments
-
-
-class _Program:
-    """The motion of hand and arm, and what is recorded of it."""
-
-    def __init__(self, scene: SceneSpec) -> None:
-        self.scene = scene
-        self.kinematics = Kinematics(scene.robot)
-        self.arm = torch.as_tensor(scene.robot.arm_indices)
-
-    def steps(self, seconds: float) -> int:
-        """Return a number of control steps."""
-        return round(seconds / self.scene.control_dt)
-
-    def play(self, backend: Backend, start: State) -> Tensor:
-        """Go through the phases; return [N, 2 + P (J + 14) + 1]: errors of the arm, joints, poses of object and palm
-        after each phase, and whether the simulation is sound."""
-        backend.set_object_gravity(torch.ones(backend.num_worlds, device=backend.device))
-        joints = start.joint_pos.double().cpu()
-        targets = start.joint_target.double().cpu()
-        palm = self.kinematics.link_poses(joints, [self.scene.robot.palm])[:, 0]
-        up, up_error = self.path(joints, palm, rise=HEIGHT, turn=0.0)
-        turned = [self.path(up[-1], palm, rise=HEIGHT, turn=sign * TURN) for sign in (1, -1)]
-        better = (turned[0][1] <= turned[1][1])[None, :, None]
-        turn = torch.where(better, turned[0][0], turned[1][0])
-        turn_error = torch.minimum(turned[0][1], turned[1][1])
-        records = [up_error[:, None], turn_error[:, None]]
-        for _ in range(self.steps(SECONDS)):
-            backend.step()
-        records += self.snapshot(backend)
-        before = joints
-        for path in (up, turn):
-            self.move(backend, targets, before, path)
-            records += self.snapshot(backend)
-            before = path[-1]
-        health = backend.health()
-        sound = ~(health.nonfinite | health.overflow)
-        return torch.cat([*records, sound.cpu().double()[:, None]], dim=1).float()
-
-    def snapshot(self, backend: Backend) -> list[Tensor]:
-        """Return joints, object pose and palm pose of every world."""
-        state = backend.state()
-        links = backend.links()
-        parts = (state.joint_pos, state.object_pos, state.object_quat, links.pos[:, 0], links.quat[:, 0])
-        return [part.double().cpu() for part in parts]
-
-    def path(self, joints: Tensor, palm: Tensor, *, rise: float, turn: float) -> tuple[Tensor, Tensor]:
-        """Move the palm [N, 4, 4] up and turn it about its x axis; return joints [waypoints, N, J] from ``joints`` on,
-        and the error at the end as a share of what is allowed [N]."""
-        quat = matrix_to_quat(palm[:, :3, :3])
-        here = self.kinematics.link_poses(joints, [self.scene.robot.palm])[:, 0]
-        risen = (here[:, 2, 3] - palm[:, 2, 3])[:, None]
-        waypoints = []
-        error = joints
-        for number in range(1, _WAYPOINTS + 1):
-            share = number / _WAYPOINTS
-            goal = palm[:, :3, 3].clone()
-            goal[:, 2:] += risen + share * (rise - risen)
-            axis = goal.new_tensor([share * turn, 0.0, 0.0]).expand_as(goal)
-            goal_quat = quat_multiply(quat, quat_from_axis_angle(axis))
-            for _ in range(_ITERATIONS):
-                at = self.kinematics.jacobian(joints, [self.scene.robot.palm])
-                away = quat_multiply(goal_quat, quat_conjugate(matrix_to_quat(at.rot[:, 0])))
-                error = torch.cat((goal - at.pos[:, 0], quat_to_axis_angle(quat_normalize(away))), dim=1)
-                J = torch.cat((at.linear[:, 0], at.angular[:, 0]), dim=1)[..., self.arm]
-                damping = 1e-4 * torch.eye(len(self.arm), dtype=J.dtype)
-                step = torch.linalg.solve(J.mT @ J + damping, J.mT @ error[..., None])[..., 0]
-                joints = joints.clone()
-                joints[:, self.arm] += step.clamp(-0.2, 0.2)
-                joints = self.kinematics.clamp(joints)
-            waypoints.append(joints)
-        position = error[:, :3].norm(dim=1) / _REACHED[0]
-        return torch.stack(waypoints), torch.maximum(position, error[:, 3:].norm(dim=1) / _REACHED[1])
-
-    def move(self, backend: Backend, targets: Tensor, before: Tensor, path: Tensor) -> None:
-        """Move the arm's targets along waypoints; the hand's stay."""
-        points = torch.cat((before[None], path))
-        count = self.steps(_MOVE_SECONDS)
-        for number in range(1, count + self.steps(_REST_SECONDS) + 1):
-            place = min(number / count, 1.0) * len(path)
-            first = min(int(place), len(path) - 1)
-            between = torch.lerp(points[first], points[first + 1], place - first)
-            now = targets.clone()
-            now[:, self.arm] = between[:, self.arm]
-            backend.set_joint_targets(now.float().to(backend.device))
-            backend.step()
-
-    def read(self, table: np.ndarray, start: State) -> _Ends:
-        """Return what :meth:`play` recorded of all states."""
-        joints = start.joint_pos.shape[1]
-        reached = table[:, :2] < 1
-        sound = table[:, -1] > 0.5
-        parts = torch.as_tensor(table[:, 2:-1].reshape(len(table), len(PHASES), joints + 14)).double()
-        joint_pos, object_pos, object_quat, palm_pos, palm_quat = parts.split([joints, 3, 4, 3, 4], dim=-1)
-        palm = self.kinematics.link_poses(start.joint_pos.double(), [self.scene.robot.palm])
-        pos, quat = _relative(
-            start.object_pos[:, None].double(), start.object_quat[:, None].double(), palm[..., :3, 3],
-            matrix_to_quat(palm[..., :3, :3]),
-        )  # fmt: skip
-        now_pos, now_quat = _relative(object_pos, object_quat, palm_pos, palm_quat)
+def _play(kinematics: Kinematics, backend: Backend, start: State) -> Tensor:
+    """Go through the phases; return [N, 1 + P + P (J + 7)]: whether the arm can raise and turn the hand, which phases
+    are passed, then the joints and the object's pose after each phase."""
+    backend.set_object_gravity(torch.ones(backend.num_worlds, device=backend.device))
+    start = start.to("cpu")
+    joints = start.joint_pos.double()
+    palm = kinematics.link_poses(joints, [kinematics.robot.palm])[:, 0]
+    up, up_error = arm_path(kinematics, joints, palm, rise=HEIGHT, turn=0.0)
+    right, right_error = arm_path(kinematics, up[-1], palm, rise=HEIGHT, turn=TURN)
+    left, left_error = arm_path(kinematics, up[-1], palm, rise=HEIGHT, turn=-TURN)
+    turn = torch.where((right_error <= left_error)[:, None], right, left)
+    turn_error = torch.minimum(right_error, left_error)
+    pos, quat = _relative(start.object_pos, start.object_quat, palm[:, :3, 3], matrix_to_quat(palm[:, :3, :3]))
+    kept = torch.ones(len(joints), dtype=torch.bool)
+    passed = []
+    moments = []
+    before = joints
+    for path, error in ((joints[None], torch.zeros(len(joints))), (up, up_error), (turn, turn_error)):
+        _move(backend, start.joint_target.double(), torch.cat((before[None], path)), kinematics.robot.arm_indices)
+        before = path[-1]
+        now = backend.state().to("cpu")
+        links = backend.links().to("cpu")
+        now_pos, now_quat = _relative(now.object_pos, now.object_quat, links.pos[:, 0], links.quat[:, 0])
         near = ((now_pos - pos).norm(dim=-1) < DISTANCE) & (quat_angle(now_quat, quat) < ANGLE)
-        kept = near.numpy().astype(int).cumprod(axis=1) > 0
-        kept[:, 1:] &= reached.astype(int).cumprod(axis=1) > 0
-
-        def with_start(first: Tensor, later: Tensor) -> np.ndarray:
-            return torch.cat((first[:, None].double(), later), dim=1).numpy()
-
-        return _Ends(
-            joint_pos=with_start(start.joint_pos, joint_pos),
-            object_pos=with_start(start.object_pos, object_pos),
-            object_quat=with_start(start.object_quat, object_quat),
-            passed=kept & sound[:, None],
-            reached=np.logical_and(reached[:, 0], reached[:, 1]),
-        )
+        kept = kept & near & (error < 1)
+        passed.append(kept)
+        moments.append(torch.cat((now.joint_pos, now.object_pos, now.object_quat), dim=1))
+    health = backend.health()
+    sound = ~(health.nonfinite | health.overflow).cpu()
+    reached = (up_error < 1) & (turn_error < 1)
+    return torch.cat((reached[:, None], torch.stack(passed, dim=1) & sound[:, None], *moments), dim=1)
 
 
 def _relative(pos: Tensor, quat: Tensor, frame_pos: Tensor, frame_quat: Tensor) -> tuple[Tensor, Tensor]:
     """Return poses in the frame of others."""
-    return quat_rotate_inverse(frame_quat, pos - frame_pos), quat_multiply(quat_conjugate(frame_quat), quat)
+    frame = frame_quat.double()
+    relative = quat_rotate_inverse(frame, pos.double() - frame_pos.double())
+    return relative, quat_multiply(quat_conjugate(frame), quat.double())
+
+
+def arm_path(
+    kinematics: Kinematics, joints: Tensor, palm: Tensor, *, rise: float, turn: float
+) -> tuple[Tensor, Tensor]:
+    """Move the palm up and turn it about its x axis.
+
+    Args:
+        kinematics: of the whole robot.
+        joints: [N, J] where the path begins.
+        palm: [N, 4, 4] pose from which the palm rises [m] and turns [rad].
+        rise: height at the end [m].
+        turn: angle at the end [rad].
+
+    Returns:
+        Joints [waypoints, N, J], and the error at the end as a share of what is allowed [N].
+    """
+    arm = torch.as_tensor(kinematics.robot.arm_indices)
+    links = [kinematics.robot.palm]
+    quat = matrix_to_quat(palm[:, :3, :3])
+    risen = (kinematics.link_poses(joints, links)[:, 0, 2, 3] - palm[:, 2, 3])[:, None]
+    waypoints = []
+    error = joints
+    for number in range(1, _WAYPOINTS + 1):
+        share = number / _WAYPOINTS
+        goal = palm[:, :3, 3].clone()
+        goal[:, 2:] += risen + share * (rise - risen)
+        axis = goal.new_tensor([share * turn, 0.0, 0.0]).expand_as(goal)
+        goal_quat = quat_multiply(quat, quat_from_axis_angle(axis))
+        for _ in range(_ITERATIONS):
+            at = kinematics.jacobian(joints, links)
+            away = quat_multiply(goal_quat, quat_conjugate(matrix_to_quat(at.rot[:, 0])))
+            error = torch.cat((goal - at.pos[:, 0], quat_to_axis_angle(quat_normalize(away))), dim=1)
+            J = torch.cat((at.linear[:, 0], at.angular[:, 0]), dim=1)[..., arm]
+            damping = 1e-4 * torch.eye(len(arm), dtype=J.dtype)
+            step = torch.linalg.solve(J.mT @ J + damping, J.mT @ error[..., None])[..., 0]
+            joints = joints.clone()
+            joints[:, arm] += step.clamp(-0.2, 0.2)
+            joints = kinematics.clamp(joints)
+        waypoints.append(joints)
+    position = error[:, :3].norm(dim=1) / _REACHED[0]
+    return torch.stack(waypoints), torch.maximum(position, error[:, 3:].norm(dim=1) / _REACHED[1])
+
+
+def _move(backend: Backend, targets: Tensor, path: Tensor, arm: np.ndarray) -> None:
+    """Move the arm's targets along waypoints [waypoints, N, J], and let it rest; the hand keeps its targets [N, J]."""
+    for number in range(1, _MOVE_STEPS + _REST_STEPS + 1):
+        place = min(number / _MOVE_STEPS, 1.0) * (len(path) - 1)
+        first = min(int(place), len(path) - 2)
+        now = targets.clone()
+        now[:, arm] = torch.lerp(path[first], path[first + 1], place - first)[:, arm]
+        backend.set_joint_targets(now.float().to(backend.device))
+        backend.step()
 
 
 def judge_picture(judgement: Judgement, robot: RobotSpec, objects: Sequence[ObjectSpec]) -> np.ndarray:
     """[H, W, 3] uint8: one row for each object: its best state at the start, and after each phase in the first engine,
     with the share of states that pass the phase in each engine."""
-    backends = list(dict.fromkeys(row.backend for row in judgement.rows))
     by_name = {spec.name: spec for spec in objects}
-    rows = []
+    pictures = []
     for name, moments in judgement.shots.items():
+        rows = [row for row in judgement.rows if row.object_name == name]
         renderer = Renderer(SceneSpec(robot=robot, objects=(by_name[name],)), size=_TILE, smooth=True)
         tiles = []
         for phase, moment in zip(("start", *PHASES), moments, strict=True):
-            target = moment["object_pos"]
+            target = moment[-7:-4]
             camera = Camera(eye=tuple(target + np.array((0.42, -0.42, 0.22))), target=tuple(target))
-            pose = pose_matrix(target, moment["object_quat"])
-            tile = renderer.draw(moment["joint_pos"], pose, camera=camera)
-            caption = [name if phase == "start" else phase]
+            tile = renderer.draw(moment[:-7], pose_matrix(target, moment[-4:]), camera=camera)
+            caption = [name]
             if phase != "start":
-                caption += [f"{backend} {judgement.share(backend, name, phase):.0%}" for backend in backends]
-            tiles.append(add_caption(tile, caption, 1 + len(backends)))
-        rows.append(np.hstack(tiles))
-    return np.vstack(rows)
+                caption = [phase, *(f"{row.backend} {getattr(row, phase) / row.tried:.0%}" for row in rows)]
+            tiles.append(add_caption(tile, caption, 1 + len(rows)))
+        pictures.append(np.hstack(tiles))
+    return np.vstack(pictures)

@@ -17,7 +17,8 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -30,17 +31,20 @@ from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track
 from xreset.retarget.validity import Thresholds, classify
-from xreset.robot_tools.homes import reach_near, table_clearance
-from xreset.robot_tools.placement import Finalist, PlaceConfig, Placement, Reach, Search
+from xreset.robot_tools.homes import hold_near, table_clearance
+from xreset.robot_tools.placement import Finalist, PlaceConfig, Reach, Search
 from xreset.spec import RobotSpec
 from xreset.tensors import one_thread
 
+_POSITION = 0.005
+_ORIENTATION = np.radians(5.0)
+"""[m], [rad] Largest distance and angle of a reached hand root from its target."""
+_FINAL_FRAMES = 600
+"""Frames on which the finalists are tried."""
 _LENGTH = 0.10
 """[m] Length that counts as much as one radian in the measure of dexterity."""
 _FIRST = 12
 """Frames that a candidate is tried on before all others: most fail on enough of them."""
-_WAVE = 8
-"""Candidates that are given up by the same standard: what had been found before all of them."""
 _DRAWS = 1000
 """Times that a candidate is drawn until it is clear of wrists and objects; then the round goes without it."""
 _SHRINK = 0.6
@@ -84,61 +88,48 @@ def place(
     random = np.random.default_rng(config.seed)
     order = torch.as_tensor(random.permutation(count))
     tried = wrists[order[: config.frames]]
-    kept = wrists[order[config.frames :][: config.final_frames]]
+    kept = wrists[order[config.frames :][:_FINAL_FRAMES]]
     if not len(kept.annotated):
         kept = tried
-    own = Placement(pos=robot.base_pos, quat=robot.base_quat)
-    trial = _Trial(robot=robot, config=config, tried=tried, kept=kept, paths=paths)
-    found = [(own, trial.reach(own, 0))]
+    best = reach(robot, tried)
+    found = [(best, robot)]
+    done = 0
     effort = config.rounds * config.candidates + _FINALIST * (1 + config.elite)
     with _mapper(processes) as each:
         for number in range(config.rounds):
-            drawn = _candidates(robot, avoid, config, random, number, found[: config.elite])
-            for begin in range(0, len(drawn), _WAVE):
-                wave = drawn[begin : begin + _WAVE]
-                least = 0
-                if len(found) >= config.elite:
-                    least = found[config.elite - 1][1].rank[0]
-                found += zip(wave, each(trial.reach, wave, [least] * len(wave)), strict=True)
-                found.sort(key=lambda pair: pair[1].rank, reverse=True)
-                progress((number * config.candidates + begin + len(wave)) / effort, found[0][1])
-        chosen = [own]
+            elite = found[: config.elite]
+            least = elite[-1][0].rank[0] if len(elite) == config.elite else 0
+            drawn = _candidates(robot, avoid, config, random, number, [candidate for _, candidate in elite])
+            for candidate, reached in zip(drawn, each(partial(reach, wrists=tried, least=least), drawn), strict=True):
+                found.append((reached, candidate))
+                best = max(best, reached, key=lambda one: one.rank)
+                done += 1
+                progress(done / effort, best)
+            found.sort(key=lambda pair: pair[0].rank, reverse=True)
+        chosen = [robot]
         if config.rounds:
-            chosen += [placement for placement, _ in found[: config.elite] if placement != own]
+            chosen += [candidate for _, candidate in found[: config.elite] if candidate is not robot]
         finalists: list[Finalist] = []
-        for finalist in each(trial.finalist, chosen):
+        for finalist in each(partial(_finalist, robot=robot, wrists=kept, paths=paths), chosen):
             finalists.append(finalist)
-            progress(1.0 - _FINALIST * (1 + config.elite - len(finalists)) / effort, found[0][1])
+            progress(1.0 - _FINALIST * (len(chosen) - len(finalists)) / effort, best)
     frames = sum(int(path.annotated.sum()) for path in paths)
     ranked = sorted(finalists, key=lambda finalist: finalist.followed, reverse=True)
-    return Search(finalists=tuple(ranked), own=finalists[0], frames=frames)
+    return Search(finalists=tuple(ranked), frames=frames)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Trial:
-    """What placements are tried on."""
-
-    robot: RobotSpec
-    config: PlaceConfig
-    tried: ArmTargets
-    """Single frames for candidates."""
-    kept: ArmTargets
-    """Single frames for finalists."""
-    paths: list[ArmTargets]
-
-    def reach(self, placement: Placement, least: int) -> Reach:
-        return reach(self.robot, placement, self.tried, self.config, least)
-
-    def finalist(self, placement: Placement) -> Finalist:
-        reached = reach(self.robot, placement, self.kept, self.config)
-        model = ArmModel(_placed(self.robot, placement))
-        valid = annotated = 0
-        for path in self.paths:
-            _, measures = track(model, path, Thresholds())
-            valid += int((classify(measures, Thresholds()) == 0).sum())
-            annotated += int(path.annotated.sum())
-        home, rule = _home(self.robot, placement)
-        return Finalist(placement=placement, reach=reached, followed=valid / annotated, home=home, home_rule=rule)
+def _finalist(placed: RobotSpec, robot: RobotSpec, wrists: ArmTargets, paths: list[ArmTargets]) -> Finalist:
+    """Try a placement of a robot on more frames and on whole motions."""
+    reached = reach(placed, wrists)
+    model = ArmModel(placed)
+    valid = 0
+    annotated = 0
+    for path in paths:
+        _, measures = track(model, path, Thresholds())
+        valid += int((classify(measures, Thresholds()) == 0).sum())
+        annotated += int(path.annotated.sum())
+    with_home, rule = _with_home(placed, robot)
+    return Finalist(robot=with_home, reach=reached, followed=valid / annotated, home_rule=rule)
 
 
 def _begin() -> None:
@@ -163,24 +154,21 @@ def _mapper(processes: int) -> Iterator[Callable[..., Iterable[Any]]]:
         pool.shutdown(cancel_futures=True)
 
 
-def reach(robot: RobotSpec, placement: Placement, wrists: ArmTargets, config: PlaceConfig, least: int = 0) -> Reach:
-    """Return what the robot reaches of wrist poses [F, 1, ...] from a placement.
+def reach(robot: RobotSpec, wrists: ArmTargets, least: int = 0) -> Reach:
+    """Return what the robot reaches of wrist poses [F, 1, ...] from where it stands.
 
-    It is given up as soon as the first number of its rank must stay below ``least``; then all frames that were not
-    tried count as reached.
+    It is given up after some frames if the first number of its rank must stay below ``least``; then all frames that
+    were not tried count as reached.
     """
-    model = ArmModel(_placed(robot, placement))
-    thresholds = Thresholds(
-        hand_error=np.inf, wrist_position=config.position, wrist_orientation=np.radians(config.orientation)
-    )
+    model = ArmModel(robot)
+    thresholds = Thresholds(hand_error=np.inf, wrist_position=_POSITION, wrist_orientation=_ORIENTATION)
     effort = ArmConfig(restarts=4, branches=2, first_iterations=40, reseeds=0)
     frames = len(wrists.annotated)
-    begin = 0
-    end = _FIRST if least else frames
     possible = frames
     dexterity = torch.zeros(0, dtype=torch.float64)
-    while begin < frames and Reach(reached=possible / frames, dexterity=0.0).rank[0] >= least:
-        part = wrists[begin:end]
+    for part in (wrists[:_FIRST], wrists[_FIRST:]) if least else (wrists,):
+        if Reach(reached=possible / frames, dexterity=0.0).rank[0] < least:
+            break
         joints, measures = track(model, part, thresholds, effort)
         reached = (classify(measures, thresholds) == 0)[:, 0]
         possible -= int((~reached).sum())
@@ -188,8 +176,6 @@ def reach(robot: RobotSpec, placement: Placement, wrists: ArmTargets, config: Pl
         jacobian = model.kinematics.jacobian(configurations, [robot.hand_root])
         rows = torch.cat((jacobian.linear[:, 0] / _LENGTH, jacobian.angular[:, 0]), dim=1)[..., model.arm]
         dexterity = torch.cat((dexterity, torch.linalg.svdvals(rows)[:, -1]))
-        begin = end
-        end = 4 * end
     return Reach(reached=possible / frames, dexterity=float(dexterity.mean()) if len(dexterity) else 0.0)
 
 
@@ -200,28 +186,21 @@ def single_frames(paths: list[ArmTargets], hand_error: float) -> ArmTargets:
     return ArmTargets.cat(parts).map(lambda x: x[:, None])
 
 
-def _placed(robot: RobotSpec, placement: Placement) -> RobotSpec:
-    return replace(robot, base_pos=placement.pos, base_quat=placement.quat)
-
-
 def _candidates(
     robot: RobotSpec,
     avoid: np.ndarray,
     config: PlaceConfig,
     random: np.random.Generator,
     number: int,
-    elite: list[tuple[Placement, Reach]],
-) -> list[Placement]:
+    elite: list[RobotSpec],
+) -> list[RobotSpec]:
     """Return the candidates of a round: first evenly over the ranges, then around the elite."""
-    tilt = config.tilt
-    if tilt is None:
-        upright = Rotation.from_quat(robot.base_quat, scalar_first=True).as_matrix()[2, 2]
-        own = float(np.degrees(np.arccos(np.clip(upright, -1, 1))))
-        tilt = (own, own)
-    low = np.array([config.x[0], config.y[0], config.z[0], -180.0, tilt[0], -180.0])
-    high = np.array([config.x[1], config.y[1], config.z[1], 180.0, tilt[1], 180.0])
+    own = _parameters(robot)[4]
+    least_tilt, most_tilt = config.tilt or (own, own)
+    low = np.array([config.x[0], config.y[0], config.z[0], -180.0, least_tilt, -180.0])
+    high = np.array([config.x[1], config.y[1], config.z[1], 180.0, most_tilt, 180.0])
     spread = (high - low) / 4 * _SHRINK**number
-    centers = [_parameters(placement) for placement, _ in elite]
+    centers = [_parameters(candidate) for candidate in elite]
     bounded = [0, 1, 2, 4]  # all but the angles that go round
     candidates = []
     for _ in range(config.candidates):
@@ -232,48 +211,46 @@ def _candidates(
                 drawn = centers[random.integers(len(centers))] + spread * random.standard_normal(6)
             drawn[bounded] = np.clip(drawn[bounded], low[bounded], high[bounded])
             if not len(avoid) or np.linalg.norm(avoid - drawn[:3], axis=1).min() >= config.clear:
-                candidates.append(_placement(drawn))
+                candidates.append(_placed(robot, drawn))
                 break
     if number == 0 and not candidates:
         raise RobotError(
             f"robot {robot.name!r}: no place in the searched ranges is {config.clear:g} m away from all wrists and "
-            "objects. "
-            "Lower --search.clear, or widen --search.x, --search.y or --search.z."
+            "objects. Lower --search.clear, or widen --search.x, --search.y or --search.z."
         )
     return candidates
 
 
-def _placement(parameters: np.ndarray) -> Placement:
-    """From (x, y, z, azimuth, tilt, spin): the base is spun about its z axis, which is tilted towards an azimuth;
-    angles in degrees."""
+def _placed(robot: RobotSpec, parameters: np.ndarray) -> RobotSpec:
+    """Return the robot with its base at (x, y, z, azimuth, tilt, spin): the base is spun about its z axis, which is
+    tilted towards an azimuth; angles in degrees."""
     turn = Rotation.from_euler("ZYZ", parameters[3:], degrees=True)
     quat = turn.as_quat(canonical=True, scalar_first=True)
-    return Placement(pos=tuple(parameters[:3].tolist()), quat=tuple(quat.tolist()))
+    return replace(robot, base_pos=tuple(parameters[:3].tolist()), base_quat=tuple(quat.tolist()))
 
 
-def _parameters(placement: Placement) -> np.ndarray:
-    """The inverse of :func:`_placement`."""
-    turn = Rotation.from_quat(placement.quat, scalar_first=True)
+def _parameters(robot: RobotSpec) -> np.ndarray:
+    """The inverse of :func:`_placed`."""
+    turn = Rotation.from_quat(robot.base_quat, scalar_first=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of an upright base, whose azimuth is 0
         spin, tilt, azimuth = turn.as_euler("zyz", degrees=True)
-    return np.array([*placement.pos, azimuth, tilt, spin])
+    return np.array([*robot.base_pos, azimuth, tilt, spin])
 
 
-def _home(robot: RobotSpec, placement: Placement) -> tuple[tuple[float, ...] | None, str]:
-    """Return arm joints for home from a placement, and how they were chosen; None if nothing is found.
+def _with_home(placed: RobotSpec, robot: RobotSpec) -> tuple[RobotSpec, str]:
+    """Return the placed robot with a home of its arm, and how it was chosen; empty if none is found.
 
     The first of these that the arm can reach, clear of the table and of itself: the pose of the hand at the
     description's home; the nearest of poses beside and above it; the description's joints.
     """
-    described = tuple(robot.home[robot.arm_indices].tolist())
-    if placement == Placement(pos=robot.base_pos, quat=robot.base_quat):
-        return described, "as described"
+    if placed == robot:
+        return robot, "as described"
     home = torch.as_tensor(robot.home)
-    placed = _placed(robot, placement)
-    found = reach_near(placed, Kinematics(robot).link_poses(home, [robot.hand_root])[0].numpy())
+    found = hold_near(placed, Kinematics(robot).link_poses(home, [robot.hand_root])[0].numpy())
     if found is not None:
-        return found.joints, "the hand where it was" + found.moved
+        held, moved = found
+        return held, "the hand where it was" + moved
     if table_clearance(placed, home[None]) > _HOME_CLEAR:
-        return described, "the joints as they were"
-    return None, ""
+        return placed, "the joints as they were"
+    return placed, ""

@@ -28,8 +28,6 @@ class PlaceConfig:
     """Distance that the base's origin keeps from every wrist and object of the demonstrations [m]."""
     frames: int = 100
     """Frames that each candidate is tried on, each on its own."""
-    final_frames: int = 600
-    """Other frames, on which the finalists are tried."""
     candidates: int = 40
     """Of each round."""
     rounds: int = 5
@@ -37,21 +35,7 @@ class PlaceConfig:
     elite: int = 5
     """Best candidates: the next round is drawn around them, and in the end they and the description's own placement are
     the finalists."""
-    position: float = 0.005
-    """Largest distance of a reached hand root from its target [m]."""
-    orientation: float = 5.0
-    """Largest angle of a reached hand root to its target [degrees]."""
     seed: int = 0
-
-
-@dataclass(frozen=True, kw_only=True)
-class Placement:
-    """A place of the robot's base in the world."""
-
-    pos: tuple[float, float, float]
-    """[m]"""
-    quat: tuple[float, float, float, float]
-    """(w, x, y, z)"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,16 +58,15 @@ class Reach:
 class Finalist:
     """A placement that was also tried on whole motions."""
 
-    placement: Placement
+    robot: RobotSpec
+    """The robot that stands there, with its home."""
     reach: Reach
     """On the final frames."""
     followed: float
     """Share of all annotated frames that are valid when the arm follows the motions from frame to frame, as in ``xreset
     retarget``."""
-    home: tuple[float, ...] | None = None
-    """Arm joints at home; None: no home was found."""
-    home_rule: str = ""
-    """How home was chosen."""
+    home_rule: str
+    """How home was chosen; empty: no home was found."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,20 +75,13 @@ class Search:
 
     finalists: tuple[Finalist, ...]
     """Those that follow most first. The description's own placement is one of them."""
-    own: Finalist
-    """The description's own placement."""
     frames: int
     """Annotated frames of the motions."""
 
     @property
     def best(self) -> Finalist:
         """The finalist that follows most and has a home."""
-        return next((finalist for finalist in self.finalists if finalist.home is not None), self.finalists[0])
-
-    @property
-    def home(self) -> tuple[float, ...] | None:
-        """Arm joints at home in the best placement."""
-        return self.best.home
+        return next((finalist for finalist in self.finalists if finalist.home_rule), self.finalists[0])
 
 
 def write_placement(path: Path, robot: RobotSpec, search: Search, command: str) -> None:
@@ -115,40 +91,31 @@ def write_placement(path: Path, robot: RobotSpec, search: Search, command: str) 
     Raises:
         RobotError: the file does not have the lines that would change, or there is no home to put there.
     """
-    if search.home is None:
-        raise RobotError(
-            f"robot {robot.name!r}: no placement has a home. Put base.pos = {_listed(search.best.placement.pos)} and "
-            f"base.quat = {_listed(search.best.placement.quat)} into {path}, and choose a home of the arm's joints "
-            "there: look at it with xreset robots check --picture."
-        )
-    text = re.sub(r"^placement *=.*\n", "", path.read_text(), flags=re.MULTILINE)
     best = search.best
+    pos = _listed(best.robot.base_pos)
+    quat = _listed(best.robot.base_quat)
+    if not best.home_rule:
+        raise RobotError(
+            f"robot {robot.name!r}: no placement has a home. Put base.pos = {pos} and base.quat = {quat} into {path}, "
+            "and choose a home of the arm's joints there: look at it with xreset robots check --picture."
+        )
     figures = f"reached = {best.reach.reached:.3f}, followed = {best.followed:.3f}, frames = {search.frames}"
-    command = json.dumps(command, ensure_ascii=False)
-    edits = [(r"^quat *=.*()$", f"\nplacement = {{ {figures}, command = {command} }}")]
-    if best.placement != search.own.placement:  # else not a digit may change: it would be another robot
-        edits.append((r"^pos *= *(.*)$", _listed(best.placement.pos)))
-        edits.append((r"^quat *= *(.*)$", _listed(best.placement.quat)))
-        for index, value in zip(robot.arm_indices, search.home, strict=True):
-            name = re.escape(robot.joint_names[index])
-            edits.append((rf'name *= *"{name}".*?\bhome *= *([-+.\deE]+)', f"{value:.3f}"))
-    write_whole(path, edited(text, path, edits))
-
-
-def _listed(values: Sequence[float]) -> str:
-    return f"[{', '.join(f'{value:.8g}' for value in values)}]"
-
-
-def edited(text: str, path: Path, edits: Sequence[tuple[str, str]]) -> str:
-    """Return the text of a ``robot.toml`` with the first match of each pattern, or of the group in it, replaced.
-
-    Raises:
-        RobotError: names a pattern that matches nothing.
-    """
+    stated = f"placement = {{ {figures}, command = {json.dumps(command, ensure_ascii=False)} }}"
+    edits = [(r"^quat *=.*()$", f"\n{stated}")]
+    if best.robot != robot:  # else not a digit may change: it would be another robot
+        edits += [(r"^pos *= *(.*)$", pos), (r"^quat *= *(.*)$", quat)]
+        for joint in best.robot.joints:
+            if joint.group == "arm":
+                pattern = rf'name *= *"{re.escape(joint.name)}".*?\bhome *= *([-+.\deE]+)'
+                edits.append((pattern, f"{joint.home:.3f}"))
+    text = re.sub(r"^placement *=.*\n", "", path.read_text(), flags=re.MULTILINE)
     for pattern, new in edits:
         match = re.search(pattern, text, flags=re.MULTILINE)
         if match is None:
             raise RobotError(f"{path} has no line like {pattern!r} to change; edit it by hand: {new}")
-        start, end = match.span(match.re.groups)
-        text = text[:start] + new + text[end:]
-    return text
+        text = text[: match.start(1)] + new + text[match.end(1) :]
+    write_whole(path, text)
+
+
+def _listed(values: Sequence[float]) -> str:
+    return f"[{', '.join(f'{value:.8g}' for value in values)}]"

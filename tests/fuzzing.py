@@ -163,8 +163,8 @@ def readers() -> Iterator[dict[str, Reader]]:
         (folder / "robot.toml").write_bytes(described.read_bytes())
         add("robot.toml", "robot.toml", read_description, "text")
         add("URDF", robot.urdf.name, urdf.load_urdf, "text")
-        add("URDF, imported", "hand.urdf", read_source, "text").write_text(HAND)
-        add("MJCF, imported", "hand.xml", read_source, "text").write_text(MJCF)
+        add("URDF, imported", "hand.urdf", lambda p: read_source(p, []), "text").write_text(HAND)
+        add("MJCF, imported", "hand.xml", lambda p: read_source(p, []), "text").write_text(MJCF)
 
         calibration = folder / "calibration" / "extrinsics_1" / "extrinsics.yml"
         calibration.parent.mkdir(parents=True)

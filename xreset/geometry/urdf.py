@@ -78,6 +78,10 @@ class Joint:
     """Largest torque [N m] or force [N]; 0 where the URDF gives none."""
     mimic: MimicSpec | None = None
     """How it follows another joint, as the URDF has it."""
+    stiffness: float = 0.0
+    """Stiffness of its drive [N m/rad or N/m]; 0 where none is given, as in a URDF."""
+    rotor: float = 0.0
+    """Inertia of its drive's rotor [kg m^2 or kg]; 0 where none is given, as in a URDF."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -302,7 +306,8 @@ def check_tree(tree: RobotTree, path: Path) -> None:
         if link.mass < 0:
             raise RobotError(f"{path}: link {link.name!r} has the mass {link.mass} kg, expected 0 or more.")
     for joint in tree.joints:
-        if not ((np.abs(joint.T_parent_joint) < _LARGEST).all() and np.isfinite(joint.axis).all()):
+        numbers = [*joint.axis, joint.effort, joint.stiffness, joint.rotor]
+        if not ((np.abs(joint.T_parent_joint) < _LARGEST).all() and np.isfinite(numbers).all()):
             raise RobotError(f"{path}: joint {joint.name!r} has a number that is not finite, or far too large.")
         if math.isnan(joint.velocity) or not joint.lower <= joint.upper:
             raise RobotError(

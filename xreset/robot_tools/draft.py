@@ -20,11 +20,8 @@ from xreset.spec import DriveSpec, FingertipSpec, JointSpec, KeypointSpec, Robot
 _BASE = ((0.85, 0.85, 0.10), (0.6427876, 0.0, 0.0, -0.7660444))
 """Where the arm stands until `robots place` finds better: on the table, beside the person, its x turned by -100
 degrees. Five published hands on xArm7 and iiwa 14 follow 98 % or more of five DexYCB sequences from there."""
-
-
-def moving(tree: RobotTree) -> list[str]:
-    """Return the joints that need a drive, root first."""
-    return [joint.name for joint in tree.joints if joint.type != "fixed" and joint.mimic is None]
+_ARMATURE = 0.1
+"""[kg m^2] Rotor inertia of the arm's joints, as in the built-in robots."""
 
 
 def draft_spec(
@@ -41,14 +38,16 @@ def draft_spec(
     write_meshes(tree, folder)
     inside = set(tree.below(hand_root)[1:])
     joints = []
-    for name in moving(tree):
-        joint = tree.joint(name)
-        home = float(np.clip(0.0, joint.lower, joint.upper)) + (bent or {}).get(name, 0.0)
+    for joint in tree.joints:
+        if joint.type == "fixed" or joint.mimic is not None:
+            continue
+        home = float(np.clip(0.0, joint.lower, joint.upper)) + (bent or {}).get(joint.name, 0.0)
         lowest = math.ceil(joint.lower * 1e4) / 1e4
         highest = math.floor(joint.upper * 1e4) / 1e4
         home = float(np.clip(round(home, 4), lowest, highest))  # four digits get into the description
         group = "hand" if joint.child in inside else "arm"
-        joints.append(JointSpec(name=name, group=group, drive=DriveSpec(kp=1.0, kd=0.1, effort=1.0), home=home))
+        drive = DriveSpec(kp=1.0, kd=0.1, effort=1.0, armature=_ARMATURE if group == "arm" else 0.0)
+        joints.append(JointSpec(name=joint.name, group=group, drive=drive, home=home))
     links = [link.name for link in tree.links if link.collisions]
     return RobotSpec(
         name=tree.name,

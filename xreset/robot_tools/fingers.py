@@ -76,8 +76,8 @@ class Hand:
     """Its links, with frames for palm, wrist, fingertips and keypoints."""
     root: str
     """Link after which the fingers part."""
-    wrist: tuple[str, ...]
-    """Joints before it."""
+    places: Poses
+    """Link -> pose [4, 4] in the frame of the tree's root, with a straight wrist."""
     palm: np.ndarray
     """[4, 4] pose of the palm in the frame of the tree's root, with a straight wrist."""
     palm_in_hand: np.ndarray
@@ -98,17 +98,18 @@ def find_hand(tree: RobotTree, folder: Path, thumb: str | None, notes: list[str]
         thumb: a link or joint of the thumb.
         notes: what is guessed is appended.
     """
-    root, wrist = _palm_link(tree, notes)
+    root = _palm_link(tree, notes)
     spec = draft_spec(tree, root, folder)
     straight = link_places(spec, {})
     fingers = _find_fingers(spec, tree, straight, thumb, notes)
     palm, bent = _find_palm(spec, tree, straight, fingers)
     tree, tips, keypoints = _with_frames(tree, root, fingers, palm, straight)
+    T_root_hand = np.linalg.inv(straight[tree.root])
     return Hand(
         tree=tree,
         root=root,
-        wrist=tuple(wrist),
-        palm=np.linalg.inv(straight[tree.root]) @ palm,
+        places={name: T_root_hand @ T for name, T in straight.items()},
+        palm=T_root_hand @ palm,
         palm_in_hand=palm,
         tips=tuple(tips),
         keypoints=tuple(keypoints),
@@ -126,8 +127,8 @@ def _carrier(tree: RobotTree, link: str) -> str:
     return link
 
 
-def _palm_link(tree: RobotTree, notes: list[str]) -> tuple[str, list[str]]:
-    """Return the link after which the fingers part, and the joints before it, which are those of a wrist."""
+def _palm_link(tree: RobotTree, notes: list[str]) -> str:
+    """Return the link after which the fingers part; joints before it are those of a wrist."""
     wrist = []
     link = _carrier(tree, tree.root)
     while True:
@@ -144,7 +145,7 @@ def _palm_link(tree: RobotTree, notes: list[str]) -> tuple[str, list[str]]:
             f"{', '.join(wrist)} move the whole hand: they are the last joints of the arm. To keep a wrist still, make "
             "its joints fixed in the hand's file"
         )
-    return link, wrist
+    return link
 
 
 def _find_fingers(spec: RobotSpec, tree: RobotTree, at: Poses, thumb: str | None, notes: list[str]) -> list[Finger]:
@@ -194,23 +195,16 @@ def _find_fingers(spec: RobotSpec, tree: RobotTree, at: Poses, thumb: str | None
 
 
 def _chains(tree: RobotTree, hand_root: str) -> list[Finger]:
-    by_child = {joint.child: joint for joint in tree.joints}
-    inside = tree.below(hand_root)
-    moving = [name for name in inside if name != hand_root and by_child[name].type != "fixed"]
-    carriers = {tree.moving_ancestor(by_child[name].parent) for name in moving}
+    """Return the chains of moving links below the hand's root; each ends in a link that carries no moving one."""
+    moved_by = {joint.child: joint.name for joint in tree.joints if joint.type != "fixed"}
+    moving = [name for name in tree.below(hand_root)[1:] if name in moved_by]
     chains = []
     for end in moving:
-        if end in carriers:
-            continue
-        links = []
-        link = end
-        while link != hand_root and link in by_child:
-            if by_child[link].type != "fixed":
-                links.insert(0, link)
-            link = by_child[link].parent
-        rest = [name for name in inside if name != end and tree.moving_ancestor(name) == end]
-        joints = [by_child[name].name for name in links]
-        chains.append(Finger(links=tuple(links), joints=tuple(joints), rest=tuple(rest)))
+        rest = tree.below(end)[1:]
+        if not moved_by.keys() & set(rest):
+            links = [name for name in moving if end in tree.below(name)]
+            joints = [moved_by[name] for name in links]
+            chains.append(Finger(links=tuple(links), joints=tuple(joints), rest=tuple(rest)))
     return chains
 
 
@@ -375,7 +369,7 @@ def _in_link(pose: np.ndarray, point: np.ndarray) -> np.ndarray:
     return pose[:3, :3].T @ (point - pose[:3, 3])
 
 
-def _surface(tree: RobotTree, links: Iterable[str], at: Poses) -> np.ndarray:
+def surface(tree: RobotTree, links: Iterable[str], at: Poses) -> np.ndarray:
     """[V, 3] vertices of the shapes of links in the hand root's frame."""
     points = [np.zeros((0, 3))]
     for name in links:
@@ -396,7 +390,7 @@ def _end(tree: RobotTree, finger: Finger, at: Poses) -> np.ndarray:
     for name in finger.rest:
         if "tip" in name.lower():
             return at[name][:3, 3]
-    cloud = _surface(tree, (last, *finger.rest), at)
+    cloud = surface(tree, (last, *finger.rest), at)
     if not len(cloud):
         raise RobotError(f"the last link of a finger, {last!r}, has no collision shape, so it can touch nothing.")
     middle = _middle(cloud)
@@ -408,7 +402,7 @@ def _end(tree: RobotTree, finger: Finger, at: Poses) -> np.ndarray:
 def _on_axis(tree: RobotTree, link: str, at: Poses) -> np.ndarray:
     """[3] the point of the axis before a link that is nearest to the middle of its shapes: makers put origins anywhere
     along an axis."""
-    cloud = _surface(tree, [link], at)
+    cloud = surface(tree, [link], at)
     if not len(cloud):
         return at[link][:3, 3]
     return _axis_point(tree, link, at, _middle(cloud))

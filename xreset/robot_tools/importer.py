@@ -9,7 +9,7 @@ finger, where the palm looks, which links follow which human keypoint, drives, h
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -27,17 +27,15 @@ from xreset.geometry.shapes import surface_of
 from xreset.geometry.urdf import RobotTree
 from xreset.geometry.urdf_writer import axes, pose, roll_pitch_yaw
 from xreset.robot_tools.draft import description_text, draft_spec
-from xreset.robot_tools.fingers import Hand, find_hand
+from xreset.robot_tools.fingers import Hand, find_hand, surface
 from xreset.robot_tools.homes import hold_near
-from xreset.robot_tools.sources import Source, bare, combined, last_link, read_source, renamed
-from xreset.spec import DriveSpec, RobotSpec, SceneSpec
+from xreset.robot_tools.sources import bare, combined, last_link, read_source, renamed
+from xreset.spec import RobotSpec, SceneSpec
 
 _ROTOR = 1e-3
 """[kg m^2] Rotor inertia on the diagonal of moving hand links where none is stated: finger links alone are too light
 for a step of 1/240 s. The inertia of a link means the same in every engine, which armature does not (as in the built-in
 robots)."""
-_ARMATURE = 0.1
-"""[kg m^2] Rotor inertia of the arm's joints, as in the built-in robots."""
 _HAND_EFFORT = 1.0
 _ARM_EFFORT = 50.0
 """[N m] Where none is stated."""
@@ -94,23 +92,23 @@ def import_robot(
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise RobotError(f"{out} is there already; give another folder, or remove it.")
-    arm_source = read_source(arm)
     notes: list[str] = []
+    arm_tree = read_source(arm, notes)
     if flange is None:
-        flange = last_link(arm_source.tree)
+        flange = last_link(arm_tree)
         notes.append(f"the hand is carried by the arm's link {flange!r} (--flange says another)")
-    arm_source = bare(arm_source, arm_source.tree.link(flange).name)
-    ahead = _out_of_flange(arm_source.tree, flange)
+    arm_tree = bare(arm_tree, arm_tree.link(flange).name, notes)
+    ahead = _out_of_flange(arm_tree, flange)
     along = f"the flange's {_axis_name(ahead)} axis"
-    hand_source = renamed(read_source(hand), arm_source.tree)
+    hand_tree = renamed(read_source(hand, notes), arm_tree)
     with atomic_folder(out) as work:
-        found = find_hand(hand_source.tree, work, thumb, notes)
+        found = find_hand(hand_tree, work, thumb, notes)
         if rpy is None:
             rpy = _turned(found.palm[:3, 0], ahead)
             if any(rpy):
                 notes.append(f"the hand is turned by --rpy {_angles(rpy)}: its fingers point along {along}")
         if offset is None:
-            distance = _stand_off(hand_source.tree, rpy, ahead)
+            distance = _stand_off(found, rpy, ahead)
             offset = tuple((distance * ahead).tolist())
             if distance > 0:
                 notes.append(
@@ -118,13 +116,11 @@ def import_robot(
                     "(--offset)"
                 )
         T = pose(offset, rpy=rpy)
-        hand_source = replace(hand_source, tree=_with_rotors(found, hand_source.rotors, notes))
-        whole = combined(arm_source, hand_source, flange, T, name or out.name)
-        notes += whole.notes
-        spec = draft_spec(whole.tree, found.root, work, tips=found.tips, keypoints=found.keypoints, bent=found.bent)
+        whole = combined(arm_tree, _with_rotors(found, notes), flange, T, name or out.name)
+        spec = draft_spec(whole, found.root, work, tips=found.tips, keypoints=found.keypoints, bent=found.bent)
         spec = _with_arm_home(spec, found.palm_in_hand, notes)
         spec = _with_drives(spec, whole, notes)
-        pairs = always_meeting(spec)
+        pairs = _always_meeting(spec)
         if pairs:
             listed = "; ".join(f"{a} and {b} ({why})" for (a, b), why in pairs.items())
             notes.append(f"never collide, because they meet: {listed}")
@@ -207,28 +203,22 @@ def _vector(values: np.ndarray) -> str:
     return ", ".join(f"{value:.2f}" for value in values.round(2) + 0.0)
 
 
-def _stand_off(hand: RobotTree, rpy: tuple[float, float, float], ahead: np.ndarray) -> float:
+def _stand_off(hand: Hand, rpy: tuple[float, float, float], ahead: np.ndarray) -> float:
     """Distance [m] by which a hand's body would reach behind the flange's origin if its root were there."""
-    poses = {hand.root: pose((0, 0, 0), rpy=rpy)}
-    for joint in hand.joints:  # parents come before children
-        if joint.type == "fixed" and joint.parent in poses:
-            poses[joint.child] = poses[joint.parent] @ joint.T_parent_joint
-    lowest = [0.0]
-    for name, T in poses.items():
-        if hand.link(name).collisions:
-            vertices, _ = surface_of(hand.link(name).collisions)
-            lowest.append(float(((vertices @ T[:3, :3].T + T[:3, 3]) @ ahead).min()))
-    return max(0.0, round(-min(lowest), 3))
+    body = [name for name in hand.tree.link_names if hand.tree.moving_ancestor(name) == hand.tree.root]
+    vertices = surface(hand.tree, body, hand.places)
+    depth = -(vertices @ pose(rpy=rpy)[:3, :3].T @ ahead)
+    return round(float(depth.max(initial=0.0)), 3)
 
 
-def _with_rotors(hand: Hand, stated: Mapping[str, float], notes: list[str]) -> RobotTree:
+def _with_rotors(hand: Hand, notes: list[str]) -> RobotTree:
     """Return the tree of a hand whose moving links carry their rotors."""
-    moved_by = {joint.child: joint.name for joint in hand.tree.joints if joint.type != "fixed"}
+    moved_by = {joint.child: joint for joint in hand.tree.joints if joint.type != "fixed"}
     inside = hand.tree.below(hand.root)[1:]
     links = []
     for link in hand.tree.links:
         if link.name in moved_by and link.name in inside:
-            rotor = stated.get(moved_by[link.name]) or _ROTOR
+            rotor = moved_by[link.name].rotor or _ROTOR
             link = replace(link, inertia=link.inertia + rotor * np.eye(3))
         links.append(link)
     notes.append(
@@ -256,32 +246,27 @@ def _with_arm_home(spec: RobotSpec, T_hand_palm: np.ndarray, notes: list[str]) -
     return held
 
 
-def _with_drives(spec: RobotSpec, source: Source, notes: list[str]) -> RobotSpec:
+def _with_drives(spec: RobotSpec, tree: RobotTree, notes: list[str]) -> RobotSpec:
     """Return the robot with drives as the files state them, else by the built-in robots' rule.
 
     The rule: stiff enough that the effort is reached within 0.35 rad, and not too stiff for the step of the engines.
     """
-    without = [joint.name for joint in spec.joints if not source.tree.joint(joint.name).effort]
+    without = [joint.name for joint in spec.joints if not tree.joint(joint.name).effort]
     joints = []
-    for joint in spec.joints:
-        stated = source.tree.joint(joint.name).effort
+    for joint, inertia in zip(spec.joints, drive_inertia(spec, spec.home), strict=True):
+        stated = tree.joint(joint.name)
         if joint.group == "arm":
-            effort = stated or _ARM_EFFORT
-            drive = DriveSpec(kp=float(np.clip(effort * 15, 300, 2000)), kd=0.0, effort=effort, armature=_ARMATURE)
+            effort = stated.effort or _ARM_EFFORT
+            kp = float(np.clip(effort * 15, 300, 2000))
+            factor = 2.0
         else:
-            effort = stated or _HAND_EFFORT
-            kp = source.stiffness.get(joint.name, float(np.clip(effort / 0.35, 0.5, 10)))
-            drive = DriveSpec(kp=kp, kd=0.0, effort=effort)
-        joints.append(replace(joint, drive=drive))
-    spec = replace(spec, joints=tuple(joints))
-    damped = []
-    for joint, inertia in zip(joints, drive_inertia(spec, spec.home), strict=True):
-        factor = 2.0 if joint.group == "arm" else 1.8
-        kp = joint.drive.kp
-        if joint.name not in source.stiffness:
+            effort = stated.effort or _HAND_EFFORT
+            kp = stated.stiffness or float(np.clip(effort / 0.35, 0.5, 10))
+            factor = 1.8
+        if not stated.stiffness:
             kp = min(kp, float(f"{_STABLE * inertia / (factor * SceneSpec.timestep) ** 2:.3g}"))
-        kd = factor * np.sqrt(kp * inertia)
-        damped.append(replace(joint, drive=replace(joint.drive, kp=kp, kd=float(f"{kd:.3g}"))))
+        kd = float(f"{factor * np.sqrt(kp * inertia):.3g}")
+        joints.append(replace(joint, drive=replace(joint.drive, kp=kp, kd=kd, effort=effort)))
     if without:
         notes.append(
             f"no effort is stated for {', '.join(without)}; they get {_ARM_EFFORT:g} (arm) or {_HAND_EFFORT:g} N m "
@@ -290,10 +275,10 @@ def _with_drives(spec: RobotSpec, source: Source, notes: list[str]) -> RobotSpec
     notes.append(
         "drives: kd = 1.8 sqrt(kp I) in the hand, critical in the arm, with the inertia I about the joint at home"
     )
-    return replace(spec, joints=tuple(damped))
+    return replace(spec, joints=tuple(joints))
 
 
-def always_meeting(spec: RobotSpec) -> dict[tuple[str, str], str]:
+def _always_meeting(spec: RobotSpec) -> dict[tuple[str, str], str]:
     """Return pairs of links that meet at home, or nearly wherever the hand's joints are, and which of the two."""
     kinematics = Kinematics(spec)
     collision = SelfCollision(spec, kinematics)

@@ -16,7 +16,6 @@ from xreset.geometry.shapes import hull
 from xreset.geometry.urdf import HULL_TOLERANCE, Joint, Link, RobotTree
 from xreset.geometry.urdf_writer import fixed, frame
 from xreset.robot_tools.couplings import SLIDE, Couplings, Pull, joint_name, read_couplings
-from xreset.robot_tools.sources import Source
 from xreset.spec import Geometry, MimicSpec, Shape
 
 _LARGEST = {"hfield": ("nrow", "ncol"), "texture": ("width", "height"), "size": ("nkey",)}
@@ -27,8 +26,8 @@ _SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "box": 3, "mesh": 0, "plane"
 """Numbers of a shape's size that count."""
 
 
-def read_mjcf(path: Path, root: ElementTree.Element) -> Source:
-    """Read an MJCF whose root element is ``root``.
+def read_mjcf(path: Path, root: ElementTree.Element, notes: list[str]) -> RobotTree:
+    """Read an MJCF whose root element is ``root``; what had to be assumed is appended to ``notes``.
 
     Raises:
         RobotError: it cannot be read, or uses what xreset does not have; the message names all of it.
@@ -43,7 +42,6 @@ def read_mjcf(path: Path, root: ElementTree.Element) -> Source:
     if not np.isfinite(data.geom_xmat).all() or not np.isfinite(data.ximat).all():
         raise RobotError(f"{path} has an orientation that is not finite.")
     problems = _unsupported(model)
-    notes: list[str] = []
     couplings = Couplings()
     pulls = _pulls(model, problems, notes)
     if not problems:
@@ -52,14 +50,12 @@ def read_mjcf(path: Path, root: ElementTree.Element) -> Source:
         raise RobotError(
             f"{path} uses what xreset does not have:" + "".join(f"\n  - {problem}" for problem in problems)
         )
+    notes += couplings.notes
     tree = _tree(path, model, couplings)
-    stiffness = {}
-    rotors = {}
-    efforts = {}
+    joints = {joint.name: joint for joint in tree.joints}
     for actuator, pull in pulls.items():
         joint, lever = couplings.lever(pull)
         lever = abs(lever * float(model.actuator_gear[actuator, 0]))
-        name = joint_name(model, joint)
         gain = float(model.actuator_gainprm[actuator, 0])
         kp = -float(model.actuator_biasprm[actuator, 1])
         limit = 0.0
@@ -69,14 +65,13 @@ def read_mjcf(path: Path, root: ElementTree.Element) -> Source:
             limit = abs(gain) * lever * float(model.actuator_ctrlrange[actuator, 1])
         if limit <= 0 and model.jnt_actfrclimited[joint]:
             limit = float(model.jnt_actfrcrange[joint, 1])
-        efforts[name] = max(limit, 0.0)
+        stated = {"effort": max(limit, 0.0)}
         if gain > 0 and kp > 0 and lever > 0:
-            stiffness[name] = kp * lever**2
-            rotors[name] = float(model.dof_armature[model.jnt_dofadr[joint]])
-    joints = [replace(joint, effort=efforts.get(joint.name, 0.0)) for joint in tree.joints]
-    return Source(
-        tree=replace(tree, joints=tuple(joints)), stiffness=stiffness, rotors=rotors, notes=(*notes, *couplings.notes)
-    )
+            stated["stiffness"] = kp * lever**2
+            stated["rotor"] = float(model.dof_armature[model.jnt_dofadr[joint]])
+        name = joint_name(model, joint)
+        joints[name] = replace(joints[name], **stated)
+    return replace(tree, joints=tuple(joints.values()))
 
 
 def _check_sizes(path: Path, root: ElementTree.Element) -> None:

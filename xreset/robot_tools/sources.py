@@ -4,14 +4,14 @@ together."""
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from xreset.errors import RobotError
 from xreset.geometry.shapes import mass_properties, surface_of
-from xreset.geometry.urdf import Joint, Link, RobotTree, check_tree, load_urdf, parse_xml
+from xreset.geometry.urdf import Link, RobotTree, check_tree, load_urdf, parse_xml
 from xreset.geometry.urdf_writer import FRAME_INERTIA, FRAME_MASS, fixed
 
 _DENSITY = 1000.0
@@ -30,21 +30,12 @@ _SMALLEST = 1e-6
 """[m] Smallest size of a shape."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Source:
-    """A robot, or a part of one, as its maker describes it."""
+def read_source(path: str | Path, notes: list[str]) -> RobotTree:
+    """Read a robot, or a part of one, from a URDF, or from an MJCF (needs the engine MuJoCo).
 
-    tree: RobotTree
-    stiffness: dict[str, float] = field(default_factory=dict)
-    """Joint -> stiffness of its drive [N m/rad or N/m], where it is stated."""
-    rotors: dict[str, float] = field(default_factory=dict)
-    """Joint -> inertia of its drive's rotor [kg m^2 or kg], where its stiffness is stated."""
-    notes: tuple[str, ...] = ()
-    """What had to be changed or assumed."""
-
-
-def read_source(path: str | Path) -> Source:
-    """Read a URDF, or an MJCF (needs the engine MuJoCo).
+    Args:
+        path: the file.
+        notes: what had to be changed or assumed is appended.
 
     Raises:
         RobotError: the file cannot be read, or uses what xreset does not have; the message names all of it.
@@ -61,11 +52,11 @@ def read_source(path: str | Path) -> Source:
                 f"{path} is MJCF, which only MuJoCo reads, and that cannot be imported ({error}). Run: pip install "
                 "mujoco"
             ) from error
-        source = read_mjcf(path, root)
-        check_tree(source.tree, path)
+        tree = read_mjcf(path, root, notes)
+        check_tree(tree, path)
     else:
-        source = Source(tree=load_urdf(path))
-    for link in source.tree.links:
+        tree = load_urdf(path)
+    for link in tree.links:
         for shape in link.collisions:
             sizes = shape.geometry.size
             if shape.geometry.kind != "box":
@@ -75,9 +66,7 @@ def read_source(path: str | Path) -> Source:
                     f"{path}: a {shape.geometry.kind} of link {link.name!r} is {min(sizes):g} m small. "
                     f"Expected at least {_SMALLEST:g}."
                 )
-    if not np.isfinite([*source.stiffness.values(), *source.rotors.values()]).all():
-        raise RobotError(f"{path} has a drive with a number that is not finite.")
-    return _with_masses(_with_limits(source, path))
+    return _with_masses(_with_limits(tree, path, notes), notes)
 
 
 def last_link(arm: RobotTree) -> str:
@@ -96,98 +85,74 @@ def last_link(arm: RobotTree) -> str:
     return ends[0]
 
 
-def bare(arm: Source, flange: str) -> Source:
+def bare(arm: RobotTree, flange: str, notes: list[str]) -> RobotTree:
     """Return an arm without what its flange carries, and with no moving joint that does not move the flange."""
-    removed = set(arm.tree.below(flange)) - {flange}
-    notes = [*arm.notes]
+    removed = set(arm.below(flange)) - {flange}
     if removed:
         notes.append(f"left out, because it hangs on the flange where the hand goes: {', '.join(sorted(removed))}")
     joints = []
     stiff = []
-    for joint in arm.tree.joints:
+    for joint in arm.joints:
         if joint.child in removed:
             continue
-        if joint.type != "fixed" and flange not in arm.tree.below(joint.child):
+        if joint.type != "fixed" and flange not in arm.below(joint.child):
             stiff.append(joint.name)
             joint = replace(joint, type="fixed", mimic=None)
         joints.append(joint)
     if stiff:
         notes.append(f"joints of the arm that do not move the hand are fixed at 0: {', '.join(stiff)}")
-    links = tuple(link for link in arm.tree.links if link.name not in removed)
-    return replace(arm, tree=replace(arm.tree, links=links, joints=tuple(joints)), notes=tuple(notes))
+    links = tuple(link for link in arm.links if link.name not in removed)
+    return replace(arm, links=links, joints=tuple(joints))
 
 
-def renamed(hand: Source, arm: RobotTree) -> Source:
+def renamed(hand: RobotTree, arm: RobotTree) -> RobotTree:
     """Return a hand with ``hand_`` before the names of links and joints that the arm has too."""
     links = {name: f"hand_{name}" for name in arm.link_names}
-    joints = {joint.name: f"hand_{joint.name}" for joint in arm.joints}
-
-    def moved(joint: Joint) -> Joint:
+    names = {joint.name: f"hand_{joint.name}" for joint in arm.joints}
+    joints = []
+    for joint in hand.joints:
+        name = names.get(joint.name, joint.name)
         mimic = joint.mimic
         if mimic is not None:
-            source = joints.get(mimic.source, mimic.source)
-            mimic = replace(mimic, joint=joints.get(mimic.joint, mimic.joint), source=source)
-        return replace(
-            joint,
-            name=joints.get(joint.name, joint.name),
-            parent=links.get(joint.parent, joint.parent),
-            child=links.get(joint.child, joint.child),
-            mimic=mimic,
-        )
-
-    tree = replace(
-        hand.tree,
-        root=links.get(hand.tree.root, hand.tree.root),
-        links=tuple(replace(link, name=links.get(link.name, link.name)) for link in hand.tree.links),
-        joints=tuple(moved(joint) for joint in hand.tree.joints),
+            mimic = replace(mimic, joint=name, source=names.get(mimic.source, mimic.source))
+        parent = links.get(joint.parent, joint.parent)
+        child = links.get(joint.child, joint.child)
+        joints.append(replace(joint, name=name, parent=parent, child=child, mimic=mimic))
+    return replace(
+        hand,
+        root=links.get(hand.root, hand.root),
+        links=tuple(replace(link, name=links.get(link.name, link.name)) for link in hand.links),
+        joints=tuple(joints),
     )
-    stiffness = {joints.get(name, name): value for name, value in hand.stiffness.items()}
-    rotors = {joints.get(name, name): value for name, value in hand.rotors.items()}
-    return replace(hand, tree=tree, stiffness=stiffness, rotors=rotors)
 
 
-def combined(arm: Source, hand: Source, flange: str, T_flange_hand: np.ndarray, name: str) -> Source:
-    """Return an arm with a hand at its flange.
-
-    Args:
-        arm: see :func:`bare`.
-        hand: see :func:`renamed`.
-        flange: link of the arm that carries the hand.
-        T_flange_hand: [4, 4] pose of the hand's root link in the flange's frame.
-        name: name of the robot.
-    """
-    tree = RobotTree(
+def combined(arm: RobotTree, hand: RobotTree, flange: str, T_flange_hand: np.ndarray, name: str) -> RobotTree:
+    """Return a bare arm with a renamed hand whose root link has a pose [4, 4] in the frame of the arm's flange."""
+    return RobotTree(
         name=name,
-        root=arm.tree.root,
-        links=(*arm.tree.links, *hand.tree.links),
-        joints=(*arm.tree.joints, fixed(flange, hand.tree.root, T_flange_hand), *hand.tree.joints),
-    )
-    return Source(
-        tree=tree,
-        stiffness=arm.stiffness | hand.stiffness,
-        rotors=arm.rotors | hand.rotors,
-        notes=(*arm.notes, *hand.notes),
+        root=arm.root,
+        links=(*arm.links, *hand.links),
+        joints=(*arm.joints, fixed(flange, hand.root, T_flange_hand), *hand.joints),
     )
 
 
-def _with_limits(source: Source, path: Path) -> Source:
-    """Return the source with finite limits, and with mimic joints that follow a joint that follows nothing; a mimic
-    joint has the limits that its source gives it."""
-    notes = list(source.notes)
+def _with_limits(tree: RobotTree, path: Path, notes: list[str]) -> RobotTree:
+    """Return the tree with finite limits, and with mimic joints that follow a joint that follows nothing; a mimic joint
+    has the limits that its source gives it."""
     joints = {}
-    for joint in source.tree.joints:
+    for joint in tree.joints:
         if joint.type != "fixed" and not np.isfinite((joint.lower, joint.upper)).all():
             notes.append(f"the joint {joint.name!r} has no limits; it gets one turn in either direction")
             joint = replace(joint, lower=-_TURNS, upper=_TURNS)
         if joint.type != "fixed" and not 0 < joint.velocity < math.inf:
             joint = replace(joint, velocity=math.pi)
         joints[joint.name] = joint
-    for joint in [*joints.values()]:
-        if joint.mimic is None:
-            continue
+    for name, joint in joints.items():
         mimic = joint.mimic
-        passed = [joint.name]
-        while mimic.source in joints and mimic.source not in passed and joints[mimic.source].mimic:
+        if mimic is None:
+            continue
+        passed = [name]
+        while mimic.source not in passed and mimic.source in joints and joints[mimic.source].mimic:
             passed.append(mimic.source)
             above = joints[mimic.source].mimic
             offset = mimic.multiplier * above.offset + mimic.offset
@@ -197,26 +162,26 @@ def _with_limits(source: Source, path: Path) -> Source:
                 f"{path}: joints follow one another in a circle: {', '.join(passed)}. Let one of them follow nothing."
             )
         if mimic.source not in joints:
-            raise RobotError(f"{path}: {joint.name!r} mimics {mimic.source!r}, which is not a joint of the same file.")
+            raise RobotError(f"{path}: {name!r} mimics {mimic.source!r}, which is not a joint of the same file.")
         driver = joints[mimic.source]
         ends = mimic.multiplier * np.array((driver.lower, driver.upper)) + mimic.offset
         low, high = sorted(ends.tolist())
         if low < joint.lower or high > joint.upper:
             notes.append(
-                f"{joint.name!r} has the limits {low:.4g}..{high:.4g} that {mimic.source!r} gives it, "
+                f"{name!r} has the limits {low:.4g}..{high:.4g} that {mimic.source!r} gives it, "
                 f"in place of {joint.lower:.4g}..{joint.upper:.4g}"
             )
             joint = replace(joint, lower=low, upper=high)
-        joints[joint.name] = replace(joint, mimic=mimic)
-    return replace(source, tree=replace(source.tree, joints=tuple(joints.values())), notes=tuple(notes))
+        joints[name] = replace(joint, mimic=mimic)
+    return replace(tree, joints=tuple(joints.values()))
 
 
-def _with_masses(source: Source) -> Source:
-    """Return the source with masses and inertias that a solid body can have: those of the shapes where the stated ones
+def _with_masses(tree: RobotTree, notes: list[str]) -> RobotTree:
+    """Return the tree with masses and inertias that a solid body can have: those of the shapes where the stated ones
     are impossible."""
     links = []
     replaced: dict[str, list[str]] = {}
-    for link in source.tree.links:
+    for link in tree.links:
         if not link.collisions:
             if link.mass <= FRAME_MASS or not plausible(link):
                 link = replace(link, mass=max(link.mass, FRAME_MASS), inertia=np.eye(3) * FRAME_INERTIA)
@@ -225,8 +190,9 @@ def _with_masses(source: Source) -> Source:
             link = _with_mass_of_shapes(link)
             replaced.setdefault(why, []).append(f"{link.name} ({link.mass:.3g} kg)")
         links.append(link)
-    notes = [f"these links {why}, and get that of their shapes: {', '.join(names)}" for why, names in replaced.items()]
-    return replace(source, tree=replace(source.tree, links=tuple(links)), notes=(*source.notes, *notes))
+    for why, names in replaced.items():
+        notes.append(f"these links {why}, and get that of their shapes: {', '.join(names)}")
+    return replace(tree, links=tuple(links))
 
 
 def _with_mass_of_shapes(link: Link) -> Link:

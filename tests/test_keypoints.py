@@ -108,12 +108,9 @@ class Synthetic(InFolder):
         self.refused("must be given once, .* found object_pos", object_quat_wxyz=None)
         self.refused("object_quat_wxyz of frame 0 is not a unit quaternion", object_quat_wxyz=2 * wxyz)
 
-    def test_what_is_not_known_is_asked_for_in_one_go(self):
-        self.refused(
-            "(?s)--order mano, mediapipe or openpose.*--units m or mm.*--coordinates table or camera", Convention()
-        )
+    def test_what_is_not_known_is_asked_for(self):
         self.refused("--table-from-camera FILE", replace(PLAIN, frame="camera"))
-        self.refused("--coordinates says .* table frame already", replace(PLAIN, table_from_camera=np.eye(4)))
+        self.refused("table must not have one", replace(PLAIN, table_from_camera=np.eye(4)))
         self.refused("Add --object", object=None)
         self.refused("Add --side", side=None)
         self.refused("Add --fps", replace(PLAIN, fps=None))
@@ -210,8 +207,9 @@ class Synthetic(InFolder):
         out = self.folder / "out.npz"
         command = ["demos", "import", "keypoints", source, "--out", out]
         code, said = run(*command)
-        self.assertEqual(code, 1)
-        self.assertIn("--order mano", said)
+        self.assertNotEqual(code, 0)
+        for option in ("--order", "--units", "--coordinates"):
+            self.assertIn(option, said)
         self.assertFalse(out.exists())
         words = "--order mediapipe --units mm --coordinates camera --fps 10 --side right --object 005_tomato_soup_can"
         code, said = run(*command, *words.split(), "--table-from-camera", self.folder / "T.txt")

@@ -319,20 +319,15 @@ def levelled(demos: Demos) -> Demos:
 
 
 def _without_repeats(parts: Sequence[Demos]) -> list[Demos]:
-    """Return the parts without the sequences that an earlier part holds."""
-    kept: list[Demos] = []
-    owners: dict[str, int] = {}
-    for number, part in enumerate(parts):
-        new = []
+    """Return the sequences of the parts one by one, each name once."""
+    kept: dict[str, Demos] = {}
+    for part in parts:
         for i, name in enumerate(part.sequence_name.tolist()):
-            first = owners.setdefault(name, number)
-            if first == number:
-                new.append(i)
-            elif _content(parts[first].select(names=[name])) != _content(part.select(indices=[i])):
+            one = part.select(indices=[i])
+            first = kept.setdefault(name, one)
+            if first is not one and _content(first) != _content(one):
                 raise DemoError(f"There are two different sequences of the name {name!r}. Rename one.")
-        if new:
-            kept.append(part.select(indices=new))
-    return kept
+    return list(kept.values())
 
 
 def _content(demos: Demos) -> list[Any]:

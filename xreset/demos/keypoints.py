@@ -30,8 +30,6 @@ from xreset.records import RATE, UNIT_TOLERANCE, Field, read_npz
 from xreset.text import is_plain, shown
 
 Order = Literal["mano", "mediapipe", "openpose"]
-Unit = Literal["m", "mm"]
-Frame = Literal["table", "camera"]
 Motion = tuple[np.ndarray, np.ndarray, Rotation]
 """Keypoints [F, 21, 3], object positions [F, 3] and F object orientations."""
 
@@ -93,11 +91,11 @@ _COLUMNS = {
 class Convention:
     """Meaning of a tracker's numbers; None: as the file says, or refuse."""
 
-    order: Order | None = None
+    order: Order
     """Order of the 21 keypoints."""
-    units: Unit | None = None
+    units: Literal["m", "mm"]
     """Unit of keypoints and object positions."""
-    frame: Frame | None = None
+    frame: Literal["table", "camera"]
     """``table``: z up, table top at z = 0. ``camera``: the frame of a camera that does not move."""
     table_from_camera: np.ndarray | None = None
     """[4, 4] pose of the camera in the table frame [m]; with ``frame="camera"``."""
@@ -111,10 +109,7 @@ class Convention:
     """The demonstrating person."""
 
 
-def read_keypoints(
-    path: str | Path,
-    convention: Convention | None = None,
-) -> Demos:
+def read_keypoints(path: str | Path, convention: Convention) -> Demos:
     """Read a tracker's sequences: an npz (one sequence), a CSV (one, or several with a column ``sequence``), or a
     folder of them.
 
@@ -128,8 +123,11 @@ def read_keypoints(
         FileFormatError: an npz file is damaged or does not have the arrays.
     """
     path = Path(path)
-    convention = convention or Convention()
-    _check_convention(convention)
+    if (convention.frame == "camera") != (convention.table_from_camera is not None):
+        raise DemoError(
+            f"The coordinates are those of the {convention.frame}. Coordinates of a camera need the camera's pose in"
+            " the table frame (--table-from-camera FILE), and coordinates of the table must not have one."
+        )
     folder = path.parent
     files = [path]
     if path.is_dir():
@@ -171,26 +169,6 @@ def read_transform(path: str | Path) -> np.ndarray:
             " with the last row 0 0 0 1."
         )
     return T.astype(float)
-
-
-def _check_convention(convention: Convention) -> None:
-    missing = []
-    if convention.order is None:
-        missing.append("the order of the keypoints: --order mano, mediapipe or openpose")
-    if convention.units is None:
-        missing.append("the unit of lengths: --units m or mm")
-    if convention.frame is None:
-        missing.append("the frame of the coordinates: --coordinates table or camera")
-    if convention.frame == "camera" and convention.table_from_camera is None:
-        missing.append(
-            "the camera's pose: --table-from-camera FILE, in the table frame (z up, table top at z = 0), 4x4, metres"
-        )
-    if missing:
-        raise DemoError("The file does not state:\n  - " + "\n  - ".join(missing))
-    if convention.frame == "table" and convention.table_from_camera is not None:
-        raise DemoError(
-            "--coordinates says that the coordinates are in the table frame already. Omit --table-from-camera."
-        )
 
 
 # Files
@@ -258,7 +236,6 @@ def sequence_of(arrays: Mapping[str, np.ndarray], what: str, convention: Convent
 
 
 def _sequence(arrays: Mapping[str, np.ndarray], convention: Convention) -> Demos:
-    assert convention.order is not None
     scale = 1e-3 if convention.units == "mm" else 1.0
     points = np.asarray(arrays["keypoints"], dtype=float) * scale
     valid = np.isfinite(points).all(axis=(1, 2))
@@ -313,7 +290,6 @@ def _text(arrays: Mapping[str, np.ndarray], field: str, option: str | None) -> s
 def _hand_problems(points: np.ndarray, convention: Convention, side: str) -> Iterator[str]:
     """Yield what in keypoints [F, 21, 3] in metres, in the file's order, contradicts the convention; the likeliest
     cause first."""
-    assert convention.order is not None
     order = ORDERS[convention.order]
     palm = 1e3 * float(np.median(np.linalg.norm(points[:, order[9]] - points[:, 0], axis=1)))
     if not _PALM[0] <= palm <= _PALM[1]:

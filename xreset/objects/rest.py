@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
+from trimesh.triangles import points_to_barycentric
 
 from xreset.spec import ObjectSpec
 
@@ -36,13 +37,7 @@ def resting_orientation(obj: ObjectSpec, up: np.ndarray) -> np.ndarray:
     normals = convex.equations[:, :3]
     distance = normals @ obj.com + convex.equations[:, 3]  # of the center of mass, negative as it is inside
     foot = obj.com - distance[:, None] * normals
-    winding = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    turn = np.sign(np.einsum("ij,ij->i", winding, normals))
-    stable = np.ones(len(corners), dtype=bool)
-    for i in range(3):
-        edge = corners[:, (i + 1) % 3] - corners[:, i]
-        to_foot = foot - corners[:, i]
-        stable &= turn * np.einsum("ij,ij->i", np.cross(edge, to_foot), normals) >= -1e-12
+    stable = (points_to_barycentric(corners, foot) >= -1e-9).all(axis=1)
     top = -normals[stable][np.argmin(normals[stable] @ up)]
     axis = np.cross(top, (0.0, 0.0, 1.0))
     sine = np.linalg.norm(axis)

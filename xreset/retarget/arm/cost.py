@@ -11,7 +11,6 @@ Shape letters: B batch (sequences, branches or restarts), n arm joints, C carrie
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,26 +22,12 @@ from xreset.geometry.rotations import (
     quat_multiply,
     quat_to_axis_angle,
 )
-from xreset.retarget.arm.config import ArmConfig
-from xreset.retarget.arm.model import ArmModel
+from xreset.retarget.arm.model import ArmProblem
 from xreset.retarget.least_squares import free_to_move, minimize
 from xreset.tensors import Tensors
 
 _CONVERGED = 1e-5
 """Steps smaller than this end the iteration [rad or m]."""
-
-
-class Frame(NamedTuple):
-    """One frame's problem for a batch."""
-
-    pos: Tensor
-    """[B, 3] position of the hand root."""
-    quat: Tensor
-    """[B, 4] orientation of the hand root."""
-    hand_poses: Tensor
-    """[B, G, 4, 4] see :meth:`ArmModel.hand_poses`."""
-    previous: Tensor | None
-    """[B, n] joints of the frame before; None where there is none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,15 +42,22 @@ class ArmSystem(Tensors):
     """[B, n] half the gradient."""
 
 
-def solve(model: ArmModel, frame: Frame, q: Tensor, config: ArmConfig, iterations: int) -> Tensor:
+def solve(frame: ArmProblem, q: Tensor, iterations: int, previous: Tensor | None = None) -> Tensor:
     """[B, n] minimizer of one frame's cost, from ``q``: Levenberg-Marquardt, each element of the batch with its own
     damping.
 
     A joint at a limit stays there while the cost pulls it outwards; steps beyond a limit are cut off there.
+
+    Args:
+        frame: the problem of one frame, without the axis T.
+        q: [B, n] first guess.
+        iterations: most steps.
+        previous: [B, n] joints of the frame before; None where there is none.
     """
+    model = frame.model
 
     def evaluate(q: Tensor, _: Tensor) -> ArmSystem:
-        return system(model, frame, q, config)
+        return system(frame, q, previous)
 
     def step(q: Tensor, here: ArmSystem, damping: Tensor) -> Tensor:
         free = free_to_move(q, here.gradient, model.lower, model.upper)
@@ -80,25 +72,28 @@ def solve(model: ArmModel, frame: Frame, q: Tensor, config: ArmConfig, iteration
     return minimize(q, evaluate, step, done, iterations, damping_range=(1e-9, 1e9))[0]
 
 
-def system(model: ArmModel, frame: Frame, q: Tensor, config: ArmConfig) -> ArmSystem:
-    """Compute the cost of one frame and its Gauss-Newton approximation at ``q`` [B, n]."""
+def system(frame: ArmProblem, q: Tensor, previous: Tensor | None = None) -> ArmSystem:
+    """Compute the cost of one frame and its Gauss-Newton approximation at ``q`` [B, n]; arguments as of
+    :func:`solve`."""
+    model = frame.model
+    config = frame.config
     origins, rot, linear, angular = model.kinematics.jacobian(model.full(q, 0.0), model.carriers)
     linear = linear[..., model.arm]  # [B, C, 3, n]
     angular = angular[..., model.arm]
     position_scale = config.position_weight**0.5
     orientation_scale = config.orientation_weight**0.5
-    turn = quat_to_axis_angle(quat_multiply(matrix_to_quat(rot[:, 0]), quat_conjugate(frame.quat)))
+    turn = quat_to_axis_angle(quat_multiply(matrix_to_quat(rot[:, 0]), quat_conjugate(frame.root_quat)))
     residuals = [
-        position_scale * (origins[:, 0] - frame.pos),
+        position_scale * (origins[:, 0] - frame.root_pos),
         orientation_scale * turn,
     ]
     jacobians = [
         position_scale * linear[:, 0],
         orientation_scale * angular[:, 0],
     ]
-    if frame.previous is not None:
+    if previous is not None:
         scale = config.smoothness_weight**0.5
-        residuals.append(scale * (q - frame.previous))
+        residuals.append(scale * (q - previous))
         jacobians.append(scale * torch.eye(q.shape[1], dtype=q.dtype).expand(len(q), -1, -1))
     low = model.low_points(origins, rot, frame.hand_poses, config.table_margin)
     at = (low.frame, low.carrier)

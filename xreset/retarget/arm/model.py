@@ -7,6 +7,7 @@ links with support points.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import torch
@@ -21,7 +22,8 @@ from xreset.geometry.collision import (
 )
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matrix_to_quat, matvec, quat_angle
-from xreset.retarget.validity import Measures
+from xreset.retarget.arm.config import ArmConfig
+from xreset.retarget.validity import Measures, Thresholds, classify
 from xreset.spec import RobotSpec, TableSpec
 from xreset.tensors import Tensors
 
@@ -48,7 +50,7 @@ class ArmTargets(Tensors):
     hand_clearance: Tensor
     """[S, T] smallest signed distance between the hand's own shapes [m]; the arm cannot change it."""
 
-    def reversed(self) -> ArmTargets:
+    def reversed(self) -> Self:
         """Return the path from the last frame to the first."""
         return self.map(lambda x: x.flip(1))
 
@@ -175,27 +177,46 @@ class ArmModel:
         return q
 
 
-def measure(model: ArmModel, targets: ArmTargets, joints: Tensor) -> Measures:
-    """Measure every frame [S, T] of the paths ``joints`` [S, T, n]."""
-    shape = joints.shape[:2]
-    poses = model.kinematics.link_poses(model.full(joints, targets.hand_joints).flatten(0, 1))
-    carriers = poses[:, [model.kinematics.link_index(link) for link in model.carriers]]
-    hand_poses = model.hand_poses(targets.hand_joints).flatten(0, 1)
-    low = model.low_points(carriers[..., :3, 3], carriers[..., :3, :3], hand_poses, _SEARCH)
-    height = poses.new_full((len(poses),), _SEARCH).scatter_reduce(0, low.frame, low.height, "amin")
-    clearance = torch.as_tensor(model.arm_collision.clearance(poses.numpy(), _SEARCH)).view(shape)
-    root = carriers[:, 0]
-    at_limit = (joints <= model.lower + _AT_LIMIT) | (joints >= model.upper - _AT_LIMIT)
-    return Measures(
-        annotated=targets.annotated,
-        hand_error=targets.hand_error,
-        wrist_position=(root[:, :3, 3].view(*shape, 3) - targets.root_pos).norm(dim=-1),
-        wrist_orientation=quat_angle(matrix_to_quat(root[:, :3, :3]).view(*shape, 4), targets.root_quat),
-        at_limit=at_limit.any(-1),
-        arm_jump=arm_jump(joints, targets.annotated),
-        table_clearance=height.view(shape),
-        self_clearance=torch.minimum(clearance, targets.hand_clearance),
-    )
+@dataclass(frozen=True, kw_only=True)
+class ArmProblem(ArmTargets):
+    """Targets that paths are searched for. An index selects sequences, or some of their frames."""
+
+    hand_poses: Tensor
+    """[S, T, G, 4, 4] see :meth:`ArmModel.hand_poses`; computed once from the targets."""
+    model: ArmModel
+    thresholds: Thresholds
+    config: ArmConfig
+
+    def repeated(self, count: int) -> ArmProblem:
+        """Return the problem with every sequence repeated, copies next to each other: [S count, ...]."""
+        return self[torch.arange(len(self.hand_poses)).repeat_interleave(count)]
+
+    def measures(self, joints: Tensor) -> Measures:
+        """Measure every frame [S, T] of the paths ``joints`` [S, T, n]."""
+        model = self.model
+        shape = joints.shape[:2]
+        poses = model.kinematics.link_poses(model.full(joints, self.hand_joints).flatten(0, 1))
+        carriers = poses[:, [model.kinematics.link_index(link) for link in model.carriers]]
+        low = model.low_points(carriers[..., :3, 3], carriers[..., :3, :3], self.hand_poses.flatten(0, 1), _SEARCH)
+        height = poses.new_full((len(poses),), _SEARCH).scatter_reduce(0, low.frame, low.height, "amin")
+        clearance = torch.as_tensor(model.arm_collision.clearance(poses.numpy(), _SEARCH)).view(shape)
+        root = carriers[:, 0]
+        at_limit = (joints <= model.lower + _AT_LIMIT) | (joints >= model.upper - _AT_LIMIT)
+        return Measures(
+            annotated=self.annotated,
+            hand_error=self.hand_error,
+            wrist_position=(root[:, :3, 3].view(*shape, 3) - self.root_pos).norm(dim=-1),
+            wrist_orientation=quat_angle(matrix_to_quat(root[:, :3, :3]).view(*shape, 4), self.root_quat),
+            at_limit=at_limit.any(-1),
+            arm_jump=arm_jump(joints, self.annotated),
+            table_clearance=height.view(shape),
+            self_clearance=torch.minimum(clearance, self.hand_clearance),
+        )
+
+    def reasons(self, joints: Tensor) -> Tensor:
+        """[S, T] reason of each frame of the paths [S, T, n], 0 where valid: see
+        :func:`~xreset.retarget.validity.classify`."""
+        return classify(self.measures(joints), self.thresholds)
 
 
 def arm_jump(joints: Tensor, annotated: Tensor) -> Tensor:

@@ -17,16 +17,15 @@ support points.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from xreset.retarget.arm.config import ArmConfig
-from xreset.retarget.arm.cost import Frame, solve, system
-from xreset.retarget.arm.model import ArmModel, ArmTargets, arm_jump, measure
+from xreset.retarget.arm.cost import solve, system
+from xreset.retarget.arm.model import ArmModel, ArmProblem, ArmTargets, arm_jump
 from xreset.retarget.validity import REASONS, Measures, Thresholds, classify
-from xreset.tensors import Tensors
 
 _WRIST_MISSED = ("joint limit", "wrist position", "wrist orientation")
 """Reasons of frames whose wrist is not where it should be."""
@@ -34,74 +33,6 @@ _HOME_BIAS = 1e-3
 """Preference among solutions of the first frame for those near home [1/rad^2]."""
 _DISTINCT = 0.5
 """Solutions of the first frame differ if a joint differs by this much [rad or m]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Paths(Tensors):
-    """Paths of the arm's joints, and which of their frames are good."""
-
-    joints: Tensor
-    """[S, K, T, n]"""
-    sound: Tensor
-    """[S, K, T] bool: valid if the joints do not jump there. A jump depends on the frame before, and so on the
-    direction and on where paths are spliced; everything else depends on the frame alone and is measured once."""
-
-    def reversed(self) -> Paths:
-        """Return the paths from the last frame to the first."""
-        return self.map(lambda x: x.flip(2))
-
-
-@dataclass(frozen=True, kw_only=True)
-class ArmProblem:
-    """Targets that paths are searched for."""
-
-    model: ArmModel
-    targets: ArmTargets
-    hand_poses: Tensor
-    """[S, T, G, 4, 4] see :meth:`ArmModel.hand_poses`; computed once from the targets."""
-    thresholds: Thresholds
-    config: ArmConfig
-
-    def select(self, *index: Tensor) -> ArmProblem:
-        """Return the problem of some sequences, or of some frames of them: every tensor is indexed alike."""
-        return replace(self, targets=self.targets[index], hand_poses=self.hand_poses[index])
-
-    def repeated(self, count: int) -> ArmProblem:
-        """Return the problem with every sequence repeated, copies next to each other: [S count, ...]."""
-        return self.select(torch.arange(len(self.hand_poses)).repeat_interleave(count))
-
-    def reversed(self) -> ArmProblem:
-        """Return the problem from the last frame to the first."""
-        return replace(
-            self,
-            targets=self.targets.reversed(),
-            hand_poses=self.hand_poses.flip(1),
-        )
-
-    def reasons(self, joints: Tensor) -> Tensor:
-        """[S, T] reason of each frame of the paths [S, T, n], 0 where valid: see
-        :func:`~xreset.retarget.validity.classify`."""
-        return classify(measure(self.model, self.targets, joints), self.thresholds)
-
-    def examined(self, joints: Tensor) -> Paths:
-        """Return the paths [S, K, T, n], with a check of their frames."""
-        measures = measure(
-            self.model,
-            self.repeated(joints.shape[1]).targets,
-            joints.flatten(0, 1),
-        )
-        no_jumps = replace(measures, arm_jump=torch.zeros_like(measures.arm_jump))
-        sound = classify(no_jumps, self.thresholds) == 0
-        return Paths(joints=joints, sound=sound.view(joints.shape[:3]))
-
-    def frame(self, t: int, previous: Tensor | None) -> Frame:
-        """Return the problem of one frame, given the joints [S, n] of the frame before."""
-        return Frame(
-            pos=self.targets.root_pos[:, t],
-            quat=self.targets.root_quat[:, t],
-            hand_poses=self.hand_poses[:, t],
-            previous=previous,
-        )
 
 
 def track(
@@ -119,43 +50,45 @@ def track(
         [S, T, n] arm joints, and the measures of every frame ([S, T] each).
     """
     problem = ArmProblem(
+        **vars(targets),
         model=model,
-        targets=targets,
         hand_poses=model.hand_poses(targets.hand_joints),
         thresholds=thresholds,
         config=config or ArmConfig(),
     )
     forwards = branches(problem)
-    joints, worth = best(problem, forwards)
+    joints, worth = best(problem, *forwards)
     failing = (problem.reasons(joints) > REASONS.index("hand error")).any(dim=1).nonzero()[:, 0]
     if len(failing):
-        part = problem.select(failing)
-        joints[failing] = _rescued(part, forwards[failing], joints[failing], worth[failing])
-    return joints, measure(model, targets, joints)
+        paths, sound = forwards
+        joints[failing] = _rescued(problem[failing], paths[failing], sound[failing], joints[failing], worth[failing])
+    return joints, problem.measures(joints)
 
 
-def _rescued(problem: ArmProblem, paths: Paths, joints: Tensor, worth: Tensor) -> Tensor:
+def _rescued(problem: ArmProblem, paths: Tensor, sound: Tensor, joints: Tensor, worth: Tensor) -> Tensor:
     """[S, T, n] better paths than ``joints`` [S, T, n], where there are any, for sequences with frames that fail.
 
     Args:
         problem: the problem of these sequences.
         paths: their paths from the first frame.
+        sound: which of the paths' frames are good.
         joints: the best of those.
         worth: [S] its worth.
     """
-    if problem.targets.annotated.shape[1] > 1:
+    if problem.annotated.shape[1] > 1:
         turned = problem.reversed()
         backwards = branches(turned)
-        back, other = best(turned, backwards)
+        back, other = best(turned, *backwards)
         joints = torch.where((other > worth)[:, None, None], back.flip(1), joints)
-        paths = Paths.cat((paths, backwards.reversed()), dim=1)
+        paths = torch.cat((paths, backwards[0].flip(2)), dim=1)
+        sound = torch.cat((sound, backwards[1].flip(2)), dim=1)
     if problem.config.reseeds:
         reason = problem.reasons(joints)
         missed = torch.isin(reason, torch.tensor([REASONS.index(name) for name in _WRIST_MISSED]))
         rows = missed.any(dim=1).nonzero()[:, 0]
         if len(rows):
-            part = problem.select(rows)
-            new = repaired(part, paths[rows], missed[rows])
+            part = problem[rows]
+            new = repaired(part, paths[rows], sound[rows], missed[rows])
             better = (part.reasons(new) == 0).sum(1) > (reason[rows] == 0).sum(1)
             joints[rows[better]] = new[better]
     return joints
@@ -163,33 +96,42 @@ def _rescued(problem: ArmProblem, paths: Paths, joints: Tensor, worth: Tensor) -
 
 def follow(problem: ArmProblem, start: Tensor) -> Tensor:
     """[S, T, n] joints along the path, every frame started from the one before; the first from ``start`` [S, n]."""
-    model = problem.model
     config = problem.config
-    frames = problem.hand_poses.shape[1]
-    path = [solve(model, problem.frame(0, None), start, config, config.first_iterations)]
-    for t in range(1, frames):
-        path.append(solve(model, problem.frame(t, path[-1]), path[-1], config, config.iterations))
+    path = [solve(problem[:, 0], start, config.first_iterations)]
+    for t in range(1, problem.annotated.shape[1]):
+        path.append(solve(problem[:, t], path[-1], config.iterations, previous=path[-1]))
     return torch.stack(path, dim=1)
 
 
-def branches(problem: ArmProblem) -> Paths:
-    """Return the paths from distinct solutions of the first frame."""
+def branches(problem: ArmProblem) -> tuple[Tensor, Tensor]:
+    """Return the paths [S, K, T, n] from distinct solutions of the first frame, and which of their frames are good."""
     starts = _first_frames(problem)  # [S, K, n]
-    paths = follow(problem.repeated(starts.shape[1]), starts.flatten(0, 1))
-    return problem.examined(paths.unflatten(0, starts.shape[:2]))
+    paths = follow(problem.repeated(starts.shape[1]), starts.flatten(0, 1)).unflatten(0, starts.shape[:2])
+    return paths, is_sound(problem, paths)
 
 
-def best(problem: ArmProblem, paths: Paths) -> tuple[Tensor, Tensor]:
+def is_sound(problem: ArmProblem, paths: Tensor) -> Tensor:
+    """[S, K, T] bool: whether a frame of the paths [S, K, T, n] is valid if the joints do not jump there.
+
+    A jump depends on the frame before, and so on the direction and on where paths are spliced; everything else depends
+    on the frame alone and is measured once.
+    """
+    measures = problem.repeated(paths.shape[1]).measures(paths.flatten(0, 1))
+    no_jumps = replace(measures, arm_jump=torch.zeros_like(measures.arm_jump))
+    return (classify(no_jumps, problem.thresholds) == 0).view(paths.shape[:3])
+
+
+def best(problem: ArmProblem, paths: Tensor, sound: Tensor) -> tuple[Tensor, Tensor]:
     """Return the path [S, T, n] that is worth most, and its worth [S]: see the config."""
-    jump = arm_jump(paths.joints, problem.targets.annotated[:, None])
-    valid = (paths.sound & (jump <= problem.thresholds.arm_jump)).sum(-1)
-    detour = (paths.joints - problem.model.home).square().sum(-1).mean(-1)
+    jump = arm_jump(paths, problem.annotated[:, None])
+    valid = (sound & (jump <= problem.thresholds.arm_jump)).sum(-1)
+    detour = (paths - problem.model.home).square().sum(-1).mean(-1)
     worth, which = (valid - problem.config.detour_cost * detour).max(dim=1)
-    return paths.joints[torch.arange(len(which)), which], worth
+    return paths[torch.arange(len(which)), which], worth
 
 
-def repaired(problem: ArmProblem, known: Paths, missed: Tensor) -> Tensor:
-    """[S, T, n] the best path from pieces of the ``known`` paths and of new ones.
+def repaired(problem: ArmProblem, known: Tensor, sound: Tensor, missed: Tensor) -> Tensor:
+    """[S, T, n] the best path from pieces of the ``known`` paths, whose good frames are ``sound``, and of new ones.
 
     The new paths lead both ways from some of the frames that are ``missed`` [S, T], solved again: a path from either
     end may be stuck at a limit there, on the wrong side of the arm's null space.
@@ -199,15 +141,16 @@ def repaired(problem: ArmProblem, known: Paths, missed: Tensor) -> Tensor:
     count = torch.bincount(owner, minlength=len(missed))
     column = torch.arange(len(owner)) - (count.cumsum(0) - count)[owner]
     # Sequences with fewer new paths than others repeat a known one.
-    new = known.joints[:, :1].repeat(1, int(count.max()), 1, 1)
+    new = known[:, :1].repeat(1, int(count.max()), 1, 1)
     new[owner, column] = paths
-    known = Paths.cat((known, problem.examined(new)), dim=1)
+    sound = torch.cat((sound, is_sound(problem, new)), dim=1)
+    known = torch.cat((known, new), dim=1)
 
-    annotated = problem.targets.annotated
-    detour = config.detour_cost * (known.joints - problem.model.home).square().sum(-1) * annotated[:, None]
+    annotated = problem.annotated
+    detour = config.detour_cost * (known - problem.model.home).square().sum(-1) * annotated[:, None]
     return splice(
-        known.joints,
-        worth=known.sound.to(known.joints.dtype),
+        known,
+        worth=sound.to(known.dtype),
         cost=detour / annotated.sum(1)[:, None, None],
         annotated=annotated,
         jump=problem.thresholds.arm_jump,
@@ -221,7 +164,7 @@ def _reseeded(problem: ArmProblem, missed: Tensor) -> tuple[Tensor, Tensor]:
     Returns the sequences [B] of the paths, ascending, and the paths [B, T, n].
     """
     owner, seed = spread_over(missed, problem.config.reseeds)
-    alone = problem.select(owner[:, None], seed[:, None])  # [C, 1, ...]
+    alone = problem[owner[:, None], seed[:, None]]  # [C, 1, ...]
     starts = _first_frames(alone)  # [C, K, n]
     count = starts.shape[1]
     is_new = torch.ones(starts.shape[:2], dtype=torch.bool)
@@ -238,7 +181,7 @@ def _reseeded(problem: ArmProblem, missed: Tensor) -> tuple[Tensor, Tensor]:
         return owner, paths
     steps = torch.arange(int(torch.maximum(seed, frames - 1 - seed).max()) + 1)
     both_ways = torch.cat((seed[:, None] + steps, seed[:, None] - steps)).clamp(0, frames - 1)  # [2B, N] frames
-    followed = follow(problem.select(owner.repeat(2)[:, None], both_ways), start.repeat(2, 1))
+    followed = follow(problem[owner.repeat(2)[:, None], both_ways], start.repeat(2, 1))
     row = torch.arange(len(owner)).repeat(2)
     for step in reversed(steps.tolist()):  # the first visit of a frame is the one that stays
         paths[row, both_ways[:, step]] = followed[:, step]
@@ -262,10 +205,9 @@ def _first_frames(problem: ArmProblem) -> Tensor:
         home + spread * (home - lower),
         home + spread * (upper - home),
     )
-    frame = problem.repeated(config.restarts).frame(0, None)
-    start = start.repeat(sequences, 1)
-    solved = solve(model, frame, start, config, config.first_iterations)
-    cost = system(model, frame, solved, config).cost
+    frame = problem.repeated(config.restarts)[:, 0]
+    solved = solve(frame, start.repeat(sequences, 1), config.first_iterations)
+    cost = system(frame, solved).cost
     shape = (sequences, config.restarts)
     solved = solved.unflatten(0, shape)
     order = (cost.view(shape) + _HOME_BIAS * (solved - home).square().sum(-1)).argsort(dim=1)

@@ -27,7 +27,7 @@ from xreset import robots
 from xreset.cli import main
 from xreset.errors import BackendUnavailableError, FileFormatError, PolicyError, RunError, XResetError
 from xreset.files import claim, file_hash
-from xreset.learning.checkpoint import Checkpoint, read_checkpoint
+from xreset.learning.checkpoint import Checkpoint, check_moments, read_checkpoint
 from xreset.learning.choice import Candidate, Choice, write_choice
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.export import ensure_policy
@@ -426,6 +426,25 @@ class TrainingTest(unittest.TestCase):
             torch.save(good | {key: wrong}, file)
             with self.subTest(key), self.assertRaisesRegex(FileFormatError, rf"{file.name}\.{key} is"):
                 read_checkpoint(file)
+        group = good["optimizer_state_dict"]["param_groups"][0]
+        for name, key, wrong in (
+            ("actor", "mlp.0.bias", "x"),
+            ("critic", "later", torch.tensor(math.nan)),
+            ("optimizer", "state", {0: {"step": torch.tensor(1.0), "exp_avg": None}}),
+            ("optimizer", "state", []),
+            ("optimizer", "param_groups", [group | {"betas": 0.9}]),
+            ("optimizer", "param_groups", [group | {"lr": math.nan}]),
+            ("optimizer", "param_groups", [group | {"params": None}]),
+        ):
+            table = f"{name}_state_dict"
+            torch.save(good | {table: good[table] | {key: wrong}}, file)
+            with self.subTest(key), self.assertRaisesRegex(FileFormatError, f"(?s){table} is .*, expected "):
+                read_checkpoint(file)
+        optimizer = torch.optim.Adam([torch.zeros(2, requires_grad=True)])
+        moments = {"step": torch.tensor(1.0), "exp_avg": torch.zeros(3), "exp_avg_sq": torch.zeros(3)}
+        optimizer.load_state_dict(optimizer.state_dict() | {"state": {0: moments}})
+        with self.assertRaisesRegex(ValueError, r"exp_avg has shape \(3,\), expected \(2,\)"):
+            check_moments(optimizer)
 
     def test_a_run_of_another_configuration_is_named(self):
         good = json.loads((self.out / "run.json").read_text())

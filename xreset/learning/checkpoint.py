@@ -6,24 +6,53 @@ import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
+from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 
-from xreset.checks import NotNegative, from_dict
+from xreset.checks import NotNegative, Rule, from_dict
 from xreset.errors import FileFormatError, RunError
 from xreset.files import atomic_write
 from xreset.text import shown
+
+
+def _are_tensors(values: Any) -> bool:
+    if not isinstance(values, dict):
+        return False
+    return all(isinstance(value, torch.Tensor) and bool(value.isfinite().all()) for value in values.values())
+
+
+def _is_setting(name: str, value: Any) -> bool:
+    """Return whether an optimizer can have such a setting. torch takes any, and fails in the next step."""
+    if name == "params":
+        return isinstance(value, list) and all(type(index) is int for index in value)
+    if name == "betas":
+        return isinstance(value, tuple | list) and len(value) == 2 and all(0 <= beta < 1 for beta in value)
+    if name in ("lr", "eps", "weight_decay"):
+        return not isinstance(value, bool) and 0 <= float(value) < inf
+    return value is None or isinstance(value, bool)
+
+
+def _is_optimizer(values: dict[str, Any]) -> bool:
+    try:
+        settings = [item for group in values["param_groups"] for item in group.items()]
+        return all(map(_are_tensors, values["state"].values())) and all(_is_setting(*item) for item in settings)
+    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError):
+        return False
+
+
+_Networks = Annotated[dict[str, Any], Rule("tensors of finite numbers", _are_tensors)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Checkpoint:
     """State of a training."""
 
-    actor_state_dict: dict[str, Any]
-    critic_state_dict: dict[str, Any]
-    optimizer_state_dict: dict[str, Any]
+    actor_state_dict: _Networks
+    critic_state_dict: _Networks
+    optimizer_state_dict: Annotated[dict[str, Any], Rule("the state and settings of an optimizer", _is_optimizer)]
     iteration: NotNegative[int]
     """Iterations done."""
     env_steps: NotNegative[int]
@@ -73,3 +102,12 @@ def must_fit(path: Path) -> Iterator[None]:
         raise RunError(
             f"{path} does not fit this run ({reason}). Was it written by another run, or another version of xreset?"
         ) from error
+
+
+def check_moments(optimizer: torch.optim.Optimizer) -> None:
+    """Raise ``ValueError`` if the optimizer has loaded moments of another shape than its parameters: torch would notice
+    in the next step."""
+    for parameter, moments in optimizer.state.items():
+        for name, value in moments.items():
+            if value.shape not in ((), parameter.shape):
+                raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {tuple(parameter.shape)}")

@@ -18,7 +18,7 @@ from tensordict import TensorDict
 
 from xreset.errors import PolicyError
 from xreset.files import atomic_write, code_version, file_hash
-from xreset.learning.checkpoint import read_checkpoint
+from xreset.learning.checkpoint import must_fit, read_checkpoint
 from xreset.learning.choice import Choice, read_choice
 from xreset.learning.config import rsl_rl_config
 from xreset.learning.model import ExportedPolicy, PointNetLstmModel
@@ -107,7 +107,8 @@ def export_checkpoint(out: Path, checkpoint: Path, policy: Path) -> None:
     shapes = observation_shapes(info.contract, str(out))
     example = TensorDict({name: torch.zeros(1, *shape) for name, shape in shapes.items()}, batch_size=[1])
     actor = actor_class(example, {"actor": list(shapes)}, "actor", len(info.contract["joint_names"]), **options)
-    actor.load_state_dict(read_checkpoint(checkpoint).actor_state_dict)
+    with must_fit(checkpoint):
+        actor.load_state_dict(read_checkpoint(checkpoint).actor_state_dict)
     export_onnx(actor, policy, info.contract, checkpoint=checkpoint)
 
 

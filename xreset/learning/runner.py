@@ -17,7 +17,7 @@ from tensordict import TensorDict
 
 from xreset.env import ManipulationEnv
 from xreset.errors import RunError
-from xreset.learning.checkpoint import Checkpoint, must_fit, read_checkpoint, write_checkpoint
+from xreset.learning.checkpoint import Checkpoint, check_moments, must_fit, read_checkpoint, write_checkpoint
 from xreset.learning.config import TrainConfig, rsl_rl_config
 from xreset.learning.distributed import Processes
 from xreset.learning.faults import FaultBudget
@@ -172,6 +172,7 @@ class TrainingRunner(OnPolicyRunner):
         content = read_checkpoint(path, self.device)
         with must_fit(path):
             self.alg.load(vars(content), None, strict=True)
+            check_moments(self.alg.optimizer)
         self.alg.learning_rate = content.learning_rate
         self.iteration = content.iteration
         self.env_steps = content.env_steps

@@ -18,9 +18,12 @@ from xreset.geometry.urdf_writer import fixed, frame
 from xreset.robot_tools.couplings import SLIDE, Couplings, Pull, joint_name, read_couplings
 from xreset.spec import Geometry, MimicSpec, Shape
 
-_LARGEST = {"hfield": ("nrow", "ncol"), "texture": ("width", "height"), "size": ("nkey",)}
+_LARGEST = {"hfield": ("nrow", "ncol"), "texture": ("width", "height"), "flexcomp": ("count",)}
 """Elements whose numbers decide how much memory MuJoCo takes."""
-_ENTRIES = 2**24
+_ENTRIES = 2**22
+"""Largest number of entries of all elements of a kind."""
+_PER_ELEMENT = 2**16
+"""Largest number of keyframes, and of user data of each element."""
 _COPIES = 1000
 _SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "box": 3, "mesh": 0, "plane": 0}
 """Numbers of a shape's size that count."""
@@ -79,14 +82,18 @@ def _check_sizes(path: Path, root: ElementTree.Element) -> None:
 
     def product(element: ElementTree.Element, names: Iterable[str]) -> float:
         try:
-            return math.prod(float(element.get(name, 1)) for name in names)
+            return math.prod(float(number) for name in names for number in element.get(name, "1").split())
         except ValueError:
             return 1.0  # MuJoCo says what is wrong
 
     for tag, names in _LARGEST.items():
-        for element in root.iter(tag):
-            if product(element, names) > _ENTRIES:
-                raise RobotError(f"{path}: a {tag} has {product(element, names):.3g} entries, which is too many.")
+        entries = sum(product(element, names) for element in root.iter(tag))
+        if entries > _ENTRIES:
+            raise RobotError(f"{path}: {tag} elements have {entries:.3g} entries, which is too many.")
+    for element in root.iter("size"):
+        for name in element.attrib:
+            if name.startswith(("nkey", "nuser")) and product(element, [name]) > _PER_ELEMENT:
+                raise RobotError(f"{path}: {name} is {element.get(name)}, expected at most {_PER_ELEMENT}.")
     copies = math.prod(product(element, ["count"]) for element in root.iter("replicate"))
     if copies > _COPIES:
         raise RobotError(f"{path} replicates up to {copies:.3g} times, which is too often.")

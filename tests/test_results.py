@@ -72,6 +72,7 @@ class ResultsTest(unittest.TestCase):
             ("reorientation_progress", -7),
             ("sequence", -1),
             ("repetition", -1),
+            ("least_distance", 1e308),
         ):
             changed = [content["episodes"][0] | {name: value}, *content["episodes"][1:]]
             file.write_text(json.dumps(content | {"episodes": changed}))
@@ -83,6 +84,7 @@ class ResultsTest(unittest.TestCase):
         lift = {"schema": "xreset-lift/1", "passed": [passing], "iteration": 9, "env_steps": 90, "minutes": 1.5}
         for changes in (
             {"minutes": -1e300},
+            {"minutes": 1e300},
             {"success_from_home": 77},
             {"iteration": -5},
             {"passed": [passing | {"share": 1e308}]},

@@ -32,7 +32,8 @@ class Rule:
 T = TypeVar("T")
 Positive = Annotated[T, Rule("a number above 0", lambda x: 0 < x <= inf)]
 """Infinity is allowed, and means no limit; otherwise write ``Positive[Finite[float]]``."""
-NotNegative = Annotated[T, Rule("a finite number, 0 or more", lambda x: 0 <= x < inf)]
+NotNegative = Annotated[T, Rule("a number from 0 to 1e15", lambda x: 0 <= x <= 1e15)]
+"""No time, number of steps or distance is larger: such a number in a file is damage."""
 Finite = Annotated[T, Rule("a finite number", isfinite)]
 Share = Annotated[T, Rule("a number from 0 to 1", lambda x: 0 <= x <= 1)]
 Range = Annotated[

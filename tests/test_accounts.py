@@ -19,28 +19,22 @@ class AccountsTest(unittest.TestCase):
         self.rows = accounts(self.names, self.post, self.reason)
 
     def test_every_item_is_kept_or_lost_for_one_reason(self):
+        phases = ("pre-contact", "post-contact")
+        rows = with_totals(self.rows)
+        expected = [(name, phase) for name in ("box", "can") for phase in phases]
         self.assertEqual(
-            [(r.object_name, r.phase) for r in self.rows][:2], [("box", "pre-contact"), ("box", "post-contact")]
+            [(r.object_name, r.phase) for r in rows], [*expected, *(("all", p) for p in (*phases, "both"))]
         )
-        for row in with_totals(self.rows):
-            self.assertEqual(row.total, row.kept + sum(row.lost.values()))
-        for row in self.rows:
-            mine = (self.names == row.object_name) & (self.post == (row.phase == "post-contact"))
+        for row in rows:
+            mine = (self.names == row.object_name) | (row.object_name == "all")
+            mine &= (self.post == (row.phase == "post-contact")) | (row.phase == "both")
             self.assertEqual((row.total, row.kept), (mine.sum(), (mine & (self.reason == "")).sum()))
-            self.assertEqual(row.lost["jump"], (mine & (self.reason == "jump")).sum())
-
-    def test_totals(self):
-        *_, before, after, both = with_totals(self.rows)
-        self.assertEqual((before.phase, after.phase, both.phase), ("pre-contact", "post-contact", "both"))
-        self.assertEqual((after.total, both.total), (self.post.sum(), 200))
-        self.assertEqual(both.kept, (self.reason == "").sum())
-        annotated = both.without("not annotated")
+            for reason, number in row.lost.items():
+                self.assertEqual(number, (mine & (self.reason == reason)).sum())
+        annotated = rows[-1].without("not annotated")
         self.assertEqual(annotated.total, (self.reason != "not annotated").sum())
-        self.assertEqual(annotated.share, both.kept / annotated.total)
-
-    def test_reasons_are_listed_by_frequency(self):
-        self.assertRegex(described(with_totals(self.rows)[-1].lost), r"^jump \d+, ")
-        self.assertEqual(described({}), "")
+        self.assertEqual(annotated.share, rows[-1].kept / annotated.total)
+        self.assertRegex(described(rows[-1].lost), r"^jump \d+, ")
 
     def test_file(self):
         with tempfile.TemporaryDirectory() as folder:

@@ -94,54 +94,55 @@ class DistillTest(unittest.TestCase):
         self.assertEqual(list(policy.contract["observation_layout"]), ["goal", "proprio", "view"])
         env = self.env(IMAGES)
         check_contract("it", policy.contract, self.robot, env.task)
-        policy.begin(env)
-        first = policy.act(env.get_observations())
-        self.assertEqual(first.shape, (2, env.num_actions))
-        blind = env.get_observations()
+        seen = env.get_observations()
+        blind = seen.clone()
         blind["view"] = torch.zeros_like(blind["view"])
-        policy.begin(env)
-        self.assertFalse(torch.allclose(first, policy.act(blind)))
-        told = blind.clone()
+        told = seen.clone()
         for name in ("policy", "perception", "privileged"):
             told[name] = torch.zeros_like(told[name])
-        policy.begin(env)
-        once = policy.act(blind)
-        policy.begin(env)
-        self.assertTrue(torch.equal(once, policy.act(told)))
+        actions = []
+        for observations in (seen, blind, told):
+            policy.begin(env)
+            actions.append(policy.act(observations))
+        self.assertEqual(actions[0].shape, (2, env.num_actions))
+        self.assertFalse(torch.allclose(actions[0], actions[1]))
+        self.assertTrue(torch.equal(actions[0], actions[2]))
         with self.assertRaisesRegex(PolicyError, "other cameras"):
             check_contract("it", policy.contract, self.robot, replace(env.task, vision=replace(IMAGES, interval=1)))
 
-    def test_a_resumed_run_continues(self):
-        with self.without_export():
-            out = self.distill("resumed")
-            before = read_checkpoint(latest_checkpoint(out))
-            resume(out, iterations=3)
-        after = read_checkpoint(latest_checkpoint(out))
-        self.assertEqual((before.iteration, after.iteration), (2, 3))
-        steps = [{int(s["step"]) for s in c.optimizer_state_dict["state"].values()} for c in (before, after)]
-        self.assertEqual(2 * max(steps[1]), 3 * max(steps[0]))
-
-    def test_the_student_learns_the_teachers_actions(self):
+    def test_the_student_learns_the_teachers_actions_and_resumes(self):
         errors = []
 
         def note(_log, _iteration, _steps, _elapsed, scalars):
             errors.append(scalars["loss/behavior"])
 
         with self.without_export(), mock.patch("xreset.learning.runner.TrainingLog.write", note):
-            self.distill("points", POINTS, iterations=20, save_interval=100)
+            out = self.distill("points", POINTS, iterations=15, save_interval=100)
+            before = read_checkpoint(latest_checkpoint(out))
+            resume(out, iterations=20)
+            after = read_checkpoint(latest_checkpoint(out))
         self.assertLess(np.mean(errors[-3:]), 0.5 * np.mean(errors[:3]))
+        self.assertEqual((before.iteration, after.iteration), (15, 20))
+        steps = [max(int(s["step"]) for s in c.optimizer_state_dict["state"].values()) for c in (before, after)]
+        self.assertEqual(20 * steps[0], 15 * steps[1], "the optimizer went on")
 
     def test_refusals(self):
         away = replace(IMAGES, cameras=(replace(FRONT, target=(3.0, 0.2, 0.5)),))
-        with self.without_export():
-            with self.assertRaisesRegex(XResetError, "No camera shows 005_tomato_soup_can, 010_potted_meat_can"):
-                self.distill("away", away)
-            with self.assertRaisesRegex(XResetError, "Unknown camera rear. Choose from: front, side, wrist"):
-                distill(self.teacher, self.bank, out=self.folder / "rear", cameras=("rear",))
-            with self.assertRaisesRegex(PolicyError, "Unknown policy 'nobody'"):
-                distill("nobody", self.bank, out=self.folder / "nobody")
-            with self.assertRaisesRegex(PolicyError, "sees through cameras itself"):
-                distill(self.run_folder, self.bank, out=self.folder / "again", config=student_config(TASK, IMAGES))
+        two = {"teacher": self.teacher, "bank": self.bank, "out": self.folder / "refused"}
+        for error, words, options in (
+            (XResetError, "Unknown camera rear. Choose from: front, side, wrist", {"cameras": ("rear",)}),
+            (PolicyError, "Unknown policy 'nobody'", {"teacher": "nobody"}),
+            (
+                PolicyError,
+                "sees through cameras itself",
+                {"teacher": self.run_folder, "config": student_config(TASK, IMAGES)},
+            ),
+        ):
+            with self.subTest(words), self.without_export(), self.assertRaisesRegex(error, words):
+                distill(**(two | options))
+        words = "No camera shows 005_tomato_soup_can, 010_potted_meat_can"
+        with self.without_export(), self.assertRaisesRegex(XResetError, words):
+            self.distill("away", away)
 
     def test_what_the_teacher_does_better(self):
         common = {

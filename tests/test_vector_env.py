@@ -24,9 +24,13 @@ from xreset.vector_env import VectorEnv
 class OneWorld(gymnasium.Env):
     """World ``index`` of a vector environment as the single environment that Gymnasium's checker takes; the others stand still."""
 
+    metadata = {"render_modes": []}  # noqa: RUF012
+
     def __init__(self, envs: VectorEnv, index: int) -> None:
-        self.envs, self.index, self.metadata = envs, index, {"render_modes": []}
-        self.observation_space, self.action_space = envs.single_observation_space, envs.single_action_space
+        self.envs = envs
+        self.index = index
+        self.observation_space = envs.single_observation_space
+        self.action_space = envs.single_action_space
 
     def mine(self, batch):
         return list(iterate(self.envs.observation_space, batch))[self.index]
@@ -39,9 +43,8 @@ class OneWorld(gymnasium.Env):
     def step(self, action):
         actions = np.zeros(self.envs.action_space.shape, np.float32)
         actions[self.index] = action
-        observations, reward, terminated, truncated, _ = self.envs.step(actions)
-        i = self.index
-        return self.mine(observations), float(reward[i]), bool(terminated[i]), bool(truncated[i]), {}
+        observations, *ends, _ = self.envs.step(actions)
+        return self.mine(observations), *(value[self.index].item() for value in ends), {}
 
 
 class VectorEnvTest(WithEnv):
@@ -57,13 +60,9 @@ class VectorEnvTest(WithEnv):
             with warnings.catch_warnings(record=True) as found:
                 warnings.simplefilter("always")
                 check_env(OneWorld(envs, world))
-            expected = (
-                "spec",
-                "infinity",
-            )  # it was not made by gymnasium.make; and joint speeds and forces have no bounds
-            self.assertEqual(
-                [str(w.message) for w in found if not any(word in str(w.message) for word in expected)], []
-            )
+            # it was not made by gymnasium.make, and joint speeds and forces have no bounds
+            other = [str(w.message) for w in found if not any(word in str(w.message) for word in ("spec", "infinity"))]
+            self.assertEqual(other, [])
 
     def test_episodes_are_truncated_and_begin_anew_a_step_later(self):
         env = self.vector_env(0.1)
@@ -81,8 +80,6 @@ class VectorEnvTest(WithEnv):
 
     def test_an_episode_counts_once(self):
         """A broken world is counted in the step that ends it, and not again in the one that resets it."""
-        from xreset.vector_env import VectorEnv
-
         task = replace(
             TASK,
             reset=ResetConfig(demo_probability=1.0),
@@ -111,15 +108,7 @@ class VectorEnvTest(WithEnv):
         env = self.vector_env(0.5)
         joints = env.env.num_actions
         right = np.zeros((N, joints))
-        for wrong in (
-            0.0,
-            np.zeros(joints),
-            right[:1],
-            right[:, :1],
-            right + 1j,
-            right.astype(bool),
-            [["left"] * joints] * N,
-        ):
+        for wrong in (0.0, right[:1], right[:, :1], right + 1j, right.astype(bool), [["left"] * joints] * N):
             with (
                 self.subTest(shape=np.shape(wrong)),
                 self.assertRaisesRegex(XResetError, rf"of shape \({N}, {joints}\)"),

@@ -55,25 +55,30 @@ QUIET = replace(TASK, observation=replace(TASK.observation, noise=evaluation_tas
 
 
 class BreakableBackend(MujocoBackend):
-    """An engine some of whose worlds are not finite until they are set again."""
+    """An engine some of whose worlds are not finite, or drop contacts, until they are set again."""
 
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
         self.broken = torch.zeros(self.num_worlds, dtype=torch.bool)
+        self.overflow = self.broken.clone()
 
     def set_state(self, state, worlds=None):
-        self.broken[slice(None) if worlds is None else worlds] = False
+        for failed in (self.broken, self.overflow):
+            failed[slice(None) if worlds is None else worlds] = False
         super().set_state(state, worlds)
 
     def state(self):
         state = super().state()
-        pos = state.object_pos.clone()
-        pos[self.broken] = torch.nan
-        return replace(state, object_pos=pos, joint_pos=torch.where(self.broken[:, None], torch.nan, state.joint_pos))
+        bad = self.broken[:, None]
+        return replace(
+            state,
+            object_pos=torch.where(bad, torch.nan, state.object_pos),
+            joint_pos=torch.where(bad, torch.nan, state.joint_pos),
+        )
 
     def health(self):
         health = super().health()
-        return replace(health, nonfinite=health.nonfinite | self.broken)
+        return replace(health, nonfinite=health.nonfinite | self.broken, overflow=health.overflow | self.overflow)
 
 
 class Waiting(TorchDispatchMode):

@@ -481,39 +481,26 @@ class ObjectFrameTest(WithEnv):
 
     def played(self, spec, bank, task: TaskConfig) -> list[torch.Tensor]:
         """Observations, rewards and actions of every step; the action is a function of the observations."""
-        names = (spec.name,)
         backend = MujocoBackend(make_scene(self.robot, (spec,), task), N, workers=0)
         self.addCleanup(backend.close)
         pivots = object_origins((spec,), task)
-        env = ManipulationEnv(backend, task, ResetDistribution(bank, self.robot, names, task.reset, "cpu", pivots))
-        groups = ("policy", "proprio", "perception", "privileged")
+        env = ManipulationEnv(
+            backend, task, ResetDistribution(bank, self.robot, (spec.name,), task.reset, "cpu", pivots)
+        )
         found = []
         for _ in range(5):  # contact makes rounding grow from the seventh step on
-            observations = env.get_observations()
-            flat = torch.cat([observations[group].flatten(1) for group in groups], dim=-1)
+            flat = torch.cat([value.flatten(1) for _, value in sorted(env.get_observations().items())], dim=-1)
             weights = torch.randn(flat.shape[1], 7, generator=torch.Generator().manual_seed(0))
             action = torch.tanh(0.1 * flat @ weights)
             _, reward, *_ = env.step(action)
             found += [flat, action, reward]
-        metrics = EpisodeMetrics(
-            env.reading(),
-            env.task_goal_pos,
-            env.goal_quat,
-            MetricPoints.of((spec,) * N, task.object_frame),
-            MetricsConfig(),
-        )
+        points = MetricPoints.of((spec,) * N, task.object_frame)
+        metrics = EpisodeMetrics(env.reading(), env.task_goal_pos, env.goal_quat, points, MetricsConfig())
         return [*found, metrics.final_distance, metrics.final_position_error, metrics.final_angle, metrics._best]
 
     def test_the_frame_of_a_mesh_does_not_matter(self):
-        base = RECIPES["minutes"].config.task
-        reset = replace(base.reset, goal_xy=0.03, goal_z=0.05, goal_yaw=0.5, training_xy=0.05)
-        task = replace(
-            base,
-            object_frame="center",
-            reset=reset,
-            distance_points=64,
-            observation=replace(base.observation, rotation="to_goal"),
-        )
+        task = replace(RECIPES["live"].config.task, distance_points=64, randomization=RandomizationConfig())
+        task = replace(task, reset=replace(task.reset, training_xy=0.05))
         one = self.played(self.specs[0], toy_bank(self.robot), task)
         other = self.played(self.specs[1], self.moved_bank(), task)
         for step, (a, b) in enumerate(zip(one, other, strict=True)):
@@ -633,7 +620,8 @@ class KinematicRetargetingTest(WithEnv):
         env = self.make(task)
         lengths = [7, 5, 6]
         rng = np.random.default_rng(0)
-        low, high = env.actions.lower.numpy(), env.actions.upper.numpy()
+        low = env.actions.lower.numpy()
+        high = env.actions.upper.numpy()
         paths = [low + (high - low) * (0.5 + 0.02 * np.cumsum(rng.random((n, 7)), axis=0)) for n in lengths]
         for path in paths:
             path[:, :3] = 0.01 * path[:, :3] + 0.01  # the arm can follow
@@ -646,14 +634,11 @@ class KinematicRetargetingTest(WithEnv):
             targets.append(env.joint_target.numpy().copy())
         for world in range(N):
             path = paths[int(env.sequence[world])]
-            at = np.arange(len(path)) * 2 + 6  # 30 Hz frames at 60 Hz control
-            for frame, step in enumerate(at):
-                np.testing.assert_allclose(targets[step][world], path[frame], atol=1e-4)
-            np.testing.assert_allclose(targets[-1][world], path[-1], atol=1e-4, err_msg="it holds the last frame")
-            half = 0.5 * (0.01 + path[0])
-            np.testing.assert_allclose(
-                targets[2][world], half, atol=1e-4, err_msg="half-way to the first frame after half the lead-in"
-            )
+            found = np.stack(targets)[:, world]
+            played = found[6 : 6 + 2 * len(path) : 2]  # 30 Hz frames at 60 Hz control
+            np.testing.assert_allclose(played, path, atol=1e-4)
+            np.testing.assert_allclose(found[-1], path[-1], atol=1e-4, err_msg="it holds the last frame")
+            np.testing.assert_allclose(found[2], 0.5 * (0.01 + path[0]), atol=1e-4, err_msg="half of the lead-in")
 
 
 if __name__ == "__main__":

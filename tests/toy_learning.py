@@ -57,6 +57,11 @@ class Shares:
     success: float
     """At the goal besides."""
 
+    @classmethod
+    def of(cls, mean: Callable[[str], float]) -> Shares:
+        """Take the mean of each curve."""
+        return cls(grasped=float(mean("task/grasped")), success=float(mean("task/success")))
+
 
 def bank() -> ResetBank:
     """States in which the brick hangs between the jaws, which are told to close."""
@@ -79,13 +84,12 @@ def bank() -> ResetBank:
 def random_policy(seed: int, backend: Backend) -> Shares:
     """What uniform actions do in two episodes."""
     env = environment(seed, backend)
-    policy, found = RandomPolicy(env.num_actions, seed), []
-    policy.begin(env)
+    policy = RandomPolicy(env.num_actions, seed)
+    logs = []
     for _ in range(2 * env.max_episode_length):
-        log = env.step(policy.act(env.get_observations()))[-1]["log"]
-        found.append([float(log[f"task/{name}"]) for name in ("grasped", "success")])
-    grasped, success = np.mean(found, axis=0)
-    return Shares(grasped=float(grasped), success=float(success))
+        *_, extras = env.step(policy.act(env.get_observations()))
+        logs.append(extras["log"])
+    return Shares.of(lambda name: np.mean([log[name] for log in logs]))
 
 
 def trained(
@@ -109,8 +113,7 @@ def trained(
         change(runner)
         runner.learn(config.iterations, init_at_random_ep_len=True)
         curves = read_scalars(Path(folder))
-    grasped, success = (float(curves[f"task/{name}"].value[-LAST:].mean()) for name in ("grasped", "success"))
-    return Shares(grasped=grasped, success=success), runner.env_steps
+    return Shares.of(lambda name: curves[name].value[-LAST:].mean()), runner.env_steps
 
 
 def scene() -> SceneSpec:

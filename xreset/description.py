@@ -17,7 +17,7 @@ from typing import Literal
 from xreset.checks import Number, Text, parsed
 from xreset.errors import RobotError
 from xreset.files import read_toml
-from xreset.geometry.urdf import find_mesh, parse_xml
+from xreset.geometry.urdf import mesh_files
 from xreset.plugins import robot_folder
 from xreset.spec import (
     KEYPOINTS,
@@ -157,13 +157,11 @@ def _robot(given: Description, folder: Path) -> RobotSpec:
 
 
 def _meshes(urdf: Path) -> tuple[Path, ...]:
-    """Mesh files of the collision shapes, as far as they exist: a wrong URDF is reported by whoever reads it."""
+    """Mesh files of the collision shapes; a wrong URDF is reported by whoever reads it."""
     try:
-        meshes = parse_xml(urdf).iterfind(".//collision//mesh")
+        return tuple(mesh_files(urdf))
     except RobotError:
         return ()
-    files = [find_mesh(mesh.get("filename", ""), urdf) for mesh in meshes]
-    return tuple(file for file in files if file is not None)
 
 
 def _contradictions(spec: RobotSpec) -> list[str]:

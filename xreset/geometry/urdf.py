@@ -9,8 +9,7 @@ from __future__ import annotations
 import io
 import math
 import os
-from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -66,13 +65,13 @@ class Joint:
     child: str
     T_parent_joint: np.ndarray
     """[4, 4] pose of the child's frame in the parent's at position 0."""
-    axis: np.ndarray
+    axis: np.ndarray = field(default_factory=lambda: np.array([1.0, 0, 0]))
     """[3] unit axis in the joint (child) frame."""
-    lower: float
+    lower: float = -math.inf
     """Lower position limit [rad or m]; -inf for a continuous joint."""
-    upper: float
+    upper: float = math.inf
     """Upper position limit [rad or m]; inf for a continuous joint."""
-    velocity: float
+    velocity: float = math.inf
     """Largest speed [rad/s or m/s]; inf where the URDF gives none."""
     effort: float = 0.0
     """Largest torque [N m] or force [N]; 0 where the URDF gives none."""
@@ -155,7 +154,7 @@ def link_meshes(robot: RobotSpec) -> list[trimesh.Trimesh | None]:
 
 
 def load_urdf(path: str | Path) -> RobotTree:
-    """Read a URDF.
+    """Read a URDF; it is read again only after a change of the file or of a mesh.
 
     ``<capsule radius length/>`` is accepted in addition to the standard shapes. Mesh files are searched next to the
     URDF (``package://NAME/`` also in the three folders above it).
@@ -169,11 +168,8 @@ def load_urdf(path: str | Path) -> RobotTree:
     path = Path(path).resolve()
     if path.stat().st_size > max_bytes() // 16:
         raise RobotError(f"{path} has {path.stat().st_size >> 20} MB, which is too large for a URDF.")
-    tree, files = _load(path)
-    if files != _modified(files):
-        _load.cache_clear()
-        tree, _ = _load(path)
-    return tree
+    files = (path, *mesh_files(path))
+    return _load(path, tuple(file.stat().st_mtime_ns for file in files))
 
 
 class _NoDoctype(ElementTree.TreeBuilder):
@@ -195,24 +191,21 @@ def parse_xml(path: Path) -> Element:
         raise RobotError(f"{path} cannot be read as XML: {shown(str(error))}") from error
 
 
-def _modified(files: Iterable[Path]) -> dict[Path, int]:
-    """Return the time of each file's last change [ns]; -1 if it is gone."""
-    return {file: file.stat().st_mtime_ns if file.exists() else -1 for file in files}
+def mesh_files(urdf: Path) -> list[Path]:
+    """Return the mesh files of a URDF's collision shapes, as far as they exist."""
+    meshes = parse_xml(urdf).iterfind("link/collision/geometry/mesh")
+    files = [find_mesh(mesh.get("filename", ""), urdf) for mesh in meshes]
+    return [file for file in files if file is not None]
 
 
 @lru_cache(maxsize=16)
-def _load(path: Path) -> tuple[RobotTree, dict[Path, int]]:
-    """Read a URDF; return its tree, and the times of the last change of the file and its meshes."""
-    files = _modified([path])
+def _load(path: Path, changed: tuple[int, ...]) -> RobotTree:
+    """Read a URDF that was last changed then, and its meshes [ns]."""
     xml = parse_xml(path)
     if xml.tag == "mujoco":
         raise RobotError(f"{path} is MJCF, not URDF; `xreset robots import` makes a robot of it.")
     if xml.tag != "robot":
         raise RobotError(f"{path} starts with <{shown(xml.tag)[1:-1]}>, which is not a URDF. Expected <robot>.")
-    for mesh in xml.iterfind("link/collision/geometry/mesh"):
-        file = find_mesh(mesh.get("filename", ""), path)
-        if file is not None:
-            files |= _modified([file])
     robot = _parsed(xml, path)
     try:
         with np.errstate(invalid="ignore"):  # check_tree refuses what is not finite
@@ -232,7 +225,7 @@ def _load(path: Path) -> tuple[RobotTree, dict[Path, int]]:
     except (ValueError, TypeError, KeyError, AttributeError, IndexError) as error:
         raise RobotError(f"{path} cannot be read as a URDF: {shown(f'{type(error).__name__}: {error}')}") from error
     check_tree(tree, path)
-    return tree, files
+    return tree
 
 
 def _parsed(xml: Element, path: Path) -> yourdfpy.Robot:
@@ -413,18 +406,16 @@ def _joint(joint: yourdfpy.Joint, path: Path) -> Joint:
     length = float(np.linalg.norm(axis))
     if kind != "fixed" and not length > _SHORTEST_AXIS:
         raise RobotError(f"{path}: joint {name!r} has the axis {axis}, expected a direction.")
-    lower = -math.inf
-    upper = math.inf
-    velocity = math.inf
-    effort = 0.0
+    limits = {}
     limit = joint.limit
     if limit is not None:
         if limit.effort is not None and 0 < limit.effort < math.inf:
-            effort = float(limit.effort)
-        velocity = math.inf if limit.velocity is None else float(limit.velocity)
+            limits["effort"] = float(limit.effort)
+        if limit.velocity is not None:
+            limits["velocity"] = float(limit.velocity)
         if kind != "continuous":
-            lower = 0.0 if limit.lower is None else float(limit.lower)
-            upper = 0.0 if limit.upper is None else float(limit.upper)
+            limits["lower"] = float(limit.lower or 0)
+            limits["upper"] = float(limit.upper or 0)
     mimic = None
     if joint.mimic is not None:
         numbers = {name: float(getattr(joint.mimic, name)) for name in ("multiplier", "offset")}
@@ -438,9 +429,6 @@ def _joint(joint: yourdfpy.Joint, path: Path) -> Joint:
         child=joint.child,
         T_parent_joint=_pose(joint.origin),
         axis=axis / max(length, _SHORTEST_AXIS),
-        lower=lower,
-        upper=upper,
-        velocity=velocity,
-        effort=effort,
         mimic=mimic,
+        **limits,
     )

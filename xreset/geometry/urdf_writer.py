@@ -56,17 +56,7 @@ def frame(name: str) -> Link:
 
 def fixed(parent: str, child: str, T_parent_child: np.ndarray) -> Joint:
     """Make a fixed joint."""
-    return Joint(
-        name=f"{child}_fixed",
-        type="fixed",
-        parent=parent,
-        child=child,
-        T_parent_joint=T_parent_child,
-        axis=np.array([1.0, 0, 0]),
-        lower=-math.inf,
-        upper=math.inf,
-        velocity=math.inf,
-    )
+    return Joint(name=f"{child}_fixed", type="fixed", parent=parent, child=child, T_parent_joint=T_parent_child)
 
 
 def urdf_text(tree: RobotTree, comment: str = "") -> str:

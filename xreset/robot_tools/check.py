@@ -78,8 +78,7 @@ def check(name_or_folder: str | Path) -> list[Finding]:
     mass = sum(link.mass for link in tree.links)
     content = f"{len(tree.links)} links, {len(tree.joints)} joints, {shapes} collision shapes, {mass:.1f} kg"
     found.append(Finding("ok", "URDF", content))
-    joints = f"{len(spec.joints)} actuated joints exist, have limits, and are at home within them"
-    found += _topic("joints", _joints(spec, tree), joints)
+    found += _topic("joints", _joints(spec, tree), f"{len(spec.joints)} actuated joints are at home within limits")
     found += _topic("mimic joints", _mimics(spec, tree), f"{len(spec.mimics)} follow an actuated joint")
     found += _topic("links", _links(spec, tree), "palm, fingertips, keypoints and collision links exist")
     found += _topic("inertias", _inertias(tree), "masses are positive, inertias are those of solid bodies")

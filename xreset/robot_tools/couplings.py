@@ -34,15 +34,12 @@ _STAY = 1e-3
 their limits, then springs rest (with their stiffness), then joints stay where they were."""
 
 
-class Pull(NamedTuple):
-    """Joints that an actuator moves, by their numbers, and by how much its length changes with each."""
-
-    joints: list[int]
-    shares: list[float]
+Pull = dict[int, float]
+"""Joints that an actuator moves, by their numbers, and by how much its length changes with each."""
 
 
 class Line(NamedTuple):
-    """``position = multiplier * position of the source + offset``"""
+    """``position = multiplier * position of the source + offset``; a joint that does not move has a multiplier of 0."""
 
     source: int
     multiplier: float
@@ -55,8 +52,6 @@ class Couplings:
 
     lines: dict[int, Line] = field(default_factory=dict)
     """Follower -> its line; sources follow nothing."""
-    held: dict[int, float] = field(default_factory=dict)
-    """Joints that do not move, and where they are."""
     notes: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     """What cannot be stated by straight lines, each with a remedy."""
@@ -64,8 +59,8 @@ class Couplings:
     def lever(self, pull: Pull) -> tuple[int, float]:
         """Return the driven joint of an actuator, and by how much the actuator's length changes with it."""
         lever = 0.0
-        source = pull.joints[0]
-        for joint, share in zip(pull.joints, pull.shares, strict=True):
+        source = next(iter(pull))
+        for joint, share in pull.items():
             line = self.lines.get(joint, Line(joint, 1.0, 0.0))
             source = line.source
             lever += share * line.multiplier
@@ -108,13 +103,14 @@ class _Mechanism:
         limited = model.jnt_limited[self.joints] > 0
         self.lower = np.where(limited, model.jnt_range[self.joints, 0], self.start - np.pi)
         self.upper = np.where(limited, model.jnt_range[self.joints, 1], self.start + np.pi)
-        self.driven = [int(np.searchsorted(self.joints, pull.joints[0])) for pull in pulls]
+        self.driven = [int(np.searchsorted(self.joints, next(iter(pull)))) for pull in pulls]
         rows = [np.zeros(len(self.joints))]
         for pull in pulls:
-            for joint, share in zip(pull.joints[1:], pull.shares[1:], strict=True):
+            (first, share), *others = pull.items()
+            for joint, other in others:
                 row = np.zeros(len(self.joints))
-                row[self.joints == joint] = pull.shares[0]
-                row[self.joints == pull.joints[0]] = -share
+                row[self.joints == joint] = share
+                row[self.joints == first] = -other
                 rows.append(row)
         self.shared = np.stack(rows)
         """[S, Q] products with the positions are 0 where tendons pull all their joints alike."""
@@ -156,7 +152,8 @@ class _Mechanism:
             )
             return
         if len(group) == 1:
-            found.held[int(self.joints[group[0]])] = float(self.closed(group, None, 0.0, self.start)[0])
+            joint = int(self.joints[group[0]])
+            found.lines[joint] = Line(joint, 0.0, float(self.closed(group, self.start)[0]))
             found.notes.append(f"{listed} is fixed, because an equality holds it in place")
             return
         source = drives[0] if drives else group[0]
@@ -165,7 +162,14 @@ class _Mechanism:
         lines = {}
         straight = np.tile(self.start, (_SAMPLES, 1))
         straight[:, source] = values
-        for follower, track in zip(followers, self.tracks(followers, source, values).T, strict=True):
+        tracks = []
+        before = self.start
+        for value in values:
+            before = before.copy()
+            before[source] = value
+            before[followers] = self.closed(followers, before)
+            tracks.append(before[followers])
+        for follower, track in zip(followers, np.transpose(tracks), strict=True):
             multiplier = 0.0
             offset = float(track.mean())
             if np.ptp(track) > _STILL:
@@ -180,25 +184,11 @@ class _Mechanism:
                 "polycoef with two numbers, remove the bar that closes a loop, or use the maker's URDF"
             )
             return
-        for joint, line in lines.items():
-            if line.multiplier:
-                found.lines[joint] = line
-            else:
-                found.held[joint] = line.offset
+        found.lines |= lines
         names = ", ".join(self.names[i] for i in followers)
         found.notes.append(
             f"coupled joints: {names} with {self.names[source]}; closed loops stay closed within {1e3 * opened:.2f} mm"
         )
-
-    def tracks(self, followers: np.ndarray, source: int, values: np.ndarray) -> np.ndarray:
-        """Return positions of the followers [V, F] while the source goes through values [V]."""
-        positions = []
-        before = self.start
-        for value in values:
-            before = before.copy()
-            before[followers] = self.closed(followers, source, value, before)
-            positions.append(before[followers])
-        return np.array(positions)
 
     def misfit(self, positions: np.ndarray, rows: np.ndarray) -> tuple[float, float]:
         """Return the widest gap of a closed loop [m], and the most that another equality is off [rad or m].
@@ -212,11 +202,9 @@ class _Mechanism:
         is_loop = np.isin(kinds, (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)))
         return float(gaps[rows & is_loop].max(initial=0)), float(gaps[rows & ~is_loop].max(initial=0))
 
-    def closed(self, free: np.ndarray, source: int | None, value: float, start: np.ndarray) -> np.ndarray:
-        """Return positions of the free joints that meet what couples them, for a position of the source."""
+    def closed(self, free: np.ndarray, start: np.ndarray) -> np.ndarray:
+        """Return positions of the free joints that meet what couples them, while the others stay at ``start`` [Q]."""
         q = start.copy()
-        if source is not None:
-            q[source] = value
 
         def cost(x: np.ndarray) -> np.ndarray:
             q[free] = x

@@ -9,13 +9,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from xreset.errors import RobotError
-from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import surface_of
 from xreset.geometry.urdf import RobotTree
-from xreset.geometry.urdf_writer import fixed, frame
+from xreset.geometry.urdf_writer import axes, fixed, frame
 from xreset.robot_tools.draft import draft_spec, link_places
 from xreset.robot_tools.opposition import closing_range, opposition, opposition_scores
 from xreset.spec import FingertipSpec, KeypointSpec, RobotSpec
@@ -42,13 +40,6 @@ _WRIST_BEHIND = 0.095
 """[m] The human wrist behind the knuckles."""
 _PALM_BEHIND = 0.04
 """[m] The palm's center behind the knuckles."""
-_PIN_SAMPLES = 9
-_PIN = 1e-3
-"""[m] By which the point of a linkage's pin may move in either body."""
-_PIN_TURN = 0.1
-"""Least change of a rotation matrix between two bodies that turn about a pin."""
-_PIN_BESIDE = 5e-3
-"""[m] Least distance of a pin from the bar's own joint."""
 _BEND = 0.15
 """Share of its range by which a finger's joint is bent at home."""
 
@@ -60,7 +51,8 @@ Poses = dict[str, np.ndarray]
 class Finger:
     """A chain of moving links from the palm to a tip."""
 
-    name: str = ""
+    name: str
+    """What it is called; empty if its names do not tell."""
     links: tuple[str, ...]
     """Its moving links from the palm on."""
     joints: tuple[str, ...]
@@ -156,42 +148,47 @@ def _find_fingers(spec: RobotSpec, tree: RobotTree, at: Poses, thumb: str | None
             f"below {spec.hand_root!r} there are {len(chains)} chains of moving links, expected a thumb and at least "
             "one finger."
         )
-    ends = np.array([_end(tree, chain, at) for chain in chains])
-    stated = [_stated_finger(tree, chain) for chain in chains]
-    known = "; ".join(", ".join(chain.links) for chain in chains)  # noqa: XR002
-    if thumb is None:
-        marked = [i for i, name in enumerate(stated) if name == "thumb"]
-    else:
-        marked = [i for i, chain in enumerate(chains) if thumb in (*chain.links, *chain.joints, *chain.rest)]
-        if len(marked) != 1:
-            raise RobotError(f"--thumb {thumb!r} is in {len(marked)} fingers; their links are {known}.")
-    if len(marked) == 1:
-        first = marked[0]
-    else:
-        tips = [_in_link(at[chain.links[-1]], end) for chain, end in zip(chains, ends, strict=True)]
-        scores = opposition_scores(opposition(spec, [chain.links[-1] for chain in chains], np.array(tips)))
-        first = int(scores.argmax())
-        if scores[first] == 0 and len(chains) > 2:
-            raise RobotError(f"no finger can oppose the others. Name a link of the thumb with --thumb: {known}.")
-        why = "it can oppose the others" if scores[first] else "the two are alike"
-        notes.append(f"the thumb is the finger of {', '.join(chains[first].links)}: {why} (--thumb says another)")
-    others = [i for i in range(len(chains)) if i != first]
-    named = {i: stated[i] for i in others}
-    if not set(named.values()) <= set(_FINGERS) or len(set(named.values())) < len(others):
+    first = _find_thumb(spec, tree, at, chains, thumb, notes)
+    others = [chain for chain in chains if chain is not first]
+    names = {chain.name for chain in others}
+    if not names <= set(_FINGERS) or len(names) < len(others):
         if len(others) > len(_FINGERS):
             raise RobotError(
                 f"the hand has {len(others)} fingers beside the thumb; xreset knows {', '.join(_FINGERS)}."
             )
-        bases = np.array([at[chain.links[0]][:3, 3] for chain in chains])
-        middle = bases[others].mean(axis=0)
-        across = np.linalg.svd(bases[others] - middle)[2][0]
-        across *= np.sign((ends[first] - middle) @ across) or 1.0
-        others.sort(key=lambda i: -float(bases[i] @ across))
-        named = dict(zip(others, _FINGERS, strict=False))
-        listed = "; ".join(f"{named[i]} is {chains[i].links[-1]}" for i in others)
+        bases = np.array([at[chain.links[0]][:3, 3] for chain in others])
+        middle = bases.mean(axis=0)
+        across = np.linalg.svd(bases - middle)[2][0]
+        across *= np.sign((_end(tree, first, at) - middle) @ across) or 1.0
+        order = np.argsort(-(bases @ across), kind="stable")
+        others = [replace(others[i], name=name) for i, name in zip(order, _FINGERS, strict=False)]
+        listed = "; ".join(f"{finger.name} is {finger.links[-1]}" for finger in others)
         notes.append(f"fingers are named from the thumb's side on: {listed}")
-    others.sort(key=lambda i: _FINGERS.index(named[i]))
-    return [replace(chains[first], name="thumb"), *(replace(chains[i], name=named[i]) for i in others)]
+    others.sort(key=lambda finger: _FINGERS.index(finger.name))
+    return [replace(first, name="thumb"), *others]
+
+
+def _find_thumb(
+    spec: RobotSpec, tree: RobotTree, at: Poses, chains: list[Finger], thumb: str | None, notes: list[str]
+) -> Finger:
+    """Return the chain with the stated link or joint, the one that is called so, or the one that opposes the others."""
+    known = "; ".join(", ".join(chain.links) for chain in chains)  # noqa: XR002
+    if thumb is None:
+        marked = [chain for chain in chains if chain.name == "thumb"]
+    else:
+        marked = [chain for chain in chains if thumb in (*chain.links, *chain.joints, *chain.rest)]
+        if len(marked) != 1:
+            raise RobotError(f"--thumb {thumb!r} is in {len(marked)} fingers; their links are {known}.")
+    if len(marked) == 1:
+        return marked[0]
+    tips = np.array([_in_link(at[chain.links[-1]], _end(tree, chain, at)) for chain in chains])
+    scores = opposition_scores(opposition(spec, [chain.links[-1] for chain in chains], tips))
+    first = int(scores.argmax())
+    if scores[first] == 0 and len(chains) > 2:
+        raise RobotError(f"no finger can oppose the others. Name a link of the thumb with --thumb: {known}.")
+    why = "it can oppose the others" if scores[first] else "the two are alike"
+    notes.append(f"the thumb is the finger of {', '.join(chains[first].links)}: {why} (--thumb says another)")
+    return chains[first]
 
 
 def _chains(tree: RobotTree, hand_root: str) -> list[Finger]:
@@ -204,7 +201,9 @@ def _chains(tree: RobotTree, hand_root: str) -> list[Finger]:
         if not moved_by.keys() & set(rest):
             links = [name for name in moving if end in tree.below(name)]
             joints = [moved_by[name] for name in links]
-            chains.append(Finger(links=tuple(links), joints=tuple(joints), rest=tuple(rest)))
+            fixed_joints = [joint.name for joint in tree.joints if joint.child in rest]
+            name = _stated_finger(" ".join((*links, *joints, *rest, *fixed_joints)))
+            chains.append(Finger(name=name, links=tuple(links), joints=tuple(joints), rest=tuple(rest)))
     return chains
 
 
@@ -215,47 +214,20 @@ def _drives_of(finger: Finger, spec: RobotSpec) -> set[str]:
 
 
 def _without_bars(spec: RobotSpec, chains: list[Finger], notes: list[str]) -> list[Finger]:
-    """Return the chains without the bars of linkages: a bar follows the same drive as a longer chain, and is pinned to
-    it."""
-    kinematics = Kinematics(spec, root=spec.hand_root)
-    if not len(kinematics.joint_names):
-        return chains
-    drives = [_drives_of(chain, spec) for chain in chains]
-    share = torch.linspace(0, 1, _PIN_SAMPLES, dtype=torch.float64)[:, None]
-    poses = kinematics.link_poses(kinematics.lower + share * (kinematics.upper - kinematics.lower)).numpy()
-    bars = {}
-    for i, chain in enumerate(chains):
-        for j, other in enumerate(chains):
-            if drives[i] != drives[j] or len(chain.links) >= len(other.links):
-                continue
-            bar = poses[:, kinematics.link_index(chain.links[-1])]
-            for link in other.links:
-                if _pinned(np.linalg.inv(poses[:, kinematics.link_index(link)]) @ bar):
-                    bars[chain.links[-1]] = link
+    """Return the chains without the bars of linkages: shorter chains of the same drive that no name calls a finger."""
+    bars = []
+    for chain in chains:
+        same = [other for other in chains if _drives_of(other, spec) == _drives_of(chain, spec)]
+        if not chain.name and len(chain.links) < max(len(other.links) for other in same):
+            bars.append(chain)
     if bars:
-        listed = ", ".join(f"{bar} (at {link})" for bar, link in bars.items())
-        notes.append(f"not fingers, but bars of a linkage: {listed}")
-    return [chain for chain in chains if chain.links[-1] not in bars]
+        notes.append(f"not fingers, but bars of a linkage: {', '.join(bar.links[-1] for bar in bars)}")
+    return [chain for chain in chains if chain not in bars]
 
 
-def _pinned(relative: np.ndarray) -> bool:
-    """Return whether a body turns about a point that is fixed in another, not about its own frame's origin, where its
-    joint is, given its poses [V, 4, 4] in the other's frame."""
-    rotations = relative[:, :3, :3]
-    identity = np.broadcast_to(-np.eye(3), rotations.shape)
-    A = np.concatenate((rotations, identity), axis=2).reshape(-1, 6)  # R p + t = c
-    b = -relative[:, :3, 3].reshape(-1)
-    point, *_ = np.linalg.lstsq(A, b, rcond=1e-6)
-    gaps = (A @ point - b).reshape(-1, 3)
-    turns = np.ptp(rotations, axis=0).max() > _PIN_TURN
-    return bool(turns and np.linalg.norm(gaps, axis=1).max() < _PIN and np.linalg.norm(point[:3]) > _PIN_BESIDE)
-
-
-def _stated_finger(tree: RobotTree, chain: Finger) -> str:
-    """Return the finger that the names of a chain state, or an empty text."""
-    fixed_joints = [joint.name for joint in tree.joints if joint.child in chain.rest]
-    text = " ".join((*chain.links, *chain.joints, *chain.rest, *fixed_joints))
-    text = re.sub("(?<=[a-z])(?=[A-Z][a-z])", "_", text).lower()  # leftThumb
+def _stated_finger(names: str) -> str:
+    """Return the finger that the names of links and joints state, or an empty text."""
+    text = re.sub("(?<=[a-z])(?=[A-Z][a-z])", "_", names).lower()  # leftThumb
     if code := _CODE.search(text):
         return _CODES[code[1]]
     for finger, words in _WORDS.items():
@@ -297,8 +269,7 @@ def _find_palm(
             "the fingers do not bend to one side when their joints move, so the palm's inner side is unknown."
         )
     z /= np.linalg.norm(z)
-    T = np.eye(4)
-    T[:3, :3] = np.stack((x, np.cross(z, x), z), axis=1)
+    T = axes(x=x, z=z)
     T[:3, 3] = bases.mean(axis=0) - _PALM_BEHIND * x
     return T, bent
 

@@ -124,11 +124,11 @@ def _pulls(model: mujoco.MjModel, problems: list[str], notes: list[str]) -> dict
         kind = mujoco.mjtTrn(int(model.actuator_trntype[actuator]))
         target = int(model.actuator_trnid[actuator, 0])
         if kind in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
-            pulls[actuator] = Pull([target], [1.0])
+            pulls[actuator] = {target: 1.0}
         elif kind == mujoco.mjtTrn.mjTRN_TENDON:
             begin = model.tendon_adr[target]
             wraps = slice(begin, begin + model.tendon_num[target])
-            pulls[actuator] = Pull(model.wrap_objid[wraps].tolist(), model.wrap_prm[wraps].tolist())
+            pulls[actuator] = dict(zip(model.wrap_objid[wraps].tolist(), model.wrap_prm[wraps].tolist(), strict=True))
             if (model.wrap_type[wraps] != int(mujoco.mjtWrap.mjWRAP_JOINT)).any():
                 problems.append(
                     f"the tendon {model.tendon(target).name!r}, which runs through space. Drive its joint by a "
@@ -150,8 +150,9 @@ def _tree(path: Path, model: mujoco.MjModel, couplings: Couplings) -> RobotTree:
         raise RobotError(f"{path}: expected one body in the world, found {', '.join(tops) or 'none'}.")
     data = mujoco.MjData(model)
     data.qpos[model.jnt_qposadr[model.jnt_type >= SLIDE]] = 0.0
-    for joint, position in couplings.held.items():
-        data.qpos[model.jnt_qposadr[joint]] = position
+    for joint, line in couplings.lines.items():
+        if not line.multiplier:
+            data.qpos[model.jnt_qposadr[joint]] = line.offset
     mujoco.mj_kinematics(model, data)
     links = {}
     joints = []
@@ -198,27 +199,27 @@ def _joint(
     T_parent_child: np.ndarray,
     axis: np.ndarray,
 ) -> Joint:
-    lower = -math.inf
-    upper = math.inf
+    limits = {}
     if model.jnt_limited[number]:
-        lower, upper = model.jnt_range[number].tolist()
+        limits = dict(zip(("lower", "upper"), model.jnt_range[number].tolist(), strict=True))
     name = joint_name(model, number)
+    kind = "prismatic" if model.jnt_type[number] == SLIDE else "revolute"
     mimic = None
-    if line := couplings.lines.get(number):
+    line = couplings.lines.get(number)
+    if line and line.multiplier:
         source = joint_name(model, line.source)
         mimic = MimicSpec(joint=name, source=source, multiplier=line.multiplier, offset=line.offset)
-    kind = "prismatic" if model.jnt_type[number] == SLIDE else "revolute"
+    elif line:
+        kind = "fixed"
     return Joint(
         name=name,
-        type="fixed" if number in couplings.held else kind,
+        type=kind,
         parent=parent,
         child=child,
         T_parent_joint=T_parent_child,
         axis=axis,
-        lower=lower,
-        upper=upper,
-        velocity=math.inf,
         mimic=mimic,
+        **limits,
     )
 
 

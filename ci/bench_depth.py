@@ -97,7 +97,7 @@ def depths(
 
 def _prepared(coal, shape: Shape) -> tuple[np.ndarray, object, np.ndarray, float]:
     """Pose, coal's geometry, and centre (homogeneous) and radius of a ball about it."""
-    points, radius = support_points(shape.geometry)
+    points, radius = support_points(shape)
     center = (points.max(axis=0) + points.min(axis=0)) / 2
     reach = radius + float(np.linalg.norm(points - center, axis=1).max())
-    return shape.T_body_shape, coal_geometry(coal, shape.geometry), shape.T_body_shape @ [*center, 1.0], reach
+    return shape.T_body_shape, coal_geometry(coal, shape.geometry), np.array([*center, 1.0]), reach

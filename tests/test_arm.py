@@ -18,7 +18,6 @@ from xreset.description import DESCRIPTION
 from xreset.description import load_robot as load
 from xreset.errors import RobotError
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.rotations import matrix_to_quat, quat_multiply
 from xreset.plugins import robot_folder
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.arm.model import ArmModel, ArmTargets
@@ -59,23 +58,6 @@ class PlaceTest(unittest.TestCase):
         self.assertGreater(self.reached.reached, 0.95)
         self.assertGreater(self.reached.dexterity, 0.1)
         self.assertEqual(placing.reach(self.lost, self.wrists), Reach(reached=0.0, dexterity=0.0))
-
-    def test_reach_moves_with_the_scene(self):
-        """Turned about the vertical together, base and wrists keep their reach; the table's top is everywhere at the
-        same height."""
-        turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=FLOAT)
-        quat = matrix_to_quat(turn)
-        moved = dataclasses.replace(
-            self.wrists,
-            root_pos=self.wrists.root_pos @ turn.T,
-            root_quat=quat_multiply(quat.expand_as(self.wrists.root_quat), self.wrists.root_quat),
-        )
-        there = dataclasses.replace(
-            self.robot,
-            base_pos=tuple((turn @ torch.tensor(self.robot.base_pos, dtype=FLOAT)).tolist()),
-            base_quat=tuple(quat_multiply(quat, torch.tensor(self.robot.base_quat, dtype=FLOAT)).tolist()),
-        )
-        self.assertAlmostEqual(placing.reach(there, moved).reached, self.reached.reached, delta=0.03)
 
     def test_a_robot_that_stands_wrong_is_moved_to_where_it_reaches(self):
         seen = []
@@ -188,31 +170,6 @@ class DirectionTest(unittest.TestCase):
 
 
 class SpliceTest(unittest.TestCase):
-    """Two paths of one joint: one is good early, the other late."""
-
-    def spliced(self, distance: float, **changes) -> list[float]:
-        paths = torch.zeros(1, 2, 6, 1, dtype=FLOAT)
-        paths[0, 1] = distance
-        worth = torch.tensor([[[1.0, 1, 1, 0, 0, 0], [0, 0, 0, 1, 1, 1]]], dtype=FLOAT)
-        arguments = {
-            "cost": torch.zeros_like(worth),
-            "annotated": torch.ones(1, 6, dtype=torch.bool),
-            "switch_cost": 0.5,
-        }
-        return splice(paths, worth=worth, jump=0.35, **(arguments | changes))[0, :, 0].tolist()
-
-    def test_each_path_is_followed_where_it_is_good(self):
-        self.assertEqual(self.spliced(0.2), [0, 0, 0, 0.2, 0.2, 0.2])
-
-    def test_a_jump_is_worth_nothing_but_allows_the_rest(self):
-        self.assertIn(self.spliced(1.0), ([0, 0, 0, 1, 1, 1], [0, 0, 1, 1, 1, 1]))
-        self.assertEqual(len(set(self.spliced(1.0, switch_cost=2.5))), 1)
-
-    def test_cost_counts_in_every_frame(self):
-        cost = torch.zeros(1, 2, 6, dtype=FLOAT)
-        cost[0, 1] = 0.9  # following the second one for three frames brings 3, and costs 2.7 and the switch
-        self.assertEqual(self.spliced(0.2, cost=cost), [0.0] * 6)
-
     def test_against_all_combinations(self):
         generator = torch.Generator().manual_seed(0)
         paths = torch.rand(3, 3, 5, 2, generator=generator, dtype=FLOAT)

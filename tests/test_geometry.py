@@ -9,7 +9,7 @@ import trimesh
 
 from tests.toy_retarget import FLOAT, UPRIGHT, box_object
 from xreset import robots
-from xreset.geometry.balls import BARE, SPACING, inscribed_balls, shape_balls, sharp_points
+from xreset.geometry.balls import BARE, SPACING, inscribed_balls, link_balls, sharp_points
 from xreset.geometry.collision import SelfCollision, height_above_table, support_points
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics
@@ -77,7 +77,7 @@ class ShapesTest(unittest.TestCase):
         for geometry in self.PRIMITIVES:
             with self.subTest(kind=geometry.kind):
                 centers, radius = inscribed_balls(geometry)
-                points, ball = support_points(geometry)
+                points, ball = support_points(Shape(geometry=geometry))
                 if len(points) > 3:
                     planes = half_spaces(hull(points))
                     depth = -(centers @ planes[:, :3].T + planes[:, 3]).max(axis=1)
@@ -99,14 +99,14 @@ class ShapesTest(unittest.TestCase):
         """Without balls under its surface the OpenArm's gripper was 7 mm deep between its balls, and bananas sank
         in."""
         for shape in (box((0, 0, 0), (0.05, 0.14, 0.04)), hull(trimesh.creation.cone(0.04, 0.08).vertices)):
-            centers, radii = shape_balls(shape)
+            centers, radii = link_balls([shape])
             surface = trimesh.sample.sample_surface(shape_mesh(shape), 4000, seed=0)[0]
             bare = (np.linalg.norm(surface[:, None] - centers, axis=-1) - radii).min(axis=1)
             self.assertLess(np.quantile(bare, 0.98), BARE + SPACING / 2)
             planes = half_spaces(shape)
             outside = (centers @ planes[:, :3].T + planes[:, 3]).max(axis=1) + radii
             self.assertLess(outside[radii < radii.max()].max(), 1e-3)
-        self.assertTrue((shape_balls(Shape(geometry=self.CAPSULE))[1] == 0.01).all())
+        self.assertTrue((link_balls([Shape(geometry=self.CAPSULE)])[1] == 0.01).all())
 
     def test_near_points_of_several_solids_are_those_that_looking_at_all_of_them_finds(self):
         sizes = ((0.06, 0.04, 0.02), (0.02, 0.02, 0.1))

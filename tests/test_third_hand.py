@@ -8,10 +8,8 @@ import sys
 import tempfile
 import unittest
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
-import torch
 
 from tests import allegro_plugin
 from xreset.cli import main
@@ -19,7 +17,6 @@ from xreset.demos.archive import read_demos, write_demos
 from xreset.demos.synth import synthesize
 from xreset.description import load_robot as load
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.urdf import load_urdf
 from xreset.plugins import robot_names
 from xreset.resets.bank import read_bank
 from xreset.retarget.file import read_retargeted
@@ -57,26 +54,6 @@ class ThirdHandTest(unittest.TestCase):
         findings = check(allegro_plugin.NAME)
         self.assertEqual([f for f in findings if f.level in ("warning", "error")], [])
 
-    def test_its_kinematics_are_the_package_s(self):
-        """The hand below its palm, against the package's own file, at random joint positions."""
-        import mujoco
-
-        hand = load_urdf(allegro_plugin.package_urdf())
-        model = mujoco.MjModel.from_xml_string(_for_mujoco(allegro_plugin.package_urdf()))
-        data = mujoco.MjData(model)
-        kinematics = Kinematics(self.robot, root=hand.root)
-        tips = [tip.link for tip in self.robot.fingertips]
-        generator = torch.Generator().manual_seed(0)
-        q = kinematics.lower + (kinematics.upper - kinematics.lower) * torch.rand(
-            20, 16, generator=generator, dtype=torch.float64
-        )
-        found = kinematics.points(q, tips).numpy()
-        names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in range(model.njnt)]
-        for row, expected in zip(q.numpy(), found, strict=True):
-            data.qpos[[model.jnt_qposadr[names.index(name)] for name in kinematics.joint_names]] = row
-            mujoco.mj_kinematics(model, data)
-            np.testing.assert_allclose([data.body(tip).xpos for tip in tips], expected, atol=1e-6)
-
     def test_demonstrations_become_states_that_physics_accepts(self):
         files = {name: str(self.folder / f"{name}.npz") for name in ("demos", "retargeted", "resets")}
         write_demos(files["demos"], synthesize(OBJECTS, per_object=1, seed=0))
@@ -96,18 +73,6 @@ class ThirdHandTest(unittest.TestCase):
         self.assertGreater(bank.post_contact.sum(), 0.5 * (trajectories.valid & trajectories.post_contact).sum())
         rows = json.loads((self.folder / "resets.accounts.json").read_text())["rows"]
         self.assertEqual(rows[-1]["kept"], bank.num_states)
-
-
-def _for_mujoco(urdf: Path) -> str:
-    """The package's file without its meshes, which MuJoCo would look for, and with its tips, which MuJoCo would fuse."""
-    root = ElementTree.parse(urdf).getroot()
-    for link in root.findall("link"):
-        for visual in link.findall("visual"):
-            link.remove(visual)
-    ElementTree.SubElement(
-        ElementTree.SubElement(root, "mujoco"), "compiler", fusestatic="false", balanceinertia="true"
-    )
-    return ElementTree.tostring(root, encoding="unicode")
 
 
 if __name__ == "__main__":

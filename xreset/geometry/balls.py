@@ -93,9 +93,7 @@ def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> 
         shapes = hand.tree.link(name).collisions
         if not shapes:
             continue
-        balls = [shape_balls(shape) for shape in shapes]
-        own_centers = np.concatenate([ball_centers for ball_centers, _ in balls])
-        own_radii = np.concatenate([ball_radii for _, ball_radii in balls])
+        own_centers, own_radii = link_balls(shapes)
         chosen = _apart(own_centers, own_radii, APART)
         gaps = np.linalg.norm(own_centers[chosen][:, None] - own_centers, axis=-1)
         has_neighbor = (gaps <= APART).sum(axis=1) > 1
@@ -173,7 +171,7 @@ def inscribed_balls(geometry: Geometry) -> tuple[np.ndarray, float]:
     if geometry.kind == "sphere":
         return center[None], geometry.size[0]
     if geometry.kind == "hull":
-        points, _ = support_points(geometry)
+        points = np.asarray(geometry.vertices)
         low = points.min(axis=0)
         high = points.max(axis=0)
         center = (low + high) / 2
@@ -201,7 +199,7 @@ def _grid(half: Iterable[float], radius: float) -> np.ndarray:
 def sharp_points(geometry: Geometry, spacing: float) -> np.ndarray:
     """[n, 3] points where a shape stands out of the balls in it: a box's edges, a cylinder's rims, a hull's
     vertices."""
-    points, radius = support_points(geometry)
+    points, radius = support_points(Shape(geometry=geometry))
     if radius > 0:
         return np.zeros((0, 3))
     if geometry.kind != "box":
@@ -245,10 +243,15 @@ def shell_balls(geometry: Geometry, centers: np.ndarray, radius: float) -> tuple
     return bare[_apart(bare, np.zeros(len(bare)), small)], small
 
 
-def shape_balls(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
-    """Fill one shape with balls: centers [n, 3] in the link's frame and radii [n]."""
-    inner, radius = inscribed_balls(shape.geometry)
-    shell, small = shell_balls(shape.geometry, inner, radius)
-    sharp = sharp_points(shape.geometry, max(min(radius, small), SPACING))
-    points = np.concatenate((inner, shell, sharp)) @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3]
-    return points, np.repeat([radius, small, 0.0], [len(inner), len(shell), len(sharp)])
+def link_balls(shapes: Sequence[Shape]) -> tuple[np.ndarray, np.ndarray]:
+    """Fill the shapes of a link with balls: centers [n, 3] in the link's frame and radii [n]."""
+    centers = []
+    radii = []
+    for shape in shapes:
+        inner, radius = inscribed_balls(shape.geometry)
+        shell, small = shell_balls(shape.geometry, inner, radius)
+        sharp = sharp_points(shape.geometry, max(min(radius, small), SPACING))
+        points = np.concatenate((inner, shell, sharp))
+        centers.append(points @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3])
+        radii.append(np.repeat([radius, small, 0.0], [len(inner), len(shell), len(sharp)]))
+    return np.concatenate(centers), np.concatenate(radii)

@@ -19,33 +19,36 @@ from torch import Tensor
 from xreset.errors import XResetError
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import RobotTree
-from xreset.spec import Geometry, RobotSpec, TableSpec
+from xreset.spec import Geometry, RobotSpec, Shape, TableSpec
 
 _RIM_POINTS = 16
 """Support points on each rim of a cylinder."""
 
 
-def support_points(geometry: Geometry) -> tuple[np.ndarray, float]:
-    """Return points [H, 3] and a radius such that the shape is the convex hull of balls of that radius around the
-    points.
+def support_points(shape: Shape) -> tuple[np.ndarray, float]:
+    """Return points [H, 3] in the body's frame and a radius such that the shape is the convex hull of balls of that
+    radius around the points.
 
     Exact for boxes, spheres, capsules and hulls; a cylinder's rims are regular polygons whose corners lie on the rim.
     """
+    geometry = shape.geometry
     size = geometry.size
+    radius = 0.0
     if geometry.kind == "box":
-        return np.array(np.meshgrid(*([-half, half] for half in size))).reshape(3, -1).T, 0.0
-    if geometry.kind == "sphere":
-        return np.zeros((1, 3)), size[0]
-    if geometry.kind == "capsule":
-        radius, half = size
-        return np.array([[0, 0, -half], [0, 0, half]]), radius
-    if geometry.kind == "cylinder":
-        radius, half = size
+        points = np.array(np.meshgrid(*([-half, half] for half in size))).reshape(3, -1).T
+    elif geometry.kind == "sphere":
+        points = np.zeros((1, 3))
+        radius = size[0]
+    elif geometry.kind == "capsule":
+        points = np.array([[0, 0, -size[1]], [0, 0, size[1]]])
+        radius = size[0]
+    elif geometry.kind == "cylinder":
         angle = np.arange(_RIM_POINTS) * (2 * np.pi / _RIM_POINTS)
-        rim = np.stack((radius * np.cos(angle), radius * np.sin(angle)), axis=1)
-        return np.concatenate([np.column_stack((rim, np.full(_RIM_POINTS, z))) for z in (-half, half)]), 0.0
-    assert geometry.vertices is not None
-    return np.asarray(geometry.vertices, dtype=float), 0.0
+        rim = np.stack((size[0] * np.cos(angle), size[0] * np.sin(angle)), axis=1)
+        points = np.concatenate([np.column_stack((rim, np.full(_RIM_POINTS, z))) for z in (-size[1], size[1])])
+    else:
+        points = np.asarray(geometry.vertices, dtype=float)
+    return points @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3], radius
 
 
 class SupportPoints(NamedTuple):
@@ -68,10 +71,10 @@ def table_points(robot: RobotSpec, kinematics: Kinematics) -> SupportPoints:
         if name in robot.table_exclude:
             continue
         for shape in kinematics.tree.link(name).collisions:
-            local, radius = support_points(shape.geometry)
-            points.append(local @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3])
-            links += [name] * len(local)
-            radii += [radius] * len(local)
+            own, radius = support_points(shape)
+            points.append(own)
+            links += [name] * len(own)
+            radii += [radius] * len(own)
     return SupportPoints(links=tuple(links), points=np.concatenate(points), radii=np.array(radii))
 
 
@@ -124,12 +127,12 @@ class SelfCollision:
             if only is not None and name not in only:
                 continue
             for shape in kinematics.tree.link(name).collisions:
-                points, radius = support_points(shape.geometry)
+                points, radius = support_points(shape)
                 center = (points.max(axis=0) + points.min(axis=0)) / 2
                 self._link.append(name)
                 self._geometry.append(coal_geometry(coal, shape.geometry))
                 local.append(shape.T_body_shape)
-                centers.append(shape.T_body_shape[:3, :3] @ center + shape.T_body_shape[:3, 3])
+                centers.append(center)
                 radii.append(radius + float(np.linalg.norm(points - center, axis=1).max()))
         self._index = [kinematics.link_index(name) for name in self._link]
         self._T_link_shape = np.array(local).reshape(-1, 4, 4)

@@ -151,9 +151,12 @@ class Kinematics:
         row = {joint.name: i for i, joint in enumerate(moving)}
         self._turns = [joint.type == "revolute" for joint in moving]
         self._steps: list[_Step] = []
+        self._above = [{0}]
+        """Each link and the links above it."""
         self._ancestry = torch.zeros(len(self.link_names), len(moving), dtype=torch.bool)
         for i, joint in enumerate(joints, start=1):
             parent = self._link_index[joint.parent]
+            self._above.append(self._above[parent] | {i})
             self._ancestry[i] = self._ancestry[parent]
             R = joint.T_parent_joint[:3, :3]
             rotations = R
@@ -209,12 +212,11 @@ class Kinematics:
             [..., L, 4, 4] pose of each link in the frame of ``base`` (the world).
         """
         indices = [self.link_index(name) for name in (self.link_names if links is None else links)]
-        rotations, positions, _, _ = self._forward(q, base, indices)
-        batch = q.shape[:-1]
-        poses = q.new_zeros(*batch, len(indices), 4, 4)
-        for slot, i in enumerate(indices):
-            poses[..., slot, :3, :3] = rotations[i].view(*batch, 3, 3)
-            poses[..., slot, :3, 3] = positions[i].view(*batch, 3)
+        rot, pos, _, _ = self._forward(q, base, indices)
+        shape = (*q.shape[:-1], len(indices))
+        poses = q.new_zeros(*shape, 4, 4)
+        poses[..., :3, :3] = rot.view(*shape, 3, 3)
+        poses[..., :3, 3] = pos.view(*shape, 3)
         poses[..., 3, 3] = 1.0
         return poses
 
@@ -252,9 +254,7 @@ class Kinematics:
         joint adds to the column of its source, times its multiplier (chain rule).
         """
         indices = [self.link_index(name) for name in links]
-        rotations, positions, axes, origins = self._forward(q, base, indices)
-        rot = torch.stack([rotations[i] for i in indices], dim=1)
-        pos = torch.stack([positions[i] for i in indices], dim=1)
+        rot, pos, axes, origins = self._forward(q, base, indices)
         shape = (*q.shape[:-1], len(indices))
         if offsets is not None:
             pos = pos + matvec(rot, offsets.expand(*shape, 3).reshape(pos.shape))
@@ -285,9 +285,8 @@ class Kinematics:
         return torch.as_tensor(np.asarray(values), dtype=self.dtype).to(self.device)
 
     def _forward(self, q: Tensor, base: Tensor | None, wanted: Sequence[int]):
-        """Return rotations [B, 3, 3] and positions [B, 3] of the wanted links and their ancestors, by link index, and
-        the axes and origins [B, 3] of the joints between, by row among the moving joints.
-        """
+        """Return rotations [B, n, 3, 3] and positions [B, n, 3] of the wanted links, and the axes and origins [B, 3] of
+        the joints above them, by row among the moving joints."""
         if q.shape[-1] != len(self.joint_names):
             expected = f"{len(self.joint_names)} ({', '.join(self.joint_names)})"
             raise ValueError(f"q has {q.shape[-1]} joints, expected {expected}")
@@ -299,7 +298,7 @@ class Kinematics:
         positions = {0: base[:, :3, 3]}
         axes: dict[int, Tensor] = {}
         origins: dict[int, Tensor] = {}
-        needed = self._with_ancestors(wanted)
+        needed = set().union(*(self._above[i] for i in wanted))
         for i, step in enumerate(self._steps, start=1):
             if i not in needed:
                 continue
@@ -318,11 +317,5 @@ class Kinematics:
                     rotation = still + sines[:, joint, None, None] * turn + cosines[:, joint, None, None] * turn_twice
             rotations[i] = rotation
             positions[i] = origin
-        return rotations, positions, axes, origins
-
-    def _with_ancestors(self, links: Sequence[int]) -> set[int]:
-        needed = set(links)
-        for i in range(len(self._steps), 0, -1):
-            if i in needed:
-                needed.add(self._steps[i - 1].parent)
-        return needed
+        rot = torch.stack([rotations[i] for i in wanted], dim=1)
+        return rot, torch.stack([positions[i] for i in wanted], dim=1), axes, origins

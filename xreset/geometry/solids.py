@@ -32,9 +32,9 @@ def link_field(shapes: Sequence[Shape]) -> DistanceFields:
     The gaps are closed as in mathematical morphology: what a ball of diameter :data:`GAP` outside the shapes cannot
     reach is inside. Flat and convex surfaces stay in place.
     """
-    corners = np.concatenate([_bounding_box(shape) for shape in shapes])
-    low = corners.min(axis=0)
-    high = corners.max(axis=0)
+    support = [support_points(shape) for shape in shapes]
+    low = np.min([points.min(axis=0) - radius for points, radius in support], axis=0)
+    high = np.max([points.max(axis=0) + radius for points, radius in support], axis=0)
     reach = GAP / 2
     origin = low - reach - 2 * _SPACING
     counts = np.ceil((high - origin + reach + 2 * _SPACING) / _SPACING).astype(int) + 1
@@ -86,10 +86,3 @@ def _distance_from_hull(shape: Shape, points: np.ndarray) -> np.ndarray:
     to_samples, _ = cKDTree(vertices).query(points[outside])
     distance[outside] = np.maximum(distance[outside], to_samples - 3e-4)
     return distance
-
-
-def _bounding_box(shape: Shape) -> np.ndarray:
-    """[2, 3] corners of the shape's bounding box along the axes of the link."""
-    points, radius = support_points(shape.geometry)
-    points = points @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3]
-    return np.stack((points.min(axis=0) - radius, points.max(axis=0) + radius))

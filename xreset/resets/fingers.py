@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.geometry.balls import shape_balls
+from xreset.geometry.balls import link_balls
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
 from xreset.geometry.surface import Surface
@@ -108,9 +108,7 @@ def _balls(kinematics: Kinematics, link: str) -> tuple[Tensor, Tensor]:
     shapes = kinematics.tree.link(link).collisions
     if not shapes:
         return torch.zeros(1, 3, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
-    balls = [shape_balls(shape) for shape in shapes]
-    centers = np.concatenate([center for center, _ in balls])
-    radii = np.concatenate([radius for _, radius in balls])
+    centers, radii = link_balls(shapes)
     return torch.as_tensor(centers), torch.as_tensor(radii)
 
 

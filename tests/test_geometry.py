@@ -10,7 +10,7 @@ import trimesh
 from tests.toy_retarget import FLOAT, UPRIGHT, box_object
 from xreset import robots
 from xreset.geometry.balls import BARE, SPACING, inscribed_balls, link_balls, sharp_points
-from xreset.geometry.collision import SelfCollision, height_above_table, support_points
+from xreset.geometry.collision import SelfCollision, height_above_table
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import box, half_spaces, hull, shape_mesh
@@ -77,22 +77,14 @@ class ShapesTest(unittest.TestCase):
         for geometry in self.PRIMITIVES:
             with self.subTest(kind=geometry.kind):
                 centers, radius = inscribed_balls(geometry)
-                points, ball = support_points(Shape(geometry=geometry))
-                if len(points) > 3:
-                    planes = half_spaces(hull(points))
-                    depth = -(centers @ planes[:, :3].T + planes[:, 3]).max(axis=1)
-                    self.assertGreaterEqual(depth.min(), radius - ball - 3e-4)  # a rim is a polygon
-                else:
-                    np.testing.assert_allclose(np.abs(centers).max(axis=0), np.abs(points).max(axis=0))
-                    self.assertEqual(radius, ball)
+                depth = -signed_distance(Shape(geometry=geometry), centers)
+                self.assertGreaterEqual(depth.min(), radius - 1e-9)
 
     def test_sharp_points_lie_on_edges_and_round_shapes_have_none(self):
         points = sharp_points(self.BOX, 0.01)
         at_side = np.isclose(np.abs(points), self.BOX.size).sum(axis=1)
-        self.assertTrue((at_side >= 2).all())
+        self.assertEqual(set(at_side.tolist()), {2, 3})
         self.assertEqual((at_side == 3).sum(), 8)
-        lonely = np.linalg.norm(points[:, None] - points, axis=-1) + np.eye(len(points))
-        self.assertLessEqual(lonely.min(axis=1).max(), 0.01 + 1e-12)
         self.assertEqual(len(sharp_points(self.SPHERE, 0.01)) + len(sharp_points(self.CAPSULE, 0.01)), 0)
 
     def test_no_surface_of_a_thick_shape_lies_bare(self):
@@ -118,8 +110,9 @@ class ShapesTest(unittest.TestCase):
         value, direction = fields.signed_distance(points, which)
         expected = (value < limit).nonzero()[:, 0]
         self.assertGreater(len(expected), 500)
-        for found, of_all in zip(fields.nearer(points, which, limit), (None, value, direction), strict=True):
-            self.assertTrue(torch.equal(found, expected if of_all is None else of_all[expected]))
+        rows, near, slope = fields.nearer(points, which, limit)
+        self.assertTrue(torch.equal(rows, expected))
+        self.assertTrue(torch.equal(near, value[expected]) and torch.equal(slope, direction[expected]))
 
     def test_a_link_of_thin_walls_is_solid_for_other_links_and_no_thicker(self):
         # A tube, open at both ends.
@@ -181,16 +174,11 @@ class SelfCollisionTest(unittest.TestCase):
             self.assertIn("right_index", a + b)
 
     def test_self_collision_names_the_links(self):
-        hand = Kinematics(self.robot, root=self.robot.hand_root)
-        counted = SelfCollision(self.robot, hand, only=self.robot.self_collision_links).link_pairs
         reason = np.array([0, REASONS.index("self collision")])
         result = SimpleNamespace(joint_pos=self.home_and(*self.CROSSED), reason=reason)
         found = colliding_links(result, self.robot)  # pyright: ignore[reportArgumentType]
-        names = {link for link in hand.link_names if "middle" in link or "ring" in link}
-        fingers = [pair for pair in found if set(pair) <= names]
-        self.assertTrue(fingers, found)
+        self.assertTrue(any("middle" in a and "ring" in b for a, b in found), found)
         self.assertEqual(set(found.values()), {1})
-        self.assertLessEqual(set(fingers), set(counted))
         result.reason = np.zeros(2)
         self.assertEqual(colliding_links(result, self.robot), {})  # pyright: ignore[reportArgumentType]
 

@@ -142,16 +142,18 @@ class Dynamics(unittest.TestCase):
         model = mujoco.MjModel.from_xml_path(str(robot.urdf))
         data = mujoco.MjData(model)
         (mimic,) = robot.mimics
-        source = robot.joint_names.index(mimic.source)
-        names = [model.joint(i).name for i in range(model.njnt)]
-        rates = np.eye(len(robot.joints))[
-            [robot.joint_names.index(mimic.source if n == mimic.joint else n) for n in names]
-        ]
-        rates[names.index(mimic.joint), source] = mimic.multiplier
+        rates = np.zeros((model.nv, len(robot.joints)))
+        for row in range(model.njnt):
+            name = model.joint(row).name
+            factor = 1.0
+            if name == mimic.joint:
+                name = mimic.source
+                factor = mimic.multiplier
+            rates[row, robot.joint_names.index(name)] = factor
         data.qpos = rates @ robot.home
         mujoco.mj_forward(model, data)
         M = np.zeros((model.nv, model.nv))
-        mujoco.mj_fullM(model, M, data.qM)
+        mujoco.mj_fullM(model, data, M)
         np.testing.assert_allclose(mass_matrix(robot, robot.home), rates.T @ M @ rates, atol=1e-6)
 
 

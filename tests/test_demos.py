@@ -79,27 +79,15 @@ class Archive(InFolder):
 
     def test_bad_values_name_sequence_and_frame(self):
         begin = self.demos.frames(1).start
-        end = self.demos.frames(1).stop
-        first_name = str(self.demos.sequence_name[0])
+        where = "First in frame {} of sequence 1".format
         for demos, message in (
-            (
-                self.changed("hand_keypoints", (begin + 3, 8, 1), np.nan),
-                "hand_keypoints is not finite.* First in frame 3 of sequence 1",
-            ),
-            (
-                self.changed("wrist_quat_wxyz", begin + 4, np.nan),
-                "wrist_quat_wxyz is not a unit .* frame 4 of sequence 1",
-            ),
-            (self.changed("object_pos", (begin, 2), np.inf), "object_pos is not finite.* frame 0 of sequence 1"),
-            (
-                self.changed("object_quat_wxyz", end - 1, (1, 1, 0, 0)),
-                r"not a unit quaternion.* frame \d+ of sequence 1",
-            ),
-            (self.changed("object_pos", (begin, 2), 200), "object_pos is .* more than 100 m .*frame 0 of sequence 1"),
+            (self.changed("hand_keypoints", (begin + 3, 8, 1), np.nan), "hand_keypoints is not finite.*" + where(3)),
+            (self.changed("wrist_quat_wxyz", begin + 4, np.nan), "wrist_quat_wxyz is not a unit .*" + where(4)),
+            (self.changed("object_pos", (begin, 2), 200), "object_pos is .* more than 100 m .*" + where(0)),
+            (self.changed("object_quat_wxyz", begin + 1, (1, 1, 0, 0)), "not a unit quaternion.*" + where(1)),
             (self.changed("hand_side", 2, "Right"), r"sequence 2 .* hand_side 'Right', expected 'right' or 'left'"),
             (self.changed("frame_offsets", 2, 0), "frame_offsets must increase"),
-            (self.changed("frame_offsets", -1, 5), "expected 0 to"),
-            (self.changed("sequence_name", 1, first_name), "must be unique"),
+            (self.changed("sequence_name", 1, self.demos.sequence_name[0]), "must be unique"),
             (replace(self.demos, hand_keypoints=1000 * self.demos.hand_keypoints), "Are these millimetres"),
             (replace(self.demos, fps=0.0), "fps"),
             (replace(self.demos, subjects=np.array(["a"])), "belong together"),
@@ -107,8 +95,6 @@ class Archive(InFolder):
             with self.subTest(message), self.assertRaisesRegex(DemoError, message):
                 write_demos(self.folder / "bad.npz", demos)
             self.assertEqual(list(self.folder.iterdir()), [])
-
-    def test_reader_refuses_what_the_writer_would(self):
         path = self.folder / "a.npz"
         write_demos(path, self.demos)
         with np.load(path) as file:
@@ -118,31 +104,24 @@ class Archive(InFolder):
         with self.assertRaisesRegex(FileFormatError, r"a\.npz.*not finite.* frame 7 of sequence 0 \(synthetic/005"):
             read_demos(path)
 
-    def names(self, *indices):
-        return [str(self.demos.sequence_name[i]) for i in indices]
-
     def test_select(self):
-        name = self.names(1)
+        names = self.demos.sequence_name
         for options, indices in (
-            ({"objects": ["banana"]}, (2, 3)),
-            ({"max_per_object": 1}, (0, 2)),
-            ({"indices": [3, 0]}, (3, 0)),
-            ({"names": name, "sides": ["right"], "subjects": ["synthetic"]}, (1,)),
+            ({"objects": ["banana"]}, [2, 3]),
+            ({"max_per_object": 1}, [0, 2]),
+            ({"indices": [3, 0]}, [3, 0]),
+            ({"names": names[1:2], "sides": ["right"], "subjects": ["synthetic"]}, [1]),
         ):
-            self.assertEqual(self.demos.select(**options).sequence_name.tolist(), self.names(*indices))
+            self.assertEqual(self.demos.select(**options).sequence_name.tolist(), names[indices].tolist())
         picked = self.demos.select(indices=[3, 0])
         whole = self.demos.hand_keypoints[self.demos.frames(3)]
         np.testing.assert_array_equal(picked.hand_keypoints[picked.frames(0)], whole)
         np.testing.assert_array_equal(picked.goal_pose[0][1], self.demos.object_pos[self.demos.frames(0)][-1])
-        np.testing.assert_array_equal(picked.start_pose[1][1], self.demos.object_quat_wxyz[0])
         for options, message in (
-            ({"objects": ["tuna"]}, "'tuna'. Choose from: 005_tomato_soup_can"),
             ({"sides": ["left"]}, r"no hand_side left. Choose from: \['right"),
-            ({"names": ["x"]}, "no sequence_name x"),
             ({"indices": [4]}, "there are 4 sequences"),
             ({"indices": [0], "objects": ["banana"]}, "No sequence meets"),
-            ({"objects": ["soup", "cup", "tuna", "mug"]}, "Unknown objects 'cup', 'tuna', 'mug'"),
-            ({"subjects": ["anna"]}, "no subject anna"),
+            ({"objects": ["soup", "cup", "mug"]}, "Unknown objects 'cup', 'mug'. Choose from: 005_tomato_soup_can"),
             ({"share": 0.0}, "share is 0, expected"),
         ):
             with self.assertRaisesRegex(DemoError, message):
@@ -151,29 +130,25 @@ class Archive(InFolder):
     def test_split_by_share_spread_and_chance(self):
         parts = [replace(self.demos, sequence_name=np.array([f"{i}{j}" for j in range(4)])) for i in range(6)]
         demos = merge_demos(parts)  # 12 sequences of each object
+        alone = demos.select(objects=["soup"])
         for options, soup in (
             ({"share": 0.25}, ["00", "01", "10"]),
             ({"max_per_object": 3, "spread": True}, ["01", "21", "41"]),
-            ({"max_per_object": 3, "seed": 1}, None),
+            # the choice for an object depends on the seed alone
+            ({"max_per_object": 3, "seed": 1}, alone.select(max_per_object=3, seed=1).sequence_name.tolist()),
         ):
             with self.subTest(**options):
                 kept, rest = demos.split(**options)
                 self.assertEqual((len(kept), len(rest)), (6, 18))
                 self.assertFalse(set(kept.sequence_name) & set(rest.sequence_name))
-                alone = demos.select(objects=["soup"]).select(**options).sequence_name.tolist()
-                if soup:
-                    self.assertEqual(kept.select(objects=["soup"]).sequence_name.tolist(), soup)
-                else:  # the choice for an object depends on the seed alone
-                    self.assertEqual(kept.select(objects=["soup"]).sequence_name.tolist(), alone)
-                    other = demos.select(objects=["soup"], max_per_object=3, seed=2)
-                    self.assertNotEqual(other.sequence_name.tolist(), alone)
+                self.assertEqual(kept.select(objects=["soup"]).sequence_name.tolist(), soup)
+        self.assertNotEqual(alone.select(max_per_object=3, seed=2).sequence_name.tolist(), soup)
         with self.assertRaisesRegex(DemoError, "none is left"):
             demos.split(share=1.0)
 
     def test_merge_demos(self):
         parts = [self.demos.select(indices=[i]) for i in range(4)]
-        self.assert_same(merge_demos(parts), self.demos)
-        self.assert_same(merge_demos([self.demos, parts[2], self.demos]), self.demos)
+        self.assert_same(merge_demos([*parts, parts[2], self.demos]), self.demos)
         T = np.eye(4)[None].copy()
         T[0, 2, 3] = 0.01
         tilted = replace(parts[0], subjects=np.array(["synthetic"]), T_level_from_table=T)
@@ -312,17 +287,17 @@ class DexYCB(InFolder):
             ({"serials": ["000000000000"]}, "no camera of meta.yml"),
             ({"ycb_grasp_ind": 2}, "not a meta.yml of DexYCB.*list index out of range"),
             ({"mano_sides": ["up"]}, "side is out of range"),
-            ({"num_frames": "many"}, "invalid literal for int"),
-            ({"ycb_ids": [2, 99]}, "KeyError"),
         ):
             self.write_meta(**changes)
             self.refused(message)
         self.write_meta()
         text = self.calibration.read_text()
-        self.calibration.write_text(text.replace("apriltag", "tag"))
-        self.refused("no pose 'apriltag'")
-        self.calibration.write_text(text.replace("tuple\n  - ", "tuple\n  - 7"))
-        self.refused("expected the 12 numbers of a rotation")
+        for wrong, message in (
+            (text.replace("apriltag", "tag"), "no pose 'apriltag'"),
+            (text.replace("tuple\n  - ", "tuple\n  - 7"), "expected the 12 numbers of a rotation"),
+        ):
+            self.calibration.write_text(wrong)
+            self.refused(message)
         self.calibration.unlink()
         self.refused("calibration")
         self.refused("no DexYCB sequence", root=self.folder / "calibration")
@@ -361,15 +336,6 @@ class RealData(unittest.TestCase):
                 self.assertLess(angles(a.wrist_quat_wxyz[a.hand_valid], b.wrist_quat_wxyz[a.hand_valid]).max(), 1e-4)
         self.assertEqual(compared, 3)
 
-    def test_objects_rest_on_the_table(self):
-        demos = levelled(read_demos(data_dir() / ARCHIVES[0][0]))
-        self.assertEqual(sorted(set(demos.object_name.tolist())), list(object_names()))
-        shift = grounded(demos, demo_objects(demos)).object_pos[:, 2] - demos.object_pos[:, 2]
-        shift = np.abs(shift[demos.frame_offsets[:-1]])
-        self.assertLess(np.median(shift), 0.006)
-        self.assertLess(np.percentile(shift, 90), 0.012)
-        self.assertLessEqual(on_something(demos, demo_objects(demos)).sum(), 3)  # a few objects start on top of others
-
     def test_synthetic_hands_have_the_conventions_of_real_hands(self):
         """Knuckles of real hands in the wrist's frame are where the model's are, for both sides."""
         for file, side in ARCHIVES:
@@ -382,35 +348,7 @@ class RealData(unittest.TestCase):
 
     def test_recorded_demonstrations_are_not_doubted(self):
         for name, _ in ARCHIVES:
-            demos = read_demos(data_dir() / name)
-            self.assertEqual(doubts(demos), [])
-            (doubt,) = doubts(replace(demos, wrist_quat_wxyz=demos.wrist_quat_wxyz[:, [1, 2, 3, 0]]))
-            self.assertIn("do not point along the fingers", doubt)
-
-
-class Hand(unittest.TestCase):
-    def test_joints_bend_and_bones_keep_their_lengths(self):
-        rng = np.random.default_rng(0)
-        points = hand.keypoints(rng.uniform(hand.LOWER, hand.UPPER, (50, 17)))
-        lengths = hand.bone_lengths(points)
-        np.testing.assert_allclose(lengths, lengths[:1].repeat(50, axis=0), atol=1e-12)
-        np.testing.assert_allclose(lengths[0].reshape(5, 4)[1:, 1:], hand.FINGER_LENGTHS, atol=1e-12)
-        for finger in range(4):
-            bent = np.zeros(17)
-            bent[3 * finger + 1] = 0.5
-            moved = hand.keypoints(bent) - hand.keypoints(np.zeros(17))
-            tip = 8 + 4 * finger
-            self.assertLess(moved[tip, 1], -0.02)  # towards the palm
-            np.testing.assert_allclose(np.delete(moved, range(tip - 2, tip + 1), axis=0), 0, atol=1e-12)
-
-    def test_axes(self):
-        for side, sign in (("right", 1), ("left", -1)):
-            axes = hand.hand_axes(np.array([0, -1.0, 0]), np.array([0, 0, -1.0]), side)
-            self.assertAlmostEqual(np.linalg.det(axes), 1)
-            points = hand.keypoints(np.zeros(17), side) @ axes.T
-            np.testing.assert_allclose(points[12] / np.linalg.norm(points[12]), [0, -1, 0], atol=0.05)
-            # palm down, seen from behind: a right hand's thumb is on the left, towards +x
-            self.assertGreater(sign * points[4, 0], 0.02)
+            self.assertEqual(doubts(read_demos(data_dir() / name)), [])
 
 
 class Synthetic(InFolder):
@@ -421,19 +359,8 @@ class Synthetic(InFolder):
         cls.demos = merge_demos([right, left])
         cls.objects = demo_objects(cls.demos)
 
-    def sequences(self):
-        """Each sequence with its object and the frame of the lift."""
-        for i in range(self.demos.num_sequences):
-            with self.subTest(str(self.demos.sequence_name[i])):
-                one = self.demos.select(indices=[i])
-                lifted = int(np.argmax(one.object_pos[:, 2] > one.object_pos[0, 2] + 1e-6))
-                yield one, self.objects[str(one.object_name[0])], lifted
-
     def hand_in_object(self, demos):
         return in_frame(demos.object_pos, demos.object_quat_wxyz, demos.hand_keypoints.astype(float))
-
-    def distances(self, demos, obj):
-        return Solid.of(obj, np.zeros(3), Rotation.identity()).distance(self.hand_in_object(demos))
 
     def test_the_same_seed_gives_the_same_bits(self):
         self.assertEqual(self.demos.object_name[:9].tolist(), list(object_names()))
@@ -443,8 +370,7 @@ class Synthetic(InFolder):
             b = again.select(objects=[name])
             for array in ("hand_keypoints", "wrist_quat_wxyz", "object_pos", "object_quat_wxyz"):
                 self.assertEqual(getattr(a, array).tobytes(), getattr(b, array).tobytes())
-        other = synthesize(["soup"], per_object=1, seed=1)
-        self.assertFalse(np.array_equal(other.object_pos[0], again.select(objects=["soup"]).object_pos[0]))
+        self.assertNotEqual(synthesize(["soup"], 1, seed=1).object_pos[0, 0], b.object_pos[0, 0])
 
     @unittest.skipUnless(importlib.util.find_spec("manifold3d"), "manifold3d is not installed")
     def test_a_wall_of_ones_own_mesh_is_held_from_both_sides(self):
@@ -454,57 +380,62 @@ class Synthetic(InFolder):
         radius = np.linalg.norm(tips[:3, :2], axis=1)  # thumb, index, middle
         inside = radius < 0.0365
         self.assertTrue(((radius < 0.040) == inside).all(), radius)  # none is in the wall
-        self.assertNotEqual(inside[0], inside[1])
-        self.assertEqual(inside[1], inside[2])
-        self.assertLess(np.abs(tips[:3, 2]).max(), 0.045)
+        self.assertEqual([inside[0] != inside[1], inside[1] == inside[2]], [True, True])
 
-    def test_the_object_rests_in_the_workspace_and_is_lifted(self):
-        for one, obj, lifted in self.sequences():
-            np.testing.assert_array_equal(one.object_pos[:lifted, :2], one.object_pos[:1, :2].repeat(lifted, axis=0))
-            x, y, _ = one.object_pos[0]
-            self.assertTrue(0.33 <= x <= 0.81 and 0.04 <= y <= 0.47)
-            height = one.object_pos[:, 2] - rest_height(obj, one.object_quat_wxyz)
-            self.assertAlmostEqual(height[0], 0, delta=1e-4)
-            self.assertGreater(height.min(), -1e-4)
-            self.assertTrue(20 <= lifted <= 45 and 60 <= one.num_frames <= 90)
-            self.assertTrue(0.139 < one.object_pos[-1, 2] - one.object_pos[0, 2] < 0.411)
+    def test_the_object_is_lifted_and_the_hand_reaches_opposes_and_holds(self):
+        for name in self.demos.sequence_name.tolist():
+            one = self.demos.select(names=[name])
+            lifted = int(np.argmax(one.object_pos[:, 2] > one.object_pos[0, 2] + 1e-6))
+            with self.subTest(name):
+                self.check_object(one, self.objects[str(one.object_name[0])], lifted)
+                self.check_grasp(one, self.objects[str(one.object_name[0])], lifted)
+                self.check_hand(one, lifted)
 
-    def test_thumb_and_fingers_oppose_each_other_on_the_surface(self):
-        for one, obj, lifted in self.sequences():
-            distance = self.distances(one, obj)
-            self.assertTrue((np.abs(distance[lifted, TIPS[:3]]) < 0.008).all())  # thumb, index, middle
-            self.assertGreater(distance[:, 1:].min(), -0.002)  # the hand goes through nothing
-            self.assertGreater(one.hand_keypoints[..., 2].min(), 0.0)
-            tips = one.hand_keypoints[lifted, TIPS].astype(float)
-            to_fingers = tips[1:3].mean(axis=0) - tips[0]
-            points = tips[0] + np.linspace(0, 1, 41)[1:-1, None] * to_fingers
-            solid = Solid.of(obj, one.object_pos[lifted].astype(float), turns(one.object_quat_wxyz[lifted]))
-            inside = (solid.distance(points) < 0).mean()  # the object is between them
-            self.assertGreater(inside * np.linalg.norm(to_fingers), 0.008)
-            self.assertGreater(inside, 0.5)
+    def check_object(self, one, obj, lifted):
+        """It rests in the workspace, and is lifted."""
+        np.testing.assert_array_equal(one.object_pos[:lifted, :2], one.object_pos[:1, :2].repeat(lifted, axis=0))
+        x, y, _ = one.object_pos[0]
+        self.assertTrue(0.33 <= x <= 0.81 and 0.04 <= y <= 0.47)
+        height = one.object_pos[:, 2] - rest_height(obj, one.object_quat_wxyz)
+        self.assertAlmostEqual(height[0], 0, delta=1e-4)
+        self.assertGreater(height.min(), -1e-4)
+        self.assertTrue(20 <= lifted <= 45 and 60 <= one.num_frames <= 90)
+        self.assertTrue(0.139 < one.object_pos[-1, 2] - one.object_pos[0, 2] < 0.411)
 
-    def test_the_hand_comes_from_the_person_smoothly_and_holds(self):
-        for one, _, lifted in self.sequences():
-            points = one.hand_keypoints.astype(float)
-            self.assertGreater(points[0, 0, 1], 0.5)  # the person is at +y
-            acceleration = np.diff(points, n=2, axis=0) * 30**2
-            self.assertLess(np.linalg.norm(acceleration, axis=-1).max(), 20)
-            self.assertLess(np.ptp(hand.bone_lengths(points), axis=0).max(), 2e-6)
-            self.assertLess(np.ptp(self.hand_in_object(one)[lifted - 1 :], axis=0).max(), 2e-5)
-            local = in_frame(points[:, 0], one.wrist_quat_wxyz, points[:, KNUCKLES])  # the wrist is MANO's root
-            expected = hand.FINGER_BASES * ((-1, 1, 1) if one.hand_side[0] == "left" else (1, 1, 1))
-            np.testing.assert_allclose(local, expected[None].repeat(one.num_frames, axis=0), atol=1e-5)
+    def check_grasp(self, one, obj, lifted):
+        """Thumb and fingers oppose each other on the surface."""
+        distance = Solid.of(obj, np.zeros(3), Rotation.identity()).distance(self.hand_in_object(one))
+        self.assertTrue((np.abs(distance[lifted, TIPS[:3]]) < 0.008).all())  # thumb, index, middle
+        self.assertGreater(distance[:, 1:].min(), -0.002)  # the hand goes through nothing
+        self.assertGreater(one.hand_keypoints[..., 2].min(), 0.0)
+        tips = one.hand_keypoints[lifted, TIPS].astype(float)
+        to_fingers = tips[1:3].mean(axis=0) - tips[0]
+        points = tips[0] + np.linspace(0, 1, 41)[1:-1, None] * to_fingers
+        solid = Solid.of(obj, one.object_pos[lifted].astype(float), turns(one.object_quat_wxyz[lifted]))
+        inside = (solid.distance(points) < 0).mean()  # the object is between them
+        self.assertGreater(inside * np.linalg.norm(to_fingers), 0.008)
+        self.assertGreater(inside, 0.5)
+
+    def check_hand(self, one, lifted):
+        """It comes from the person smoothly, keeps its bones, and holds."""
+        points = one.hand_keypoints.astype(float)
+        self.assertGreater(points[0, 0, 1], 0.5)  # the person is at +y
+        acceleration = np.diff(points, n=2, axis=0) * 30**2
+        self.assertLess(np.linalg.norm(acceleration, axis=-1).max(), 20)
+        self.assertLess(np.ptp(hand.bone_lengths(points), axis=0).max(), 2e-6)
+        self.assertLess(np.ptp(self.hand_in_object(one)[lifted - 1 :], axis=0).max(), 2e-5)
+        local = in_frame(points[:, 0], one.wrist_quat_wxyz, points[:, KNUCKLES])  # the wrist is MANO's root
+        expected = hand.FINGER_BASES * ((-1, 1, 1) if one.hand_side[0] == "left" else (1, 1, 1))
+        np.testing.assert_allclose(local, expected[None].repeat(one.num_frames, axis=0), atol=1e-5)
 
     def test_bad_options(self):
-        with self.assertRaises(ObjectError):
-            synthesize(["teapot"])
-        for options, words in (
-            ({"per_object": 0}, "per_object is 0"),
-            ({"per_object": 10**9}, "per_object is 1000000000 .* 1 to 100000"),
-            ({"fps": 1}, "fps is 1"),
+        for error, words, objects, options in (
+            (ObjectError, "teapot", ["teapot"], {}),
+            (DemoError, "per_object is 1000000000 .* 1 to 100000", ["soup"], {"per_object": 10**9}),
+            (DemoError, "fps is 1", ["soup"], {"fps": 1}),
         ):
-            with self.assertRaisesRegex(DemoError, words):
-                synthesize(["soup"], **options)
+            with self.assertRaisesRegex(error, words):
+                synthesize(objects, **options)
 
 
 class Plausible(unittest.TestCase):
@@ -540,12 +471,7 @@ class Commands(InFolder):
         code, info = run("demos", "info", file)
         self.assertEqual(code, 0)
         self.assertIn(info, out)
-        demos = read_demos(file)
-        lift = 100 * np.median([np.ptp(demos.object_pos[demos.frames(i), 2]) for i in range(2)])  # it starts lowest
-        distance = 100 * np.median(np.linalg.norm(demos.goal_pose[0] - demos.start_pose[0], axis=1))
-        angle = np.degrees(np.median(angles(demos.start_pose[1], demos.goal_pose[1])))
-        row = rf"005_tomato_soup_can\W+1\W+1\W+\d+\W+100%\W+{lift:.1f}\W+{distance:.1f}\W+{angle:.0f}\W"
-        self.assertRegex(info, row)
+        self.assertRegex(info, r"005_tomato_soup_can\W+1\W+1\W+\d+\W+100%")
         run(*synth)
         self.assertEqual(file.read_bytes(), first)
 
@@ -553,18 +479,12 @@ class Commands(InFolder):
         file = self.folder / "demos.npz"
         code, out = run("demos", "import", "dexycb", data_dir() / "dexycb_layout", "--out", file)
         self.assertEqual(code, 0, out)
-        self.assertEqual(sorted(read_demos(file).hand_side.tolist()), ["left", "right", "right"])
         self.assertIn("3 sequences", out)
 
     def test_errors_leave_no_file(self):
-        file = self.folder / "demos.npz"
-        for words, command in (
-            ("no DexYCB sequence", ("import", "dexycb", self.folder, "--out", file)),
-            ("Unknown object 'teapot'", ("synth", "--out", file, "--objects", "teapot")),
-        ):
-            code, out = run("demos", *command)
-            self.assertEqual(code, 1)
-            self.assertIn(words, out)
+        code, out = run("demos", "import", "dexycb", self.folder, "--out", self.folder / "demos.npz")
+        self.assertEqual(code, 1)
+        self.assertIn("no DexYCB sequence", out)
         self.assertEqual(list(self.folder.iterdir()), [])
 
 

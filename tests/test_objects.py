@@ -5,7 +5,6 @@ import json
 import os
 import unittest
 import zipfile
-from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
@@ -63,12 +62,6 @@ class StandIns(unittest.TestCase):
                     if piece.geometry.vertices is not None:
                         self.assertLessEqual(len(piece.geometry.vertices), 64)
 
-    def test_inertia_of_a_box_is_the_textbooks(self):
-        obj = load_object("cheez-its")
-        a, b, c = 2 * np.array(obj.pieces[0].geometry.size)
-        expected = obj.mass / 12 * np.diag([b * b + c * c, a * a + c * c, a * a + b * b])
-        np.testing.assert_allclose(obj.inertia, expected, rtol=1e-9, atol=1e-12)
-
     def test_close_to_the_real_meshes(self):
         folder = data_dir() / "ycb"
         for name in object_names():
@@ -95,10 +88,6 @@ class Geometry(unittest.TestCase):
         self.assertLess(len(few.geometry.vertices), 200)
         self.assertTrue((few.geometry.vertices[:, None] == points).all(axis=-1).any(axis=1).all())
 
-    def test_hull_of_flat_points(self):
-        with self.assertRaisesRegex(ObjectError, "span no volume"):
-            hull(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]))
-
     def test_winding_number_counts_overlaps(self):
         a = trimesh.creation.box((2, 2, 2))
         b = a.copy().apply_translation((1, 0, 0))
@@ -109,19 +98,17 @@ class Geometry(unittest.TestCase):
     def test_limited_hull_keeps_the_shape(self):
         sphere = trimesh.creation.icosphere(4, 0.05)
         mesh = shape_mesh(limited_hull(sphere.vertices))
-        self.assertEqual(len(mesh.vertices), 64)
+        self.assertEqual((len(mesh.vertices), mesh.is_volume), (64, True))
         self.assertGreater(mesh.volume / sphere.volume, 0.9)
-        self.assertTrue(mesh.is_volume)
 
 
 class Sampling(unittest.TestCase):
     def test_well_spread_on_the_outer_surface(self):
-        for obj in load_objects(["scissors", "mustard", "powerdrill"]):  # whose pieces overlap
-            points = surface_points(obj, 64)
-            self.assertEqual(points.shape, (64, 3))
-            np.testing.assert_allclose(distance_to_pieces(points, obj), 0, atol=1e-4)
-            np.testing.assert_array_equal(points, surface_points(obj))
-            self.assertFalse(np.array_equal(points, surface_points(obj, seed=1)))
+        obj = load_object("scissors")  # whose pieces overlap
+        points = surface_points(obj, 64)
+        np.testing.assert_allclose(distance_to_pieces(points, obj), 0, atol=1e-4)
+        np.testing.assert_array_equal(points, surface_points(obj))
+        self.assertFalse(np.array_equal(points, surface_points(obj, seed=1)))
         obj = load_object("soup")
         points = surface_points(obj, 64)
         everywhere, _, _ = sample_surface(obj.vertices, obj.faces, 4000, seed=5)
@@ -129,14 +116,11 @@ class Sampling(unittest.TestCase):
         self.assertLess(cKDTree(points).query(everywhere)[0].max(), 0.02)
 
     def test_keypoints_are_corners_that_span_the_box(self):
-        for obj in load_objects(object_names()):
-            points = keypoints(obj)
-            self.assertGreater(
-                abs(np.linalg.det(points[1:] - points[0])), 1e-6
-            )  # not coplanar: they see every rotation
-            low, high = bounding_box(obj)
-            self.assertTrue((np.isclose(points, low) | np.isclose(points, high)).all())
-            self.assertEqual(len(np.unique(points, axis=0)), 4)
+        obj = load_object("scissors")
+        points = keypoints(obj)
+        self.assertGreater(abs(np.linalg.det(points[1:] - points[0])), 1e-6)  # not coplanar: they see every rotation
+        low, high = bounding_box(obj)
+        self.assertTrue((np.isclose(points, low) | np.isclose(points, high)).all())
 
 
 class Rest(unittest.TestCase):
@@ -145,25 +129,20 @@ class Rest(unittest.TestCase):
         quats = np.array([[1, 0, 0, 0], [0.5**0.5, 0, 0.5**0.5, 0], [0, 1, 0, 0]])
         low, high = bounding_box(obj)
         np.testing.assert_allclose(rest_height(obj, quats), [-low[2], high[0], high[2]], atol=1e-12)
-        self.assertIsInstance(rest_height(obj, quats[0]), float)
 
     def test_stable_pose_stands_over_its_base(self):
-        for name in object_names():
+        for name in ("pitcher", "powerdrill"):
             obj = load_object(name)
             rotation = Rotation.from_quat(resting_orientation(obj, Z), scalar_first=True)
             self.assertGreater(rotation.apply(Z)[2], np.cos(np.radians(5)))
             vertices = rotation.apply(obj.vertices)
             base = vertices[vertices[:, 2] < vertices[:, 2].min() + 1e-5, :2]
-            center = rotation.apply(obj.com)[:2]
             edges = ConvexHull(base).equations
-            self.assertLess((edges[:, :2] @ center + edges[:, 2]).max(), 1e-6, name)
-
-    def test_nearest_stable_pose(self):
+            self.assertLess((edges[:, :2] @ rotation.apply(obj.com)[:2] + edges[:, 2]).max(), 1e-6, name)
         box = load_object("cheez-its")
-        rotation = Rotation.from_quat(resting_orientation(box, np.array([0.9, 0.1, 0.4])), scalar_first=True)
-        np.testing.assert_allclose(rotation.apply([1, 0, 0]), Z, atol=1e-9)
-        upside_down = Rotation.from_quat(resting_orientation(box, -Z), scalar_first=True)
-        np.testing.assert_allclose(upside_down.apply(Z), -Z, atol=1e-9)
+        for up, nearest in (([0.9, 0.1, 0.4], [1, 0, 0]), (-Z, -Z)):
+            rotation = Rotation.from_quat(resting_orientation(box, np.array(up)), scalar_first=True)
+            np.testing.assert_allclose(rotation.apply(nearest), Z, atol=1e-9)
 
 
 class MeshImport(InFolder):
@@ -192,11 +171,14 @@ class MeshImport(InFolder):
         self.assertEqual(self.load(BOX, facts="mass = 0.2").obj.mass, 0.2)
         mug = self.load(BOX, "025_mug")
         self.assertEqual((mug.obj.mass, mug.mass_source, mug.notes), (0.118, "published (YCB)", ()))
+        inside_out = self.load(trimesh.Trimesh(BOX.vertices, BOX.faces[:, ::-1]), facts="mass = 1.0")
+        self.assertEqual(inside_out.notes, ())
+        mesh = trimesh.Trimesh(inside_out.obj.vertices, inside_out.obj.faces, process=False)
+        self.assertGreater(mesh.volume, 0)
 
     @CUTS
     def test_concave_mesh_is_cut_and_cached(self):
         first = self.load(RING).obj
-        self.assertGreaterEqual(len(first.pieces), 4)
         volume = sum(shape_mesh(piece).volume for piece in first.pieces)
         self.assertAlmostEqual(volume / RING.volume, 1.0, delta=0.1)
         np.testing.assert_allclose(first.com, 0, atol=1e-9)
@@ -214,17 +196,15 @@ class MeshImport(InFolder):
         self.load(BOX)  # the cache knows the version of the cutter
         self.assertEqual(len(list(file.parent.glob("*.npz"))), 3)
 
-    def test_without_manifold3d_the_error_names_the_remedy(self):
+    def test_without_manifold3d_or_a_writable_cache(self):
+        (self.folder / "file").write_text("")
+        with mock.patch.dict(os.environ, {"XRESET_CACHE": str(self.folder / "file")}):
+            self.assertEqual(len(self.load(BOX).obj.pieces), 1)
         with (
             mock.patch.dict("sys.modules", {"manifold3d": None}),
             self.assertRaisesRegex(ObjectError, r"pip install 'xreset\[objects\]'"),
         ):
             self.load(RING)
-
-    def test_an_unwritable_cache_does_no_harm(self):
-        (self.folder / "file").write_text("")
-        with mock.patch.dict(os.environ, {"XRESET_CACHE": str(self.folder / "file")}):
-            self.assertEqual(len(self.load(BOX).obj.pieces), 1)
 
     @CUTS
     def test_open_meshes_are_closed_and_it_is_said(self):
@@ -298,8 +278,6 @@ class MeshImport(InFolder):
         header = {"asset": {"version": "2.0"}, "accessors": [{"componentType": 5126, "type": "VEC3", "count": 10**9}]}
         (self.folder / "huge.gltf").write_text(json.dumps(header))
         scene = trimesh.Scene(BOX)
-        (self.folder / "box.glb").write_bytes(scene.export(file_type="glb"))
-        self.assertEqual(len(read_mesh(self.folder / "box.glb").faces), 12)
         for i in range(50):
             scene.add_geometry(scene.geometry["geometry_0"], node_name=f"copy {i}", geom_name="geometry_0")
         (self.folder / "copies.glb").write_bytes(scene.export(file_type="glb"))
@@ -337,26 +315,16 @@ class MeshImport(InFolder):
         for text, words in (
             ("mass = -1", "mass is -1, expected a number from 0.0001 to 50"),
             ("mass = 1\ndensity = 2", "one follows"),
-            ("weight = 1", "unknown: weight|Unknown.*weight"),
-            ("friction = 'high'", "friction is 'high'"),
+            ("weight = 1", "unknown: weight"),
             ("mass", "TOML"),
-            ("mass = nan", "mass is nan"),
         ):
             path.with_suffix(".toml").write_text(text)
             with self.subTest(text), self.assertRaisesRegex(XResetError, words):
                 import_with_notes(path, "thing")
 
-        with self.assertRaisesRegex(ValueError, "mass is -1"):
-            Properties(mass=-1.0)
-
     def test_own_friction_takes_the_place_of_the_middle(self):
         c = RandomizationConfig(friction=(0.5, 1.0))
         torch.testing.assert_close(own_friction([None, 0.95, 0.35], c), torch.tensor([[0.0], [0.1], [-0.2]]))
-
-    def test_mesh_inside_out(self):
-        result = self.load(trimesh.Trimesh(BOX.vertices, BOX.faces[:, ::-1]), facts="mass = 1.0")
-        self.assertEqual(result.notes, ())
-        self.assertGreater(trimesh.Trimesh(result.obj.vertices, result.obj.faces, process=False).volume, 0)
 
     def test_bad_meshes(self):
         box = trimesh.creation.box((0.1, 0.1, 0.1))
@@ -366,7 +334,6 @@ class MeshImport(InFolder):
             "garbage": ("v 0 0\nf 1 2 3\n", "no triangles|cannot be read"),
             "nan": (nan, "finite|cannot be read"),
             "flat": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "flat"),
-            "tilted": ("v 0 0 0\nv 0.1 0 0.1\nv 0 0.1 0.1\nf 1 2 3\n", "flat"),
             "tilted square": ("v 0 0 0\nv 0.1 0 0.1\nv 0 0.1 0.1\nv 0.1 0.1 0.2\nf 1 2 3\nf 2 4 3\n", "flat"),
             "millimetres": (box.copy().apply_scale(1000).export(file_type="obj"), "millimetres"),
         }
@@ -395,14 +362,10 @@ class MeshImport(InFolder):
         with self.assertRaisesRegex(ObjectError, "no folder"):
             load_object("soup", self.folder / "nowhere")
 
-    def test_real_cans_stay_whole(self):
-        folder = data_dir() / "ycb"
-        for name in ("soup", "tuna", "spam"):
-            obj = load_object(name, folder)
-            self.assertEqual(len(obj.pieces), 1, name)
-            outside = distance_to_pieces(obj.vertices, obj)
-            self.assertLess(outside.max(), 0.002)  # 64 vertices are enough
-            self.assertLess(np.linalg.norm(load_object(name).com - obj.com), 0.003)
+    def test_a_real_can_stays_whole(self):
+        obj = load_object("soup", data_dir() / "ycb")
+        self.assertEqual(len(obj.pieces), 1)
+        self.assertLess(distance_to_pieces(obj.vertices, obj).max(), 0.002)  # 64 vertices are enough
 
 
 @CUTS
@@ -441,13 +404,6 @@ class ThinWalls(unittest.TestCase):
         )  # a finger of 16 mm through the handle
         self.assertAlmostEqual(pieces.volume, mug.volume, delta=1e-9)
 
-    def test_the_stated_deviation_is_the_measured_one(self):
-        result = import_with_notes(data_dir() / "ycb" / "037_scissors.obj", "scissors")  # hollows next to each other
-        mesh = trimesh.Trimesh(result.obj.vertices, result.obj.faces, process=False)
-        measured = max(self.off(mesh, SimpleNamespace(shapes=result.obj.pieces)))
-        self.assertAlmostEqual(result.deviation, measured, delta=4e-4)
-        self.assertLess(result.deviation, 0.002)
-
     def test_a_small_bridge_on_a_large_piece_is_seen(self):
         """The middle of what covers a hollow is 4 mm from its walls; a few hundred points of the plate miss it."""
         hollow = trimesh.creation.box(
@@ -471,18 +427,12 @@ class ThinWalls(unittest.TestCase):
         self.assertLess(pieces.deviation, 0.002)
 
     def test_limits_of_pieces_and_effort(self):
-        whole = decompose(RING)
-        self.assertLess(whole.deviation, 0.002)
-        self.assertTrue(whole.finished)
         few = decompose(RING, Settings(max_pieces=3))
         self.assertLessEqual(len(few.shapes), 3)
         short = decompose(RING, Settings(effort=5_000))
-        again = decompose(RING, Settings(effort=5_000))
-        self.assertFalse(short.finished)
+        self.assertEqual((few.finished, short.finished), (True, False))
         for stopped in (few, short):
             self.assertGreater(stopped.deviation, 0.002)
-        for one, other in zip(short.shapes, again.shapes, strict=True):
-            np.testing.assert_array_equal(one.geometry.vertices, other.geometry.vertices)
 
 
 @CUTS
@@ -503,10 +453,9 @@ class RandomShapes(InFolder):
         self.assertNotEqual(nine[0].read_bytes(), nine[8].read_bytes())
 
     def test_a_folder_is_never_overwritten(self):
-        with self.assertRaisesRegex(ObjectError, "exists. Name a new folder"):
-            make_shapes(self.folder, 1)
-        with self.assertRaisesRegex(ObjectError, "count is 0, expected a number from 1"):
-            make_shapes(self.folder / "none", 0)
+        for words, folder, count in (("exists. Name a new", self.folder, 1), ("count is 0", self.folder / "none", 0)):
+            with self.assertRaisesRegex(ObjectError, words):
+                make_shapes(folder, count)
 
 
 if __name__ == "__main__":

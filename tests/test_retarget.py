@@ -22,7 +22,7 @@ from xreset.demos.synth import synthesize
 from xreset.errors import DemoError, FileFormatError, RobotError
 from xreset.geometry.collision import height_above_table, table_points
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.rotations import quat_angle, quat_from_axis_angle, quat_rotate, quat_to_matrix
+from xreset.geometry.rotations import quat_angle, quat_from_axis_angle, quat_to_matrix
 from xreset.geometry.surface import Surface
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.arm.model import ArmModel, ArmTargets
@@ -114,31 +114,11 @@ class HandTest(unittest.TestCase):
         self.assertLess((found.joints - self.motion.joints)[..., seen].abs().max().item(), 5e-3)
         self.assertLess(quat_angle(found.root_quat, self.motion.root_quat).max().item(), 5e-3)
 
-    def test_moves_with_the_scene(self):
-        """A rigid motion of everything moves the hand with it: object and contacts too, far above the table, which
-        stays."""
-        turn = quat_from_axis_angle(torch.tensor([0.4, 0.2, -1.0], dtype=FLOAT))
-        shift = torch.tensor([0.3, -0.1, 0.2], dtype=FLOAT)
-        above = self.keypoints + torch.tensor([0.0, 0.0, 2.0], dtype=FLOAT)
-        points: dict[str, Any] = {
-            "keypoints": above,
-            "contact_points": above + 0.02,
-            "object_pos": above[:, :, self.tip] + 0.03,
-        }
-        turned = {name: quat_rotate(turn, x) + shift for name, x in points.items()}
-        quat = turn.expand(*above.shape[:2], 4)
-        still = self.solve(in_contact=self.touching, **points)
-        moved = self.solve(in_contact=self.touching, object_quat=quat, **turned)
-        assert_close(still.cost, moved.cost, atol=0, rtol=1e-6)
-        assert_close(still.joints, moved.joints, atol=1e-6, rtol=0)
-        assert_close(quat_rotate(turn, still.root_pos) + shift, moved.root_pos, atol=1e-6, rtol=0)
-
     def test_order_and_company_of_sequences_do_not_matter(self):
         targets = self.targets(object_pos=self.keypoints[:, :, self.tip] + 0.01)
         together = retarget_hand(self.model, targets).joints
-        for order in ([2, 0, 1], [0], [1], [2]):
-            rows = torch.tensor(order)
-            assert_close(retarget_hand(self.model, targets[rows]).joints, together[rows], atol=1e-9, rtol=0)
+        for order in ([2, 0, 1], [1]):
+            assert_close(retarget_hand(self.model, targets[order]).joints, together[order], atol=1e-9, rtol=0)
 
     def test_joints_do_not_jump(self):
         """Keypoints that jump to another posture in one frame: the wall spreads the change over several."""
@@ -171,9 +151,7 @@ class HandTest(unittest.TestCase):
         mask = torch.zeros_like(self.touching)
         mask[:, :, self.tip] = True
         pulled = self.solve(HandConfig(contact_weight=50.0), contact_points=aim, in_contact=mask)
-        free, near = ((m.keypoints - aim)[:, :, self.tip].norm(dim=-1).mean().item() for m in (self.solve(), pulled))
-        self.assertGreater(free, 0.035)
-        self.assertLess(near, 0.025)
+        self.assertLess((pulled.keypoints - aim)[:, :, self.tip].norm(dim=-1).mean().item(), 0.025)
 
     def test_the_hand_stays_out_of_the_object(self):
         inside = self.targets(object_pos=self.keypoints[:, :, self.tip])
@@ -186,17 +164,12 @@ class HandTest(unittest.TestCase):
         self.assertLess(depth[1], 0.005)
 
     def test_joints_stay_within_limits(self):
-        lower = self.model.kinematics.lower
-        upper = self.model.kinematics.upper
         joints = self.solve(keypoints=self.keypoints * torch.tensor([1.0, 3.0, 1.0], dtype=FLOAT)).joints
-        self.assertTrue(((joints >= lower) & (joints <= upper)).all())
-        self.assertTrue(((joints == lower) | (joints == upper)).any())
+        clamped = self.model.kinematics.clamp(joints)
+        self.assertTrue((joints == clamped).all())
+        self.assertTrue((joints == self.model.kinematics.lower).any() or (joints == self.model.kinematics.upper).any())
 
     def test_pairs_for_any_subset_of_keypoints(self):
-        whole = keypoint_pairs(KEYPOINTS, [f"link_{name}" for name in KEYPOINTS])
-        for pair in (("wrist", "index1"), ("thumb4", "little4")):
-            self.assertIn(tuple(map(KEYPOINTS.index, pair)), whole)
-        self.assertEqual(len(whole), len(set(whole)))
         jaws = keypoint_pairs(("wrist", "thumb4", "index4", "middle4"), ("hand", "left", "right", "right"))
         self.assertEqual(set(jaws), {(0, 1), (0, 2), (0, 3), (1, 2), (1, 3)})
 
@@ -212,21 +185,15 @@ class HandTest(unittest.TestCase):
 class ConfigTest(unittest.TestCase):
     def test_numbers_out_of_range_are_refused_by_name(self):
         config: Any
-        for config, name, values in (
-            (HandConfig, "jump_weight", (-1.0, np.nan, np.inf)),
-            (HandConfig, "contact_knee", (0.0, np.nan)),
-            (HandConfig, "object_clearance", (np.nan, -np.inf)),
-            (HandConfig, "clearance_growth", ((0.1, np.nan),)),
-            (ArmConfig, "reseeds", (-1,)),
-            (ArmConfig, "restarts", (0,)),
-            (ArmConfig, "position_weight", (-50.0, np.nan)),
+        for config, name, value in (
+            (HandConfig, "jump_weight", -1.0),
+            (HandConfig, "contact_knee", 0.0),
+            (HandConfig, "object_clearance", np.nan),
+            (HandConfig, "clearance_growth", (0.1, np.nan)),
+            (ArmConfig, "restarts", 0),
         ):
-            for value in values:
-                with (
-                    self.subTest(name=name, value=value),
-                    self.assertRaisesRegex(ValueError, f"^{name} is .*, expected"),
-                ):
-                    config(**{name: value})
+            with self.subTest(name), self.assertRaisesRegex(ValueError, f"^{name} is .*, expected"):
+                config(**{name: value})
         HandConfig(object_clearance=-0.001, jump_limit=np.inf)  # deeper than the surface; no limit
 
 
@@ -257,12 +224,6 @@ class ArmTest(unittest.TestCase):
         joints, measures = track(self.model, targets, Thresholds(), dataclasses.replace(self.CONFIG, **changes))
         return joints, measures, [REASONS[i] for i in classify(measures, Thresholds())[0]]
 
-    def heights(self, model: ArmModel, joints: torch.Tensor) -> tuple[tuple[str, ...], torch.Tensor]:
-        """The links of all support points and their heights above the table [..., H]."""
-        support = table_points(model.robot, model.kinematics)
-        points = model.kinematics.points(joints, support.links, torch.as_tensor(support.points))
-        return support.links, height_above_table(points, torch.as_tensor(support.radii), model.table)
-
     def test_follows_a_path_that_the_arm_can_follow(self):
         joints, measures, reasons = self.track(self.targets(8))
         self.assertLess(measures.wrist_position.max().item(), 1e-3)
@@ -271,40 +232,16 @@ class ArmTest(unittest.TestCase):
         self.assertTrue(((joints >= self.model.lower) & (joints <= self.model.upper)).all())
 
     def test_stays_above_the_table(self):
-        _, heights = self.heights(self.model, self.path(4))
+        support = table_points(self.robot, self.model.kinematics)
+        points = self.model.kinematics.points(self.path(4), support.links, torch.as_tensor(support.points))
+        heights = height_above_table(points, torch.as_tensor(support.radii), self.model.table)
         sunk = self.targets(4, shift=(0.0, 0.0, -heights.min().item() - 0.05))
         _, free, free_reasons = self.track(sunk, collision_weight=0.0)
         _, kept, kept_reasons = self.track(sunk)
-        self.assertLess(free.table_clearance.min().item(), -0.045)
+        self.assertAlmostEqual(free.table_clearance.min().item(), -0.05, delta=0.005)
         self.assertGreater(kept.table_clearance.min().item(), -0.006)
         self.assertEqual(max(free_reasons, key=REASONS.index), "table collision")
         self.assertEqual(max(kept_reasons, key=REASONS.index), "wrist position")
-
-    def test_lowest_points_are_those_of_all_points(self):
-        for name in ("ur7e-sharpa", "openarm"):
-            model = ArmModel(robots.load(name))
-            kinematics = model.kinematics
-            span = (kinematics.upper - kinematics.lower).clamp_max(6.0)
-            generator = torch.Generator().manual_seed(0)
-            joints = kinematics.clamp(span * (torch.rand(300, len(span), generator=generator, dtype=FLOAT) - 0.5))
-            carriers = kinematics.link_poses(joints, model.carriers)
-            hand_poses = model.hand_poses(joints[:, torch.as_tensor(model.hand.joint_indices)])
-            low = model.low_points(carriers[..., :3, 3], carriers[..., :3, :3], hand_poses, 0.02)
-            links, heights = self.heights(model, joints)
-            carriers_of = [model.carriers.index(link) if link in model.carriers else 0 for link in links]
-            of_carrier = torch.tensor(carriers_of)
-            for carrier in range(len(model.carriers)):
-                own = low[low.carrier == carrier]
-                points = torch.cat((heights[:, of_carrier == carrier], torch.full((300, 1), torch.inf)), dim=1)
-                expected = points.amin(1)
-                self.assertEqual(own.frame.tolist(), (expected < 0.02).nonzero()[:, 0].tolist())
-                assert_close(own.height, expected[own.frame], atol=1e-12, rtol=0)
-            self.assertGreater(len(low.frame), 40)
-
-    def test_out_of_reach_is_invalid(self):
-        _, measures, reasons = self.track(self.targets(2, shift=(0.0, -3.0, 0.0)))
-        self.assertNotIn("valid", reasons)
-        self.assertGreater(measures.wrist_position.min().item(), 0.5)
 
 
 class ValidityTest(unittest.TestCase):
@@ -333,21 +270,15 @@ class ValidityTest(unittest.TestCase):
         measures = Measures(**{name: torch.tensor([value]) for name, value in (self.GOOD | changes).items()})
         return REASONS[int(classify(measures, Thresholds()))]
 
-    def test_every_reason_can_be_reached(self):
+    def test_every_reason_can_be_reached_and_the_first_counts(self):
         self.assertEqual(self.reason(), "valid")
         self.assertEqual(self.reason(at_limit=True), "valid")  # a limit alone does no harm
         self.assertEqual(list(self.BAD), list(REASONS[1:]))
-        for name, changes in self.BAD.items():
-            self.assertEqual(self.reason(**changes), name)
-
-    def test_the_first_reason_counts(self):
-        self.assertEqual(self.reason(arm_jump=1.0, hand_error=1.0), "hand error")
         everything = {}
-        for changes in self.BAD.values():
+        for name, changes in reversed(self.BAD.items()):
             everything |= changes
-        self.assertEqual(self.reason(**everything), "not annotated")
-
-    def test_not_a_number_is_invalid(self):
+            self.assertEqual(self.reason(**changes), name)
+            self.assertEqual(self.reason(**everything), name)
         for name, value in self.GOOD.items():
             if isinstance(value, float):
                 self.assertNotEqual(self.reason(**{name: float("nan")}), "valid", name)
@@ -366,21 +297,23 @@ class PipelineTest(unittest.TestCase):
         cls.objects = list(demo_objects(demos).values())
         cls.config = RetargetConfig(arm=ArmConfig(restarts=12, branches=2))
         cls.ticks = []
-        cls.result = cls.retarget(lambda done, total: cls.ticks.append((done, total)))
+        cls.result = retarget_demos(
+            cls.demos, cls.robot, cls.objects, cls.config, progress=lambda *at: cls.ticks.append(at)
+        )
         cls.first, cls.second = (demos.frames(i) for i in range(2))
 
-    @classmethod
-    def retarget(cls, progress=lambda done, total: None) -> Retargeted:
-        return retarget_demos(cls.demos, cls.robot, cls.objects, cls.config, progress=progress)
-
-    def write(self, name: str, result: Retargeted, **config) -> Path:
-        write_retargeted(self.folder / name, result, config=config, inputs={})
+    def write(self, name: str, result: Retargeted) -> Path:
+        write_retargeted(self.folder / name, result, config={}, inputs={})
         return self.folder / name
 
     def test_most_frames_of_a_synthetic_demonstration_are_valid(self):
         seen = self.result.annotated[self.first]
         self.assertGreater(self.result.valid[self.first].sum() / seen.sum(), 0.8)
         self.assertLess(self.result.hand_error[self.first][seen].mean(), 0.015)
+        self.assertEqual(self.ticks, [(1, 1)])
+        first = self.result.first_contact[0]
+        self.assertEqual(np.flatnonzero(self.result.contact[self.first])[0], first)
+        self.assertGreater(first, 0)
 
     def test_the_file_says_what_the_robot_does(self):
         result = self.result
@@ -400,40 +333,20 @@ class PipelineTest(unittest.TestCase):
         # They differ by the wrist's error at most.
         np.testing.assert_allclose(gap[seen], result.hand_error[seen], atol=0.011)
 
-    def test_the_object_rests_on_the_table_and_keeps_its_goal(self):
-        vertices = torch.as_tensor(self.objects[0].vertices)
-        for i, rows in enumerate((self.first, self.second)):
-            quat = torch.as_tensor(self.result.object_quat_wxyz[rows.start])
-            lowest = quat_rotate(quat, vertices)[:, 2].min().item() + self.result.object_pos[rows.start, 2]
-            self.assertAlmostEqual(lowest, 0.0, delta=1e-6)
-            np.testing.assert_array_equal(self.result.goal_pos[i], self.result.object_pos[rows.stop - 1])
-
-    def test_first_contact_splits_the_sequence(self):
-        first = self.result.first_contact[0]
-        contact = self.result.contact[self.first]
-        self.assertTrue(0 < first < len(contact))
-        self.assertFalse(contact[:first].any())
-        self.assertTrue(contact[first])
-
     def test_a_sequence_without_a_hand_stays_at_home(self):
         joints = self.result.joint_pos[self.second]
         np.testing.assert_array_equal(joints, np.tile(self.robot.home, (len(joints), 1)))
         self.assertEqual({REASONS[r] for r in self.result.reason[self.second]}, {"not annotated"})
         self.assertEqual(self.result.first_contact[1], -1)
+        np.testing.assert_array_equal(self.result.goal_pos[1], self.result.object_pos[-1])
 
-    def test_progress_ends_complete(self):
-        self.assertEqual(self.ticks[-1], (1, 1))
-        self.assertEqual(self.ticks, sorted(self.ticks))
-
-    def test_the_same_inputs_give_the_same_file(self):
-        first = self.write("a.npz", self.result).read_bytes()
-        self.assertEqual(self.write("b.npz", self.retarget()).read_bytes(), first)
-
-    def test_the_file_comes_back(self):
-        back = read_retargeted(self.write("c.npz", self.result, x=1))
+    def test_a_file_comes_back_and_the_same_inputs_give_the_same_file(self):
+        file = self.write("a.npz", self.result)
+        again = retarget_demos(self.demos, self.robot, self.objects, self.config)
+        self.assertEqual(self.write("b.npz", again).read_bytes(), file.read_bytes())
+        back = read_retargeted(file)
         for field in dataclasses.fields(Retargeted):
             np.testing.assert_array_equal(getattr(back, field.name), getattr(self.result, field.name), field.name)
-        self.assertEqual(back.robot_fingerprint, self.robot.fingerprint)
 
     def test_a_file_that_contradicts_itself_is_refused(self):
         for changes, message in (

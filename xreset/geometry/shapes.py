@@ -187,7 +187,7 @@ def section(
     return np.asarray(center, dtype=float) + along_u + along_v
 
 
-def prism(outline: Sequence[tuple[float, float]], bottom: float, top: float) -> Shape:
+def prism(outline: ArrayLike, bottom: float, top: float) -> Shape:
     """Make the convex hull of a polygon in x and y between two heights."""
     xy = np.asarray(outline, dtype=float)
     return loft([np.column_stack([xy, np.full(len(xy), z)]) for z in (bottom, top)])

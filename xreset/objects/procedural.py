@@ -84,6 +84,11 @@ def _rod(start: np.ndarray, end: np.ndarray, u: np.ndarray, v: np.ndarray, power
     return loft([section(place, u, v, power=power, count=_CORNERS) for place in (start, end)])
 
 
+def _ring(z: float, a: float, b: float, power: float = 2.0) -> np.ndarray:
+    """Return a horizontal cross section with half axes a and b."""
+    return section(z * _Z, a * _X, b * _Y, power=power, count=_CORNERS)
+
+
 def _box(rng: np.random.Generator) -> list[Shape]:
     """A box with more or less round edges along its longest side, in one of three orientations."""
     narrow = rng.uniform(0.025, 0.085)
@@ -108,18 +113,15 @@ def _cup(rng: np.random.Generator) -> list[Shape]:
     bottom = rng.uniform(0.02, 0.04)
     top = bottom * rng.uniform(1.05, 1.35)
     height = rng.uniform(0.05, 0.16)
-    rings = [section(z * _Z, r * _X, r * _Y, count=_CORNERS) for z, r in ((0.0, bottom), (height, top))]
-    return [loft(rings)]
+    return [loft([_ring(0.0, bottom, bottom), _ring(height, top, top)])]
 
 
 def _egg(rng: np.random.Generator) -> list[Shape]:
     """An ellipsoid whose lowest part is cut off, so that it stands."""
     a, b, c = rng.uniform(0.022, 0.045, 3)
-    rings = []
-    for z in np.linspace(-0.8, 0.98, 9):
-        r = np.sqrt(1.0 - z * z)
-        rings.append(section(z * c * _Z, r * a * _X, r * b * _Y, count=_CORNERS))
-    return [loft(rings)]
+    heights = np.linspace(-0.8, 0.98, 9)
+    radii = np.sqrt(1.0 - heights * heights)
+    return [loft([_ring(z * c, r * a, r * b) for z, r in zip(heights, radii, strict=True)])]
 
 
 def _wedge(rng: np.random.Generator) -> list[Shape]:
@@ -140,12 +142,13 @@ def _bottle(rng: np.random.Generator) -> list[Shape]:
     neck = rng.uniform(0.01, 0.04)
     share = rng.uniform(0.3, 0.6)
     power = rng.uniform(2.0, 5.0)
-
-    def ring(z: float, size: float, power: float) -> np.ndarray:
-        return section(z * _Z, size * a * _X, size * b * _Y, power=power, count=_CORNERS)
-
     top = body + shoulder
-    levels = [ring(0.0, 1.0, power), ring(body, 1.0, power), ring(top, share, 2.0), ring(top + neck, share, 2.0)]
+    levels = [
+        _ring(0.0, a, b, power),
+        _ring(body, a, b, power),
+        _ring(top, share * a, share * b),
+        _ring(top + neck, share * a, share * b),
+    ]
     return [loft(pair) for pair in pairwise(levels)]
 
 

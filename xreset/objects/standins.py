@@ -39,18 +39,17 @@ def stand_in(name: str) -> ObjectSpec:
 
 
 def _box(made: dict[str, Any]) -> list[Shape]:
-    size = [length * _MM for length in made["size"]]
-    return [box(np.array(made["center"]) * _MM, size)]
+    return [box(_metres(made["center"]), tuple(_metres(made["size"])))]
 
 
 def _cylinder(made: dict[str, Any]) -> list[Shape]:
-    return [cylinder(np.array(made["center"]) * _MM, made["radius"] * _MM, made["height"] * _MM)]
+    return [cylinder(_metres(made["center"]), made["radius"] * _MM, made["height"] * _MM)]
 
 
 def _lofts(made: dict[str, Any]) -> list[Shape]:
     """Hulls of horizontal superellipses around a vertical axis."""
     u, v = _axes(made["turn"])
-    center = np.array([*made["center"], 0.0]) * _MM + made["forward"] * _MM * v
+    center = _metres([*made["center"], 0.0]) + made["forward"] * _MM * v
     shapes = []
     for outline in made["pieces"]:
         rings = []
@@ -64,7 +63,7 @@ def _lofts(made: dict[str, Any]) -> list[Shape]:
 def _hulls(made: dict[str, Any]) -> list[Shape]:
     """Hulls of points next to a vertical axis."""
     u, v = _axes(made["turn"])
-    center = np.array([*made["center"], 0.0]) * _MM
+    center = _metres([*made["center"], 0.0])
     shapes = []
     for points in made["pieces"]:
         corners = [center + out * _MM * u + z * _MM * _UP + side * _MM * v for out, z, side in points]
@@ -76,9 +75,8 @@ def _ribs(made: dict[str, Any]) -> list[Shape]:
     """Hulls of neighbouring ellipses across a curved line."""
     rings = []
     for x, y, z, width, height, degrees in made["ribs"]:
-        across = np.array([-np.sin(np.radians(degrees)), np.cos(np.radians(degrees)), 0.0])
-        center = np.array([x, y, z]) * _MM
-        rings.append(section(center, width * _MM * across, height * _MM * _UP, count=made["corners"]))
+        _, across = _axes(degrees)
+        rings.append(section(_metres([x, y, z]), width * _MM * across, height * _MM * _UP, count=made["corners"]))
     return [loft(pair) for pair in pairwise(rings)]
 
 
@@ -91,8 +89,7 @@ def _bars(made: dict[str, Any]) -> list[Shape]:
             center = np.zeros(3)
             center[axis] = place * _MM
             center[1 - axis] = (low + high) / 2 * _MM
-            half = np.zeros(3)
-            half[1 - axis] = (high - low) / 2 * _MM
+            half = (high - low) / 2 * _MM * np.eye(3)[1 - axis]
             rings.append(section(center, half, depth * _MM * _UP, power=power, count=made["corners"]))
         shapes.append(loft(rings))
     return shapes
@@ -100,11 +97,11 @@ def _bars(made: dict[str, Any]) -> list[Shape]:
 
 def _prisms(made: list[dict[str, Any]]) -> list[Shape]:
     """Polygons between two heights."""
-    shapes = []
-    for part in made:
-        outline = [(x * _MM, y * _MM) for x, y in part["outline"]]
-        shapes.append(prism(outline, part["bottom"] * _MM, part["top"] * _MM))
-    return shapes
+    return [prism(_metres(part["outline"]), part["bottom"] * _MM, part["top"] * _MM) for part in made]
+
+
+def _metres(lengths: Any) -> np.ndarray:
+    return np.array(lengths) * _MM
 
 
 def _axes(degrees: float) -> tuple[np.ndarray, np.ndarray]:

@@ -68,9 +68,7 @@ def fingers_of(
         object_pos: [M, 3]
         object_quat: [M, 4]
     """
-    q = torch.as_tensor(joint_pos, dtype=torch.float64)
-    pos = torch.as_tensor(object_pos, dtype=torch.float64)
-    quat = torch.as_tensor(object_quat, dtype=torch.float64)
+    q, pos, quat = (torch.as_tensor(array, dtype=torch.float64) for array in (joint_pos, object_pos, object_quat))
     links: list[str] = []
     finger: list[int] = []
     for number, tip in enumerate(robot.fingertips):
@@ -81,7 +79,7 @@ def fingers_of(
     surfaces = {obj.name: Surface(obj) for obj in objects if obj.name in object_name}
     gap = q.new_zeros(len(q), len(links))
     point = q.new_zeros(len(q), len(links), 3)
-    inward = q.new_zeros(len(q), len(links), 3)
+    inward = torch.zeros_like(point)
     for g, link in enumerate(links):
         centers, radii = _balls(kinematics, link)
         R = poses[:, g, :3, :3]

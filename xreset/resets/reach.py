@@ -45,11 +45,9 @@ class Reach:
         at_home = Rotation.from_matrix(root.numpy())
         level = np.cross((0.0, 0.0, 1.0), at_home.apply(self._center))
         level /= max(float(np.linalg.norm(level)), 1e-9)
-        grasps = []
-        for tilt, yaw in product(np.radians(_TILTS), np.radians(_YAWS)):
-            turned = Rotation.from_rotvec((0.0, 0.0, yaw)) * Rotation.from_rotvec(tilt * level) * at_home
-            grasps.append(turned.as_quat())
-        self._grasps = np.stack(grasps)
+        turns = np.radians(list(product(_TILTS, _YAWS)))
+        tilted = Rotation.from_rotvec(turns[:, :1] * level) * at_home
+        self._grasps = (Rotation.from_rotvec(turns[:, 1:] * (0.0, 0.0, 1.0)) * tilted).as_quat()
 
     @one_thread()
     def holds(self, start: np.ndarray, goal: np.ndarray, turn: Rotation) -> np.ndarray:

@@ -119,8 +119,7 @@ def retarget_demos(
     arm = ArmModel(robot)
     joint_pos = np.tile(robot.home, (demos.num_frames, 1))
     reason = np.full(demos.num_frames, REASONS.index("not annotated"), dtype=np.int32)
-    hand_error = np.full(demos.num_frames, np.inf)
-    wrist_error = np.full(demos.num_frames, np.inf)
+    hand_error, wrist_error = np.full((2, demos.num_frames), np.inf)
     for sequences, targets, motion in _hand_motions(human, hand, config.hand, progress):
         path = _arm_targets(hand, arm, targets, motion)
         with one_thread():
@@ -138,11 +137,8 @@ def retarget_demos(
 
     links = arm.kinematics.link_poses(torch.as_tensor(joint_pos), robot.tracked_links)
     contact = np.asarray(human.touching.any(axis=1))
-    first_contact = np.full(demos.num_sequences, -1, dtype=np.int32)
-    for sequence in range(demos.num_sequences):
-        own = contact[demos.frames(sequence)]
-        if own.any():
-            first_contact[sequence] = own.argmax()
+    touches = [contact[demos.frames(sequence)] for sequence in range(len(demos))]
+    first_contact = np.array([own.argmax() if own.any() else -1 for own in touches], dtype=np.int32)
     goal_pos, goal_quat = demos.goal_pose
     return Retargeted(
         robot=robot.name,

@@ -28,10 +28,8 @@ def jaw_keypoints(model: HandModel, keypoints: np.ndarray) -> np.ndarray:
     fingertips."""
     chosen = keypoints[:, model.keypoint_indices]
     for tip, followed in zip(model.robot.fingertips, (("thumb4",), _OPPOSING), strict=True):
-        weights = np.array([[name in followed for name in KEYPOINTS]], dtype=float)
-        point = np.einsum("fk,fkx->fx", np.broadcast_to(weights, keypoints.shape[:2]), keypoints) / len(followed)
-        follower = np.array(model.names) == tip.keypoint
-        chosen = np.where(follower[:, None], point[:, None], chosen)
+        point = keypoints[:, [KEYPOINTS.index(name) for name in followed]].mean(axis=1)
+        chosen[:, np.array(model.names) == tip.keypoint] = point[:, None]
     return chosen
 
 

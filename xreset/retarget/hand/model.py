@@ -162,21 +162,15 @@ class HandModel:
         fingertips = self.robot.fingertips
         balls = self.balls
         first, second = self.kinematics.points(self.home, [tip.link for tip in fingertips])
+        poses = self.kinematics.link_poses(self.home, balls.links)[balls.link]
+        centers = matvec(poses[:, :3, :3], balls.centers) + poses[:, :3, 3]
         pads = []
         for tip, ahead in zip(fingertips, (second - first, first - second), strict=True):
-            links = [link for link in tip.contact_links if link in balls.links]
-            if not links:
+            own = torch.tensor([link in tip.contact_links for link in balls.links], device=self.device)[balls.link]
+            if not bool(own.any()):
                 return none
-            direction = ahead / ahead.norm().clamp_min(1e-9)
-            rows = []
-            front = []
-            for link, pose in zip(links, self.kinematics.link_poses(self.home, links), strict=True):
-                own = (balls.link == balls.links.index(link)).nonzero()[:, 0]
-                centers = balls.centers[own] @ pose[:3, :3].mT + pose[:3, 3]
-                rows.append(own)
-                front.append(centers @ direction + balls.radii[own])
-            reach = torch.cat(front)
-            pads.append(torch.cat(rows)[reach > reach.max() - _PAD_DEPTH])
+            front = centers @ (ahead / ahead.norm().clamp_min(1e-9)) + balls.radii
+            pads.append((own & (front > front[own].max() - _PAD_DEPTH)).nonzero()[:, 0])
         return pads
 
     def keypoints(self, joints: Tensor, root_pos: Tensor, root_quat: Tensor) -> Tensor:

@@ -53,7 +53,7 @@ class Reader:
     read: Callable[[Path], Any]
     """Reads a file of that name; the others beside it are valid."""
     kind: str
-    """``npz``, ``json``, ``yaml``, ``text`` or ``bytes``: what damage understands of it."""
+    """``npz``, ``json``, ``yaml``, ``checkpoint``, ``text`` or ``bytes``: what damage understands of it."""
     may_hold: tuple[str, ...] = ()
     """Fields that may hold numbers that are not finite."""
     slow: bool = False
@@ -79,8 +79,8 @@ def readers() -> Iterator[dict[str, Reader]]:
     from xreset.eval.report.read import read_scalars, run_facts
     from xreset.eval.results import read_episodes, read_evaluation, read_result, read_traces, write_results
     from xreset.eval.study.file import SHIPPED, read_study
+    from xreset.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
     from xreset.learning.clock import LiftClock, read_lift
-    from xreset.learning.runner import read_checkpoint
     from xreset.objects.catalogue import load_object
     from xreset.objects.meshes import read_mesh
     from xreset.objects.properties import properties_of
@@ -154,17 +154,30 @@ def readers() -> Iterator[dict[str, Reader]]:
         write_json(add("conformance", "conformance.json", lambda p: page(read_page([p])), "json"), stored)
 
         write_policy(add("policy", "policy.onnx", OnnxPolicy, "bytes"), contract)
-        path = add("checkpoint", "000001.pt", read_checkpoint, "bytes")
-        states = {key: {} for key in ("actor_state_dict", "critic_state_dict", "optimizer_state_dict")}
-        numbers = {"iteration": 1, "env_steps": 1, "elapsed": 0.1, "learning_rate": 1e-3}
-        torch.save({**states, **numbers, "random": []}, path)
+        weights = {"weight": torch.ones(2, requires_grad=True)}
+        optimizer = torch.optim.Adam(weights.values())
+        weights["weight"].sum().backward()
+        optimizer.step()
+        checkpoint = Checkpoint(
+            actor_state_dict={"weight": torch.ones(2)},
+            critic_state_dict={"weight": torch.ones(2)},
+            optimizer_state_dict=optimizer.state_dict(),
+            iteration=1,
+            env_steps=1,
+            elapsed=0.1,
+            learning_rate=1e-3,
+        )
+        path = add("checkpoint", "000001.pt", lambda p: vars(read_checkpoint(p)), "checkpoint")
+        write_checkpoint(path, checkpoint)
 
         described = openarm.urdf.with_name("robot.toml")
         (folder / "robot.toml").write_bytes(described.read_bytes())
         add("robot.toml", "robot.toml", read_description, "text")
         add("URDF", robot.urdf.name, urdf.load_urdf, "text")
         add("URDF, imported", "hand.urdf", lambda p: read_source(p, []), "text").write_text(HAND)
-        add("MJCF, imported", "hand.xml", lambda p: read_source(p, []), "text").write_text(MJCF)
+        sizes = '<size nkey="1" nuser_body="1"/><asset><texture name="t" type="2d" builtin="flat" width="8" height="8"/></asset>'
+        with_sizes = MJCF.replace("<worldbody>", f"{sizes}<worldbody>")
+        add("MJCF, imported", "hand.xml", lambda p: read_source(p, []), "text").write_text(with_sizes)
 
         calibration = folder / "calibration" / "extrinsics_1" / "extrinsics.yml"
         calibration.parent.mkdir(parents=True)
@@ -214,7 +227,9 @@ def readers() -> Iterator[dict[str, Reader]]:
             "text",
             ("hand_keypoints", "wrist_quat_wxyz"),
         )
-        write_csv(path, once.hand_keypoints, once.object_pos, turn, columns={"object": SOUP, "side": "right"})
+        times = np.arange(len(once.object_pos)) / once.fps
+        columns = {"object": SOUP, "side": "right", "time": times}
+        write_csv(path, once.hand_keypoints, once.object_pos, turn, columns=columns)
         np.savetxt(add("camera, text", "camera.txt", read_transform, "text"), np.eye(4))
         np.save(add("camera, npy", "camera.npy", read_transform, "bytes"), np.eye(4))
 
@@ -355,6 +370,7 @@ def damages(kind: str) -> st.SearchStrategy[Damage]:
         "npz": [_arrays],
         "json": [_tree(json.loads, _dump_json)],
         "yaml": [_tree(yaml.safe_load, _dump_yaml)],
+        "checkpoint": [_tree(_load_checkpoint, _dump_checkpoint)],
         "text": [_words],
     }
     return st.one_of(*(make() if callable(make) else make for make in own.get(kind, [])), _bytes())
@@ -398,6 +414,7 @@ def _words() -> st.SearchStrategy[Damage]:
         "\x9b",
         "../../etc/passwd",
         "1" * 5000,
+        "100000000",
         "[" * 2000,
     )
 
@@ -514,3 +531,17 @@ def _dump_json(data: Any) -> bytes:
 
 def _dump_yaml(data: Any) -> bytes:
     return yaml.dump(data).encode("utf-8", "surrogatepass")
+
+
+def _load_checkpoint(whole: bytes) -> Any:
+    import torch
+
+    return torch.load(io.BytesIO(whole), weights_only=True)
+
+
+def _dump_checkpoint(data: Any) -> bytes:
+    import torch
+
+    out = io.BytesIO()
+    torch.save(data, out)
+    return out.getvalue()

@@ -84,7 +84,7 @@ class DistillTest(unittest.TestCase):
 
     def test_every_policy_that_ships_can_teach(self):
         for file in shipped().values():  # in float16, and of a history of clouds
-            load_teacher(file)  # which compares its actions with the file's
+            load_teacher(path=file)  # which compares its actions with the file's
 
     def test_the_run_is_a_policy_that_sees(self):
         info = read_run(self.run_folder)

@@ -13,10 +13,9 @@ from tensordict import TensorDict
 from tests.test_env import TASK, BreakableBackend, N, WithEnv
 from xreset.errors import RunError
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig, rsl_rl_config
-from xreset.learning.faults import MAX_SHARE, WINDOW, FaultBudget
 from xreset.learning.ppo import SequencePpo
 from xreset.learning.run import checkpoints
-from xreset.learning.runner import TrainingRunner
+from xreset.learning.runner import MAX_SHARE, WINDOW, FaultBudget, TrainingRunner
 
 CONFIG = TrainConfig(
     task=TASK,

@@ -5,9 +5,8 @@ from unittest import mock
 
 import numpy as np
 
-from xreset.learning.config import TrainConfig
+from xreset.learning.config import ScheduleConfig, TrainConfig
 from xreset.learning.runner import TrainingRunner
-from xreset.learning.schedules import ScheduleConfig
 
 
 class ScheduleTest(unittest.TestCase):

@@ -6,7 +6,7 @@ Nothing is lost without a reason: ``total == kept + sum(lost.values())`` in ever
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -68,18 +68,17 @@ def accounts(object_name: np.ndarray, post_contact: np.ndarray, reason: np.ndarr
 
 def with_totals(rows: Sequence[Account]) -> list[Account]:
     """Return the accounts, then the sums over all objects: of each phase, and of both."""
-    before = _summed((row for row in rows if row.phase == "pre-contact"), "pre-contact")
-    after = _summed((row for row in rows if row.phase == "post-contact"), "post-contact")
-    return [*rows, before, after, _summed(rows, "both")]
-
-
-def _summed(rows: Iterable[Account], phase: Phase) -> Account:
-    kept = 0
-    lost: Counter[str] = Counter()
-    for row in rows:
-        kept += row.kept
-        lost.update(row.lost)
-    return Account(object_name="all", phase=phase, kept=kept, lost=dict(lost.most_common()))
+    sums = []
+    phases: tuple[Phase, ...] = ("pre-contact", "post-contact", "both")
+    for phase in phases:
+        kept = 0
+        lost: Counter[str] = Counter()
+        for row in rows:
+            if phase in (row.phase, "both"):
+                kept += row.kept
+                lost.update(row.lost)
+        sums.append(Account(object_name="all", phase=phase, kept=kept, lost=dict(lost.most_common())))
+    return [*rows, *sums]
 
 
 def described(lost: dict[str, int]) -> str:

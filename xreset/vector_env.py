@@ -98,15 +98,15 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
 def observation_space(env: ManipulationEnv) -> gymnasium.spaces.Dict:
     """Return the space of one world's observations, by group."""
-    boxes: dict[str, gymnasium.Space[Any]] = {}
+    boxes = {}
     for name, value in env.get_observations().items():
-        boxes[name] = gymnasium.spaces.Box(-np.inf, np.inf, tuple(value.shape[1:]), np.float32)
+        boxes[name] = gymnasium.spaces.Box(-np.inf, np.inf, value.shape[1:])
     return gymnasium.spaces.Dict(boxes)
 
 
 def action_space(env: ManipulationEnv) -> gymnasium.spaces.Box:
     """Return the space of one world's actions."""
-    return gymnasium.spaces.Box(-1.0, 1.0, (env.num_actions,), np.float32)
+    return gymnasium.spaces.Box(-1.0, 1.0, (env.num_actions,))
 
 
 def checked_action(env: ManipulationEnv, actions: Any) -> torch.Tensor:
@@ -139,4 +139,4 @@ def arrays(observations: TensorDict) -> dict[str, np.ndarray]:
 
 def array(value: Any) -> np.ndarray:
     """Return a tensor as an array."""
-    return value.detach().cpu().numpy()
+    return value.cpu().numpy()

@@ -97,8 +97,8 @@ def must_fit(path: Path) -> Iterator[None]:
         yield
     except torch.OutOfMemoryError:
         raise
-    except (KeyError, IndexError, TypeError, AttributeError, ValueError, RuntimeError) as error:
-        reason = shown(str(error).splitlines()[0] if str(error) else type(error).__name__)
+    except Exception as error:
+        reason = shown(str(error).partition("\n")[0] or type(error).__name__)
         raise RunError(
             f"{path} does not fit this run ({reason}). Was it written by another run, or another version of xreset?"
         ) from error

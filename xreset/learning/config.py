@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
+import numpy as np
+
 from xreset.checks import Checked, NotNegative, Positive, Rule, Share
-from xreset.learning.schedules import ScheduleConfig
 from xreset.task.config import TaskConfig
 
 Widths = Annotated[tuple[int, ...], Rule("one width or more, each above 0", lambda widths: min(widths, default=0) >= 1)]
@@ -88,6 +90,53 @@ class PpoConfig(Checked):
             )
 
 
+Points = tuple[tuple[float, float], ...]
+"""Pairs of a share of the run, from 0 to 1, and the value there; straight lines between them. Empty: no schedule."""
+
+
+def is_schedule(points: Points) -> bool:
+    """Whether the shares rise from 0 or more to 1 or less, and all values lie between 0 and 1."""
+    shares = [share for share, _ in points]
+    rising = all(earlier < later for earlier, later in pairwise(shares))
+    return rising and all(0 <= share <= 1 and 0 <= value <= 1 for share, value in points)
+
+
+ShareSchedule = Annotated[
+    Points,
+    Rule(
+        "pairs of a share of the run and a value, all from 0 to 1, each share greater than the one before", is_schedule
+    ),
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScheduleConfig(Checked):
+    """Settings that change during a run.
+
+    A schedule is a list of points: a share of the run and the setting's value there, such as ``0 0.9 1 0.25``. Values
+    between two points lie on a straight line. The share of the run counts iterations, or minutes if the run is limited
+    to some and more of them have passed.
+    """
+
+    REMOVED: ClassVar[dict[str, Any]] = {"demo_probability": []}
+
+    teacher: ShareSchedule = ()
+    """Share of the worlds in which the teacher acts during a distillation. Empty: none."""
+    success_position: ShareSchedule = ()
+    """Replaces ``task.reward.success_position`` [m], such as ``0 0.05 1 0.01``: what counts as success becomes
+    stricter. Evaluations keep their own limits."""
+    faults: ShareSchedule = ()
+    """Factor on the faults of a real loop, such as ``0 0 0.5 1``: all delays, lost actions, errors and losses of the
+    tracker (not its interval), and the probability of pushes of ``task.randomization``. An episode keeps the delays,
+    the biases and the probabilities that it began with."""
+
+
+def value_at(points: Points, progress: float) -> float:
+    """Return the value of a schedule at a share of the run."""
+    shares, values = zip(*points, strict=True)
+    return float(np.interp(progress, shares, values))
+
+
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig(Checked):
     """Configuration of a training run, as saved in the run folder."""
@@ -136,6 +185,13 @@ def rsl_rl_config(config: TrainConfig, num_envs: int, teacher: Path | None = Non
     if m.normalize_returns:
         critic["class_name"] = "xreset.learning.model:ReturnCritic"
     batches = max(1, min(num_envs * p.horizon // p.minibatch_size, num_envs // 2))
+    update = {
+        "sequence_length": p.sequence_length,
+        "num_learning_epochs": p.mini_epochs,
+        "num_mini_batches": batches,
+        "learning_rate": p.learning_rate,
+        "max_grad_norm": p.grad_norm,
+    }
     settings = {
         "num_steps_per_env": p.horizon,
         "save_interval": config.save_interval,
@@ -145,36 +201,25 @@ def rsl_rl_config(config: TrainConfig, num_envs: int, teacher: Path | None = Non
         },
         "actor": actor,
         "critic": critic,
-        "algorithm": {
+        "algorithm": update
+        | {
             "class_name": "xreset.learning.ppo:SequencePpo",
-            "sequence_length": p.sequence_length,
             "bounds_loss": p.bounds_loss,
-            "num_learning_epochs": p.mini_epochs,
-            "num_mini_batches": batches,
             "clip_param": p.clip,
             "gamma": p.discount,
             "lam": p.gae_lambda,
             "value_loss_coef": p.value_loss,
             "entropy_coef": p.entropy,
-            "learning_rate": p.learning_rate,
-            "max_grad_norm": p.grad_norm,
             "schedule": p.schedule,
             "desired_kl": p.desired_kl,
         },
     }
     if teacher is not None:
         settings["student"] = actor
-        settings["teacher"] = {"class_name": "xreset.learning.teacher:make_teacher", "path": teacher}
+        settings["teacher"] = {"class_name": "xreset.learning.teacher:load_teacher", "path": teacher}
         settings["obs_groups"] |= {
             "student": settings["obs_groups"]["actor"],
             "teacher": ["policy", "proprio", "perception"],
         }
-        settings["algorithm"] = {
-            "class_name": "xreset.learning.distillation:SequenceDistillation",
-            "sequence_length": p.sequence_length,
-            "num_learning_epochs": p.mini_epochs,
-            "num_mini_batches": batches,
-            "learning_rate": p.learning_rate,
-            "max_grad_norm": p.grad_norm,
-        }
+        settings["algorithm"] = update | {"class_name": "xreset.learning.distillation:SequenceDistillation"}
     return settings

@@ -19,7 +19,7 @@ from tensordict import TensorDict
 from xreset.errors import PolicyError
 from xreset.files import atomic_write, code_version, file_hash
 from xreset.learning.checkpoint import must_fit, read_checkpoint
-from xreset.learning.choice import Choice, read_choice
+from xreset.learning.choice import read_choice
 from xreset.learning.config import rsl_rl_config
 from xreset.learning.model import ExportedPolicy, PointNetLstmModel
 from xreset.learning.run import checkpoints, latest_checkpoint, read_run
@@ -122,9 +122,10 @@ def ensure_policy(out: Path) -> Path:
     if policy.exists() and not checkpoints(out):
         return policy
     checkpoint = latest_checkpoint(out)
-    choice = current_choice(out)
-    if choice is not None:
-        checkpoint = checkpoint.with_name(choice.chosen)
+    choice = read_choice(out)
+    if choice is not None and choice.candidates[0].name == checkpoint.name:
+        chosen = checkpoint.with_name(choice.chosen)
+        checkpoint = chosen if chosen.exists() else checkpoint
     if not policy.exists() or not _is_of(policy, checkpoint):
         export_checkpoint(out, checkpoint, policy)
     return policy
@@ -159,13 +160,3 @@ def _is_of(policy: Path, checkpoint: Path) -> bool:
     except DecodeError:
         return False
     return entries.get(_CHECKPOINT_KEY) == file_hash(checkpoint)
-
-
-def current_choice(out: Path) -> Choice | None:
-    """Return the choice of ``xreset select``, if the run still has the chosen checkpoint and no newer one than it
-    knew."""
-    choice = read_choice(out)
-    names = [checkpoint.name for checkpoint in checkpoints(out)]
-    if choice is None or choice.chosen not in names or names[-1] != choice.candidates[0].name:
-        return None
-    return choice

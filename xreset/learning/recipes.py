@@ -11,9 +11,8 @@ from pathlib import Path
 from xreset.cameras.config import VisionConfig
 from xreset.checks import from_dict, merged
 from xreset.errors import RunError
-from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
+from xreset.learning.config import ModelConfig, PpoConfig, ScheduleConfig, TrainConfig
 from xreset.learning.run import read_run
-from xreset.learning.schedules import ScheduleConfig
 from xreset.task.config import TaskConfig
 from xreset.text import plain
 

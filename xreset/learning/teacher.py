@@ -22,13 +22,11 @@ _CLOSE = 1e-3
 """Largest difference between an action of the file and one of the network."""
 
 
-def make_teacher(*_: Any, path: Path) -> PointNetLstmModel:
-    """Return :func:`load_teacher`, as rsl-rl makes models."""
-    return load_teacher(path)
-
-
-def load_teacher(path: Path) -> PointNetLstmModel:
+def load_teacher(*_: Any, path: Path) -> PointNetLstmModel:
     """Return the network of an exported policy, in evaluation mode on the CPU.
+
+    Args:
+        path: the policy. What rsl-rl gives other models in addition is not used.
 
     Raises:
         PolicyError: the file is no policy, or is built in another way than this version exports policies.

@@ -19,7 +19,7 @@ from xreset import robots
 from xreset.demos.archive import Demos, demo_objects, read_demos
 from xreset.retarget.hand.config import HandConfig
 from xreset.retarget.hand.model import HandModel
-from xreset.retarget.pipeline import RetargetConfig, hand_motions, rest_on_table
+from xreset.retarget.pipeline import HandMotions, RetargetConfig, rest_on_table
 from xreset.spec import ObjectSpec
 
 _CONTACT = 0.020
@@ -84,7 +84,9 @@ def run(options: Options, console: Console) -> None:
     if found[0].beyond_limits > 0:
         raise AssertionError(f"a hand joint is {found[0].beyond_limits} rad beyond its limits")
     whole = seconds_of(
-        lambda: list(hand_motions(demos, robots.load(options.robot), list(objects.values()), device=options.device))
+        lambda: list(
+            HandMotions(demos, robots.load(options.robot), list(objects.values()), device=options.device).batches()
+        )
     )
     console.print(
         f"hand retargeting of {len(demos)} sequences, {demos.num_frames} frames, all preparation included: {whole:.0f} s"
@@ -111,7 +113,8 @@ def errors(demos: Demos, objects: Mapping[str, ObjectSpec], options: Options, co
     points, touching = vertex_contacts(on_table, objects)
     parts: list[tuple[np.ndarray, ...]] = []
     beyond = 0.0
-    for sequences, _, motion in hand_motions(demos, robot, specs, RetargetConfig(hand=config), device=options.device):
+    hands = HandMotions(demos, robot, specs, RetargetConfig(hand=config), device=options.device)
+    for sequences, _, motion in hands.batches():
         beyond = max(
             beyond,
             float(torch.maximum(hand.kinematics.lower - motion.joints, motion.joints - hand.kinematics.upper).max()),

@@ -18,7 +18,7 @@ from xreset.retarget.hand.cost import system
 from xreset.retarget.hand.jaw import jaw_keypoints, jaw_state
 from xreset.retarget.hand.model import HandModel, HandState, HandTargets
 from xreset.retarget.hand.solve import retarget_hand
-from xreset.retarget.pipeline import RetargetConfig, hand_motions
+from xreset.retarget.pipeline import HandMotions, RetargetConfig
 from xreset.spec import KEYPOINTS
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=FLOAT)
@@ -83,7 +83,8 @@ class PadsTest(unittest.TestCase):
         demos = synthesize(["soup"], per_object=1, seed=1)
         objects = list(demo_objects(demos).values())
         config = HandConfig(clearance_growth=(), iterations=0)
-        [(_, targets, _)] = hand_motions(demos, self.model.robot, objects, RetargetConfig(hand=config))
+        hands = HandMotions(demos, self.model.robot, objects, RetargetConfig(hand=config))
+        [(_, targets, _)] = hands.batches()
         self.assertFalse(targets.held[0, 0])
         self.assertTrue(targets.held[0, -1])
 

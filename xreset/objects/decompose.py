@@ -221,14 +221,10 @@ class _Surface:
         self._face = np.concatenate((face_of_vertex, face))
         self._tree = cKDTree(self._points)
 
-    def distance(self, points: np.ndarray) -> np.ndarray:
-        """[N] distances from points [N, 3] to the nearest of many points of this surface [m]."""
-        return self._tree.query(points)[0]
-
     def quick_deviation(self, vertices: np.ndarray, faces: np.ndarray) -> float:
         """Return the largest distance from a few points of another surface to the nearest of many of this one [m]."""
         points, _, _ = sample_surface(vertices, faces, 400)
-        return float(self.distance(np.concatenate((vertices, points))).max())
+        return float(self._tree.query(np.concatenate((vertices, points)))[0].max())
 
     def deviation(self, vertices: np.ndarray, faces: np.ndarray) -> float:
         """Return the largest distance of a point of another surface to this one, to ``_EXACT`` [m].

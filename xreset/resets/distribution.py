@@ -80,17 +80,14 @@ class _Grouped:
         self.rows = known[np.argsort(index[known], kind="stable")]
         """Rows of the table, in the sorted order."""
         count = np.bincount(index[known], minlength=len(object_names))
-        self._count = _tensor(count, device)
+        self.count = _tensor(count, device)
+        """Number of rows of each object."""
         self._first = _tensor(np.cumsum(count) - count, device)
-
-    def count(self, object_index: Tensor) -> Tensor:
-        """Return the number of rows of given objects [M]."""
-        return self._count[object_index]
 
     def draw(self, object_index: Tensor, uniform: Tensor) -> Tensor:
         """Return places in the sorted order, drawn evenly from the rows of given objects [M] by numbers [M] in [0,
         1)."""
-        count = self._count[object_index]
+        count = self.count[object_index]
         return self._first[object_index] + torch.minimum((uniform * count).long(), (count - 1).clamp_min(0))
 
 
@@ -167,7 +164,7 @@ class ResetDistribution:
         home = self.home(sequence, generator)
         if not len(self._states.state):
             return home
-        from_bank = (uniform[:, 0] < self.config.demo_probability) & (self._grouped_states.count(object_index) > 0)
+        from_bank = (uniform[:, 0] < self.config.demo_probability) & (self._grouped_states.count[object_index] > 0)
         row = self._grouped_states.draw(object_index, uniform[:, 1])
         row = torch.where(from_bank, row, 0)  # a valid row for home worlds; its values are not used
         gravity = uniform[:, 3] if self.config.random_gravity else torch.ones_like(uniform[:, 3])

@@ -113,15 +113,14 @@ def retarget_demos(
         RobotError: the robot's description does not allow retargeting.
     """
     config = config or RetargetConfig()
-    human = _HumanMotion(demos, objects, config.contact_distance)
-    demos = human.demos
-    hand = HandModel(robot, device=device)
+    hands = HandMotions(demos, robot, objects, config, device=device)
+    demos = hands.demos
     arm = ArmModel(robot)
     joint_pos = np.tile(robot.home, (demos.num_frames, 1))
     reason = np.full(demos.num_frames, REASONS.index("not annotated"), dtype=np.int32)
     hand_error, wrist_error = np.full((2, demos.num_frames), np.inf)
-    for sequences, targets, motion in _hand_motions(human, hand, config.hand, progress):
-        path = _arm_targets(hand, arm, targets, motion)
+    for sequences, targets, motion in hands.batches(progress):
+        path = _arm_targets(hands.model, arm, targets, motion)
         with one_thread():
             joints, measures = track(arm, path, config.thresholds, config.arm)
         full = arm.full(joints, path.hand_joints)
@@ -136,7 +135,7 @@ def retarget_demos(
             wrist_error[rows][annotated] = measures.wrist_position[slot, own][annotated]
 
     links = arm.kinematics.link_poses(torch.as_tensor(joint_pos), robot.tracked_links)
-    contact = np.asarray(human.touching.any(axis=1))
+    contact = np.asarray(hands.touching.any(axis=1))
     touches = [contact[demos.frames(sequence)] for sequence in range(len(demos))]
     first_contact = np.array([own.argmax() if own.any() else -1 for own in touches], dtype=np.int32)
     goal_pos, goal_quat = demos.goal_pose
@@ -169,22 +168,6 @@ def retarget_demos(
     )
 
 
-def hand_motions(
-    demos: Demos,
-    robot: RobotSpec,
-    objects: Sequence[ObjectSpec],
-    config: RetargetConfig | None = None,
-    *,
-    device: str = "cpu",
-    progress: Progress = lambda done, total: None,
-) -> Iterator[tuple[list[int], HandTargets, HandMotion]]:
-    """Retarget the hand alone, in batches: sequences, the hand's targets, its motion. Arguments as in
-    :func:`retarget_demos`."""
-    config = config or RetargetConfig()
-    human = _HumanMotion(demos, objects, config.contact_distance)
-    return _hand_motions(human, HandModel(robot, device=device), config.hand, progress)
-
-
 def wrist_paths(
     demos: Demos,
     robot: RobotSpec,
@@ -195,10 +178,9 @@ def wrist_paths(
 ) -> list[ArmTargets]:
     """Return the paths that hand retargeting demands of the arm, in batches. Arguments and errors as in
     :func:`retarget_demos`."""
-    hand = HandModel(robot)
+    hands = HandMotions(demos, robot, objects, config)
     arm = ArmModel(robot)
-    motions = hand_motions(demos, robot, objects, config, progress=progress)
-    return [_arm_targets(hand, arm, targets, motion) for _, targets, motion in motions]
+    return [_arm_targets(hands.model, arm, targets, motion) for _, targets, motion in hands.batches(progress)]
 
 
 def _by_name(demos: Demos, objects: Sequence[ObjectSpec]) -> dict[str, ObjectSpec]:
@@ -212,23 +194,50 @@ def _by_name(demos: Demos, objects: Sequence[ObjectSpec]) -> dict[str, ObjectSpe
     return {name: given[name] for name in needed}
 
 
-class _HumanMotion:
-    """Demonstrations on the table, and the contacts of their hands."""
+class HandMotions:
+    """Hands that follow demonstrations: the demonstrations on the table, and the contacts of human hands in them."""
 
-    def __init__(self, demos: Demos, objects: Sequence[ObjectSpec], contact_distance: float) -> None:
+    def __init__(
+        self,
+        demos: Demos,
+        robot: RobotSpec,
+        objects: Sequence[ObjectSpec],
+        config: RetargetConfig | None = None,
+        *,
+        device: str = "cpu",
+    ) -> None:
+        """Find the contacts; arguments and errors as of :func:`retarget_demos`."""
+        config = config or RetargetConfig()
+        self.model = HandModel(robot, device=device)
+        """The robot's hand."""
+        self._config = config.hand
         surfaces = {name: Surface(spec) for name, spec in _by_name(demos, objects).items()}
         self._objects = list(surfaces)
         self._fields = DistanceFields.join([surface.field for surface in surfaces.values()])
         self.demos = demos = rest_on_table(demos, objects)
-        points, self.touching = human_contacts(demos, surfaces, contact_distance)
+        self._contact_points, self.touching = human_contacts(demos, surfaces, config.contact_distance)
         """Contact points [F, 21, 3] of the human keypoints, and which of them [F, 21] touch the object."""
-        keypoints = np.where(demos.hand_valid[:, None, None], demos.hand_keypoints, 0.0)
-        self._keypoints = keypoints.astype(np.float64)
-        self._contact_points = points
+        self._keypoints = np.where(demos.hand_valid[:, None, None], demos.hand_keypoints, 0.0).astype(np.float64)
 
-    def hand_targets(self, hand: HandModel, sequences: Sequence[int], jaw: str) -> HandTargets:
+    def batches(
+        self, progress: Progress = lambda done, total: None
+    ) -> Iterator[tuple[list[int], HandTargets, HandMotion]]:
+        """Retarget the hand alone, in batches of those sequences that have a hand: sequences, the hand's targets, its
+        motion."""
+        demos = self.demos
+        todo = [i for i in range(len(demos)) if demos.hand_valid[demos.frames(i)].any()]
+        for begin in range(0, len(todo), _SEQUENCES_PER_BATCH):
+            sequences = todo[begin : begin + _SEQUENCES_PER_BATCH]
+            targets = self._targets(sequences)
+            with one_thread():
+                motion = retarget_hand(self.model, targets, self._config)
+            yield sequences, targets, motion
+            progress(begin + len(sequences), len(todo))
+
+    def _targets(self, sequences: Sequence[int]) -> HandTargets:
         """Return the targets of some sequences, padded with frames that are not annotated."""
         demos = self.demos
+        hand = self.model
         rows = [demos.frames(i) for i in sequences]
         frames = max(row.stop - row.start for row in rows)
 
@@ -239,7 +248,7 @@ class _HumanMotion:
             return torch.as_tensor(out)
 
         keypoints = self._keypoints[:, hand.keypoint_indices]
-        if hand.is_jaw and jaw == "analytic":
+        if hand.is_jaw and self._config.jaw == "analytic":
             keypoints = jaw_keypoints(hand, self._keypoints)
         held = np.logical_and(self.touching[:, _THUMB].any(axis=1), self.touching[:, _FINGERS].any(axis=1))
         which = [self._objects.index(name) for name in demos.object_name[list(sequences)].tolist()]
@@ -254,21 +263,6 @@ class _HumanMotion:
             object_index=torch.tensor(which),
             fields=self._fields,
         )
-
-
-def _hand_motions(
-    human: _HumanMotion, hand: HandModel, config: HandConfig, progress: Progress
-) -> Iterator[tuple[list[int], HandTargets, HandMotion]]:
-    """Retarget the hand in batches of those sequences that have a hand."""
-    demos = human.demos
-    todo = [i for i in range(demos.num_sequences) if demos.hand_valid[demos.frames(i)].any()]
-    for begin in range(0, len(todo), _SEQUENCES_PER_BATCH):
-        sequences = todo[begin : begin + _SEQUENCES_PER_BATCH]
-        targets = human.hand_targets(hand, sequences, config.jaw)
-        with one_thread():
-            motion = retarget_hand(hand, targets, config)
-        yield sequences, targets, motion
-        progress(begin + len(sequences), len(todo))
 
 
 def _arm_targets(hand: HandModel, arm: ArmModel, targets: HandTargets, motion: HandMotion) -> ArmTargets:

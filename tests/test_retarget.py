@@ -28,6 +28,7 @@ from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track
 from xreset.retarget.file import Retargeted, read_retargeted, write_retargeted
+from xreset.retarget.hand import terms
 from xreset.retarget.hand.clearance import Distances, Objects, too_near
 from xreset.retarget.hand.config import HandConfig
 from xreset.retarget.hand.cost import system
@@ -57,6 +58,28 @@ class ChainTest(unittest.TestCase):
             dense[:, block, block] = diagonal[:, t]
         expected = torch.linalg.solve(dense, rhs.reshape(S, -1)).view(S, T, n)
         assert_close(solve_chain(diagonal, coupling, rhs), expected, atol=1e-10, rtol=0)
+
+
+class TermTest(unittest.TestCase):
+    """Values of the terms; the gradient of their sum is tested below, and that of the pads with the jaws."""
+
+    def test_contact_costs_nothing_within_the_margin_and_is_linear_beyond_the_knee(self):
+        x = torch.tensor([[[0.05, 0.0, 0.0], [0.11, 0.0, 0.0], [0.5, 0.0, 0.0]]], dtype=FLOAT)
+        for knee, costs in ((1e-9, (0.0, 0.01, 0.4)), (0.02, (0.0, 0.01**2 / 0.04, 0.4 - 0.01))):  # 0: the paper's cost
+            for point, expected in enumerate(costs):
+                weight = torch.eye(3, dtype=FLOAT)[point] * 2.0
+                found = terms.contact(x, torch.zeros_like(x), weight[None], 0.1, knee)
+                self.assertAlmostEqual(found.cost.item(), 2.0 * expected, places=7)
+                self.assertGreaterEqual(torch.linalg.eigvalsh(found.curvature).min().item(), -1e-12)
+
+    def test_jumps_cost_beyond_their_limit_and_nothing_attracts_from_afar(self):
+        d = torch.tensor([[0.1, -0.3, 0.5]], dtype=FLOAT)
+        limit = torch.tensor([0.2, 0.2, torch.inf], dtype=FLOAT)
+        found = terms.change(d, torch.tensor([2.0, 3.0, 4.0], dtype=FLOAT), limit, 100.0)
+        assert_close(found.curvature, torch.tensor([[2.0, 103.0, 4.0]], dtype=FLOAT))
+        self.assertAlmostEqual(found.cost.item(), 2 * 0.01 + 3 * 0.09 + 4 * 0.25 + 100 * 0.01)
+        far = terms.attraction(torch.tensor([[0.01, 1.2]], dtype=FLOAT), torch.tensor([3.0, 5.0], dtype=FLOAT), 1.0)
+        assert_close(far.gradient, torch.tensor([[0.03, 0.0]], dtype=FLOAT), atol=1e-5, rtol=0)
 
 
 class HandTest(unittest.TestCase):

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -34,14 +34,9 @@ class Properties(Checked):
         if self.mass is not None and self.density is not None:
             raise ValueError("mass and density are both given; one follows from the other")
 
-    @property
-    def known(self) -> dict[str, float]:
-        """The known properties by name."""
-        return {name: value for name, value in asdict(self).items() if value is not None}
-
     def to_toml(self) -> str:
         """Return the text of the file; empty if nothing is known."""
-        return "".join(f"{name} = {float(value)!r}\n" for name, value in self.known.items())
+        return "".join(f"{name} = {float(value)!r}\n" for name, value in vars(self).items() if value is not None)
 
 
 def properties_of(mesh: Path) -> Properties:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from math import inf
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -51,7 +52,7 @@ class ResetBank:
     object_quat_wxyz: Annotated[np.ndarray, Field(("L", 4), "f", unit=True)] = _empty(4)
     object_name: Annotated[np.ndarray, Field(("L",), "U")] = _empty(dtype=np.str_)
     sequence_index: Annotated[np.ndarray, Field(("L",), "i")] = _empty(dtype=np.int32)
-    frame_index: Annotated[np.ndarray, Field(("L",), "i")] = _empty(dtype=np.int32)
+    frame_index: Annotated[np.ndarray, Field(("L",), "i", within=(0, inf))] = _empty(dtype=np.int32)
     post_contact: Annotated[np.ndarray, Field(("L",), "b")] = _empty(dtype=np.bool_)
     """[L] bool: whether the human hand had touched the object by that frame."""
 
@@ -71,7 +72,7 @@ class ResetBank:
 
     # Rejected candidates
     rejected_sequence_index: Annotated[np.ndarray, Field(("C",), "i")] = _empty(dtype=np.int32)
-    rejected_frame_index: Annotated[np.ndarray, Field(("C",), "i")] = _empty(dtype=np.int32)
+    rejected_frame_index: Annotated[np.ndarray, Field(("C",), "i", within=(0, inf))] = _empty(dtype=np.int32)
     rejected_post_contact: Annotated[np.ndarray, Field(("C",), "b")] = _empty(dtype=np.bool_)
     rejected_reason: Annotated[np.ndarray, Field(("C",), "i")] = _empty(dtype=np.int32)
     """[C] index into ``reason_names``."""
@@ -229,9 +230,6 @@ def bank_problem(arrays: dict[str, np.ndarray]) -> str | None:
     """Return what contradicts itself between the arrays of a bank, or None."""
     if problem := unique_problem(arrays["sequence_name"]):
         return problem
-    for name in ("frame_index", "rejected_frame_index"):
-        if (arrays[name] < 0).any():
-            return f"array {name!r} holds negative numbers."
     for name, target, what in (
         ("sequence_index", "sequence_name", "sequences"),
         ("rejected_sequence_index", "sequence_name", "sequences"),

@@ -8,9 +8,9 @@ from pathlib import Path
 from unittest import mock
 
 import torch
-from tensordict import TensorDict
 
 from tests.test_env import TASK, BreakableBackend, N, WithEnv
+from tests.test_learning import observations
 from xreset.errors import RunError
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig, rsl_rl_config
 from xreset.learning.ppo import SequencePpo
@@ -71,18 +71,13 @@ class Learning(unittest.TestCase):
 
         env = mock.Mock(num_envs=N, num_actions=3, device="cpu")
 
-        def observations(seed: int) -> TensorDict:
-            g = torch.Generator().manual_seed(seed)
-            widths = {"policy": (7,), "proprio": (9,), "perception": (1, 10, 3), "privileged": (4,)}
-            return TensorDict({k: torch.randn(N, *w, generator=g) for k, w in widths.items()}, batch_size=[N])
-
         torch.manual_seed(0)
         alg = SequencePpo.construct_algorithm(
-            observations(0), env, rsl_rl_config(CONFIG, N) | {"multi_gpu": None}, "cpu"
+            observations(N), env, rsl_rl_config(CONFIG, N) | {"multi_gpu": None}, "cpu"
         )
         with torch.no_grad():
             for t in range(8):
-                alg.act(observations(t))
+                alg.act(observations(N, seed=t))
                 reward = torch.linspace(-1, 1, N)
                 done = torch.zeros(N)
                 faulty = torch.zeros(N, dtype=torch.bool)
@@ -90,8 +85,10 @@ class Learning(unittest.TestCase):
                     reward[1] = faulty_reward
                     done[1] = 1.0
                     faulty[1] = marked
-                alg.process_env_step(observations(t + 1), reward, done, {"time_outs": done * 0, "faulty": faulty})
-            alg.compute_returns(observations(8))
+                alg.process_env_step(
+                    observations(N, seed=t + 1), reward, done, {"time_outs": done * 0, "faulty": faulty}
+                )
+            alg.compute_returns(observations(N, seed=8))
         torch.manual_seed(1)
         alg.update()
         return alg.actor.state_dict() | {f"critic.{k}": v for k, v in alg.critic.state_dict().items()}

@@ -5,10 +5,10 @@ import tempfile
 import unittest
 from dataclasses import asdict
 from pathlib import Path
+from types import SimpleNamespace
 from unittest import mock
 
 import torch
-from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
 from xreset import robots
@@ -144,37 +144,28 @@ class ModelTest(unittest.TestCase):
 
 def places(alg: SequencePpo) -> dict[str, int]:
     """Where in memory the tensors lie that an update reads: a captured one reads there for ever."""
-    storage = alg.storage
+    read = vars(alg.storage) | {"rate": alg._rate, "sums": alg._sums}
     tensors = {f"actor {name}": value for name, value in alg.actor.state_dict().items()}
     tensors |= {f"critic {name}": value for name, value in alg.critic.state_dict().items()}
-    tensors |= dict(storage.observations.items()) | {"rate": alg._rate, "sums": alg._sums}
-    tensors |= {
-        name: getattr(storage, name)
-        for name in ("actions", "values", "dones", "returns", "advantages", "actions_log_prob")
-    }
-    lists = {
-        "params": storage.distribution_params,
-        "state a": storage.saved_hidden_state_a,
-        "state c": storage.saved_hidden_state_c,
-    }
-    tensors |= {f"{name} {i}": value for name, values in lists.items() for i, value in enumerate(values)}
+    tensors |= dict(alg.storage.observations.items())
+    for name in set(read) - {"observations", "rewards"}:  # an update reads the returns of the rewards
+        values = read[name] if isinstance(read[name], list | tuple) else [read[name]]
+        for i, value in enumerate(values):
+            if isinstance(value, torch.Tensor):
+                tensors[f"{name} {i}"] = value
     return {name: value.data_ptr() for name, value in tensors.items()}
 
 
 class StorageTest(unittest.TestCase):
     def test_sequences_cover_the_rollout_once_with_their_states(self):
-        storage = RolloutStorage("rl", N, T, observations(N), [A], "cpu")
         code = torch.arange(T * N, dtype=torch.float32).view(T, N, 1)
-        for t in range(T):
-            tr = RolloutStorage.Transition()
-            tr.observations, tr.actions, tr.rewards = observations(N, seed=t), code[t].expand(N, A), code[t, :, 0]
-            tr.dones = torch.tensor([t == 2, t == 3, False])
-            tr.values, tr.actions_log_prob = code[t], code[t, :, 0]
-            tr.distribution_params = (code[t].expand(N, A), code[t].expand(N, A))
-            state = code[t].expand(N, 12)[None]
-            tr.hidden_states = ((state, state), (state, state))
-            storage.add_transition(tr)
-        storage.returns, storage.advantages = code.clone(), code.clone()
+        dones = torch.zeros(T, N, 1)
+        dones[2, 0] = 1
+        dones[3, 1] = 1
+        names = ("actions", "values", "advantages", "returns", "actions_log_prob")
+        storage = SimpleNamespace(observations=observations(T, N), dones=dones, **dict.fromkeys(names, code))
+        storage.distribution_params = (code,)
+        storage.saved_hidden_state_a = storage.saved_hidden_state_c = [code.expand(T, N, 12)[:, None]] * 2
         seen = []
         for worlds in torch.randperm(N).tensor_split(2):
             batch = minibatch(storage, worlds, L)
@@ -182,9 +173,7 @@ class StorageTest(unittest.TestCase):
             torch.testing.assert_close(batch.values[1:] - batch.values[:-1], torch.full_like(batch.values[1:], N))
             torch.testing.assert_close(batch.hidden_states[0][0][0, :, 0], batch.values[::L, :, 0].flatten())
             # a step is the first of an episode where the step before it was the last
-            world, step = (batch.values % N).squeeze(-1), (batch.values // N).squeeze(-1)
-            expected = ((world == 0) & (step == 3)) | ((world == 1) & (step == 4))
-            self.assertTrue(torch.equal(batch.masks, expected))
+            self.assertTrue(torch.equal(batch.masks, firsts((3, 0), (4, 1))[:, worlds]))
         self.assertEqual(sorted(seen), list(range(T * N)))
 
     def bandit(
@@ -201,16 +190,14 @@ class StorageTest(unittest.TestCase):
         ``bias`` is added to the first policy's means; without ``capture`` a GPU is given every kernel of an update by itself.
         """
 
-        class Bandit:
-            num_envs, num_actions = 64, A
-
         model = ModelConfig(
             pointnet=(8, 6), lstm=12, mlp=(16,), initial_std=0.5, normalize_returns=ppo.pop("normalize_returns", False)
         )
         config = TrainConfig(model=model, ppo=PpoConfig(horizon=8, minibatch_size=128, **ppo))
         torch.manual_seed(0)
         obs = observations(64).to(device)
-        alg = SequencePpo.construct_algorithm(obs, Bandit(), rsl_rl_config(config, 64) | {"multi_gpu": None}, device)
+        env = SimpleNamespace(num_envs=64, num_actions=A)
+        alg = SequencePpo.construct_algorithm(obs, env, rsl_rl_config(config, 64) | {"multi_gpu": None}, device)
         alg._graphs.active &= capture
         alg.actor.mlp[-1].bias.data += bias
         obs["perception"] = obs["perception"][:, -1:].expand(-1, 5, -1, -1)  # a scene in which nothing moves

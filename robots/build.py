@@ -51,15 +51,9 @@ def robot_tree(figures: Figures) -> RobotTree:
     base = figures["base"]
     palm = figures["palm"]
     mimics = {mimic["joint"]: MimicSpec(**mimic) for mimic in figures.get("mimics", [])}
-    links = [_link(base)]
-    joints = []
-    parent = base["name"]
-    for part in figures["arm"]:
-        links.append(_link(part))
-        joints.append(_joint(part, parent, mimics))
-        parent = part["name"]
-    links.append(_link(palm))
-    joints.append(fixed(parent, palm["name"], _pose(palm)))
+    links = [_link(part) for part in (base, *figures["arm"], palm)]
+    joints = [_joint(part, before.name, mimics) for part, before in zip(figures["arm"], links, strict=False)]
+    joints.append(fixed(links[-2].name, palm["name"], _pose(palm)))
     for part in figures["hand"]:
         links.append(_link(part, figures.get("rotor", 0.0)))
         joints.append(_joint(part, part["parent"], mimics))
@@ -117,9 +111,8 @@ def _shape(kind: Any, first: list[float], second: list[float], radius: float = 0
         return shapes.box(second, first)
     axis = np.subtract(second, first)
     length = float(np.linalg.norm(axis))
-    T = np.eye(4)
-    T[:3, :3] = Rotation.align_vectors(axis / length, [0, 0, 1])[0].as_matrix()
-    T[:3, 3] = np.add(first, second) / 2
+    turn = Rotation.align_vectors(axis / length, [0, 0, 1])[0]
+    T = shapes.transform(turn.as_matrix(), np.add(first, second) / 2)
     return Shape(geometry=Geometry(kind=kind, size=(radius, length / 2)), T_body_shape=T)
 
 

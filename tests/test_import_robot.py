@@ -311,7 +311,10 @@ class Toy(WithFolder):
         copies = '<replicate count="30000"><replicate count="30000"><geom size="0.01"/></replicate></replicate></body>'
         for words, text in (
             ("orientation that is not finite", MJCF.replace('euler="0 0 0.9"', 'euler="-inf 0 0"')),
-            ("1e-300 m small", MJCF.replace('size="0.018 0.007 0.007"', 'size="1e-300 1e-300 1e-300"')),
+            (
+                "size 1e-300 m. Expected at least 1e-06 m",
+                MJCF.replace('size="0.018 0.007 0.007"', 'size="1e-300 1e-300 1e-300"'),
+            ),
             (
                 "hfield elements have 1.6e.09 entries",
                 asset('<hfield name="h" nrow="40000" ncol="40000" size="1 1 1 1"/>'),

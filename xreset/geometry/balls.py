@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 import torch
@@ -128,8 +128,8 @@ def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> 
 
 def _slices(parts: Sequence[np.ndarray]) -> tuple[slice, ...]:
     """Return where each part is among the rows of all parts."""
-    ends = np.cumsum([len(part) for part in parts], dtype=int).tolist()
-    return tuple(slice(end - len(part), end) for part, end in zip(parts, ends, strict=True))
+    ends = np.cumsum([0, *(len(part) for part in parts)]).tolist()
+    return tuple(slice(first, end) for first, end in pairwise(ends))
 
 
 def _joined(parts: Sequence[np.ndarray], *shape: int) -> Tensor:

@@ -226,9 +226,7 @@ def coal_geometry(coal, geometry: Geometry):
         return coal.Cylinder(size[0], 2 * size[1])
     assert geometry.vertices is not None and geometry.faces is not None
     points = coal.StdVec_Vec3s()
-    for vertex in geometry.vertices:
-        points.append(np.asarray(vertex, dtype=float))
+    points.extend([*np.asarray(geometry.vertices, dtype=float)])
     triangles = coal.StdVec_Triangle()
-    for face in geometry.faces.tolist():
-        triangles.append(coal.Triangle(*face))
+    triangles.extend([coal.Triangle(*face) for face in geometry.faces.tolist()])
     return coal.Convex(points, triangles)

@@ -36,24 +36,24 @@ CYLINDER_SECTIONS = 48
 """Sides of the prism that stands for a cylinder in a surface mesh."""
 
 
+def transform(R: ArrayLike, position: ArrayLike) -> np.ndarray:
+    """[4, 4] pose of a rotation, 3 x 3 or its nine numbers, and a position [3]."""
+    T = np.eye(4)
+    T[:3, :3] = np.reshape(R, (3, 3))
+    T[:3, 3] = position
+    return T
+
+
 def box(center: ArrayLike, size: Sequence[float]) -> Shape:
     """Make an axis-aligned box of edge lengths ``size``."""
     half = tuple(float(edge) / 2 for edge in size)
-    return _placed(Geometry(kind="box", size=half), center)
+    return Shape(geometry=Geometry(kind="box", size=half), T_body_shape=transform(np.eye(3), center))
 
 
 def cylinder(center: ArrayLike, radius: float, height: float) -> Shape:
     """Make a cylinder along z."""
-    return _placed(
-        Geometry(kind="cylinder", size=(float(radius), float(height) / 2)),
-        center,
-    )
-
-
-def _placed(geometry: Geometry, center: ArrayLike) -> Shape:
-    T = np.eye(4)
-    T[:3, 3] = center
-    return Shape(geometry=geometry, T_body_shape=T)
+    geometry = Geometry(kind="cylinder", size=(float(radius), float(height) / 2))
+    return Shape(geometry=geometry, T_body_shape=transform(np.eye(3), center))
 
 
 def hull(points: np.ndarray, tolerance: float = 0.0) -> Shape:

@@ -35,6 +35,8 @@ HULL_TOLERANCE = 5e-4
 hundreds."""
 _LARGEST = 1e6
 """Largest number in a URDF, limits excepted: masses [kg], positions [m], inertias [kg m^2]. No robot comes near."""
+_SMALLEST = 1e-6
+"""[m] Smallest size of a shape."""
 _SHORTEST_AXIS = 1e-9
 _FOLDERS_ABOVE = 3
 """Folders above the URDF's own in which meshes may lie: those of a ROS package and of its workspace, never the root."""
@@ -284,18 +286,22 @@ def check_tree(tree: RobotTree, path: Path) -> None:
     """Raise ``RobotError`` for numbers that are not finite or too large; limits of continuous joints may be
     infinite."""
     for link in tree.links:
-        parts = [link.com, link.inertia, np.array([link.mass])]
+        parts = [link.com, link.inertia, link.mass]
+        least = math.inf
         for shape in link.collisions:
-            parts += [
-                shape.T_body_shape,
-                np.asarray(shape.geometry.size or 0.0),
-            ]
-            if shape.geometry.vertices is not None:
+            sizes = np.array(shape.geometry.size)
+            parts += [shape.T_body_shape, sizes]
+            if shape.geometry.kind == "hull":
                 parts.append(shape.geometry.vertices)
+            elif shape.geometry.kind == "capsule":
+                sizes = sizes + np.array((0.0, _SMALLEST))  # its half length may be 0
+            least = min(least, sizes.min(initial=math.inf))
         if not all((np.abs(part) < _LARGEST).all() for part in parts):
             raise RobotError(f"{path}: link {link.name!r} has a number that is not finite, or far too large.")
-        if any(min(shape.geometry.size, default=0.0) < 0 for shape in link.collisions):
-            raise RobotError(f"{path}: link {link.name!r} has a shape of negative size.")
+        if least < _SMALLEST:
+            raise RobotError(
+                f"{path}: link {link.name!r} has a shape of size {least:g} m. Expected at least {_SMALLEST:g} m."
+            )
         if link.mass < 0:
             raise RobotError(f"{path}: link {link.name!r} has the mass {link.mass} kg, expected 0 or more.")
     for joint in tree.joints:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from xreset.geometry.shapes import transform
 from xreset.geometry.urdf import Joint, Link, RobotTree
 
 FRAME_MASS = 1e-4
@@ -36,17 +37,12 @@ def pose(
         rotation = Rotation.from_euler("xyz", rpy)
     else:
         rotation = Rotation.from_quat(np.array(quat, dtype=float), scalar_first=True)
-    T = np.eye(4)
-    T[:3, :3] = rotation.as_matrix()
-    T[:3, 3] = xyz
-    return T
+    return transform(rotation.as_matrix(), xyz)
 
 
-def axes(*, x: Sequence[float], z: Sequence[float]) -> np.ndarray:
+def axes(*, x: ArrayLike, z: ArrayLike) -> np.ndarray:
     """[4, 4] rotation whose first and third columns are the unit vectors ``x`` and ``z``."""
-    T = np.eye(4)
-    T[:3, :3] = np.stack((x, np.cross(z, x), z), axis=1)
-    return T
+    return transform(np.stack((x, np.cross(z, x), z), axis=1), np.zeros(3))
 
 
 def frame(name: str) -> Link:

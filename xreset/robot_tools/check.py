@@ -156,16 +156,15 @@ def _mimics(spec: RobotSpec, tree: RobotTree) -> Problems:
 
 def _links(spec: RobotSpec, tree: RobotTree) -> Problems:
     known = {link.name: link for link in tree.links}
-    wanted = {"hand.root": [spec.hand_root], "hand.palm": [spec.palm]}
+    wanted = [("hand.root", spec.hand_root), ("hand.palm", spec.palm)]
     for tip in spec.fingertips:
-        wanted[f"fingertip {tip.name!r}"] = [tip.link]
-        wanted[f"contact_links of {tip.name!r}"] = [*tip.contact_links]
-    for point in spec.keypoints:
-        wanted[f"keypoint {point.keypoint!r}"] = [point.link]
-    wanted["collision.self"] = [*spec.self_collision_links]
-    wanted["collision.exclude"] = [link for pair in spec.collision_exclude for link in pair]  # noqa: XR002
-    wanted["collision.table_exclude"] = [*spec.table_exclude]
-    absent = [(where, link) for where, links in wanted.items() for link in links if link not in known]  # noqa: XR002
+        wanted += [(f"fingertip {tip.name!r}", link) for link in (tip.link, *tip.contact_links)]
+    wanted += [(f"keypoint {point.keypoint!r}", point.link) for point in spec.keypoints]
+    wanted += [("collision.self", link) for link in spec.self_collision_links]
+    for pair in spec.collision_exclude:
+        wanted += [("collision.exclude", link) for link in pair]
+    wanted += [("collision.table_exclude", link) for link in spec.table_exclude]
+    absent = [(where, link) for where, link in wanted if link not in known]
     for where, link in absent:
         yield "error", f"{where}: the URDF has no link {link!r}. Choose from: {', '.join(known)}."
     if absent:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from xreset.errors import RobotError
-from xreset.geometry.shapes import surface_of
+from xreset.geometry.shapes import surface_of, transform
 from xreset.geometry.urdf import RobotTree
 from xreset.geometry.urdf_writer import axes, fixed, frame
 from xreset.robot_tools.draft import draft_spec, link_places
@@ -287,9 +287,7 @@ def _with_frames(
     for finger in fingers:
         last = finger.links[-1]
         end = _end(tree, finger, straight)
-        T = np.eye(4)
-        T[:3, :3] = straight[last][:3, :3].T @ palm[:3, :3]
-        T[:3, 3] = _in_link(straight[last], end)
+        T = transform(straight[last][:3, :3].T @ palm[:3, :3], _in_link(straight[last], end))
         tip = FingertipSpec(
             name=finger.name,
             link=f"{finger.name}_tip_frame",
@@ -303,9 +301,7 @@ def _with_frames(
             link = finger.links[near]
             beside = _in_link(straight[link], joints[near])
             if np.linalg.norm(beside) > _BESIDE:
-                T = np.eye(4)
-                T[:3, 3] = beside
-                frames.append((f"{keypoint}_frame", link, T))
+                frames.append((f"{keypoint}_frame", link, transform(np.eye(3), beside)))
                 link = f"{keypoint}_frame"
             keypoints.append(KeypointSpec(keypoint=keypoint, link=link))
         keypoints.append(KeypointSpec(keypoint=tip.keypoint, link=tip.link))

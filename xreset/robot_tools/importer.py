@@ -8,13 +8,11 @@ finger, where the palm looks, which links follow which human keypoint, drives, h
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
 from xreset.description import DESCRIPTION, load_robot
@@ -42,9 +40,6 @@ _ARM_EFFORT = 50.0
 _STABLE = 0.8
 """Share of the largest kp that is stable in engines that integrate drives explicitly: kd times the step stays below the
 inertia."""
-_ALWAYS = 0.9
-"""Links that meet in this share of the hand's configurations are modelled so, and never collide."""
-_SAMPLES = 200
 _HOME_PALM = (0.57, 0.45, 0.25)
 """[m] Position of the palm at home: above the table, looking down, fingers away from the person."""
 _ALONG = 0.9
@@ -120,10 +115,10 @@ def import_robot(
         spec = draft_spec(whole, found.root, work, tips=found.tips, keypoints=found.keypoints, bent=found.bent)
         spec = _with_arm_home(spec, found.palm_in_hand, notes)
         spec = _with_drives(spec, whole, notes)
-        pairs = _always_meeting(spec)
+        pairs = SelfCollision(spec, Kinematics(spec)).overlapping_at_home
         if pairs:
-            listed = "; ".join(f"{a} and {b} ({why})" for (a, b), why in pairs.items())
-            notes.append(f"never collide, because they meet: {listed}")
+            listed = "; ".join(f"{a} and {b}" for a, b in pairs)
+            notes.append(f"never collide, because they meet at home: {listed}")
         spec = replace(spec, collision_exclude=tuple(pairs))
         (work / DESCRIPTION).write_text(description_text(spec, notes))
         load_robot(work)
@@ -276,19 +271,3 @@ def _with_drives(spec: RobotSpec, tree: RobotTree, notes: list[str]) -> RobotSpe
         "drives: kd = 1.8 sqrt(kp I) in the hand, critical in the arm, with the inertia I about the joint at home"
     )
     return replace(spec, joints=tuple(joints))
-
-
-def _always_meeting(spec: RobotSpec) -> dict[tuple[str, str], str]:
-    """Return pairs of links that meet at home, or nearly wherever the hand's joints are, and which of the two."""
-    kinematics = Kinematics(spec)
-    collision = SelfCollision(spec, kinematics)
-    pairs = dict.fromkeys(collision.overlapping_at_home, "at home")
-    q = torch.tensor(spec.home).repeat(_SAMPLES, 1)
-    hand = torch.as_tensor(spec.hand_indices)
-    draw = torch.rand(_SAMPLES, len(hand), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    q[:, hand] = kinematics.lower[hand] + draw * (kinematics.upper[hand] - kinematics.lower[hand])
-    near = collision.near(kinematics.link_poses(q).numpy(), 0.0)
-    for pair, count in Counter((a, b) for _, a, b in near).items():
-        if count >= _ALWAYS * _SAMPLES:
-            pairs[pair] = "in nearly every position"
-    return pairs

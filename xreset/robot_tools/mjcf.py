@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from xreset.errors import ObjectError, RobotError
-from xreset.geometry.shapes import hull
+from xreset.geometry.shapes import hull, transform
 from xreset.geometry.urdf import HULL_TOLERANCE, Joint, Link, RobotTree
 from xreset.geometry.urdf_writer import fixed, frame
 from xreset.robot_tools.couplings import SLIDE, Couplings, Pull, joint_name, read_couplings
@@ -163,13 +163,10 @@ def _tree(path: Path, model: mujoco.MjModel, couplings: Couplings) -> RobotTree:
         above = names[int(body.parentid[0])]
         if number == 1 and moving:
             raise RobotError(f"{path}: the first body {body.name!r} has joints; put it into a body that does not move.")
-        T = np.eye(4)
-        T[:3, :3] = data.xmat[number].reshape(3, 3)
-        T[:3, 3] = data.xpos[number]
+        T = transform(data.xmat[number], data.xpos[number])
         children = [*(f"{names[number]}_axis{i}" for i in range(len(moving) - 1)), names[number]]
         for child, joint in zip(children, moving, strict=False):
-            T = T.copy()
-            T[:3, 3] = data.xanchor[joint]
+            T = transform(T[:3, :3], data.xanchor[joint])
             poses[child] = T
             links[child] = frame(child)
             between = np.linalg.inv(poses[above]) @ T
@@ -230,10 +227,7 @@ def _shapes(model: mujoco.MjModel, data: mujoco.MjData, body: int, T_world_link:
         kind = _kind(geom)
         if not _is_solid(geom) or kind == "plane":
             continue
-        T = np.eye(4)
-        T[:3, :3] = data.geom_xmat[number].reshape(3, 3)
-        T[:3, 3] = data.geom_xpos[number]
-        T = np.linalg.inv(T_world_link) @ T
+        T = np.linalg.inv(T_world_link) @ transform(data.geom_xmat[number], data.geom_xpos[number])
         geometry = Geometry(kind=kind, size=tuple(map(float, geom.size[: _SIZES[kind]])))  # pyright: ignore[reportArgumentType]
         if kind == "mesh":
             mesh = model.mesh(geom.dataid[0])

@@ -26,8 +26,6 @@ _FLANGES = (
 )
 """Links that carry the tool in the makers' files: UR, ABB and Fanuc (ROS-Industrial), xArm, Panda and FR3, iiwa,
 Kinova."""
-_SMALLEST = 1e-6
-"""[m] Smallest size of a shape."""
 
 
 def read_source(path: str | Path, notes: list[str]) -> RobotTree:
@@ -56,16 +54,6 @@ def read_source(path: str | Path, notes: list[str]) -> RobotTree:
         check_tree(tree, path)
     else:
         tree = load_urdf(path)
-    for link in tree.links:
-        for shape in link.collisions:
-            sizes = shape.geometry.size
-            if shape.geometry.kind != "box":
-                sizes = sizes[:1]  # the half length of a capsule may be 0
-            if sizes and min(sizes) < _SMALLEST:
-                raise RobotError(
-                    f"{path}: a {shape.geometry.kind} of link {link.name!r} is {min(sizes):g} m small. "
-                    f"Expected at least {_SMALLEST:g}."
-                )
     return _with_masses(_with_limits(tree, path, notes), notes)
 
 

@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from xreset.checks import Number, Rule, Text
+from xreset.checks import NotNegative, Number, Positive, Rule, Text
 
 GRAVITY = 9.81
 """Magnitude of gravity in m/s^2; it points along -z."""
@@ -54,15 +54,15 @@ class Shape:
 class DriveSpec:
     """An implicit PD position drive: torque = kp (target - q) - kd qd, limited to the effort limit."""
 
-    kp: Number
+    kp: Positive[Number]
     """Stiffness [N m/rad] (prismatic: N/m)."""
-    kd: Number
+    kd: NotNegative[Number]
     """Damping [N m s/rad] (prismatic: N s/m)."""
-    effort: Number
+    effort: Positive[Number]
     """Largest torque [N m] (force [N]) of the drive."""
-    armature: Number = 0.0
+    armature: NotNegative[Number] = 0.0
     """Rotor inertia as seen at the joint [kg m^2] (mass [kg])."""
-    friction_loss: Number = 0.0
+    friction_loss: NotNegative[Number] = 0.0
     """Dry friction [N m] ([N])."""
 
 

@@ -13,23 +13,22 @@ import torch
 
 from xreset.description import DESCRIPTION, load_robot
 from xreset.errors import XResetError
-from xreset.geometry.collision import SelfCollision, height_above_table, table_points
+from xreset.geometry.collision import SelfCollision
 from xreset.geometry.dynamics import damping_ratio, drive_inertia
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import RobotTree, robot_tree
 from xreset.plugins import robot_folder
 from xreset.retarget.hand.model import HandModel, predicted_gigabytes
 from xreset.robot_tools.draft import link_places
+from xreset.robot_tools.homes import table_clearance
 from xreset.robot_tools.opposition import opposition, opposition_scores
-from xreset.robot_tools.sources import largest_moment
-from xreset.spec import RobotSpec, SceneSpec, TableSpec
+from xreset.robot_tools.sources import is_solid, largest_moment, plausible
+from xreset.spec import RobotSpec, SceneSpec
 
 Level = Literal["ok", "skipped", "warning", "error"]
 
 MIN_CLEARANCE = 0.005
 """Clearance [m] from the table that the home configuration should have."""
-_ROUNDING = 1e-3
-"""Relative slack of the triangle inequality: published inertias are rounded."""
 _SAMPLES = 200
 _LIMIT_SLACK = 1e-3
 """[rad or m] By which a mimic joint's limits may fall short of its source's: published figures are rounded."""
@@ -193,20 +192,18 @@ def _inertias(tree: RobotTree) -> Problems:
                 )
                 yield "error", text
             continue
-        moments = np.linalg.eigvalsh(link.inertia)
-        listed = ", ".join(f"{moment:.3g}" for moment in moments)
-        if moments[0] <= 0 or moments[2] > (moments[0] + moments[1]) * (1 + _ROUNDING):
+        moments = ", ".join(f"{moment:.3g}" for moment in np.linalg.eigvalsh(link.inertia))
+        if not is_solid(link):
             yield (
                 "error",
-                f"{name!r} has the principal moments {listed} kg m^2. Expected those of a solid body: positive ones, "
+                f"{name!r} has the principal moments {moments} kg m^2. Expected those of a solid body: positive ones, "
                 "the largest at most the sum of the others.",
             )
-        elif link.collisions and moments[2] > largest_moment(link):
+        elif not plausible(link):
             yield (
                 "warning",
-                f"{name!r} has a moment of {moments[2]:.3g} kg m^2; {link.mass:.3g} kg of its size can have "
-                f"{largest_moment(link):.2g} at "
-                "most. Is it a placeholder? `xreset robots import` replaces such.",
+                f"{name!r} has the principal moments {moments} kg m^2; {link.mass:.3g} kg of its size can have "
+                f"{largest_moment(link):.2g} at most. Is it a placeholder? `xreset robots import` replaces such.",
             )
 
 
@@ -214,12 +211,6 @@ def _inertias(tree: RobotTree) -> Problems:
 
 
 def _drives(spec: RobotSpec) -> Problems:
-    for joint in spec.joints:
-        drive = joint.drive
-        if drive.kp <= 0 or drive.effort <= 0 or min(drive.kd, drive.armature, drive.friction_loss) < 0:
-            text = "kp and effort must be positive; kd, armature and friction_loss must not be negative."
-            yield "error", f"{joint.name!r}: {text}"
-            return
     step = SceneSpec.timestep
     ratios = damping_ratio(spec, spec.home)
     inertias = drive_inertia(spec, spec.home)
@@ -320,19 +311,15 @@ def _around_home(spec: RobotSpec) -> torch.Tensor:
 
 
 def _above_table(spec: RobotSpec, q: torch.Tensor) -> Problems:
-    kinematics = Kinematics(spec)
-    support = table_points(spec, kinematics)
-    points = kinematics.points(q, support.links, torch.tensor(support.points))
-    height = height_above_table(points, torch.tensor(support.radii), TableSpec())
-    clearance, lowest = height[0].min(dim=0)
-    share = 100 * float((height.min(dim=1).values < 0).double().mean())
+    height = table_clearance(spec, q)
+    clearance = float(height[0])
+    share = 100 * float((height < 0).double().mean())
     level: Level = "ok"
     if clearance < 0:
         level = "error"
     elif clearance < MIN_CLEARANCE or share > 1:
         level = "warning"
-    link = support.links[int(lowest)]
-    yield level, f"lowest at {clearance * 1e3:.0f} mm above the table ({link}); {share:.0f} % of the spread below it"
+    yield level, f"lowest at {clearance * 1e3:.0f} mm above the table; {share:.0f} % of the spread below it"
 
 
 def _free_of_itself(spec: RobotSpec, q: torch.Tensor) -> Problems:

@@ -195,12 +195,17 @@ def _with_mass_of_shapes(link: Link) -> Link:
     return replace(link, mass=mass, com=com, inertia=inertia)
 
 
-def plausible(link: Link) -> bool:
-    """Return whether a link's moments are positive, those of a solid body, and at most :func:`largest_moment`."""
+def is_solid(link: Link) -> bool:
+    """Return whether a link's moments are positive, and the largest is at most the sum of the others (rounded)."""
     moments = np.linalg.eigvalsh(link.inertia)
-    if moments[0] <= 0 or moments[2] > (moments[0] + moments[1]) * 1.001:
-        return False
-    return not link.collisions or float(moments[2]) <= largest_moment(link)
+    return bool(moments[0] > 0 and moments[2] <= (moments[0] + moments[1]) * 1.001)
+
+
+def plausible(link: Link) -> bool:
+    """Return whether a link's moments are those of a solid body, and at most :func:`largest_moment`."""
+    if not link.collisions:
+        return is_solid(link)
+    return is_solid(link) and bool(np.linalg.eigvalsh(link.inertia)[2] <= largest_moment(link))
 
 
 def largest_moment(link: Link) -> float:

@@ -40,7 +40,7 @@ def pose(
     return transform(rotation.as_matrix(), xyz)
 
 
-def axes(*, x: ArrayLike, z: ArrayLike) -> np.ndarray:
+def axes(*, x: Sequence[float] | np.ndarray, z: Sequence[float] | np.ndarray) -> np.ndarray:
     """[4, 4] rotation whose first and third columns are the unit vectors ``x`` and ``z``."""
     return transform(np.stack((x, np.cross(z, x), z), axis=1), np.zeros(3))
 

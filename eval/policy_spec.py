@@ -15,6 +15,7 @@ from xreset.eval.baselines import KinematicRetargeting
 from xreset.files import file_hash
 from xreset.learning.choice import read_choice
 from xreset.learning.run import read_run
+from xreset.objects.catalogue import object_names
 from xreset.policies import results_folder, shipped
 from xreset.policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_contract
 from xreset.resets.bank import ResetBank
@@ -55,6 +56,15 @@ class PolicySpec:
     def unseen(self, names: Iterable[str]) -> tuple[str, ...]:
         """Return the names of objects that the training did not have, sorted; none for a baseline."""
         return () if self.objects is None else tuple(sorted(set(names) - set(self.objects)))
+
+    def objects_of(self, folder: Path | None) -> tuple[str, ...]:
+        """Return the objects that stand for the policy where nobody names any.
+
+        These are the objects of the training that the folder has (None: the stand-ins), or all of its objects if it has
+        none of them. A policy may know shapes that were made for its training only.
+        """
+        names = object_names(folder)
+        return tuple(name for name in names if name in (self.objects or ())) or names
 
     def make_env(
         self,

@@ -186,7 +186,8 @@ def rehearse(
     spec.check_seed(seed)
     actor = OnnxActor(spec.exported().read_bytes())
     if demos is None:
-        demos = synthesize(spec.objects or (), 2, meshes=objects or spec.objects_folder)
+        meshes = Path(objects) if objects else spec.objects_folder
+        demos = synthesize(spec.objects_of(meshes), 2, meshes=meshes)
     trial = load_trial(spec, demos, objects=objects, seed=seed, num_envs=num_envs)
     for prop in properties:
         for value in prop.values:

@@ -9,7 +9,7 @@ def main(meshes: str, name: str, out: str) -> None:
     """Make demonstrations of the mesh ``meshes/NAME.obj`` and a bank from them, and film the policy's first episode."""
     thing = xreset.load_object(name, meshes)
     demos = xreset.synthesize([name], 2, meshes=meshes)  # or xreset.read_demos("demos.npz")
-    policy = xreset.load_policy("nine-objects")  # or a run folder, or an .onnx file
+    policy = xreset.load_policy("many-objects")  # or a run folder, or an .onnx file
 
     motion = xreset.retarget_demos(demos, policy.robot, [thing])  # robot states that follow the human hand
     bank = xreset.make_bank(motion, policy.robot, [thing], engine="pybullet")  # those that the engine finds stable

@@ -19,7 +19,7 @@ class Played(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
         cls.enterClassContext(one_thread())
-        cls.session = Session("nine-objects")
+        cls.session = Session("many-objects")
         cls.addClassCleanup(lambda: cls.session.close())
 
     def setUp(self):
@@ -66,7 +66,7 @@ class Played(unittest.TestCase):
         session = self.session
         link = "wrist_2_link"
         session.choose_policy("zero", robot=session.policy.robot.name)
-        self.addCleanup(session.choose_policy, "nine-objects")
+        self.addCleanup(session.choose_policy, "many-objects")
         places = []
         for pull in ((0.0, 0.0, 0.0), (0.0, 0.2, 0.0)):
             q = torch.as_tensor(self.steps(1.0).joint_pos).double()
@@ -161,9 +161,10 @@ class Played(unittest.TestCase):
             self.steps(0.5)
             write_trace(path, session)
             self.assertEqual(npz_schema(path), SCHEMA)
+            steps = round(0.5 / session.control_dt)
             with np.load(path) as arrays:
-                self.assertEqual(arrays["inputs"].shape, (30, len(arrays["input_names"])))
-                self.assertEqual(arrays["reward"].shape, (30, len(arrays["reward_names"])))
+                self.assertEqual(arrays["inputs"].shape, (steps, len(arrays["input_names"])))
+                self.assertEqual(arrays["reward"].shape, (steps, len(arrays["reward_names"])))
                 np.testing.assert_array_equal(arrays["joint_pos"][-1], session.history[-1].joint_pos)
             write_film(path, session, seconds=0.2)
             self.assertEqual(path.read_bytes()[4:8], b"ftyp")

@@ -4,7 +4,7 @@
 
     can = xreset.load_object("soup")
     demos = xreset.synthesize([can.name], 4)                               # or xreset.read_demos("demos.npz")
-    policy = xreset.load_policy("nine-objects")                            # or a run folder, or an .onnx file
+    policy = xreset.load_policy("many-objects")                            # or a run folder, or an .onnx file
 
     motion = xreset.retarget_demos(demos, policy.robot, [can])             # robot states that follow the human hand
     bank = xreset.make_bank(motion, policy.robot, [can], engine="mujoco")  # those that a physics engine finds stable

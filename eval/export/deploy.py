@@ -55,4 +55,4 @@ def _with_objects(
     spec = policy if isinstance(policy, PolicySpec) else load_policy(policy, robot=robot)
     spec.exported()
     folder = Path(objects) if objects else spec.objects_folder
-    return spec, load_objects(only or spec.objects or (), folder)
+    return spec, load_objects(only or spec.objects_of(folder), folder)

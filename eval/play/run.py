@@ -12,7 +12,7 @@ from xreset.tensors import one_thread
 
 
 def play(
-    policy: str | Path | PolicySpec = "nine-objects",
+    policy: str | Path | PolicySpec = "many-objects",
     *,
     thing: str | None = None,
     engine: str = "mujoco",

@@ -116,7 +116,7 @@ class Session:
 
     def __init__(
         self,
-        policy: str | Path | PolicySpec = "nine-objects",
+        policy: str | Path | PolicySpec = "many-objects",
         *,
         thing: str | None = None,
         engine: str = "mujoco",

@@ -1,4 +1,4 @@
-"""One film of many objects in every engine: objects side by side, engines below one another."""
+"""One labelled film of many objects in every engine: objects side by side, engines below one another."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from xreset.eval.report.read import collect
 from xreset.eval.results import mesh_folder, read_traces
 from xreset.files import write_whole
 from xreset.objects.catalogue import load_object
+from xreset.pictures.render import add_caption
+from xreset.text import short_name
 
 
 def make_film(
@@ -65,7 +67,9 @@ def make_film(
             progress(number * len(shown) + row, len(names) * len(shown))
             episode = recorded_episode(data.episodes, engine, sequence)
             clip = draw_clip(engine, episode, trace, spec, obj, camera)
-            columns[name].append(clip.frames[:, ::2, ::2])
+            label = f"{short_name(name)}, {engine}"
+            half = clip.frames[:, ::2, ::2]
+            columns[name].append(np.stack([add_caption(picture, [label], 1) for picture in half]))
             rate = clip.fps
     if not columns:
         raise RunError(

@@ -9,7 +9,7 @@ from xreset.eval.play import run
 
 
 def play(
-    policy: Policy = "nine-objects",
+    policy: Policy = "many-objects",
     *,
     object: str | None = None,
     backend: str = "mujoco",

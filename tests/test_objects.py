@@ -410,6 +410,10 @@ class ThinWalls(unittest.TestCase):
         self.assertLessEqual(len(few.shapes), 3)
         short = decompose(RING, Settings(effort=5_000))
         self.assertEqual((few.finished, short.finished), (True, False))
+        crossing = trimesh.creation.box((0.1, 0.08, 0.06))  # few triangles, and many pieces to join
+        crossing.vertices[0, 0] = 0.5
+        settings = Settings(hull_depth=0.0, max_pieces=16, effort=300_000)
+        self.assertFalse(decompose(crossing, settings).finished)
         for stopped in (few, short):
             self.assertGreater(stopped.deviation, 0.002)
 

@@ -52,6 +52,8 @@ _NEAREST = 8
 """Triangles of a surface that the distance of a point is computed from."""
 _BATCH = 2000
 """Triangles whose distance is computed together."""
+_LEAST_EFFORT = 2000
+"""Triangles that the measure of a pair of pieces counts for at least: its points take time in any case."""
 _TOUCH = 2e-4
 """Pieces whose bounding boxes are closer than this may be joined [m]."""
 
@@ -408,7 +410,7 @@ class _Cutter:
                 other_low, other_high = boxes[other]
                 near = ((low <= other_high + _TOUCH) & (other_low <= high + _TOUCH)).all()
                 if near and self.effort > 0:
-                    self._spend(self._solid.solid)
+                    self.effort -= max(self._solid.solid.num_tri(), _LEAST_EFFORT)
                     both = batch_hull([piece, neighbour])
                     if self._solid.excess(both, quick=True) <= tolerance:
                         loss = both.volume() - piece.volume() - neighbour.volume()

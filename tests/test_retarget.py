@@ -312,7 +312,7 @@ class PipelineTest(unittest.TestCase):
     def setUpClass(cls):
         cls.folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
         cls.robot = robots.load("ur7e-sharpa")
-        demos = synthesize(["soup"], per_object=2, seed=0)
+        demos = synthesize(["soup"], per_object=2, seed=0, fps=20)
         valid = demos.hand_valid.copy()
         valid[demos.frames(1)] = False  # a sequence in which the hand was never seen
         keypoints = np.where(valid[:, None, None], demos.hand_keypoints, np.nan)

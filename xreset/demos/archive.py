@@ -249,7 +249,7 @@ def one_sequence(
         wrist_quat_wxyz=wrist_quat,
         object_pos=object_pos.astype(np.float32),
         object_quat_wxyz=object_rot.as_quat(canonical=True, scalar_first=True).astype(np.float32),
-        fps=fps,
+        fps=float(fps),
     )
 
 

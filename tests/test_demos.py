@@ -475,6 +475,25 @@ class Commands(InFolder):
         run(*synth)
         self.assertEqual(file.read_bytes(), first)
 
+    def test_split_and_merge(self):
+        file = self.folder / "demos.npz"
+        write_demos(file, synthesize(["soup"], 2, fps=10))
+        left = self.folder / "a.npz"
+        rest = self.folder / "b.npz"
+        for command in (
+            ("split", file, "--out", left, "--rest", rest, "--share", 0.5),
+            ("merge", left, rest, "--out", self.folder / "both.npz"),
+            ("select", self.folder / "both.npz", "--out", left, "--per-object", 1, "--pick", "spread"),
+        ):
+            code, out = run("demos", *command)
+            self.assertEqual(code, 0, out)
+        both = read_demos(self.folder / "both.npz").sequence_name.tolist()
+        self.assertEqual(both, read_demos(file).sequence_name.tolist())
+        self.assertEqual(read_demos(left).sequence_name.tolist(), both[1:])
+        code, out = run("demos", "split", file, "--out", left, "--rest", left, "--share", 0.5)
+        self.assertEqual(code, 1)
+        self.assertIn("Nothing was overwritten", out)
+
     def test_import(self):
         file = self.folder / "demos.npz"
         code, out = run("demos", "import", "dexycb", self.folder, "--out", file)

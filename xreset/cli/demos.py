@@ -185,8 +185,6 @@ def split(file: Source, *, out: Path, rest: Path, selection: Flat[Selection] = S
         rest: Archive to write: all other sequences.
         selection: Conditions.
     """
-    if out.resolve() == rest.resolve():
-        raise DemoError(f"--out and --rest are both {out}. Choose two files.")
     kept, others = archive.read_demos(file).split(**selection.conditions())
     inputs = {"demos": file_hash(file)}
     _save(kept, out, {"select": asdict(selection)}, inputs)

@@ -6,13 +6,13 @@ two (:mod:`xreset.live.faults`). The results are curves as in :mod:`xreset.eval.
 
 from __future__ import annotations
 
-import math
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,85 +24,40 @@ from xreset.eval.pages import render
 from xreset.eval.plots import COLORS, svg
 from xreset.eval.policy_spec import PolicySpec, load_policy
 from xreset.eval.rollout import Episode, episode_of, episode_starts, play_rounds
-from xreset.eval.sensitivity import SWEEPS, Property, amount, chosen, nominal_task
+from xreset.eval.sensitivity import SWEEPS, Property, amount, chosen, nominal_task, read_rows
 from xreset.eval.stress import COSTLY, Point, Stress, by_property, draw_curves, plot_size, sweep
 from xreset.eval.trial import Engine, Trial, engine, load_trial
 from xreset.files import claim_folder, write_json, write_whole
 from xreset.inputs import Data
 from xreset.live.engine import begin, make_controller
 from xreset.live.faults import Faults, FaultyDriver
-from xreset.physics import Capability
 from xreset.resets.distribution import Reset
 from xreset.runtime import OnnxActor, Runner
 from xreset.task.terminations import out_of_bounds
 
 SCHEMA = "xreset-rehearsal/1"
-_FRAME = 1 / 30
-"""Time between the poses of a tracker in all faults of trackers [s]."""
-_DEGREE = math.pi / 180
-
-
-def _tracked(**changes: float) -> Faults:
-    return replace(Faults(tracker_interval=_FRAME), **changes)
-
-
-def _published(share: float) -> Faults:
-    """Return the faults of the published training (table A3) at once, at a share of their ranges.
-
-    The sizes of pushes are those of the recipe ``live``, because a push in that table has no duration.
-    """
-    return Faults(
-        tracker_interval=_FRAME,
-        pose_delay=0.2 * share,
-        pose_jitter=_FRAME / 2 * share,
-        position_noise=0.005 * share,
-        position_bias=0.005 * share,
-        angle_noise=3.75 * _DEGREE * share,
-        angle_bias=3.75 * _DEGREE * share,
-        arm_delay=0.05 * share,
-        hand_delay=0.133 * share,
-        object_push=0.5 * share,
-        arm_push=0.25 * share,
-        drawn_delays=True,
-    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fault(Property):
-    """A fault between policy and robot, and what makes it of a value in the property's unit."""
+    """A fault between policy and robot. The fields are explained in ``properties.toml``."""
 
-    make: Callable[[float], Faults]
     nominal: float = 0.0
+    scaled: dict[str, float]
+    fixed: dict[str, Any] = field(default_factory=dict)
+
+    def at(self, value: float) -> Faults:
+        """Return the fault at one value; ``ValueError`` if it cannot have the value."""
+        changes = dict(self.fixed)
+        for name, factor in self.scaled.items():
+            changes[name] = factor * value
+        return Faults(**changes)
 
 
-def _fault(
-    name: str,
-    unit: str,
-    values: tuple[float, ...],
-    make: Callable[[float], Faults],
-    needs: Capability | None = None,
-) -> Fault:
-    return Fault(name=name, unit=unit, values=values, make=make, needs=needs)
-
-
-LOOP = (
-    _fault("tracker interval", "ms", (33, 67, 100), lambda x: Faults(tracker_interval=x / 1000)),
-    _fault("pose delay", "ms", (33, 100, 200), lambda x: _tracked(pose_delay=x / 1000, pose_jitter=0.2 * x / 1000)),
-    _fault("position noise", "mm", (5, 10), lambda x: _tracked(position_noise=x / 1000)),
-    _fault("position bias", "mm", (5, 10), lambda x: _tracked(position_bias=x / 1000)),
-    _fault("angle noise", "degrees", (3.75, 7.5), lambda x: _tracked(angle_noise=x * _DEGREE)),
-    _fault("angle bias", "degrees", (3.75, 7.5), lambda x: _tracked(angle_bias=x * _DEGREE)),
-    _fault("lost frames", "s", (0.25, 0.5), lambda x: _tracked(lost_frames=x)),
-    _fault("action delay", "ms", (17, 33, 67, 133), lambda x: Faults(arm_delay=x / 1000, hand_delay=x / 1000)),
-    _fault("missed deadlines", "% of the steps", (5, 20), lambda x: Faults(missed_deadlines=x / 100)),
-    _fault("object push", "m/s", (0.25, 0.5, 1.0), lambda x: Faults(object_push=x), needs="object_wrench"),
-    _fault("arm push", "of the torque", (0.25, 0.5, 1.0), lambda x: Faults(arm_push=x)),
-    _fault("published faults", "times their ranges", (0.5, 1.0), _published, needs="object_wrench"),
-)
-"""Faults of the loop."""
+FAULTS = read_rows("faults", Fault)
 _PHYSICAL = {prop.name: prop for prop in SWEEPS}
 PROPERTIES: tuple[Property, ...] = (
-    *LOOP,
+    *FAULTS,
     _PHYSICAL["object mass"],
     _PHYSICAL["object friction"],
     replace(_PHYSICAL["force gain"], values=(0.0, 0.5, 2.0)),
@@ -226,7 +181,7 @@ def _setting(trial: Trial, prop: Property | None, value: float) -> tuple[Trial, 
     if not isinstance(prop, Fault):
         return replace(trial, task=prop.set_in(task, value)), Faults()
     try:
-        return replace(trial, task=task), prop.make(value)
+        return replace(trial, task=task), prop.at(value)
     except ValueError as error:
         raise XResetError(f"{prop.option} {amount(prop.unit, value)} cannot be tried: {error}.") from None
 

@@ -7,8 +7,11 @@ engines (:mod:`xreset.eval.engines.attribution`) share both.
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -56,28 +59,20 @@ class Effect:
 
 @dataclass(frozen=True, kw_only=True)
 class Property:
-    """One physical property. One without ``values`` is not swept; one without ``measured`` is not compared."""
+    """One physical property. The fields are explained in ``properties.toml``."""
 
     name: str
     task_field: str = ""
-    """Field of :class:`~xreset.task.config.RandomizationConfig` that sets it; default: the name."""
     values: tuple[float, ...] = ()
-    """Values of a sweep, ascending, without the nominal one."""
     nominal: float = 1.0
-    """Value of an evaluation; of the frictions, with the default materials."""
     unit: str = "x"
-    """Unit of the values; ``x`` for a factor."""
     needs: Capability | None = None
-    """What an engine must be able to set."""
     measured: str = ""
     """Field of :class:`~xreset.eval.engines.measure.Measured`."""
     resolution: float = 0.0
-    """Differences of engines below this cannot be measured: a share of the larger value, with ``absolute`` a number."""
     absolute: bool = False
     shown_unit: str = ""
-    """Unit in which the measured number is shown."""
     of_cameras: bool = False
-    """Whether only policies that see have the property."""
 
     @property
     def option(self) -> str:
@@ -108,96 +103,29 @@ class Property:
             raise XResetError(f"{self.option} {amount(self.unit, value)} cannot be tried: {error}.") from None
 
 
+_Row = TypeVar("_Row", bound=Property)
+
+
 def amount(unit: str, value: float) -> str:
     """Return a value with its unit, such as ``33 ms`` or ``x 0.7``."""
     number = f"{float(f'{value:.3g}'):g}"
     return f"x {number}" if unit == "x" else f"{number} {unit}"
 
 
-def _drive(part: str, name: str, resolution: float) -> Property:
-    return Property(
-        name=f"{part} {name}",
-        values=(0.6, 0.8, 1.25, 1.6),
-        needs="drives",
-        measured=f"{part}_{name}",
-        resolution=resolution,
-    )
+TABLE = tomllib.loads(Path(__file__).with_name("properties.toml").read_text())
+"""The tables ``properties`` and ``faults``, by name of the row."""
 
 
-def _friction(pair: str, material: str) -> Property:
-    return Property(
-        name=f"{pair} friction",
-        task_field=material,
-        needs="friction",
-        measured=f"{pair}_friction",
-        resolution=0.03,
-    )
+def read_rows(table: str, kind: type[_Row]) -> tuple[_Row, ...]:
+    """Return the rows of a table, in its order."""
+    rows = []
+    for name, row in TABLE[table].items():
+        values = tuple(row.get("values", ()))
+        rows.append(kind(**row | {"name": name, "values": values}))
+    return tuple(rows)
 
 
-def _camera(name: str, values: tuple[float, ...], unit: str) -> Property:
-    return Property(
-        name=f"camera {name}", values=values, nominal=1.0 if unit == "x" else 0.0, unit=unit, of_cameras=True
-    )
-
-
-PROPERTIES = (
-    _friction("tip", "elastomer"),
-    _friction("link", "metal"),
-    _friction("table", "table"),
-    Property(
-        name="object friction",
-        task_field="friction",
-        values=(0.4, 0.55, 0.95, 1.2),
-        nominal=0.75,
-        unit="coefficient",
-        needs="friction",
-    ),
-    Property(name="hand friction", values=(0.4, 0.8), nominal=0.1, unit="coefficient", needs="friction"),
-    Property(
-        name="torsional friction",
-        values=(0.0, 0.3, 2.0),
-        needs="torsional_friction",
-        measured="torsional_friction",
-        resolution=5e-5,
-        absolute=True,
-        shown_unit="mm",
-    ),
-    Property(
-        name="object mass",
-        task_field="mass_scale",
-        values=(0.5, 0.7, 1.3, 2.0),
-        needs="object_mass",
-        measured="mass",
-        resolution=0.005,
-    ),
-    Property(name="object inertia", values=(0.5, 2.0), needs="object_inertia", measured="inertia", resolution=0.02),
-    Property(name="object com", values=(0.005, 0.01, 0.02), nominal=0.0, unit="m", needs="object_com"),
-    _drive("arm", "stiffness", 0.02),
-    _drive("arm", "damping", 0.02),
-    _drive("hand", "stiffness", 0.03),
-    _drive("hand", "damping", 0.02),
-    Property(name="effort", values=(0.4, 0.6, 0.8), needs="drives"),
-    Property(name="timestep", measured="timestep", resolution=0.05, shown_unit="ms"),
-    Property(name="contact softness", measured="contact_give", resolution=2e-5, absolute=True, shown_unit="mm"),
-    Property(
-        name="action latency",
-        values=(0.5, 1.0, 2.0),
-        nominal=0.0,
-        unit="control steps",
-        measured="delay",
-        resolution=0.5,
-        absolute=True,
-        shown_unit="control steps",
-    ),
-    Property(name="observation latency", values=(0.5, 1.0, 2.0), nominal=0.0, unit="control steps"),
-    Property(name="force gain", values=(0.5, 2.0)),
-    _camera("shift", (0.01, 0.03), "m"),
-    _camera("turn", (0.035, 0.087), "rad"),
-    _camera("noise", (2.0,), "x"),
-    _camera("latency", (50.0,), "ms"),
-)
-"""In the order of tables."""
-
+PROPERTIES = read_rows("properties", Property)
 SWEEPS = tuple(p for p in PROPERTIES if p.values)
 """The properties that can be swept."""
 COMPARED = {p.name: p for p in PROPERTIES if p.measured}

@@ -115,32 +115,29 @@ class RayCaster:
         self.body = torch.zeros(*shape, *size, dtype=torch.int8, device=device)
         balls = torch.tensor([_ball(mesh) for mesh in meshes], dtype=torch.float32)
         self._sphere = balls[bodies.cpu()].to(device)
-        self._launch: Any = None
         try:
             with quiet():
                 self._on_stream = TorchStream(device)
                 with self._on_stream():
                     self._meshes = [_warp_mesh(mesh) for mesh in meshes]
                     self._ids = torch.tensor([mesh.id for mesh in self._meshes])[bodies.cpu()].to(device)
-                    self._launch = wp.launch(_cast, (*shape, size[0] * size[1]), self._arrays(*size), record_cmd=True)
+                    arrays = [
+                        wp.from_torch(self.due, dtype=wp.bool),
+                        wp.from_torch(self.camera, dtype=wp.mat44),
+                        wp.from_torch(self.tangent),
+                        wp.from_torch(self.pose, dtype=wp.mat44),
+                        wp.from_torch(self._ids, dtype=wp.uint64),
+                        wp.from_torch(self._sphere, dtype=wp.vec4),
+                        *size,
+                        wp.from_torch(self.depth.flatten(2)),
+                        wp.from_torch(self.body.flatten(2)),
+                    ]
+                    self._launch = wp.launch(_cast, (*shape, size[0] * size[1]), arrays, record_cmd=True)
         except Exception as error:  # a missing compiler or driver may fail in any way
             raise XResetError(
                 f"The renderer of depth images cannot start on {device}: {error}. Use --device cpu, or a policy "
                 "without cameras."
             ) from error
-
-    def _arrays(self, *size: int) -> list[Any]:
-        return [
-            wp.from_torch(self.due, dtype=wp.bool),
-            wp.from_torch(self.camera, dtype=wp.mat44),
-            wp.from_torch(self.tangent),
-            wp.from_torch(self.pose, dtype=wp.mat44),
-            wp.from_torch(self._ids, dtype=wp.uint64),
-            wp.from_torch(self._sphere, dtype=wp.vec4),
-            *size,
-            wp.from_torch(self.depth.flatten(2)),
-            wp.from_torch(self.body.flatten(2)),
-        ]
 
     def cast(self) -> None:
         """Draw the images of the worlds that are due. Nothing waits for a GPU."""

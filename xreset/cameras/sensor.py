@@ -13,7 +13,7 @@ import trimesh
 from PIL import Image
 from torch import Tensor
 
-from xreset.cameras.config import CameraConfig, VisionConfig
+from xreset.cameras.config import VisionConfig
 from xreset.cameras.pose import mounted_pose
 from xreset.cameras.rays import RayCaster
 from xreset.errors import XResetError
@@ -65,7 +65,7 @@ class Cameras:
         self._mounts = [None if name is None else len(bodies) + i for i, name in enumerate(mounts)]
         self._links = [*bodies, *(name or self._kinematics.root for name in mounts)]
         home = self._kinematics.link_poses(torch.as_tensor(robot.home, dtype=torch.float32, device=device), self._links)
-        _check_outside(config.cameras, self._mounts, home.cpu().numpy(), list(bodies.items()))
+        self._check_outside(home.cpu().numpy(), bodies)
         worlds = len(object_index)
         fixed = torch.arange(first_object, device=device).expand(worlds, -1)
         held = first_object + object_index[:, None]
@@ -174,6 +174,22 @@ class Cameras:
         is_object = self.rays.body == self.rays.pose.shape[1] - 1
         return (is_object & (self._in_range(self.rays.depth) > 0)).flatten(1).any(dim=1)
 
+    def _check_outside(self, poses: np.ndarray, bodies: dict[str, trimesh.Trimesh]) -> None:
+        """Refuse cameras inside a link of the robot at home; poses [L, 4, 4] of the bodies, then of the cameras'
+        links."""
+        for i, camera in enumerate(self.config.cameras):
+            mount = self._mounts[i]
+            eye = mounted_pose(camera)[:, 3]
+            if mount is not None:
+                eye = poses[mount] @ eye
+            for (name, mesh), pose in zip(bodies.items(), poses, strict=False):
+                local = np.linalg.inv(pose) @ eye
+                if winding_number(local[None, :3], mesh.vertices, mesh.faces)[0] > 0.5:
+                    raise XResetError(
+                        f"Camera {i + 1} at {camera.pos} is inside the robot's link {name!r} and sees nothing else. "
+                        "Move it out (pos)."
+                    )
+
     def _in_range(self, depth: Tensor) -> Tensor:
         return torch.where((depth >= self._near) & (depth <= self._far), depth, 0.0)
 
@@ -228,28 +244,3 @@ def _table(table: TableSpec) -> trimesh.Trimesh:
     mesh = trimesh.creation.box(2 * np.array(table.half_size))
     mesh.apply_translation((*table.center, -table.half_size[2]))
     return mesh
-
-
-def _check_outside(
-    cameras: tuple[CameraConfig, ...],
-    mounts: list[int | None],
-    poses: np.ndarray,
-    bodies: list[tuple[str, trimesh.Trimesh]],
-) -> None:
-    """Refuse cameras inside a link of the robot at home.
-
-    Args:
-        poses: [L, 4, 4] poses of the bodies, then of the cameras' links.
-        mounts: index of each camera's link among the poses.
-    """
-    for i, (camera, mount) in enumerate(zip(cameras, mounts, strict=True)):
-        eye = mounted_pose(camera)[:, 3]
-        if mount is not None:
-            eye = poses[mount] @ eye
-        for (name, mesh), pose in zip(bodies, poses, strict=False):
-            local = np.linalg.inv(pose) @ eye
-            if winding_number(local[None, :3], mesh.vertices, mesh.faces)[0] > 0.5:
-                raise XResetError(
-                    f"Camera {i + 1} at {camera.pos} is inside the robot's link {name!r} and sees nothing else. "
-                    "Move it out (pos)."
-                )

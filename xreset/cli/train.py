@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from argparse import ArgumentParser
 from collections.abc import Callable
 from functools import partial
@@ -13,7 +12,7 @@ from xreset.cli._common import Objects
 from xreset.errors import RunError
 from xreset.learning import train as training
 from xreset.learning.config import TrainConfig
-from xreset.learning.recipes import default_recipe, dropped_terms, starting_config
+from xreset.learning.recipes import default_recipe, starting_config
 
 
 def train(
@@ -69,9 +68,6 @@ def train(
         return
     if goals is None and (robot is None or resets is None):
         raise RunError("A new run needs --robot and --resets, or --goals. To continue the run in --out, add --resume.")
-    note = dropped_terms(like)
-    if note and not config.task.reward.own:
-        print(note, file=sys.stderr)
     training.train(
         resets,
         out=out,

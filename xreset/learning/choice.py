@@ -4,17 +4,12 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
 
-from xreset.checks import Checked, NotNegative, Positive, Rule, from_dict
+from xreset.checks import Checked, NotNegative, Positive, Share, from_dict
 from xreset.files import read_json, write_json
 
 FILE = "choice.json"
 SCHEMA = "xreset-choice/1"
-
-
-def _are_shares(values: dict[str, float]) -> bool:
-    return bool(values) and all(0 <= value <= 1 for value in values.values())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +18,7 @@ class Candidate(Checked):
 
     name: str
     """File name of the checkpoint or policy."""
-    task_progress: Annotated[dict[str, float], Rule("an engine at least, and numbers from 0 to 1", _are_shares)]
+    task_progress: dict[str, Share[float]]
     """Engine -> mean over the episodes; without engines in which it was not played because it could no longer be
     chosen."""
 

@@ -54,9 +54,9 @@ class LiftClock:
 
     def resume(self, iteration: int) -> None:
         """Continue from the file, if there is one, without what came after ``iteration``."""
-        if iteration and (self.folder / FILE).is_file():
-            old = read_lift(self.folder)
-            self.lift = Lift(passed=tuple(p for p in old.passed if p.iteration <= iteration))
+        if iteration:
+            passed = read_lift(self.folder).passed
+            self.lift = Lift(passed=tuple(p for p in passed if p.iteration <= iteration))
 
     def tick(self, share: float, *, iteration: int, env_steps: int, seconds: float) -> None:
         """Record an iteration's share of success from home."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import sys
 import tomllib
 from dataclasses import asdict, dataclass, replace
 from math import radians
@@ -50,8 +51,8 @@ def default_recipe(fine_tuned: str | Path | None) -> str:
 def starting_config(like: str) -> TrainConfig:
     """Return the configuration of a recipe, or of a run without the reward terms that its user added.
 
-    Such a term names code to import. A file must not decide that, so the terms have to be named again
-    (:func:`dropped_terms`).
+    Such a term names code to import. A file must not decide that, so the terms have to be named again, which a note on
+    standard error says.
 
     Args:
         like: name of a recipe, or a run folder.
@@ -65,19 +66,14 @@ def starting_config(like: str) -> TrainConfig:
         recipes = "; ".join(f"{name}, {recipe.about}" for name, recipe in RECIPES.items())
         raise RunError(f"There is no recipe and no run folder {like!r}. Recipes: {recipes}.")
     config = read_run(like).config
-    reward = replace(config.task.reward, own={})
-    return replace(config, task=replace(config.task, reward=reward))
-
-
-def dropped_terms(like: str) -> str | None:
-    """Return a note on a run's own reward terms, which :func:`starting_config` leaves out; None if there are none."""
-    own = {} if like in RECIPES else read_run(like).config.task.reward.own
-    if not own:
-        return None
-    return (
-        f"{like} was trained with reward terms of your own. They are off, because a run folder must not decide which "
-        f"code is imported. If you trust this code, add {own_terms_flag(own)}."
-    )
+    reward = config.task.reward
+    if reward.own:
+        print(
+            f"{like} was trained with reward terms of your own. They are off unless you name them again, because a run "
+            f"folder must not decide which code is imported. If you trust this code, add {own_terms_flag(reward.own)}.",
+            file=sys.stderr,
+        )
+    return replace(config, task=replace(config.task, reward=replace(reward, own={})))
 
 
 def own_terms_flag(own: dict[str, float]) -> str:

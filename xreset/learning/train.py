@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -23,7 +22,7 @@ from xreset.learning.config import TrainConfig
 from xreset.learning.distributed import Processes, leave
 from xreset.learning.export import export_onnx, policy_file
 from xreset.learning.model import PointNetLstmModel
-from xreset.learning.recipes import default_recipe, dropped_terms, own_terms_flag, starting_config, student_config
+from xreset.learning.recipes import default_recipe, own_terms_flag, starting_config, student_config
 from xreset.learning.run import TEACHER, RunInfo, checkpoints, latest_checkpoint, read_run, write_run
 from xreset.learning.runner import TrainingRunner
 from xreset.plugins import backend_class, device_for
@@ -89,10 +88,7 @@ def train(
     """
     out = Path(out)
     if config is None:
-        recipe = recipe or default_recipe(weights if goals is not None else None)
-        config = starting_config(recipe)
-        if note := dropped_terms(recipe):
-            print(note, file=sys.stderr)
+        config = starting_config(recipe or default_recipe(weights if goals is not None else None))
     if iterations is not None:
         config = replace(config, iterations=iterations)
     device = device or device_for(engine, "cuda" if torch.cuda.is_available() else "cpu")

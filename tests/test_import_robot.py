@@ -244,7 +244,7 @@ class Toy(WithFolder):
         warnings = " ".join(finding.message for finding in check(folder) if finding.level == "warning")
         self.assertRegex(
             warnings,
-            r"'f1_a' has the principal moments 0.1, 0.1, 0.1 .*placeholder.*lie along z of the palm 'palm_frame'",
+            r"'f1_a' has the principal moments 0.1, 0.1, 0.1 .*placeholder.*do not lie along x of the palm 'palm_frame'",
         )
 
     def test_mjcf_is_the_same_hand(self):

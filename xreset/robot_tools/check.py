@@ -21,7 +21,7 @@ from xreset.plugins import robot_folder
 from xreset.retarget.hand.model import HandModel, predicted_gigabytes
 from xreset.robot_tools.draft import link_places
 from xreset.robot_tools.homes import table_clearance
-from xreset.robot_tools.opposition import opposition, opposition_scores
+from xreset.robot_tools.opposition import opposition
 from xreset.robot_tools.sources import is_solid, largest_moment, plausible
 from xreset.spec import RobotSpec, SceneSpec
 
@@ -235,13 +235,11 @@ def _frames(spec: RobotSpec, tree: RobotTree) -> Problems:
     palm = np.linalg.inv(places[spec.palm])
     tips = np.array([(palm @ places[tip.link])[:3, 3] for tip in spec.fingertips])
     along = tips[1:].mean(axis=0) if len(tips) > 1 else tips[0]
-    longest = int(np.abs(along).argmax())
-    if longest != 0 or tips[:, 0].mean() <= 0:
-        axis = ("-" if along[longest] < 0 else "") + "xyz"[longest]
+    if np.abs(along).argmax() != 0 or tips[:, 0].mean() <= 0:
         yield (
             "warning",
-            f"the fingers lie along {axis} of the palm {spec.palm!r}: its x should point towards them, z out of its "
-            "inner side.",
+            f"the fingers do not lie along x of the palm {spec.palm!r}. Its x should point towards them, its z out of "
+            "its inner side.",
         )
     body = tree.moving_ancestor(spec.hand_root)
     if tree.moving_ancestor(spec.palm) != body:
@@ -285,7 +283,7 @@ def _thumb(spec: RobotSpec) -> Problems:
     tips = [tip.link for tip in spec.fingertips]
     names = spec.fingertip_names
     meetings = opposition(spec, tips, np.zeros((len(tips), 3)))
-    scores = opposition_scores(meetings)
+    scores = np.sqrt(meetings).sum(axis=1)
     best = int(scores.argmax())
     met = [", ".join(names[i] for i in np.flatnonzero(row)) or "no other" for row in meetings]  # noqa: XR002
     if scores[best] == 0:

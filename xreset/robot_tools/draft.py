@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -24,6 +23,14 @@ _ARMATURE = 0.1
 """[kg m^2] Rotor inertia of the arm's joints, as in the built-in robots."""
 
 
+Positions = float | np.ndarray
+
+
+def rounded(positions: Positions, lower: Positions, upper: Positions) -> np.ndarray:
+    """Round joint positions to the four digits that get into a description, within the limits."""
+    return np.clip(np.round(positions * 1e4), np.ceil(lower * 1e4), np.floor(upper * 1e4)) / 1e4
+
+
 def draft_spec(
     tree: RobotTree,
     hand_root: str,
@@ -42,9 +49,7 @@ def draft_spec(
         if joint.type == "fixed" or joint.mimic is not None:
             continue
         home = float(np.clip(0.0, joint.lower, joint.upper)) + (bent or {}).get(joint.name, 0.0)
-        lowest = math.ceil(joint.lower * 1e4) / 1e4
-        highest = math.floor(joint.upper * 1e4) / 1e4
-        home = float(np.clip(round(home, 4), lowest, highest))  # four digits get into the description
+        home = float(rounded(home, joint.lower, joint.upper))
         group = "hand" if joint.child in inside else "arm"
         drive = DriveSpec(kp=1.0, kd=0.1, effort=1.0, armature=_ARMATURE if group == "arm" else 0.0)
         joints.append(JointSpec(name=joint.name, group=group, drive=drive, home=home))

@@ -15,7 +15,7 @@ from xreset.geometry.shapes import surface_of, transform
 from xreset.geometry.urdf import RobotTree
 from xreset.geometry.urdf_writer import axes, fixed, frame
 from xreset.robot_tools.draft import draft_spec, link_places
-from xreset.robot_tools.opposition import closing_range, opposition, opposition_scores
+from xreset.robot_tools.opposition import closing_range, opposition
 from xreset.spec import FingertipSpec, KeypointSpec, RobotSpec
 
 _FINGERS = ("index", "middle", "ring", "little")
@@ -182,7 +182,7 @@ def _find_thumb(
     if len(marked) == 1:
         return marked[0]
     tips = np.array([_in_link(at[chain.links[-1]], _end(tree, chain, at)) for chain in chains])
-    scores = opposition_scores(opposition(spec, [chain.links[-1] for chain in chains], tips))
+    scores = np.sqrt(opposition(spec, [chain.links[-1] for chain in chains], tips)).sum(axis=1)
     first = int(scores.argmax())
     if scores[first] == 0 and len(chains) > 2:
         raise RobotError(f"no finger can oppose the others. Name a link of the thumb with --thumb: {known}.")

@@ -15,13 +15,13 @@ from xreset.geometry.rotations import matrix_to_quat
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track
 from xreset.retarget.validity import Thresholds, classify
+from xreset.robot_tools.draft import rounded
 from xreset.spec import RobotSpec, TableSpec
 
 _STEPS = (-0.15, 0.0, 0.15)
 """[m] Steps along each axis to other places that are tried."""
 _CLEAR = 0.10
 """[m] Height above the table that keeps the spread around a home clear of it."""
-_DIGITS = 4
 
 
 def table_clearance(robot: RobotSpec, q: Tensor) -> Tensor:
@@ -56,24 +56,23 @@ def hold_near(robot: RobotSpec, T_world_root: np.ndarray) -> tuple[RobotSpec, st
         hand_error=zero,
         hand_clearance=zero,
     )
-    inside = [torch.ceil(model.lower * 10**_DIGITS), torch.floor(model.upper * 10**_DIGITS)]
     low = None
     for rows in (slice(0, 1), slice(1, count)):
         joints, measures = track(model, targets[rows], Thresholds())
         height = table_clearance(robot, model.full(joints[:, 0], hand))
         for index in np.flatnonzero(classify(measures, Thresholds())[:, 0] == 0).tolist():
-            rounded = torch.clamp(torch.round(joints[index, 0] * 10**_DIGITS), *inside) / 10**_DIGITS
             step = (100 * steps[rows][index]).tolist()
             moved = f", moved by ({', '.join(f'{value:.0f}' for value in step)}) cm" if any(step) else ""
-            home = (_with_arm_at(robot, rounded.tolist()), moved)
+            positions = rounded(joints[index, 0].numpy(), model.lower.numpy(), model.upper.numpy())
+            home = (_with_arm_at(robot, positions), moved)
             if height[index] > _CLEAR:
                 return home
             low = low or home
     return low
 
 
-def _with_arm_at(robot: RobotSpec, positions: list[float]) -> RobotSpec:
+def _with_arm_at(robot: RobotSpec, positions: np.ndarray) -> RobotSpec:
     joints = [*robot.joints]
-    for index, position in zip(robot.arm_indices, positions, strict=True):
+    for index, position in zip(robot.arm_indices, positions.tolist(), strict=True):
         joints[index] = replace(joints[index], home=position)
     return replace(robot, joints=tuple(joints))

@@ -32,7 +32,8 @@ def closing_range(lower: float, upper: float) -> float | None:
 
 def opposition(robot: RobotSpec, links: Sequence[str], offsets: np.ndarray) -> np.ndarray:
     """Return for each pair of fingertips [E, E] the share of random joint positions in which they are near each other
-    and close towards each other.
+    and close towards each other. The sum of the square roots of a row says how much a fingertip opposes the others, and
+    as many of them as possible.
 
     Args:
         robot: the robot; only what is below its hand root counts.
@@ -55,8 +56,3 @@ def opposition(robot: RobotSpec, links: Sequence[str], offsets: np.ndarray) -> n
             facing = closing[:, i] @ closing[:, j].T < _FACING
             meetings[i, j] = meetings[j, i] = float((near & facing).double().mean())
     return meetings
-
-
-def opposition_scores(meetings: np.ndarray) -> np.ndarray:
-    """[E] how much each fingertip opposes the others, and as many of them as possible; see :func:`opposition`."""
-    return np.sqrt(meetings).sum(axis=1)

@@ -17,7 +17,7 @@ from torch import Tensor
 from xreset.env import ManipulationEnv, make_scene, object_origins
 from xreset.eval.metrics import MetricPoints
 from xreset.eval.policy_spec import PolicySpec
-from xreset.inputs import Data, Kind, load_inputs
+from xreset.inputs import Data, load_inputs
 from xreset.physics import Backend
 from xreset.plugins import backend_class, device_for, make_backend
 from xreset.resets.bank import ResetBank
@@ -133,23 +133,21 @@ def load_trial(
     seed: int = 0,
     num_envs: int = 64,
     settle: bool = False,
-    accept: tuple[Kind, ...] = ("demos", "motion", "goals"),
 ) -> Trial:
     """Load what a policy is to play. For the baseline ``ik``, demonstrations are retargeted here.
 
     Args:
         policy: the policy, whose robot and task are taken.
-        source: demonstrations, motion, a bank or a goal set, or a file of them. A goal set's starts are played as they
+        source: demonstrations, motion or a goal set, or a file of them; or a loaded bank. A goal set's starts are played as they
             are, because they are perturbed already; only the robot's joints are.
         objects: folder of object meshes; default: the folder of the policy's training.
         seed: seed of the perturbations.
         num_envs: worlds that run at the same time.
         settle: whether objects come to rest before episodes begin (:mod:`xreset.resets.settle`), in MuJoCo for every
             engine, so that all engines play the same starts. Default: the recorded poses, as in the paper.
-        accept: the kinds of data that the caller can use.
     """
     folder = Path(objects) if objects else policy.objects_folder
-    inputs = load_inputs(source, robot=policy.robot, objects=folder, accept=accept)
+    inputs = load_inputs(source, robot=policy.robot, objects=folder, accept=("demos", "motion", "goals"))
     hashes = {} if policy.hash is None else {"policy": policy.hash}
     if inputs.hash is not None:
         is_bank = isinstance(inputs.data, ResetBank) and not isinstance(inputs.data, GoalSet)

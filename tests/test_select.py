@@ -17,7 +17,6 @@ from xreset.cli import main
 from xreset.errors import FileFormatError, PolicyError, RunError
 from xreset.eval.engines.attribution import attribute
 from xreset.eval.evaluate import evaluate
-from xreset.eval.frontier import frontier
 from xreset.eval.policy_spec import PolicySpec
 from xreset.eval.select import SEED, candidates_in, select
 from xreset.eval.setting import Setting
@@ -101,7 +100,6 @@ class SelectTest(unittest.TestCase):
         for measure in (
             lambda: evaluate(policy, self.demos, [], seed=SEED),
             lambda: stress(policy, trial, [], self.folder),
-            lambda: frontier(policy, trial, [], self.folder, states=1),
             lambda: attribute(policy, mock.Mock(), mock.Mock(), trial, episodes=1),
         ):
             with self.assertRaisesRegex(PolicyError, f"Seed {SEED} chose this checkpoint"):

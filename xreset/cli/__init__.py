@@ -33,7 +33,6 @@ COMMANDS: dict[str, str] = {
     "distill": "Train a policy that sees, by imitating one that is told the object's pose.",
     "policies": "List the policies that ship with xreset.",
     "eval": "Evaluate a policy or a baseline in one or several engines.",
-    "frontier": "Show from which demonstrated states a policy reaches the goal.",
     "stress": "Measure robustness: change stiffness, latency, friction and more, one at a time.",
     "rehearse": "Rehearse a policy for a robot: late poses and actions, lost frames, pushes, in every engine.",
     "serve": "Serve a policy to a robot's computer over the network.",

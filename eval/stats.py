@@ -41,22 +41,6 @@ def bootstrap_ci95(
     return float(low), float(high)
 
 
-def wilson_ci95(hits: float, count: int) -> tuple[float, float]:
-    """Return the 95 % interval of a share, of which ``hits`` of ``count`` were observed (Wilson, J. Am. Stat. Assoc.
-    22, 1927).
-
-    Unlike a bootstrap, it holds for small counts, and for a share of 0 or 1. Without observations it is all of [0, 1].
-    """
-    if not count:
-        return 0.0, 1.0
-    z2 = 1.959963984540054**2
-    share = hits / count
-    weight = 1.0 / (1.0 + z2 / count)
-    middle = weight * (share + z2 / (2 * count))
-    half = weight * float(np.sqrt(z2 * (share * (1.0 - share) / count + z2 / (4 * count**2))))
-    return max(middle - half, 0.0), min(middle + half, 1.0)
-
-
 def crossed_bootstrap_ci95(
     values: np.ndarray, runs: np.ndarray, groups: np.ndarray, *, draws: int = 2000, seed: int = 0
 ) -> tuple[float, float]:

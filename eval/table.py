@@ -42,25 +42,13 @@ def markdown(rows: Rows, escape: Callable[[str], str] = escape) -> str:
 
 
 def rich_table(rows: Rows) -> Table:
-    """Return a table for a terminal.
-
-    If two columns describe a row, they are joined to one, so that four engines fit into 80 characters.
-    """
-    grouped = not any(rows.head[:2])
+    """Return a table for a terminal; a first cell without text continues the row above."""
     table = Table(title=rows.title, title_justify="left")
-    for i, name in enumerate(rows.head[grouped:]):
-        table.add_column(_cell(name), justify="right" if i else "left", overflow="fold")
+    for i, name in enumerate(rows.head):
+        table.add_column(Text(name), justify="right" if i > 1 else "left", overflow="fold")
     for line in rows.body:
-        if grouped and line[0]:
-            table.add_section()
-            table.add_row(_cell(line[0]), style="bold")
-        table.add_row(*map(_cell, line[grouped:]))
+        table.add_row(*map(Text, line))
     return table
-
-
-def _cell(text: str) -> Text:
-    """Return a cell without markup. A number stays next to its unit, and three shares stay on one line."""
-    return Text(text.replace(" / ", "/").replace(" %", "\N{NO-BREAK SPACE}%"))
 
 
 METRICS = {
@@ -106,8 +94,6 @@ class Figure:
     """A figure of an evaluation: a row of the terminal's table, a column of the report's table."""
 
     text: Callable[[EvalResult], str]
-    share: Callable[[EvalResult], float] | None = None
-    """Length of the bar behind the text, in [0, 1]."""
     interval: Callable[[EvalResult], tuple[float, float] | None] | None = None
     """95 % interval, in [0, 1]; None where the figure was not measured."""
     fault: bool = False
@@ -117,18 +103,14 @@ class Figure:
 FIGURES = {
     "task progress": Figure(
         lambda s: f"{s.task_progress.mean:.1%}",
-        share=lambda s: s.task_progress.mean,
         interval=lambda s: s.task_progress.ci95,
     ),
     "approach": Figure(lambda s: f"{s.approach_rate:.0%}"),
     "grasp": Figure(lambda s: f"{s.grasp_rate:.0%}"),
     "reorient": Figure(lambda s: f"{s.reorient_rate:.0%}"),
-    "reorientation progress": Figure(
-        lambda s: f"{s.reorientation_progress:.1%}", share=lambda s: s.reorientation_progress
-    ),
+    "reorientation progress": Figure(lambda s: f"{s.reorientation_progress:.1%}"),
     "published success": Figure(
         lambda s: success_text(s.published_success_rate),
-        share=lambda s: s.published_success_rate or 0.0,
         interval=lambda s: s.published_success_ci95,
     ),
     "published distance": Figure(lambda s: distance_text(s.least_distance)),

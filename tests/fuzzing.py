@@ -76,7 +76,7 @@ def readers() -> Iterator[dict[str, Reader]]:
     from xreset.eval.engines.actions import Actions, read_actions, write_actions
     from xreset.eval.engines.page import page
     from xreset.eval.engines.page import read as read_page
-    from xreset.eval.report.read import read_scalars, run_facts
+    from xreset.eval.report.read import read_curves, run_facts
     from xreset.eval.results import read_episodes, read_evaluation, read_result, read_traces, write_results
     from xreset.eval.study.file import SHIPPED, read_study
     from xreset.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
@@ -143,7 +143,7 @@ def readers() -> Iterator[dict[str, Reader]]:
             writer.add_scalar("episode/return", 0.1 * step, step)
         writer.close()
         (events,) = (folder / "curves").iterdir()
-        add("event file", f"curves/{events.name}", lambda p: read_scalars(p.parent), "bytes", may_hold=("value",))
+        add("event file", f"curves/{events.name}", lambda p: read_curves(p.parent), "bytes", may_hold=("value",))
         add("study", "study.toml", read_study, "text", ("config",)).write_bytes(
             (SHIPPED / "first_grasp.toml").read_bytes()
         )

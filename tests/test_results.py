@@ -60,53 +60,24 @@ class ResultsTest(unittest.TestCase):
         self.assertIsNone(found["mujoco"]["least_distance"])
         self.assertAlmostEqual(found["sapien"]["least_distance"], 0.0775)
 
-    def test_nothing_was_evaluated(self):
-        evaluation = read_evaluation(self.folder / "empty")
-        self.assertEqual((len(evaluation), len(evaluation.to_frame()), str(evaluation)), (0, 0, "no results"))
-
-    def test_impossible_episodes_are_refused(self):
-        file = self.folder / "mujoco.episodes.json"
-        content = json.loads(file.read_text())
-        for name, value in (
-            ("task_progress", 1e308),
-            ("reorientation_progress", -7),
-            ("sequence", -1),
-            ("repetition", -1),
-            ("least_distance", 1e308),
-        ):
-            changed = [content["episodes"][0] | {name: value}, *content["episodes"][1:]]
-            file.write_text(json.dumps(content | {"episodes": changed}))
-            with self.subTest(name), self.assertRaisesRegex(FileFormatError, rf"episodes\[0\]\.{name} is .*, expected"):
-                read_evaluation(self.folder)
-
-    def test_impossible_passings_are_refused(self):
+    def test_impossible_values_are_refused(self):
+        episode = json.loads((self.folder / "mujoco.episodes.json").read_text())["episodes"][0]
         passing = {"share": 0.1, "iteration": 3, "env_steps": 30, "minutes": 0.5}
         lift = {"schema": "xreset-lift/1", "passed": [passing], "iteration": 9, "env_steps": 90, "minutes": 1.5}
-        for changes in (
-            {"minutes": -1e300},
-            {"minutes": 1e300},
-            {"success_from_home": 77},
-            {"iteration": -5},
-            {"passed": [passing | {"share": 1e308}]},
-        ):
-            write_json(self.folder / "lift.json", lift | changes)
-            with self.subTest(changes), self.assertRaisesRegex(FileFormatError, "expected a"):
-                read_lift(self.folder)
-
-    def test_a_candidate_without_a_score_is_refused(self):
-        choice = {
-            "schema": "xreset-choice/1",
-            "chosen": "1.pt",
-            "policy_hash": "ab",
-            "candidates": [{"name": "1.pt", "task_progress": {}}],
-            "engines": {},
-            "seed": 0,
-            "episodes_per_demo": 1,
-            "demos": "cd",
-        }
-        write_json(self.folder / "choice.json", choice)
-        with self.assertRaisesRegex(FileFormatError, "task_progress is {}, expected an engine"):
-            read_choice(self.folder)
+        choice = {"schema": "xreset-choice/1", "chosen": "1.pt", "policy_hash": "ab", "engines": {}, "seed": 0}
+        choice |= {"candidates": [{"name": "1.pt", "task_progress": {}}], "episodes_per_demo": 1, "demos": "cd"}
+        files = []
+        far = {"task_progress": 1e308, "reorientation_progress": -7, "least_distance": 1e308}
+        for name, value in (far | {"sequence": -1, "repetition": -1}).items():
+            content = {"schema": "xreset-episodes/1", "episodes": [episode | {name: value}] * 4}
+            files.append(("mujoco.episodes.json", content, read_evaluation))
+        for change in ({"minutes": -1e300}, {"minutes": 1e300}, {"iteration": -5}, {"passed": [passing | {"share": 1e308}]}):
+            files.append(("lift.json", lift | change, read_lift))
+        files.append(("choice.json", choice, read_choice))
+        for name, content, read in files:
+            write_json(self.folder / name, content)
+            with self.subTest(content), self.assertRaisesRegex(FileFormatError, "is .*, expected a"):
+                read(self.folder)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ import torch
 
 from tests import toy_grasp
 from xreset.env import ManipulationEnv, make_scene
-from xreset.eval.report.read import read_scalars
+from xreset.eval.report.read import read_curves
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.runner import TrainingRunner
 from xreset.physics import Backend
@@ -112,8 +112,8 @@ def trained(
         runner = TrainingRunner(environment(seed, backend), config, Path(folder))
         change(runner)
         runner.learn(config.iterations, init_at_random_ep_len=True)
-        curves = read_scalars(Path(folder))
-    return Shares.of(lambda name: curves[name].value[-LAST:].mean()), runner.env_steps
+        curves = read_curves(Path(folder))
+    return Shares.of(lambda name: curves[name].iloc[-LAST:].mean()), runner.env_steps
 
 
 def scene() -> SceneSpec:

@@ -52,7 +52,6 @@ def write_lerobot(
     video: bool = True,
     size: tuple[int, int] = (320, 240),
     cameras: Sequence[str] = (),
-    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
     """Write a data set; ``docs/rollouts.md`` has its features.
 
@@ -61,7 +60,6 @@ def write_lerobot(
         video: whether films are drawn: from one camera for all episodes, the goal as a translucent object.
         size: width and height of the films [pixels], even.
         cameras: names of depth cameras (:data:`xreset.cameras.config.CAMERAS`), each of which gives a film.
-        progress: called with (episodes done, episodes in all).
 
     Raises:
         XResetError: a camera is unknown, pyarrow or the encoder of films is missing, the folder is not empty, or it
@@ -80,24 +78,17 @@ def write_lerobot(
         )
     try:
         with atomic_folder(folder) as part:
-            _write(part, recording, videos, size, progress)
+            _write(part, recording, videos, size)
     except OSError as error:
         raise XResetError(
             f"cannot write {folder}: {error.strerror or error}. Nothing was changed; choose another place."
         ) from error
 
 
-def _write(
-    root: Path,
-    recording: Recording,
-    videos: tuple[str, ...],
-    size: tuple[int, int],
-    progress: Callable[[int, int], None],
-) -> None:
+def _write(root: Path, recording: Recording, videos: tuple[str, ...], size: tuple[int, int]) -> None:
     import pyarrow as pa
     from pyarrow import parquet
 
-    count = len(recording.traces)
     offsets = recording.offsets
     features = _features(recording, videos, size)
     task_index, tasks = pd.factorize(recording.episodes["task"])
@@ -105,7 +96,6 @@ def _write(
     rows = []
     painters: dict[Any, Painter] = {}
     for i, episode in enumerate(recording.episodes.to_dict("records")):
-        progress(i, count)
         length = int(offsets[i + 1] - offsets[i])
         arrays = _arrays(recording, i, int(task_index[i]))
         distance = episode["least_distance"]  # NaN: an earlier version did not measure it
@@ -162,7 +152,6 @@ def _write(
     write_json(root / "meta/stats.json", {key: _stats(key, values) for key, values in whole.items()})
     write_json(root / "meta/xreset.json", {"schema": SCHEMA})  # with the version of xreset
     write_json(root / "meta/info.json", _info(recording, len(tasks), features))
-    progress(count, count)
 
 
 def _info(recording: Recording, tasks: int, features: dict[str, Any]) -> dict[str, Any]:

@@ -15,7 +15,7 @@ import pandas as pd
 
 from xreset.description import load_robot
 from xreset.errors import FileFormatError, RunError
-from xreset.eval.report.clips import finite_states, recorded_episode
+from xreset.eval.report.clips import finite_states, recorded
 from xreset.eval.report.read import results_in
 from xreset.eval.results import Table, mesh_folder, read_evaluation, read_traces
 from xreset.eval.rollout import Trace
@@ -105,17 +105,18 @@ def read_recorded(
             name = robot or result.robot
             if name not in robots:
                 robots[name] = load_robot(name)
-            for trace in read_traces(results, engine, robots[name].joint_names):
+            traces_here = {engine: read_traces(results, engine, robots[name].joint_names)}
+            for episode in recorded(evaluation.to_frame(), traces_here).to_dict("records"):
+                trace = episode.pop("trace")
                 action = _actions(trace, results / f"{engine}.trace.npz")
                 intervals.setdefault(round(float(np.median(np.diff(trace.time))), 6), results)
-                episode = recorded_episode(evaluation.to_frame(), engine, trace.sequence)
                 last = _finite_frames(trace, action, f"{results}, {engine}")
                 if last < 2:
                     continue
-                cut = {
-                    field: getattr(trace, field)[:last] for field in ("time", "joint_pos", "object_pos", "object_quat")
-                }
-                rows.append(episode._asdict() | {"task": task.replace("{object}", short_name(trace.object))})
+                cut = {}
+                for field in ("time", "joint_pos", "object_pos", "object_quat"):
+                    cut[field] = getattr(trace, field)[:last]
+                rows.append(episode | {"task": task.replace("{object}", short_name(trace.object))})
                 traces.append(replace(trace, **cut))
                 actions.append(action[:last])
                 meshes.append(mesh_folder(objects, result.objects_folder))
@@ -134,7 +135,7 @@ def read_recorded(
     return Recording(
         robot=next(iter(robots.values())),
         fps=_rate(next(iter(intervals))),
-        episodes=pd.DataFrame(rows).drop(columns="Index"),
+        episodes=pd.DataFrame(rows),
         traces=tuple(traces),
         actions=tuple(actions),
         meshes=tuple(meshes),

@@ -1,5 +1,5 @@
-"""The report of an evaluation: one self-contained HTML page and one picture.
+"""The report of an evaluation: one self-contained HTML page.
 
 from xreset.eval.report.make import make_report
-make_report(Path("runs/soup"))          # runs/soup/report/index.html and overview.png
+make_report(Path("runs/soup"))          # runs/soup/report/index.html
 """

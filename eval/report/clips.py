@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 import torch
 
 from xreset.cameras.config import VisionConfig
@@ -61,62 +62,57 @@ class Strip:
 # Which episodes -------------------------------------------------------------------------------------------------------
 
 
-def recorded(episodes: Table, sequences: Iterable[int]) -> Table:
-    """Return the episodes that the traces of demonstrations show: the first repetition of each, in every engine."""
-    own = episodes[episodes["sequence"].isin(list(sequences))]
-    return own.sort_values("repetition", kind="stable").drop_duplicates(["engine", "sequence"])
+def recorded(episodes: Table, traces: Mapping[str, Sequence[Trace]]) -> Table:
+    """Return the episodes that traces show, each with its ``trace``: the first repetition of a demonstration.
 
-
-def recorded_episode(episodes: Table, engine: str, sequence: int) -> Any:
-    """Return the row of the episode that a trace shows.
+    Args:
+        episodes: episodes in all engines.
+        traces: recorded episodes by engine.
 
     Raises:
-        FileFormatError: there is no such episode.
+        FileFormatError: a trace shows a demonstration of which no episode is known.
     """
-    for row in recorded(episodes[episodes["engine"] == engine], [sequence]).itertuples():
-        return row
-    raise FileFormatError(
-        f"{engine}.trace.npz has a trace of demonstration {sequence}, of which no episode is known. Evaluate again."
-    )
+    parts = []
+    for engine, found in traces.items():
+        own = episodes[episodes["engine"] == engine].sort_values("repetition", kind="stable")
+        own = own.drop_duplicates("sequence").set_index("sequence", drop=False)
+        for trace in found:
+            if trace.sequence not in own.index:
+                raise FileFormatError(
+                    f"{engine}.trace.npz has a trace of demonstration {trace.sequence}, of which no episode is known. "
+                    "Evaluate again."
+                )
+        parts.append(own.loc[[trace.sequence for trace in found]].assign(trace=list(found)))
+    return pd.concat(parts, ignore_index=True)
 
 
-def trace_of(traces: Sequence[Trace], sequence: int) -> Trace:
-    """Return the trace of a demonstration."""
-    return next(trace for trace in traces if trace.sequence == sequence)
-
-
-def choose_sequence(episodes: Table, traces: Mapping[str, Sequence[Trace]]) -> int | None:
-    """Return the demonstration with the best recorded episodes; None if no demonstration was recorded in every engine.
+def best_everywhere(shown: Table) -> Table:
+    """Return the episodes, one for each engine, of the demonstration that went best; empty if none was recorded in
+    every engine.
 
     Best is the highest mean task progress over all engines, then the highest mean reorientation progress, then the
     lowest index.
+
+    Args:
+        shown: :func:`recorded`.
     """
-    if not traces:
-        return None
-    sequences = [{trace.sequence for trace in found} for found in traces.values()]  # noqa: XR002
-    common = set.intersection(*sequences)
-    shown = recorded(episodes[episodes["engine"].isin(list(traces))], common)
-    if shown.empty:
-        return None
+    engines = shown["engine"].nunique()
+    everywhere = shown.groupby("sequence").filter(lambda own: len(own) == engines)
     metrics = ["task_progress", "reorientation_progress"]
-    quality = shown.groupby("sequence")[metrics].mean().sort_values(metrics, ascending=False, kind="stable")
-    return int(quality.index[0])
+    quality = everywhere.groupby("sequence")[metrics].mean().sort_values(metrics, ascending=False, kind="stable")
+    return everywhere[everywhere["sequence"].isin(quality.index[:1])]
 
 
-def choose_failures(episodes: Table, traces: Sequence[Trace], count: int) -> list[tuple[Any, Trace]]:
+def worst_episodes(shown: Table, count: int) -> Table:
     """Return the recorded episodes of one engine that missed the goal, worst first, at most ``count``.
 
     Worst is the lowest stage, then the least reorientation progress, then the lowest index of the demonstration.
     Objects take turns, so that a hard object does not hide the others.
     """
-    by_sequence = {trace.sequence: trace for trace in traces}
-    missed = recorded(episodes, by_sequence)
-    missed = missed[~missed["reorient"]].sort_values(
-        ["task_progress", "reorientation_progress", "sequence"], ignore_index=True
-    )
+    order = ["task_progress", "reorientation_progress", "sequence"]
+    missed = shown[~shown["reorient"]].sort_values(order, ignore_index=True)
     turns = missed.groupby("object").cumcount().sort_values(kind="stable")
-    chosen = missed.loc[sorted(turns.index[:count])]
-    return [(row, by_sequence[row.sequence]) for row in chosen.itertuples()]
+    return missed.loc[sorted(turns.index[:count])]
 
 
 def count_failures(episodes: Table) -> dict[str, int]:

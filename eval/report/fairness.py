@@ -3,156 +3,132 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from xreset.eval.report.groups import Group, members_of
-from xreset.eval.report.read import Training, conditions, differences
 from xreset.eval.results import Table
 from xreset.text import short_name
 
+if TYPE_CHECKING:
+    from xreset.eval.report.read import Training
+
+POLICY_CONDITIONS = ("policy", "policy file")
+"""Conditions in which the engines of one policy must agree."""
+_CONDITIONS = ("objects", "robot", "object meshes", "number of episodes", "seed of the evaluation")
 _PLAYED_TASK = ("task.termination.", "task.reset.spawn_", "task.reset.home_noise", "task.timestep")
 """Fields of a training's task that its evaluation keeps (:func:`xreset.task.config.evaluation_task`) and that make it
 easier or harder."""
-_UNFAIR = "These results are not comparable: "
+_SAME_NAMES = " Their sequences have the same names: if one was made from the other, as for ik, they are comparable."
 
 
-def notes(trainings: Sequence[Training]) -> tuple[str, ...]:
-    """Return everything besides the policy in which evaluations differ; empty if all were evaluated alike."""
-    evaluated = [t for t in trainings if t.results]
-    found = []
-    for training in evaluated:
-        found += [f"{training.label}: {note}" for note in differences(tuple(training.results.values()))]
-        if training.episodes["published_success"].isna().any():
-            found.append(
-                f"{training.label}: the published success is missing, because an earlier version evaluated it. "
-                "Evaluate it again."
-            )
-    table = _condition_table(evaluated)
+def uneven(trainings: Sequence[Training], further: Sequence[str] = ()) -> list[str]:
+    """Return a sentence for each condition besides the policy in which evaluations differ; none if all were evaluated
+    alike.
+
+    Args:
+        further: further conditions to compare, of :data:`POLICY_CONDITIONS`.
+    """
+    table = _condition_table(trainings)
     if table.empty:
-        return tuple(found)
-    first = table.groupby("run", sort=False).first()  # differences within a training are found above
-
-    def compare(what: str, column: str, advice: str = "") -> None:
-        if first[column].nunique() > 1:
-            found.append(f"{_UNFAIR}not the same {what} ({_listing(table, column)}).{advice}")
-
-    if first["sequences"].nunique() == 1:
-        if table["demonstrations"].nunique() > 1:
-            found.append(
-                f"The files of demonstrations differ ({_listing(table, 'demonstrations')}), their sequences have the "
-                "same names. That is so if one was made from the other, such as retargeted trajectories for ik; "
-                "otherwise the results are not comparable."
-            )
-    else:
-        what = "objects" if first["objects"].nunique() > 1 else "demonstrations"
-        compare(what, what)
-    compare("robot", "robot")
-    folders = set(table["object meshes"]) - {"stand-ins"}
-    compare("object meshes", "object meshes", " Two folders may hold the same meshes." if len(folders) > 1 else "")
-    compare("number of episodes", "number of episodes")
-    compare("seed of the evaluation", "seed")
+        return []
+    tasks = sorted(name for name in table if name.startswith(_PLAYED_TASK))
+    found = []
+    for name in (*_CONDITIONS, *tasks, *further):
+        found += _difference(table, name, name)
+    if table["objects"].nunique() == 1:
+        same_names = table["sequences"].nunique() == 1
+        found += _difference(table, "demonstrations", "demonstrations", _SAME_NAMES if same_names else "")
     for engine, own in table.groupby("engine"):
-        if own["version"].nunique() > 1:
-            found.append(f"{_UNFAIR}not the same version of {engine} ({_listing(own, 'version')}).")
-    return (*found, *_task_notes(evaluated))
+        found += _difference(own, "version", f"version of {engine}")
+    return found
 
 
 def _condition_table(trainings: Sequence[Training]) -> Table:
     """Return one row for each training and engine: how the training was evaluated there."""
     rows = []
     for training in trainings:
-        names = training.episodes[["sequence_name", "object"]].drop_duplicates()
-        played = {
-            "run": training.label,
-            "sequences": "\n".join(sorted(names["object"] + "/" + names["sequence_name"])),
-            "objects": ", ".join(sorted(map(short_name, names["object"].unique()))),
-        }
         for engine, result in training.results.items():
-            rows.append(played | conditions(result) | {"engine": engine, "version": result.backend_version})
+            episodes = training.episodes[training.episodes["engine"] == engine]
+            row = {
+                "run": training.label,
+                "engine": engine,
+                "version": result.backend_version,
+                "policy": result.policy,
+                "policy file": result.inputs.get("policy", "")[:12],
+                "robot": result.robot,
+                "objects": ", ".join(sorted(map(short_name, episodes["object"].unique()))),
+                "object meshes": result.objects_folder or "stand-ins",
+                "demonstrations": result.inputs.get("demos", "")[:12],
+                "sequences": tuple(sorted(set(episodes["object"] + "/" + episodes["sequence_name"]))),
+                "number of episodes": result.episodes,
+                "seed of the evaluation": result.seed,
+            }
+            rows.append(row | {name: text for name, text in training.facts.items() if name.startswith(_PLAYED_TASK)})
     return pd.DataFrame(rows)
 
 
-def _task_notes(trainings: Sequence[Training]) -> list[str]:
-    """Return a sentence for each field of the task in which the policies' own evaluation tasks differ."""
-    rows = []
-    for training in trainings:
-        for name, fact in training.facts.items():
-            if name.startswith(_PLAYED_TASK):
-                rows.append({"field": name, "run": training.label, "value": str(fact.value), "text": fact.text})
-    if not rows:
+def _difference(table: Table, column: str, what: str, advice: str = "") -> list[str]:
+    """Return a sentence if a condition differs: which value in which evaluation. A training with one value in all of
+    its engines is named without the engines."""
+    if table[column].nunique() < 2:
         return []
-    found = []
-    table: Table = pd.DataFrame(rows)
-    for field, own in table.groupby("field"):
-        if own["value"].nunique() > 1:
-            found.append(f"{_UNFAIR}each policy plays its own task, whose {field} differs ({_listing(own, 'text')}).")
-    return found
+    parts = []
+    for value, rows in table.groupby(column, sort=False):
+        names = []
+        for label, own in rows.groupby("run", sort=False):
+            everywhere = len(own) == (table["run"] == label).sum()
+            names += [label] if everywhere else [f"{label} in {engine}" for engine in own["engine"]]
+        parts.append(f"{value}: {', '.join(names)}")
+    return [f"These results are not comparable: not the same {what} ({'; '.join(parts)}).{advice}"]
 
 
-def begun(trainings: Sequence[Training]) -> tuple[str, ...]:
+def begun(trainings: Sequence[Training]) -> list[str]:
     """Return a sentence for each training that began with the networks of another: its curves are not all of its
     learning."""
     found = []
     for training in trainings:
-        weights = training.facts.get("weights")
-        if weights is not None and weights.value is not None:
+        weights = training.facts.get("weights", "new")
+        if weights != "new":
             found.append(
-                f"{training.label} began with the networks of another training ({weights.text}): "
+                f"{training.label} began with the networks of another training ({weights}): "
                 "its minutes and steps are not all that its policy took."
             )
-    return tuple(found)
+    return found
 
 
-def health(found: Table) -> tuple[str, ...]:
+def health(found: Table) -> list[str]:
     """Return a sentence for each score (:func:`xreset.eval.report.groups.scores`) with episodes in which the engine
-    broke down."""
+    broke down or dropped contacts."""
     sentences = []
-    faults = {"nonfinite": "stopped being finite", "overflow": "dropped contacts"}
     for row in found.to_dict("records"):
-        for fault, what in faults.items():
-            if row[fault]:
-                sentences.append(
-                    f"{row[fault]} of {row['episodes']} episodes of {row['group']} in {row['engine']} {what}: "
-                    "that figure means little."
-                )
-    return tuple(sentences)
+        if row["nonfinite"] or row["overflow"]:
+            sentences.append(
+                f"Of {row['episodes']} episodes of {row['group']} in {row['engine']}, {row['nonfinite']} stopped being "
+                f"finite and {row['overflow']} dropped contacts: that figure means little."
+            )
+    return sentences
 
 
-def missing(groups: Sequence[Group], tags: Sequence[str]) -> tuple[str, ...]:
+def missing(trainings: Sequence[Training], tags: Sequence[str]) -> list[str]:
     """Return what some of the trainings lack."""
-    members = members_of(groups)
-    with_curves = [m for m in members if m.scalars]
-    evaluated = [m for m in members if m.results]
+    with_curves = [t for t in trainings if len(t.curves)]
+    evaluated = [t for t in trainings if t.results]
     lacking = {
-        "No learning curves": [m for m in members if not m.scalars],
-        "No evaluation results": [m for m in members if not m.results],
-        "No run.json, so its configuration is not known": [m for m in members if not m.facts],
-        "No lift.json, so the first success from home is not known": [m for m in with_curves if m.lift is None],
+        "No learning curves": [t for t in trainings if t.curves.empty],
+        "No evaluation results": [t for t in trainings if not t.results],
+        "No run.json, so its configuration is not known": [t for t in trainings if not t.facts],
+        "No lift.json, so the first success from home is not known": [t for t in with_curves if t.lift is None],
+        "No published success, which an earlier version did not measure": [
+            t for t in evaluated if t.episodes["published_success"].isna().any()
+        ],
     }
     for tag in tags:
-        lacking[f"No curve {tag}"] = [m for m in with_curves if tag not in m.scalars]
-    for engine in sorted(set().union(*(m.results for m in members))):
-        lacking[f"Not evaluated in {engine}"] = [m for m in evaluated if engine not in m.results]
+        lacking[f"No curve {tag}"] = [t for t in with_curves if tag not in t.curves]
+    for engine in sorted(set().union(*(t.results for t in trainings))):
+        lacking[f"Not evaluated in {engine}"] = [t for t in evaluated if engine not in t.results]
     sentences = []
     for what, without in lacking.items():
         if without:
-            labels = ", ".join(m.label for m in without)
-            sentences.append(f"{what}: {labels}.")
-    return tuple(sentences)
-
-
-def _listing(table: Table, column: str) -> str:
-    """Return ``value: who has it; ...``; a training with one value in all of its engines is named without the
-    engines."""
-    parts = []
-    for value, rows in table.groupby(column, sort=False):
-        whole = []
-        single = []
-        for label, own in rows.groupby("run", sort=False):
-            if len(own) == (table["run"] == label).sum():
-                whole.append(label)
-            else:
-                single += [f"{label} in {engine}" for engine in own["engine"]]
-        parts.append(f"{value}: {', '.join([*whole, *single])}")
-    return "; ".join(parts)
+            sentences.append(f"{what}: {', '.join(t.label for t in without)}.")
+    return sentences

@@ -1,31 +1,60 @@
-"""One labelled film of many objects in every engine: objects side by side, engines below one another."""
+"""Films of recorded episodes: the best one in every engine, and one labelled film of many objects in every engine."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
+from xreset.cameras.config import VisionConfig
 from xreset.description import load_robot
 from xreset.errors import RunError
-from xreset.eval.report.clips import camera_for, choose_sequence, draw_clip, encode_mp4, recorded_episode, trace_of
-from xreset.eval.report.read import collect
-from xreset.eval.results import mesh_folder, read_traces
+from xreset.eval.report.clips import (
+    Clip,
+    best_everywhere,
+    camera_for,
+    draw_clip,
+    encode_mp4,
+    policy_cameras,
+    recorded,
+)
+from xreset.eval.report.read import ReportData, collect
+from xreset.eval.results import Table, mesh_folder, read_traces
 from xreset.files import write_whole
 from xreset.objects.catalogue import load_object
 from xreset.pictures.render import add_caption
+from xreset.spec import RobotSpec
 from xreset.text import short_name
 
 
+def draw_best(shown: Table, robot: RobotSpec, meshes: Path | None, vision: VisionConfig | None = None) -> list[Clip]:
+    """Draw the episode that went best over all engines, in each of them; empty if no demonstration was recorded in
+    every engine.
+
+    Args:
+        shown: :func:`xreset.eval.report.clips.recorded`.
+        meshes: folder of object meshes; None: the stand-ins.
+        vision: cameras of a policy that sees, whose images are drawn below.
+    """
+    best = list(best_everywhere(shown).itertuples())
+    clips = []
+    for episode in best:
+        camera = camera_for([best[0].trace])
+        obj = load_object(episode.object, meshes)
+        eyes = policy_cameras(robot, obj, vision)
+        clips.append(draw_clip(episode.engine, episode, episode.trace, robot, obj, camera, eyes))
+    return clips
+
+
+def read_recorded(data: ReportData, robot: RobotSpec) -> Table:
+    """Return the recorded episodes of a report; see :func:`xreset.eval.report.clips.recorded`."""
+    traces = {engine: read_traces(data.folder, engine, robot.joint_names) for engine in data.engines}
+    return recorded(data.episodes, traces)
+
+
 def make_film(
-    folder: Path,
-    out: Path,
-    *,
-    robot: str | None = None,
-    objects: Path | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    folder: Path, out: Path, *, robot: str | None = None, objects: Path | None = None
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Write an mp4 with the episode of each object that went best over all engines, all at their own speed.
 
@@ -33,7 +62,6 @@ def make_film(
         folder: a run folder, or a folder of results.
         robot: name or folder of the robot; default: as the results name it.
         objects: folder of meshes; default: as the results name it.
-        progress: called with (clips drawn, clips in all).
 
     Returns:
         The engines, from above, and the objects, from the left.
@@ -45,40 +73,25 @@ def make_film(
     """
     data = collect(folder)
     spec = load_robot(robot or data.robot)
-    traces = {engine: read_traces(data.folder, engine, spec.joint_names) for engine in data.engines}
+    shown = read_recorded(data, spec)
     meshes = mesh_folder(objects, data.results[0].objects_folder)
-    names = set()
-    for found in traces.values():
-        names.update(trace.object for trace in found)
     columns = {}
-    rate = 0.0
-    for number, name in enumerate(sorted(names)):
-        own = {}
-        for engine, found in traces.items():
-            own[engine] = [trace for trace in found if trace.object == name]
-        sequence = choose_sequence(data.episodes, own)
-        if sequence is None:
-            continue
-        shown = {engine: trace_of(found, sequence) for engine, found in own.items()}
-        camera = camera_for(list(shown.values()))
-        obj = load_object(name, meshes)
-        columns[name] = []
-        for row, (engine, trace) in enumerate(shown.items()):
-            progress(number * len(shown) + row, len(names) * len(shown))
-            episode = recorded_episode(data.episodes, engine, sequence)
-            clip = draw_clip(engine, episode, trace, spec, obj, camera)
-            label = f"{short_name(name)}, {engine}"
-            half = clip.frames[:, ::2, ::2]
-            columns[name].append(np.stack([add_caption(picture, [label], 1) for picture in half]))
-            rate = clip.fps
+    for name, own in shown.groupby("object"):
+        if clips := draw_best(own, spec, meshes):
+            columns[str(name)] = clips
     if not columns:
         raise RunError(
             f"no demonstration in {data.folder} was recorded in every engine. Evaluate all engines in one command."
         )
-    length = max(map(len, chain(*columns.values())))
+    every = list(chain(*columns.values()))
+    length = max(len(clip.frames) for clip in every)
     films = []
-    for column in columns.values():
-        lasting = [frames[np.minimum(np.arange(length), len(frames) - 1)] for frames in column]
-        films.append(np.concatenate(lasting, axis=1))
-    write_whole(out, encode_mp4(np.concatenate(films, axis=2), rate))
+    for name, clips in columns.items():
+        column = []
+        for clip in clips:
+            half = clip.frames[np.minimum(np.arange(length), len(clip.frames) - 1), ::2, ::2]
+            label = f"{short_name(name)}, {clip.engine}"
+            column.append(np.stack([add_caption(picture, [label], 1) for picture in half]))
+        films.append(np.concatenate(column, axis=1))
+    write_whole(out, encode_mp4(np.concatenate(films, axis=2), every[-1].fps))
     return data.engines, tuple(columns)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from os.path import commonprefix
 from typing import Any
 
 import pandas as pd
 
-from xreset.eval.report.read import Training, conditions
+from xreset.eval.report.fairness import uneven
+from xreset.eval.report.read import Training
 from xreset.eval.results import Table, mean, means
 from xreset.eval.stats import crossed_bootstrap_ci95
 
@@ -32,24 +32,23 @@ def grouped(trainings: Sequence[Training]) -> tuple[tuple[Group, ...], tuple[str
         The groups, in the order of their first trainings, and sentences about trainings of the same configuration that
         are not grouped.
     """
-    alike: list[list[Training]] = []
+    alike: dict[object, list[Training]] = {}
     for training in trainings:
-        key = _configuration(training)
-        group = next((group for group in alike if key and _configuration(group[0]) == key), None)
-        if group is None:
-            alike.append([training])
-        else:
-            group.append(training)
+        shared = [fact for fact in training.facts.items() if fact[0] not in ("seed", "iterations")]
+        alike.setdefault(tuple(shared) or training.label, []).append(training)
     groups = []
     notes = []
-    for members in alike:
+    for members in alike.values():
         names = [m.label for m in members]
-        reason = _difference(members)
-        if reason is None:
-            groups.append(Group(label=_label(names), members=tuple(members)))
-        else:
+        reasons = uneven(members)
+        seeds = {m.facts.get("seed") for m in members}
+        if len(seeds) < len(members):
+            reasons = ["Some have the same seed, too."]
+        if reasons:
             groups += singles(members)
-            notes.append(f"{', '.join(names)} have the same configuration and are not grouped: {reason}.")
+            notes.append(f"{', '.join(names)} have the same configuration and are not grouped. {reasons[0]}")
+        else:
+            groups.append(Group(label=_label(names), members=tuple(members)))
     if len({group.label for group in groups}) < len(groups):  # shortened names may be equal
         groups = [replace(group, label=" + ".join(m.label for m in group.members)) for group in groups]  # noqa: XR002
     return tuple(groups), tuple(notes)
@@ -66,33 +65,6 @@ def members_of(groups: Iterable[Group]) -> list[Training]:
 def singles(trainings: Sequence[Training]) -> tuple[Group, ...]:
     """Return a group for each training."""
     return tuple(Group(label=training.label, members=(training,)) for training in trainings)
-
-
-def _configuration(training: Training) -> dict[str, object]:
-    """Return the facts that repetitions of a run share: all except the seed and the planned length."""
-    return {name: fact.value for name, fact in training.facts.items() if name not in ("seed", "iterations")}
-
-
-def _difference(members: Sequence[Training]) -> str | None:
-    """Return why trainings of one configuration are not repetitions of one another; None if they are."""
-    for a, b in combinations(members, 2):
-        if a.facts["seed"].value == b.facts["seed"].value:
-            return f"{a.label} and {b.label} have the same seed, too"
-        for engine in a.results.keys() & b.results.keys():
-            theirs = conditions(b.results[engine])
-            for condition, value in conditions(a.results[engine]).items():
-                if not condition.startswith("policy") and value != theirs[condition]:
-                    return f"in the evaluations of {a.label} and {b.label} in {engine} the {condition} differs"
-            if _played(a, engine) != _played(b, engine):
-                return f"{a.label} and {b.label} were evaluated with different episodes in {engine}"
-            if a.results[engine].backend_version != b.results[engine].backend_version:
-                return f"{a.label} and {b.label} were evaluated in different versions of {engine}"
-    return None
-
-
-def _played(training: Training, engine: str) -> set[tuple[int, int]]:
-    own = training.episodes[training.episodes["engine"] == engine]
-    return set(zip(own["sequence"], own["repetition"], strict=True))
 
 
 def _label(labels: Sequence[str]) -> str:

@@ -2,64 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from xreset.description import load_robot
 from xreset.errors import RunError, XResetError
 from xreset.eval.pages import render
-from xreset.eval.report import clips as drawing
 from xreset.eval.report import fairness, tables
-from xreset.eval.report.clips import Clip, Strip
+from xreset.eval.report.clips import Clip, Strip, draw_strip, policy_cameras, worst_episodes
 from xreset.eval.report.curves import X
-from xreset.eval.report.figures import write_overview, write_picture
+from xreset.eval.report.figures import write_picture
+from xreset.eval.report.film import draw_best, read_recorded
 from xreset.eval.report.groups import Group, grouped, scores, singles
-from xreset.eval.report.page import headline, page
+from xreset.eval.report.page import page
 from xreset.eval.report.read import ReportData, Training, collect, read_trainings
-from xreset.eval.results import EvalResult, mesh_folder, read_traces
+from xreset.eval.results import mesh_folder
 from xreset.eval.table import Rows, caption
 from xreset.files import claim_folder, write_whole
 from xreset.objects.catalogue import load_object
-from xreset.text import short_name
 
 CURVES = ("task/success", "task/success_from_home")
 """Curves that a comparison draws by default."""
 _FAILURES = 4
 """Most failures that a report shows."""
 
-Progress = Callable[[int, int], None]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Report:
-    """A report that was written."""
-
-    html: Path
-    overview: Path
-    results: tuple[EvalResult, ...]
-    headline: str
-    """The result in one or two sentences."""
-    notes: tuple[str, ...]
-    """What is missing or not comparable."""
-
 
 def make_report(
-    folder: Path,
-    out: Path | None = None,
-    *,
-    robot: str | None = None,
-    objects: Path | None = None,
-    progress: Progress = lambda done, total: None,
-) -> Report:
-    """Write ``index.html`` and ``overview.png``.
+    folder: Path, out: Path | None = None, *, robot: str | None = None, objects: Path | None = None
+) -> tuple[Path, ReportData]:
+    """Write ``index.html``; return its path, and what it shows.
 
     Args:
         folder: a run folder, or a folder of results.
         out: folder of the report; default: ``report`` in the folder.
         robot: name or folder of the robot, for the clips; default: as the run and the results name it.
         objects: folder of meshes, for the clips; default: as the results name it.
-        progress: called with (clips and strips drawn, clips and strips in all).
 
     Raises:
         RunError: there are no results.
@@ -68,53 +46,30 @@ def make_report(
     """
     out = folder / "report" if out is None else out
     data = collect(folder)
-    html = out / "index.html"
-    overview = out / "overview.png"
     with claim_folder(out):
         clips = []
         strips = []
         try:
-            clips, strips = _draw(data, robot, objects, progress)
+            clips, strips = _draw(data, robot, objects)
         except XResetError as error:  # numbers are worth a page without films; the page says why
             data = replace(data, notes=(*data.notes, f"There are no clips: {error}"))
-        content = page(data, clips, strips)
-        caption = ""
-        if clips:
-            caption = f"{short_name(clips[0].episode.object)}: middle and end of the same episode in each engine"
-        write_overview(overview, data.title, data.results, clips, caption)
-        write_whole(html, content)
-    return Report(html=html, overview=overview, results=data.results, headline=headline(data), notes=data.notes)
+        write_whole(out / "index.html", page(data, clips, strips))
+    return out / "index.html", data
 
 
-def _draw(
-    data: ReportData, robot: str | None, objects: Path | None, progress: Progress
-) -> tuple[list[Clip], list[Strip]]:
+def _draw(data: ReportData, robot: str | None, objects: Path | None) -> tuple[list[Clip], list[Strip]]:
     """Draw one episode in every engine, and the failures in the first engine."""
     spec = load_robot(robot or data.robot)
-    recorded = {engine: read_traces(data.folder, engine, spec.joint_names) for engine in data.engines}
-    sequence = drawing.choose_sequence(data.episodes, recorded)
-    if sequence is None:
-        raise XResetError("no demonstration was recorded in every engine. Evaluate all engines in one command.")
-    traces = {engine: drawing.trace_of(found, sequence) for engine, found in recorded.items()}
-    first = data.engines[0]
-    missed = drawing.choose_failures(data.episodes_in(first), recorded[first], _FAILURES)
+    shown = read_recorded(data, spec)
     meshes = mesh_folder(objects, data.results[0].objects_folder)
-    names = {trace.object for _, trace in missed} | {trace.object for trace in traces.values()}
-    loaded = {name: load_object(name, meshes) for name in sorted(names)}
     vision = data.run.config.task.vision if data.run else None
-    eyes = {name: drawing.policy_cameras(spec, obj, vision) for name, obj in loaded.items()}
-    camera = drawing.camera_for(list(traces.values()))
-    total = len(traces) + len(missed)
-    clips = []
-    for engine, trace in traces.items():
-        progress(len(clips), total)
-        episode = drawing.recorded_episode(data.episodes, engine, sequence)
-        clips.append(drawing.draw_clip(engine, episode, trace, spec, loaded[trace.object], camera, eyes[trace.object]))
+    clips = draw_best(shown, spec, meshes, vision)
+    if not clips:
+        raise XResetError("no demonstration was recorded in every engine. Evaluate all engines in one command.")
     strips = []
-    for episode, trace in missed:
-        progress(len(clips) + len(strips), total)
-        strips.append(drawing.draw_strip(episode, trace, spec, loaded[trace.object], eyes[trace.object]))
-    progress(total, total)
+    for episode in worst_episodes(shown[shown["engine"] == data.engines[0]], _FAILURES).itertuples():
+        obj = load_object(episode.object, meshes)
+        strips.append(draw_strip(episode, episode.trace, spec, obj, policy_cameras(spec, obj, vision)))
     return clips, strips
 
 
@@ -157,9 +112,13 @@ def compare(
     groups, notes = (singles(trainings), ()) if apart else grouped(trainings)
     tags = choose_curves(trainings, curves)
     found = scores(groups)
-    captions = _captions(trainings, groups)
-    if any(t.lift for t in trainings):
-        captions.append(tables.LIFTED)
+    notes = (
+        *notes,
+        *fairness.uneven(trainings),
+        *fairness.begun(trainings),
+        *fairness.health(found),
+        *fairness.missing(trainings, tags),
+    )
     made = Comparison(
         picture=out / "compare.png",
         page=out / "compare.md",
@@ -167,14 +126,8 @@ def compare(
         results=tables.results(groups, found),
         lifted=tables.lifted(groups, x),
         different=tables.different(groups),
-        notes=(
-            *notes,
-            *fairness.notes(trainings),
-            *fairness.begun(trainings),
-            *fairness.health(found),
-            *fairness.missing(groups, tags),
-        ),
-        captions=tuple(captions),
+        notes=notes,
+        captions=tuple(_captions(trainings, groups)),
     )
     content = render("compare.md.j2", **vars(made))
     write_picture(made.picture, groups, tags, found, x)
@@ -188,39 +141,34 @@ def choose_curves(trainings: Sequence[Training], wanted: Sequence[str]) -> tuple
     Raises:
         RunError: no training has one of the wanted curves.
     """
-    known = sorted(set().union(*(t.scalars for t in trainings)))
+    known = sorted(set().union(*(t.curves for t in trainings)))
     if not known and not wanted:
         return ()
     chosen = tuple(dict.fromkeys(wanted or CURVES))
-    unknown = [tag for tag in chosen if tag not in known]
-    if unknown:
-        there = f"there are {', '.join(known)}" if known else "none of these runs has learning curves"
-        raise RunError(f"there is no curve {', '.join(unknown)}; {there}. Choose with --curve.")
+    if unknown := set(chosen) - set(known):
+        raise RunError(
+            f"there is no curve {', '.join(sorted(unknown))}; there are {', '.join(known) or 'none'}. "
+            "Choose with --curve."
+        )
     return chosen
 
 
 def _captions(trainings: Sequence[Training], groups: Sequence[Group]) -> list[str]:
     captions = []
-    numbers = sorted({next(iter(t.results.values())).episodes for t in trainings if t.results})
-    if numbers:
-        count = str(numbers[0]) if len(numbers) == 1 else f"{numbers[0]} to {numbers[-1]}"
-        captions.append(
-            f"From home at full gravity, {count} episodes of each training in each engine. "
-            "The 95 % interval is a bootstrap over demonstrations."
-        )
-        policies = []
-        for training in trainings:
-            policies += [result.policy for result in training.results.values()]
+    policies = []
+    for training in trainings:
+        policies += [result.policy for result in training.results.values()]
+    if policies:
+        captions.append("From home at full gravity. The 95 % interval is a bootstrap over demonstrations.")
         captions.append(caption(policies))
     for group in groups:
         if len(group.members) > 1:
-            names = ", ".join(m.label for m in group.members)
-            text = (
-                f"{group.label} is {len(group.members)} trainings that differ in the seed only ({names}): "
-                "curves are their mean, bands go from the lowest to the highest"
+            captions.append(
+                f"{group.label} is {len(group.members)} trainings that differ in the seed only "
+                f"({', '.join(m.label for m in group.members)}): curves are their mean, bands go from the lowest to "
+                "the highest, and intervals are bootstraps over trainings and demonstrations, which are too narrow "
+                "for few trainings."
             )
-            if sum(bool(m.results) for m in group.members) > 1:
-                text += ", and the interval is a bootstrap over trainings and demonstrations, "
-                text += "which is too narrow for few trainings"
-            captions.append(text + ".")
+    if any(t.lift for t in trainings):
+        captions.append(tables.LIFTED)
     return captions

@@ -42,7 +42,7 @@ def page(data: ReportData, clips: Sequence[Clip], strips: Sequence[Strip] = ()) 
         png=lambda strip: _base64(encode_png(strip.picture)),
         failed=len(first),
         failures={what: count for what, count in count_failures(first).items() if count},
-        charts=charts(data.results, object_progress(data.episodes), data.curves),
+        charts=charts(object_progress(data.episodes), data.curves),
         stressed=by_property(data.stress),
         demonstrations=demonstrations,
     )
@@ -55,30 +55,7 @@ def _base64(content: bytes) -> str:
 def headline(data: ReportData) -> str:
     """Return the result in one or two sentences."""
     ranked = sorted(data.results, key=lambda s: -s.task_progress.mean)
-    best = ranked[0]
-    worst = ranked[-1]
-    high = percent(best.task_progress.mean)
-    low = percent(worst.task_progress.mean)
-    if len(ranked) == 1:
-        text = f"Task progress is {high} in {best.backend}"
-    elif high == low:
-        text = f"Task progress is {high} in each of the {len(ranked)} engines"
-    else:
-        number = f"{len(ranked)} engines" if len(ranked) > 2 else "the two engines"
-        text = f"Task progress is {high} in {best.backend} and {low} in {worst.backend}, "
-        text += f"the best and the worst of {number}"
-    grasped = _between([s.grasp_rate for s in ranked])
-    at_goal = _between([s.reorient_rate for s in ranked])
-    text += f". The object is grasped in {grasped} of the episodes and at its goal at the end of {at_goal}."
-    successes = [s.published_success_rate for s in ranked if s.published_success_rate is not None]
-    if len(successes) == len(ranked):
-        text += f" By the published paper's measure {_between(successes)} of the episodes succeed."
-    if data.run is not None and data.run.backend in data.engines and len(ranked) > 1:
+    text = f"Task progress is {', '.join(f'{percent(s.task_progress.mean)} in {s.backend}' for s in ranked)}."
+    if data.run is not None and len(ranked) > 1:
         text += f" The policy was trained in {data.run.backend}."
     return text
-
-
-def _between(values: Sequence[float]) -> str:
-    low = percent(min(values))
-    high = percent(max(values))
-    return low if low == high else f"{low} to {high}"

@@ -4,15 +4,15 @@ results."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from xreset.errors import FileFormatError, RunError, XResetError, needs
 from xreset.eval.report.clips import missed_by_student
+from xreset.eval.report.fairness import POLICY_CONDITIONS, uneven
 from xreset.eval.results import EvalResult, Table, read_evaluation
 from xreset.eval.stress import Stress, read_stress
 from xreset.files import read_json
@@ -24,33 +24,6 @@ from xreset.learning.run import TEACHER, RunInfo, read_run
 from xreset.policies import results_folder, shipped
 from xreset.text import short_name
 
-CURVES = {
-    "episode/return": "episode return",
-    "task/grasped": "worlds with a grasp",
-    "task/success": "worlds at the goal",
-}
-"""TensorBoard tag -> what the report calls the curve."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Curve:
-    """A scalar over the iterations of a training."""
-
-    label: str
-    iteration: np.ndarray
-    """[T] rising"""
-    value: np.ndarray
-    """[T]"""
-
-
-class Fact(NamedTuple):
-    """One property of a training."""
-
-    value: Any
-    """Two trainings agree in the property if their values are equal."""
-    text: str
-    """The property as tables show it."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Training:
@@ -58,10 +31,11 @@ class Training:
 
     label: str
     folder: Path
-    facts: dict[str, Fact]
-    """Configuration by name of the field, such as ``task.reset.demo_probability``; empty without ``run.json``."""
-    scalars: dict[str, Curve]
-    """TensorBoard tag -> curve; empty without event files."""
+    facts: dict[str, str]
+    """Configuration by name of the field, such as ``task.reset.demo_probability``, as tables show it; empty without
+    ``run.json``."""
+    curves: Table
+    """What :func:`read_curves` returns."""
     results: dict[str, EvalResult]
     """Engine -> result."""
     episodes: Table
@@ -86,7 +60,8 @@ class ReportData:
     """The training; None for baselines, and where ``run.json`` cannot be read."""
     trained_with: str | None
     """Version of xreset that the policy was trained with."""
-    curves: tuple[Curve, ...]
+    curves: Table
+    """What :func:`read_curves` returns."""
     choice: Choice | None = None
     """How the evaluated policy was chosen among the run's checkpoints."""
     stress: tuple[Stress, ...] = ()
@@ -126,7 +101,7 @@ def collect(folder: Path) -> ReportData:
     """
     is_run = (folder / "run.json").is_file()
     results = results_in(folder)
-    evaluation = read_evaluation(results)
+    evaluation = read_evaluation(results, name_of(folder))
     if not evaluation:
         policy = str(folder) if is_run else "POLICY"
         out = "" if is_run else f" --out {results}"
@@ -134,10 +109,18 @@ def collect(folder: Path) -> ReportData:
             f"{results} holds no evaluation results. "
             f"Make them first: xreset eval {policy} --backend mujoco --demos DEMOS{out}"
         )
-    curves, curve_note = read_curves(folder)
-    notes = differences(evaluation)
-    if curve_note:
-        notes.append(curve_note)
+    episodes = evaluation.to_frame()
+    by_engine = {result.backend: result for result in evaluation}
+    notes = []
+    curves: Table = pd.DataFrame()
+    try:
+        curves = read_curves(folder)
+    except XResetError as error:
+        notes.append(str(error))
+    evaluated = Training(
+        label=name_of(folder), folder=folder, facts={}, curves=curves, results=by_engine, episodes=episodes
+    )
+    notes = uneven([evaluated], POLICY_CONDITIONS) + notes
     run = None
     trained_with = None
     if is_run:
@@ -148,7 +131,7 @@ def collect(folder: Path) -> ReportData:
             notes.append(f"The training is not described here: {error}")
     if run is not None and run.teacher is not None:
         if taught := read_evaluation(folder / "teacher"):
-            notes.append(missed_by_student(evaluation.to_frame(), taught.to_frame()))
+            notes.append(missed_by_student(episodes, taught.to_frame()))
         else:
             notes.append(
                 "The teacher was not evaluated from the same starts. Make its results first: "
@@ -161,7 +144,7 @@ def collect(folder: Path) -> ReportData:
         name=name_of(folder),
         folder=results,
         results=tuple(evaluation),
-        episodes=evaluation.to_frame(),
+        episodes=episodes,
         run=run,
         trained_with=trained_with,
         curves=curves,
@@ -192,62 +175,25 @@ def name_of(folder: Path) -> str:
     return whole.parent.name if whole.name == "eval" else whole.name
 
 
-def conditions(result: EvalResult) -> dict[str, Any]:
-    """Return what was evaluated, and how: results that differ in any of it are not comparable."""
-    return {
-        "policy": result.policy,
-        "robot": result.robot,
-        "policy file": result.inputs.get("policy", "")[:12],
-        "demonstrations": result.inputs.get("demos", "")[:12],
-        "object meshes": result.objects_folder or "stand-ins",
-        "number of episodes": result.episodes,
-        "seed": result.seed,
-    }
-
-
-def differences(results: Sequence[EvalResult]) -> list[str]:
-    """Return a sentence for each condition in which the engines of one policy differ."""
-    notes = []
-    table: Table = pd.DataFrame([conditions(s) for s in results], index=[s.backend for s in results])
-    for what in table:
-        if table[what].nunique() > 1:
-            listing = ", ".join(f"{engine}: {value}" for engine, value in table[what].items())
-            notes.append(
-                f"These results are not comparable: the {what} differs ({listing}). "
-                "Evaluate all engines in one command."
-            )
-    return notes
-
-
 # Learning curves ------------------------------------------------------------------------------------------------------
 
 
-def read_curves(folder: Path) -> tuple[tuple[Curve, ...], str | None]:
-    """Return the learning curves of :data:`CURVES` in a folder, and a note if the curves cannot be read."""
-    try:
-        scalars = read_scalars(folder)
-    except XResetError as error:
-        return (), str(error)
-    return tuple(replace(scalars[tag], label=label) for tag, label in CURVES.items() if tag in scalars), None
-
-
-def read_scalars(folder: Path) -> dict[str, Curve]:
-    """Return all scalars of TensorBoard's event files in a folder, by tag; empty if there are no event files.
+def read_curves(folder: Path) -> Table:
+    """Return all scalars of TensorBoard's event files in a folder: a row for each iteration, a column for each tag, NaN
+    where nothing was logged. The table is empty if there are no event files.
 
     Raises:
         FileFormatError: an event file is damaged.
         XResetError: there are event files, and TensorBoard, which reads them, cannot be imported.
     """
-    values: dict[str, dict[int, float]] = {}
+    scalars = []
     for file in sorted(folder.glob("events.out.tfevents.*")):
-        for tag, step, value in _scalars(file):
-            # A resumed run repeats the steps after its checkpoint: the later value counts.
-            values.setdefault(tag, {})[step] = value
-    curves = {}
-    for tag, by_step in values.items():
-        steps = sorted(by_step)
-        curves[tag] = Curve(label=tag, iteration=np.array(steps), value=np.array([by_step[step] for step in steps]))
-    return curves
+        scalars += _scalars(file)
+    table: Table = pd.DataFrame(scalars, columns=["tag", "iteration", "value"])
+    # A resumed run repeats the steps after its checkpoint: the later value counts.
+    return table.drop_duplicates(["tag", "iteration"], keep="last").pivot(
+        index="iteration", columns="tag", values="value"
+    )
 
 
 def _scalars(file: Path) -> Iterator[tuple[str, int, float]]:
@@ -294,7 +240,7 @@ def read_trainings(runs: Sequence[str]) -> tuple[Training, ...]:
             ``runs/NAME``).
 
     Raises:
-        RunError: none is given, a folder does not exist or is empty, or two have the same label or are the same folder.
+        RunError: none is given, a folder does not exist or is empty, or two have the same label.
         FileFormatError: a file is damaged or of another version.
     """
     if not runs:
@@ -307,9 +253,6 @@ def read_trainings(runs: Sequence[str]) -> tuple[Training, ...]:
                 f"{folders[label]} and {folder} would both be called {label!r}. "
                 f"Name them: {label}-1={folders[label]} {label}-2={folder}"
             )
-        for other, known in folders.items():
-            if folder.resolve() == known.resolve():
-                raise RunError(f"{other!r} and {label!r} are the same folder {folder}. Give every run once.")
         folders[label] = folder
     return tuple(read_training(label, folder) for label, folder in folders.items())
 
@@ -326,19 +269,10 @@ def read_training(label: str, folder: Path, results: Path | None = None) -> Trai
         RunError: the folder does not exist, or holds neither learning curves nor results.
         FileFormatError: a file is damaged or of another version.
     """
-    results = results or results_in(folder)
-    evaluation = read_evaluation(results, label)
-    scalars = read_scalars(folder)
-    if not scalars and any(folder.glob("events.out.tfevents.*")):
-        advice = "Leave it out, or compare later."
-        if evaluation:
-            advice = f"Compare its evaluations alone: {label}={results}"
-        raise FileFormatError(
-            f"the event files in {folder} hold no learning curve: they are damaged, or the training has not finished "
-            f"an iteration. {advice}"
-        )
+    evaluation = read_evaluation(results or results_in(folder), label)
+    curves = read_curves(folder)
     lift = read_lift(folder) if (folder / LIFT_FILE).is_file() else None
-    if not evaluation and not scalars and lift is None:
+    if not evaluation and curves.empty and lift is None:
         raise RunError(
             f"{folder} holds neither learning curves (events.out.tfevents.*) nor evaluation results. "
             f"Evaluate it first: xreset eval {folder} --backend mujoco --demos DEMOS"
@@ -348,7 +282,7 @@ def read_training(label: str, folder: Path, results: Path | None = None) -> Trai
         label=label,
         folder=folder,
         facts=run_facts(read_json(file, RUN_SCHEMA, keep_version=True), file) if file.is_file() else {},
-        scalars=scalars,
+        curves=curves,
         results={s.backend: s for s in evaluation},
         episodes=evaluation.to_frame(),
         lift=lift,
@@ -372,58 +306,41 @@ def _split(text: str) -> tuple[str, Path]:
 _RUN_TYPES = {"robot": str, "resets": str, "resets_hash": str, "device": str, "seed": int, "config": dict}
 
 
-def run_facts(run: dict[str, Any], file: Path) -> dict[str, Fact]:
-    """Return the content of ``run.json``, flat.
+def run_facts(run: dict[str, Any], file: Path) -> dict[str, str]:
+    """Return the content of ``run.json``, flat, as text.
 
     The content is not checked against this version's configuration, so that trainings of different versions of xreset
-    can be compared. A reset bank is identified by its hash, wherever the file is; a folder of meshes by whether there
-    is one, because the bank was made with certain meshes; a device by its kind, because the number of a GPU does not
-    matter.
+    can be compared. What does not matter to a training is left out: the folder of meshes, because the bank was made
+    with certain meshes; the number of a GPU; the commit of xreset.
     """
-    wrong = [name for name, kind in _RUN_TYPES.items() if not isinstance(run.get(name), kind)]
     contract = run.get("contract") or {}
     names = contract.get("objects") or [] if isinstance(contract, dict) else None
+    wrong = [name for name, kind in _RUN_TYPES.items() if not isinstance(run.get(name), kind)]
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         wrong.append("contract")
     if wrong:
         raise FileFormatError(
             f"{file} lacks {', '.join(wrong)}, or holds it as another type. Train again, or leave this run out."
         )
-    bank = str(run["resets_hash"])
-    version = str(run.get("xreset"))
-    meshes = run.get("objects")
-    facts = {
-        "robot": Fact((run["robot"], contract.get("robot_fingerprint")), str(run["robot"])),
-        "objects": Fact(names, ", ".join(map(short_name, names or ())) or "-"),
-        "meshes": Fact(meshes is None, "stand-ins" if meshes is None else str(meshes)),
-        "bank": Fact(bank, f"{Path(run['resets']).name} ({bank[:8]})"),
-        "weights": Fact(run.get("weights_hash"), str(run.get("weights") or "new")),
-        "backend": _fact(f"{run.get('backend')} {run.get('backend_version')}"),
-        "device": Fact(run["device"].partition(":")[0], run["device"]),
-        "num_envs": _fact(run.get("num_envs")),
-        "seed": _fact(run["seed"]),
-        "xreset": Fact(version.partition("+")[0], version),  # runs of another commit are repetitions
+    return {
+        "robot": f"{run['robot']} ({str(contract.get('robot_fingerprint'))[:8]})",
+        "objects": ", ".join(map(short_name, names or ())) or "-",
+        "meshes": "stand-ins" if run.get("objects") is None else "meshes",
+        "bank": f"{Path(run['resets']).name} ({run['resets_hash'][:8]})",
+        "weights": str(run.get("weights") or "new"),
+        "backend": f"{run.get('backend')} {run.get('backend_version')}",
+        "device": run["device"].partition(":")[0],
+        "num_envs": str(run.get("num_envs")),
+        "seed": str(run["seed"]),
+        "xreset": str(run.get("xreset")).partition("+")[0],
+        **dict(_flat(run["config"])),
     }
-    return facts | _flat_facts(run["config"], "")
 
 
-def _flat_facts(data: dict[str, Any], prefix: str) -> dict[str, Fact]:
-    facts = {}
+def _flat(data: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the entries of a nested configuration: name and text."""
     for name, value in data.items():
         if isinstance(value, dict):
-            facts |= _flat_facts(value, f"{prefix}{name}.")
+            yield from _flat(value, f"{prefix}{name}.")
         else:
-            facts[prefix + name] = _fact(value)
-    return facts
-
-
-def _fact(value: Any) -> Fact:
-    if isinstance(value, list):
-        return Fact(tuple(map(str, value)), ", ".join(map(_text, value)))
-    return Fact(value, _text(value))
-
-
-def _text(value: Any) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+            yield prefix + name, f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from xreset import runtime
 from xreset.cli._common import Policy, Robot, Several, Sources, TrainedObjects
-from xreset.cli._terminal import Console, Progress, console
+from xreset.cli._terminal import console
 from xreset.errors import RunError
 from xreset.eval.export import deploy as deployment
 from xreset.eval.export import lerobot as dataset
@@ -39,9 +39,8 @@ def lerobot(
         camera: Also draw films of this depth camera: front, side or wrist; give it again for more.
     """
     recording = _recording(folders, backend, robot, objects, task)
-    with Progress(Console(stderr=True)) as bar:
-        progress = bar.count("writing episodes")
-        dataset.write_lerobot(out, recording, video=video, size=size, cameras=camera, progress=progress)
+    with console.status("writing episodes"):
+        dataset.write_lerobot(out, recording, video=video, size=size, cameras=camera)
     _say(recording, out)
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from xreset.cli._common import Robot, Source
-from xreset.cli._terminal import Progress, console
+from xreset.cli._terminal import console
 from xreset.eval import table
 from xreset.eval.report import film as films
-from xreset.eval.report import make
+from xreset.eval.report import make, page
 from xreset.policies import results_folder, shipped
 from xreset.text import short_name
 
@@ -21,32 +21,30 @@ def report(
     objects: Path | None = None,
     film: Path | None = None,
 ) -> None:
-    """Make a self-contained HTML page of a run's evaluations, and one picture.
+    """Make a self-contained HTML page of a run's evaluations.
 
     Args:
         run: Run folder, folder of results (for example of a baseline), or name of a policy that ships with xreset (then
             runs/NAME).
-        out: Folder for index.html and overview.png; default: report/ in the run folder.
+        out: Folder for index.html; default: report/ in the run folder.
         objects: Folder of real meshes, for the clips; default: as the results name it.
         film: MP4 to write as well: every object in every engine, next to each other.
     """
     if not run.exists() and str(run) in shipped():
         run = results_folder(str(run))
-    with Progress() as bar:
-        made = make.make_report(run, out, robot=robot, objects=objects, progress=bar.count("drawing clips"))
-    console.print(table.results_table(made.results))
-    console.print(made.headline)
-    for note in made.notes:
+    with console.status("drawing clips"):
+        html, data = make.make_report(run, out, robot=robot, objects=objects)
+    console.print(table.results_table(data.results))
+    console.print(page.headline(data))
+    for note in data.notes:
         console.print(f"note: {note}", style="yellow")
     if film is not None:
-        with Progress() as bar:
-            engines, shown = films.make_film(
-                run, film, robot=robot, objects=objects, progress=bar.count("drawing the film")
-            )
+        with console.status("drawing the film"):
+            engines, shown = films.make_film(run, film, robot=robot, objects=objects)
         rows = ", ".join(engines)
         columns = ", ".join(map(short_name, shown))
-        console.print(f"film:    {film}\n         from the top: {rows}; from the left: {columns}")
-    console.print(f"page:    {made.html}\npicture: {made.overview}")
+        console.print(f"film: {film}\n      from the top: {rows}; from the left: {columns}")
+    console.print(f"page: {html}")
 
 
 COMMAND = report

@@ -20,8 +20,6 @@ from pathlib import Path
 from xreset.errors import XResetError
 from xreset.eval.study.plan import Plan, Step
 
-CPU = -1
-"""The place of steps without a GPU: one at a time."""
 _POLL = 0.5
 """[s]"""
 
@@ -36,19 +34,15 @@ def visible_gpus() -> tuple[int, ...]:
     return tuple(numbers[:count] or range(count))
 
 
-def choose_places(free: Counter[int], gpus: int, per_gpu: int) -> Counter[int] | None:
-    """Return places for a step; None if too few are free. A step of several GPUs takes all places of each.
+def choose_gpus(free: Sequence[int], count: int) -> list[int] | None:
+    """Return different GPUs for a step, those with the most free places first; None if too few are free.
 
     Args:
-        free: GPU, or :data:`CPU` -> number of free places.
-        gpus: GPUs of the step; 0: it needs the CPU.
-        per_gpu: places of each GPU.
+        free: GPUs, each as often as it has free places.
+        count: GPUs of the step.
     """
-    each = per_gpu if gpus > 1 else 1
-    candidates = [place for place in free if (place == CPU) == (gpus == 0) and free[place] >= each]
-    candidates.sort(key=lambda place: -free[place])
-    chosen = candidates[: max(gpus, 1)]
-    return Counter(dict.fromkeys(chosen, each)) if len(chosen) == max(gpus, 1) else None
+    chosen = sorted(gpu for gpu, _ in Counter(free).most_common(count))
+    return chosen if len(chosen) == count else None
 
 
 def launch(plan: Plan, steps: Sequence[Step], *, per_gpu: int = 1, say: Callable[[str], None] = print) -> list[str]:
@@ -61,19 +55,19 @@ def launch(plan: Plan, steps: Sequence[Step], *, per_gpu: int = 1, say: Callable
         What failed, or cannot start: sentences.
     """
     gpus = visible_gpus()
-    free = Counter(dict.fromkeys(gpus, per_gpu)) + Counter({CPU: 1})
+    free = list(gpus) * per_gpu
     waiting = {step.name: step for step in steps}
-    running: dict[str, tuple[Step, Future[str], Counter[int]]] = {}
+    running: dict[str, tuple[Step, Future[str], list[int]]] = {}
     processes: list[subprocess.Popen] = []
     problems: list[str] = []
     busy: set[str] = set()
 
     def collect() -> None:
         """Note which steps have ended."""
-        for name, (step, job, places) in list(running.items()):
+        for name, (step, job, used) in list(running.items()):
             if job.done():
                 del running[name]
-                free.update(places)
+                free.extend(used)
                 problem = job.result()
                 if step.busy():  # another process was faster
                     waiting[name] = step
@@ -86,7 +80,9 @@ def launch(plan: Plan, steps: Sequence[Step], *, per_gpu: int = 1, say: Callable
 
     def begin(step: Step) -> None:
         """Start a step if a place is free, unless it is done, in progress elsewhere, or cannot start."""
-        places = choose_places(free, step.gpus, per_gpu)
+        used = choose_gpus(free, step.gpus)
+        if not step.gpus and any(not other.gpus for other, *_ in running.values()):
+            used = None  # steps on the CPU come one at a time
         if step.gpus > len(gpus):
             waiting.pop(step.name)
             problems.append(
@@ -97,21 +93,21 @@ def launch(plan: Plan, steps: Sequence[Step], *, per_gpu: int = 1, say: Callable
             if step.name not in busy:
                 say(f"{step.name}: in progress in another process; waiting for its end")
             busy.add(step.name)
-        elif places is not None:  # only now, because a training reads its newest checkpoint to say what is left
+        elif used is not None:  # only now, because a training reads its newest checkpoint to say what is left
             waiting.pop(step.name)
             undone = [need for need in step.needs if not plan.steps[need].done()]
             if undone:
                 problems.append(f"{step.name} cannot start: {', '.join(undone)} is not done.")
             elif not step.done():
-                free.subtract(places)
-                used = sorted(place for place in places if place != CPU)
+                for gpu in used:
+                    free.remove(gpu)
                 job = pool.submit(_run, step, used, log_of(plan.out, step.name), processes)
-                running[step.name] = (step, job, places)
+                running[step.name] = (step, job, used)
                 say(f"{step.name}: begun{' on GPU ' if used else ''}{', '.join(map(str, used))}")
 
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        with ThreadPoolExecutor(free.total()) as pool:
+        with ThreadPoolExecutor(len(free) + 1) as pool:
             try:
                 while waiting or running:
                     collect()

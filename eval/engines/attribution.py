@@ -115,7 +115,6 @@ def attribute(
     trial: Trial,
     *,
     episodes: int,
-    sequences: np.ndarray | None = None,
     only: Sequence[str] = (),
     progress: Callable[[str, int, int], None] = lambda run, done, total: None,
 ) -> Attribution:
@@ -127,7 +126,6 @@ def attribute(
         b: engine towards which A is changed.
         trial: what is played; the mass and inertia of its first object are measured.
         episodes: episodes of each demonstration.
-        sequences: indices of the demonstrations to play; None: all.
         only: names of the properties to try; empty: all.
         progress: called with (name of the run, control steps done, control steps in all).
 
@@ -151,7 +149,6 @@ def attribute(
             engine,
             replace(trial, task=task),
             repetitions=episodes,
-            only=sequences,
             progress=partial(progress, label),
         ).episodes
         effect = Effect.of(played, rows[0].episodes if rows else played)

@@ -32,8 +32,7 @@ def view(
     """Show demonstrations, robot motion or a reset bank in a browser, or write pictures of them.
 
     In a frame that is not valid, the robot has the color of the reason. The object's goal is translucent. Human
-    keypoints are pink, keypoints in contact yellow, with a black dot where they touch the object. The robot's
-    fingertips are blue.
+    keypoints are pink, keypoints in contact yellow. The robot's fingertips are blue.
 
     Args:
         file: Demonstrations, or what `xreset retarget`, `xreset resets` or `xreset goals` made.

@@ -7,8 +7,6 @@ from xreset.pictures.meshes import INVALID_COLOR, Color
 HUMAN_COLOR: Color = (0.85, 0.10, 0.45)
 TOUCH_COLOR: Color = (1.00, 0.80, 0.00)
 """Keypoints in contact with the object."""
-CONTACT_COLOR: Color = (0.05, 0.05, 0.05)
-"""Points of the object's surface that keypoints touch."""
 REACHED_COLOR: Color = (0.10, 0.55, 0.90)
 """The robot's fingertips."""
 GOOD_COLOR: Color = (0.30, 0.70, 0.35)

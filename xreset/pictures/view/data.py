@@ -22,8 +22,7 @@ GOOD: dict[Kind, str] = {
     "reset states": "stable in physics",
 }
 """Name of a row without a reason against it."""
-Phase = Literal["before contact", "after contact"]
-PHASES: tuple[Phase, ...] = ("before contact", "after contact")
+PHASES = ("before contact", "after contact")
 BONES = np.column_stack((PARENTS, np.arange(1, 21)))
 """[20, 2] keypoints at the ends of each bone of the human hand."""
 
@@ -36,12 +35,10 @@ class Human:
     """[N, 21, 3] NaN where not annotated."""
     touching: np.ndarray
     """[N, 21] bool: keypoints in contact with the object."""
-    contacts: np.ndarray
-    """[N, 21, 3] point of the object's surface that each keypoint touches; NaN without contact."""
 
     def select(self, rows: np.ndarray) -> Human:
         """Return the hands of some rows."""
-        return Human(keypoints=self.keypoints[rows], touching=self.touching[rows], contacts=self.contacts[rows])
+        return Human(keypoints=self.keypoints[rows], touching=self.touching[rows])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,21 +85,15 @@ class View:
     """[N] distance of the hand from its target [m]."""
     human: Human | None = None
 
-    def choose(
-        self,
-        *,
-        sequence: int | None = None,
-        object_name: str | None = None,
-        phase: Phase | None = None,
-        reason: str | None = None,
-    ) -> np.ndarray:
-        """Return the indices of the rows that meet every given condition, in order; may be empty.
+    def choose(self, *, sequence: int | None = None, reason: str | None = None) -> np.ndarray:
+        """Return the indices of the rows of a sequence, or with a reason, in order; may be empty.
 
         Args:
-            reason: one of :attr:`reasons`; empty text for good rows.
+            sequence: None: all sequences.
+            reason: one of :attr:`reasons`; empty text for good rows; None: all rows.
 
         Raises:
-            XResetError: unknown sequence, object or reason.
+            XResetError: unknown sequence.
         """
         keep = np.ones(len(self.frame), dtype=bool)
         if sequence is not None:
@@ -110,16 +101,7 @@ class View:
             if not 0 <= sequence < count:
                 raise XResetError(f"There is no sequence {sequence}: the file has {count}. Choose 0 to {count - 1}.")
             keep &= self.sequence == sequence
-        if object_name is not None:
-            names = [spec.name for spec in self.objects]
-            if object_name not in names:
-                raise XResetError(f"The file has no object {object_name!r}. Choose from: {', '.join(names)}.")
-            keep &= self.object_index == names.index(object_name)
-        if phase is not None:
-            keep &= self.post_contact == (phase == "after contact")
         if reason is not None:
-            if reason not in ("", *self.reasons):
-                raise XResetError(f"Unknown reason {reason!r}. Choose from: {', '.join(self.reasons) or 'none'}.")
             keep &= np.array(self.reason) == reason
         return np.flatnonzero(keep)
 
@@ -134,7 +116,7 @@ class View:
         state = GOOD[self.kind]
         if reason := self.reason[row]:
             state = reason if self.robot is None else f"not valid: {reason}"
-        phase: str = PHASES[int(self.post_contact[row])]
+        phase = PHASES[int(self.post_contact[row])]
         if self.contact[row] and self.kind != "reset states":
             phase += ", human touches"
             if self.human is not None:

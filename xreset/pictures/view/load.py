@@ -160,9 +160,8 @@ def _human(demos: Demos, objects: Sequence[ObjectSpec]) -> tuple[Demos, Human]:
     demos = rest_on_table(demos, objects)
     keypoints = np.where(demos.hand_valid[:, None, None], demos.hand_keypoints.astype(np.float64), np.nan)
     surfaces = {spec.name: Surface(spec) for spec in objects if spec.name in demos.object_name}
-    points, touching = human_contacts(demos, surfaces, RetargetConfig().contact_distance)
-    contacts = np.where(touching[..., None], points, np.nan)
-    return demos, Human(keypoints=keypoints, touching=touching, contacts=contacts)
+    _, touching = human_contacts(demos, surfaces, RetargetConfig().contact_distance)
+    return demos, Human(keypoints=keypoints, touching=touching)
 
 
 def _human_of(path: Path, demos_path: Path, view: View) -> Human:

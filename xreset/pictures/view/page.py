@@ -10,10 +10,10 @@ import numpy as np
 
 from xreset.errors import XResetError
 from xreset.pictures.meshes import GOAL_COLOR, OBJECT_COLOR, Color, rgb
-from xreset.pictures.view.colors import CONTACT_COLOR, HUMAN_COLOR, REACHED_COLOR, TOUCH_COLOR, reason_color
-from xreset.pictures.view.data import BONES, GOOD, PHASES, View
+from xreset.pictures.view.colors import HUMAN_COLOR, REACHED_COLOR, TOUCH_COLOR, reason_color
+from xreset.pictures.view.data import BONES, GOOD, View
 from xreset.pictures.view.server import RobotMeshes, WebPage
-from xreset.pictures.view.timeline import bar, legend, mark
+from xreset.pictures.view.timeline import bar
 
 _ALL = "all"
 _IDLE = 0.1
@@ -62,12 +62,10 @@ class Page(WebPage):
         """Update the scene and the text from the controls."""
         with self._lock, self._server.atomic():
             row = self.row
-            self._scene.show(row)
             if row is None:
-                self._mark.content = ""
                 self._text.content = "nothing meets this choice"
                 return
-            self._mark.content = mark(self._frame.value, len(self._rows))
+            self._scene.show(row)
             first, *others = self.view.text(row)
             position = f"{self._frame.value + 1} of {len(self._rows)}"
             self._text.content = "\n\n".join((f"**{first}**", *others, position))
@@ -89,11 +87,8 @@ class Page(WebPage):
             if count:
                 self._reasons[f"{reason or GOOD[view.kind]} ({count})"] = reason
         names = [f"{number}: {name}" for number, name in enumerate(view.sequence_name)]
-        objects = [spec.name for spec in view.objects]
         first = _ALL if sequence is None else names[sequence]
         self._sequence = gui.add_dropdown("sequence", [_ALL, *names], initial_value=first)
-        self._object = gui.add_dropdown("object", [_ALL, *objects])
-        self._phase = gui.add_dropdown("phase", [_ALL, *PHASES])
         self._reason = gui.add_dropdown("state", [_ALL, *self._reasons], visible=bool(view.reasons))
         label = "number" if view.kind == "reset states" else "frame"
         self._frame = gui.add_slider(label, 0, _slider_end(self._rows), 1, 0)
@@ -102,10 +97,8 @@ class Page(WebPage):
         self._play = gui.add_checkbox("play", False)
         self._speed = gui.add_slider("speed", 0.1, 2.0, 0.1, 1.0)
         self._bar = gui.add_html("")
-        self._mark = gui.add_html("")
-        self._legend = gui.add_html("")
         self._text = gui.add_markdown("")
-        for control in (self._sequence, self._object, self._phase, self._reason):
+        for control in (self._sequence, self._reason):
             control.on_update(lambda _: self._choose())
         self._frame.on_update(lambda _: self.show())
 
@@ -114,10 +107,6 @@ class Page(WebPage):
             chosen = {}
             if self._sequence.value != _ALL:
                 chosen["sequence"] = int(self._sequence.value.partition(":")[0])
-            if self._object.value != _ALL:
-                chosen["object_name"] = self._object.value
-            if self._phase.value != _ALL:
-                chosen["phase"] = self._phase.value
             if self._reason.value != _ALL:
                 chosen["reason"] = self._reasons[self._reason.value]
             self._rows = self.view.choose(**chosen)
@@ -127,9 +116,7 @@ class Page(WebPage):
             self.show()
 
     def _show_choice(self) -> None:
-        reasons = [self.view.reason[row] for row in self._rows]
-        self._bar.content = bar(reasons)
-        self._legend.content = legend(reasons, GOOD[self.view.kind])
+        self._bar.content = bar([self.view.reason[row] for row in self._rows])
 
     def _step(self, by: int) -> None:
         with self._lock:
@@ -165,24 +152,19 @@ class _Scene:
             return scene.add_point_cloud(name, nowhere, rgb(color), **options)
 
         self._keypoints = add_points("/human/keypoints", HUMAN_COLOR, 0.012)
-        self._contacts = add_points("/human/contacts", CONTACT_COLOR, 0.006)
         self._tips = add_points("/robot/fingertips", REACHED_COLOR, 0.008)
         no_bones = np.zeros((len(BONES), 2, 3), np.float32)
         self._bones = scene.add_line_segments("/human/bones", no_bones, rgb(HUMAN_COLOR), thickness=0.003)
 
-    def show(self, row: int | None) -> None:
-        """Place everything as in a row; None hides what moves."""
+    def show(self, row: int) -> None:
+        """Place everything as in a row."""
         view = self._view
-        shown = -1 if row is None else int(view.object_index[row])
+        shown = int(view.object_index[row])
         for i, (body, goal) in enumerate(zip(self._objects, self._goals, strict=True)):
             body.visible = i == shown
             goal.visible = i == shown
-        for link in self._robot.links.values() if self._robot else ():
-            link.visible = row is not None
-        self._tips.visible = row is not None and view.fingertips is not None
+        self._tips.visible = view.fingertips is not None
         self._show_human(row)
-        if row is None:
-            return
         sequence = view.sequence[row]
         self._objects[shown].position = view.object_pos[row]
         self._objects[shown].wxyz = view.object_quat[row]
@@ -194,12 +176,11 @@ class _Scene:
             reason = view.reason[row]
             self._robot.place(view.joint_pos[row], reason_color(reason) if reason else None)
 
-    def _show_human(self, row: int | None) -> None:
+    def _show_human(self, row: int) -> None:
         human = self._view.human
-        visible = row is not None and human is not None and np.isfinite(human.keypoints[row]).all()
+        visible = human is not None and np.isfinite(human.keypoints[row]).all()
         self._keypoints.visible = visible
         self._bones.visible = visible
-        self._contacts.visible = False
         if human is None or not visible:
             return
         keypoints = human.keypoints[row].astype(np.float32)
@@ -208,6 +189,3 @@ class _Scene:
         self._keypoints.points = keypoints
         self._keypoints.colors = colors.astype(np.uint8)
         self._bones.points = keypoints[BONES]
-        if touching.any():
-            self._contacts.visible = True
-            self._contacts.points = human.contacts[row][touching].astype(np.float32)

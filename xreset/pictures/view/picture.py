@@ -6,7 +6,7 @@ import numpy as np
 
 from xreset.description import load_robot
 from xreset.pictures.render import Points, Renderer, pose_matrix
-from xreset.pictures.view.colors import CONTACT_COLOR, HUMAN_COLOR, REACHED_COLOR, TOUCH_COLOR, reason_color
+from xreset.pictures.view.colors import HUMAN_COLOR, REACHED_COLOR, TOUCH_COLOR, reason_color
 from xreset.pictures.view.data import BONES, Human, View
 from xreset.plugins import robot_names
 from xreset.spec import SceneSpec
@@ -53,7 +53,6 @@ def _human_points(human: Human, row: int) -> list[Points]:
     dots = np.linspace(start, end, _BONE_DOTS)[1:-1]
     return [
         Points(pos=dots, color=HUMAN_COLOR, radius=0.0018),
-        Points(pos=human.contacts[row], color=CONTACT_COLOR, radius=0.003),
         Points(pos=keypoints[~touching], color=HUMAN_COLOR),
         Points(pos=keypoints[touching], color=TOUCH_COLOR, radius=0.005),
     ]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -105,7 +105,6 @@ def roll_out(
     trial: Trial,
     *,
     repetitions: int,
-    only: np.ndarray | None = None,
     progress: Progress = lambda done, total: None,
 ) -> Rollouts:
     """Play demonstrations ``repetitions`` times each.
@@ -115,13 +114,12 @@ def roll_out(
         engine: where it acts.
         trial: what it plays.
         repetitions: episodes of each demonstration, each with another perturbation of robot and object.
-        only: indices of the demonstrations to play; None: all.
         progress: called with (control steps done, control steps in all).
     """
     bank = trial.bank
-    chosen = np.arange(len(bank.sequence_name)) if only is None else np.asarray(only)
-    sequences = np.repeat(chosen, repetitions)
-    repetition = np.tile(np.arange(repetitions), len(chosen))
+    count = len(bank.sequence_name)
+    sequences = np.repeat(np.arange(count), repetitions)
+    repetition = np.tile(np.arange(repetitions), count)
     objects = [trial.names.index(name) for name in bank.sequence_object[sequences]]
     starts = trial.starts()
     found: dict[int, Episode] = {}
@@ -170,8 +168,7 @@ class Round:
 
         def watch(step: int, reading: Reading) -> None:
             look(step, reading)
-            if step:
-                progress(self.number * length + step, self.total * length)
+            progress(self.number * length + step, self.total * length)
 
         return play(policy, self.env, self.points, watch)
 
@@ -232,30 +229,13 @@ def episode_starts(distribution: ResetDistribution, sequence: np.ndarray, repeti
     return Reset.cat(parts)
 
 
-_FLAGS = (
-    "approach",
-    "grasp",
-    "reorient",
-    "reorient_once",
-    "out_of_bounds",
-    "nonfinite",
-    "overflow",
-    "published_success",
-)
-_NUMBERS = (
-    "reorientation_progress",
-    "task_progress",
-    "least_distance",
-    "final_distance",
-    "final_position_error",
-    "final_angle",
-)
-
-
 def episode_of(result: EpisodeMetrics, world: int, bank: ResetBank, sequence: int, repetition: int) -> Episode:
     """Return the result of one world, which has played a start of a demonstration."""
-    values: dict[str, Any] = {name: bool(getattr(result, name)[world]) for name in _FLAGS}
-    values |= {name: round(float(getattr(result, name)[world]), 6) for name in _NUMBERS}
+    values: dict[str, Any] = {}
+    for field in fields(Episode):
+        if hasattr(result, field.name):
+            value = getattr(result, field.name)[world].item()
+            values[field.name] = value if isinstance(value, bool) else round(value, 6)
     return Episode(
         sequence=sequence,
         sequence_name=str(bank.sequence_name[sequence]),

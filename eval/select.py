@@ -36,11 +36,11 @@ def candidates_in(folder: Path, most: int) -> list[Path]:
     Raises:
         RunError: there is none.
     """
-    is_run = (folder / "run.json").is_file()
-    found = checkpoints(folder) if is_run else sorted(folder.glob("*.onnx"))
+    found = checkpoints(folder) if (folder / "run.json").is_file() else sorted(folder.glob("*.onnx"))
     if not found:
-        what = "checkpoints in it" if is_run else "run.json and no exported policies (.onnx) in it"
-        raise RunError(f"{folder} has no {what}: there is nothing to choose from.")
+        raise RunError(
+            f"{folder} has no checkpoints and no exported policies (.onnx): there is nothing to choose from."
+        )
     picks = np.linspace(len(found) - 1, 0, min(most, len(found))).round().astype(int)
     return [found[i] for i in picks]
 

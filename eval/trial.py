@@ -138,8 +138,8 @@ def load_trial(
 
     Args:
         policy: the policy, whose robot and task are taken.
-        source: demonstrations, motion or a goal set, or a file of them; or a loaded bank. A goal set's starts are played as they
-            are, because they are perturbed already; only the robot's joints are.
+        source: demonstrations, motion or a goal set, or a file of them; or a loaded bank. The starts of a goal set are
+            played as they are, because they are perturbed already; only the robot's joints are.
         objects: folder of object meshes; default: the folder of the policy's training.
         seed: seed of the perturbations.
         num_envs: worlds that run at the same time.

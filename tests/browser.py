@@ -30,7 +30,7 @@ INPUT = (
 """Control of a page of viser, by its label."""
 _BUTTON = "[...document.querySelectorAll('button')].find(e => e.textContent === '{label}')"
 _OPTION = "[...document.querySelectorAll('[role=option]')].find(e => e.textContent === '{label}' && e.offsetParent)"
-_KEYS = {"ArrowRight": 39, "ArrowLeft": 37, "ArrowDown": 40, "Enter": 13, "End": 35, "Home": 36}
+_KEYS = {"ArrowRight": 39, "End": 35}
 
 
 def find_chromium() -> str:
@@ -111,10 +111,6 @@ class Browser:
         """Press a key where the focus is."""
         for kind in ("rawKeyDown", "keyUp"):
             self.send("Input.dispatchKeyEvent", type=kind, key=name, code=name, windowsVirtualKeyCode=_KEYS[name])
-
-    def type(self, text: str) -> None:
-        """Type text where the focus is."""
-        self.send("Input.insertText", text=text)
 
     def click(self, element: str) -> None:
         """Click the middle of a JavaScript expression's element, once it stays where it is and nothing covers it."""

@@ -6,7 +6,6 @@ import tempfile
 import unittest
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -32,8 +31,6 @@ from xreset.objects.sampling import metric_points
 from xreset.physics import Contacts, Health, Links, State
 from xreset.task.config import TaskConfig
 from xreset.task.reading import Reading
-from xreset.task.rewards import keypoint_distance
-from xreset.tensors import Tensors
 
 CORNERS = torch.tensor([[-1.0, -1, -1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]]) * 0.05
 POINTS = MetricPoints(keypoints=CORNERS[None], surface=CORNERS[None])
@@ -77,13 +74,9 @@ def episode(*steps: Reading, start: Reading | None = None, lost_at: int | None =
     return metrics
 
 
-def together(a: Tensors, b: Tensors) -> Any:
-    """The worlds of two bundles of tensors."""
-    return type(a)(**{name: torch.cat((value, getattr(b, name))) for name, value in vars(a).items()})
-
-
 SCORES = {"": 0.0, "a": 0.33, "ag": 0.66, "g": 0.66}
 HELD = {"press": PRESS, "tips": (0.0, 0.0, 0.0)}
+AWAY = GOAL + torch.tensor([0.1, 0.1, 0.0])
 OFF = GOAL + torch.tensor([0.0, 0.0195, 0.0])
 
 
@@ -119,20 +112,15 @@ class MetricsTest(unittest.TestCase):
                 self.assertEqual(bool(m.out_of_bounds), name.startswith("left the scene") or name == "left later")
                 self.assertEqual(bool(m.overflow), name.startswith("overflow"))
 
-    def test_pose_error_is_the_largest_keypoint_distance(self):
-        """Half a turn about z moves every corner of the tetrahedron by 2 sqrt(2) 5 cm; a shift adds to it in the worst corner."""
-        for shift, expected in ((0.0, 0.1), (0.1, 0.2)):
-            pos = START[None] + torch.tensor([[shift, shift, 0.0]])
-            found = keypoint_distance(pos, IDENTITY[None], START[None], turned(180)[None], CORNERS[None])
-            self.assertAlmostEqual(float(found), expected * math.sqrt(2), places=6)
-
     def test_reorientation_progress_is_the_best_of_the_episode(self):
-        """The goal is 0.20 above the start without a turn, so every keypoint is that far."""
+        """The goal is 0.20 above the start without a turn, so every keypoint is that far. Half a turn about z moves
+        every corner by 2 sqrt(2) 5 cm; a shift adds to it in the worst corner."""
         for expected, m in (
             (0.75, episode(reading(raised(0.05)), reading(raised(0.15)), reading(raised(0.1)))),
             (0.0, episode(reading(raised(-0.1)))),
             (1.0, episode(reading(GOAL))),
             (0.0, episode(reading(), reading(raised(0.05)), reading(GOAL), lost_at=1)),
+            (1 - 0.1 / (0.2 * math.sqrt(2)), episode(reading(raised(0.1)), start=reading(AWAY, turned(180)))),
         ):
             self.assertAlmostEqual(float(m.reorientation_progress), expected, places=5)
         there = episode(reading(GOAL), start=reading(GOAL))  # nothing is left to do: no division by zero
@@ -177,28 +165,10 @@ class MetricsTest(unittest.TestCase):
         ):
             self.assertEqual((bool(m.nonfinite), bool(m.overflow), bool(m.out_of_bounds)), expected)
 
-    def test_worlds_are_judged_one_by_one(self):
-        def both(a: Reading, b: Reading) -> Reading:
-            return Reading(
-                state=together(a.state, b.state),
-                links=a.links,
-                contacts=together(a.contacts, b.contacts),
-                health=together(a.health, b.health),
-                tip_distance=torch.cat((a.tip_distance, b.tip_distance)),
-            )
-
-        start = both(reading(), reading())
-        points = MetricPoints.cat((POINTS, POINTS))
-        m = EpisodeMetrics(start, GOAL.expand(2, 3), IDENTITY.expand(2, 4), points, MetricsConfig())
-        m.update(both(reading(tips=(0.01, 0.2, 0.2)), reading(GOAL)), torch.tensor([False, True]))
-        m.update(both(reading(GOAL), reading(GOAL)), torch.tensor([False, False]))
-        torch.testing.assert_close(m.task_progress, torch.tensor([1.0, 0.0]))
-        self.assertEqual(m.out_of_bounds.tolist(), [False, True])
-
 
 class RecordedTest(unittest.TestCase):
     def test_distances_are_those_of_the_recorded_states(self):
-        """Objects fall past their goals. Every control step is recorded here, and numpy computes the distances again."""
+        """Objects fall past their goals, and numpy computes the distances of every recorded control step again."""
         policy = load_policy("random", robot="ur7e-sharpa")
         short = replace(policy.task.termination, episode_seconds=0.4)
         policy = replace(policy, task=replace(policy.task, termination=short))
@@ -206,45 +176,33 @@ class RecordedTest(unittest.TestCase):
         falling.start_pos[:, 2] = (0.30, 0.35, 0.40)
         falling.goal_pos[:] = (0.51, 0.3, 0.20)
         falling.goal_quat_wxyz[:] = falling.start_quat_wxyz
-        points = {name: metric_points(load_object(name)) for name in OBJECTS}
-        least = []
-        for seed in range(4):
-            trial = load_trial(policy, falling, seed=seed)
-            with mock.patch("xreset.eval.rollout.TRACE_INTERVAL", 0.0):
-                found = roll_out(policy.start(None), engine("mujoco", workers=0), trial, repetitions=1)
-            for episode, trace in zip(found.episodes, found.traces, strict=True):
-                self.assertEqual(len(trace.time), 25)
-                turn = Rotation.from_quat(trace.object_quat, scalar_first=True)
-                goal = Rotation.from_quat(trace.goal_quat, scalar_first=True)
-                here = np.einsum("tij,pj->tpi", turn.as_matrix(), points[trace.object]) + trace.object_pos[:, None]
-                there = goal.apply(points[trace.object]) + trace.goal_pos
-                distance = np.linalg.norm(here - there, axis=-1).mean(axis=1)
-                expected = (distance.min(), distance[-1], np.linalg.norm(trace.object_pos[-1] - trace.goal_pos))
-                measured = (episode.least_distance, episode.final_distance, episode.final_position_error)
-                np.testing.assert_allclose(measured, expected, atol=5e-6)
-                self.assertAlmostEqual(episode.final_angle, float((turn[-1] * goal.inv()).magnitude()), delta=1e-3)
-                self.assertEqual(episode.published_success, distance.min() <= 0.02)
-                least.append((distance.argmin(), episode.published_success))
-        self.assertTrue(all(0 < step < 24 for step, _ in least), least)
-        self.assertEqual({success for _, success in least}, {True, False})
+        trial = load_trial(policy, falling, seed=1)
+        with mock.patch("xreset.eval.rollout.TRACE_INTERVAL", 0.0):
+            found = roll_out(policy.start(None), engine("mujoco", workers=0), trial, repetitions=1)
+        for episode, trace in zip(found.episodes, found.traces, strict=True):
+            points = metric_points(load_object(trace.object))
+            turn = Rotation.from_quat(trace.object_quat, scalar_first=True)
+            goal = Rotation.from_quat(trace.goal_quat, scalar_first=True)
+            here = np.einsum("tij,pj->tpi", turn.as_matrix(), points) + trace.object_pos[:, None]
+            distance = np.linalg.norm(here - goal.apply(points) - trace.goal_pos, axis=-1).mean(axis=1)
+            expected = (distance.min(), distance[-1], np.linalg.norm(trace.object_pos[-1] - trace.goal_pos))
+            measured = (episode.least_distance, episode.final_distance, episode.final_position_error)
+            np.testing.assert_allclose(measured, expected, atol=5e-6)
+            self.assertAlmostEqual(episode.final_angle, float((turn[-1] * goal.inv()).magnitude()), delta=1e-3)
+            self.assertEqual(episode.published_success, distance.min() <= 0.02)
+            self.assertTrue(0 < distance.argmin() < 24 == len(distance) - 1)
+        self.assertGreater(len({e.least_distance for e in found.episodes}), 2, "each world is judged by itself")
 
 
 class BootstrapTest(unittest.TestCase):
-    def test_one_value_has_no_spread(self):
-        self.assertEqual(bootstrap_ci95(np.array([0.3])), (0.3, 0.3))
-        self.assertEqual(bootstrap_ci95(np.full(9, 0.66)), (0.66, 0.66))
-
-    def test_the_same_values_give_the_same_interval(self):
-        values = np.random.default_rng(1).random(30)
-        self.assertEqual(bootstrap_ci95(values), bootstrap_ci95(values))
-        self.assertNotEqual(bootstrap_ci95(values), bootstrap_ci95(values, seed=1))
-
     def test_agrees_with_the_normal_approximation(self):
         values = np.random.default_rng(2).normal(5.0, 2.0, 400)
         low, high = bootstrap_ci95(values)
         half = 1.96 * values.std() / math.sqrt(len(values))
         self.assertAlmostEqual(low, values.mean() - half, delta=0.1 * half)
         self.assertAlmostEqual(high, values.mean() + half, delta=0.1 * half)
+        self.assertEqual(bootstrap_ci95(values), (low, high))
+        self.assertEqual(bootstrap_ci95(np.array([0.3])), (0.3, 0.3))
 
     def covered(self, cluster: bool) -> float:
         """Share of 200 experiments whose interval holds the true mean: 15 demonstrations, 5 episodes each, which are nearly alike."""
@@ -300,18 +258,14 @@ class ResultsTest(unittest.TestCase):
         write_results(self.folder, toy_summary(), toy_rollouts(), self.JOINTS)
         path = self.folder / "mujoco.json"
         good = json.loads(path.read_text())
+        health = {"nonfinite": "<script>alert(1)</script>", "overflow": 0, "out_of_bounds": 0}
         for words, changes in (
-            ("missing: inputs", {"inputs": None}),
             ("missing: grasp_rate", {"grasp_rate": None}),
             ("unknown: later", {"later": 1}),
             ("policy is 5, expected str", {"policy": 5}),
-            ("grasp_rate is -5, expected a number from 0 to 1", {"grasp_rate": -5}),
             ("mean is 7, expected a number from 0 to 1", {"task_progress": {"mean": 7, "ci95": [0, 1]}}),
             ("ci95 has 1 entries", {"task_progress": {"mean": 0.5, "ci95": [0]}}),
-            (
-                "nonfinite is '<script>alert",
-                {"health": {"nonfinite": "<script>alert(1)</script>", "overflow": 0, "out_of_bounds": 0}},
-            ),
+            ("nonfinite is '<script>alert", {"health": health}),
             ("inputs.demos is 3", {"inputs": {"demos": 3}}),
             ("no object or no demonstration", {"per_demo": []}),
         ):
@@ -334,14 +288,6 @@ class ResultsTest(unittest.TestCase):
                 np.testing.assert_array_equal(getattr(found, name), value, name)
         episodes = json.loads((self.folder / "mujoco.episodes.json").read_text())["episodes"]
         self.assertEqual(Episode(**episodes[2]), rollouts.episodes[2])
-
-    def test_writing_twice_gives_the_same_bytes(self):
-        contents = []
-        for name in ("one", "two"):
-            write_results(self.folder / name, toy_summary(), toy_rollouts(), self.JOINTS)
-            contents.append([f.read_bytes() for f in sorted((self.folder / name).iterdir())])
-        self.assertEqual(len(contents[0]), 3)
-        self.assertEqual(contents[0], contents[1])
 
     def test_refusals(self):
         rollouts = toy_rollouts()

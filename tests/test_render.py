@@ -69,17 +69,15 @@ class Pictures(unittest.TestCase):
                 (x.min() / 2 + x.max() / 2 + 0.5, y.min() / 2 + y.max() / 2 + 0.5), expected, atol=2.0
             )
 
-    def test_object_index_picks_the_object(self):
+    def test_the_object_is_the_one_of_the_index_and_the_robot_moves(self):
         empty = self.renderer.draw(self.home)
         small, large = (
             self.changed(self.renderer.draw(self.home, at(0.4, 0.1, 0.4), object_index=i), empty).sum() for i in (0, 1)
         )
         self.assertGreater(large, 2.5 * small)
-
-    def test_the_robot_moves_with_its_joints(self):
-        q = self.home.copy()
-        q[0] += 0.5
-        self.assertGreater(self.changed(self.renderer.draw(self.home), self.renderer.draw(q)).sum(), 100)
+        moved = self.home.copy()
+        moved[0] += 0.5
+        self.assertGreater(self.changed(empty, self.renderer.draw(moved)).sum(), 100)
 
     def test_a_near_object_hides_a_far_one_and_never_the_reverse(self):
         eye = np.array(self.camera.eye)
@@ -97,10 +95,6 @@ class Pictures(unittest.TestCase):
         lit = self.renderer.draw(self.home)[y, x]
         dark = self.renderer.draw(self.home, at(*above))[y, x]
         self.assertLess(int(dark.max()), 0.75 * int(lit.max()))
-
-    def test_the_table_is_lit_where_nothing_stands_in_the_light(self):
-        x, y = pixel(self.camera, self.size, (0.95, 0.25, 0.0)).astype(int)
-        self.assertGreater(int(self.renderer.draw(self.home)[y, x].min()), 150)
 
     def test_goal_is_translucent(self):
         T = at(0.4, 0.1, 0.3)
@@ -177,10 +171,9 @@ class Meshes(unittest.TestCase):
 class Png(unittest.TestCase):
     def test_written_picture_reads_back(self):
         picture = np.random.default_rng(0).integers(0, 256, (7, 5, 3), dtype=np.uint8)
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "a.png"
-            write_png(path, picture)
-            np.testing.assert_array_equal(np.asarray(Image.open(path)), picture)
+        path = Path(self.enterContext(tempfile.TemporaryDirectory())) / "a.png"
+        write_png(path, picture)
+        np.testing.assert_array_equal(np.asarray(Image.open(path)), picture)
 
 
 class WithoutEmbree(unittest.TestCase):

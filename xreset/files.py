@@ -336,10 +336,8 @@ def must_exist(path: Path, what: str) -> None:
         raise FileFormatError(f"there is no {path} ({what}). Check the path, or make the file first.") from None
     except (OSError, ValueError) as error:  # a name too long, a folder that may not be entered, a zero in the name
         raise FileFormatError(f"there is no {shown(str(path))} ({what}): {error}.") from error
-    if stat.S_ISDIR(mode):
-        raise FileFormatError(f"{path} is a folder, expected a file ({what}).")
     if not stat.S_ISREG(mode):
-        raise FileFormatError(f"{path} is no regular file, expected one ({what}).")
+        raise FileFormatError(f"{path} is a folder or a device, expected a file ({what}).")
 
 
 def check_schema(path: Path, found: Any, expected: str) -> None:

@@ -31,13 +31,13 @@ from xreset.text import shown
 Kind = Literal["demos", "motion", "bank", "goals"]
 Data = Demos | Retargeted | ResetBank
 
-_SCHEMAS: dict[Kind, str] = {"demos": DEMOS, "motion": MOTION, "bank": BANK, "goals": GOALS}
-_COMMANDS: dict[Kind, str] = {
-    "demos": "xreset demos",
-    "motion": "xreset retarget",
-    "bank": "xreset resets",
-    "goals": "xreset goals",
+_KINDS: dict[Kind, tuple[str, Callable[[Path], Data], str]] = {
+    "demos": (DEMOS, read_demos, "xreset demos"),
+    "motion": (MOTION, read_retargeted, "xreset retarget"),
+    "bank": (BANK, read_bank, "xreset resets"),
+    "goals": (GOALS, read_goals, "xreset goals"),
 }
+"""Schema, reader, and the command that writes such files."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,17 +157,13 @@ def load_inputs(
 
 
 def _read(path: Path, accept: tuple[Kind, ...]) -> Data:
-    schema = npz_schema(path)
-    if schema == DEMOS and "demos" in accept:
-        return read_demos(path)
-    if schema == MOTION and "motion" in accept:
-        return read_retargeted(path)
-    if schema == BANK and "bank" in accept:
-        return read_bank(path)
-    if schema == GOALS and "goals" in accept:
-        return read_goals(path)
-    expected = " or ".join(f"{_SCHEMAS[kind]!r} ({_COMMANDS[kind]})" for kind in accept)
-    raise FileFormatError(f"{path} states schema {shown(schema)}, expected {expected}.")
+    stated = npz_schema(path)
+    expected = []
+    for schema, read, command in (_KINDS[kind] for kind in accept):
+        if stated == schema:
+            return read(path)
+        expected.append(f"{schema!r} ({command})")
+    raise FileFormatError(f"{path} states schema {shown(stated)}, expected {' or '.join(expected)}.")
 
 
 def _object_names(data: Data) -> tuple[str, ...]:

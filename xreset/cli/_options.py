@@ -15,7 +15,7 @@ from xreset.errors import XResetError
 from xreset.files import claim
 
 _COUNTS = {
-    "num_envs", "iterations", "episodes", "states", "grasps", "per_object", "max_per_object", "max_demos", "perturbed",
+    "num_envs", "iterations", "episodes", "states", "grasps", "per_object", "max_per_object", "perturbed",
     "per_gpu", "most", "processes",
 }  # fmt: skip
 """Whole numbers from 1."""

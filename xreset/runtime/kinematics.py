@@ -66,16 +66,14 @@ class Kinematics:
 
 def _quaternion(matrix: Array) -> Array:
     """[N, 4] quaternions of rotation matrices [N, 3, 3] (Shepperd's method)."""
-    x, y, z = np.moveaxis(np.diagonal(matrix, axis1=1, axis2=2), 1, 0)
-    m = matrix
-    a = m[:, 2, 1] - m[:, 1, 2]
-    b = m[:, 0, 2] - m[:, 2, 0]
-    c = m[:, 1, 0] - m[:, 0, 1]
-    d = m[:, 1, 0] + m[:, 0, 1]
-    e = m[:, 0, 2] + m[:, 2, 0]
-    f = m[:, 2, 1] + m[:, 1, 2]
-    rows = ((1 + x + y + z, a, b, c), (a, 1 + x - y - z, d, e), (b, d, 1 - x + y - z, f), (c, e, f, 1 - x - y + z))
-    candidates = np.stack([np.stack(row, axis=-1) for row in rows], axis=1)
+    skew = matrix - matrix.transpose(0, 2, 1)
+    vector = np.stack((skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]), axis=1)
+    trace = np.trace(matrix, axis1=1, axis2=2)
+    candidates = np.empty((len(matrix), 4, 4))
+    candidates[:, 0, 0] = 1.0 + trace
+    candidates[:, 0, 1:] = vector
+    candidates[:, 1:, 0] = vector
+    candidates[:, 1:, 1:] = matrix + matrix.transpose(0, 2, 1) + np.eye(3) * (1.0 - trace)[:, None, None]
     best = np.diagonal(candidates, axis1=1, axis2=2).argmax(axis=1)
     chosen = candidates[np.arange(len(matrix)), best]
     return chosen / np.linalg.norm(chosen, axis=1, keepdims=True)

@@ -71,7 +71,12 @@ class ResultsTest(unittest.TestCase):
         for name, value in (far | {"sequence": -1, "repetition": -1}).items():
             content = {"schema": "xreset-episodes/1", "episodes": [episode | {name: value}] * 4}
             files.append(("mujoco.episodes.json", content, read_evaluation))
-        for change in ({"minutes": -1e300}, {"minutes": 1e300}, {"iteration": -5}, {"passed": [passing | {"share": 1e308}]}):
+        for change in (
+            {"minutes": -1e300},
+            {"minutes": 1e300},
+            {"iteration": -5},
+            {"passed": [passing | {"share": 1e308}]},
+        ):
             files.append(("lift.json", lift | change, read_lift))
         files.append(("choice.json", choice, read_choice))
         for name, content, read in files:

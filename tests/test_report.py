@@ -268,7 +268,7 @@ class ClipTest(Reported):
             engines, objects = make_film(self.folder, out)
         names = tuple(sorted({trace.object for trace in rollouts.traces}))
         self.assertEqual((set(engines), objects), (set(ENGINES), names))
-        self.assertEqual(out.read_text(), repr(((3, 4 * 150, len(names) * 200, 3), 10)))
+        self.assertEqual(out.read_text(), repr(((3, 4 * (150 + 24), len(names) * 200, 3), 10)))
 
 
 class FailureTest(Reported):

@@ -71,9 +71,10 @@ class Ho3d(InFolder):
         self.assertEqual(found.object_name[0], self.demos.object_name[0])
 
     def test_frames_that_are_missing_or_not_annotated(self):
-        self.write(leave_out=(7,), objRot=lambda i, value: None if i < 2 else value)
+        last = self.demos.num_frames - 1
+        self.write(leave_out=(7,), objRot=lambda i, value: value if 2 <= i < last else None)
         found = self.read()
-        self.assertEqual(found.num_frames, self.demos.num_frames - 2)  # cut off at the ends
+        self.assertEqual(found.num_frames, last - 2)  # cut off at the ends
         middle = (self.demos.object_pos[6] + self.demos.object_pos[8]) / 2
         np.testing.assert_allclose(found.object_pos[5], middle, atol=1e-5)  # interpolated between others
 

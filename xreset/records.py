@@ -8,7 +8,6 @@ same bytes.
 from __future__ import annotations
 
 import json
-import logging
 import math
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,7 +19,6 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from xreset import __version__
 from xreset.errors import FileFormatError, XResetError
 from xreset.files import RAISE_LIMIT, atomic_write, check_schema, code_version, max_bytes, must_exist
 from xreset.text import is_plain, shown
@@ -129,10 +127,6 @@ def read_npz(
         problem = check(arrays)
     if problem is not None:
         raise FileFormatError(f"{path} is not valid as {what}: {problem}")
-    if unknown := sorted(set(members) - set(own)):
-        logging.getLogger(__name__).info(
-            "%s also holds %s, which this xreset (%s) ignores.", path, shown(unknown), __version__
-        )
     return arrays
 
 

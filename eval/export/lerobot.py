@@ -23,7 +23,7 @@ from xreset.eval.rollout import Trace
 from xreset.files import atomic_folder, write_json
 from xreset.objects.catalogue import load_object
 from xreset.pictures.render import Renderer
-from xreset.spec import SceneSpec
+from xreset.spec import RobotSpec, SceneSpec
 
 SCHEMA = "xreset-lerobot/1"
 VERSION = "v3.0"
@@ -97,7 +97,7 @@ def _write(root: Path, recording: Recording, videos: tuple[str, ...], size: tupl
     painters: dict[Any, Painter] = {}
     for i, episode in enumerate(recording.episodes.to_dict("records")):
         length = int(offsets[i + 1] - offsets[i])
-        arrays = _arrays(recording, i, int(task_index[i]))
+        arrays = _arrays(episode, i, int(offsets[i]), int(task_index[i]), recording.fps)
         distance = episode["least_distance"]  # NaN: an earlier version did not measure it
         row = {
             "episode_index": i,
@@ -121,7 +121,7 @@ def _write(root: Path, recording: Recording, videos: tuple[str, ...], size: tupl
         }
         for video in videos:
             chunk, file = divmod(i, _CHUNK)
-            film = _draw(recording, i, video, painters, size)
+            film = _draw(recording.robot, episode, video, painters, size)
             path = root / f"videos/{video}/chunk-{chunk:03d}/file-{file:03d}.mp4"
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(encode_mp4(film, recording.fps, keyframes=_KEYFRAMES))
@@ -156,7 +156,7 @@ def _write(root: Path, recording: Recording, videos: tuple[str, ...], size: tupl
 
 def _info(recording: Recording, tasks: int, features: dict[str, Any]) -> dict[str, Any]:
     file = "chunk-{chunk_index:03d}/file-{file_index:03d}"
-    count = len(recording.traces)
+    count = len(recording.episodes)
     return {
         "codebase_version": VERSION,
         "robot_type": recording.robot.name,
@@ -203,20 +203,20 @@ def _features(recording: Recording, videos: tuple[str, ...], size: tuple[int, in
     return features
 
 
-def _arrays(recording: Recording, index: int, task: int) -> dict[str, np.ndarray]:
+def _arrays(episode: dict[str, Any], index: int, offset: int, task: int, fps: float) -> dict[str, np.ndarray]:
     """Return the numbers of an episode's frames, each [T, n]."""
-    trace = recording.traces[index]
+    trace = episode["trace"]
     count = len(trace.time)
     goal = np.tile(np.concatenate((trace.goal_pos, trace.goal_quat)), (count, 1))
     frame = np.arange(count)[:, None]
     return {
         "observation.state": trace.joint_pos.astype(np.float32),
         "observation.environment_state": np.hstack((trace.object_pos, trace.object_quat, goal)).astype(np.float32),
-        "action": recording.actions[index].astype(np.float32),
-        "timestamp": (frame / recording.fps).astype(np.float32),
+        "action": episode["action"].astype(np.float32),
+        "timestamp": (frame / fps).astype(np.float32),
         "frame_index": frame,
         "episode_index": np.full((count, 1), index),
-        "index": recording.offsets[index] + frame,
+        "index": offset + frame,
         "task_index": np.full((count, 1), task),
     }
 
@@ -233,20 +233,20 @@ def _stats(key: str, rows: np.ndarray) -> dict[str, list[Any]]:
 
 
 def _draw(
-    recording: Recording, index: int, video: str, painters: dict[Any, Painter], size: tuple[int, int]
+    robot: RobotSpec, episode: dict[str, Any], video: str, painters: dict[Any, Painter], size: tuple[int, int]
 ) -> np.ndarray:
     """Return the film [T, H, W, 3] of an episode, always from the same camera, so that episodes can be compared."""
-    trace = recording.traces[index]
-    named = (trace.object, recording.meshes[index])
+    trace = episode["trace"]
+    named = (trace.object, episode["meshes"])
     key = (video, *named)
     if key not in painters:
         obj = load_object(*named)
         if video == VIDEO:
-            renderer = Renderer(SceneSpec(robot=recording.robot, objects=(obj,)), size=size)
+            renderer = Renderer(SceneSpec(robot=robot, objects=(obj,)), size=size)
             painters[key] = partial(draw_state, renderer)
         else:
             camera = CAMERAS[video.removeprefix(_DEPTH)]
-            eyes = policy_cameras(recording.robot, obj, VisionConfig(cameras=(camera,), width=size[0], height=size[1]))
+            eyes = policy_cameras(robot, obj, VisionConfig(cameras=(camera,), width=size[0], height=size[1]))
             assert eyes is not None, "there is a camera"
             painters[key] = partial(draw_view, eyes, width=size[0])
     return np.stack([painters[key](trace, row) for row in range(len(trace.time))])

@@ -48,21 +48,15 @@ class Recording:
     fps: float
     """Frames per second."""
     episodes: Table
-    """One row for each recorded episode (:func:`xreset.eval.results.episode_table`), with the task in words in the
-    column ``task``."""
-    traces: tuple[Trace, ...]
-    """Finite states [T] of each episode. Joint positions in rad (prismatic: m), poses in the world frame (z up, table
-    top at z = 0), quaternions (w, x, y, z)."""
-    actions: tuple[np.ndarray, ...]
-    """[T, J] joint targets of each episode: the last target before the next frame. The last frame repeats its
-    target."""
-    meshes: tuple[Path | None, ...]
-    """Folder of each object's mesh; None: a stand-in."""
+    """One row for each recorded episode (:func:`xreset.eval.results.episode_table`), with further columns: ``task`` in
+    words; ``trace``, its finite states [T]; ``action`` [T, J], joint targets: the last target before the next frame, of
+    the last frame its own; ``meshes``, folder of the object's mesh or None: a stand-in. Joint positions in rad
+    (prismatic: m), poses in the world frame (z up, table top at z = 0), quaternions (w, x, y, z)."""
 
     @property
     def offsets(self) -> np.ndarray:
         """[E + 1] episode i owns the frames ``offsets[i] : offsets[i + 1]``."""
-        return np.cumsum([0, *map(len, self.actions)])
+        return np.cumsum([0, *map(len, self.episodes["action"])])
 
 
 def read_recorded(
@@ -90,9 +84,6 @@ def read_recorded(
         FileFormatError: a file is damaged, or older than recorded actions.
     """
     rows = []
-    traces = []
-    actions = []
-    meshes = []
     robots: dict[str, RobotSpec] = {}
     intervals: dict[float, Path] = {}
     for folder in folders:
@@ -116,10 +107,13 @@ def read_recorded(
                 cut = {}
                 for field in ("time", "joint_pos", "object_pos", "object_quat"):
                     cut[field] = getattr(trace, field)[:last]
-                rows.append(episode | {"task": task.replace("{object}", short_name(trace.object))})
-                traces.append(replace(trace, **cut))
-                actions.append(action[:last])
-                meshes.append(mesh_folder(objects, result.objects_folder))
+                episode |= {
+                    "task": task.replace("{object}", short_name(trace.object)),
+                    "trace": replace(trace, **cut),
+                    "action": action[:last],
+                    "meshes": mesh_folder(objects, result.objects_folder),
+                }
+                rows.append(episode)
     if not rows:
         of = f" of {', '.join(backends)}" if backends else ""
         raise RunError(
@@ -136,9 +130,6 @@ def read_recorded(
         robot=next(iter(robots.values())),
         fps=_rate(next(iter(intervals))),
         episodes=pd.DataFrame(rows),
-        traces=tuple(traces),
-        actions=tuple(actions),
-        meshes=tuple(meshes),
     )
 
 
@@ -178,11 +169,11 @@ def write_arrays(path: str | Path, recording: Recording) -> None:
     Raises:
         XResetError: the file cannot be written.
     """
-    traces = recording.traces
+    traces = recording.episodes["trace"]
     per_frame = {
         "time": [t.time for t in traces],
         "joint_pos": [t.joint_pos for t in traces],
-        "joint_target": recording.actions,
+        "joint_target": recording.episodes["action"],
         "object_pos": [t.object_pos for t in traces],
         "object_quat_wxyz": [t.object_quat for t in traces],
     }

@@ -144,18 +144,17 @@ class Session:
         self._seed = seed
         self.engine = engine
         self.time = 0.0
-        self._open(self._loaded(policy, robot), thing, engine)
+        self._open(policy, robot, thing, engine)
 
     # Choosing ---------------------------------------------------------------------------------------------------------
 
     def choose_policy(self, policy: str | Path | PolicySpec, *, robot: str | Path | None = None) -> None:
         """Let another policy act, and begin anew. Arguments and errors as for the constructor's."""
-        spec = self._loaded(policy, robot)
-        self._open(spec, self.object_name, self.engine)
+        self._open(policy, robot, self.object_name, self.engine)
 
     def choose_object(self, name: str) -> None:
         """Play with another object, and begin anew; ``XResetError`` if it is unknown."""
-        self._open(self.policy, name, self.engine)
+        self._open(self.policy, None, name, self.engine)
 
     def choose_engine(self, name: str) -> None:
         """Go on in another engine at the same state, with the same memory of the policy.
@@ -175,13 +174,10 @@ class Session:
         """Name of the object."""
         return self.env.backend.scene.objects[0].name
 
-    def _loaded(self, policy: str | Path | PolicySpec, robot: str | Path | None) -> PolicySpec:
-        if isinstance(policy, PolicySpec):
-            return policy
-        return load_policy(policy, robot=robot, seed=self._seed)
-
-    def _open(self, policy: PolicySpec, thing: str | None, engine: str) -> None:
+    def _open(self, policy: str | Path | PolicySpec, robot: str | Path | None, thing: str | None, engine: str) -> None:
         """Open worlds; where this fails, the session stays as it was."""
+        if not isinstance(policy, PolicySpec):
+            policy = load_policy(policy, robot=robot, seed=self._seed)
         folder = self._folder or policy.objects_folder
         source = self._demos
         if source is None:
@@ -205,10 +201,10 @@ class Session:
         self.objects = names
         self._inputs = inputs
         self._player: Policy = player
-        robot = policy.robot
-        self._kinematics = Kinematics(robot)
-        self._stiffness = torch.tensor([joint.drive.kp for joint in robot.joints], dtype=torch.float32)
-        self.inputs = _slices(layout(len(robot.joints), len(robot.fingertips), policy.task.observation))
+        spec = policy.robot
+        self._kinematics = Kinematics(spec)
+        self._stiffness = torch.tensor([joint.drive.kp for joint in spec.joints], dtype=torch.float32)
+        self.inputs = _slices(layout(len(spec.joints), len(spec.fingertips), policy.task.observation))
         self.terms: tuple[str, ...] = ()
         self.history: deque[Moment] = deque(maxlen=round(KEPT_SECONDS / self.control_dt))
         self._begin()

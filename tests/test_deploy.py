@@ -181,13 +181,11 @@ class ContractTest(unittest.TestCase):
         episode = _Episode(load_controller(self.out))
         begin = {"object": "brick", "goal_pos": [0, 0, 1], "goal_quat": [1, 0, 0, 0], "target": self.home}
         for message, words in (
-            ("{", "is not JSON"),
             ('{"a":' * 5000, "is not JSON"),
             ("[]", "one of the keys begin, goal, step"),
             ({"step": {}}, "no episode yet. Send begin first"),
             ({"begin": 3}, "begin is not an object"),
             ({"begin": begin | {"object": ["hat"]}}, "no object"),
-            ({"begin": begin | {"target": [1]}}, r"target has shape \(1,\)"),
             ({"begin": begin | {"goal_pos": [0, 0, float("nan")]}}, "goal_pos has shape"),
             ({"begin": begin | {"goal_pos": [0, 0, 10**400]}}, "goal_pos holds something that is not a number"),
             ({"begin": begin | {"goal_quat": [1, 1, 0, 0]}}, "length 1.414, expected a unit quaternion"),

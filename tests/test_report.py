@@ -398,9 +398,8 @@ class PageTest(Reported):
         self.write(engines=("pybullet",))
         text = page(collect(self.folder), [])
         self.assertEqual(text.count('<td class="bad">1</td>'), 2, "faults of an engine stand out")
-        outline = Outline(text)
-        self.assertEqual((len(outline.of("video")), outline.open), (0, []))
-        self.assertNotIn("Training", outline.text)
+        self.assertNotIn("<video", text)
+        self.assertNotIn("Training", Outline(text).text)
 
     def test_names_cannot_inject_anything(self):
         hostile = '<script>alert("x")</script>'
@@ -449,7 +448,7 @@ class CommandTest(Reported):
         with claim_folder(self.folder / "report"):
             code, printed = self.run_command(str(self.folder))
         self.assertEqual((code, list((self.folder / "report").iterdir())), (1, []))
-        self.assertRegex(printed, "another command is writing .*report. Wait for its end, or choose another --out")
+        self.assertRegex(printed, "^xreset report: another command is writing .*report. Wait for its end, or")
 
     def test_the_table_fits_into_eighty_characters(self):
         from rich.console import Console

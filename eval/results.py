@@ -268,7 +268,13 @@ def write_results(folder: Path, summary: EvalResult, rollouts: Rollouts, joint_n
     name = summary.backend
     episodes = [asdict(e) for e in rollouts.episodes]
     write_json(folder / f"{name}.episodes.json", {"schema": EPISODES_SCHEMA, "episodes": episodes})
-    traces = rollouts.traces
+    write_traces(folder / f"{name}.trace.npz", rollouts.traces, joint_names)
+    write_json(folder / f"{name}.json", {"schema": SCHEMA} | asdict(summary))
+    return folder / f"{name}.json"
+
+
+def write_traces(path: Path, traces: Sequence[Trace], joint_names: tuple[str, ...], **others: Any) -> None:
+    """Write recorded episodes; ``others``: further arrays, which :func:`read_traces` ignores."""
     arrays = {
         "time": traces[0].time,
         "joint_names": np.array(joint_names),
@@ -280,9 +286,7 @@ def write_results(folder: Path, summary: EvalResult, rollouts: Rollouts, joint_n
     targets = [t.joint_target for t in traces if t.joint_target is not None]
     if len(targets) == len(traces):
         arrays["joint_target"] = np.stack(targets)
-    write_npz(folder / f"{name}.trace.npz", TRACE_SCHEMA, arrays)
-    write_json(folder / f"{name}.json", {"schema": SCHEMA} | asdict(summary))
-    return folder / f"{name}.json"
+    write_npz(path, TRACE_SCHEMA, arrays | others)
 
 
 def read_evaluation(folder: Path, run: str = "") -> Evaluation:

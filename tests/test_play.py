@@ -8,10 +8,10 @@ import numpy as np
 import torch
 
 from xreset.errors import XResetError
-from xreset.eval.play.record import SCHEMA, write_film, write_trace
+from xreset.eval.play.record import write_film, write_trace
 from xreset.eval.play.session import AWAY, Session
+from xreset.eval.results import read_traces
 from xreset.plugins import backend_names, backend_status
-from xreset.records import npz_schema
 from xreset.tensors import one_thread
 
 
@@ -154,18 +154,21 @@ class Played(unittest.TestCase):
     def test_film_and_trace(self):
         session = self.session
         with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "play"
+            path = Path(folder) / "play.trace.npz"
             for write in (write_trace, write_film):
                 with self.assertRaisesRegex(XResetError, "Nothing has happened yet"):
                     write(path, session)
             self.steps(0.5)
             write_trace(path, session)
-            self.assertEqual(npz_schema(path), SCHEMA)
             steps = round(0.5 / session.control_dt)
+            (trace,) = read_traces(Path(folder), "play", session.policy.robot.joint_names)
+            self.assertEqual((len(trace.time), len(np.asarray(trace.joint_target))), (steps, steps - 1))
+            np.testing.assert_array_equal(trace.joint_pos[-1], session.history[-1].joint_pos)
+            np.testing.assert_array_equal(trace.goal_pos, session.history[-1].goal_pos)
             with np.load(path) as arrays:
                 self.assertEqual(arrays["inputs"].shape, (steps, len(arrays["input_names"])))
                 self.assertEqual(arrays["reward"].shape, (steps, len(arrays["reward_names"])))
-                np.testing.assert_array_equal(arrays["joint_pos"][-1], session.history[-1].joint_pos)
+                self.assertEqual(arrays["goal_path_pos"].shape, (steps, 3))
             write_film(path, session, seconds=0.2)
             self.assertEqual(path.read_bytes()[4:8], b"ftyp")
 

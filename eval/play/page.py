@@ -454,7 +454,7 @@ class Page(WebPage):
 
     def _save_trace(self, client: Any) -> None:
         with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "play.npz"
+            path = Path(folder) / "play.trace.npz"
             write_trace(path, self.session)
             client.send_file_download(path.name, path.read_bytes())
 

@@ -11,44 +11,58 @@ import numpy as np
 from xreset.errors import XResetError
 from xreset.eval.play.session import Moment, Session
 from xreset.eval.report.clips import encode_mp4
+from xreset.eval.results import write_traces
+from xreset.eval.rollout import Trace
 from xreset.files import write_whole
 from xreset.pictures.render import Renderer, pose_matrix
-from xreset.records import write_npz
 from xreset.spec import SceneSpec
 
-SCHEMA = "xreset-play/1"
 FRAMES_PER_SECOND = 20.0
 SIZE = (640, 480)
 """Width and height of a film [pixels]."""
 
 
 def write_trace(path: str | Path, session: Session) -> None:
-    """Write all moments that a session remembers, T of them, as npz.
+    """Write all moments that a session remembers, T of them, as one recorded episode (``xreset-trace/1``).
 
-    Every field of :class:`~xreset.eval.play.session.Moment` is an array [T, ...]. ``reward`` [T, R] has the names
-    ``reward_names`` [R]. The columns of ``inputs`` [T, D] have the names ``input_names`` [D].
+    Its goal is the last one. Next to the arrays of every recorded episode, ``goal_path_pos`` [T, 3] and
+    ``goal_path_quat`` [T, 4] say where the goal was, and the other fields of
+    :class:`~xreset.eval.play.session.Moment` are arrays [T, ...]. ``reward`` [T, R] has the names ``reward_names`` [R].
+    The columns of ``inputs`` [T, D] have the names ``input_names`` [D].
 
     Raises:
         XResetError: nothing has happened yet.
     """
     moments = last_moments(session, None)
-    arrays = {}
-    for f in fields(Moment):
-        arrays[f.name] = np.array([getattr(moment, f.name) for moment in moments])
+    arrays = {f.name: np.array([getattr(moment, f.name) for moment in moments]) for f in fields(Moment)}
+    goal_pos = arrays.pop("goal_pos")
+    goal_quat = arrays.pop("goal_quat")
+    states = {name: arrays.pop(name) for name in ("time", "joint_pos", "object_pos", "object_quat")}
+    trace = Trace(
+        sequence=0,
+        object=session.object_name,
+        goal_pos=goal_pos[-1],
+        goal_quat=goal_quat[-1],
+        joint_target=arrays.pop("joint_target")[1:],  # those before the first state are of no recorded step
+        **states,
+    )
     input_names = []
     for name, place in session.inputs.items():
         input_names += [name] * (place.stop - place.start)
     robot = session.policy.robot
-    names = {
-        "policy": session.policy.name,
-        "robot": robot.name,
-        "object_name": session.object_name,
-        "joint_names": np.array(robot.joint_names),
-        "fingertip_names": np.array(robot.fingertip_names),
-        "reward_names": np.array(session.terms),
-        "input_names": np.array(input_names),
-    }
-    write_npz(path, SCHEMA, names | arrays)
+    write_traces(
+        Path(path),
+        [trace],
+        robot.joint_names,
+        policy=session.policy.name,
+        robot=robot.name,
+        fingertip_names=np.array(robot.fingertip_names),
+        reward_names=np.array(session.terms),
+        input_names=np.array(input_names),
+        goal_path_pos=goal_pos,
+        goal_path_quat=goal_quat,
+        **arrays,
+    )
 
 
 def write_film(path: str | Path, session: Session, *, seconds: float = 10.0) -> None:

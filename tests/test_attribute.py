@@ -12,7 +12,6 @@ import torch
 
 from tests import toy_grasp
 from tests.command import xreset
-from tests.data import PYBULLET
 from tests.toy_results import episodes
 from xreset.errors import XResetError
 from xreset.eval.engines.attribution import Attribution, Row, attribute, change_towards
@@ -116,13 +115,6 @@ class ProbesTest(unittest.TestCase):
             found, tip_friction=0.45, torsional_friction=0.003, mass=1.3, inertia=0.7, arm_stiffness=0.8, arm_damping=0.9,
             hand_stiffness=0.5, hand_damping=0.9, timestep=1 / 480, delay=1.0,
         )  # fmt: skip
-
-    @PYBULLET
-    def test_engines_that_step_finer_are_seen(self):
-        found = measure(engine("pybullet", workers=0), SCENE)
-        self.assertAlmostEqual(found.timestep, 1 / 480, delta=1e-5)
-        self.assertAlmostEqual(found.torsional_friction, 0.002, delta=2e-5)
-        self.assertLess(found.contact_give, 1e-5)
 
 
 class ChangeTest(unittest.TestCase):

@@ -23,12 +23,11 @@ from xreset.backends.conformance.grasp_checks import grasp
 from xreset.backends.conformance.harness import Bench, snapshot
 from xreset.backends.conformance.scene import gripper, objects, scene, shape, solid
 from xreset.backends.mjcf import compile_scene
-from xreset.backends.mjcf_model import OBJECT, SceneModel
+from xreset.backends.mjcf_model import SceneModel
 from xreset.backends.mujoco import MujocoBackend, MujocoWorld
 from xreset.backends.mujoco_warp import MujocoWarpBackend
 from xreset.backends.mujoco_warp_setup import contact_room, differing_fields
 from xreset.backends.mujoco_warp_step import ForkedStep, constraints, finish, smooth_dynamics
-from xreset.backends.rigid import OTHER_LINK, TABLE
 from xreset.errors import BackendUnavailableError, ObjectError, RobotError, XResetError
 from xreset.physics import Backend
 from xreset.plugins import device_for
@@ -127,15 +126,6 @@ class Model(unittest.TestCase):
         wrist = "robot/wrist/0"
         self.assertEqual(own, {frozenset(("robot/base/0", wrist)), frozenset(("robot/column/0", wrist))})
 
-    def test_roles(self):
-        names = [self.at.model.geom(i).name for i in range(self.at.model.ngeom)]
-        role = dict(zip(names, self.at.geom_role.tolist(), strict=True))
-        self.assertEqual(role["table"], TABLE)
-        self.assertEqual(role["robot/jaw_a/0"], 0)
-        self.assertEqual(role["robot/finger_b/0"], 1)
-        self.assertEqual(role["robot/wrist/0"], OTHER_LINK)
-        self.assertEqual(role["object/box/0"], OBJECT)
-
     def test_slots_hold_any_of_the_objects(self):
         models = [compile_scene(self.scene, i, slots_for=range(3)) for i in range(3)]
         self.assertEqual([int(m.parked.sum()) for m in models], [3, 3, 2])  # of one box, one cylinder and two hulls
@@ -225,13 +215,6 @@ class BothBackends(unittest.TestCase):
                 backend.set_object_mass(torch.ones(3))
             with self.assertRaises(ValueError):
                 backend.set_friction(torch.ones(4, 2))
-
-    def test_setting_no_world_does_nothing(self):
-        for backend in self.both():
-            backend.set_state(self.bench.start())
-            before = snapshot(backend.state())
-            backend.set_state(self.bench.start()[[]], torch.tensor([], dtype=torch.long))
-            torch.testing.assert_close(backend.state().object_pos, before.object_pos)
 
 
 class Steps(unittest.TestCase):

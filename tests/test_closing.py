@@ -126,21 +126,6 @@ class ClosingTest(unittest.TestCase):
         frame, part = self.states(replace(self.data, object_pos=pos))
         self.assertEqual(sorted(set(frame[part > 0].tolist())), [0, 1, 5])
 
-    def test_off(self):
-        frame, part = self.states(spacing=None)
-        self.assertEqual((frame.tolist(), part.tolist()), (list(range(10)), [0.0] * 10))
-
-    def test_options_out_of_range(self):
-        for words, config in (
-            ("spacing is 0, expected a number above 0", lambda: ClosingConfig(spacing=0)),
-            ("spacing is inf, expected a finite", lambda: ClosingConfig(spacing=np.inf)),
-            ("within is -1", lambda: ClosingConfig(within=-1)),
-            ("force is -2", lambda: SqueezeConfig(force=-2)),
-            ("reach is nan", lambda: SqueezeConfig(reach=np.nan)),
-        ):
-            with self.assertRaisesRegex(ValueError, words):
-                config()
-
 
 class FingersTest(unittest.TestCase):
     """The gripper's jaws are flat, parallel to the brick's sides, and slide along their normal."""

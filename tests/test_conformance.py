@@ -128,21 +128,6 @@ class MimicJointThatDoesNotFollow(MujocoWorld):
         self._model.eq_active0[:] = 0
 
 
-@breaks("mimic_joints")
-class MimicJointThatIsNotSet(MujocoWorld):
-    def set_state(self, state):
-        super().set_state(state)
-        self._data.qpos[self._at.qpos[self._at.joints.mimic]] = 0.0
-
-
-@breaks("forward_kinematics", "links_after_set")
-class LinksAtTheCentreOfMass(MujocoWorld):
-    def links(self):
-        _, quat, linvel, angvel = super().links()
-        body = self._at.link_body
-        return self._data.xipos[body], quat, linvel, angvel
-
-
 # Worlds ---------------------------------------------------------------------------------------------------------------
 
 
@@ -212,12 +197,6 @@ class BatchWithTheFirstWorldsBody(MujocoBackend):
             other._model.body_inertia[:] = first._model.body_inertia
 
 
-@breaks("free_spin", "resting_weight")
-class ThirdObjectReplacedByTheFirst(MujocoWorld):
-    def __init__(self, scene, object_index):
-        super().__init__(scene, 0 if object_index == 2 else object_index)
-
-
 @breaks("broken_world")
 class HiddenBrokenWorld(MujocoWorld):
     def health(self, state):
@@ -248,11 +227,6 @@ def mass_invented_for_a_link(model, at):
     model.body_mass[at.moving_bodies[1]] += 0.001
 
 
-@remodelled("mass_properties", "free_spin")
-def principal_axes_dropped(model, at):
-    model.body_iquat[:] = (1.0, 0.0, 0.0, 0.0)
-
-
 @breaks("mass_properties")
 class CentreOfMassAtTheOrigin(MujocoWorld):
     def mass_properties(self):
@@ -263,24 +237,6 @@ class CentreOfMassAtTheOrigin(MujocoWorld):
 def stiffness_scaled(model, at):
     model.actuator_gainprm[:, 0] *= 0.8
     model.actuator_biasprm[:, 1] *= 0.8
-
-
-@remodelled("own_weight")
-def stiffness_and_damping_scaled(model, at):
-    """Free motion hardly tells, a load does."""
-
-    model.actuator_gainprm[:] *= 0.8
-    model.actuator_biasprm[:] *= 0.8
-
-
-@remodelled("joint_tracking")
-def joints_damped_by_default(model, at):
-    model.dof_damping[:] = 0.5
-
-
-@remodelled("joint_tracking", "drive_equation")
-def drive_without_armature(model, at):
-    model.dof_armature[:] = 0.0
 
 
 @remodelled("drive_equation", "effort_limit")
@@ -374,15 +330,6 @@ class MassWithoutInertia(MujocoWorld):
         self._model.body_inertia[self._at.object_body] = kept
 
 
-@breaks("set_as_built")
-class MassWithoutTheSolversWeights(MujocoWorld):
-    def set_object_inertia(self, inertia):
-        body = self._at.object_body
-        kept = self._model.body_invweight0[body].copy()
-        super().set_object_inertia(inertia)
-        self._model.body_invweight0[body] = kept
-
-
 @breaks("object_inertia_set")
 class InertiaScaledTwice(MujocoWorld):
     def set_object_inertia(self, inertia):
@@ -442,12 +389,6 @@ class DriveScalesThatAccumulate(MujocoWorld):
         super().set_drives(self._scale)
 
 
-@breaks("drive_scale")
-class DriveScalesWithoutDamping(MujocoWorld):
-    def set_drives(self, scale):
-        super().set_drives(np.stack((scale[0], np.ones_like(scale[1]), scale[2])))
-
-
 @breaks("sliding_distance", "slope")
 class FrictionSquared(MujocoWorld):
     """As the product of two bodies that both have the pair's coefficient."""
@@ -456,20 +397,9 @@ class FrictionSquared(MujocoWorld):
         super().set_friction(np.square(friction))
 
 
-@breaks("sliding_distance", "slope")
-class FrictionAveragedWithTheObjects(MujocoWorld):
-    def set_friction(self, friction):
-        super().set_friction((friction + 0.5) / 2)
-
-
 @remodelled("slope")
 def friction_pyramid(model, at):
     model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
-
-
-@remodelled("torsional_friction", "torsional_friction_set")
-def no_torsional_friction(model, at):
-    model.geom_condim[:] = 3
 
 
 @breaks("torsional_friction_set")

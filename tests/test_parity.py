@@ -16,6 +16,7 @@ from tests.command import xreset
 from tests.toy_bank import toy_retargeted
 from xreset import robots
 from xreset.errors import DemoError
+from xreset.eval.engines.actions import grasp_and_lift
 from xreset.eval.engines.agreement import Metric, carried, compare, outcome_metric, palm_distance, press_metrics
 from xreset.eval.engines.episodes import (
     GraspMotion,
@@ -26,9 +27,9 @@ from xreset.eval.engines.episodes import (
     squeezed,
     squeezing_state,
 )
-from xreset.eval.engines.grasps import NEAR, Grasps, find_grasps
+from xreset.eval.engines.grasps import Grasps, find_grasps
 from xreset.eval.engines.recording import Recording
-from xreset.eval.trial import Engine, engine
+from xreset.eval.trial import engine
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.objects.catalogue import load_object
@@ -95,34 +96,15 @@ def grasps_of(
     )
 
 
-def altered(base: Engine, name: str, **changes) -> Engine:
-    """An engine that simulates another scene than it is asked for."""
-
-    def make(scene: SceneSpec, num_worlds: int, object_index: torch.Tensor):
-        return base.make(
-            replace(scene, **{field: change(getattr(scene, field)) for field, change in changes.items()}),
-            num_worlds,
-            object_index,
-        )
-
-    return replace(base, name=name, make=make)
+def weak(scene: SceneSpec, factor: float = 0.5) -> SceneSpec:
+    """The scene with weaker drives."""
+    joints = [replace(joint, drive=replace(joint.drive, kp=factor * joint.drive.kp)) for joint in scene.robot.joints]
+    return replace(scene, robot=replace(scene.robot, joints=tuple(joints)))
 
 
-def with_squared_friction(base: Engine) -> Engine:
-    def make(scene: SceneSpec, num_worlds: int, object_index: torch.Tensor):
-        pairs = scene.friction
-        squared = replace(pairs, tip=pairs.tip**2, link=pairs.link**2, table=pairs.table**2)
-        backend = base.make(replace(scene, friction=squared), num_worlds, object_index)
-        set_friction = backend.set_friction
-        backend.set_friction = lambda friction, worlds=None: set_friction(friction**2, worlds)
-        return backend
-
-    return replace(base, name="friction squared", make=make)
-
-
-def with_drives(robot: RobotSpec, factor: float) -> RobotSpec:
-    joints = (replace(joint, drive=replace(joint.drive, kp=factor * joint.drive.kp)) for joint in robot.joints)
-    return replace(robot, joints=tuple(joints))
+def heavy(scene: SceneSpec) -> SceneSpec:
+    """The scene with an object that hardly any grasp carries."""
+    return replace(scene, objects=tuple(replace(thing, mass=8 * thing.mass) for thing in scene.objects))
 
 
 class Episodes(unittest.TestCase):
@@ -147,10 +129,6 @@ class Episodes(unittest.TestCase):
             arm = torch.as_tensor(kinematics.robot.arm_indices)
             torch.testing.assert_close(q[:, arm], home[:, arm], rtol=0, atol=0)
 
-    def test_fingertips_stay_within_the_limits(self):
-        q = moved_fingertips(self.kinematics, self.home, -0.5)
-        self.assertTrue(bool(((q >= self.kinematics.lower) & (q <= self.kinematics.upper)).all()))
-
     def test_the_squeeze_is_a_force(self):
         motion = GraspMotion(squeeze=4.0)
         held = moved_fingertips(self.kinematics, self.home, motion.reach)
@@ -164,17 +142,6 @@ class Episodes(unittest.TestCase):
         hand = torch.as_tensor(self.robot.hand_indices)
         torch.testing.assert_close(torque[hand], torch.einsum("ecj,ec->j", jacobian, force)[hand], atol=1e-9, rtol=0)
         self.assertLess(float(torque[torch.as_tensor(self.robot.arm_indices)].abs().max()), 1e-9)
-
-    def test_the_palm_is_carried_without_turning(self):
-        way = torch.zeros(30, 3)
-        way[:, 1], way[:, 2] = torch.linspace(0, 0.02, 30), torch.linspace(0, 0.1, 30)
-        path = carried_palm(self.kinematics, self.home, way)
-        start = self.kinematics.link_poses(self.home, [self.robot.palm])[0, 0]
-        palm = self.kinematics.link_poses(path, [self.robot.palm])[:, 0, 0]
-        torch.testing.assert_close(palm[:, :3, 3], start[:3, 3] + way, atol=5e-5, rtol=0)
-        torch.testing.assert_close(palm[:, :3, :3], start[:3, :3].expand(30, 3, 3), atol=2e-3, rtol=0)
-        hand = torch.as_tensor(self.robot.hand_indices)
-        torch.testing.assert_close(path[:, 0, hand], self.home[:, hand].expand(30, -1), rtol=0, atol=0)
 
     def test_a_closing_opens_closes_lifts_and_shakes(self):
         pos, quat = torch.tensor([[0.6, 0.3, 0.05]]), torch.tensor([[1.0, 0, 0, 0]])
@@ -194,8 +161,7 @@ class Episodes(unittest.TestCase):
         self.assertLess(float(height[:closing].abs().max()), 1e-6)
         self.assertAlmostEqual(float(height[closing + 31]), 0.1, delta=1e-3)
         swing = (palm[closing + 42 :] - palm[closing + 41]).abs().amax(0)
-        self.assertGreater(float(swing[0]), 0.7 * BRISK.amplitude)
-        self.assertGreater(float(swing[1]), 0.7 * BRISK.amplitude)
+        self.assertGreater(float(swing[:2].min()), 0.7 * BRISK.amplitude)
         self.assertLess(float((episode.targets[1:] - episode.targets[:-1]).abs().max()), 0.1)  # nothing jumps
 
     def test_a_lift_begins_where_the_state_is(self):
@@ -225,15 +191,15 @@ class Finding(unittest.TestCase):
         torch.testing.assert_close(
             air.object_pos[:, 2] - table.object_pos[:, 2], torch.full((5,), 0.1, dtype=torch.float64), atol=6e-4, rtol=0
         )
+        actions = grasp_and_lift(self.robot, self.can, table, 1)
+        self.assertEqual(
+            (actions.phase_at(1.5), actions.label), ("lift", f"grasp and lift of {self.can.name}, {table.label[1]}")
+        )
         before = replace(motion, first_contact=np.full(5, -1))
-        with self.assertRaisesRegex(DemoError, "no grasp was found in 0 frames after first contact"):
-            self.find(before)
-
-    def test_a_hand_that_is_not_at_the_object_grasps_nothing(self):
-        away = grasps_of(self.robot, self.can, [(0.0, 0.0), (0.12 + NEAR, 0.0)])
-        self.assertEqual(self.find(away).label, ("toy/0:0",))
-        with self.assertRaisesRegex(DemoError, "no grasp was found in 2 frames"):
-            self.find(grasps_of(self.robot, self.can, [(0.2, 0.0)]))
+        away = grasps_of(self.robot, self.can, [(0.2, 0.0)])
+        for ungrasped, frames in ((before, 0), (away, 2)):
+            with self.assertRaisesRegex(DemoError, f"no grasp was found in {frames} frames after first contact"):
+                self.find(ungrasped)
 
     def test_a_turned_or_moved_object_is_not_at_rest(self):
         motion = grasps_of(self.robot, self.can, [(0.0, 0.0), (0.0, 0.01), (0.02, 0.0)])
@@ -285,17 +251,11 @@ class Numbers(unittest.TestCase):
         self.assertAlmostEqual(tip.measured or 0.0, 0.2, places=5)  # median of 0.2, 0.2, 0 and sqrt 2
         self.assertEqual(tip.n, 4)
 
-    def test_a_finger_that_presses_in_one_engine_only_counts(self):
-        force = recording().tip_force.clone()
-        force[:, 0, 1] = 0.0
-        _, tip = press_metrics(recording(tip_force=force), recording(), steps=3)
-        self.assertEqual(tip.n, 4)
-
-    def test_only_the_last_steps_of_a_press_count(self):
         force = recording().tip_force.clone()
         force[0] *= 100
-        metrics = press_metrics(recording(tip_force=force), recording(), steps=2)
-        self.assertEqual([m.measured for m in metrics], [0.0, 0.0])
+        force[:, 0, 1] = 0.0
+        total, tip = press_metrics(recording(tip_force=force), recording(), steps=2)
+        self.assertEqual((tip.n, tip.measured), (4, 0.0), "a finger that presses in one engine only counts")
 
     def test_nothing_to_compare_misses_the_target(self):
         none = recording(tip_force=torch.zeros(3, 2, 2, 3))
@@ -344,8 +304,8 @@ class Comparing(unittest.TestCase):
             grasps_of(robot, can),
             [
                 replace(reference, name="same"),
-                with_squared_friction(reference),
-                altered(reference, "drives halved", robot=lambda robot: with_drives(robot, 0.5)),
+                toy_grasp.with_scene(reference, "heavy", heavy),
+                toy_grasp.with_scene(reference, "weak", weak),
             ],
             grasps=6,
             tries=BRISK,
@@ -365,28 +325,22 @@ class Comparing(unittest.TestCase):
     def test_outcomes_are_mixed(self):
         """Else an engine in which nothing, or everything, is carried would agree."""
         outcomes = self.result.reference.carried
-        for kind in ("closing", "hold"):
-            self.assertEqual(
-                {flag for name, flags in outcomes.items() if name.startswith(kind) for flag in flags},
-                {True, False},
-                outcomes,
-            )
+        self.assertEqual(set(outcomes["closing"]), {True, False})
+        self.assertEqual(set(outcomes["hold 0.5"] + outcomes["hold 0.8"]), {True, False})
 
     def test_the_timestep_matters_little(self):
         metrics = {metric.metric: metric for metric in self.result.floor.metrics}
         self.assertTrue(metrics["press, total"].ok)
         self.assertGreater(metrics["press, total"].measured or 0.0, 0.0)
 
-    def test_squared_friction_is_seen(self):
-        metrics = self.metrics("friction squared")
-        self.assertFalse(metrics["hold, outcome"].ok)
-        self.assertFalse(metrics["closing, outcome"].ok)
-
-    def test_halved_drives_are_seen(self):
-        metrics = self.metrics("drives halved")
-        self.assertFalse(metrics["press, total"].ok)
-        self.assertGreater(metrics["press, total"].measured or 0.0, 0.3)
-        self.assertFalse(metrics["press, fingertip"].ok)
+    def test_what_differs_is_seen(self):
+        for name, missed in (
+            ("heavy", ("hold, outcome", "closing, outcome")),
+            ("weak", ("press, total", "press, fingertip")),
+        ):
+            for metric in missed:
+                self.assertFalse(self.metrics(name)[metric].ok, f"{name}: {metric}")
+        self.assertGreater(self.metrics("weak")["press, total"].measured or 0.0, 0.3)
 
     def test_common_states_favour_no_engine(self):
         labels = self.result.hold.label
@@ -399,34 +353,23 @@ class Comparing(unittest.TestCase):
         data = json.loads(json.dumps(self.result.as_dict(), allow_nan=False))
         self.assertEqual(data["schema"], "xreset-parity/1")
         self.assertFalse(data["ok"])
-        row = data["engines"][0]["metrics"][0]
-        self.assertEqual(
-            {"metric", "target", "measured", "n", "verdict"} & set(row),
-            {"metric", "target", "measured", "n", "verdict"},
-        )
         self.assertEqual(len(data["grasps"]["hold"]), len(data["engines"][0]["carried"]["hold 0.5"]))
 
 
 class Engines(unittest.TestCase):
     """A reduced comparison in the other engines."""
 
-    def check(self, name: str) -> None:
-        if backend_status(name).reason is not None:
-            self.skipTest(f"{name} cannot be used here")
+    def test_they_agree_with_mujoco(self):
         robot, can = robots.load("ur7e-sharpa"), load_object("soup")
+        tested = [engine(name, workers=0) for name in ("pybullet", "sapien") if backend_status(name).reason is None]
         motion = grasps_of(robot, can, FREE_OFFSETS, gap=FREE_GAP)
-        tested, reference = engine(name, workers=0), engine("mujoco", workers=0)
-        result = compare(robot, [can], motion, [tested], grasps=3, tries=BRISK, reference=reference)
-        metrics = {metric.metric: metric for metric in result.engines[0].metrics}
-        for metric in ("press, total", "press, fingertip", "closing, outcome"):  # a few holds near the edge say little
-            with self.subTest(metric):
-                self.assertTrue(metrics[metric].ok, metrics[metric])
-
-    def test_pybullet(self):
-        self.check("pybullet")
-
-    def test_sapien(self):
-        self.check("sapien")
+        reference = engine("mujoco", workers=0)
+        result = compare(robot, [can], motion, tested, grasps=3, tries=BRISK, reference=reference)
+        for found in result.engines:
+            metrics = {metric.metric: metric for metric in found.metrics}
+            for name in ("press, total", "press, fingertip", "closing, outcome"):  # few holds near the edge say little
+                with self.subTest(name, engine=found.engine.name):
+                    self.assertTrue(metrics[name].ok, metrics[name])
 
 
 class Command(unittest.TestCase):
@@ -443,7 +386,7 @@ class Command(unittest.TestCase):
         path, out = self.retargeted(), self.folder / "parity.json"
         good, bad = (
             engine("mujoco", workers=0),
-            altered(engine("mujoco", workers=0), "pybullet", robot=lambda r: with_drives(r, 0.3)),
+            toy_grasp.with_scene(engine("mujoco", workers=0), "pybullet", lambda scene: weak(scene, 0.3)),
         )
         for made, code in ((replace(good, name="pybullet"), 0), (bad, 1)):
             with (

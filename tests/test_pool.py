@@ -31,7 +31,6 @@ from xreset.spec import (
     RobotSpec,
     SceneSpec,
     Shape,
-    lowest_point,
 )
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -153,11 +152,6 @@ class PoolTest(unittest.TestCase):
                 pool.set_state(random_state(5, 0))
                 yield pool
 
-    def test_starts_at_home_with_the_object_on_the_table(self):
-        with ToyBackend(toy_scene(), 3, workers=0) as pool:
-            torch.testing.assert_close(pool.state().joint_pos, torch.tensor([[0.1, 0.2]]).expand(3, 2))
-            torch.testing.assert_close(pool.state().object_pos[:, 2], torch.tensor([0.1, 0.2, 0.1]))
-
     def test_state_round_trip_and_subset(self):
         for pool in self.each():
             expected = random_state(5, 0)
@@ -189,15 +183,6 @@ class PoolTest(unittest.TestCase):
             self.assertEqual(pool.contacts().tip_touch.tolist(), [[True, False]] * 5)
             pool.set_state(random_state(1, 2), torch.tensor([3]))
             self.assertEqual(pool.contacts().table_force[:, 2].tolist(), [-3.0, -3.0, -3.0, 0.0, -3.0])
-
-    def test_setting_a_state_ends_the_wrench(self):
-        for pool in self.each():
-            pool.set_object_wrench(torch.ones(5, 3), torch.zeros(5, 3))
-            pool.set_state(random_state(1, 2), torch.tensor([0]))
-            before = pool.state().object_linvel.clone()
-            pool.step(1)
-            change = (pool.state().object_linvel - before)[:, 0]
-            torch.testing.assert_close(change, torch.tensor([0.0, 0.5, 1.0, 0.5, 1.0]))
 
     def test_mass_of_some_worlds(self):
         for pool in self.each():
@@ -352,31 +337,6 @@ class DeathTest(unittest.TestCase):
             self.assertRaisesRegex(XResetError, "Move it to a module, or pass workers=0"),
         ):
             ToyBackend(toy_scene(), 2, workers=1)
-
-
-class RestHeightTest(unittest.TestCase):
-    def test_lowest_points(self):
-        from scipy.spatial.transform import Rotation
-
-        T = np.eye(4)
-        T[:3, :3] = Rotation.from_euler("xyz", [0.4, -0.7, 1.1]).as_matrix()
-        T[:3, 3] = (0.3, -0.2, 0.5)
-        angles = np.linspace(0, 2 * np.pi, 2001)
-        rim = np.stack([0.2 * np.cos(angles), 0.2 * np.sin(angles), np.zeros_like(angles)], axis=1)
-        cylinder = np.concatenate([rim + np.array([0, 0, 0.3]), rim - np.array([0, 0, 0.3])])
-        corners = np.array(list(product((-0.1, 0.1), (-0.2, 0.2), (-0.3, 0.3))))
-        cases = [
-            (Geometry(kind="box", size=(0.1, 0.2, 0.3)), corners, 0.0),
-            (Geometry(kind="cylinder", size=(0.2, 0.3)), cylinder, 0.0),
-            (Geometry(kind="capsule", size=(0.2, 0.3)), np.array([[0, 0, 0.3], [0, 0, -0.3]]), 0.2),
-            (Geometry(kind="sphere", size=(0.25,)), np.zeros((1, 3)), 0.25),
-            (Geometry(kind="hull", vertices=corners, faces=np.zeros((1, 3), dtype=int)), corners, 0.0),
-        ]
-        for geometry, points, margin in cases:
-            expected = (points @ T[:3, :3].T + T[:3, 3])[:, 2].min() - margin
-            self.assertAlmostEqual(
-                lowest_point([Shape(geometry=geometry, T_body_shape=T)]), expected, places=5, msg=geometry.kind
-            )
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ import torch
 
 from tests import toy_grasp
 from tests.command import xreset
-from tests.data import data_dir
 from tests.toy_bank import SOUP, SPAM
 from tests.toy_grasp import recording
 from xreset.errors import DemoError, FileFormatError, XResetError
@@ -320,32 +319,6 @@ class CommandTest(unittest.TestCase):
                 code, _, err = xreset("engines", "trace", *arguments)
                 self.assertEqual(code, 1)
                 self.assertIn(message, err)
-
-
-class RealGraspTest(unittest.TestCase):
-    """The open-loop grasp and lift of a demonstrated grasp, from the file to the pictures."""
-
-    def test_a_demonstrated_grasp_is_lifted(self):
-        from xreset import robots
-        from xreset.demos.archive import read_demos
-        from xreset.eval.engines.actions import grasp_and_lift
-        from xreset.eval.engines.grasps import find_grasps
-        from xreset.objects.catalogue import load_objects
-        from xreset.retarget.pipeline import retarget_demos
-
-        folder = data_dir()
-        robot = robots.load("ur7e-sharpa")
-        (can,) = load_objects(["005_tomato_soup_can"], folder / "ycb")
-        demos = read_demos(folder / "dexycb_right_9x20.npz")
-        first = int(np.flatnonzero(np.asarray(demos.object_name) == can.name)[0])
-        data = retarget_demos(demos.select(indices=[first]), robot, [can])
-        actions = grasp_and_lift(robot, can, find_grasps(data, robot, (can,), 1, where="table"))
-        result = trace(actions, engine("mujoco", workers=0), [engine("sapien", workers=0)])
-        self.assertGreater(result.reference.lifted or 0.0, 0.07)
-        self.assertGreater(result.engines[0].lifted or 0.0, 0.07)
-        self.assertEqual(actions.phase_at(1.5), "lift")
-        position = next(p for p in result.engines[0].divergences if p.quantity == "object position")
-        self.assertLess(position.largest, 0.01)
 
 
 if __name__ == "__main__":

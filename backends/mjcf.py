@@ -20,10 +20,10 @@ import numpy as np
 
 from xreset.backends.mjcf_model import (
     MIN_FRICTION,
+    OBJECT,
     SceneModel,
     add_sensors,
     body_name,
-    locate,
     pos_quat,
 )
 from xreset.backends.rigid import OTHER_LINK, TABLE, Inertia, Mechanism, MovingJoints, mechanism, object_inertia
@@ -122,8 +122,28 @@ def compile_scene(
         ) from error
     _let_com_move(model, model.body("object").id)
     model.body_gravcomp[model.body("object").id] = 0.0
-    joint_ids = np.array([model.joint(name).id for name in names])
-    return locate(scene, robot, joints, model, joint_ids, roles, parked, sensed)
+    geoms = [model.geom(i).name for i in range(model.ngeom)]
+    bodies = [model.body(body_name(body)).id for body in robot.bodies]
+    tracked = [robot.frames[link] for link in scene.robot.tracked_links]
+    joint_ids = [model.joint(name).id for name in names]
+    free = model.joint("object").id
+    return SceneModel(
+        scene=scene,
+        model=model,
+        joints=joints,
+        qpos=model.jnt_qposadr[joint_ids].astype(np.int64),
+        dof=model.jnt_dofadr[joint_ids].astype(np.int64),
+        link_body=np.array([bodies[i] for i, _ in tracked]),
+        link_pos=np.array([T[:3, 3] for _, T in tracked]),
+        link_quat=np.array([pos_quat(T)[1] for _, T in tracked]),
+        moving_bodies=np.array(bodies[1:]),
+        object_body=model.body("object").id,
+        object_qpos=int(model.jnt_qposadr[free]),
+        object_dof=int(model.jnt_dofadr[free]),
+        geom_role=np.array([roles.get(name, OBJECT) for name in geoms]),
+        parked=np.array([name in parked for name in geoms]),
+        sensed_tip=np.array(sensed, dtype=np.int64),
+    )
 
 
 # Options --------------------------------------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import mujoco
@@ -102,51 +101,3 @@ def add_sensors(spec: mujoco.MjSpec, robot: Mechanism, roles: dict[str, int]) ->
             intprm=_NET_FORCE,
         )
     return list(tips.values())
-
-
-def locate(
-    scene: SceneSpec,
-    robot: Mechanism,
-    joints: MovingJoints,
-    model: mujoco.MjModel,
-    joint_ids: np.ndarray,
-    roles: dict[str, int],
-    parked: set[str],
-    sensed: list[int],
-) -> SceneModel:
-    """Find the parts of a scene in its model.
-
-    Args:
-        scene: what the model was compiled from.
-        robot: its robot.
-        joints: its moving joints.
-        model: the compiled model.
-        joint_ids: [J + Q] number of each moving joint in the model.
-        roles: geom -> role.
-        parked: geoms that are parked.
-        sensed: fingertip of each geom that has a contact sensor.
-    """
-    geoms = [model.geom(i).name for i in range(model.ngeom)]
-    bodies, frames = zip(*(robot.frames[link] for link in robot.robot.tracked_links), strict=True)
-
-    def ids(bodies: Iterable[Body]) -> np.ndarray:
-        return np.array([model.body(body_name(body)).id for body in bodies], dtype=np.int64)
-
-    free = model.joint("object").id
-    return SceneModel(
-        scene=scene,
-        model=model,
-        joints=joints,
-        qpos=model.jnt_qposadr[joint_ids].astype(np.int64),
-        dof=model.jnt_dofadr[joint_ids].astype(np.int64),
-        link_body=ids(robot.bodies[body] for body in bodies),
-        link_pos=np.array([T[:3, 3] for T in frames]),
-        link_quat=np.array([pos_quat(T)[1] for T in frames]),
-        moving_bodies=ids(robot.bodies[1:]),
-        object_body=model.body("object").id,
-        object_qpos=int(model.jnt_qposadr[free]),
-        object_dof=int(model.jnt_dofadr[free]),
-        geom_role=np.array([roles.get(name, OBJECT) for name in geoms], dtype=np.int64),
-        parked=np.array([name in parked for name in geoms]),
-        sensed_tip=np.array(sensed, dtype=np.int64),
-    )

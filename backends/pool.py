@@ -187,7 +187,7 @@ class PoolBackend(Backend):
             workers = 0 if num_worlds == 1 else usable_cores()
         if workers < 0:
             raise ValueError(f"workers is {workers}, expected 0 or more")
-        layout = layout_of(num_worlds, scene.robot)
+        layout = layout_of(scene, self.object_index)
         jobs = []
         for worlds in np.array_split(np.arange(num_worlds), max(min(workers, num_worlds), 1)):
             held = tuple(self.object_index[worlds].tolist())

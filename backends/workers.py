@@ -23,11 +23,12 @@ from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from torch import Tensor
 
 from xreset.backends.rigid import object_inertia
 from xreset.errors import XResetError
-from xreset.physics import Contacts, Parameter, State
-from xreset.spec import RobotSpec, SceneSpec
+from xreset.physics import Contacts, Parameter, Parameters, State
+from xreset.spec import SceneSpec
 
 if TYPE_CHECKING:
     from xreset.backends.pool import World
@@ -39,41 +40,30 @@ LINK_FIELDS = ("link_pos", "link_quat", "link_linvel", "link_angvel")
 CONTACT_FIELDS = tuple(field.name for field in fields(Contacts))
 
 
-def layout_of(n: int, robot: RobotSpec) -> np.dtype:
-    """Return the shared arrays of n worlds as the fields of one record.
+def layout_of(scene: SceneSpec, object_index: Tensor) -> np.dtype:
+    """Return the shared arrays of worlds with these objects [N] as the fields of one record.
 
     The state is both what a world is set to and what it reports.
     """
-    joints = len(robot.joints)
+    robot = scene.robot
     tips = len(robot.fingertips)
     links = 1 + tips
-    bodies = joints + len(robot.mimics) + 1
+    bodies = len(robot.joints) + len(robot.mimics) + 1
     shapes = {
-        "joint_pos": (joints,),
-        "joint_vel": (joints,),
-        "joint_target": (joints,),
-        "object_pos": (3,),
-        "object_quat": (4,),
-        "object_linvel": (3,),
-        "object_angvel": (3,),
         "link_pos": (links, 3),
         "link_quat": (links, 4),
         "link_linvel": (links, 3),
         "link_angvel": (links, 3),
         "tip_force": (tips, 3),
         "table_force": (3,),
-        "friction": (3,),
-        "torsional_friction": (),
-        "object_mass": (),
-        "object_inertia": (),
-        "object_com": (3,),
-        "object_gravity": (),
-        "drives": (3, joints),
         "wrench": (6,),
         "body_mass": (bodies,),
         "body_com": (bodies, 3),
         "body_inertia": (bodies, 3, 3),
     }
+    for bundle in (State.initial(scene, object_index), Parameters.nominal(scene, object_index)):
+        shapes |= {name: tuple(value.shape[1:]) for name, value in vars(bundle).items()}
+    n = len(object_index)
     flags = {"tip_touch": (tips,), "nonfinite": (), "overflow": ()}
     numbers = [(name, np.float32, (n, *shape)) for name, shape in shapes.items()]
     return np.dtype(numbers + [(name, np.bool_, (n, *shape)) for name, shape in flags.items()])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields
 from functools import partial
 from itertools import chain
 from typing import Any, ClassVar, get_args
@@ -12,9 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.capture import GraphRunner
 from xreset.errors import XResetError
-from xreset.geometry.rotations import quat_multiply, quat_rotate, quat_rotate_inverse, quat_to_matrix
+from xreset.geometry.rotations import quat_to_matrix
 from xreset.physics import (
     Backend,
     Capability,
@@ -29,7 +28,6 @@ from xreset.physics import (
     unavailable,
 )
 from xreset.spec import SceneSpec
-from xreset.tensors import where
 
 try:
     import mujoco_warp as mjw
@@ -51,6 +49,7 @@ from xreset.backends.mujoco_warp_setup import (
 )
 from xreset.torch_warp import TorchStream, quiet
 
+_DRIVE_FIELDS = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange")
 _SET_PER_WORLD = (
     "body_mass",
     "body_inertia",
@@ -59,14 +58,15 @@ _SET_PER_WORLD = (
     "body_invweight0",
     "body_gravcomp",
     "geom_friction",
-    "actuator_gainprm",
-    "actuator_biasprm",
-    "actuator_forcerange",
+    *_DRIVE_FIELDS,
 )
 """Model fields that the setters change.
 
 They, and all that MuJoCo derives from them, must be batched, or every world gets the values of world 0.
 """
+
+_VECTORS = {"friction": wp.vec3, "object_com": wp.vec3, "inertia": wp.vec3, "com": wp.vec3, "invweight": wp.vec2}
+"""Types of the parameters and nominal values that are no plain numbers, for Warp."""
 
 _SOLVER_ITERATIONS = 8
 """Most Newton iterations; worlds that have converged stop earlier, but a step waits for the slowest. With 8 the
@@ -152,10 +152,12 @@ class MujocoWarpBackend(Backend):
     def set_state(self, state: State, worlds: Tensor | None = None) -> None:
         self._must_be_open()
         index = self._selected(worlds)
-        self._coming[index] = self._checked_state(state, len(index))
+        for name, value in self._checked_state(state, len(index)).items():
+            self._coming[name][index] = value
         self._mask.zero_()
         self._mask[index] = True
-        self._begin()
+        with self._on_stream():
+            self._run("begin")
 
     def state(self) -> State:
         self._must_be_open()
@@ -163,8 +165,7 @@ class MujocoWarpBackend(Backend):
 
     def set_joint_targets(self, targets: Tensor) -> None:
         self._must_be_open()
-        present = self._state.joint_target
-        present.copy_(self._checked("joint_target", targets, present.shape))
+        self._ctrl.copy_(self._checked("joint_target", targets, self._ctrl.shape))
 
     def step(self, substeps: int | None = None) -> None:
         self._must_be_open()
@@ -173,7 +174,6 @@ class MujocoWarpBackend(Backend):
             for _ in range(substeps):
                 self._run("step")
             self._run("read")
-        self._captured.run(self._read_motion)
 
     # Readings ---------------------------------------------------------------------------------------------------------
 
@@ -187,16 +187,19 @@ class MujocoWarpBackend(Backend):
 
     def health(self) -> Health:
         self._must_be_open()
-        return Health(nonfinite=self._nonfinite, overflow=(self._array["overflow"] & _OVERFLOW) != 0)
+        return Health(nonfinite=self._nonfinite, overflow=(self._overflow & _OVERFLOW) != 0)
 
     def set_where(self, mask: Tensor, state: State, parameters: Parameters) -> None:
         self._must_be_open()
+        self._mask.copy_(mask)
         for name, value in parameters.given().items():
             present = self._parameters[name]
-            present.copy_(where(mask, self._checked(name, value, present.shape), present))
-        self._coming.map(Tensor.copy_, self._checked_state(state, self.num_worlds))
-        self._mask.copy_(mask)
-        self._begin()
+            mine = self._mask.view(-1, *[1] * (present.ndim - 1))
+            torch.where(mine, self._checked(name, value, present.shape), present, out=present)
+        for name, value in self._checked_state(state, self.num_worlds).items():
+            self._coming[name].copy_(value)
+        with self._on_stream():
+            self._run("begin")
 
     def mass_properties(self) -> MassProperties:
         self._must_be_open()
@@ -219,12 +222,14 @@ class MujocoWarpBackend(Backend):
         present = self._parameters[name]
         present[index] = self._checked(name, value, (len(index), *present.shape[1:]))
         self._mask.zero_()
-        self._begin()
+        self._mask[index] = True
+        with self._on_stream():
+            self._run("parameters")
 
     def set_object_wrench(self, force: Tensor, torque: Tensor) -> None:
         self._must_be_open()
         wrench = torch.cat((torch.as_tensor(force), torch.as_tensor(torque)), dim=-1)
-        self._wrench.copy_(self._checked("wrench", wrench, (self.num_worlds, 6)))
+        self._xfrc_applied[:, self._at.object_body] = self._checked("wrench", wrench, (self.num_worlds, 6))
 
     def close(self) -> None:
         """Free the worlds' memory once nobody else holds a view of it."""
@@ -234,49 +239,57 @@ class MujocoWarpBackend(Backend):
     # Building ---------------------------------------------------------------------------------------------------------
 
     def _allocate(self) -> None:
-        """Allocate the tensors that the worlds are read into, and view the engine's arrays."""
+        """Allocate the arrays that the worlds are read into, and name the arrays that setters write to."""
         n = self.num_worlds
+        robot = self.scene.robot
         at = self._at
+
+        def ints(values: np.ndarray) -> Any:
+            return wp.array(values.astype(np.int32), dtype=int)
+
+        self._out = kernels.outputs(n, len(robot.joints), len(robot.fingertips))
         joints = at.joints
-        tips = len(self.scene.robot.fingertips)
+        self._addresses = [ints(at.qpos[joints.driven]), ints(at.dof[joints.driven])]
+        self._mimic = [ints(at.qpos[joints.mimic]), ints(at.dof[joints.mimic]), ints(joints.source)]
+        self._mimic += [wp.array(joints.multiplier, dtype=float), wp.array(joints.offset, dtype=float)]
+        self._link_arrays = [
+            ints(at.link_body),
+            wp.array(at.link_pos, dtype=wp.vec3),
+            wp.array(at.link_quat, dtype=wp.quat),
+        ]
+        self._geom_role = ints(at.geom_role)
+        self._friction_columns = ints(at.friction_column)
 
-        def on_device(values: np.ndarray) -> Tensor:
-            return torch.as_tensor(values, device=self.device)
-
-        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-            return torch.zeros(shape, dtype=dtype, device=self.device)
-
-        self._object_qpos = slice(at.object_qpos, at.object_qpos + 7)
-        self._object_dof = slice(at.object_dof, at.object_dof + 6)
-        self._geom_role = wp.array(at.geom_role.astype(np.int32), dtype=int)
-        self._qpos_address = on_device(at.qpos)
-        self._dof_address = on_device(at.dof)
-        self._mimic_source = on_device(joints.source)
-        self._mimic_multiplier = on_device(joints.multiplier).float()
-        self._mimic_offset = on_device(joints.offset).float()
-        self._friction_column = on_device(at.friction_column)
-        self._link_body = on_device(at.link_body)
-        self._link_root = on_device(at.model.body_rootid[at.link_body]).long()
-        self._link_pos = on_device(at.link_pos).float()
-        self._link_quat = on_device(at.link_quat).float()
-
-        names = ("qpos", "qvel", "ctrl", "qacc_warmstart", "overflow", "xpos", "xquat", "cvel", "subtree_com")
-        self._array = {name: wp.to_torch(getattr(self._data, name)) for name in names}
-        self._wrench = wp.to_torch(self._data.xfrc_applied)[:, at.object_body]
-        self._coming = State.initial(self.scene, self.object_index).to(self.device).clone()
-        self._state = replace(self._coming.clone(), joint_target=self._array["ctrl"])
-        links = (n, 1 + tips)
-        self._links = Links(
-            pos=zeros(*links, 3), quat=zeros(*links, 4), linvel=zeros(*links, 3), angvel=zeros(*links, 3)
-        )
-        touch = zeros(n, tips, dtype=torch.bool)
-        self._contacts = Contacts(tip_force=zeros(n, tips, 3), tip_touch=touch, table_force=zeros(n, 3))
-        self._nonfinite = zeros(n, dtype=torch.bool)
-        self._mask = zeros(n, dtype=torch.bool)
-        self._captured = GraphRunner(self.device)
+        self._ctrl = wp.to_torch(self._data.ctrl)
+        self._xfrc_applied = wp.to_torch(self._data.xfrc_applied)
+        self._overflow = wp.to_torch(self._data.overflow)
+        view = {name: wp.to_torch(array) for name, array in self._out.items()}
+        view["joint_target"] = self._ctrl
+        self._nonfinite = view["nonfinite"]
+        self._state = State(**{field.name: view[field.name] for field in fields(State)})
+        self._links = Links(**{field.name: view[f"link_{field.name}"] for field in fields(Links)})
+        self._contacts = Contacts(**{field.name: view[field.name] for field in fields(Contacts)})
         self._every_world = torch.arange(n, device=self.device)
-        self._model_field = {name: wp.to_torch(getattr(self._model, name)) for name in _SET_PER_WORLD}
-        self._nominal = {name: value.clone() for name, value in self._model_field.items()}
+        self._mask = torch.zeros(n, dtype=torch.bool, device=self.device)
+        self._coming = {field.name: torch.zeros_like(view[field.name]) for field in fields(State)}
+        self._name_parameters()
+
+    def _name_parameters(self) -> None:
+        """Name the values that the parameters of the worlds start from, and the present values."""
+        body = self._at.object_body
+        field = {name: wp.to_torch(getattr(self._model, name)) for name in _SET_PER_WORLD}
+        self._drive_fields = [wp.from_torch(field[name]) for name in _DRIVE_FIELDS]
+        gain, bias, force_range = (field[name][0] for name in _DRIVE_FIELDS)
+        nominal = {
+            "mass": field["body_mass"][:, body],
+            "inertia": field["body_inertia"][:, body],
+            "com": field["body_ipos"][:, body],
+            "total": field["body_subtreemass"][:, 0],
+            "invweight": field["body_invweight0"][:, body],
+            # stiffness, damping, effort limit, and the followers' offsets times the stiffness
+            "drive": torch.stack((gain[:, 0], -bias[:, 2], force_range[:, 1], bias[:, 0]), dim=1),
+        }
+        self._nominal = {name: value.clone() for name, value in nominal.items()}
         self._parameters = Parameters.nominal(self.scene, self.object_index).to(self.device).given()
         """The present values of each world."""
 
@@ -289,11 +302,11 @@ class MujocoWarpBackend(Backend):
         # The kinematics of the present positions are always there: a step begins after them, and all that changes them
         # ends with them.
         kinematics = partial(mjw.fwd_kinematics, self._model, self._data)
-        velocities = partial(mjw.com_vel, self._model, self._data)
         sequences: dict[str, tuple[Callable[[], None], ...]] = {
             "step": (step, kinematics),
-            "read": (self._read_contacts, velocities),
-            "begin": (kinematics, velocities),
+            "read": (self._read_contacts, self._read_motion),
+            "begin": (self._write_state, self._write_parameters, kinematics, self._read_motion),
+            "parameters": (self._write_parameters, kinematics),
         }
         for part in chain.from_iterable(sequences.values()):
             part()
@@ -309,16 +322,14 @@ class MujocoWarpBackend(Backend):
                 self._graphs[name] = capture.graph
         wp.synchronize_device(self._warp_device)
 
-    # Reading and writing ----------------------------------------------------------------------------------------------
+    # What the graphs hold ---------------------------------------------------------------------------------------------
 
     def _read_contacts(self) -> None:
         """Read the forces of the last step's contacts; their arrays stay until the next step."""
         d = self._data
-        outputs = []
-        for name, dtype in (("tip_force", wp.vec3), ("tip_touch", None), ("table_force", wp.vec3)):
-            array = wp.from_torch(getattr(self._contacts, name), dtype=dtype)
+        outputs = [self._out[name] for name in ("tip_force", "tip_touch", "table_force")]
+        for array in outputs:
             array.zero_()
-            outputs.append(array)
         contact = d.contact
         found = [d.nacon, d.naconmax, d.njmax, contact.worldid, contact.geom, contact.frame, contact.efc_address]
         wp.launch(
@@ -330,97 +341,82 @@ class MujocoWarpBackend(Backend):
 
     def _read_motion(self) -> None:
         """Translate positions and velocities of joints, object and links."""
-        array = self._array
-        driven = len(self.scene.robot.joints)
-        qpos = array["qpos"]
-        qvel = array["qvel"]
-        pos, quat = qpos[:, self._object_qpos].split((3, 4), dim=1)
-        linvel, spin = qvel[:, self._object_dof].split((3, 3), dim=1)
-        state = State(
-            joint_pos=qpos[:, self._qpos_address[:driven]],
-            joint_vel=qvel[:, self._dof_address[:driven]],
-            joint_target=array["ctrl"],
-            object_pos=pos,
-            object_quat=quat,
-            object_linvel=linvel,
-            object_angvel=quat_rotate(quat, spin),
+        m = self._model
+        d = self._data
+        out = self._out
+        mjw.com_vel(m, d)
+        state = ("joint_pos", "joint_vel", "object_pos", "object_quat", "object_linvel", "object_angvel", "nonfinite")
+        wp.launch(
+            kernels.read_state,
+            dim=self.num_worlds,
+            inputs=[*self._addresses, self._at.object_qpos, self._at.object_dof, d.qpos, d.qvel],
+            outputs=[out[name] for name in state],
         )
-        self._state.map(Tensor.copy_, state)
-        self._nonfinite |= ~(qpos.isfinite().all(dim=1) & qvel.isfinite().all(dim=1))
-
-        turn = array["xquat"][:, self._link_body]
-        point = array["xpos"][:, self._link_body] + quat_rotate(turn, self._link_pos)
-        omega, velocity = array["cvel"][:, self._link_body].split((3, 3), dim=-1)
-        arm = point - array["subtree_com"][:, self._link_root]  # velocities refer to the centre of mass of the tree
-        links = Links(
-            pos=point,
-            quat=quat_multiply(turn, self._link_quat.expand_as(turn)),
-            linvel=velocity + torch.linalg.cross(omega, arm),
-            angvel=omega,
+        wp.launch(
+            kernels.read_links,
+            dim=out["link_pos"].shape,
+            inputs=[*self._link_arrays, m.body_rootid, d.xpos, d.xquat, d.cvel, d.subtree_com],
+            outputs=[out[name] for name in ("link_pos", "link_quat", "link_linvel", "link_angvel")],
         )
-        self._links.map(Tensor.copy_, links)
-
-    def _begin(self) -> None:
-        """Write the coming state of the worlds of the mask and the parameters of all, and read the worlds."""
-        self._captured.run(self._write)
-        with self._on_stream():
-            self._run("begin")
-        self._captured.run(self._read_motion)
-
-    def _write(self) -> None:
-        self._write_state()
-        self._write_parameters()
-
-    def _write_state(self) -> None:
-        """Write the coming state of the worlds of the mask, and clear what remains of their past."""
-        state = self._coming
-        driven = len(self.scene.robot.joints)
-        source = self._mimic_source
-        multiplier = self._mimic_multiplier
-        quat = state.object_quat / state.object_quat.norm(dim=1, keepdim=True)
-        qpos = torch.empty_like(self._array["qpos"])
-        qpos[:, self._qpos_address[:driven]] = state.joint_pos
-        qpos[:, self._qpos_address[driven:]] = multiplier * state.joint_pos[:, source] + self._mimic_offset
-        qpos[:, self._object_qpos] = torch.cat((state.object_pos, quat), dim=1)
-        qvel = torch.empty_like(self._array["qvel"])
-        qvel[:, self._dof_address[:driven]] = state.joint_vel
-        qvel[:, self._dof_address[driven:]] = multiplier * state.joint_vel[:, source]
-        spin = quat_rotate_inverse(quat, state.object_angvel)  # of a free joint: in the body's frame
-        qvel[:, self._object_dof] = torch.cat((state.object_linvel, spin), dim=1)
-        for name, new in (("qpos", qpos), ("qvel", qvel), ("ctrl", state.joint_target)):
-            present = self._array[name]
-            present.copy_(where(self._mask, new, present))
-        array = self._array
-        contacts = vars(self._contacts).values()
-        for past in (array["qacc_warmstart"], self._wrench, array["overflow"], self._nonfinite, *contacts):
-            past.masked_fill_(self._mask.view(-1, *[1] * (past.ndim - 1)), 0)
 
     def _write_parameters(self) -> None:
-        """Write the present parameters of all worlds into the engine's model, and all that MuJoCo derives from them."""
-        body = self._at.object_body
-        field = self._model_field
-        nominal = self._nominal
-        present = self._parameters
-        mass = present["object_mass"]
-        nominal_mass = nominal["body_mass"][:, body]
-        ratio = mass / nominal_mass
-        turning = ratio * present["object_inertia"]
-        field["body_mass"][:, body] = mass
-        field["body_inertia"][:, body] = nominal["body_inertia"][:, body] * turning[:, None]
-        field["body_ipos"][:, body] = nominal["body_ipos"][:, body] + present["object_com"]
-        field["body_subtreemass"][:, body] = mass
-        field["body_subtreemass"][:, 0] = nominal["body_subtreemass"][:, 0] + mass - nominal_mass
-        weight = nominal["body_invweight0"][:, body]  # of a free body: the inverse of mass and inertia
-        field["body_invweight0"][:, body] = weight / torch.stack((ratio, turning), dim=1)
-        field["body_gravcomp"][:, body] = 1.0 - present["object_gravity"]
-        pairs = torch.nn.functional.pad(present["friction"], (0, 1)).clamp_min(MIN_FRICTION)
-        field["geom_friction"][..., 0] = pairs[:, self._friction_column]
-        field["geom_friction"][..., 1] = present["torsional_friction"][:, None]
-        stiffness, damping, effort = present["drives"][..., None].unbind(1)
-        field["actuator_gainprm"][..., :1] = stiffness * nominal["actuator_gainprm"][..., :1]
-        field["actuator_biasprm"][..., :2] = stiffness * nominal["actuator_biasprm"][..., :2]
-        field["actuator_biasprm"][..., 2:3] = damping * nominal["actuator_biasprm"][..., 2:3]
-        field["actuator_forcerange"][:] = effort * nominal["actuator_forcerange"]
+        """Write the parameters of the worlds of the mask into the engine's model."""
+        m = self._model
+        values = {name: self._parameters[name] for name in get_args(Parameter)} | self._nominal
+        arrays = [wp.from_torch(value, dtype=_VECTORS.get(name)) for name, value in values.items()]
+        wp.launch(
+            kernels.write_parameters,
+            dim=self.num_worlds,
+            inputs=[
+                wp.from_torch(self._mask),
+                *arrays,
+                self._friction_columns,
+                MIN_FRICTION,
+                self._at.object_body,
+            ],
+            outputs=[
+                m.body_mass,
+                m.body_inertia,
+                m.body_ipos,
+                m.body_subtreemass,
+                m.body_invweight0,
+                m.body_gravcomp,
+                m.geom_friction,
+                *self._drive_fields,
+            ],
+        )
+
+    def _write_state(self) -> None:
+        """Write the coming state of the worlds of the mask."""
+        d = self._data
+        out = self._out
+        at = self._at
+        values = []
+        for name, value in self._coming.items():
+            vector = {"object_quat": wp.quat}.get(name, wp.vec3) if name.startswith("object") else None
+            values.append(wp.from_torch(value, dtype=vector))
+        wp.launch(
+            kernels.write_state,
+            dim=self.num_worlds,
+            inputs=[
+                wp.from_torch(self._mask),
+                *values,
+                *self._addresses,
+                *self._mimic,
+                at.object_qpos,
+                at.object_dof,
+                at.object_body,
+            ],
+            outputs=[
+                d.qpos,
+                d.qvel,
+                d.ctrl,
+                d.qacc_warmstart,
+                d.xfrc_applied,
+                d.overflow,
+                *(out[name] for name in ("nonfinite", "tip_force", "tip_touch", "table_force")),
+            ],
+        )
 
     def _run(self, name: str) -> None:
         wp.capture_launch(self._graphs[name])
@@ -432,11 +428,11 @@ class MujocoWarpBackend(Backend):
             return self._every_world
         return torch.as_tensor(worlds, dtype=torch.int64, device=self.device)
 
-    def _checked_state(self, state: State, rows: int) -> State:
+    def _checked_state(self, state: State, rows: int) -> dict[str, Tensor]:
         checked = {}
-        for name, present in vars(self._state).items():
+        for name, present in self._coming.items():
             checked[name] = self._checked(name, getattr(state, name), (rows, *present.shape[1:]))
-        return State(**checked)
+        return checked
 
     def _must_be_open(self) -> None:
         if self._data is None:

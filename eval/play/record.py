@@ -34,7 +34,9 @@ def write_trace(path: str | Path, session: Session) -> None:
         XResetError: nothing has happened yet.
     """
     moments = last_moments(session, None)
-    arrays = {f.name: np.array([getattr(moment, f.name) for moment in moments]) for f in fields(Moment)}
+    arrays = {}
+    for each in fields(Moment):
+        arrays[each.name] = np.array([getattr(moment, each.name) for moment in moments])
     goal_pos = arrays.pop("goal_pos")
     goal_quat = arrays.pop("goal_quat")
     states = {name: arrays.pop(name) for name in ("time", "joint_pos", "object_pos", "object_quat")}

@@ -6,6 +6,7 @@ import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
+from itertools import chain, starmap
 from math import inf
 from pathlib import Path
 from typing import Annotated, Any
@@ -37,8 +38,8 @@ def _is_setting(name: str, value: Any) -> bool:
 
 def _is_optimizer(values: dict[str, Any]) -> bool:
     try:
-        settings = [item for group in values["param_groups"] for item in group.items()]
-        return all(map(_are_tensors, values["state"].values())) and all(_is_setting(*item) for item in settings)
+        settings = chain.from_iterable(group.items() for group in values["param_groups"])
+        return all(map(_are_tensors, values["state"].values())) and all(starmap(_is_setting, settings))
     except (KeyError, TypeError, ValueError, AttributeError, RuntimeError):
         return False
 

@@ -81,8 +81,9 @@ def _check_sizes(path: Path, root: ElementTree.Element) -> None:
     """Raise ``RobotError`` for a small file that takes much memory when MuJoCo reads it."""
 
     def product(element: ElementTree.Element, names: Iterable[str]) -> float:
+        numbers = " ".join(element.get(name, "1") for name in names).split()
         try:
-            return math.prod(float(number) for name in names for number in element.get(name, "1").split())
+            return math.prod(map(float, numbers))
         except ValueError:
             return 1.0  # MuJoCo says what is wrong
 

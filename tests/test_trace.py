@@ -254,10 +254,10 @@ class EvaluationTest(unittest.TestCase):
         )
         trial = toy_grasp.trial(task, num_envs=1)
         mujoco = engine("mujoco", workers=0)
-        cls.rollouts = roll_out(toy_grasp.OpenLoop(), mujoco, trial, repetitions=1, only=np.array([1]))
+        cls.episode = roll_out(toy_grasp.OpenLoop(), mujoco, trial, repetitions=1).traces[1]
 
     def test_a_replay_in_the_same_engine_is_the_episode(self):
-        (episode,) = self.rollouts.traces
+        episode = self.episode
         actions = recorded_actions(toy_grasp.robot(), toy_grasp.brick(), episode, label="episode")
         self.assertEqual(len(actions.joint_target), 42)
         replayed = trace(actions, engine("mujoco", workers=0), []).reference.recording
@@ -268,7 +268,7 @@ class EvaluationTest(unittest.TestCase):
         np.testing.assert_allclose(replayed.joint_pos[every - 1 :: every, 0].numpy(), episode.joint_pos[1:], atol=1e-6)
 
     def test_the_control_rate_is_that_of_the_episode(self):
-        (episode,) = self.rollouts.traces
+        episode = self.episode
         slower = replace(episode, time=2 * episode.time)
         self.assertEqual(recorded_actions(toy_grasp.robot(), toy_grasp.brick(), slower, label="").scene.substeps, 8)
         odd = replace(episode, time=0.9 * episode.time)

@@ -1,4 +1,4 @@
-"""``xreset demos``: import, synth, select, split, merge, mirror, info."""
+"""``xreset demos``: import, synth, select, split, merge, mirror, noise, info."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rich.table import Table
 from xreset.checks import Options
 from xreset.cli._common import Flat, Source, Sources
 from xreset.cli._terminal import Console, Progress
-from xreset.demos import archive, dexycb, ho3d, keypoints, mirror, plausible, synth
+from xreset.demos import archive, dexycb, ho3d, keypoints, mirror, noise, plausible, synth
 from xreset.errors import DemoError
 from xreset.files import file_hash
 
@@ -230,6 +230,19 @@ def reflect(
     _save(result, out, {"mirrored": True, "tolerance": tolerance}, {"demos": file_hash(file)})
 
 
+def add_noise(file: Source, *, out: Path, tier: Literal["low", "medium", "high"] = "medium", seed: int = 0) -> None:
+    """Add the errors of a worse hand tracker to demonstrations: the published paper's tiers.
+
+    Args:
+        file: Archive of demonstrations.
+        out: Archive to write.
+        tier: The hand is off by at most 10, 20 or 40 mm along each axis, and its fingers by 3, 6 or 12 mm.
+        seed: Chooses the errors.
+    """
+    noisy = noise.with_noise(archive.read_demos(file), noise.TIERS[tier], seed)
+    _save(noisy, out, {"noise": tier, "seed": seed}, {"demos": file_hash(file)})
+
+
 def describe(file: Source) -> None:
     """Describe an archive of demonstrations, object by object, and warn of what looks wrong.
 
@@ -289,5 +302,6 @@ COMMAND = {
     "split": split,
     "merge": merge,
     "mirror": reflect,
+    "noise": add_noise,
     "info": describe,
 }

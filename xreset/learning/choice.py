@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated
 
-from xreset.checks import Checked, NotNegative, Positive, Share, from_dict
+from xreset.checks import Checked, NotNegative, Positive, Rule, Share, from_dict
 from xreset.files import read_json, write_json
 
 FILE = "choice.json"
@@ -18,7 +19,7 @@ class Candidate(Checked):
 
     name: str
     """File name of the checkpoint or policy."""
-    task_progress: dict[str, Share[float]]
+    task_progress: Annotated[dict[str, Share[float]], Rule("an engine at least", bool)]
     """Engine -> mean over the episodes; without engines in which it was not played because it could no longer be
     chosen."""
 

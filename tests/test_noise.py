@@ -1,0 +1,57 @@
+"""Errors of a worse hand tracker: one offset for a demonstration, wandering fingers, bones and objects as they were."""
+
+import unittest
+
+import numpy as np
+
+from xreset.demos.hand import PARENTS
+from xreset.demos.noise import MEMORY, TIERS, HandNoise, with_noise
+from xreset.demos.synth import synthesize
+
+
+def bones(points: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(points[:, 1:] - points[:, PARENTS], axis=-1)
+
+
+class NoiseTest(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        cls.demos = synthesize(["soup", "mustard"], 3, seed=0)
+        cls.seen = cls.demos.hand_valid
+
+    def test_a_demonstration_is_shifted_as_a_whole_within_the_bound(self):
+        shifted = with_noise(self.demos, HandNoise(wrist=0.04, finger=0.0, cap=0.0))
+        shifts = []
+        for sequence in range(self.demos.num_sequences):
+            frames = self.demos.frames(sequence)
+            shift = (shifted.hand_keypoints - self.demos.hand_keypoints)[frames][self.seen[frames]]
+            np.testing.assert_allclose(shift, np.broadcast_to(shift[0, 0], shift.shape), atol=1e-6)
+            shifts.append(shift[0, 0])
+        self.assertLessEqual(np.abs(shifts).max(), 0.04)
+        self.assertGreater(np.ptp(shifts, axis=0).min(), 0.01)
+
+    def test_fingers_wander_and_keep_their_bones(self):
+        noise = HandNoise(wrist=0.0, finger=0.006, cap=0.012)
+        noisy = with_noise(self.demos, noise)
+        before = self.demos.hand_keypoints[self.seen].astype(float)
+        after = noisy.hand_keypoints[self.seen].astype(float)
+        np.testing.assert_allclose(bones(after), bones(before), atol=1e-6)
+        np.testing.assert_array_equal(after[:, 0], before[:, 0])
+        moved = np.linalg.norm(after - before, axis=-1)[:, 1:]
+        self.assertGreater(moved.mean(), 0.003)
+        frames = self.demos.frames(0)
+        path = (noisy.hand_keypoints - self.demos.hand_keypoints)[frames][self.seen[frames]][:, 4]
+        still = np.corrcoef(path[1:].ravel(), path[:-1].ravel())[0, 1]
+        self.assertGreater(still, MEMORY - 0.3)
+
+    def test_objects_stay_and_a_seed_repeats(self):
+        noisy = with_noise(self.demos, TIERS["low"], seed=3)
+        again = with_noise(self.demos, TIERS["low"], seed=3)
+        other = with_noise(self.demos, TIERS["low"], seed=4)
+        np.testing.assert_array_equal(noisy.object_pos, self.demos.object_pos)
+        np.testing.assert_array_equal(noisy.hand_keypoints, again.hand_keypoints)
+        self.assertGreater(np.nanmax(np.abs(noisy.hand_keypoints - other.hand_keypoints)), 1e-3)
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -69,7 +69,7 @@ def _wandering(steps: np.ndarray) -> np.ndarray:
     """Return errors [F, ...] of the steps' standard deviation that remember the frame before."""
     steps = steps.copy()
     steps[1:] *= math.sqrt(1.0 - MEMORY**2)
-    return lfilter([1.0], [1.0, -MEMORY], steps, axis=0)
+    return np.asarray(lfilter([1.0], [1.0, -MEMORY], steps, axis=0))
 
 
 def _with_bones(hand: np.ndarray, errors: np.ndarray) -> np.ndarray:

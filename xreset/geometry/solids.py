@@ -38,11 +38,11 @@ def link_field(shapes: Sequence[Shape]) -> DistanceFields:
     reach = GAP / 2
     origin = low - reach - 2 * _SPACING
     counts = np.ceil((high - origin + reach + 2 * _SPACING) / _SPACING).astype(int) + 1
-    nodes = origin + _SPACING * np.moveaxis(np.indices(counts), 0, -1)
+    nodes = origin + _SPACING * np.moveaxis(np.indices(tuple(counts)), 0, -1)
     points = nodes.reshape(-1, 3)
     values = np.min([signed_distance(shape, points) for shape in shapes], axis=0).reshape(counts)
     if len(shapes) > 1:
-        slope = np.stack(np.gradient(values, _SPACING), axis=-1)
+        slope = np.stack([*np.gradient(values, _SPACING)], axis=-1)
         steepness = np.linalg.norm(slope, axis=-1)
         # On a flat ridge between two shapes the slope says nothing; other nodes are near.
         rim = (values > reach) & (values <= reach + 2 * _SPACING) & (steepness > 0.5)

@@ -50,7 +50,7 @@ class Surface:
         """[3] upper corner of the bounding box."""
         origin = self.low - _GRID_MARGIN
         counts = np.ceil((self.high - self.low + 2 * _GRID_MARGIN) / _GRID_SPACING).astype(int) + 1
-        nodes = origin + _GRID_SPACING * np.moveaxis(np.indices(counts), 0, -1)
+        nodes = origin + _GRID_SPACING * np.moveaxis(np.indices(tuple(counts)), 0, -1)
         inside = _nodes_inside(obj.pieces, nodes)
 
         count = int(np.clip(mesh.area / _SAMPLE_SPACING**2, 2_000, 40_000))

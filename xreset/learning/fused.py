@@ -51,7 +51,7 @@ def _first_layer(cloud, frame, w1, b1, P: tl.constexpr, K: tl.constexpr, A: tl.c
     a = tl.arange(0, A)
     point = cloud + frame * (K * P) + p * K
     total = tl.load(point)[:, None] * tl.load(w1 + a * K)[None, :]
-    for k in tl.static_range(1, K):
+    for k in tl.static_range(1, K):  # pyright: ignore[reportGeneralTypeIssues]
         total += tl.load(point + k)[:, None] * tl.load(w1 + a * K + k)[None, :]
     return total + tl.load(b1 + a)[None, :]
 

@@ -238,7 +238,7 @@ class _Surface:
         farthest = 0.0
         pool = vertices[faces]
         middle = pool.mean(axis=1)
-        bound = self._tree.query(middle)[0] + np.linalg.norm(pool - middle[:, None], axis=2).max(axis=1)
+        bound: np.ndarray = self._tree.query(middle)[0] + np.linalg.norm(pool - middle[:, None], axis=2).max(axis=1)
         while bound.size and bound.max() > farthest + _EXACT:
             first, rest = np.split(np.argsort(-bound, kind="stable"), [_BATCH])
             corners = pool[first]

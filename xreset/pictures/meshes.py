@@ -48,7 +48,8 @@ def place(mesh: trimesh.Trimesh, color: Color, pose: np.ndarray) -> Triangles:
     """Return the triangles of a mesh at a pose [4, 4], in one color."""
     vertices = np.float32(mesh.vertices @ pose[:3, :3].T + pose[:3, 3])
     normals = np.float32(mesh.vertex_normals @ pose[:3, :3].T)
-    return Triangles(vertices[mesh.faces], normals[mesh.faces], np.full((len(mesh.faces), 3), color, np.float32))
+    faces = np.asarray(mesh.faces)
+    return Triangles(vertices[faces], normals[faces], np.full((len(faces), 3), color, np.float32))
 
 
 def join(parts: Sequence[Triangles]) -> Triangles:

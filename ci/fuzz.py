@@ -1,4 +1,6 @@
-"""Fuzzes every reader for some minutes; see tests/fuzzing.py for what is done to files and what must hold."""
+"""Fuzzes every reader and command for some minutes.
+
+tests/fuzzing.py and tests/fuzzing_commands.py say what is done and what must hold."""
 
 from __future__ import annotations
 
@@ -11,15 +13,20 @@ import time
 import warnings
 from collections import Counter
 from pathlib import Path
+from random import Random
 
 sys.path.insert(0, os.getcwd())
 
 from hypothesis import HealthCheck, Phase, given, seed, settings
 
 from tests.fuzzing import Reader, damages, outcome, readers
+from tests.fuzzing_commands import commands, draw, outcome_of_command
 
 GIGABYTES = 6
 """Of address space that the whole process may take beyond what it has at the start."""
+
+COMMAND_LINES = "command lines"
+"""The name of the commands among the readers."""
 
 
 def _round(
@@ -53,18 +60,38 @@ def _round(
     run()
 
 
+def _command_lines(
+    count: Counter, broken: dict[str, bytes], slowest: dict[str, float], number: int, end: float
+) -> None:
+    random = Random(number)
+    options = commands()
+    for _ in range(100):
+        if time.monotonic() > end:
+            return
+        line = draw(random, options)
+        began = time.process_time()
+        try:
+            verdict = outcome_of_command(line)
+            count["read" if verdict == "ran" else verdict] += 1
+        except AssertionError as error:
+            count["broken"] += 1
+            broken.setdefault(str(error)[:160], repr(line).encode())
+        slowest[COMMAND_LINES] = max(slowest[COMMAND_LINES], time.process_time() - began)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=10.0)
-    parser.add_argument("--reader", nargs="+", help="only these")
+    parser.add_argument("--reader", nargs="+", help="only these; 'command lines' for junk options")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     with readers() as found:
         chosen = {name: reader for name, reader in found.items() if not options.reader or name in options.reader}
-        counts = {name: Counter() for name in chosen}
-        broken: dict[str, dict[str, bytes]] = {name: {} for name in chosen}
-        slowest = dict.fromkeys(chosen, 0.0)
+        names = [*chosen, *([COMMAND_LINES] if COMMAND_LINES in (options.reader or [COMMAND_LINES]) else [])]
+        counts = {name: Counter() for name in names}
+        broken: dict[str, dict[str, bytes]] = {name: {} for name in names}
+        slowest = dict.fromkeys(names, 0.0)
         virtual = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (virtual + (GIGABYTES << 30), resource.RLIM_INFINITY))
         end, rounds = time.monotonic() + 60 * options.minutes, 0
@@ -72,7 +99,13 @@ def main() -> int:
             rounds += 1
             for name, reader in chosen.items():
                 _round(name, reader, counts[name], broken[name], slowest, options.seed * 1_000_003 + rounds, end)
-    print("| reader | files | refused | read, and sound | broken | slowest |\n|---|---|---|---|---|---|")
+            if COMMAND_LINES in names:
+                _command_lines(
+                    counts[COMMAND_LINES], broken[COMMAND_LINES], slowest, options.seed * 1_000_003 + rounds, end
+                )
+    print(
+        "| reader | files or command lines | refused | read and sound, or ran | broken | slowest |\n|---|---|---|---|---|---|"
+    )
     for name, count in counts.items():
         print(
             f"| {name} | {count.total()} | {count['refused']} | {count['read']} | {count['broken']} | {slowest[name]:.1f} s |"

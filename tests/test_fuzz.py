@@ -11,6 +11,7 @@ if not find_spec("hypothesis"):
 from hypothesis import HealthCheck, given, settings
 
 from tests.fuzzing import Reader, damages, outcome, readers
+from tests.fuzzing_commands import outcome_of_command
 
 EXAMPLES = 40
 
@@ -67,6 +68,19 @@ class EveryReader(unittest.TestCase):
             outcome(reader, damage(whole))
 
         run()
+
+
+class CommandLines(unittest.TestCase):
+    def test_junk_is_refused_in_one_short_message(self):
+        for line in (
+            ("eval", "x", "--demos", "y", "--device", "1" * 5000),
+            ("engines", "page", "--from", "x" * 5000),
+            ("demos", "mirror", "demos.npz", "--out", "null.npz"),
+            ("demos", "merge", "demos.npz", "--out", "null.npz"),
+            ("demos", "info", "\udcff\n.npz"),
+        ):
+            with self.subTest(line[:4]):
+                self.assertEqual(outcome_of_command(list(line)), "refused")
 
 
 if __name__ == "__main__":

@@ -42,11 +42,13 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
     """Open a temporary file that replaces ``path`` when the block ends, and is removed if the block raises.
 
     Raises:
-        XResetError: the file cannot be written (no such folder, no permission, disk full); ``path`` is then as it was
-            before.
+        XResetError: the file cannot be written (no such folder, no permission, disk full, a device); ``path`` is then
+            as it was before.
     """
     path = Path(path)
     try:
+        if path.exists() and not path.is_file() and not path.is_dir():  # root could replace /dev/null by a file
+            raise XResetError(f"cannot write {path}: it is a device. Choose another place.")
         with _temporary(path.parent, Path.touch) as temporary, open(temporary, mode) as file:
             yield file
             file.flush()

@@ -144,6 +144,7 @@ def device_for(name: str, device: str) -> str:
 
 def make_backend(name: str, scene: SceneSpec, num_worlds: int, **options: Any) -> Backend:
     """Build a backend by name; see :class:`xreset.physics.Backend` for the options."""
+    device_for(name, str(options.get("device", "cpu")))  # refuses an unknown device
     cls = backend_class(name)
     cls.engine_version()  # fails with reason and remedy where the engine is missing
     return cls(scene, num_worlds, **options)

@@ -21,12 +21,15 @@ _COUNTS = {
 """Whole numbers from 1."""
 _INDICES = {"seed", "episode", "repetition", "sequence", "frame", "port"}
 """Whole numbers from 0."""
-_WRITTEN = ("out", "png", "mp4", "picture", "json")
+_WRITTEN = ("out", "rest", "png", "mp4", "picture", "json")
 """Files or folders that a command writes."""
 _IN_PLACE = {"policy"}
 """Options whose file a command may replace by its output."""
 _LARGEST = 2**32 - 1
 """The largest seed that numpy, torch and all engines accept; also an upper limit for counts."""
+
+_LONGEST = 1000
+"""Most characters of a text or a file name; messages repeat them."""
 
 
 def checked(command: Callable[..., None]) -> Callable[..., None]:
@@ -59,6 +62,9 @@ def _check(options: dict[str, Any]) -> None:
         low = 1 if name in _COUNTS else 0 if name in _INDICES else None
         if low is not None and not low <= value <= _LARGEST:
             raise XResetError(f"{flag} is {value}, expected a whole number from {low} to {_LARGEST}.")
+        for text in value if isinstance(value, tuple) else (value,):
+            if isinstance(text, str | Path) and len(str(text)) > _LONGEST:
+                raise XResetError(f"{flag} has {len(str(text))} characters, expected at most {_LONGEST}.")
         if isinstance(value, float) and math.isnan(value):
             raise XResetError(f"{flag} is not a number.")
         if name == "device" and isinstance(value, str):

@@ -23,7 +23,7 @@ class InTheBrowser(unittest.TestCase):
         cls.enterClassContext(one_thread())
         cls.browser = Browser(find_chromium())
         cls.addClassCleanup(cls.browser.close)
-        cls.session = Session("many-objects")
+        cls.session = Session("nine-objects")
         cls.addClassCleanup(cls.session.close)
         with redirect_stdout(io.StringIO()):
             cls.page = Page(cls.session, port=8970)

@@ -236,7 +236,8 @@ def add_noise(file: Source, *, out: Path, tier: Literal["low", "medium", "high"]
     Args:
         file: Archive of demonstrations.
         out: Archive to write.
-        tier: The hand is off by at most 10, 20 or 40 mm along each axis, and its fingers by 3, 6 or 12 mm.
+        tier: The hand is off by at most 10, 20 or 40 mm along each axis, and each keypoint of its fingers by 3, 6 or
+            12 mm, before the bones get their lengths back.
         seed: Chooses the errors.
     """
     noisy = noise.with_noise(archive.read_demos(file), noise.TIERS[tier], seed)

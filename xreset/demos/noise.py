@@ -29,7 +29,8 @@ class HandNoise:
     finger: float
     """Standard deviation of a keypoint's error along each axis of the palm [m]."""
     cap: float
-    """Largest error of a keypoint [m]."""
+    """Largest error of a keypoint [m], before the bones get their lengths back. A fingertip moves with the bones before
+    it, so it may end up farther away."""
 
 
 TIERS = {

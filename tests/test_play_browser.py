@@ -75,7 +75,7 @@ class InTheBrowser(unittest.TestCase):
         self.until(lambda: np.linalg.norm(session.history[-1].goal_pos - goal) > 0.05, "the goal to move")
         self.assertFalse(self.page._hint.visible)
         self.assertGreater(session.history[-1].distance, 0.1)
-        self.until(lambda: self.pass_time(2.0).distance < 0.05, "the object to follow")
+        self.assertLess(self.pass_time(4.0).distance, 0.05)
         self.until(lambda: "At the goal" in self.browser.text(), "the page to say so")
 
         links = []

@@ -57,11 +57,18 @@ class PolicySpec:
         """Return the names of objects that the training did not have, sorted; none for a baseline."""
         return () if self.objects is None else tuple(sorted(set(names) - set(self.objects)))
 
-    def objects_of(self, folder: Path | None) -> tuple[str, ...]:
-        """Return the objects that stand for the policy where nobody names any.
+    def meshes(self, objects: str | Path | None) -> Path | None:
+        """Return the stated folder of meshes, or else that of the training; None: the stand-ins."""
+        return Path(objects) if objects else self.objects_folder
 
-        These are the objects of the training that the folder has (None: the stand-ins), or all of its objects if it has
-        none of them. A policy may know shapes that were made for its training only.
+    def objects_of(self, folder: Path | None) -> tuple[str, ...]:
+        """Return the objects to take where nobody names any: those of the training that the folder has.
+
+        A folder without any of them gives all of its objects. A policy may know shapes that were made for its training
+        only, so the folder need not have all of them.
+
+        Args:
+            folder: folder of meshes; None: the stand-ins.
         """
         names = object_names(folder)
         return tuple(name for name in names if name in (self.objects or ())) or names

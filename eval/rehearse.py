@@ -141,7 +141,7 @@ def rehearse(
     spec.check_seed(seed)
     actor = OnnxActor(spec.exported().read_bytes())
     if demos is None:
-        meshes = Path(objects) if objects else spec.objects_folder
+        meshes = spec.meshes(objects)
         demos = synthesize(spec.objects_of(meshes), 2, meshes=meshes)
     trial = load_trial(spec, demos, objects=objects, seed=seed, num_envs=num_envs)
     for prop in properties:

@@ -146,7 +146,7 @@ def load_trial(
         settle: whether objects come to rest before episodes begin (:mod:`xreset.resets.settle`), in MuJoCo for every
             engine, so that all engines play the same starts. Default: the recorded poses, as in the paper.
     """
-    folder = Path(objects) if objects else policy.objects_folder
+    folder = policy.meshes(objects)
     inputs = load_inputs(source, robot=policy.robot, objects=folder, accept=("demos", "motion", "goals"))
     hashes = {} if policy.hash is None else {"policy": policy.hash}
     if inputs.hash is not None:

@@ -54,5 +54,5 @@ def _with_objects(
 ) -> tuple[PolicySpec, tuple[ObjectSpec, ...]]:
     spec = policy if isinstance(policy, PolicySpec) else load_policy(policy, robot=robot)
     spec.exported()
-    folder = Path(objects) if objects else spec.objects_folder
+    folder = spec.meshes(objects)
     return spec, load_objects(only or spec.objects_of(folder), folder)

@@ -178,7 +178,7 @@ class Session:
         """Open worlds; where this fails, the session stays as it was."""
         if not isinstance(policy, PolicySpec):
             policy = load_policy(policy, robot=robot, seed=self._seed)
-        folder = self._folder or policy.objects_folder
+        folder = policy.meshes(self._folder)
         source = self._demos
         if source is None:
             names = object_names(folder)

@@ -99,7 +99,7 @@ def import_robot(
     with atomic_folder(out) as work:
         found = find_hand(hand_tree, work, thumb, notes)
         if rpy is None:
-            rpy = _turned(found.palm[:3, 0], ahead)
+            rpy = _turned(np.eye(3), found.palm[:3, 0], ahead)
             if any(rpy):
                 notes.append(f"the hand is turned by --rpy {_angles(rpy)}: its fingers point along {along}")
         if offset is None:
@@ -170,15 +170,11 @@ def _mounting(flange: str, ahead: np.ndarray, T_flange_hand: np.ndarray, T_flang
     name = _axis_name(ahead)
     if fingers @ ahead > _ALONG:
         return f"{text}. The angle about {name} is yours to know: --rpy turns the hand as it is mounted on your arm"
-    angles = _turned(fingers, ahead, T_flange_hand[:3, :3])
+    angles = _turned(T_flange_hand[:3, :3], fingers, ahead)
     return f"{text}; for fingers along its {name} axis: --rpy {_angles(angles)}"
 
 
-def _turned(
-    fingers: np.ndarray,
-    ahead: np.ndarray,
-    R: np.ndarray = np.eye(3),  # noqa: B008
-) -> tuple[float, float, float]:
+def _turned(R: np.ndarray, fingers: np.ndarray, ahead: np.ndarray) -> tuple[float, float, float]:
     """Return roll, pitch and yaw of a frame with rotation R after the shortest turn of the fingers' direction to the
     one ahead; zeros where they nearly point there."""
     if fingers @ ahead > _ALONG:

@@ -109,32 +109,15 @@ def outcome_of_command(line: list[str]) -> str:
     """``refused`` or ``ran``; raises ``AssertionError`` if a command broke, took too much, or wrote what it must not.
 
     The command runs in this process, in a temporary folder that also has the home folder and the cache."""
-    streams = [TextIOWrapper(BytesIO(), encoding="utf-8") for _ in range(2)]
     with tempfile.TemporaryDirectory() as name, mock.patch.dict(os.environ, HOME=f"{name}/home"):
-        work = Path(name) / "work"
-        work.mkdir()
         os.environ.pop("XDG_CACHE_HOME", None)
         os.environ.pop("XRESET_CACHE", None)
-        (work / "folder").mkdir()
-        (work / "file.npz").write_bytes(b"x")
-        (work / "null.npz").symlink_to("/dev/null")
-        write_demos(work / "demos.npz", toy_demos())
+        work = Path(name) / "work"
+        _fill(work)
         before = _files(Path(name))
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        signal.signal(signal.SIGVTALRM, _too_slow)
-        signal.setitimer(signal.ITIMER_VIRTUAL, SECONDS)
-        try:
-            with chdir(work), redirect_stdout(streams[0]), redirect_stderr(streams[1]):
-                main(line)
-            code: Any = 0
-        except SystemExit as end:
-            code = end.code or 0
-        except (Exception, TooSlow) as error:
-            raise AssertionError(f"{type(error).__name__}: {str(error)[:200]} {_place(error)}") from error
-        finally:
-            signal.setitimer(signal.ITIMER_VIRTUAL, 0)
-            streams[1].flush()
-        message = streams[1].buffer.getvalue().decode()
+        with chdir(work):
+            code, message = _called(line)
         grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory) / 2**20
         written = {path for path, content in _files(Path(name)).items() if before.get(path) != content}
         outputs = [(work / value).resolve() for flag, value in pairwise(line) if flag.lstrip("-") in _WRITTEN]
@@ -147,6 +130,34 @@ def outcome_of_command(line: list[str]) -> str:
     assert grown < GIGABYTES, f"it took {grown:.1f} GB"
     assert not stray or not outputs, f"it wrote {stray[:3]}"
     return "refused" if code else "ran"
+
+
+def _fill(work: Path) -> None:
+    """Make the folder in which a command runs, with the files that :data:`NAMES` names."""
+    work.mkdir()
+    (work / "folder").mkdir()
+    (work / "file.npz").write_bytes(b"x")
+    (work / "null.npz").symlink_to("/dev/null")
+    write_demos(work / "demos.npz", toy_demos())
+
+
+def _called(line: list[str]) -> tuple[Any, str]:
+    """Call a command; return its exit status and what it said on standard error."""
+    streams = [TextIOWrapper(BytesIO(), encoding="utf-8") for _ in range(2)]
+    signal.signal(signal.SIGVTALRM, _too_slow)
+    signal.setitimer(signal.ITIMER_VIRTUAL, SECONDS)
+    code: Any = 0
+    try:
+        with redirect_stdout(streams[0]), redirect_stderr(streams[1]):
+            main(line)
+    except SystemExit as end:
+        code = end.code or 0
+    except (Exception, TooSlow) as error:
+        raise AssertionError(f"{type(error).__name__}: {str(error)[:200]} {_place(error)}") from error
+    finally:
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0)
+    streams[1].flush()
+    return code, streams[1].buffer.getvalue().decode()
 
 
 def _files(folder: Path) -> dict[Path, bytes]:

@@ -17,12 +17,11 @@ from tests.command import xreset
 from tests.toy_bank import SOUP, SPAM
 from tests.toy_grasp import recording
 from xreset.errors import DemoError, FileFormatError, XResetError
-from xreset.eval.engines.actions import Actions, read_actions, recorded_actions, write_actions
+from xreset.eval.engines.actions import Actions, from_file, read_actions, recorded_actions, write_actions
 from xreset.eval.engines.divergence import THRESHOLDS, Divergence, differences
 from xreset.eval.engines.recording import Recording
 from xreset.eval.engines.replay import TraceResult, trace
-from xreset.eval.engines.sources import from_file
-from xreset.eval.engines.trace_view import rich_table, sentences, write_film, write_plot
+from xreset.eval.engines.trace_view import rich_table, sentences, write_plot
 from xreset.eval.results import write_results
 from xreset.eval.rollout import roll_out
 from xreset.eval.setting import Place
@@ -42,7 +41,6 @@ def grasp_actions(steps: int = 60) -> Actions:
         label="toy grasp",
         start=toy_grasp.start(),
         joint_target=torch.as_tensor(np.stack([toy_grasp.targets(i) for i in range(steps)]), dtype=torch.float32),
-        phases=(("close", 0.0), ("lift", 0.25), ("hold", 0.75)),
     )
 
 
@@ -54,7 +52,7 @@ def wave_actions() -> Actions:
     start = replace(
         actions.start, object_pos=torch.tensor([[0.9, 0.5, 0.02]]), object_quat=torch.tensor([[1.0, 0, 0, 0]])
     )
-    return replace(actions, start=start, joint_target=(home + step).expand(30, -1).clone(), phases=())
+    return replace(actions, start=start, joint_target=(home + step).expand(30, -1).clone())
 
 
 def assert_near(found: tuple[float | None, ...], expected: tuple[float, ...]) -> None:
@@ -199,13 +197,11 @@ class TraceTest(unittest.TestCase):
         with tempfile.TemporaryDirectory() as folder:
             write_plot(Path(folder) / "trace.png", two)
             self.assertEqual((Path(folder) / "trace.png").read_bytes()[:8], b"\x89PNG\r\n\x1a\n")
-            write_film(Path(folder) / "film.mp4", two)
-            self.assertEqual((Path(folder) / "film.mp4").read_bytes()[4:8], b"ftyp")
         with io.StringIO() as sink:
             from rich.console import Console
 
             Console(width=120, file=sink).print(rich_table(two))
-            for expected in ("slippery", "object position", "(from 5 mm)", "4 starts moved by 1e-06", "lift"):
+            for expected in ("slippery", "object position", "(from 5 mm)", "4 starts moved by 1e-06"):
                 self.assertIn(expected, sink.getvalue())
 
 
@@ -224,7 +220,7 @@ class ActionsTest(unittest.TestCase):
         found = read_actions(self.path, self.actions.robot, lambda _: self.actions.object)
         for name in ("timestep", "substeps", "friction"):
             self.assertEqual(getattr(found.scene, name), getattr(self.actions.scene, name), name)
-        self.assertEqual((found.label, found.phases), (self.actions.label, self.actions.phases))
+        self.assertEqual(found.label, self.actions.label)
         torch.testing.assert_close(found.joint_target, self.actions.joint_target, rtol=0, atol=0)
         for name, value in vars(self.actions.start).items():
             torch.testing.assert_close(getattr(found.start, name), value, rtol=0, atol=0)

@@ -3,8 +3,8 @@
 .. code-block:: python
 
     from xreset.eval.engines.agreement import compare
-    from xreset.eval.engines.sources import load_motion
     from xreset.eval.trial import engine
-    robot, objects, motion = load_motion(Path("retargeted.npz"))
-    result = compare(robot, objects, motion, [engine("pybullet"), engine("sapien")], grasps=48)
+    from xreset.inputs import load_inputs
+    inputs = load_inputs(Path("retargeted.npz"))
+    result = compare(inputs.robot, inputs.objects, inputs.motion(), [engine("pybullet"), engine("sapien")])
 """

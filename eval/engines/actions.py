@@ -3,7 +3,7 @@ meant.
 
 Actions are kept as joint targets, not as a policy's outputs: what a policy's output becomes depends on where the joints
 are (see :mod:`xreset.task.actions`), and would no longer be the same in every engine. Shape letters: T control steps, J
-joints, P phases.
+joints.
 """
 
 from __future__ import annotations
@@ -18,14 +18,18 @@ import numpy as np
 import torch
 
 from xreset.description import load_robot
-from xreset.errors import FileFormatError
-from xreset.eval.engines.episodes import GraspMotion, closing_episode
-from xreset.eval.engines.grasps import Grasps
+from xreset.errors import DemoError, FileFormatError
+from xreset.eval.engines.episodes import STANDARD, closing_episode
+from xreset.eval.engines.grasps import Grasps, find_grasps
 from xreset.eval.engines.recording import Recording
+from xreset.eval.results import TRACE_SCHEMA, mesh_folder, read_result, read_traces
 from xreset.eval.rollout import Trace
+from xreset.eval.setting import Place
 from xreset.eval.trial import nominal_scene
+from xreset.inputs import load_inputs
+from xreset.objects.catalogue import load_object
 from xreset.physics import State
-from xreset.records import JOINT, POSITION, Field, Schema, read_npz, write_npz
+from xreset.records import JOINT, POSITION, Field, Schema, npz_schema, read_npz, write_npz
 from xreset.resets.bank import check_robot
 from xreset.spec import ObjectSpec, PairFriction, RobotSpec, SceneSpec
 from xreset.task.config import EVALUATION_TIMESTEP, TaskConfig
@@ -44,8 +48,6 @@ _FIELDS: Schema = {
     "timestep": Field((), "f", within=(1e-6, 1.0)),
     "substeps": Field((), "i", within=(1, 1e6)),
     "friction": Field((3,), "f", within=(0.0, 100.0)),
-    "phase_name": Field(("P",), "U"),
-    "phase_start": Field(("P",), "f", within=(0.0, 1e6)),
     "joint_target": Field(("T", "J"), "f", within=JOINT),
     "start_joint_pos": Field(("J",), "f", within=JOINT),
     "start_joint_vel": Field(("J",), "f", within=(-1e4, 1e4)),
@@ -69,8 +71,6 @@ class Actions:
     """[1, ...]"""
     joint_target: torch.Tensor
     """[T, J] rad (m): the drives' targets from the beginning of each control step."""
-    phases: tuple[tuple[str, float], ...] = ()
-    """Parts of the sequence: name, and begin [s]."""
 
     @property
     def robot(self) -> RobotSpec:
@@ -82,39 +82,63 @@ class Actions:
         """The scene's object."""
         return self.scene.objects[0]
 
-    def phase_at(self, time: float) -> str:
-        """Return the name of the phase at a time [s]; empty if there are no phases."""
-        begun = [name for name, start in self.phases if start <= time]
-        return begun[-1] if begun else ""
+
+def from_file(source: Path, place: Place, thing: str | None = None, episode: int = 0) -> Actions:
+    """Return an open-loop grasp and lift of a grasp in the file; or recorded actions, also those of an evaluation.
+
+    Args:
+        source: demonstrations, motion, the trace of an evaluation, or recorded actions.
+        place: robot and meshes.
+        thing: name of an object of the file; default: its first.
+        episode: which of the object's grasps or recorded episodes.
+
+    Raises:
+        FileFormatError: the file is of another kind, or for another robot.
+        DemoError: the file shows no such grasp.
+    """
+    schema = npz_schema(source)
+    if schema == SCHEMA:
+        return read_actions(source, place.robot, lambda name: load_object(name, place.objects))
+    if schema == TRACE_SCHEMA:
+        return _from_evaluation(source, place, thing, episode)
+    only = () if thing is None else (thing,)
+    inputs = load_inputs(source, robot=place.robot, objects=place.objects, only=only, accept=("demos", "motion"))
+    motion = inputs.motion()
+    first = inputs.objects[0].name if only else motion.object_name[0]
+    grasped = next(o for o in inputs.objects if o.name == first)
+    grasps = find_grasps(motion, inputs.robot, (grasped,), len(motion.valid), where="table")
+    _check_episode(episode, len(grasps), f"{source} shows {len(grasps)} grasps of {grasped.name} on the table")
+    return grasp_and_lift(inputs.robot, grasped, grasps[episode : episode + 1])
 
 
-def grasp_and_lift(robot: RobotSpec, thing: ObjectSpec, grasps: Grasps, number: int = 0) -> Actions:
-    """Return the open-loop try of a grasp: the hand, open around the object at rest, closes, lifts and shakes."""
-    motion = GraspMotion()
+def _from_evaluation(source: Path, place: Place, wanted: str | None, episode: int) -> Actions:
+    """Return the actions of a recorded episode: an evaluation records the first episode of each demonstration."""
+    name = source.name.removesuffix(".trace.npz")
+    summary = read_result(source.with_name(f"{name}.json"))
+    spec = load_robot(place.robot or summary.robot)
+    traces = read_traces(source.parent, name, spec.joint_names)
+    names = list(dict.fromkeys(trace.object for trace in traces))
+    chosen = wanted or names[0]
+    if chosen not in names:
+        raise DemoError(f"{source} has no {chosen}; it has {', '.join(names)}.")
+    mine = [trace for trace in traces if trace.object == chosen]
+    _check_episode(episode, len(mine), f"{source} records {len(mine)} episodes of {chosen}")
+    found = mine[episode]
+    thing = load_object(chosen, mesh_folder(place.objects, summary.objects_folder))
+    return recorded_actions(spec, thing, found, label=f"{summary.policy} in {name}, demonstration {found.sequence}")
+
+
+def _check_episode(episode: int, count: int, found: str) -> None:
+    if episode >= count:
+        raise DemoError(f"{found}, so --episode is at most {count - 1}.")
+
+
+def grasp_and_lift(robot: RobotSpec, thing: ObjectSpec, grasp: Grasps) -> Actions:
+    """Return the open-loop try of one grasp: the hand, open around the object at rest, closes, lifts and shakes."""
     scene = SceneSpec(robot=robot, objects=(thing,))
-    dt = scene.control_dt
-    one = slice(number, number + 1)
-    episode = closing_episode(robot, grasps.joint_pos[one], grasps.object_pos[one], grasps.object_quat[one], dt, motion)
-    phases = []
-    step = 0
-    for name, seconds in (
-        ("settle", motion.settle),
-        ("close", motion.close),
-        ("hold", motion.hold),
-        ("lift", motion.lift),
-        ("carry", motion.hold),
-        ("shake x", motion.shake),
-        ("shake y", motion.shake),
-    ):
-        phases.append((name, step * dt))
-        step += round(seconds / dt)
-    return Actions(
-        scene=scene,
-        label=f"grasp and lift of {thing.name}, {grasps.label[number]}",
-        start=episode.start,
-        joint_target=episode.targets[:, 0],
-        phases=tuple(phases),
-    )
+    start, targets = closing_episode(robot, grasp, scene.control_dt, STANDARD)
+    label = f"grasp and lift of {thing.name}, {grasp.label[0]}"
+    return Actions(scene=scene, label=label, start=start, joint_target=targets[:, 0])
 
 
 def recorded_actions(robot: RobotSpec, thing: ObjectSpec, trace: Trace, *, label: str) -> Actions:
@@ -155,8 +179,6 @@ def write_actions(path: str | Path, actions: Actions, replays: Mapping[str, Reco
         "timestep": np.float64(scene.timestep),
         "substeps": np.int64(scene.substeps),
         "friction": np.array([friction.tip, friction.link, friction.table]),
-        "phase_name": np.array([name for name, _ in actions.phases], dtype=np.str_),
-        "phase_start": np.array([start for _, start in actions.phases], dtype=np.float64),
         "joint_target": actions.joint_target.numpy(),
     }
     for name, key in _STATE_KEYS.items():
@@ -205,7 +227,6 @@ def read_actions(path: str | Path, robot: RobotSpec | str | None, objects: Calla
         label=str(a["label"]),
         start=State(**start),
         joint_target=torch.as_tensor(a["joint_target"], dtype=torch.float32),
-        phases=tuple(zip(a["phase_name"].tolist(), a["phase_start"].tolist(), strict=True)),
     )
 
 

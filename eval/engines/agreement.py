@@ -7,14 +7,16 @@ Shape letters as in :mod:`xreset.eval.engines.recording`.
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from xreset.eval.engines.episodes import GraspMotion
+from xreset.eval.engines.episodes import STANDARD, GraspMotion
 from xreset.eval.engines.grasps import Grasps, find_grasps
 from xreset.eval.engines.recording import Recording
 from xreset.eval.engines.trials import FRICTIONS, CommonStates, common_states, try_closings, try_holds
@@ -33,43 +35,17 @@ PRESS_FLOOR = 0.5
 PRESS_TIME = 0.25
 """Forces are averaged over the last of these seconds of a press."""
 
-_ON_FIXED = "on a fixed object: relative difference, median over"
-_TARGETS = {
-    "press, total": (f"sum of the fingertips' forces {_ON_FIXED} the grasps", "", "at most", 0.10),
-    "press, fingertip": (f"force vector of a fingertip {_ON_FIXED} all fingertips that press", "", "at most", 0.30),
-    "hold, outcome": (
-        "lift and shake from one common state at pair frictions 0.5, 0.8: share that end alike",
-        "",
-        "at least",
-        0.85,
-    ),
-    "hold, object in palm": (
-        "object in the palm's frame after lift and shake: mean distance of its surface points, "
-        "median over grasps that both hold",
-        "mm",
-        "at most",
-        4.0,
-    ),
-    "closing, outcome": (
-        "hand closes, lifts and shakes: share of the grasps that end alike, carried or not",
-        "",
-        "at least",
-        0.80,
-    ),
-}
-"""Name of a metric -> claim, unit, and the target: at most or at least a value."""
+_METRICS = tomllib.loads(Path(__file__).with_name("metrics.toml").read_text())
 
 
 @dataclass(frozen=True, kw_only=True)
 class Metric:
-    """One row of the table."""
+    """One row of the table. The first fields are explained in ``metrics.toml``."""
 
     metric: str
     claim: str
     unit: str
-    """Unit of the measured number; empty for a share."""
     sense: str
-    """``at most`` or ``at least`` the target."""
     target: float
     measured: float | None
     """None if nothing could be compared."""
@@ -81,18 +57,15 @@ class Metric:
     @classmethod
     def of(cls, name: str, values: Tensor, q: float | None = 0.5) -> Metric:
         """Judge a quantile of some numbers [n], by default the median; ``q`` None: their mean."""
-        claim, unit, sense, target = _TARGETS[name]
+        row = _METRICS[name]
         numbers = values.double().flatten()
         measured = math.nan
         if len(numbers):
             measured = float(numbers.mean() if q is None else numbers.quantile(q))
-        met = measured <= target if sense == "at most" else measured >= target
+        met = measured <= row["target"] if row["sense"] == "at most" else measured >= row["target"]
         return cls(
             metric=name,
-            claim=claim,
-            unit=unit,
-            sense=sense,
-            target=target,
+            **row,
             measured=measured if math.isfinite(measured) else None,
             n=len(numbers),
             verdict="met" if met else "missed",
@@ -177,7 +150,7 @@ def compare(
     engines: Iterable[Engine],
     *,
     grasps: int = 48,
-    tries: GraspMotion | None = None,
+    tries: GraspMotion = STANDARD,
     reference: Engine | None = None,
     progress: Callable[[str, int, int], None] = lambda doing, done, total: None,
 ) -> Parity:
@@ -196,7 +169,6 @@ def compare(
     Raises:
         DemoError: the motion shows no grasp.
     """
-    tries = tries or GraspMotion()
     reference = reference or engine(REFERENCE)
     floor = _at_half_timestep(reference)
     everyone = (reference, floor, *engines)

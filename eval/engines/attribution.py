@@ -202,16 +202,11 @@ def change_towards(prop: Property, a: float, b: float, task: TaskConfig, engine:
         return "the same in both, as far as is measured"
     if prop.needs is not None and prop.needs not in backend_class(engine).capabilities:
         return f"cannot be set in {engine}"
-    match prop.name:
-        case "contact softness":
-            return "follows from each engine's solver, so it cannot be changed"
-        case "action latency":
-            return prop.set_in(task, b - a) if b > a else "targets that come late cannot be made to come earlier"
-        case "timestep":
-            substeps = max(1, round(task.substeps * a / b))
-            if substeps == task.substeps:
-                return f"with {substeps} physics steps per control step, no other timestep comes nearer"
-            return replace(task, timestep=task.timestep * task.substeps / substeps, substeps=substeps)
+    if prop.name == "timestep":
+        substeps = max(1, round(task.substeps * a / b))
+        if substeps == task.substeps:
+            return f"with {substeps} physics steps per control step, no other timestep comes nearer"
+        return replace(task, timestep=task.timestep * task.substeps / substeps, substeps=substeps)
     if a <= 0:
         return f"there is none in {engine}, so no factor leads to the other value"
     ratio = max(b, 0.0) / a

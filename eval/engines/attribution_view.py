@@ -1,15 +1,13 @@
-"""The attribution for a terminal, and as a picture: task progress of every run, with its interval, between A and B."""
+"""The attribution for a terminal: task progress of every run, with its interval, between A and B."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from pathlib import Path
 
 from rich.table import Table
 
 from xreset.eval.engines.attribution import Attribution
-from xreset.eval.plots import COLORS, picture
 from xreset.eval.sensitivity import COMPARED
 from xreset.eval.table import success_text
 
@@ -73,26 +71,3 @@ def _values(name: str, found: Attribution) -> list[str]:
     prop = COMPARED[name]
     values = [getattr(measured, prop.measured) for measured in (found.measured_a, found.measured_b)]
     return [prop.shown(value) if math.isfinite(value) else "unknown" for value in values]
-
-
-_COLOR = {"as it is": COLORS[0], "towards": COLORS[4], "all": COLORS[2], "other": COLORS[1]}
-
-
-def write_plot(path: Path, found: Attribution, title: str) -> None:
-    """Write the plot as PNG."""
-    with picture(path, (8, 1.3 + 0.36 * len(found.rows)), font_size=10) as figure:
-        ax = figure.subplots()
-        for y, row in enumerate(found.rows):
-            mean = 100 * row.effect.task_progress
-            low, high = (100 * x for x in row.effect.ci95)
-            error = [[max(mean - low, 0)], [max(high - mean, 0)]]
-            ax.barh(y, mean, xerr=error, color=_COLOR[row.kind], height=0.62, capsize=3)
-            text = f"{mean:.0f} % ({100 * row.effect.difference:+.1f})"
-            ax.text(high + 1.5, y, text, va="center", fontweight="bold" if row.effect.is_certain else "normal")
-            if row in (found.rows[0], found.rows[-1]):
-                ax.axvline(mean, color=_COLOR[row.kind], linestyle="--", linewidth=0.9)
-        ax.set_yticks(range(len(found.rows)), [row.name for row in found.rows])
-        ax.invert_yaxis()
-        ax.set_xlim(0, 118)
-        ax.set_xlabel("task progress [%], 95 % interval")
-        figure.suptitle(title, fontweight="bold", fontsize="medium")

@@ -63,8 +63,6 @@ class Differences:
     """[T] names of joint or fingers, for the quantities that have them."""
     diverged: dict[str, np.ndarray]
     """[T] bool: whether the difference counts."""
-    touch: np.ndarray
-    """[T, E] bool: which fingers touch."""
 
     def first(self) -> tuple[Divergence, ...]:
         """Return how each quantity diverges; nothing if no step is finite."""
@@ -132,7 +130,6 @@ def differences(found: Recording, reference: Recording, robot: RobotSpec, dt: fl
             "contact force": [fingers[i] for i in change.argmax(axis=1)],
         },
         diverged=diverged,
-        touch=touch,
     )
 
 

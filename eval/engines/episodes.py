@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from xreset.eval.engines.recording import OpenLoopEpisode
+from xreset.eval.engines.grasps import Grasps
 from xreset.geometry.kinematics import Kinematics
 from xreset.physics import State
 from xreset.spec import RobotSpec
@@ -60,27 +60,14 @@ class GraspMotion:
         return sum(round(seconds / dt) for seconds in (self.settle, self.close, self.hold))
 
 
-def closing_episode(
-    robot: RobotSpec,
-    joint_pos: Tensor,
-    object_pos: Tensor,
-    object_quat: Tensor,
-    dt: float,
-    motion: GraspMotion | None = None,
-) -> OpenLoopEpisode:
-    """Return a whole try: the open hand around an object at rest closes, lifts and shakes.
+STANDARD = GraspMotion()
 
-    Args:
-        robot: the robot.
-        joint_pos: [G, J] the hand as it holds the object (rad, m).
-        object_pos: [G, 3] position of the object [m].
-        object_quat: [G, 4]
-        dt: control step [s].
-        motion: how the grasp is tried.
-    """
-    motion = motion or GraspMotion()
+
+def closing_episode(robot: RobotSpec, grasps: Grasps, dt: float, motion: GraspMotion) -> tuple[State, Tensor]:
+    """Return start [G, ...] and targets [T, G, J] of a whole try: the open hand around an object at rest closes, lifts
+    and shakes; dt: control step [s]."""
     kinematics = Kinematics(robot)
-    held = joint_pos.double()
+    held = grasps.joint_pos
     opened = moved_fingertips(kinematics, held, -motion.opening)
     closed = squeezed(kinematics, held, motion)
     parts = (
@@ -90,25 +77,14 @@ def closing_episode(
     )
     closing = opened + torch.cat(parts)[:, None, None] * (closed - opened)
     targets = torch.cat((closing, _carried(kinematics, closed, motion, dt)))
-    return OpenLoopEpisode(start=State.at_rest(opened, object_pos, object_quat), targets=targets.float())
+    return State.at_rest(opened, grasps.object_pos, grasps.object_quat), targets.float()
 
 
-def lifting_episode(robot: RobotSpec, start: State, dt: float, motion: GraspMotion | None = None) -> OpenLoopEpisode:
-    """Lift and shake what the hand holds in states [G, ...], with the targets of each state; dt: control step [s]."""
-    motion = motion or GraspMotion()
-    targets = start.joint_target.double().cpu()
+def lifting_targets(robot: RobotSpec, start: State, dt: float, motion: GraspMotion) -> Tensor:
+    """[T, G, J] targets that lift and shake what the hand holds in states [G, ...], from the targets of each state."""
+    targets = start.joint_target.double()
     still = targets.expand(round(motion.hold / dt), *targets.shape)
-    return OpenLoopEpisode(
-        start=start, targets=torch.cat((still, _carried(Kinematics(robot), targets, motion, dt))).float()
-    )
-
-
-def squeezing_state(
-    robot: RobotSpec, joint_pos: Tensor, object_pos: Tensor, object_quat: Tensor, motion: GraspMotion | None = None
-) -> State:
-    """Return states [G] at rest in which the drives already squeeze; arguments as for :func:`closing_episode`."""
-    closed = squeezed(Kinematics(robot), joint_pos.double(), motion or GraspMotion())
-    return State.at_rest(joint_pos, object_pos, object_quat, closed)
+    return torch.cat((still, _carried(Kinematics(robot), targets, motion, dt))).float()
 
 
 def moved_fingertips(kinematics: Kinematics, joint_pos: Tensor, distance: float) -> Tensor:

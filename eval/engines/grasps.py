@@ -21,6 +21,7 @@ from xreset.geometry.rotations import quat_rotate_inverse
 from xreset.geometry.surface import Surface
 from xreset.retarget.file import Retargeted
 from xreset.spec import ObjectSpec, RobotSpec, lowest_point
+from xreset.tensors import Tensors
 
 REST_DISTANCE = 0.010
 """Distance [m] from its start up to which an object counts as at rest on the table."""
@@ -35,7 +36,7 @@ NEAR = 0.025
 
 
 @dataclass(frozen=True, kw_only=True)
-class Grasps:
+class Grasps(Tensors):
     """G grasps: how a hand is about to hold an object."""
 
     label: tuple[str, ...]
@@ -52,6 +53,10 @@ class Grasps:
     def __len__(self) -> int:
         """G"""
         return len(self.label)
+
+    def __getitem__(self, rows: slice) -> Grasps:
+        """Select grasps."""
+        return replace(super().__getitem__(rows), label=self.label[rows])
 
 
 def find_grasps(

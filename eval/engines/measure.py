@@ -1,6 +1,7 @@
 """The physics that an engine really has, measured through the interface by short experiments.
 
-Nothing here knows any engine, so plugins and altered engines are measured alike. Gravity is off except where an object
+Nothing here knows any engine, so plugins and altered engines are measured alike. What ``xreset engines check`` proves
+of every engine, such as masses and the absence of delays, is not measured again. Gravity is off except where an object
 rests on the table.
 """
 
@@ -20,7 +21,6 @@ from xreset.errors import XResetError
 from xreset.eval.trial import Engine
 from xreset.geometry.dynamics import mass_matrix
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.rotations import quat_rotate_inverse
 from xreset.geometry.shapes import hull
 from xreset.geometry.urdf import link_meshes, robot_tree
 from xreset.physics import Backend, State
@@ -39,10 +39,6 @@ class Measured:
     """Pair friction of object and table."""
     torsional_friction: float
     """Torsional friction of object and table touching in one point [m]; NaN where it stops the object at once."""
-    mass: float
-    """Share of the object's mass."""
-    inertia: float
-    """Share of the object's inertia, at its mass."""
     arm_stiffness: float
     """Share of kp, median over the arm's joints."""
     arm_damping: float
@@ -53,19 +49,13 @@ class Measured:
     """Share of kd."""
     timestep: float
     """Step with which motion is integrated [s]."""
-    contact_give: float
-    """How far an object sinks into the table under ten times its weight [m]."""
-    delay: float
-    """Control steps until a new target acts."""
 
 
 _SLAB_HALF = (0.06, 0.06, 0.02)
-"""[m] of a box that slides or is loaded."""
+"""[m] of a box that slides."""
 _SLAB_MASS = 0.5
 _SPEED = 0.5
 """[m/s] of a slab that slides."""
-_LOAD = 10.0
-"""Load on a slab at rest, in its weight."""
 _PRESS = 3.0
 """[N] of the paddle on a link."""
 _PULL = 3.0
@@ -73,7 +63,7 @@ _PULL = 3.0
 _STEP = 0.03
 """[rad, m] of the drives, where that is within two fifths of their effort."""
 _SETTLE = 0.25
-"""[s] before loads and pulls."""
+"""[s] before pulls."""
 _TIME = 0.40
 """[s] of all experiments."""
 _PULL_WINDOW = (0.05, 0.12)
@@ -91,40 +81,32 @@ _PADDLE = 1
 _THING = 2
 _TOP = 3
 _WORLDS = {
-    "slide x": _SLAB,
-    "slide xy": _SLAB,
-    "load": _SLAB,
+    "slide": _SLAB,
     "spin": _TOP,
     "tip": _PADDLE,
     "link": _PADDLE,
     "force": _THING,
-    "torque x": _THING,
-    "torque y": _THING,
-    "torque z": _THING,
     "drives": _THING,
 }
 """Experiment -> index of its object; one world each."""
 _AT = {name: i for i, name in enumerate(_WORLDS)}
-_TORQUES = ("torque x", "torque y", "torque z")
 
 
 def measure(engine: Engine, scene: SceneSpec) -> Measured:
     """Put an engine through the experiments.
 
-    - A slab slides over the table from 0.5 m/s, along x and along the diagonal: its way d tells the friction, (v0^2 -
-      v1^2) / (2 g (d + v0 h / 2)) with h the step of the integration. (Its deceleration does not tell it: MuJoCo's
-      contacts lift what slides, so it patters.)
+    - A slab slides over the table from 0.5 m/s: its way d tells the friction, (v0^2 - v1^2) / (2 g (d + v0 h / 2)) with
+      h the step of the integration. (Its deceleration does not tell it: MuJoCo's contacts lift what slides, so it
+      patters.)
     - A top that can hardly fall spins on its point: what it loses, I dw, tells the torsional friction, I dw / int(N) dt
       with the load's impulse from the momentum (contacts may patter).
-    - A slab at rest is loaded with ten times its weight: how much it gives.
     - A paddle that can hardly turn is pressed onto a fingertip, and onto the farthest other link, with 3 N and then
       pulled sideways with three times what friction should carry: the friction is the ratio of the impulses that were
       missing along and across.
-    - A force on the free object: its acceleration is F / m, and its distance x after n steps, x = a t (t + h) / 2,
-      tells the step h of the integration. A torque about each of its axes tells its inertia.
+    - A constant force on the free object: its distance x = a t (t + h) / 2 and velocity a t tell the step h of the
+      integration.
     - Every drive gets a small step of its target q*. M v = kp int(q* - q) dt - kd (q - q0), fitted over the response,
-      tells kp and kd (of what moves, so an integrator's numerical damping counts as damping); when it begins tells the
-      delay.
+      tells kp and kd (of what moves, so an integrator's numerical damping counts as damping).
 
     Args:
         scene: robot and object (the first) of the skill, and its friction and timestep.
@@ -151,11 +133,7 @@ class _Bench:
         self._presses = {"tip": _reachable(scene, tip=True), "link": _reachable(scene, tip=False)}
         self._dt = scene.timestep
         self._place = free_place(scene)
-        _, axes = np.linalg.eigh(self._thing.inertia)
-        self._axes = axes.T  # principal axes in the object's frame, one for each torque
-        self._principal = [float(axis @ self._thing.inertia @ axis) for axis in self._axes]
         self._push = 2.0 * self._thing.mass  # [N] for 2 m/s^2
-        self._torques = [10.0 * inertia for inertia in self._principal]  # [N m] for 10 rad/s^2
         friction = scene.friction
         self._pull = {
             "tip": _PULL * _PRESS * max(friction.tip, 0.1),
@@ -174,8 +152,8 @@ class _Bench:
         targets[_AT["drives"]] += torch.tensor(self._drive_steps(), dtype=torch.float32)
         rows = {name: [value] for name, value in vars(start).items()}
         for step in range(round(_TIME / self._dt)):
-            force, torque = self._loads(step)
-            backend.set_object_wrench(force.to(backend.device), torque.to(backend.device))
+            force = self._loads(step).to(backend.device)
+            backend.set_object_wrench(force, torch.zeros_like(force))
             if step % self.scene.substeps == 0:
                 backend.set_joint_targets(targets.to(backend.device))
             backend.step(1)
@@ -198,54 +176,43 @@ class _Bench:
         row = _AT["force"]
         velocity = float(log["object_linvel"][_PUSH_STEPS, row, 0])
         distance = float(log["object_pos"][_PUSH_STEPS, row, 0] - log["object_pos"][0, row, 0])
-        mass = self._push * t / velocity / self._thing.mass
         step = 2.0 * distance / velocity - t
-        shares = []
-        for i, name in enumerate(_TORQUES):
-            quat = log["object_quat"][_PUSH_STEPS, _AT[name]]
-            turned = quat_rotate_inverse(quat, log["object_angvel"][_PUSH_STEPS, _AT[name]]).numpy()
-            shares.append(self._torques[i] * t / float(turned @ self._axes[i]) / self._principal[i])
-        inertia = float(np.median(shares)) / mass
-        height = log["object_pos"][:, _AT["load"], 2]
-        stiffness, damping, delay = self._drives(log)
+        stiffness, damping = self._drives(log)
         arm = self._robot.arm_indices
         hand = self._robot.hand_indices
         return Measured(
-            tip_friction=self._pulled(log, "tip", mass),
-            link_friction=self._pulled(log, "link", mass),
-            table_friction=(self._slid(log, _AT["slide x"], step) + self._slid(log, _AT["slide xy"], step)) / 2,
-            torsional_friction=inertia * self._torsion(log),
-            mass=mass,
-            inertia=inertia,
+            tip_friction=self._pulled(log, "tip"),
+            link_friction=self._pulled(log, "link"),
+            table_friction=self._slid(log, step),
+            torsional_friction=self._torsion(log),
             arm_stiffness=_median(stiffness[arm]),
             arm_damping=_median(damping[arm]),
             hand_stiffness=_median(stiffness[hand]),
             hand_damping=_median(damping[hand]),
             timestep=step,
-            contact_give=float(height[round(_SETTLE / dt)] - height[-1]),
-            delay=float(delay),
         )
 
-    def _pulled(self, log: dict[str, Tensor], name: str, mass: float) -> float:
+    def _pulled(self, log: dict[str, Tensor], name: str) -> float:
         """Return the friction of a paddle, from the impulses that were missing along and across the link."""
         _, normal, along = self._presses[name]
         begin = round((_SETTLE + _PULL_WINDOW[0]) / self._dt)
         end = round((_SETTLE + _PULL_WINDOW[1]) / self._dt)
         velocity = log["object_linvel"][:, _AT[name]]
-        gained = mass * _SLAB_MASS * (velocity[end] - velocity[begin]).numpy()
+        gained = _SLAB_MASS * (velocity[end] - velocity[begin]).numpy()
         time = (end - begin) * self._dt
         carried = self._pull[name] * time - float(gained @ along)
         pressed = _PRESS * time + float(gained @ normal)  # the press pushes against the normal
         return carried / pressed if pressed > 0.05 * _PRESS * time else float("nan")
 
-    def _slid(self, log: dict[str, Tensor], world: int, step: float) -> float:
-        """Return the friction from how far a slab has slid."""
+    def _slid(self, log: dict[str, Tensor], step: float) -> float:
+        """Return the friction from how far the slab has slid."""
+        world = _AT["slide"]
         end = log["object_linvel"][-1, world, :2].norm()
         way = (log["object_pos"][-1, world, :2] - log["object_pos"][0, world, :2]).norm()
         return float((_SPEED**2 - end**2) / (2 * GRAVITY * (way + _SPEED * step / 2)))
 
     def _torsion(self, log: dict[str, Tensor]) -> float:
-        """Return the torsional friction [m] from the spin that a top has lost, if its inertia at its mass is as stated.
+        """Return the torsional friction [m] from the spin that a top has lost.
 
         It is measured while the top has half of its spin; NaN if friction takes that in one step.
         """
@@ -273,24 +240,18 @@ class _Bench:
             else:
                 pos[i] = torch.tensor([*self._place, 0.0])
                 start.object_angvel[i, 2] = self._spin
-        start.object_linvel[_AT["slide x"], 0] = _SPEED
-        start.object_linvel[_AT["slide xy"], :2] = _SPEED * np.sqrt(0.5)
+        start.object_linvel[_AT["slide"], 0] = _SPEED
         return start
 
-    def _loads(self, step: int) -> tuple[Tensor, Tensor]:
-        """Return force and torque [N, 3] on the objects in a physics step."""
+    def _loads(self, step: int) -> Tensor:
+        """[N, 3] forces on the objects in a physics step."""
         force = np.zeros((len(_WORLDS), 3))
-        torque = np.zeros((len(_WORLDS), 3))
         late = step * self._dt >= _SETTLE
         for name, (_, normal, along) in self._presses.items():
             force[_AT[name]] = -_PRESS * normal + (self._pull[name] * along if late else 0.0)
-        if late:
-            force[_AT["load"], 2] = -_LOAD * _SLAB_MASS * GRAVITY
         if step < _PUSH_STEPS:
             force[_AT["force"], 0] = self._push
-            for i, name in enumerate(_TORQUES):  # the object starts unturned, and turns about this axis only
-                torque[_AT[name]] = self._torques[i] * self._axes[i]
-        return torch.as_tensor(force, dtype=torch.float32), torch.as_tensor(torque, dtype=torch.float32)
+        return torch.as_tensor(force, dtype=torch.float32)
 
     def _drive_steps(self) -> list[float]:
         """[J] change of each target, away from the nearer joint limit."""
@@ -302,18 +263,12 @@ class _Bench:
             out.append(size if limits.upper - joint.home >= joint.home - limits.lower else -size)
         return out
 
-    def _drives(self, log: dict[str, Tensor]) -> tuple[np.ndarray, np.ndarray, int]:
-        """Return the shares [J] of kp and kd, and the delay in control steps, after a step of the targets."""
+    def _drives(self, log: dict[str, Tensor]) -> np.ndarray:
+        """[2, J] shares of kp and kd, after a step of the targets."""
         position = log["joint_pos"][:, _AT["drives"]].numpy()
         velocity = log["joint_vel"][:, _AT["drives"]].numpy()
         drives = [joint.drive for joint in self._robot.joints]
         change = np.array(self._drive_steps(), dtype=np.float32).astype(float)
-        moved = (np.abs(position - position[0]) > 1e-3 * np.abs(change)).any(axis=1)
-        if not moved.any():
-            raise XResetError("no joint follows its target, so its drives cannot be measured.")
-        late = (int(moved.argmax()) - 1) // self.scene.substeps * self.scene.substeps
-        position = position[late:]
-        velocity = velocity[late:]
         M = mass_matrix(self._robot, self._robot.home) + np.diag([drive.armature for drive in drives])
         loss = np.array([drive.friction_loss for drive in drives])
         momentum = velocity @ M + np.cumsum(loss * np.sign(velocity), axis=0) * self._dt
@@ -325,8 +280,7 @@ class _Bench:
             columns = np.stack((pulled[:, j], position[0, j] - position[:, j]), axis=1)
             fit, *_ = np.linalg.lstsq(columns, momentum[:, j], rcond=None)
             gains.append(fit / (drive.kp, drive.kd))
-        kp, kd = np.transpose(gains)
-        return kp, kd, late // self.scene.substeps
+        return np.transpose(gains)
 
 
 def _block(name: str, *, inertia: np.ndarray) -> ObjectSpec:

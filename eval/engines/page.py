@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, get_args
 
 from jinja2 import UndefinedError
 
@@ -25,86 +24,56 @@ _NONE = "-"
 Json = Mapping[str, Any]
 
 
-class Column(NamedTuple):
-    """One engine on one device."""
-
-    engine: str
-    version: str
-    device: str
-
-    @property
-    def title(self) -> str:
-        """Such as ``mujoco 4.0.0``; the device is named where it is not the CPU."""
-        return f"{self.engine} {self.version}" + ("" if self.device == "cpu" else f", {self.device}")
+Checks = dict[str, dict[str, Json]]
+"""Checks of each engine on each device, by title of its column and by name, as in the file."""
 
 
-Checks = dict[Column, dict[str, Json]]
-"""Checks of each engine on each device, by name, as in the file."""
-
-
-@dataclass(frozen=True)
-class Results:
-    """The content of the page."""
-
-    commands: list[tuple[str, str, str]] = field(default_factory=list)
-    """What a file measured, the command that made it, and the version of xreset."""
-    checks: dict[str, Checks] = field(default_factory=dict)
-    """Checks by robot."""
-    capabilities: dict[Column, set[str]] = field(default_factory=dict)
-
-    def add(self, data: Json) -> None:
-        """Add the content of a file. A later check replaces one of the same engine, version, device and robot."""
-        covers = []
-        for run in data["runs"]:
-            column = Column(run["engine"], run["engine_version"], run["device"])
-            found = self.checks.setdefault(run["robot"], {}).setdefault(column, {})
-            found.update({check["check"]: check for check in run["checks"]})
-            self.capabilities.setdefault(column, set()).update(run["capabilities"])
-            covers.append(f"{column.engine} {column.version} with {run['robot']} on {column.device}")
-        command = data.get("command", "")
-        self.commands.append(
-            ("; ".join(covers), f"`{command}`" if command else "not recorded", data.get("xreset_version", ""))
-        )
-
-
-def read(paths: Iterable[Path]) -> Results:
+def read(paths: Iterable[Path]) -> list[Json]:
     """Read the files.
 
     Raises:
         FileFormatError: a file is of another kind, or incomplete.
         XResetError: there is no file.
     """
-    results = Results()
+    files = []
     for path in paths:
         data = read_json(path, CONFORMANCE)
         try:
-            alone = Results()
-            alone.add(data)
-            page(alone)  # asks the file for everything that the page needs
+            page([data])  # asks the file for everything that the page needs
         except (KeyError, TypeError, AttributeError, ValueError, IndexError, OverflowError, UndefinedError) as error:
             what = f"{type(error).__name__} {shown(str(error))}"
             raise FileFormatError(f"{path} is no complete {CONFORMANCE}: {what}. Make it again.") from error
-        results.add(data)
-    if not results.commands:
+        files.append(data)
+    if not files:
         raise XResetError("there is nothing to make a page of. Give files of xreset engines check --json.")
-    return results
+    return files
 
 
-def _order(columns: Iterable[Column]) -> list[Column]:
-    """Engines in the order of the files, with each one's versions and devices next to each other."""
-    known = list(columns)
-    engines = list(dict.fromkeys(column.engine for column in known))
-    return sorted(known, key=lambda column: engines.index(column.engine))
+def page(files: Iterable[Json]) -> str:
+    """Return the page of the contents of files, in Markdown.
 
-
-def page(results: Results) -> str:
-    """Return the page, in Markdown."""
+    A later check replaces one of the same engine, version, device and robot.
+    """
+    commands = []
+    capabilities: dict[str, set[str]] = {}
+    robots: dict[str, Checks] = {}
+    for data in files:
+        covers = []
+        for run in data["runs"]:
+            engine = f"{run['engine']} {run['engine_version']}"
+            covers.append(f"{engine} with {run['robot']} on {run['device']}")
+            column = engine if run["device"] == "cpu" else f"{engine}, {run['device']}"
+            found = robots.setdefault(run["robot"], {}).setdefault(column, {})
+            found.update({check["check"]: check for check in run["checks"]})
+            capabilities.setdefault(column, set()).update(run["capabilities"])
+        command = f"`{data['command']}`" if data.get("command") else "not recorded"
+        commands.append(("; ".join(covers), command, data.get("xreset_version", "")))
     known = []
     not_done = []
-    for robot, checks in results.checks.items():
+    for robot, checks in robots.items():
         for column in _order(checks):
             for name, check in checks[column].items():
-                where = (column.title, robot)
+                where = (column, robot)
                 for m in check["measures"]:
                     if m["verdict"] == "known difference":
                         amounts = [_amount(m[key], m) for key in ("measured", "tolerance", "bound")]
@@ -114,41 +83,43 @@ def page(results: Results) -> str:
     measured = ("engine", "robot", "measure", "measured", "tolerance", "accepted up to", "why")
     return render(
         "engines.md.j2",
-        commands=_table(("what", "command", "xreset"), results.commands),
-        capabilities=_capabilities(results.capabilities),
-        summaries={robot: _summary(checks) for robot, checks in results.checks.items()},
+        commands=_table(("what", "command", "xreset"), commands),
+        capabilities=_capabilities(capabilities),
+        summaries={robot: _summary(checks) for robot, checks in robots.items()},
         known_differences=_table(measured, known),
         not_done=_table(("engine", "robot", "check", "", "why"), not_done),
     )
 
 
-def _capabilities(found: Mapping[Column, set[str]]) -> str:
+def _order(columns: Iterable[str]) -> list[str]:
+    """Engines in the order of the files, with each one's versions and devices next to each other."""
+    known = list(columns)
+    engines = list(dict.fromkeys(column.split()[0] for column in known))
+    return sorted(known, key=lambda column: engines.index(column.split()[0]))
+
+
+def _capabilities(found: Mapping[str, set[str]]) -> str:
     columns = _order(found)
     others = sorted(set().union(*found.values()))
     rows = []
     for name in dict.fromkeys((*get_args(Capability), *others)) if found else ():
         rows.append((name.replace("_", " "), *("yes" if name in found[column] else "no" for column in columns)))
-    return _table(("", *(column.title for column in columns)), rows)
-
-
-def _every_check(checks: Checks) -> dict[str, Json]:
-    """Return all checks that any engine has run, by name, in the order of the suite."""
-    found: dict[str, Json] = {}
-    for column in _order(checks):
-        found = found | checks[column] | found  # an earlier column wins
-    return found
+    return _table(("", *columns), rows)
 
 
 def _summary(checks: Checks) -> str:
     columns = _order(checks)
+    every: dict[str, Json] = {}
+    for column in columns:
+        every = every | checks[column] | every  # an earlier column wins
     rows = []
     group = None
-    for name, check in _every_check(checks).items():
+    for name, check in every.items():
         if check["group"] != group:
             group = check["group"]
             rows.append((f"**{group}**", *[""] * (1 + len(columns))))
         rows.append((f"`{name}`", check["statement"], *(_verdict(checks[column].get(name)) for column in columns)))
-    return _table(("check", "what must hold", *(column.title for column in columns)), rows)
+    return _table(("check", "what must hold", *columns), rows)
 
 
 def _verdict(check: Json | None) -> str:
@@ -180,12 +151,8 @@ def _share(measure: Json) -> float:
 
 
 def _amount(value: Any, measure: Json) -> str:
-    return f"{_number(value)} {measure['unit']}".rstrip()
-
-
-def _number(value: Any) -> str:
-    """Two digits that matter; numbers that are not finite are text in the file."""
-    return "not measured" if value is None else f"{float(value):.2g}"
+    """Two digits that matter, with the unit; numbers that are not finite are text in the file."""
+    return f"{float(value):.2g} {measure['unit']}".rstrip()
 
 
 def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:

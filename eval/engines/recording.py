@@ -1,4 +1,4 @@
-"""Open-loop episodes of joint targets, and what an engine does with them.
+"""What an engine does with an open-loop episode: starts of G worlds, and the joint targets of each control step.
 
 Shape letters: G worlds, J joints, E fingertips, T control steps, P surface points.
 """
@@ -11,20 +11,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from xreset.eval.trial import Engine
 from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
 from xreset.physics import Backend, State
-from xreset.spec import SceneSpec
-
-
-@dataclass(frozen=True, kw_only=True)
-class OpenLoopEpisode:
-    """The starts of G worlds, and the targets of their drives."""
-
-    start: State
-    """[G, ...]"""
-    targets: Tensor
-    """[T, G, J] joint targets of each control step."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,11 +57,11 @@ class Recording:
         return quat_rotate_inverse(self.palm_quat[step][:, None], world - self.palm_pos[step][:, None])
 
 
-def play(backend: Backend, episode: OpenLoopEpisode) -> Recording:
-    """Set each world to its start and give the drives the episode's targets."""
-    backend.set_state(episode.start.to(backend.device))
+def play(backend: Backend, start: State, targets: Tensor) -> Recording:
+    """Set each world to its start [G, ...] and give the drives the targets [T, G, J]."""
+    backend.set_state(start.to(backend.device))
     frames: dict[str, list[Tensor]] = defaultdict(list)
-    for target in episode.targets.to(backend.device):
+    for target in targets.to(backend.device):
         backend.set_joint_targets(target)
         backend.step()
         state = backend.state()
@@ -92,14 +80,8 @@ def play(backend: Backend, episode: OpenLoopEpisode) -> Recording:
             frames[name].append(value.cpu().clone())
     health = backend.health()
     return Recording(
-        start=episode.start.to("cpu"),
-        joint_target=episode.targets.cpu(),
+        start=start.to("cpu"),
+        joint_target=targets.cpu(),
         broken=(health.nonfinite | health.overflow).cpu(),
         **{name: torch.stack(values) for name, values in frames.items()},
     )
-
-
-def record(engine: Engine, scene: SceneSpec, object_index: Tensor, episode: OpenLoopEpisode) -> Recording:
-    """Play an episode in new worlds of an engine; ``object_index``: [G] index of the object in each world."""
-    with engine.make(scene, len(object_index), object_index) as backend:
-        return play(backend, episode)

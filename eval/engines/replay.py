@@ -12,7 +12,7 @@ import torch
 from xreset.errors import XResetError
 from xreset.eval.engines.actions import Actions
 from xreset.eval.engines.divergence import THRESHOLDS, Differences, Divergence, differences, worst
-from xreset.eval.engines.recording import OpenLoopEpisode, Recording, record
+from xreset.eval.engines.recording import Recording, play
 from xreset.eval.trial import Engine
 from xreset.physics import State
 
@@ -32,12 +32,16 @@ class EngineTrace:
     recording: Recording
     """Its first world is the sequence's own."""
     differences: Differences
-    divergences: tuple[Divergence, ...]
 
     @property
     def name(self) -> str:
         """Name of the engine."""
         return self.engine.name
+
+    @property
+    def divergences(self) -> tuple[Divergence, ...]:
+        """How each quantity diverges; empty if no step is finite."""
+        return self.differences.first()
 
     @property
     def lifted(self) -> float | None:
@@ -123,12 +127,12 @@ def trace(
         progress(engine.name)
         worlds = len(start.joint_pos)
         targets = actions.joint_target[:, None].expand(-1, worlds, -1).contiguous()
-        episode = OpenLoopEpisode(start=start, targets=targets)
-        return record(engine, actions.scene, torch.zeros(worlds, dtype=torch.long), episode)
+        with engine.make(actions.scene, worlds, torch.zeros(worlds, dtype=torch.long)) as backend:
+            return play(backend, start, targets)
 
     def compared(engine: Engine, recording: Recording) -> EngineTrace:
         found = differences(recording, expected, actions.robot, dt)
-        return EngineTrace(engine=engine, recording=recording, differences=found, divergences=found.first())
+        return EngineTrace(engine=engine, recording=recording, differences=found)
 
     expected = replayed(reference, _perturbed(actions.start, seed))
     base = compared(reference, expected)

@@ -1,4 +1,4 @@
-"""A comparison of replays for a terminal, as a picture and as a film."""
+"""A comparison of replays for a terminal and as a picture."""
 
 from __future__ import annotations
 
@@ -13,9 +13,6 @@ from rich.text import Text
 from xreset.eval.engines.divergence import THRESHOLDS, Divergence
 from xreset.eval.engines.replay import PERTURBATION, EngineTrace, TraceResult
 from xreset.eval.plots import COLORS, picture
-from xreset.eval.report.clips import camera_for, draw_clip, encode_mp4
-from xreset.eval.rollout import Trace
-from xreset.files import write_whole
 
 _SHOWN = {
     "joints": ("mrad", 1e3),
@@ -56,7 +53,7 @@ def rich_table(result: TraceResult) -> Table:
 def _cell(result: TraceResult, found: Divergence, noise: bool) -> Text:
     lines = ["never"]
     if found.time is not None:
-        lines = [f"{found.time:.3f} s {result.actions.phase_at(found.time)}".rstrip()]
+        lines = [f"{found.time:.3f} s"]
         if noise:
             lines.append("within noise")
     if found.where:
@@ -85,32 +82,22 @@ def sentences(result: TraceResult) -> Iterator[str]:
             yield f"{engine.name} stays with {same}: within the thresholds, or as near as {same} stays to itself."
         else:
             time, first = min(beyond, key=lambda timed: timed[0])
-            phase = result.actions.phase_at(time)
-            during = f" (during {phase!r})" if phase else ""
             where = f": {first.where}" if first.where else ""
-            yield f"{engine.name} diverges first in {first.quantity} at {time:.3f} s{during}{where}."
+            yield f"{engine.name} diverges first in {first.quantity} at {time:.3f} s{where}."
 
 
 def write_plot(path: Path, result: TraceResult) -> None:
     """Write the plot as PNG.
 
     Rows of differences on logarithmic axes, with the thresholds (dashed) and the reference's distance to itself from
-    perturbed starts (grey); then, for each engine, when each finger touches the object.
+    perturbed starts (grey).
     """
     quantities = [quantity for quantity in THRESHOLDS if quantity != "contacts"]
-    fingers = result.actions.robot.fingertip_names
-    engines = (result.reference, *result.engines)
-    heights = [1.7] * len(quantities) + [0.35 + 0.13 * len(fingers) * len(engines)]
-    with picture(path, (10, sum(heights) + 0.9), dpi=110, font_size=9) as figure:
+    with picture(path, (10, 1.7 * len(quantities) + 0.9), dpi=110, font_size=9) as figure:
         figure.suptitle(f"{result.actions.label}: distance to {result.reference.name}", fontweight="bold")
-        axes = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
-        for ax, quantity in zip(axes, quantities, strict=False):
+        axes = figure.subplots(len(quantities), 1, sharex=True)
+        for ax, quantity in zip(axes, quantities, strict=True):
             _draw_differences(ax, result, quantity)
-        _draw_touches(axes[-1], engines, fingers)
-        for name, start in result.actions.phases:
-            for ax in axes:
-                ax.axvline(start, color="black", alpha=0.15, linewidth=0.8)
-            axes[0].text(start, 1, f" {name}", transform=axes[0].get_xaxis_transform(), va="top")
         axes[-1].set_xlabel("time [s]")
         handles, labels = axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False)
@@ -132,45 +119,3 @@ def _draw_differences(ax, result: TraceResult, quantity: str) -> None:
     ax.set_ylim(bottom=floor)
     ax.grid(axis="y", alpha=0.2)
     ax.set_title(f"{quantity} [{unit}]", loc="left", fontsize="medium")
-
-
-def _draw_touches(ax, engines: tuple[EngineTrace, ...], fingers: tuple[str, ...]) -> None:
-    count = len(engines)
-    for finger in range(len(fingers)):
-        ax.axhline(finger * count - 0.5, color="black", alpha=0.15, linewidth=0.8)
-        for k, engine in enumerate(engines):
-            d = engine.differences
-            y = finger * count + k
-            ax.fill_between(
-                d.time, y - 0.4, y + 0.4, where=d.touch[:, finger], step="pre", color=COLORS[k % len(COLORS)]
-            )
-    ax.set_yticks([i * count + (count - 1) / 2 for i in range(len(fingers))], list(fingers))
-    ax.set_ylim(len(fingers) * count - 0.5, -0.5)
-    names = ", ".join(engine.name for engine in engines)
-    ax.set_title(f"which fingers touch the object (in each, from above: {names})", loc="left", fontsize="medium")
-
-
-def write_film(path: Path, result: TraceResult) -> None:
-    """Write an mp4 at the sequence's own speed, with the engines next to each other, the reference first.
-
-    The translucent object is where the reference ends.
-    """
-    actions = result.actions
-    goal = result.reference.recording
-    traces = []
-    for engine in (result.reference, *result.engines):
-        r = engine.recording
-        trace = Trace(
-            sequence=0,
-            object=actions.object.name,
-            goal_pos=goal.object_pos[-1, 0].numpy(),
-            goal_quat=goal.object_quat[-1, 0].numpy(),
-            time=result.reference.differences.time,
-            joint_pos=r.joint_pos[:, 0].numpy(),
-            object_pos=r.object_pos[:, 0].numpy(),
-            object_quat=r.object_quat[:, 0].numpy(),
-        )
-        traces.append(trace)
-    camera = camera_for(traces)
-    clips = [draw_clip("", None, trace, actions.robot, actions.object, camera) for trace in traces]
-    write_whole(path, encode_mp4(np.concatenate([clip.frames for clip in clips], axis=2), clips[0].fps))

@@ -11,10 +11,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from xreset.eval.engines.episodes import GraspMotion, closing_episode, lifting_episode, squeezing_state
+from xreset.eval.engines.episodes import GraspMotion, closing_episode, lifting_targets, squeezed
 from xreset.eval.engines.grasps import Grasps
-from xreset.eval.engines.recording import OpenLoopEpisode, Recording, play
+from xreset.eval.engines.recording import Recording, play
 from xreset.eval.trial import Engine
+from xreset.geometry.kinematics import Kinematics
 from xreset.physics import State
 from xreset.spec import RobotSpec, SceneSpec
 
@@ -46,25 +47,24 @@ def try_closings(tested: Engine, scene: SceneSpec, grasps: Grasps, tries: GraspM
         table.
     """
     dt = scene.control_dt
-    episode = closing_episode(scene.robot, grasps.joint_pos, grasps.object_pos, grasps.object_quat, dt, tries)
-    closing = OpenLoopEpisode(start=episode.start, targets=episode.targets[: tries.closing_steps(dt)])
+    start, targets = closing_episode(scene.robot, grasps, dt, tries)
     with tested.make(scene, len(grasps), grasps.object_index) as backend:
-        whole = play(backend, episode)
+        whole = play(backend, start, targets)
         mass = torch.tensor([scene.objects[i].mass for i in grasps.object_index.tolist()], device=backend.device)
         backend.set_object_mass(PRESS_MASS * mass)
         backend.set_object_gravity(torch.zeros_like(mass))
-        return play(backend, closing), whole
+        return play(backend, start, targets[: tries.closing_steps(dt)]), whole
 
 
 def try_holds(tested: Engine, scene: SceneSpec, common: CommonStates, tries: GraspMotion) -> tuple[Recording, ...]:
     """Lift and shake, once with each of the frictions."""
-    episode = lifting_episode(scene.robot, common.start, scene.control_dt, tries)
+    targets = lifting_targets(scene.robot, common.start, scene.control_dt, tries)
     recordings = []
     with tested.make(scene, len(common.object_index), common.object_index) as backend:
         for mu in FRICTIONS:
             friction = torch.tensor([mu, mu, scene.friction.table], device=backend.device)
             backend.set_friction(friction.repeat(backend.num_worlds, 1))
-            recordings.append(play(backend, episode))
+            recordings.append(play(backend, common.start, targets))
     return tuple(recordings)
 
 
@@ -91,11 +91,11 @@ def common_states(
         dt: control step [s].
         tries: how grasps are tried.
     """
-    shown = min(round(count * IN_AIR), len(air))
-    held = squeezing_state(robot, air.joint_pos[:shown], air.object_pos[:shown], air.object_quat[:shown], tries)
-    labels = [f"{label} as demonstrated" for label in air.label[:shown]]
-    states = [held]
-    index = [air.object_index[:shown]]
+    shown = air[: round(count * IN_AIR)]
+    closed = squeezed(Kinematics(robot), shown.joint_pos, tries)
+    states = [State.at_rest(shown.joint_pos, shown.object_pos, shown.object_quat, closed)]
+    labels = [f"{label} as demonstrated" for label in shown.label]
+    index = [shown.object_index]
     last = tries.closing_steps(dt) - 1
     names = list(closings)
     for g in range(len(table)):

@@ -26,9 +26,9 @@ def attribute(
 ) -> None:
     """Find the physical difference between two engines that costs a policy its skill.
 
-    First both engines are measured through their interface: friction, object mass and inertia, drive stiffness and
-    damping, timestep, contact softness, latency. Then the policy plays the same episodes in one engine, in that engine
-    with one property changed to the value of the other engine, with all properties changed, and in the other engine.
+    First both engines are measured through their interface: friction, drive stiffness and damping, timestep. Then the
+    policy plays the same episodes in one engine, in that engine with one property changed to the value of the other
+    engine, with all properties changed, and in the other engine.
 
     Args:
         demos: Demonstrations (xreset demos) or retargeted trajectories (xreset retarget): starts and goals, and the
@@ -38,7 +38,7 @@ def attribute(
         only: Property to change; give it again for more. Default: all in which the engines differ.
         episodes: Episodes per demonstration.
         setting: Robot, meshes, seed of the perturbations of the starts, device and worlds.
-        out: Folder for attribution.json and attribution.png; default: attribute/ next to the policy's results.
+        out: Folder for attribution.json; default: attribute/ next to the policy's results.
     """
     if backend == towards:
         raise XResetError(f"--backend and --towards are both {backend!r}. Choose two engines.")
@@ -66,7 +66,6 @@ def attribute(
         "inputs": played.inputs,
     }
     write_json(out / "attribution.json", content)
-    attribution_view.write_plot(out / "attribution.png", found, title)
     console.print(attribution_view.rich_table(found, title))
     for line in attribution_view.not_tried(found):
         console.print(line, style="dim")

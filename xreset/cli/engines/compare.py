@@ -10,8 +10,9 @@ from rich.text import Text
 from xreset.cli._common import AllEngines, Device, Objects, Robot, Several, Source, this_command, usable_engines
 from xreset.cli._terminal import Progress, console
 from xreset.eval import trial
-from xreset.eval.engines import agreement, sources
+from xreset.eval.engines import agreement
 from xreset.files import code_version, file_hash, write_json
+from xreset.inputs import load_inputs
 
 
 def compare(
@@ -43,17 +44,12 @@ def compare(
         engines = [each for each in engines if not each.slow]
     with Progress() as bar:
         task = bar.add_task("retargeting")
-        spec, loaded, grasped = sources.load_motion(
-            motion,
-            robot=robot,
-            objects_folder=objects,
-            only=only,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
-        )
+        loaded = load_inputs(motion, robot=robot, objects=objects, only=only, accept=("demos", "motion"))
+        grasped = loaded.motion(lambda done, total: bar.update(task, completed=done, total=total))
         inputs = {"motion": file_hash(motion)}  # now: after minutes of work the file may be another, or gone
         result = agreement.compare(
-            spec,
-            loaded,
+            loaded.robot,
+            loaded.objects,
             grasped,
             engines,
             grasps=grasps,

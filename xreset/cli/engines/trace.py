@@ -7,7 +7,7 @@ from pathlib import Path
 from xreset.cli._common import Flat, Several, Source, usable_engines
 from xreset.cli._terminal import Progress, console
 from xreset.eval import trial
-from xreset.eval.engines import actions, replay, sources, trace_view
+from xreset.eval.engines import actions, replay, trace_view
 from xreset.eval.setting import Place
 from xreset.files import write_json
 
@@ -20,7 +20,6 @@ def trace(
     object: str | None = None,
     episode: int = 0,
     place: Flat[Place] = Place(),
-    mp4: bool = False,
     out: Path = Path("runs/trace"),
 ) -> None:
     """Replay the same actions from the same state in several engines, and show when and by how much they diverge.
@@ -33,7 +32,6 @@ def trace(
         object: Object, if the source has several; default: the first.
         episode: Which of the object's grasps or recorded episodes.
         place: Robot, meshes, seed, device.
-        mp4: Also write film.mp4: engines next to each other, the reference first.
         out: Folder for trace.json, trace.png, and actions.npz: the actions, and what every engine did.
     """
     base = trial.engine(reference, device=place.device)
@@ -41,7 +39,7 @@ def trace(
     engines = [trial.engine(name, device=place.device) for name in names]
     with Progress() as bar:
         task = bar.add_task("actions", total=None)
-        played = sources.from_file(source, place, object, episode)
+        played = actions.from_file(source, place, object, episode)
         result = replay.trace(
             played, base, engines, seed=place.seed, progress=lambda name: bar.update(task, description=name)
         )
@@ -49,8 +47,6 @@ def trace(
         actions.write_actions(out / "actions.npz", played, replays)
         write_json(out / "trace.json", result.as_dict())
         trace_view.write_plot(out / "trace.png", result)
-        if mp4:
-            trace_view.write_film(out / "film.mp4", result)
     console.print(trace_view.rich_table(result))
     for sentence in trace_view.sentences(result):
         console.print(sentence)

@@ -2,12 +2,12 @@
 moved."""
 
 import dataclasses
-import os
 import shutil
 import tempfile
 import unittest
 from itertools import product
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import splice, spread_over, track
 from xreset.retarget.validity import Thresholds, classify
 from xreset.robot_tools.check import check
-from xreset.robot_tools.placement import Finalist, PlaceConfig, Reach, Search, write_placement
+from xreset.robot_tools.placement import Finalist, PlaceConfig, write_placement
 
 try:
     from xreset.robot_tools import place as placing
@@ -55,51 +55,46 @@ class PlaceTest(unittest.TestCase):
         cls.reached = placing.reach(cls.robot, cls.wrists)
 
     def test_reach_of_poses_within_reach_and_out_of_it(self):
-        self.assertGreater(self.reached.reached, 0.95)
-        self.assertGreater(self.reached.dexterity, 0.1)
-        self.assertEqual(placing.reach(self.lost, self.wrists), Reach(reached=0.0, dexterity=0.0))
+        self.assertGreater(self.reached[0], 0.95)
+        self.assertGreater(self.reached[1], 0.1)
+        self.assertEqual(placing.reach(self.lost, self.wrists), (0.0, 0.0))
 
     def test_a_robot_that_stands_wrong_is_moved_to_where_it_reaches(self):
         seen = []
         avoid = self.wrists.root_pos[:, 0].numpy()
-        found = placing.place(
-            self.lost, [self.wrists], avoid, CONFIG, lambda done, best: seen.append((done, best.rank))
+        best, own = placing.place(
+            self.lost, [self.wrists], avoid, CONFIG, lambda done, reached: seen.append((done, reached))
         )
-        own = found.finalists[-1]
-        self.assertEqual((own.robot, own.reach.reached, own.followed), (self.lost, 0.0, 0.0))
-        self.assertGreater(found.best.reach.reached, 0.2)
+        self.assertEqual((own.robot, own.reached, own.followed), (self.lost, 0.0, 0.0))
+        self.assertGreater(best.reached, 0.2)
         # Every path is one frame long here.
-        self.assertAlmostEqual(found.best.followed, found.best.reach.reached, delta=0.2)
-        self.assertEqual(found.frames, 40)
-        self.assertGreaterEqual(np.linalg.norm(avoid - found.best.robot.base_pos, axis=1).min(), CONFIG.clear)
+        self.assertAlmostEqual(best.followed, best.reached, delta=0.2)
+        self.assertEqual(best.frames, 40)
+        self.assertGreaterEqual(np.linalg.norm(avoid - best.robot.base_pos, axis=1).min(), CONFIG.clear)
         self.assertEqual(seen, sorted(seen))  # the best yet never gets worse
-        self.assertEqual(found.best.home_rule, "the joints as they were")  # home held the hand three metres up
-        self.assertEqual(found.best.robot.joints, self.lost.joints)
+        self.assertEqual(best.home_rule, "the joints as they were")  # home held the hand three metres up
+        self.assertEqual(best.robot.joints, self.lost.joints)
 
-    def test_a_placement_that_keeps_home_is_preferred(self):
-        chosen = []
-        for rule in ("", "test"):
-            chosen.append(Finalist(robot=self.robot, reach=self.reached, followed=0.5, home_rule=rule))
-        self.assertIs(Search(finalists=tuple(chosen), frames=1).best, chosen[1])
-
-    def test_the_same_seed_finds_the_same_in_any_number_of_processes(self):
-        small = dataclasses.replace(CONFIG, candidates=2, rounds=2)
-        first, second = (placing.place(self.robot, [self.wrists], NOWHERE, small, processes=n) for n in (1, 2))
-        self.assertEqual(first, second)
-
-    def test_a_process_that_is_killed_is_an_error(self):
-        with self.assertRaisesRegex(RobotError, "was killed; is there memory"), placing._mapper(2) as each:
-            list(each(os._exit, [9]))
+    def test_a_placement_with_a_home_is_preferred(self):
+        homes = [(self.lost, "as described"), (self.robot, "")]
+        few = dataclasses.replace(CONFIG, candidates=1, rounds=1, elite=1, clear=0.0)
+        with (
+            mock.patch.object(placing, "_with_home", side_effect=homes),
+            mock.patch.object(placing, "_candidates", return_value=[self.robot]),
+        ):
+            found = placing.place(self.lost, [self.wrists[:8]], NOWHERE, few)
+        self.assertEqual([finalist.robot for finalist in found], [self.lost, self.robot])
+        self.assertGreater(found[1].followed, found[0].followed)
 
     def test_a_candidate_that_cannot_come_in_is_given_up(self):
-        least = self.reached.rank[0]
-        self.assertEqual(placing.reach(self.robot, self.wrists, least).rank[0], least)
+        least = placing._rank(self.reached)[0]
+        self.assertEqual(placing._rank(placing.reach(self.robot, self.wrists, least))[0], least)
         # What was tried fails, what was not counts as reached.
-        self.assertEqual(placing.reach(self.lost, self.wrists, least).reached, 1 - placing._FIRST / 40)
+        self.assertEqual(placing.reach(self.lost, self.wrists, least)[0], 1 - placing._FIRST / 40)
 
     def test_without_a_round_the_own_placement_is_measured(self):
         found = placing.place(self.robot, [self.wrists], NOWHERE, dataclasses.replace(CONFIG, rounds=0))
-        self.assertEqual([finalist.robot for finalist in found.finalists], [self.robot])
+        self.assertEqual([finalist.robot for finalist in found], [self.robot])
 
     def test_home_holds_the_hand_where_it_did(self):
         near = dataclasses.replace(self.robot, base_pos=(0.46, 0.61, 0.56))
@@ -209,12 +204,13 @@ class WritePlacementTest(unittest.TestCase):
         moved = dataclasses.replace(
             self.robot, base_pos=(0.1, 0.2, 0.3), base_quat=(0.6, 0.0, 0.8, 0.0), joints=tuple(joints)
         )
-        reach = Reach(reached=0.9123, dexterity=0.5)
-        self.best = Finalist(robot=moved, reach=reach, followed=0.8765, home_rule="the hand where it was")
-        self.own = Finalist(robot=self.robot, reach=reach, followed=0.75, home_rule="as described")
+        self.best = Finalist(
+            robot=moved, reached=0.9123, dexterity=0.5, followed=0.8765, frames=321, home_rule="the hand where it was"
+        )
+        self.own = dataclasses.replace(self.best, robot=self.robot, followed=0.75, home_rule="as described")
 
-    def write(self, *finalists: Finalist, command: str = "x") -> None:
-        write_placement(self.file, self.robot, Search(finalists=finalists, frames=321), command)
+    def write(self, best: Finalist, command: str = "x") -> None:
+        write_placement(self.file, self.robot, best, command)
 
     def lines(self) -> list[str]:
         """Lines of the description without the figure of its placement."""
@@ -222,7 +218,7 @@ class WritePlacementTest(unittest.TestCase):
 
     def test_the_description_reads_back(self):
         for _ in range(2):  # the second one replaces the first
-            self.write(self.best, self.own, command='xreset robots place openarm --demos "my demos.npz"')
+            self.write(self.best, 'xreset robots place openarm --demos "my demos.npz"')
             after = load(self.folder)
             self.assertEqual(after.base_pos, self.best.robot.base_pos)
             self.assertEqual(after.base_quat, self.best.robot.base_quat)
@@ -234,7 +230,7 @@ class WritePlacementTest(unittest.TestCase):
 
     def test_where_the_own_placement_is_best_only_its_figure_is_written(self):
         lines = self.lines()
-        self.write(self.own, self.best, command=r"a \\g<1> \b")
+        self.write(self.own, r"a \\g<1> \b")
         after = load(self.folder)
         self.assertEqual(after.fingerprint, self.robot.fingerprint)
         self.assertEqual((after.placement.followed, after.placement.command), (0.75, r"a \\g<1> \b"))

@@ -10,7 +10,6 @@ from rich.table import Table
 from rich.text import Text
 
 from xreset import __version__, description, inputs
-from xreset.backends import workers
 from xreset.cli._common import AllEngines, Device, Objects, Robot, RobotName, Source, this_command, usable_engines
 from xreset.cli._terminal import Progress, console
 from xreset.demos import archive
@@ -109,7 +108,6 @@ def place(
     demos: Path,
     objects: Objects = None,
     max_per_object: int = 2,
-    processes: int | None = None,
     write: bool = False,
     search: PlaceConfig = PlaceConfig(),
 ) -> None:
@@ -118,7 +116,6 @@ def place(
     Args:
         demos: Archive of demonstrations (`xreset demos`).
         max_per_object: Number of sequences of each object, spread over the archive.
-        processes: Number of processes, with about 0.5 GB each; default: one for each core, at most 8.
         write: Write the placement and its home into the robot's robot.toml.
         search: Ranges and effort of the search.
     """
@@ -131,27 +128,27 @@ def place(
         avoid = np.concatenate((wrists, pipeline.rest_on_table(chosen, specs).object_pos))
         task = bar.add_task("placements", total=1.0)
 
-        def report(done: float, best: placement.Reach) -> None:
-            bar.update(task, completed=done, description=f"placements (best yet reaches {best.reached:.0%})")
+        def report(done: float, reached: float) -> None:
+            bar.update(task, completed=done, description=f"placements (best yet reaches {reached:.0%})")
 
-        found = places.place(spec, paths, avoid, search, report, processes or min(workers.usable_cores(), 8))
+        found = places.place(spec, paths, avoid, search, report)
     table = Table("", "follows", "reaches", "dexterity", "base.pos", "base.quat", "home", title="placements")
-    for finalist in found.finalists:
+    for finalist in found:
         table.add_row(
-            "best" if finalist is found.best else "runner-up",
+            "best" if finalist is found[0] else "runner-up",
             f"{finalist.followed:.1%}",
-            f"{finalist.reach.reached:.1%}",
-            f"{finalist.reach.dexterity:.3f}",
+            f"{finalist.reached:.1%}",
+            f"{finalist.dexterity:.3f}",
             f"[{_digits(finalist.robot.base_pos)}]",
             f"[{_digits(finalist.robot.base_quat)}]",
             finalist.home_rule or "not found",
         )
     console.print(table)
-    console.print(f"arm at home in the best: {_digits(found.best.robot.home[spec.arm_indices])}")
-    console.print(f"of {found.frames} annotated frames of {chosen.num_sequences} sequences")
+    console.print(f"arm at home in the best: {_digits(found[0].robot.home[spec.arm_indices])}")
+    console.print(f"of {found[0].frames} annotated frames of {chosen.num_sequences} sequences")
     if write:
         file = description.robot_folder(robot) / description.DESCRIPTION
-        placement.write_placement(file, spec, found, this_command())
+        placement.write_placement(file, spec, found[0], this_command())
         console.print(f"wrote {file}")
 
 

@@ -3,23 +3,16 @@
 Hand retargeting says where the hand root must be in every frame of some demonstrations. Candidates are drawn at random,
 then around the best of them (the cross-entropy method), and tried on single frames, from several starts: what the arm
 *can* reach. The few best, and the robot's own placement, then follow whole motions as in ``xreset retarget``, and the
-one that follows most wins. The number of processes does not change the result.
+one that follows most wins.
 
 Shape letters: F frames, n arm joints.
 """
 
 from __future__ import annotations
 
-import multiprocessing
-import signal
 import warnings
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
@@ -32,7 +25,7 @@ from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track
 from xreset.retarget.validity import Thresholds, classify
 from xreset.robot_tools.homes import hold_near, table_clearance
-from xreset.robot_tools.placement import Finalist, PlaceConfig, Reach, Search
+from xreset.robot_tools.placement import Finalist, PlaceConfig
 from xreset.spec import RobotSpec
 from xreset.tensors import one_thread
 
@@ -51,8 +44,6 @@ _SHRINK = 0.6
 """Factor by which the spread of candidates about the best shrinks from round to round."""
 _HOME_CLEAR = 0.02
 """[m] Least height above the table of a home of which only the joints are kept."""
-_FINALIST = 10
-"""A finalist takes about as long as this many candidates."""
 
 
 @one_thread()
@@ -61,22 +52,21 @@ def place(
     paths: list[ArmTargets],
     avoid: np.ndarray,
     config: PlaceConfig | None = None,
-    progress: Callable[[float, Reach], None] = lambda done, best: None,
-    processes: int = 1,
-) -> Search:
+    progress: Callable[[float, float], None] = lambda done, reached: None,
+) -> list[Finalist]:
     """Find the placement from which the robot follows most of the motions.
-
-    Of the finalists, the best is the one that follows most and has a home; the others are kept as runners-up.
 
     Args:
         robot: the robot; its own placement is the first candidate, and a finalist.
         paths: what hand retargeting asks of the arm: see :func:`xreset.retarget.pipeline.wrist_paths`.
         avoid: [., 3] points that the base keeps clear of.
-        progress: called with the share that is done and the best reach yet.
-        processes: number of processes that try placements; each needs about 0.5 GB.
+        progress: called with the share that is done and the share of frames that the best candidate yet reaches.
+
+    Returns:
+        The finalists, those with a home first, and of these the one that follows most.
 
     Raises:
-        RobotError: there is no wrist pose to reach, no room for the base, or a process was killed.
+        RobotError: there is no wrist pose to reach, or no room for the base.
     """
     config = config or PlaceConfig()
     wrists = single_frames(paths, Thresholds().hand_error)
@@ -91,71 +81,56 @@ def place(
     kept = wrists[order[config.frames :][:_FINAL_FRAMES]]
     if not len(kept.annotated):
         kept = tried
-    best = reach(robot, tried)
-    found = [(best, robot)]
+    found = [(reach(robot, tried), robot)]
+    best = found[0][0]
     done = 0
-    effort = config.rounds * config.candidates + _FINALIST * (1 + config.elite)
-    with _mapper(processes) as each:
-        for number in range(config.rounds):
-            elite = found[: config.elite]
-            least = elite[-1][0].rank[0] if len(elite) == config.elite else 0
-            drawn = _candidates(robot, avoid, config, random, number, [candidate for _, candidate in elite])
-            for candidate, reached in zip(drawn, each(partial(reach, wrists=tried, least=least), drawn), strict=True):
-                found.append((reached, candidate))
-                best = max(best, reached, key=lambda one: one.rank)
-                done += 1
-                progress(done / effort, best)
-            found.sort(key=lambda pair: pair[0].rank, reverse=True)
-        chosen = [robot]
-        if config.rounds:
-            chosen += [candidate for _, candidate in found[: config.elite] if candidate is not robot]
-        finalists: list[Finalist] = []
-        for finalist in each(partial(_finalist, robot=robot, wrists=kept, paths=paths), chosen):
-            finalists.append(finalist)
-            progress(1.0 - _FINALIST * (len(chosen) - len(finalists)) / effort, best)
-    frames = sum(int(path.annotated.sum()) for path in paths)
-    ranked = sorted(finalists, key=lambda finalist: finalist.followed, reverse=True)
-    return Search(finalists=tuple(ranked), frames=frames)
+    for number in range(config.rounds):
+        elite = found[: config.elite]
+        least = _rank(elite[-1][0])[0] if len(elite) == config.elite else 0
+        for candidate in _candidates(robot, avoid, config, random, number, [candidate for _, candidate in elite]):
+            found.append((reach(candidate, tried, least), candidate))
+            best = max(best, found[-1][0], key=_rank)
+            done += 1
+            progress(0.8 * done / (config.rounds * config.candidates), best[0])
+        found.sort(key=lambda pair: _rank(pair[0]), reverse=True)
+    chosen = [robot]
+    if config.rounds:
+        chosen += [candidate for _, candidate in found[: config.elite] if candidate is not robot]
+    finalists: list[Finalist] = []
+    for candidate in chosen:
+        finalists.append(_finalist(candidate, robot, kept, paths))
+        progress(0.8 + 0.2 * len(finalists) / len(chosen), best[0])
+    return sorted(finalists, key=lambda finalist: (finalist.home_rule != "", finalist.followed), reverse=True)
+
+
+def _rank(reached: tuple[float, float]) -> tuple[int, float]:
+    """Return what candidates are compared by: reach to half a percent, then dexterity."""
+    return round(reached[0] * 200), reached[1]
 
 
 def _finalist(placed: RobotSpec, robot: RobotSpec, wrists: ArmTargets, paths: list[ArmTargets]) -> Finalist:
     """Try a placement of a robot on more frames and on whole motions."""
-    reached = reach(placed, wrists)
+    reached, dexterity = reach(placed, wrists)
     model = ArmModel(placed)
     valid = 0
-    annotated = 0
     for path in paths:
         _, measures = track(model, path, Thresholds())
         valid += int((classify(measures, Thresholds()) == 0).sum())
-        annotated += int(path.annotated.sum())
+    frames = sum(int(path.annotated.sum()) for path in paths)
     with_home, rule = _with_home(placed, robot)
-    return Finalist(robot=with_home, reach=reached, followed=valid / annotated, home_rule=rule)
+    return Finalist(
+        robot=with_home,
+        reached=reached,
+        dexterity=dexterity,
+        followed=valid / frames,
+        frames=frames,
+        home_rule=rule,
+    )
 
 
-def _begin() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends a process at once, without a traceback of each
-    torch.set_num_threads(1)
-
-
-@contextmanager
-def _mapper(processes: int) -> Iterator[Callable[..., Iterable[Any]]]:
-    """Yield ``map``, which calls a function here or in several processes."""
-    if processes < 2:
-        yield map
-        return
-    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _begin)
-    try:
-        yield pool.map
-    except BrokenProcessPool as error:
-        raise RobotError(
-            "a process that tried placements was killed; is there memory for all of them? Try fewer (--processes)."
-        ) from error
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def reach(robot: RobotSpec, wrists: ArmTargets, least: int = 0) -> Reach:
-    """Return what the robot reaches of wrist poses [F, 1, ...] from where it stands.
+def reach(robot: RobotSpec, wrists: ArmTargets, least: int = 0) -> tuple[float, float]:
+    """Return what the robot reaches of wrist poses [F, 1, ...] from where it stands: share and dexterity, as in
+    :class:`Finalist`.
 
     It is given up after some frames if the first number of its rank must stay below ``least``; then all frames that
     were not tried count as reached.
@@ -167,7 +142,7 @@ def reach(robot: RobotSpec, wrists: ArmTargets, least: int = 0) -> Reach:
     possible = frames
     dexterity = torch.zeros(0, dtype=torch.float64)
     for part in (wrists[:_FIRST], wrists[_FIRST:]) if least else (wrists,):
-        if Reach(reached=possible / frames, dexterity=0.0).rank[0] < least:
+        if round(200 * possible / frames) < least:
             break
         joints, measures = track(model, part, thresholds, effort)
         reached = (classify(measures, thresholds) == 0)[:, 0]
@@ -176,7 +151,7 @@ def reach(robot: RobotSpec, wrists: ArmTargets, least: int = 0) -> Reach:
         jacobian = model.kinematics.jacobian(configurations, [robot.hand_root])
         rows = torch.cat((jacobian.linear[:, 0] / _LENGTH, jacobian.angular[:, 0]), dim=1)[..., model.arm]
         dexterity = torch.cat((dexterity, torch.linalg.svdvals(rows)[:, -1]))
-    return Reach(reached=possible / frames, dexterity=float(dexterity.mean()) if len(dexterity) else 0.0)
+    return possible / frames, float(dexterity.mean()) if len(dexterity) else 0.0
 
 
 def single_frames(paths: list[ArmTargets], hand_error: float) -> ArmTargets:

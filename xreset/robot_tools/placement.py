@@ -39,59 +39,31 @@ class PlaceConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reach:
-    """What a robot reaches from a placement."""
-
-    reached: float
-    """Share of the frames within the tolerances, clear of table and self."""
-    dexterity: float
-    """Mean over the reached frames of the smallest singular value of the hand root's Jacobian, lengths in units of 0.1
-    m; 0 is singular."""
-
-    @property
-    def rank(self) -> tuple[int, float]:
-        """For comparison: reach to half a percent, then dexterity."""
-        return (round(self.reached * 200), self.dexterity)
-
-
-@dataclass(frozen=True, kw_only=True)
 class Finalist:
     """A placement that was also tried on whole motions."""
 
     robot: RobotSpec
     """The robot that stands there, with its home."""
-    reach: Reach
-    """On the final frames."""
+    reached: float
+    """Share of the final frames, each on its own, within the tolerances, clear of table and self."""
+    dexterity: float
+    """Mean over the reached frames of the smallest singular value of the hand root's Jacobian, lengths in units of 0.1
+    m; 0 is singular."""
     followed: float
     """Share of all annotated frames that are valid when the arm follows the motions from frame to frame, as in ``xreset
     retarget``."""
+    frames: int
+    """Annotated frames of the motions."""
     home_rule: str
     """How home was chosen; empty: no home was found."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Search:
-    """Result of :func:`xreset.robot_tools.place.place`."""
-
-    finalists: tuple[Finalist, ...]
-    """Those that follow most first. The description's own placement is one of them."""
-    frames: int
-    """Annotated frames of the motions."""
-
-    @property
-    def best(self) -> Finalist:
-        """The finalist that follows most and has a home."""
-        return next((finalist for finalist in self.finalists if finalist.home_rule), self.finalists[0])
-
-
-def write_placement(path: Path, robot: RobotSpec, search: Search, command: str) -> None:
-    """Put the placement found, its home configuration and its figures into a ``robot.toml``; all other lines stay as
-    they are.
+def write_placement(path: Path, robot: RobotSpec, best: Finalist, command: str) -> None:
+    """Put a placement, its home configuration and its figures into a ``robot.toml``; all other lines stay as they are.
 
     Raises:
         RobotError: the file does not have the lines that would change, or there is no home to put there.
     """
-    best = search.best
     pos = _listed(best.robot.base_pos)
     quat = _listed(best.robot.base_quat)
     if not best.home_rule:
@@ -99,7 +71,7 @@ def write_placement(path: Path, robot: RobotSpec, search: Search, command: str) 
             f"robot {robot.name!r}: no placement has a home. Put base.pos = {pos} and base.quat = {quat} into {path}, "
             "and choose a home of the arm's joints there: look at it with xreset robots check --picture."
         )
-    figures = f"reached = {best.reach.reached:.3f}, followed = {best.followed:.3f}, frames = {search.frames}"
+    figures = f"reached = {best.reached:.3f}, followed = {best.followed:.3f}, frames = {best.frames}"
     stated = f"placement = {{ {figures}, command = {json.dumps(command, ensure_ascii=False)} }}"
     edits = [(r"^quat *=.*()$", f"\n{stated}")]
     if best.robot != robot:  # else not a digit may change: it would be another robot

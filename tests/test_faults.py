@@ -2,6 +2,7 @@
 
 import tempfile
 import unittest
+from collections import deque
 from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
@@ -12,10 +13,11 @@ import torch
 from tests.test_env import TASK, BreakableBackend, N, WithEnv
 from tests.test_learning import observations
 from xreset.errors import RunError
-from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig, rsl_rl_config
+from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
+from xreset.learning.distributed import Processes
 from xreset.learning.ppo import SequencePpo
 from xreset.learning.run import checkpoints
-from xreset.learning.runner import MAX_SHARE, WINDOW, FaultBudget, TrainingRunner
+from xreset.learning.runner import MAX_SHARE, WINDOW, TrainingRunner
 
 CONFIG = TrainConfig(
     task=TASK,
@@ -41,16 +43,23 @@ class PlannedBackend(BreakableBackend):
 
 class Budget(unittest.TestCase):
     def test_the_share_of_a_window(self):
-        budget = FaultBudget(1000)
-        self.assertAlmostEqual(budget.allowed, MAX_SHARE * WINDOW * 1000)
-        self.assertIsNone(budget.add(150, 50))
-        self.assertRegex(budget.add(1, 0) or "", "151 worlds were not finite and 50 dropped .* 0.1%")
+        def counted(*faults: tuple[int, int]) -> None:
+            env = mock.Mock(nonfinite_count=torch.tensor(0), overflow_count=torch.tensor(0))
+            runner = mock.Mock(
+                env=env,
+                processes=Processes(),
+                _faults_before=torch.zeros(2, dtype=torch.long),
+                _recent_faults=deque(maxlen=WINDOW),
+            )
+            for nonfinite, overflow in faults:
+                env.nonfinite_count = env.nonfinite_count + nonfinite
+                env.overflow_count = env.overflow_count + overflow
+                TrainingRunner._check_faults(runner, 1000)
 
-        budget = FaultBudget(1000)
-        budget.add(200, 0)
-        for _ in range(WINDOW - 1):
-            self.assertIsNone(budget.add(0, 0))
-        self.assertIsNone(budget.add(0, 200), "old faults are forgotten")
+        counted((150, 50))
+        counted((200, 0), *[(0, 0)] * (WINDOW - 1), (0, 200))  # old faults are forgotten
+        with self.assertRaisesRegex(RunError, "151 worlds were not finite and 50 dropped .* 0.1%"):
+            counted((150, 50), (1, 0))
 
 
 class Environment(WithEnv):
@@ -68,13 +77,8 @@ class Environment(WithEnv):
 class Learning(unittest.TestCase):
     def updated(self, faulty_reward: float, *, marked: bool) -> dict[str, torch.Tensor]:
         """Weights after one update in which world 1's step 2 had that reward, and was the last of its episode."""
-
-        env = mock.Mock(num_envs=N, num_actions=3, device="cpu")
-
         torch.manual_seed(0)
-        alg = SequencePpo.construct_algorithm(
-            observations(N), env, rsl_rl_config(CONFIG, N) | {"multi_gpu": None}, "cpu"
-        )
+        alg = SequencePpo(observations(N), 3, CONFIG, "cpu", Processes())
         with torch.no_grad():
             for t in range(8):
                 alg.act(observations(N, seed=t))
@@ -118,7 +122,7 @@ class Run(WithEnv):
             self.assertTrue(bool(value.isfinite().all()), name)
         # all in the second iteration
         plan = {step: ("broken" if step % 2 else "overflow", step % N) for step in range(9, 17)}
-        self.assertGreater(len(plan), FaultBudget(8 * N).allowed)
+        self.assertGreater(len(plan), MAX_SHARE * WINDOW * 8 * N)
         with self.assertRaisesRegex(RunError, "4 worlds were not finite and 4 dropped contacts.*--resume"):
             self.train(folder / "many", plan)
         self.assertEqual([c.name for c in checkpoints(folder / "many")], ["000001.pt"])

@@ -14,10 +14,11 @@ from tensordict import TensorDict
 from xreset import robots
 from xreset.checks import from_dict
 from xreset.errors import FileFormatError
-from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig, rsl_rl_config
+from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
+from xreset.learning.distributed import Processes
 from xreset.learning.export import export_onnx
 from xreset.learning.model import PointNetLstmModel, ReturnCritic, embed_sequences
-from xreset.learning.ppo import SequencePpo, minibatch
+from xreset.learning.ppo import SequencePpo, first_steps, piece_states
 from xreset.policy import OnnxPolicy, policy_contract
 from xreset.task.config import (
     ObservationConfig,
@@ -29,8 +30,8 @@ from xreset.task.config import (
 )
 
 N, T, L, A = 3, 8, 4, 5
-GROUPS = {"actor": ["policy", "proprio", "perception"], "critic": ["policy", "proprio", "privileged", "perception"]}
-SMALL = {"hidden_dims": [16], "pointnet_dims": [8, 6], "lstm_dim": 12}
+GROUPS = ("policy", "proprio", "perception")
+SMALL = ModelConfig(pointnet=(8, 6), lstm=12, mlp=(16,))
 
 
 def observations(*batch: int, seed: int = 0) -> TensorDict:
@@ -39,12 +40,9 @@ def observations(*batch: int, seed: int = 0) -> TensorDict:
     return TensorDict({k: torch.randn(*batch, *w, generator=g) for k, w in widths.items()}, batch_size=list(batch))
 
 
-def make_model(kind: str = "actor") -> PointNetLstmModel:
+def make_model() -> PointNetLstmModel:
     torch.manual_seed(0)
-    gaussian = {"class_name": "GaussianDistribution", "std_type": "log"} if kind == "actor" else None
-    return PointNetLstmModel(
-        observations(N), GROUPS, kind, A if kind == "actor" else 1, distribution_cfg=gaussian, **SMALL
-    )
+    return PointNetLstmModel(observations(N), GROUPS, A, SMALL, stochastic=True)
 
 
 def firsts(*steps: tuple[int, int]) -> torch.Tensor:
@@ -86,7 +84,7 @@ class ModelTest(unittest.TestCase):
         dones = first.roll(-1, dims=0)
         model = make_model()
         obs = with_real_history(observations(T, N), first)
-        zero = torch.zeros(1, N, SMALL["lstm_dim"])
+        zero = torch.zeros(1, N, SMALL.lstm)
         model.reset(hidden_state=(zero, zero))
         stepwise = []
         states = []
@@ -121,7 +119,7 @@ class ModelTest(unittest.TestCase):
 
         first = firsts((2, 1), (6, 0))
         g = torch.Generator().manual_seed(0)
-        states = tuple(torch.randn(2, 1, 2 * N, SMALL["lstm_dim"], generator=g))
+        states = tuple(torch.randn(2, 1, 2 * N, SMALL.lstm, generator=g))
         obs = with_real_history(observations(T, N), first)
         found = []
         for on_gpu, low in ((False, False), (True, False), (True, True)):
@@ -157,24 +155,17 @@ def places(alg: SequencePpo) -> dict[str, int]:
 
 
 class StorageTest(unittest.TestCase):
-    def test_sequences_cover_the_rollout_once_with_their_states(self):
-        code = torch.arange(T * N, dtype=torch.float32).view(T, N, 1)
+    def test_sequences_begin_with_their_states(self):
+        code = torch.arange(T * N, dtype=torch.float32).view(T, N)
         dones = torch.zeros(T, N, 1)
         dones[2, 0] = 1
         dones[3, 1] = 1
-        names = ("actions", "values", "advantages", "returns", "actions_log_prob")
-        storage = SimpleNamespace(observations=observations(T, N), dones=dones, **dict.fromkeys(names, code))
-        storage.distribution_params = (code,)
-        storage.saved_hidden_state_a = storage.saved_hidden_state_c = [code.expand(T, N, 12)[:, None]] * 2
-        seen = []
-        for worlds in torch.randperm(N).tensor_split(2):
-            batch = minibatch(storage, worlds, L)
-            seen += batch.values.flatten().tolist()
-            torch.testing.assert_close(batch.values[1:] - batch.values[:-1], torch.full_like(batch.values[1:], N))
-            torch.testing.assert_close(batch.hidden_states[0][0][0, :, 0], batch.values[::L, :, 0].flatten())
-            # a step is the first of an episode where the step before it was the last
-            self.assertTrue(torch.equal(batch.masks, firsts((3, 0), (4, 1))[:, worlds]))
-        self.assertEqual(sorted(seen), list(range(T * N)))
+        worlds = torch.tensor([2, 0])
+        h, _ = piece_states([code[:, None, :, None]] * 2, worlds, L)
+        torch.testing.assert_close(h[0, :, 0], code[::L, worlds].flatten())
+        # a step is the first of an episode where the step before it was the last
+        first = first_steps(SimpleNamespace(dones=dones), worlds)
+        self.assertTrue(torch.equal(first, firsts((3, 0), (4, 1))[:, worlds]))
 
     def bandit(
         self,
@@ -196,8 +187,7 @@ class StorageTest(unittest.TestCase):
         config = TrainConfig(model=model, ppo=PpoConfig(horizon=8, minibatch_size=128, **ppo))
         torch.manual_seed(0)
         obs = observations(64).to(device)
-        env = SimpleNamespace(num_envs=64, num_actions=A)
-        alg = SequencePpo.construct_algorithm(obs, env, rsl_rl_config(config, 64) | {"multi_gpu": None}, device)
+        alg = SequencePpo(obs, A, config, device, Processes())
         alg._graphs.active &= capture
         alg.actor.mlp[-1].bias.data += bias
         obs["perception"] = obs["perception"][:, -1:].expand(-1, 5, -1, -1)  # a scene in which nothing moves
@@ -247,7 +237,7 @@ class StorageTest(unittest.TestCase):
 class ReturnCriticTest(unittest.TestCase):
     def test_values_stay_when_their_unit_changes(self):
         torch.manual_seed(0)
-        critic = ReturnCritic(observations(N), GROUPS, "critic", 1, **SMALL)
+        critic = ReturnCritic(observations(N), GROUPS, 1, SMALL)
         obs = observations(N)
         before = critic(obs)
         seen = []
@@ -291,8 +281,7 @@ class ExportTest(unittest.TestCase):
     def test_paired_points_are_exported_with_their_nine_numbers(self):
         obs = observations(4)
         obs["perception"] = torch.randn(4, 1, 10, 9, generator=torch.Generator().manual_seed(1))
-        gaussian = {"class_name": "GaussianDistribution", "std_type": "log"}
-        model = PointNetLstmModel(obs, GROUPS, "actor", A, distribution_cfg=gaussian, **SMALL)
+        model = PointNetLstmModel(obs, GROUPS, A, SMALL, stochastic=True)
         file = self.file.with_name("paired.onnx")
         self.export(model, file, {"paired_cloud": 10 * 9}, cloud="paired")
         with torch.no_grad():
@@ -305,9 +294,8 @@ class ConfigTest(unittest.TestCase):
         self.assertEqual(from_dict(TrainConfig, json.loads(json.dumps(asdict(config)))), config)
 
     def test_table_viii(self):
-        cfg = rsl_rl_config(TrainConfig(), 4096)
-        self.assertEqual(cfg["algorithm"]["num_mini_batches"], 2)
-        self.assertEqual((cfg["num_steps_per_env"], cfg["algorithm"]["sequence_length"]), (16, 4))
+        ppo = TrainConfig().ppo
+        self.assertEqual((ppo.minibatches(4096), ppo.horizon, ppo.sequence_length), (2, 16, 4))
 
     def test_numbers_that_make_no_sense_are_refused(self):
         for make, options, problem in (

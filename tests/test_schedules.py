@@ -20,14 +20,14 @@ class ScheduleTest(unittest.TestCase):
 
     def test_a_training_moves_its_limit_of_success_and_its_faults(self):
         """On straight lines between the points."""
-        world = mock.Mock()
+        env = mock.Mock()
         schedule = ScheduleConfig(success_position=((0.2, 0.05), (1.0, 0.01)), faults=((0.0, 0.0), (0.5, 1.0)))
-        runner = mock.Mock(world=world, train_config=TrainConfig(schedule=schedule))
+        runner = mock.Mock(env=env, config=TrainConfig(schedule=schedule))
         for progress in (0.1, 0.25, 0.6, 1.5):
             TrainingRunner._follow_schedule(runner, progress)
         for called, expected in (
-            (world.set_success_position, (0.05, 0.0475, 0.03, 0.01)),
-            (world.variation.set_fault_scale, (0.2, 0.5, 1.0, 1.0)),
+            (env.set_success_position, (0.05, 0.0475, 0.03, 0.01)),
+            (env.variation.set_fault_scale, (0.2, 0.5, 1.0, 1.0)),
         ):
             np.testing.assert_allclose([call.args[0] for call in called.call_args_list], expected)
 

@@ -27,7 +27,7 @@ from xreset import robots
 from xreset.cli import main
 from xreset.errors import BackendUnavailableError, FileFormatError, RunError, XResetError
 from xreset.files import claim, file_hash
-from xreset.learning.checkpoint import Checkpoint, check_moments, read_checkpoint
+from xreset.learning.checkpoint import Checkpoint, load_moments, read_checkpoint
 from xreset.learning.choice import Candidate, Choice, write_choice
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.export import ensure_policy
@@ -249,7 +249,7 @@ class TrainingTest(unittest.TestCase):
         self.assertEqual((info.weights, info.weights_hash), (str(given), file_hash(given)))
         content, before = newest(out), read_checkpoint(given)
         self.assertEqual((content.iteration, content.env_steps), (1, 8 * 4))  # counters start at zero
-        runner = mock.Mock(device="cpu", train_config=CONFIG)
+        runner = mock.Mock(config=CONFIG, _load=read_checkpoint)
         TrainingRunner.load_networks(runner, given)
         self.assertEqual(runner.alg.learning_rate, before.learning_rate)  # an adaptive rate goes on
         for networks in ("actor_state_dict", "critic_state_dict"):
@@ -403,15 +403,11 @@ class TrainingTest(unittest.TestCase):
             torch.save(good | {key: wrong}, file)
             with self.subTest(key), self.assertRaisesRegex(FileFormatError, rf"{file.name}\.{key} is"):
                 read_checkpoint(file)
-        group = good["optimizer_state_dict"]["param_groups"][0]
         for name, key, wrong in (
             ("actor", "mlp.0.bias", "x"),
             ("critic", "later", torch.tensor(math.nan)),
             ("optimizer", "state", {0: {"step": torch.tensor(1.0), "exp_avg": None}}),
             ("optimizer", "state", []),
-            ("optimizer", "param_groups", [group | {"betas": 0.9}]),
-            ("optimizer", "param_groups", [group | {"lr": math.nan}]),
-            ("optimizer", "param_groups", [group | {"params": None}]),
         ):
             table = f"{name}_state_dict"
             torch.save(good | {table: good[table] | {key: wrong}}, file)
@@ -419,9 +415,8 @@ class TrainingTest(unittest.TestCase):
                 read_checkpoint(file)
         optimizer = torch.optim.Adam([torch.zeros(2, requires_grad=True)])
         moments = {"step": torch.tensor(1.0), "exp_avg": torch.zeros(3), "exp_avg_sq": torch.zeros(3)}
-        optimizer.load_state_dict(optimizer.state_dict() | {"state": {0: moments}})
         with self.assertRaisesRegex(ValueError, r"exp_avg has shape \(3,\), expected \(2,\)"):
-            check_moments(optimizer)
+            load_moments(optimizer, {0: moments})
 
     def test_a_run_of_another_configuration_is_named(self):
         good = json.loads((self.out / "run.json").read_text())

@@ -23,7 +23,7 @@ def run(folder: Path, arguments: list[str]) -> None:
             "learning_rate": runner.alg.learning_rate,
             "env_steps": runner.env_steps,
             "policy_obs": runner.env.get_observations()["policy"],
-            "random": runner.world.generator.get_state(),
+            "random": runner.env.generator.get_state(),
         }
         torch.save(begin | end, folder / f"{runner.processes.rank}.pt")
 

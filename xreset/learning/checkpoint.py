@@ -5,9 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
-from itertools import chain, starmap
-from math import inf
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,23 +23,9 @@ def _are_tensors(values: Any) -> bool:
     return all(isinstance(value, torch.Tensor) and bool(value.isfinite().all()) for value in values.values())
 
 
-def _is_setting(name: str, value: Any) -> bool:
-    """Return whether an optimizer can have such a setting. torch takes any, and fails in the next step."""
-    if name == "params":
-        return isinstance(value, list) and all(type(index) is int for index in value)
-    if name == "betas":
-        return isinstance(value, tuple | list) and len(value) == 2 and all(0 <= beta < 1 for beta in value)
-    if name in ("lr", "eps", "weight_decay"):
-        return not isinstance(value, bool) and 0 <= float(value) < inf
-    return value is None or isinstance(value, bool)
-
-
 def _is_optimizer(values: dict[str, Any]) -> bool:
-    try:
-        settings = chain.from_iterable(group.items() for group in values["param_groups"])
-        return all(map(_are_tensors, values["state"].values())) and all(starmap(_is_setting, settings))
-    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError):
-        return False
+    moments = values.get("state")
+    return isinstance(moments, dict) and all(map(_are_tensors, moments.values()))
 
 
 _Networks = Annotated[dict[str, Any], Rule("tensors of finite numbers", _are_tensors)]
@@ -52,8 +36,9 @@ class Checkpoint:
     """State of a training."""
 
     actor_state_dict: _Networks
-    critic_state_dict: _Networks
-    optimizer_state_dict: Annotated[dict[str, Any], Rule("the state and settings of an optimizer", _is_optimizer)]
+    critic_state_dict: _Networks = field(default_factory=dict)
+    """Empty in a distillation, which has none."""
+    optimizer_state_dict: Annotated[dict[str, Any], Rule("the state of an optimizer", _is_optimizer)]
     iteration: NotNegative[int]
     """Iterations done."""
     env_steps: NotNegative[int]
@@ -105,9 +90,13 @@ def must_fit(path: Path) -> Iterator[None]:
         ) from error
 
 
-def check_moments(optimizer: torch.optim.Optimizer) -> None:
-    """Raise ``ValueError`` if the optimizer has loaded moments of another shape than its parameters: torch would notice
-    in the next step."""
+def load_moments(optimizer: torch.optim.Optimizer, moments: dict[int, Any]) -> None:
+    """Give an optimizer the moments of a checkpoint; its settings stay.
+
+    Raises:
+        ValueError: moments have another shape than their parameters; torch would notice in the next step.
+    """
+    optimizer.load_state_dict(optimizer.state_dict() | {"state": moments})
     for parameter, moments in optimizer.state.items():
         for name, value in moments.items():
             if value.shape not in ((), parameter.shape):

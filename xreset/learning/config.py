@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
-from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -89,6 +88,10 @@ class PpoConfig(Checked):
                 f"sequence_length is {self.sequence_length}, expected a divisor of the horizon, which is {self.horizon}"
             )
 
+    def minibatches(self, num_worlds: int) -> int:
+        """Return the number of minibatches of an iteration with this number of worlds in each process."""
+        return max(1, min(num_worlds * self.horizon // self.minibatch_size, num_worlds // 2))
+
 
 Points = tuple[tuple[float, float], ...]
 """Pairs of a share of the run, from 0 to 1, and the value there; straight lines between them. Empty: no schedule."""
@@ -150,76 +153,3 @@ class TrainConfig(Checked):
     iterations: Positive[int] = 10000
     save_interval: Positive[int] = 50
     """Iterations between checkpoints."""
-
-
-def rsl_rl_config(config: TrainConfig, num_envs: int, teacher: Path | None = None) -> dict[str, Any]:
-    """Return the nested dictionary that rsl-rl's runner takes.
-
-    Args:
-        num_envs: number of worlds of one process.
-        teacher: exported policy to learn from by distillation; None: the rewards teach.
-    """
-    m = config.model
-    p = config.ppo
-    network: dict[str, Any] = {
-        "class_name": "xreset.learning.model:PointNetLstmModel",
-        "hidden_dims": list(m.mlp),
-        "pointnet_dims": list(m.pointnet),
-        "lstm_dim": m.lstm,
-        "bfloat16_clouds": p.precision == "bfloat16",
-    }
-    gaussian = {
-        "class_name": "xreset.learning.model:Gaussian",
-        "init_std": m.initial_std,
-        "std_type": "log",
-        "learn_std": True,
-    }
-    critic = network.copy()
-    if m.critic_mlp is not None:
-        critic["hidden_dims"] = list(m.critic_mlp)
-    actor = network | {"distribution_cfg": gaussian}
-    vision = config.task.vision
-    if vision.cameras:
-        conv = list(m.conv) if vision.view == "depth" else []
-        actor |= {"class_name": "xreset.learning.model:VisionModel", "conv_dims": conv}
-    if m.normalize_returns:
-        critic["class_name"] = "xreset.learning.model:ReturnCritic"
-    batches = max(1, min(num_envs * p.horizon // p.minibatch_size, num_envs // 2))
-    update = {
-        "sequence_length": p.sequence_length,
-        "num_learning_epochs": p.mini_epochs,
-        "num_mini_batches": batches,
-        "learning_rate": p.learning_rate,
-        "max_grad_norm": p.grad_norm,
-    }
-    settings = {
-        "num_steps_per_env": p.horizon,
-        "save_interval": config.save_interval,
-        "obs_groups": {
-            "actor": list(config.task.policy_groups),
-            "critic": ["policy", "proprio", "privileged", "perception"],
-        },
-        "actor": actor,
-        "critic": critic,
-        "algorithm": update
-        | {
-            "class_name": "xreset.learning.ppo:SequencePpo",
-            "bounds_loss": p.bounds_loss,
-            "clip_param": p.clip,
-            "gamma": p.discount,
-            "lam": p.gae_lambda,
-            "value_loss_coef": p.value_loss,
-            "entropy_coef": p.entropy,
-            "schedule": p.schedule,
-            "desired_kl": p.desired_kl,
-        },
-    }
-    if teacher is not None:
-        settings["student"] = actor
-        settings["teacher"] = {"class_name": "xreset.learning.teacher:load_teacher", "path": teacher}
-        settings["obs_groups"] |= {
-            "student": settings["obs_groups"]["actor"],
-            "teacher": ["policy", "proprio", "perception"],
-        }
-        settings["algorithm"] = update | {"class_name": "xreset.learning.distillation:SequenceDistillation"}
-    return settings

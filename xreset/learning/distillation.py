@@ -7,28 +7,49 @@ some worlds, as in :mod:`xreset.learning.ppo`.
 
 from __future__ import annotations
 
-from typing import Any
+from pathlib import Path
 
 import torch
 from rsl_rl.algorithms import Distillation
+from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor
 
-from xreset.learning.ppo import sequences
+from xreset.learning.config import TrainConfig
+from xreset.learning.distributed import Processes
+from xreset.learning.model import make_actor
+from xreset.learning.ppo import first_steps, piece_states
+from xreset.learning.teacher import load_teacher
 
 
 class SequenceDistillation(Distillation):
     """rsl-rl's distillation with an update on sequences.
 
     Attributes:
+        networks: name -> network that a checkpoint holds. The teacher is in a file of its own.
         teacher_share: share of the worlds in which the teacher acts.
     """
 
-    def __init__(self, *args: Any, sequence_length: int, num_mini_batches: int, **options: Any) -> None:
-        """Set up as rsl-rl does."""
-        super().__init__(*args, gradient_length=1, **options)
-        self.sequence_length = sequence_length
-        self.num_mini_batches = num_mini_batches
+    def __init__(
+        self, obs: TensorDict, num_actions: int, config: TrainConfig, device: str, processes: Processes, teacher: Path
+    ) -> None:
+        """Make student, teacher and storage; ``obs`` are the observations of all worlds of this process."""
+        p = config.ppo
+        student = make_actor(obs, num_actions, config)
+        super().__init__(
+            student,
+            load_teacher(teacher),
+            RolloutStorage("distillation", len(obs), p.horizon, obs, [num_actions], device),
+            num_learning_epochs=p.mini_epochs,
+            gradient_length=1,
+            learning_rate=p.learning_rate,
+            max_grad_norm=p.grad_norm,
+            device=device,
+            multi_gpu_cfg=processes.ranks,
+        )
+        self.networks = {"actor": student}
+        self.sequence_length = p.sequence_length
+        self.num_mini_batches = p.minibatches(len(obs))
         self.teacher_share = 0.0
 
     def act(self, obs: TensorDict) -> Tensor:
@@ -51,7 +72,8 @@ class SequenceDistillation(Distillation):
         for _ in range(self.num_learning_epochs):
             order = torch.randperm(storage.num_envs, device=self.device)
             for worlds in order.tensor_split(self.num_mini_batches):
-                first, states = sequences(storage, worlds, self.sequence_length)
+                states = piece_states(storage.saved_hidden_state_a, worlds, self.sequence_length)
+                first = first_steps(storage, worlds)
                 actions = self.student(storage.observations[:, worlds], masks=first, hidden_state=states)
                 loss = self.loss_fn(actions, storage.privileged_actions[:, worlds])
                 self.optimizer.zero_grad()
@@ -65,17 +87,3 @@ class SequenceDistillation(Distillation):
         self.student.reset(hidden_state=memory)
         storage.clear()
         return {"behavior": float(total) / (self.num_learning_epochs * self.num_mini_batches)}
-
-    def save(self) -> dict[str, Any]:
-        """Return what a checkpoint holds. The teacher is in a file of its own."""
-        return {
-            "actor_state_dict": self.student.state_dict(),
-            "critic_state_dict": {},
-            "optimizer_state_dict": self.optimizer.state_dict(),
-        }
-
-    def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
-        """Continue with a checkpoint's student."""
-        self.student.load_state_dict(loaded_dict["actor_state_dict"], strict=strict)
-        self.optimizer.load_state_dict(loaded_dict["optimizer_state_dict"])
-        return True

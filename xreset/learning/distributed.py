@@ -29,6 +29,11 @@ class Processes:
         return cls(rank=rank, local_rank=local_rank, count=count)
 
     @property
+    def ranks(self) -> dict[str, int] | None:
+        """What rsl-rl's algorithms want to know of several processes."""
+        return {"global_rank": self.rank, "world_size": self.count} if self.count > 1 else None
+
+    @property
     def is_main(self) -> bool:
         """Whether this process writes the run's files."""
         return self.rank == 0

@@ -13,15 +13,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from rsl_rl.utils import resolve_class
 from tensordict import TensorDict
 
 from xreset.errors import PolicyError
 from xreset.files import atomic_write, code_version, file_hash
 from xreset.learning.checkpoint import must_fit, read_checkpoint
 from xreset.learning.choice import read_choice
-from xreset.learning.config import rsl_rl_config
-from xreset.learning.model import ExportedPolicy, PointNetLstmModel
+from xreset.learning.model import ExportedPolicy, PointNetLstmModel, make_actor
 from xreset.learning.run import checkpoints, latest_checkpoint, read_run
 from xreset.policies import shipped
 from xreset.policy import INPUTS, METADATA_KEY, OUTPUTS, observation_shapes
@@ -102,11 +100,9 @@ def _quiet() -> Iterator[None]:
 def export_checkpoint(out: Path, checkpoint: Path, policy: Path) -> None:
     """Write the policy of one of a run's checkpoints as an ONNX file."""
     info = read_run(out)
-    settings = rsl_rl_config(info.config, info.num_envs)
-    actor_class, options = resolve_class(settings["actor"])
     shapes = observation_shapes(info.contract, str(out))
     example = TensorDict({name: torch.zeros(1, *shape) for name, shape in shapes.items()}, batch_size=[1])
-    actor = actor_class(example, {"actor": list(shapes)}, "actor", len(info.contract["joint_names"]), **options)
+    actor = make_actor(example, len(info.contract["joint_names"]), info.config)
     with must_fit(checkpoint):
         actor.load_state_dict(read_checkpoint(checkpoint).actor_state_dict)
     export_onnx(actor, policy, info.contract, checkpoint=checkpoint)

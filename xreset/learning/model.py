@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import copy
 import importlib.util
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -18,17 +20,19 @@ from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from xreset.learning.config import ModelConfig, TrainConfig
+
 LstmState = tuple[Tensor, Tensor]
 
 
 class PointNet(nn.Module):
     """Embeds clouds [..., P, K] as [..., dims[-1]]: the same MLP for every point, then the maximum over points."""
 
-    def __init__(self, dims: list[int], point_width: int = 3) -> None:
+    def __init__(self, dims: Sequence[int], point_width: int = 3) -> None:
         """Build the per-point MLP K -> dims[0] -> ..., K being ``point_width``; no activation after the last layer."""
         super().__init__()
         layers: list[nn.Module] = []
-        for width_in, width_out in zip([point_width, *dims[:-1]], dims, strict=True):
+        for width_in, width_out in zip((point_width, *dims[:-1]), dims, strict=True):
             layers += [nn.Linear(width_in, width_out), nn.ELU()]
         self.mlp = nn.Sequential(*layers[:-1])
         self.use_bfloat16 = False
@@ -52,14 +56,17 @@ class PointNet(nn.Module):
 class ImageEncoder(nn.Module):
     """Embeds images [..., C, H, W] as [..., 1, embedding]: convolutions that halve the image, then one linear layer."""
 
-    def __init__(self, shape: tuple[int, int, int], channels: list[int], embedding: int) -> None:
+    def __init__(self, shape: Sequence[int], channels: Sequence[int], embedding: int) -> None:
         """Build for images of a shape (C, H, W)."""
         super().__init__()
         kernels = [5, *[3] * (len(channels) - 1)]
-        self.cnn = CNN(shape[1:], shape[0], channels, kernel_size=kernels, stride=2, padding="zeros", activation="elu")
-        width = self.cnn.output_dim
-        assert isinstance(width, int), "a flattened output has one width"
-        self.linear = nn.Linear(width, embedding)
+        count, height, width = shape
+        self.cnn = CNN(
+            (height, width), count, list(channels), kernel_size=kernels, stride=2, padding="zeros", activation="elu"
+        )
+        features = self.cnn.output_dim
+        assert isinstance(features, int), "a flattened output has one width"
+        self.linear = nn.Linear(features, embedding)
         self.use_bfloat16 = False
         """Not used: images are embedded in the precision of the rest."""
 
@@ -166,7 +173,7 @@ class Gaussian(GaussianDistribution):
 
 
 class PointNetLstmModel(MLPModel):
-    """Actor or critic for rsl-rl's runner.
+    """Actor or critic for rsl-rl's algorithms.
 
     In a rollout the model keeps its own LSTM state. In an update it gets whole rollouts [T, N, ...] of some worlds, the
     state with which each piece starts, and ``masks`` [T, N], True where a step is the first of an episode. There the
@@ -178,29 +185,40 @@ class PointNetLstmModel(MLPModel):
     def __init__(
         self,
         obs: TensorDict,
-        obs_groups: dict[str, list[str]],
-        obs_set: str,
+        groups: Sequence[str],
         output_dim: int,
-        hidden_dims: list[int] | tuple[int, ...] = (512, 256, 128),
-        distribution_cfg: dict | None = None,
-        pointnet_dims: list[int] | tuple[int, ...] = (64, 128, 64),
-        lstm_dim: int = 512,
-        bfloat16_clouds: bool = False,
+        config: ModelConfig,
+        *,
+        conv: Sequence[int] = (),
+        stochastic: bool = False,
     ) -> None:
-        """Build the model for the observation groups of one set (``actor`` or ``critic``)."""
-        self._latent_dim = lstm_dim
-        self.cloud_group = next(group for group in obs_groups[obs_set] if obs[group].ndim == 4)
-        super().__init__(obs, obs_groups, obs_set, output_dim, hidden_dims, "elu", False, distribution_cfg)
-        normalizer = EmpiricalNormalization(self.obs_dim)
-        encoder, width = self._encoder(obs[self.cloud_group].shape[1:], list(pointnet_dims))
-        encoder.use_bfloat16 = bfloat16_clouds
-        self.trunk = Trunk(self.obs_dim, encoder, width, lstm_dim, normalizer)
-        self.state: LstmState | None = None
+        """Build the model.
 
-    def _encoder(self, shape: torch.Size, dims: list[int]) -> tuple[PointNet | ImageEncoder, int]:
-        """Return what embeds clouds of a shape (H, P, K), and the width of all embeddings of a step."""
-        history, _, point_width = shape
-        return PointNet(dims, point_width), history * dims[-1]
+        Args:
+            obs: an example of the observations.
+            groups: flat groups of the observations, then the group of clouds or images.
+            output_dim: number of outputs.
+            config: widths of the layers.
+            conv: channels of the convolutions for images; empty: the last group has clouds.
+            stochastic: whether the outputs are the means of a Gaussian.
+        """
+        gaussian = {"class_name": Gaussian, "init_std": config.initial_std, "std_type": "log"}
+        *flat, self.cloud_group = groups
+        self._latent_dim = config.lstm
+        super().__init__(
+            obs, {"flat": flat}, "flat", output_dim, config.mlp, distribution_cfg=gaussian if stochastic else None
+        )
+        normalizer = EmpiricalNormalization(self.obs_dim)
+        shape = obs[self.cloud_group].shape[1:]
+        width = config.pointnet[-1]
+        encoder: PointNet | ImageEncoder
+        if conv:
+            encoder = ImageEncoder(shape, conv, width)
+        else:
+            encoder = PointNet(config.pointnet, shape[2])
+            width *= shape[0]
+        self.trunk = Trunk(self.obs_dim, encoder, width, config.lstm, normalizer)
+        self.state: LstmState | None = None
 
     def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: HiddenState = None) -> Tensor:
         """Return the MLP's input: [N, lstm] in a rollout, [T, N, lstm] in an update.
@@ -231,7 +249,9 @@ class PointNetLstmModel(MLPModel):
         return trunk.norm(out).unflatten(1, (pieces, -1)).transpose(0, 1).flatten(0, 1)
 
     def _embed_rollout(self, cloud: Tensor, first: Tensor) -> Tensor:
-        """Return embeddings [T, N, H, embedding] of cloud histories [T, N, H, P, K] in an update."""
+        """Return embeddings [T, N, H, embedding] of clouds [T, N, H, P, K] or images in an update."""
+        if self.cloud_group == "view":  # what cameras show is not shifted from step to step
+            return self.trunk.pointnet(cloud)
         return embed_sequences(self.trunk.pointnet, cloud, first)
 
     def reset(self, dones: Tensor | None = None, hidden_state: HiddenState = None) -> None:
@@ -253,30 +273,8 @@ class PointNetLstmModel(MLPModel):
         normalizer.update(torch.cat([obs[group] for group in self.obs_groups], dim=-1))
         normalizer._std = std.copy_(normalizer._std)
 
-    def _get_obs_dim(self, obs: TensorDict, obs_groups: dict[str, list[str]], obs_set: str) -> tuple[list[str], int]:
-        flat = [group for group in obs_groups[obs_set] if obs[group].ndim == 2]
-        return flat, sum(obs[group].shape[-1] for group in flat)
-
     def _get_latent_dim(self) -> int:
         return self._latent_dim
-
-
-class VisionModel(PointNetLstmModel):
-    """An actor that sees: depth images, or clouds of the points in them, which are not shifted from step to step."""
-
-    def __init__(self, *args: Any, conv_dims: list[int] | tuple[int, ...] = (), **options: Any) -> None:
-        """Build; ``conv_dims`` are the channels of the convolutions, empty for clouds of points."""
-        self._conv_dims = list(conv_dims)
-        super().__init__(*args, **options)
-
-    def _encoder(self, shape: torch.Size, dims: list[int]) -> tuple[PointNet | ImageEncoder, int]:
-        if not self._conv_dims:
-            return super()._encoder(shape, dims)
-        channels, height, width = shape
-        return ImageEncoder((channels, height, width), self._conv_dims, dims[-1]), dims[-1]
-
-    def _embed_rollout(self, cloud: Tensor, first: Tensor) -> Tensor:
-        return self.trunk.pointnet(cloud)
 
 
 class ReturnCritic(PointNetLstmModel):
@@ -346,3 +344,21 @@ class ExportedPolicy(nn.Module):
         """One control step."""
         latent, (h, c) = self.trunk(flat, cloud, (h_in, c_in))
         return self.output(self.mlp(latent)), h, c
+
+
+def make_actor(obs: TensorDict, num_actions: int, config: TrainConfig) -> PointNetLstmModel:
+    """Return a new actor; ``obs`` is an example of the observations."""
+    vision = config.task.vision
+    conv = config.model.conv if vision.cameras and vision.view == "depth" else ()
+    actor = PointNetLstmModel(obs, config.task.policy_groups, num_actions, config.model, conv=conv, stochastic=True)
+    actor.trunk.pointnet.use_bfloat16 = config.ppo.precision == "bfloat16"
+    return actor
+
+
+def make_critic(obs: TensorDict, config: TrainConfig) -> PointNetLstmModel:
+    """Return a new critic; ``obs`` is an example of the observations."""
+    m = config.model
+    kind = ReturnCritic if m.normalize_returns else PointNetLstmModel
+    critic = kind(obs, ("policy", "proprio", "privileged", "perception"), 1, replace(m, mlp=m.critic_mlp or m.mlp))
+    critic.trunk.pointnet.use_bfloat16 = config.ppo.precision == "bfloat16"
+    return critic

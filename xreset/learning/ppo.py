@@ -17,10 +17,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from xreset.capture import GraphRunner
-from xreset.learning.model import ReturnCritic
-
-Batch = Any
-"""A :class:`RolloutStorage.Batch` with all of its fields, which rsl-rl declares as optional."""
+from xreset.learning.config import TrainConfig
+from xreset.learning.distributed import Processes
+from xreset.learning.model import LstmState, ReturnCritic, make_actor, make_critic
 
 BOUND = 1.1
 """Mean of an action beyond which ``bounds_loss`` pulls it back."""
@@ -29,65 +28,66 @@ FASTEST = 1e-2
 """Limits of an adaptive learning rate (rsl-rl's)."""
 
 
-def minibatch(storage: RolloutStorage, worlds: Tensor, length: int) -> Batch:
-    """Return the rollout [T, M, ...] of M worlds [M], with masks and the models' states of :func:`sequences`."""
-    first, state = sequences(storage, worlds, length)
-    states = (state, _states(storage.saved_hidden_state_c, worlds, length))
-    return RolloutStorage.Batch(
-        observations=storage.observations[:, worlds],
-        actions=storage.actions[:, worlds],
-        values=storage.values[:, worlds],
-        advantages=storage.advantages[:, worlds],
-        returns=storage.returns[:, worlds],
-        old_actions_log_prob=storage.actions_log_prob[:, worlds],
-        old_distribution_params=tuple(p[:, worlds] for p in storage.distribution_params or ()),
-        hidden_states=states,  # pyright: ignore[reportArgumentType]
-        masks=first,
-    )
-
-
-def sequences(storage: RolloutStorage, worlds: Tensor, length: int) -> tuple[Tensor, tuple[Tensor, ...] | None]:
-    """Return where episodes of M worlds [M] begin, and the actor's memory at the start of each piece of a length.
-
-    Returns:
-        [T, M] bool, True where a step is the first of an episode; and states [1, pieces * M, lstm], all worlds of the
-        first piece first.
-    """
+def first_steps(storage: RolloutStorage, worlds: Tensor) -> Tensor:
+    """[T, M] bool, True where a step of M worlds [M] is the first of an episode."""
     first = torch.zeros_like(storage.dones[:, worlds, 0], dtype=torch.bool)
     # step 0 starts with the state that was saved there, zeroed where an episode had ended
     first[1:] = storage.dones[:-1, worlds, 0].bool()
-    return first, _states(storage.saved_hidden_state_a, worlds, length)
+    return first
 
 
-def _states(saved: Any, worlds: Tensor, length: int) -> tuple[Tensor, ...] | None:
-    """[T, 1, N, lstm] each -> [1, pieces * M, lstm] each."""
-    if saved is None:
-        return None
-    return tuple(state[::length, 0, worlds].flatten(0, 1)[None] for state in saved)
+def piece_states(saved: Any, worlds: Tensor, length: int) -> LstmState:
+    """Return a model's state at the start of each piece of a length: [1, pieces * M, lstm] each, all worlds [M] of the
+    first piece first.
+
+    Args:
+        saved: [T, 1, N, lstm] each, as rsl-rl's storage keeps them.
+    """
+    h, c = (state[::length, 0, worlds].flatten(0, 1)[None] for state in saved)
+    return h, c
 
 
 class SequencePpo(PPO):
-    """rsl-rl's PPO with an update on sequences that never waits for a GPU."""
+    """rsl-rl's PPO with an update on sequences that never waits for a GPU.
 
-    def __init__(self, *args: Any, sequence_length: int, bounds_loss: float = 0.0, **options: Any) -> None:
-        """Set up as rsl-rl does.
+    Attributes:
+        networks: name -> network that a checkpoint holds.
+    """
 
-        Args:
-            args: rsl-rl's.
-            sequence_length: steps of a sequence; divides the number of steps of a rollout.
-            bounds_loss: weight of the squared excess of the actions' means over :data:`BOUND`.
-            options: rsl-rl's.
-        """
-        super().__init__(*args, **options)
-        self.sequence_length = sequence_length
-        self.bounds_loss = bounds_loss
-        device = torch.device(self.device)
-        on_gpu = device.type == "cuda"
+    def __init__(
+        self, obs: TensorDict, num_actions: int, config: TrainConfig, device: str, processes: Processes
+    ) -> None:
+        """Make networks and storage; ``obs`` are the observations of all worlds of this process."""
+        p = config.ppo
+        actor = make_actor(obs, num_actions, config)
+        critic = make_critic(obs, config)
+        super().__init__(
+            actor,
+            critic,
+            RolloutStorage("rl", len(obs), p.horizon, obs, [num_actions], device),
+            num_learning_epochs=p.mini_epochs,
+            num_mini_batches=p.minibatches(len(obs)),
+            clip_param=p.clip,
+            gamma=p.discount,
+            lam=p.gae_lambda,
+            value_loss_coef=p.value_loss,
+            entropy_coef=p.entropy,
+            learning_rate=p.learning_rate,
+            max_grad_norm=p.grad_norm,
+            schedule=p.schedule,
+            desired_kl=p.desired_kl,
+            device=device,
+            multi_gpu_cfg=processes.ranks,
+        )
+        self.networks = {"actor": actor, "critic": critic}
+        self.sequence_length = p.sequence_length
+        self.bounds_loss = p.bounds_loss
+        on_gpu = device.startswith("cuda")
         count = self.storage.num_envs
         self._rate = torch.tensor(self.learning_rate, device=device, dtype=torch.float32 if on_gpu else torch.float64)
         self._sums = torch.zeros(4, device=device)
         self._worlds = torch.zeros(count // self.num_mini_batches, dtype=torch.long, device=device)
-        self._graphs = GraphRunner(device)
+        self._graphs = GraphRunner(torch.device(device))
         self._graphs.active &= not self.is_multi_gpu and count % self.num_mini_batches == 0  # all minibatches alike
 
     def update(self) -> dict[str, float]:
@@ -120,19 +120,26 @@ class SequencePpo(PPO):
 
     def _learn(self) -> None:
         """Take one step of the optimizer on the minibatch of ``_worlds``, and add its losses to ``_sums``."""
-        batch = minibatch(self.storage, self._worlds, self.sequence_length)
-        self.actor(batch.observations, masks=batch.masks, hidden_state=batch.hidden_states[0], stochastic_output=True)
-        log_prob = self.actor.get_output_log_prob(batch.actions)
-        values = self.critic(batch.observations, masks=batch.masks, hidden_state=batch.hidden_states[1])
+        storage = self.storage
+        worlds = self._worlds
+        observations = storage.observations[:, worlds]
+        first = first_steps(storage, worlds)
+        state, critic_state = (
+            piece_states(saved, worlds, self.sequence_length)
+            for saved in (storage.saved_hidden_state_a, storage.saved_hidden_state_c)
+        )
+        self.actor(observations, masks=first, hidden_state=state, stochastic_output=True)
+        log_prob = self.actor.get_output_log_prob(storage.actions[:, worlds])
+        values = self.critic(observations, masks=first, hidden_state=critic_state)
         entropy = self.actor.output_entropy.mean()
         if self.schedule == "adaptive":
-            self._adapt(batch)
+            self._adapt(tuple(p[:, worlds] for p in storage.distribution_params or ()))
             self._use_rate()
-        advantages = batch.advantages.squeeze(-1)
-        ratio = torch.exp(log_prob - batch.old_actions_log_prob.squeeze(-1))
+        advantages = storage.advantages[:, worlds, 0]
+        ratio = torch.exp(log_prob - storage.actions_log_prob[:, worlds, 0])
         clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
         surrogate = torch.max(-advantages * ratio, -advantages * clipped).mean()
-        value = self._value_loss(values, batch)
+        value = self._value_loss(values, storage.values[:, worlds], storage.returns[:, worlds])
         excess = (self.actor.output_mean.abs() - BOUND).clamp_min(0.0).square().sum(dim=-1).mean()
         loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy + self.bounds_loss * excess
         self.optimizer.zero_grad()
@@ -144,17 +151,17 @@ class SequencePpo(PPO):
         self.optimizer.step()
         self._sums += torch.stack((value, surrogate, entropy, excess)).detach()
 
-    def _value_loss(self, values: Tensor, batch: Batch) -> Tensor:
+    def _value_loss(self, values: Tensor, old_values: Tensor, returns: Tensor) -> Tensor:
         """Return the mean squared error of values, in units of the returns' deviation if the critic knows it."""
         unit = self.critic.return_std if isinstance(self.critic, ReturnCritic) else 1.0
-        error = (values - batch.returns) / unit
-        near = batch.values + unit * ((values - batch.values) / unit).clamp(-self.clip_param, self.clip_param)
-        return torch.max(error.square(), ((near - batch.returns) / unit).square()).mean()
+        error = (values - returns) / unit
+        near = old_values + unit * ((values - old_values) / unit).clamp(-self.clip_param, self.clip_param)
+        return torch.max(error.square(), ((near - returns) / unit).square()).mean()
 
     @torch.no_grad()
-    def _adapt(self, batch: Batch) -> None:
+    def _adapt(self, old_params: tuple[Tensor, ...]) -> None:
         """Divide (multiply) the rate by 1.5 where the policy moved more than twice (less than half) the desired KL."""
-        kl = self.actor.get_kl_divergence(batch.old_distribution_params, self.actor.output_distribution_params).mean()
+        kl = self.actor.get_kl_divergence(old_params, self.actor.output_distribution_params).mean()
         if self.is_multi_gpu:
             torch.distributed.all_reduce(kl)
             kl = kl / self.gpu_world_size

@@ -1,4 +1,4 @@
-"""The training loop on rsl-rl's runner: iterations, checkpoints, a clean stop."""
+"""The training loop: iterations, checkpoints, a clean stop."""
 
 from __future__ import annotations
 
@@ -7,24 +7,29 @@ import signal
 import time
 from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stdout
-from io import StringIO
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
-from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 
 from xreset.env import ManipulationEnv
 from xreset.errors import RunError
-from xreset.learning.checkpoint import Checkpoint, check_moments, must_fit, read_checkpoint, write_checkpoint
-from xreset.learning.config import TrainConfig, rsl_rl_config, value_at
+from xreset.learning.checkpoint import Checkpoint, load_moments, must_fit, read_checkpoint, write_checkpoint
+from xreset.learning.config import TrainConfig, value_at
+from xreset.learning.distillation import SequenceDistillation
 from xreset.learning.distributed import Processes
 from xreset.learning.log import TrainingLog
+from xreset.learning.ppo import SequencePpo
+
+MAX_SHARE = 1e-3
+"""Largest share of world-steps that may break; the run ends beyond it."""
+WINDOW = 200
+"""Iterations over which the share is taken. The first iterations may use the allowance of the whole window."""
 
 
-class TrainingRunner(OnPolicyRunner):
+class TrainingRunner:
     """Runs iterations of PPO, or of a distillation, on a :class:`~xreset.env.ManipulationEnv`.
 
     Attributes:
@@ -32,69 +37,64 @@ class TrainingRunner(OnPolicyRunner):
         env_steps: control steps of all worlds of all processes.
         elapsed: time of all iterations [s].
         processes: this process among those that train together.
-        wandb: project of Weights & Biases to which learning curves are sent; None: they are not sent.
+        alg: the algorithm, with its networks.
     """
 
-    wandb: str | None = None
-
-    def __init__(self, env: ManipulationEnv, config: TrainConfig, folder: Path, *, teacher: Path | None = None) -> None:
-        """Build algorithm and models; rsl-rl's own logging stays off.
+    def __init__(
+        self,
+        env: ManipulationEnv,
+        config: TrainConfig,
+        folder: Path,
+        *,
+        teacher: Path | None = None,
+        wandb: str | None = None,
+    ) -> None:
+        """Build algorithm and networks.
 
         Args:
+            env: the worlds of this process.
+            config: the training.
+            folder: run folder.
             teacher: exported policy to learn from by distillation; None: the rewards teach.
+            wandb: project of Weights & Biases to which learning curves are sent; None: they are not sent.
         """
+        self.env = env
+        self.config = config
         self.folder = folder
-        self.train_config = config
+        self.wandb = wandb
+        self.device = str(env.device)
         torch.set_float32_matmul_precision("highest" if config.ppo.precision == "float32" else "high")
-        settings = rsl_rl_config(config, env.num_envs, teacher)
-        with redirect_stdout(StringIO()):  # rsl-rl prints the models
-            super().__init__(env, settings, log_dir=None, device=str(env.device))  # pyright: ignore[reportArgumentType]
-        self.world = env
+        self.processes = Processes.of_environment()
+        self.processes.join(self.device)
+        made_of = (env.get_observations(), env.num_actions, config, self.device, self.processes)
+        self.alg = SequencePpo(*made_of) if teacher is None else SequenceDistillation(*made_of, teacher)
         self.iteration = 0
         self.env_steps = 0
         self.elapsed = 0.0
         self._faults_before = torch.zeros(2, dtype=torch.long, device=self.device)
+        self._recent_faults: deque[list[int]] = deque(maxlen=WINDOW)
 
-    def _configure_multi_gpu(self) -> None:
-        """Join the other processes: as in rsl-rl's runner, but on CPUs too."""
-        self.processes = Processes.of_environment()
-        self.processes.join(self.device)
-        self.gpu_global_rank = self.processes.rank
-        self.gpu_local_rank = self.processes.local_rank
-        self.gpu_world_size = self.processes.count
-        self.is_distributed = self.gpu_world_size > 1
-        ranks = {
-            "global_rank": self.gpu_global_rank,
-            "local_rank": self.gpu_local_rank,
-            "world_size": self.gpu_world_size,
-        }
-        self.cfg["multi_gpu"] = ranks if self.is_distributed else None
-
-    def learn(
-        self, num_learning_iterations: int, init_at_random_ep_len: bool = False, *, seconds: float = math.inf
-    ) -> None:
+    def learn(self, total: int, *, init_at_random_ep_len: bool = False, seconds: float = math.inf) -> None:
         """Train until a number of iterations is done in all, and write a checkpoint. Ctrl-C ends after an iteration.
 
         Args:
-            num_learning_iterations: iterations in all, those of a resumed run included.
+            total: iterations in all, those of a resumed run included.
             init_at_random_ep_len: start the first episodes at random times.
             seconds: most time to spend here; the present iteration is completed.
         """
-        env = self.world
-        total = num_learning_iterations
+        env = self.env
         if init_at_random_ep_len:
             env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=int(env.max_episode_length))
         self.alg.train_mode()
-        if self.is_distributed:
+        if self.processes.count > 1:
             self.alg.broadcast_parameters()
         obs = env.get_observations()
         log = None
         if self.processes.is_main:
-            log = TrainingLog(self.folder, env.num_envs, str(env.device), total, self.wandb)
+            log = TrainingLog(self.folder, env.num_envs, self.device, total, self.wandb)
             log.clock.resume(self.iteration)
         saved_at = self.iteration
-        steps = self.cfg["num_steps_per_env"] * env.num_envs * self.gpu_world_size
-        budget = FaultBudget(steps)
+        steps = self.config.ppo.horizon * env.num_envs * self.processes.count
         begin = time.perf_counter()
         with _stop_on_interrupt() as requests:
             while self.iteration < total:
@@ -105,7 +105,7 @@ class TrainingRunner(OnPolicyRunner):
                 with torch.no_grad():
                     obs = self._roll_out(obs, log)
                     self._check_finite(obs)
-                    self._check_faults(budget)
+                    self._check_faults(steps)
                     collected = time.perf_counter()
                     self.alg.compute_returns(obs)
                 losses = self.alg.update()
@@ -122,7 +122,7 @@ class TrainingRunner(OnPolicyRunner):
                         "speed/learn_seconds": now - collected,
                     }
                     log.write(self.iteration, self.env_steps, self.elapsed, scalars)
-                if self.iteration % self.train_config.save_interval == 0:
+                if self.iteration % self.config.save_interval == 0:
                     self.save_checkpoint()
                     saved_at = self.iteration
         if self.iteration != saved_at or not self.iteration:
@@ -132,8 +132,8 @@ class TrainingRunner(OnPolicyRunner):
 
     def _roll_out(self, obs: TensorDict, log: TrainingLog | None) -> TensorDict:
         """Let the policy act for a horizon; returns the last observations."""
-        for _ in range(self.cfg["num_steps_per_env"]):
-            obs, reward, done, extras = self.world.step(self.alg.act(obs))
+        for _ in range(self.config.ppo.horizon):
+            obs, reward, done, extras = self.env.step(self.alg.act(obs))
             self.alg.process_env_step(obs, reward, done, extras)
             if log is not None:
                 log.add(reward, done, extras["log"])
@@ -141,12 +141,12 @@ class TrainingRunner(OnPolicyRunner):
 
     def _follow_schedule(self, progress: float) -> None:
         """Set what changes during a run to its values at a share of the run."""
-        schedule = self.train_config.schedule
+        schedule = self.config.schedule
         if schedule.success_position:
-            self.world.set_success_position(value_at(schedule.success_position, progress))
+            self.env.set_success_position(value_at(schedule.success_position, progress))
         if schedule.faults:
-            self.world.variation.set_fault_scale(value_at(schedule.faults, progress))
-        if schedule.teacher:
+            self.env.variation.set_fault_scale(value_at(schedule.faults, progress))
+        if schedule.teacher and isinstance(self.alg, SequenceDistillation):
             self.alg.teacher_share = value_at(schedule.teacher, progress)
 
     def _agreed(self, stop: bool) -> bool:
@@ -158,7 +158,8 @@ class TrainingRunner(OnPolicyRunner):
         if not self.processes.is_main:
             return
         content = Checkpoint(
-            **self.alg.save(),
+            **{f"{name}_state_dict": network.state_dict() for name, network in self.alg.networks.items()},
+            optimizer_state_dict=self.alg.optimizer.state_dict(),
             iteration=self.iteration,
             env_steps=self.env_steps,
             elapsed=self.elapsed,
@@ -168,10 +169,9 @@ class TrainingRunner(OnPolicyRunner):
 
     def load_checkpoint(self, path: Path) -> None:
         """Continue from a checkpoint: models, optimizer and counters. Episodes begin again."""
-        content = read_checkpoint(path, self.device)
+        content = self._load(path)
         with must_fit(path):
-            self.alg.load(vars(content), None, strict=True)
-            check_moments(self.alg.optimizer)
+            load_moments(self.alg.optimizer, content.optimizer_state_dict["state"])
         self.alg.learning_rate = content.learning_rate
         self.iteration = content.iteration
         self.env_steps = content.env_steps
@@ -183,22 +183,34 @@ class TrainingRunner(OnPolicyRunner):
         An adaptive learning rate starts where the other run's rate was: a new run's rate would undo in one step what
         the networks have learned.
         """
-        content = read_checkpoint(path, self.device)
-        with must_fit(path):
-            self.alg.load(vars(content), {"actor": True, "critic": True}, strict=True)
-        if self.train_config.ppo.schedule == "adaptive":
+        content = self._load(path)
+        if self.config.ppo.schedule == "adaptive":
             self.alg.learning_rate = content.learning_rate
 
-    def _check_faults(self, budget: FaultBudget) -> None:
-        """End the run if too many worlds broke. Every process comes to the same result."""
-        env = self.world
-        total = torch.stack((env.nonfinite_count, env.overflow_count))
-        nonfinite, overflow = self.processes.sum(total - self._faults_before).tolist()
+    def _load(self, path: Path) -> Checkpoint:
+        """Read a checkpoint, and load its networks."""
+        content = read_checkpoint(path, self.device)
+        with must_fit(path):
+            for name, network in self.alg.networks.items():
+                network.load_state_dict(getattr(content, f"{name}_state_dict"))
+        return content
+
+    def _check_faults(self, steps: int) -> None:
+        """End the run if too many worlds broke. Every process comes to the same result.
+
+        Args:
+            steps: world-steps of an iteration, of all processes.
+        """
+        total = torch.stack((self.env.nonfinite_count, self.env.overflow_count))
+        self._recent_faults.append(self.processes.sum(total - self._faults_before).tolist())
         self._faults_before = total
-        if problem := budget.add(nonfinite, overflow):
+        nonfinite, overflow = (sum(counts) for counts in zip(*self._recent_faults, strict=True))
+        if nonfinite + overflow > MAX_SHARE * WINDOW * steps:
             raise RunError(
-                f"The run ends: {problem}. Look for what the robot or an object does that the engine cannot simulate. "
-                f"Then continue from the last checkpoint: xreset train --out {self.folder} --resume"
+                f"The run ends: {nonfinite} worlds were not finite and {overflow} dropped contacts or constraints in "
+                f"the last {len(self._recent_faults)} iterations, more than {MAX_SHARE:.1%} of the {WINDOW * steps} "
+                f"world-steps of {WINDOW} iterations. Look for what the robot or an object does that the engine cannot "
+                f"simulate. Then continue from the last checkpoint: xreset train --out {self.folder} --resume"
             )
 
     def _check_finite(self, obs: TensorDict) -> None:
@@ -209,40 +221,6 @@ class TrainingRunner(OnPolicyRunner):
                     f"The observation group {group!r} is not finite at iteration {self.iteration}. Continue from the "
                     f"last checkpoint: xreset train --out {self.folder} --resume"
                 )
-
-
-MAX_SHARE = 1e-3
-"""Largest share of world-steps that may break; the run ends beyond it."""
-WINDOW = 200
-"""Iterations over which the share is taken. The first iterations may use the allowance of the whole window."""
-
-
-class FaultBudget:
-    """The faults of the last :data:`WINDOW` iterations."""
-
-    def __init__(self, steps_per_iteration: int) -> None:
-        """Start with none; ``steps_per_iteration`` is the number of world-steps of an iteration, over all processes."""
-        self.allowed = MAX_SHARE * WINDOW * steps_per_iteration
-        self._window_steps = WINDOW * steps_per_iteration
-        self._recent: deque[tuple[int, int]] = deque(maxlen=WINDOW)
-
-    def add(self, nonfinite: int, overflow: int) -> str | None:
-        """Add an iteration's faults; return a message if there are too many.
-
-        Args:
-            nonfinite: number of worlds that were ended because a position or velocity was not finite.
-            overflow: number of worlds that were ended because contacts or constraints were dropped.
-        """
-        self._recent.append((nonfinite, overflow))
-        nonfinite = sum(counts[0] for counts in self._recent)
-        overflow = sum(counts[1] for counts in self._recent)
-        if nonfinite + overflow <= self.allowed:
-            return None
-        return (
-            f"{nonfinite} worlds were not finite and {overflow} dropped contacts or constraints in the last "
-            f"{len(self._recent)} iterations, more than {MAX_SHARE:.1%} of the {self._window_steps} world-steps of "
-            f"{WINDOW} iterations"
-        )
 
 
 _SAME_REQUEST = 2.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from xreset.errors import PolicyError
+from xreset.learning.config import ModelConfig
 from xreset.learning.model import PointNetLstmModel
 from xreset.policy import OnnxPolicy, observation_shapes
 
@@ -22,11 +23,8 @@ _CLOSE = 1e-3
 """Largest difference between an action of the file and one of the network."""
 
 
-def load_teacher(*_: Any, path: Path) -> PointNetLstmModel:
+def load_teacher(path: Path) -> PointNetLstmModel:
     """Return the network of an exported policy, in evaluation mode on the CPU.
-
-    Args:
-        path: the policy. What rsl-rl gives other models in addition is not used.
 
     Raises:
         PolicyError: the file is no policy, or is built in another way than this version exports policies.
@@ -41,18 +39,19 @@ def load_teacher(*_: Any, path: Path) -> PointNetLstmModel:
         weights = _weights(graph)
         model = PointNetLstmModel(
             observations,
-            {"actor": list(shapes)},
-            "actor",
+            list(shapes),
             len(policy.contract["joint_names"]),
-            hidden_dims=_widths(weights, "mlp.")[:-1],
-            pointnet_dims=_widths(weights, "trunk.pointnet.mlp."),
-            lstm_dim=weights["trunk.lstm.weight_hh_l0"].shape[1],
+            ModelConfig(
+                pointnet=_widths(weights, "trunk.pointnet.mlp."),
+                lstm=weights["trunk.lstm.weight_hh_l0"].shape[1],
+                mlp=_widths(weights, "mlp.")[:-1],
+            ),
         )
         model.load_state_dict(model.state_dict() | weights)
         model.eval()
         with torch.no_grad():
             difference = (model(observations).clamp(-1, 1) - policy.act(observations)).abs().max()
-    except (KeyError, IndexError, StopIteration, RuntimeError) as error:
+    except (KeyError, IndexError, StopIteration, RuntimeError, ValueError) as error:
         raise PolicyError(f"{path} cannot teach: its network is not built as xreset exports it ({error}).") from error
     if not difference < _CLOSE:
         raise PolicyError(f"{path} cannot teach: rebuilt from its file, its network acts otherwise ({difference:.2g}).")
@@ -60,11 +59,11 @@ def load_teacher(*_: Any, path: Path) -> PointNetLstmModel:
     return model.requires_grad_(False)
 
 
-def _widths(weights: dict[str, Tensor], prefix: str) -> list[int]:
+def _widths(weights: dict[str, Tensor], prefix: str) -> tuple[int, ...]:
     """Return the widths of the linear layers whose names begin with a prefix, in order."""
     layers = [name for name in weights if name.startswith(prefix) and name.endswith(".bias")]
     layers.sort(key=lambda name: int(name.split(".")[-2]))
-    return [len(weights[name]) for name in layers]
+    return tuple(len(weights[name]) for name in layers)
 
 
 def _weights(graph: GraphProto) -> dict[str, Tensor]:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 
@@ -21,7 +21,6 @@ from xreset.inputs import Inputs, load_inputs
 from xreset.learning.config import TrainConfig
 from xreset.learning.distributed import Processes, leave
 from xreset.learning.export import export_onnx, policy_file
-from xreset.learning.model import PointNetLstmModel
 from xreset.learning.recipes import default_recipe, own_terms_flag, starting_config, student_config
 from xreset.learning.run import TEACHER, RunInfo, checkpoints, latest_checkpoint, read_run, write_run
 from xreset.learning.runner import TrainingRunner
@@ -274,8 +273,7 @@ def _run(out: Path, info: RunInfo, inputs: Inputs, *, minutes: float, resumed: b
             stack.enter_context(claim_folder(out))
             stack.enter_context(claim_folder(out / "checkpoints"))
         try:
-            runner = stack.enter_context(_runner(processes, out, info, inputs, resumed=resumed))
-            runner.wandb = wandb
+            runner = stack.enter_context(_runner(processes, out, info, inputs, resumed=resumed, wandb=wandb))
             runner.learn(info.config.iterations, init_at_random_ep_len=True, seconds=60 * minutes)
         except (MemoryError, RuntimeError) as error:
             if isinstance(error, RuntimeError) and not _NO_MEMORY.search(str(error)):
@@ -286,13 +284,14 @@ def _run(out: Path, info: RunInfo, inputs: Inputs, *, minutes: float, resumed: b
                 "Start with fewer (--num-envs), or smaller minibatches (--config.ppo.minibatch-size), in another --out."
             ) from error
         if processes.is_main:
-            actor = cast(PointNetLstmModel, runner.alg.get_policy())
-            export_onnx(actor, out / "policy.onnx", info.contract, checkpoint=latest_checkpoint(out))
+            export_onnx(
+                runner.alg.networks["actor"], out / "policy.onnx", info.contract, checkpoint=latest_checkpoint(out)
+            )
 
 
 @contextmanager
 def _runner(
-    processes: Processes, out: Path, info: RunInfo, inputs: Inputs, *, resumed: bool
+    processes: Processes, out: Path, info: RunInfo, inputs: Inputs, *, resumed: bool, wandb: str | None
 ) -> Iterator[TrainingRunner]:
     """Yield a run's runner, which has read the checkpoint that it continues from, or the networks that it begins
     with."""
@@ -308,7 +307,8 @@ def _runner(
     with make_env(*scene, task, engine=info.backend, num_envs=info.num_envs, device=device, seed=seed) as env:
         if env.vision is not None:
             env.vision.check_sees_objects()
-        runner = TrainingRunner(env, info.config, out, teacher=out / TEACHER if info.teacher else None)
+        teacher = out / TEACHER if info.teacher else None
+        runner = TrainingRunner(env, info.config, out, teacher=teacher, wandb=wandb)
         if begin is not None:
             runner.load_checkpoint(begin)
         elif info.weights is not None:

@@ -58,26 +58,6 @@ class LightnessTest(unittest.TestCase):
             "{}",
         )
 
-    def test_a_second_thread_never_sees_half_a_module(self):
-        code = """
-import importlib, pathlib, sys, tempfile, threading, time
-from xreset import cli
-folder = tempfile.TemporaryDirectory()
-sys.modules.pop("xreset.slow", None)
-import xreset
-xreset.__path__.append(folder.name)
-pathlib.Path(folder.name, "slow.py").write_text("import time; first = 1; time.sleep(0.5); last = 2")
-sys.meta_path.insert(0, cli._Lazily)
-module = importlib.import_module("xreset.slow")
-first = threading.Thread(target=lambda: module.last)
-first.start()
-while "first" not in vars(module): time.sleep(0.01)
-print(module.last)
-first.join()
-"""
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-        self.assertEqual((done.stdout, done.stderr), ("2\n", ""))
-
 
 class UsageTest(unittest.TestCase):
     def test_version(self):

@@ -3,21 +3,15 @@
 The first word selects a module of this package, which is imported only then, so that ``xreset --help`` is instant. A
 command module holds typed functions; tyro turns their signatures and docstrings into flags.
 
-The help of a command must be instant too. Therefore every module of xreset that a command imports runs when one of its
-names is first used. Command modules import modules (``from xreset.eval import trial``, then ``trial.engine(...)``), and
-names only from light modules, such as configurations and errors."""
+The help of a command must be instant too. Therefore command modules import at their top only what is light, such as
+configurations and errors; their functions import the rest."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from importlib import import_module
-from importlib.abc import Loader
-from importlib.machinery import ModuleSpec, PathFinder
 from io import TextIOWrapper
-from threading import RLock
-from types import ModuleType
-from typing import Any, NoReturn
+from typing import NoReturn
 
 COMMANDS: dict[str, str] = {
     "demos": "Import, synthesize, select, merge and describe human demonstrations.",
@@ -102,11 +96,7 @@ def _run(group: str, commands: dict[str, str], argv: list[str]) -> None:
     if name not in commands:
         print(f"xreset{group}: Unknown command {name!r}.\n\n{_usage(group, commands)}", file=sys.stderr)
         raise SystemExit(2)
-    sys.meta_path.insert(0, _Lazily)
-    try:
-        module = import_module(f"xreset.cli{group.replace(' ', '.')}.{name}")
-    finally:
-        sys.meta_path.remove(_Lazily)
+    module = import_module(f"xreset.cli{group.replace(' ', '.')}.{name}")
     if hasattr(module, "COMMANDS"):
         _run(f"{group} {name}", module.COMMANDS, arguments)
         return
@@ -125,58 +115,6 @@ def _run(group: str, commands: dict[str, str], argv: list[str]) -> None:
         tyro.extras.subcommand_cli_from_dict(verbs, prog=program, description=about, args=arguments)
     else:
         tyro.cli(checked(command), prog=program, description=about, args=arguments)
-
-
-_LOCK = RLock()
-"""Held while a lazy module runs, so that no other thread sees half of it."""
-
-
-class _LazyModule(ModuleType):
-    """A module that runs when one of its names is first used.
-
-    ``importlib.util.LazyLoader`` is not enough: it also runs the module for ``__file__``, which ``inspect`` reads of
-    all modules."""
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(f"module {self.__name__!r} has not run yet and has no {name!r}")
-        with _LOCK:
-            if (
-                self.__spec__.loader_state == "running"
-            ):  # a name that the module itself, or a circular import, uses too early
-                raise AttributeError(f"module {self.__name__!r} has no {name!r} yet")
-            if isinstance(self, _LazyModule):
-                self.__spec__.loader_state = "running"
-                try:
-                    self.__loader__.loader.exec_module(self)
-                    self.__class__ = ModuleType
-                finally:
-                    self.__spec__.loader_state = None
-        return getattr(self, name)
-
-
-class _Lazily(Loader):
-    """Finds the modules of xreset, except the commands, and makes them lazy."""
-
-    def __init__(self, loader: Loader) -> None:
-        self.loader = loader
-
-    @classmethod
-    def find_spec(
-        cls, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
-    ) -> ModuleSpec | None:
-        if not name.startswith("xreset.") or name.startswith("xreset.cli"):
-            return None
-        spec = PathFinder.find_spec(name, path, target)
-        if spec is not None and spec.loader is not None:
-            spec.loader = cls(spec.loader)
-        return spec
-
-    def create_module(self, spec: ModuleSpec) -> ModuleType:
-        return _LazyModule(spec.name)
-
-    def exec_module(self, module: ModuleType) -> None:
-        pass
 
 
 def _usage(group: str, commands: dict[str, str]) -> str:

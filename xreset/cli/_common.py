@@ -6,14 +6,16 @@ import shlex
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import tyro
 
 from xreset.cli import INVOCATION
 from xreset.cli._terminal import Progress, console
-from xreset.eval import trial
 from xreset.plugins import backend_names, backend_status
+
+if TYPE_CHECKING:
+    from xreset.eval import trial
 
 _T = TypeVar("_T")
 Source = Annotated[Path, tyro.conf.Positional]
@@ -70,6 +72,8 @@ def engine_bars(names: Sequence[str]) -> Iterator[Callable[[str, int, int], None
 
 def chosen_engines(names: Sequence[str], device: str) -> list[trial.Engine]:
     """Return the engines of these names, each once; without names, MuJoCo."""
+    from xreset.eval import trial
+
     return [trial.engine(name, device=device) for name in dict.fromkeys(names or ("mujoco",))]
 
 

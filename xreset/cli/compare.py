@@ -10,7 +10,6 @@ import tyro
 from xreset.cli._common import Several
 from xreset.cli._terminal import console
 from xreset.eval import table
-from xreset.eval.report import make
 
 
 def compare(
@@ -35,6 +34,8 @@ def compare(
         apart: Show runs that differ only in their seed separately.
         out: Folder for compare.png and compare.md.
     """
+    from xreset.eval.report import make
+
     with console.status("reading"):
         made = make.compare(runs, out, x=x, curves=curve, apart=apart)
     for rows in (made.results, made.lifted, made.different):

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from rich.table import Table
 
 from xreset.checks import Options
 from xreset.cli._common import Flat, Source, Sources
-from xreset.cli._terminal import Console, Progress
-from xreset.demos import archive, dexycb, ho3d, keypoints, mirror, noise, plausible, synth
+from xreset.cli._terminal import Progress, console
 from xreset.errors import DemoError
 from xreset.files import file_hash
+
+if TYPE_CHECKING:
+    from xreset.demos.archive import Demos
 
 Side = Literal["right", "left", "both"]
 
@@ -28,8 +28,10 @@ def import_dexycb(folder: Source, *, out: Path) -> None:
         folder: The folder that holds the subjects' folders and `calibration`.
         out: Archive to write.
     """
-    with _progress("reading DexYCB") as progress:
-        demos = dexycb.read_dexycb(folder, progress=progress)
+    from xreset.demos.dexycb import read_dexycb
+
+    with Progress() as bar:
+        demos = read_dexycb(folder, progress=bar.count("reading DexYCB"))
     _save(demos, out, {"dataset": "dexycb"})
 
 
@@ -44,7 +46,9 @@ def import_ho3d(folder: Source, *, out: Path, fps: float, cameras: Path) -> None
         cameras: File with the camera's pose in the table frame (4x4, metres, as text or npy; x right, y down, z
             forward) for all sequences; or a folder with SEQUENCE.txt, where sequences without one are left out.
     """
-    _save(ho3d.read_ho3d(folder, fps=fps, cameras=cameras), out, {"dataset": "ho3d", "fps": fps})
+    from xreset.demos.ho3d import read_ho3d
+
+    _save(read_ho3d(folder, fps=fps, cameras=cameras), out, {"dataset": "ho3d", "fps": fps})
 
 
 def import_keypoints(
@@ -77,8 +81,10 @@ def import_keypoints(
         side: The hand, if the files do not state it.
         subject: Who demonstrated, if the files do not state it.
     """
-    T = None if table_from_camera is None else keypoints.read_transform(table_from_camera)
-    convention = keypoints.Convention(
+    from xreset.demos.keypoints import Convention, read_keypoints, read_transform
+
+    T = None if table_from_camera is None else read_transform(table_from_camera)
+    convention = Convention(
         order=order,
         units=units,
         frame=coordinates,
@@ -88,12 +94,12 @@ def import_keypoints(
         side=side,
         subject=subject,
     )
-    demos = keypoints.read_keypoints(path, convention)
+    demos = read_keypoints(path, convention)
     config = {"dataset": "keypoints", **vars(convention), "table_from_camera": None if T is None else T.tolist()}
-    _save(demos, out, config, {"keypoints": file_hash(path)} if path.is_file() else {})
+    _save(demos, out, config, **({"keypoints": path} if path.is_file() else {}))
 
 
-def synthesize(
+def synth(
     *,
     out: Path,
     objects: tuple[str, ...] = (),
@@ -114,15 +120,19 @@ def synthesize(
         side: Hand.
         meshes: Folder of real meshes, with z up; default: the built-in stand-ins.
     """
+    from xreset.demos.archive import merge_demos
+    from xreset.demos.synth import synthesize
+
     parts = []
-    with _progress("making demonstrations") as progress:
+    with Progress() as bar:
         for hand in ("right", "left"):
             if side in (hand, "both"):
-                part = synth.synthesize(
+                progress = bar.count(f"{hand} hands")
+                part = synthesize(
                     objects or None, per_object, seed, fps=fps, side=hand, meshes=meshes, progress=progress
                 )
                 parts.append(part)
-    demos = archive.merge_demos(parts)
+    demos = merge_demos(parts)
     config = {"objects": list(objects), "per_object": per_object, "seed": seed, "fps": fps, "side": side}
     _save(demos, out, config)
 
@@ -172,8 +182,7 @@ def select(file: Source, *, out: Path, selection: Flat[Selection] = Selection())
         out: Archive to write.
         selection: Conditions.
     """
-    chosen = archive.read_demos(file).select(**selection.conditions())
-    _save(chosen, out, {"select": asdict(selection)}, {"demos": file_hash(file)})
+    _save(_read(file).select(**selection.conditions()), out, {"select": asdict(selection)}, demos=file)
 
 
 def split(file: Source, *, out: Path, rest: Path, selection: Flat[Selection] = Selection()) -> None:
@@ -185,10 +194,9 @@ def split(file: Source, *, out: Path, rest: Path, selection: Flat[Selection] = S
         rest: Archive to write: all other sequences.
         selection: Conditions.
     """
-    kept, others = archive.read_demos(file).split(**selection.conditions())
-    inputs = {"demos": file_hash(file)}
-    _save(kept, out, {"select": asdict(selection)}, inputs)
-    _save(others, rest, {"select_others": asdict(selection)}, inputs)
+    kept, others = _read(file).split(**selection.conditions())
+    _save(kept, out, {"select": asdict(selection)}, demos=file)
+    _save(others, rest, {"select_others": asdict(selection)}, demos=file)
 
 
 def merge(files: Sources, *, out: Path) -> None:
@@ -199,8 +207,10 @@ def merge(files: Sources, *, out: Path) -> None:
         files: Archives of demonstrations.
         out: Archive to write.
     """
-    demos = archive.merge_demos([archive.read_demos(file) for file in files])
-    _save(demos, out, {"merge": len(files)}, {f"demos {i}": file_hash(file) for i, file in enumerate(files)})
+    from xreset.demos.archive import merge_demos
+
+    demos = merge_demos([_read(file) for file in files])
+    _save(demos, out, {"merge": len(files)}, **{f"demos {i}": file for i, file in enumerate(files)})
 
 
 def reflect(
@@ -221,13 +231,16 @@ def reflect(
         objects: Folder of real meshes; default: the built-in stand-ins.
         tolerance: Largest distance between an object's surface and its reflection, over 95 % of it [m].
     """
-    demos = archive.read_demos(file).select(sides=["left"])
-    symmetries = {name: mirror.symmetry(spec) for name, spec in archive.demo_objects(demos, objects).items()}
+    from xreset.demos.archive import demo_objects
+    from xreset.demos.mirror import mirrored, symmetry
+
+    demos = _read(file).select(sides=["left"])
+    symmetries = {name: symmetry(spec) for name, spec in demo_objects(demos, objects).items()}
     for name, found in sorted(symmetries.items()):
         verdict = "mirrored" if found.deviation <= tolerance else "left out: not symmetric enough"
-        Console().print(f"{name}: {1e3 * found.deviation:.1f} mm from its reflection, {verdict}")
-    result = mirror.mirrored(demos, symmetries, tolerance=tolerance)
-    _save(result, out, {"mirrored": True, "tolerance": tolerance}, {"demos": file_hash(file)})
+        console.print(f"{name}: {1e3 * found.deviation:.1f} mm from its reflection, {verdict}")
+    result = mirrored(demos, symmetries, tolerance=tolerance)
+    _save(result, out, {"mirrored": True, "tolerance": tolerance}, demos=file)
 
 
 def add_noise(file: Source, *, out: Path, tier: Literal["low", "medium", "high"] = "medium", seed: int = 0) -> None:
@@ -240,8 +253,9 @@ def add_noise(file: Source, *, out: Path, tier: Literal["low", "medium", "high"]
             12 mm, before the bones get their lengths back.
         seed: Chooses the errors.
     """
-    noisy = noise.with_noise(archive.read_demos(file), noise.TIERS[tier], seed)
-    _save(noisy, out, {"noise": tier, "seed": seed}, {"demos": file_hash(file)})
+    from xreset.demos.noise import TIERS, with_noise
+
+    _save(with_noise(_read(file), TIERS[tier], seed), out, {"noise": tier, "seed": seed}, demos=file)
 
 
 def describe(file: Source) -> None:
@@ -250,22 +264,26 @@ def describe(file: Source) -> None:
     Args:
         file: The archive.
     """
-    _print_summary(archive.read_demos(file), file)
+    _print_summary(_read(file), file)
 
 
-@contextmanager
-def _progress(what: str) -> Iterator[Callable[[int, int, str], None]]:
-    with Progress(Console(stderr=True)) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, total, name: bar.update(task, completed=done, total=total, description=f"{what}: {name}")
+def _read(file: Path) -> Demos:
+    from xreset.demos.archive import read_demos
+
+    return read_demos(file)
 
 
-def _save(demos: archive.Demos, out: Path, config: dict[str, Any], inputs: dict[str, str] | None = None) -> None:
-    archive.write_demos(out, demos, config=config, inputs=inputs)
-    _print_summary(demos, out)
+def _save(made: Demos, out: Path, config: dict[str, Any], **inputs: Path) -> None:
+    """Write and describe demonstrations that were made from some files."""
+    from xreset.demos.archive import write_demos
+
+    write_demos(out, made, config=config, inputs={name: file_hash(path) for name, path in inputs.items()})
+    _print_summary(made, out)
 
 
-def _print_summary(demos: archive.Demos, path: Path) -> None:
+def _print_summary(demos: Demos, path: Path) -> None:
+    from xreset.demos.plausible import doubts, start_to_goal
+
     table = Table(caption="right, left: sequences. hand: frames with a hand. lift, goal: medians, from the start pose")
     table.add_column("object", no_wrap=True)
     for column in ("right", "left", "frames", "hand", "lift, cm", "goal, cm", "goal, deg"):
@@ -276,7 +294,7 @@ def _print_summary(demos: archive.Demos, path: Path) -> None:
         first = own.frame_offsets[:-1]
         height = own.object_pos[:, 2]
         lift = np.median(np.maximum.reduceat(height, first) - height[first])
-        distance, angle = map(np.median, plausible.start_to_goal(own))
+        distance, angle = map(np.median, start_to_goal(own))
         table.add_row(
             name,
             str(right),
@@ -287,10 +305,9 @@ def _print_summary(demos: archive.Demos, path: Path) -> None:
             f"{100 * distance:.1f}",
             f"{np.degrees(angle):.0f}",
         )
-    console = Console()
     console.print(table)
     console.print(f"{path}: {demos.num_sequences} sequences, {demos.num_frames} frames at {demos.fps:g} per second")
-    for doubt in plausible.doubts(demos):
+    for doubt in doubts(demos):
         console.print(f"note: {doubt}", style="yellow")
 
 
@@ -298,7 +315,7 @@ COMMAND = {
     "import dexycb": import_dexycb,
     "import ho3d": import_ho3d,
     "import keypoints": import_keypoints,
-    "synth": synthesize,
+    "synth": synth,
     "select": select,
     "split": split,
     "merge": merge,

@@ -8,7 +8,6 @@ from pathlib import Path
 from xreset.cameras.config import VisionConfig
 from xreset.cli._common import Objects, Policy, Robot, Several
 from xreset.errors import RunError
-from xreset.learning import train as training
 
 
 def distill(
@@ -43,6 +42,8 @@ def distill(
         seed: Seed of every random number.
         resume: Continue the run in --out from its newest checkpoint.
     """
+    from xreset.learning import train as training
+
     if resume:
         training.resume(out, iterations=iterations, minutes=minutes)
         return

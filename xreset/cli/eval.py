@@ -6,8 +6,7 @@ from pathlib import Path
 
 from xreset.cli._common import Engines, Flat, PolicyOrBaseline, engine_bars
 from xreset.cli._terminal import console
-from xreset.eval import evaluate as evaluation
-from xreset.eval import policy_spec, table
+from xreset.eval import table
 from xreset.eval.setting import Setting
 
 
@@ -35,6 +34,9 @@ def evaluate(
         out: Folder for the results; default: eval/ in the run folder or next to the policy, runs/NAME/eval for a policy
             that ships with xreset, runs/BASELINE-ROBOT/eval for a baseline.
     """
+    from xreset.eval import evaluate as evaluation
+    from xreset.eval import policy_spec
+
     engines = tuple(dict.fromkeys(backend or ("mujoco",)))
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
     with engine_bars(engines) as progress:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from xreset import runtime
 from xreset.cli._common import Policy, Robot, Several, Sources, TrainedObjects
 from xreset.cli._terminal import console
 from xreset.errors import RunError
-from xreset.eval.export import deploy as deployment
-from xreset.eval.export import lerobot as dataset
-from xreset.eval.export import recorded
+
+if TYPE_CHECKING:
+    from xreset.eval.export import recorded
 
 
 def lerobot(
@@ -38,6 +39,8 @@ def lerobot(
         size: Width and height of the films, pixels.
         camera: Also draw films of this depth camera: front, side or wrist; give it again for more.
     """
+    from xreset.eval.export import lerobot as dataset
+
     recording = _recording(folders, backend, robot, objects, task)
     with console.status("writing episodes"):
         dataset.write_lerobot(out, recording, video=video, size=size, cameras=camera)
@@ -53,6 +56,8 @@ def npz(folders: Sources, *, out: Path, backend: Several = (), robot: Robot = No
         backend: Only episodes of this engine; give it again for more. Default: all.
         task: The task in words; {object} is replaced by the object's name.
     """
+    from xreset.eval.export import recorded
+
     recording = _recording(folders, backend, robot, None, task)
     recorded.write_arrays(out, recording)
     _say(recording, out)
@@ -69,6 +74,8 @@ def deploy(
         out: Folder to write; must not exist.
         object: Object whose points the contract lists; give it again for more. Default: the objects of the training.
     """
+    from xreset.eval.export import deploy as deployment
+
     spec = deployment.export_deploy(policy, out, robot=robot, objects=objects, only=object)
     contract = runtime.read_contract(out)
     named = []
@@ -84,6 +91,8 @@ def deploy(
 def _recording(
     folders: tuple[Path, ...], backends: tuple[str, ...], robot: str | None, objects: Path | None, task: str | None
 ) -> recorded.Recording:
+    from xreset.eval.export import recorded
+
     if not folders:
         raise RunError("Nothing to export. Give a run folder, or a folder that xreset eval wrote into.")
     return recorded.read_recorded(folders, backends=backends, robot=robot, objects=objects, task=task or recorded.TASK)

@@ -10,7 +10,6 @@ import tyro
 
 from xreset.cli._common import Objects, Several
 from xreset.cli._terminal import Progress, console
-from xreset.resets import goals as goal_sets
 from xreset.resets.config import GoalConfig
 
 Pose = tuple[float, float, float, float, float, float, float]
@@ -39,6 +38,8 @@ def goals(
         pose: Goal of your own: x y z [m] and quaternion w x y z of the mesh frame; give it again for more.
         draw: Number, sizes, offsets and seed.
     """
+    from xreset.resets import goals as goal_sets
+
     with Progress() as bar:
         made = goal_sets.make_goals(
             names, robot=robot, meshes=objects, families=family or None, poses=pose, config=draw,

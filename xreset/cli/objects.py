@@ -9,9 +9,7 @@ from rich.table import Table
 from xreset.cli._common import Source
 from xreset.cli._terminal import Console
 from xreset.errors import ObjectError
-from xreset.objects import catalogue, meshes, procedural, sampling
 from xreset.objects.properties import Properties
-from xreset.pictures import pieces, render
 from xreset.spec import ObjectSpec
 
 
@@ -21,6 +19,8 @@ def list_(*, objects: Path | None = None) -> None:
     Args:
         objects: Folder of real meshes; default: the built-in stand-ins.
     """
+    from xreset.objects import catalogue
+
     table = _table()
     for name in catalogue.object_names(objects):
         table.add_row(*_cells(catalogue.load_object(name, objects)))
@@ -56,6 +56,9 @@ def import_(
         tolerance: Largest deviation of the pieces from the surface, in metres; default: 0.002.
         png: Picture to write: the meshes next to their pieces, with the deviation in millimetres.
     """
+    from xreset.objects import meshes
+    from xreset.pictures import pieces, render
+
     try:
         properties = Properties(mass=mass, density=density, friction=friction, tolerance=tolerance)
     except ValueError as error:
@@ -109,6 +112,8 @@ def _table(*more: str) -> Table:
 
 
 def _cells(obj: ObjectSpec) -> tuple[str, ...]:
+    from xreset.objects import catalogue, sampling
+
     low, high = sampling.bounding_box(obj)
     kinds = {piece.geometry.kind for piece in obj.pieces}
     return (
@@ -130,6 +135,8 @@ def make(*, out: Path, count: int = 40, seed: int = 0) -> None:
         count: Number of shapes.
         seed: Chooses sizes and masses.
     """
+    from xreset.objects import procedural
+
     written = procedural.make_shapes(out, count, seed)
     Console().print(f"{out}: {len(written)} shapes")
 

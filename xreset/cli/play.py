@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from xreset.cli._common import Host, Policy, Port, Robot, TrainedObjects
-from xreset.eval.play import run
 
 
 def play(
@@ -28,6 +27,8 @@ def play(
         demos: Starts and goals: demonstrations, robot motion or reset states. Default: synthetic demonstrations.
         seed: Chooses starts and goals.
     """
+    from xreset.eval.play import run
+
     run.play(
         policy,
         thing=object,

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from rich.table import Table
 
-from xreset import policy as policy_files
 from xreset.cli._terminal import console
 from xreset.policies import card, shipped
 
 
 def list_() -> None:
     """List the policies that ship with xreset. Every command that takes a policy takes their names."""
+    from xreset import policy as policy_files
+
     for name, file in shipped().items():
         contract = policy_files.OnnxPolicy(file).contract
         about = card(file)

@@ -8,8 +8,6 @@ from rich.table import Table
 
 from xreset.cli._common import Flat, Policy, Several, chosen_engines, engine_bars, usable_engines
 from xreset.cli._terminal import console
-from xreset.eval import policy_spec
-from xreset.eval import rehearse as rehearsal
 from xreset.eval.setting import Setting
 
 
@@ -37,6 +35,9 @@ def rehearse(
         setting: Robot, meshes, seed, device and worlds.
         out: Folder for the results; default: rehearsal/ in the run folder or next to the policy.
     """
+    from xreset.eval import policy_spec
+    from xreset.eval import rehearse as rehearsal
+
     engines = chosen_engines(backend or usable_engines(), setting.device)
     if not backend:
         engines = [each for each in engines if not each.slow]

@@ -7,8 +7,6 @@ from pathlib import Path
 from xreset.cli._common import Robot, Source
 from xreset.cli._terminal import console
 from xreset.eval import table
-from xreset.eval.report import film as films
-from xreset.eval.report import make, page
 from xreset.policies import results_folder, shipped
 from xreset.text import short_name
 
@@ -30,6 +28,9 @@ def report(
         objects: Folder of real meshes, for the clips; default: as the results name it.
         film: MP4 to write as well: every object in every engine, next to each other.
     """
+    from xreset.eval.report import film as films
+    from xreset.eval.report import make, page
+
     if not run.exists() and str(run) in shipped():
         run = results_folder(str(run))
     with console.status("drawing clips"):

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.table import Table
 
-from xreset import description
 from xreset.accounts import accounts_path, described, with_totals, write_accounts
 from xreset.cli._terminal import Console, Progress
 from xreset.files import file_hash
-from xreset.objects import catalogue
-from xreset.resets import bank as banks
-from xreset.resets import filter as trying
-from xreset.resets import settle as settling
 from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
-from xreset.retarget import file
+
+if TYPE_CHECKING:
+    from xreset.resets import bank as banks
+    from xreset.retarget import file
 
 
 def resets(
@@ -52,6 +50,13 @@ def resets(
         settle: Let objects come to rest (in the first engine) before episodes begin at home. Default: the recorded
             poses, as in the paper, from which one object in eight tips or rolls.
     """
+    from xreset import description
+    from xreset.objects import catalogue
+    from xreset.resets import bank as banks
+    from xreset.resets import filter as trying
+    from xreset.resets import settle as settling
+    from xreset.retarget import file
+
     backends = list(dict.fromkeys(backend)) or ["mujoco"]
     console = Console()
     data = file.read_retargeted(retargeted)

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.table import Table
 
-from xreset import description
 from xreset.accounts import accounts_path, described, with_totals, write_accounts
 from xreset.cli._common import Objects, Source
 from xreset.cli._terminal import Progress, console
-from xreset.demos import align, archive, plausible
 from xreset.files import file_hash
-from xreset.retarget import collisions, file, pipeline
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.hand.config import HandConfig
+
+if TYPE_CHECKING:
+    from xreset.retarget import file
 
 
 def retarget(
@@ -41,6 +42,10 @@ def retarget(
         hand: Weights of hand retargeting.
         arm: Weights and effort of the arm's inverse kinematics.
     """
+    from xreset import description
+    from xreset.demos import align, archive, plausible
+    from xreset.retarget import collisions, file, pipeline
+
     spec = description.load_robot(robot)
     chosen = archive.read_demos(demos)
     if max_per_object is not None:

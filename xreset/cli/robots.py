@@ -9,26 +9,21 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from xreset import __version__, description, inputs
+from xreset import __version__
 from xreset.cli._common import AllEngines, Device, Objects, Robot, RobotName, Source, this_command, usable_engines
 from xreset.cli._terminal import Progress, console
-from xreset.demos import archive
 from xreset.errors import RobotError
 from xreset.files import write_json
-from xreset.pictures import render
 from xreset.plugins import robot_names
 from xreset.resets.config import SqueezeConfig
-from xreset.retarget import pipeline
-from xreset.robot_tools import check as checks
-from xreset.robot_tools import importer, placement
-from xreset.robot_tools import judge as judging
-from xreset.robot_tools import picture as pictures
-from xreset.robot_tools import place as places
+from xreset.robot_tools import placement
 from xreset.robot_tools.placement import PlaceConfig
 
 
 def list_robots() -> None:
     """List robots: built-in ones and those of installed packages."""
+    from xreset import description
+
     table = Table("robot", "joints (arm + hand)", "fingertips", "folder")
     for name in robot_names():
         try:
@@ -49,6 +44,11 @@ def check(robot: RobotName, /, *, picture: Path | None = None) -> None:
     Args:
         picture: PNG to write: the robot at home, with the frames of its palm, fingertips and joints.
     """
+    from xreset import description
+    from xreset.pictures import render
+    from xreset.robot_tools import check as checks
+    from xreset.robot_tools import picture as pictures
+
     styles = {"ok": "green", "skipped": "dim", "warning": "yellow", "error": "bold red"}
     findings = checks.check(robot)
     for finding in findings:
@@ -91,6 +91,11 @@ def import_(
             turned so that the fingers point out of the arm, along its last joint's axis.
         thumb: A link or joint of the thumb, if the import chooses another finger.
     """
+    from xreset import description
+    from xreset.pictures import render
+    from xreset.robot_tools import importer
+    from xreset.robot_tools import picture as pictures
+
     made = importer.import_robot(arm, hand, out, name=name, flange=flange, offset=offset, rpy=rpy, thumb=thumb)
     render.write_png(out / "robot.png", pictures.robot_picture(description.load_robot(out)))
     for title, lines in (("guessed", made.guessed), ("for you to decide", made.to_say)):
@@ -119,6 +124,11 @@ def place(
         write: Write the placement and its home into the robot's robot.toml.
         search: Ranges and effort of the search.
     """
+    from xreset import description
+    from xreset.demos import archive
+    from xreset.retarget import pipeline
+    from xreset.robot_tools import place as places
+
     spec = description.load_robot(robot)
     chosen = archive.read_demos(demos).select(max_per_object=max_per_object, spread=True)
     specs = list(archive.demo_objects(chosen, objects).values())
@@ -180,6 +190,10 @@ def judge(
         picture: PNG to write: the best state of each object at the start and after each phase.
         json: File to write the counts to.
     """
+    from xreset import inputs
+    from xreset.pictures import render
+    from xreset.robot_tools import judge as judging
+
     loaded = inputs.load_inputs(bank, robot=robot, objects=objects, accept=("bank",))
     names = list(dict.fromkeys(backend)) or usable_engines()
     with Progress() as bar:

@@ -9,7 +9,6 @@ from rich.table import Table
 
 from xreset.cli._common import Flat, Several, Source, chosen_engines
 from xreset.cli._terminal import console
-from xreset.eval import select as selection
 from xreset.eval.setting import Setting
 
 
@@ -37,6 +36,8 @@ def select(
         setting: Robot, meshes, device and worlds; --seed is not used, see --starts.
         starts: Seed of the starts; default: one that evaluations do not use.
     """
+    from xreset.eval import select as selection
+
     engines = chosen_engines(backend or ("mujoco", "pybullet", "sapien"), setting.device)
 
     def say(name: str, engine: str, score: float | None) -> None:

@@ -5,9 +5,7 @@ from __future__ import annotations
 import logging
 
 from xreset.cli._common import Policy, Robot, Several, TrainedObjects
-from xreset.eval.export import deploy
 from xreset.live import serve as server
-from xreset.pictures.view import server as pages
 
 
 def serve(
@@ -26,6 +24,9 @@ def serve(
         port: Port to listen at.
         object: Object that clients may name; give it again for more. Default: the objects of the training.
     """
+    from xreset.eval.export import deploy
+    from xreset.pictures.view import server as pages
+
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     spec, contract = deploy.served(policy, robot=robot, objects=objects, only=object)
     listening = server.PolicyServer(contract, spec.exported().read_bytes(), host=host, port=port)

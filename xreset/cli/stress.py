@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.table import Table
 
 from xreset.cli._common import Engines, Flat, PolicyOrBaseline, Several, chosen_engines, engine_bars
 from xreset.cli._terminal import console
-from xreset.eval import policy_spec, sensitivity, trial
-from xreset.eval import stress as sweeps
 from xreset.eval.setting import Setting
+
+if TYPE_CHECKING:
+    from xreset.eval import stress as sweeps
 
 
 def stress(
@@ -33,6 +35,9 @@ def stress(
         setting: Robot, meshes, seed, device and worlds.
         out: Folder for the results; default: stress/ in the run folder or next to the policy.
     """
+    from xreset.eval import policy_spec, sensitivity, trial
+    from xreset.eval import stress as sweeps
+
     properties = sensitivity.chosen(property)
     engines = chosen_engines(backend, setting.device)
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)

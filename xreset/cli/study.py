@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from xreset.cli._common import Name, Several
 from xreset.cli._terminal import Console
 from xreset.errors import RunError
 from xreset.eval.study import file as files
-from xreset.eval.study import launch, plan, report
+
+if TYPE_CHECKING:
+    from xreset.eval.study import plan
 
 
 def study(
@@ -36,6 +38,8 @@ def study(
         per_gpu: Number of simultaneous trainings on each GPU of this machine.
         dry_run: Print the plan and its commands, and do nothing.
     """
+    from xreset.eval.study import launch, plan, report
+
     path = files.study_path(file)
     console = Console()
 

@@ -10,7 +10,6 @@ from pathlib import Path
 
 from xreset.cli._common import Objects
 from xreset.errors import RunError
-from xreset.learning import train as training
 from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import default_recipe, starting_config
 
@@ -59,6 +58,8 @@ def train(
             login.
         config: Task, model and algorithm. The defaults shown are those of --like.
     """
+    from xreset.learning import train as training
+
     if resume and like != "paper":
         raise RunError("--resume continues with the run's own configuration. Omit --like.")
     if resume and weights is not None:

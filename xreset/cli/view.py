@@ -10,10 +10,8 @@ from rich.progress import track
 from xreset.cli._common import Host, Objects, Port, Robot, Source
 from xreset.cli._terminal import console
 from xreset.errors import XResetError
-from xreset.eval.report import clips
 from xreset.files import write_whole
-from xreset.pictures import render
-from xreset.pictures.view import data, load, page, picture, server
+from xreset.pictures.view import data
 
 
 def view(
@@ -42,6 +40,8 @@ def view(
         png: Picture to write, instead of a page.
         mp4: Film of the sequence to write, instead of a page.
     """
+    from xreset.pictures.view import load
+
     shown = load.load_view(file, demos=demos, robot=robot, objects=objects)
     if png is None and mp4 is None:
         _serve(shown, host, port, sequence, frame or 0)
@@ -54,6 +54,8 @@ def view(
 
 
 def _serve(shown: data.View, host: str, port: int, sequence: int | None, frame: int) -> None:
+    from xreset.pictures.view import page, server
+
     opened = page.Page(shown, host=host, port=port, sequence=sequence, frame=frame)
     number = opened.url.rpartition(":")[2]
     print(f"{len(shown.sequence_name)} sequences, {len(shown.frame)} {shown.kind} at {opened.url}", flush=True)
@@ -63,6 +65,9 @@ def _serve(shown: data.View, host: str, port: int, sequence: int | None, frame: 
 
 
 def _write_png(path: Path, shown: data.View, rows: np.ndarray, frame: int | None) -> None:
+    from xreset.pictures import render
+    from xreset.pictures.view import picture
+
     chosen = len(rows) // 2 if frame is None else frame
     if not 0 <= chosen < len(rows):
         raise XResetError(f"Frame {chosen} does not exist. Choose one from 0 to {len(rows) - 1}.")
@@ -71,6 +76,9 @@ def _write_png(path: Path, shown: data.View, rows: np.ndarray, frame: int | None
 
 
 def _write_mp4(path: Path, shown: data.View, rows: np.ndarray) -> None:
+    from xreset.eval.report import clips
+    from xreset.pictures.view import picture
+
     if not len(rows):
         raise XResetError("This sequence has no state to film. Choose another one with --sequence.")
     draw = picture.Drawer(shown).draw

@@ -7,7 +7,7 @@ x, y, z). Poses are in the table frame: z up, table top at z = 0, the person at 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,9 +24,6 @@ from xreset.text import shown
 
 SCHEMA_NAME = "xreset-demos/1"
 SIDES = ("right", "left")
-
-Progress = Callable[[int, int, str], None]
-"""Called with (sequences or files done, all of them, name) before each one."""
 
 _HAND = 0.5
 """Largest distance of a keypoint from its wrist [m]; the longest hand on record has 0.33 m."""
@@ -208,10 +205,6 @@ class Demos(ObjectMotions):
                 picks = ((picks + place) * len(rows) / max(len(picks), 1)).astype(int)
             kept.extend(rows[picks])
         return chosen[np.sort(kept)] if kept else chosen[:0]
-
-
-def no_progress(done: int, total: int, name: str) -> None:
-    """Show nothing: the default of :data:`Progress`."""
 
 
 def one_sequence(

@@ -13,7 +13,7 @@ The world frame is the master camera's; the table frame is the AprilTag's. Objec
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from xreset.checks import is_rigid
-from xreset.demos.archive import SIDES, Demos, Progress, merge_demos, no_progress, one_sequence
+from xreset.demos.archive import SIDES, Demos, merge_demos, one_sequence
 from xreset.errors import DemoError, FileFormatError
 from xreset.objects.ycb import NAME_OF_ID
 from xreset.records import Field, read_npz
@@ -53,12 +53,12 @@ class _Sequence:
         return f"{self.folder.parent.name}/{self.folder.name}"
 
 
-def read_dexycb(root: str | Path, *, progress: Progress = no_progress) -> Demos:
+def read_dexycb(root: str | Path, *, progress: Callable[[int, int], None] = lambda done, total: None) -> Demos:
     """Read all sequences below a DexYCB folder, in the table frame.
 
     Args:
         root: the folder that holds the subjects' folders and ``calibration``.
-        progress: called with (sequences done, sequences in all, name) before each sequence is read.
+        progress: called with (sequences done, sequences in all).
 
     Raises:
         DemoError: the folder is not in DexYCB's layout, or parts of a sequence are missing or contradict each other.
@@ -72,11 +72,11 @@ def read_dexycb(root: str | Path, *, progress: Progress = no_progress) -> Demos:
         )
     calibrations: dict[str, _Poses] = {}
     parts = []
-    for done, sequence in enumerate(found):
-        progress(done, len(found), sequence.name)
+    for sequence in found:
         if sequence.extrinsics not in calibrations:
             calibrations[sequence.extrinsics] = _read_extrinsics(root, sequence.extrinsics)
         parts.append(_read(sequence, calibrations[sequence.extrinsics]))
+        progress(len(parts), len(found))
     return merge_demos(parts)
 
 

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xreset.demos.archive import Demos, merge_demos, no_progress, one_sequence
+from xreset.demos.archive import Demos, merge_demos, one_sequence
 from xreset.demos.grasp import Contacts, Grasp, Solid, best_of, fit_hand, plan_contacts
 from xreset.demos.motion import clear_approach, object_path, place_hand, random_timing
 from xreset.errors import DemoError
@@ -54,7 +54,7 @@ def synthesize(
     fps: float = 30.0,
     side: Literal["right", "left"] = "right",
     meshes: str | Path | None = None,
-    progress: Callable[[int, int, str], None] = no_progress,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Demos:
     """Make synthetic demonstrations of the built-in stand-ins, or of the objects of a folder of meshes, which stand
     with z up.
@@ -68,7 +68,7 @@ def synthesize(
         fps: frames per second; a sequence lasts about 2.4 s.
         side: the hand.
         meshes: folder of real meshes; None for the stand-ins.
-        progress: called with (sequences done, sequences in all, name) before each sequence is made.
+        progress: called with (sequences done, sequences in all).
 
     Raises:
         ObjectError: unknown object.
@@ -86,9 +86,9 @@ def synthesize(
         starts = [_start(spec, np.array(up), side) for up in _REST_UP.get(spec.name, (_Z,))]
         for index in range(per_object):
             name = f"{SUBJECT}/{spec.name}_{side}_{seed}_{index:03d}"
-            progress(len(parts), len(specs) * per_object, name)
             rng = np.random.default_rng([seed, index, zlib.crc32(spec.name.encode()), side == "left"])
             parts.append(_sequence(spec, starts, name, side, fps, rng))
+            progress(len(parts), len(specs) * per_object)
     return merge_demos(parts)
 
 

@@ -7,8 +7,6 @@ from pathlib import Path
 from xreset.cli._common import Flat, PolicyOrBaseline, Several
 from xreset.cli._terminal import Progress, console
 from xreset.errors import XResetError
-from xreset.eval import policy_spec, trial
-from xreset.eval.engines import attribution, attribution_view
 from xreset.eval.setting import Setting
 from xreset.files import write_json
 
@@ -40,6 +38,9 @@ def attribute(
         setting: Robot, meshes, seed of the perturbations of the starts, device and worlds.
         out: Folder for attribution.json; default: attribute/ next to the policy's results.
     """
+    from xreset.eval import policy_spec, trial
+    from xreset.eval.engines import attribution, attribution_view
+
     if backend == towards:
         raise XResetError(f"--backend and --towards are both {backend!r}. Choose two engines.")
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from rich.text import Text
 
-from xreset import description
-from xreset.backends import conformance, pool
 from xreset.cli._common import AllEngines, Device, this_command, usable_engines
 from xreset.cli._terminal import console
 from xreset.errors import XResetError
 from xreset.files import code_version, write_json
 from xreset.plugins import backend_class, backend_status, make_backend
 from xreset.spec import SceneSpec
+
+if TYPE_CHECKING:
+    from xreset.backends import conformance
 
 
 def check(
@@ -35,6 +36,9 @@ def check(
         json: File to write the results to.
         verbose: Show every measured number, not only the one nearest to its tolerance.
     """
+    from xreset import description
+    from xreset.backends import conformance
+
     known = [c.name for c in conformance.CHECKS]
     if unknown := sorted(set(only) - set(known)):
         raise XResetError(f"Unknown check {', '.join(unknown)}. Choose from: {', '.join(known)}.")
@@ -74,6 +78,8 @@ def check(
 
 def _maker(name: str, device: str) -> conformance.MakeBackend:
     """Return what builds worlds on a device. A few worlds run in this process, which is faster than to start others."""
+    from xreset.backends import conformance, pool
+
     pooled = issubclass(backend_class(name), pool.PoolBackend)
 
     def make(scene: SceneSpec, num_worlds: int, **chosen: Any) -> Any:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.table import Table
 from rich.text import Text
 
 from xreset.cli._common import AllEngines, Device, Objects, Robot, Several, Source, this_command, usable_engines
 from xreset.cli._terminal import Progress, console
-from xreset.eval import trial
-from xreset.eval.engines import agreement
 from xreset.files import code_version, file_hash, write_json
-from xreset.inputs import load_inputs
+
+if TYPE_CHECKING:
+    from xreset.eval.engines import agreement
 
 
 def compare(
@@ -38,6 +39,10 @@ def compare(
         grasps: Number of closings, and of holds.
         json: File to write the results to.
     """
+    from xreset.eval import trial
+    from xreset.eval.engines import agreement
+    from xreset.inputs import load_inputs
+
     names = [name for name in dict.fromkeys(backend) or usable_engines() if name != agreement.REFERENCE]
     engines = [trial.engine(name, device=device) for name in names]
     if not backend:

@@ -7,7 +7,6 @@ from typing import Annotated
 
 import tyro
 
-from xreset.eval.engines import page as matrix
 from xreset.files import write_whole
 
 
@@ -23,6 +22,8 @@ def page(
             engine, device and robot, the later one counts.
         out: File to write; default: print it.
     """
+    from xreset.eval.engines import page as matrix
+
     text = matrix.page(matrix.read(source))
     if out is None:
         print(text, end="")

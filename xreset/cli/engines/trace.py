@@ -6,8 +6,6 @@ from pathlib import Path
 
 from xreset.cli._common import Flat, Several, Source, usable_engines
 from xreset.cli._terminal import Progress, console
-from xreset.eval import trial
-from xreset.eval.engines import actions, replay, trace_view
 from xreset.eval.setting import Place
 from xreset.files import write_json
 
@@ -34,6 +32,9 @@ def trace(
         place: Robot, meshes, seed, device.
         out: Folder for trace.json, trace.png, and actions.npz: the actions, and what every engine did.
     """
+    from xreset.eval import trial
+    from xreset.eval.engines import actions, replay, trace_view
+
     base = trial.engine(reference, device=place.device)
     names = [name for name in dict.fromkeys(backend) or usable_engines() if name != reference]
     engines = [trial.engine(name, device=place.device) for name in names]

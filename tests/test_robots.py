@@ -205,7 +205,7 @@ class Registry(unittest.TestCase):
         with self.assertRaises(RobotError) as caught:
             load(self.folder)
         for part in (
-            "unknown: plam (palm?); missing: palm",
+            "unknown: hand.plam; missing: palm",
             "joints[0].home",
             "joints[0].kp",
             "index5",

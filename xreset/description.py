@@ -9,26 +9,18 @@ format.
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
-from dataclasses import dataclass, fields
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
-from xreset.checks import Number, Text, parsed
+from xreset.checks import parsed
 from xreset.errors import RobotError
 from xreset.files import read_toml
 from xreset.geometry.urdf import mesh_files
 from xreset.plugins import robot_folder
-from xreset.spec import (
-    KEYPOINTS,
-    DriveSpec,
-    FingertipSpec,
-    JointSpec,
-    KeypointSpec,
-    MimicSpec,
-    PlacementSpec,
-    RobotSpec,
-)
+from xreset.spec import RobotSpec
 
 DESCRIPTION = "robot.toml"
 """Name of the description in a robot's folder."""
@@ -52,108 +44,62 @@ def load_robot(name_or_folder: str | Path) -> RobotSpec:
 def read_description(path: Path) -> RobotSpec:
     """Read a ``robot.toml``; see :func:`load_robot`."""
     data = read_toml(path, SCHEMA, error=RobotError, hint=" A robot's folder holds one beside its URDF.")
-    given, problems = parsed(Description, data, "the file")
-    if given is not None:
-        spec = _robot(given, path.parent)
+    spec, problems = parsed(RobotSpec, _fields(data, path.parent), "the file")
+    if spec is not None:
         problems = _contradictions(spec)
         if not problems:
-            return spec
-    listed = "".join(f"\n  - {problem.removeprefix('the file.')}" for problem in problems)
+            return replace(spec, meshes=_meshes(spec.urdf))
+    listed = "".join(f"\n  - {_as_written(problem)}" for problem in problems)
     noun = "place" if len(problems) == 1 else "places"
     raise RobotError(f"{path} is wrong in {len(problems)} {noun}:{listed}")
 
 
-# The format -----------------------------------------------------------------------------------------------------------
+_FIELDS = {
+    "base.pos": "base_pos",
+    "base.quat": "base_quat",
+    "base.placement": "placement",
+    "hand.root": "hand_root",
+    "hand.palm": "palm",
+    "collision.self": "self_collision_links",
+    "collision.exclude": "collision_exclude",
+    "collision.table_exclude": "table_exclude",
+}
+"""Entry of a table of the file -> field of a :class:`~xreset.spec.RobotSpec`; other entries have the field's name."""
+_TABLES = ("base", "hand", "collision", "home_std")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Joint(DriveSpec):
-    """A joint and its drive, in one table."""
-
-    name: Text
-    group: Literal["arm", "hand"]
-    home: Number
-
-
-@dataclass(frozen=True, kw_only=True)
-class Base:
-    """Pose of the URDF's root link in the world."""
-
-    pos: tuple[Number, Number, Number]
-    quat: tuple[Number, Number, Number, Number]
-    placement: PlacementSpec | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Hand:
-    """Links of the hand."""
-
-    root: Text
-    palm: Text
+def _fields(data: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Return what a file holds as fields of a :class:`~xreset.spec.RobotSpec`; what does not fit stays as it is."""
+    values = {name: value for name, value in data.items() if name != "schema"}
+    for table in _TABLES:
+        if isinstance(data.get(table), dict):
+            for entry, value in values.pop(table).items():
+                name = f"{table}.{entry}"
+                values[_FIELDS.get(name, name)] = value
+    arm, hand = RobotSpec.home_std
+    values.setdefault("home_std", [values.pop("home_std.arm", arm), values.pop("home_std.hand", hand)])
+    if isinstance(data.get("urdf"), str):
+        values["urdf"] = (folder / data["urdf"]).resolve()
+    if isinstance(data.get("keypoints"), dict):
+        values["keypoints"] = [{"keypoint": keypoint, "link": link} for keypoint, link in data["keypoints"].items()]
+    if isinstance(data.get("joints"), list):
+        values["joints"] = [_joint(joint) for joint in data["joints"]]
+    return values
 
 
-@dataclass(frozen=True, kw_only=True)
-class Collision:
-    """Which links collide; see :class:`xreset.spec.RobotSpec`."""
-
-    self: tuple[Text, ...] = ()
-    exclude: tuple[tuple[Text, Text], ...] = ()
-    table_exclude: tuple[Text, ...] = ()
-
-
-@dataclass(frozen=True, kw_only=True)
-class HomeSpread:
-    """:attr:`xreset.spec.RobotSpec.home_std`."""
-
-    arm: Number = RobotSpec.home_std[0]
-    hand: Number = RobotSpec.home_std[1]
+def _joint(entries: Any) -> Any:
+    """Return a joint of the file, which holds its drive's entries, as fields of a :class:`~xreset.spec.JointSpec`."""
+    if not isinstance(entries, dict):
+        return entries
+    own = {name: value for name, value in entries.items() if name in ("name", "group", "home")}
+    return {**own, "drive": {name: value for name, value in entries.items() if name not in own}}
 
 
-@dataclass(frozen=True, kw_only=True)
-class Description:
-    """The whole file."""
-
-    schema: str
-    name: Text
-    urdf: Text
-    joints: tuple[Joint, ...]
-    fingertips: tuple[FingertipSpec, ...]
-    base: Base
-    hand: Hand
-    keypoints: dict[str, Text]
-    mimics: tuple[MimicSpec, ...] = ()
-    collision: Collision = Collision()
-    home_std: HomeSpread = HomeSpread()
-    gravity_compensated: bool = True
-    like: str = ""
-
-
-def _robot(given: Description, folder: Path) -> RobotSpec:
-    joints = []
-    for joint in given.joints:
-        drive = DriveSpec(**{f.name: getattr(joint, f.name) for f in fields(DriveSpec)})
-        joints.append(JointSpec(name=joint.name, group=joint.group, home=joint.home, drive=drive))
-    urdf = (folder / given.urdf).resolve()
-    return RobotSpec(
-        name=given.name,
-        urdf=urdf,
-        meshes=_meshes(urdf),
-        joints=tuple(joints),
-        mimics=given.mimics,
-        base_pos=given.base.pos,
-        base_quat=given.base.quat,
-        placement=given.base.placement,
-        palm=given.hand.palm,
-        hand_root=given.hand.root,
-        fingertips=given.fingertips,
-        keypoints=tuple(KeypointSpec(keypoint=keypoint, link=link) for keypoint, link in given.keypoints.items()),
-        self_collision_links=given.collision.self,
-        collision_exclude=given.collision.exclude,
-        table_exclude=given.collision.table_exclude,
-        gravity_compensated=given.gravity_compensated,
-        like=given.like,
-        home_std=(given.home_std.arm, given.home_std.hand),
-    )
+def _as_written(problem: str) -> str:
+    """Return a problem with the names that the file has."""
+    written = {field: entry for entry, field in _FIELDS.items()}
+    problem = problem.removeprefix("the file.").replace("].drive", "]")
+    return re.sub(r"^\w+", lambda match: written.get(match[0], match[0]), problem)
 
 
 def _meshes(urdf: Path) -> tuple[Path, ...]:
@@ -179,11 +125,6 @@ def _contradictions(spec: RobotSpec) -> list[str]:
     for mimic in spec.mimics:
         if mimic.source not in spec.joint_names:
             problems.append(f"mimics: {mimic.joint!r} follows {mimic.source!r}, which is not among the joints.")
-    for keypoint in spec.keypoints:
-        if keypoint.keypoint not in KEYPOINTS:
-            problems.append(f"keypoints: unknown keypoint {keypoint.keypoint!r}. Choose from: {', '.join(KEYPOINTS)}.")
-    if not spec.joints:
-        problems.append("joints: there is none.")
     if not spec.fingertips or spec.fingertips[0].name != "thumb":
         problems.append(f"fingertips: the first must be 'thumb', found {list(spec.fingertip_names)}.")
     if not len(spec.arm_indices) or not len(spec.hand_indices):

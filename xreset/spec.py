@@ -24,6 +24,8 @@ FINGERS = ("thumb", "index", "middle", "ring", "little")
 KEYPOINTS = ("wrist", *(f"{finger}{i}" for finger in FINGERS for i in range(1, 5)))  # noqa: XR002
 """The 21 human hand keypoints in the order of the demonstrations: the wrist, then each finger from base (1) to tip
 (4)."""
+Keypoint = Annotated[str, Rule(f"one of {', '.join(KEYPOINTS)}", KEYPOINTS.__contains__)]
+"""One of :data:`KEYPOINTS`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,12 +72,12 @@ class DriveSpec:
 class JointSpec:
     """One actuated joint."""
 
-    name: str
+    name: Text
     """Its name in the URDF."""
     group: Literal["arm", "hand"]
     """Arm joints take a position change per control step, hand joints an absolute target."""
     drive: DriveSpec
-    home: float
+    home: Number
     """Home position [rad or m]."""
 
 
@@ -99,17 +101,16 @@ class FingertipSpec:
     """URDF link (a fixed frame) at the tip."""
     contact_links: tuple[Text, ...]
     """URDF links whose contact with the object counts as this finger's contact; they have the fingertip's friction."""
-    keypoint: Annotated[str, Rule(f"one of {', '.join(KEYPOINTS)}", KEYPOINTS.__contains__)]
-    """The human keypoint that it follows, one of :data:`KEYPOINTS`."""
+    keypoint: Keypoint
+    """The human keypoint that it follows."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class KeypointSpec:
     """Which robot link follows a human keypoint during retargeting."""
 
-    keypoint: str
-    """One of :data:`KEYPOINTS`."""
-    link: str
+    keypoint: Keypoint
+    link: Text
     """URDF link whose origin follows it."""
 
 
@@ -131,7 +132,7 @@ class PlacementSpec:
 class RobotSpec:
     """A robot: a URDF and one small typed description. See :func:`xreset.load_robot`."""
 
-    name: str
+    name: Text
     """Such as ``ur7e-sharpa``."""
     urdf: Path
     """The URDF file: the one source of kinematics, inertias and collision shapes for every engine."""
@@ -139,28 +140,28 @@ class RobotSpec:
     """Actuated joints. This order is the joint order everywhere (length J)."""
     mimics: tuple[MimicSpec, ...] = ()
     """Joints that follow an actuated one."""
-    base_pos: tuple[float, float, float]
+    base_pos: tuple[Number, Number, Number]
     """Position of the URDF's root link in the world [m]."""
-    base_quat: tuple[float, float, float, float]
+    base_quat: tuple[Number, Number, Number, Number]
     """Orientation of the URDF's root link in the world (w, x, y, z)."""
-    palm: str
+    palm: Text
     """Link that stands for the hand: origin near the palm's centre, x towards the fingers, z out of the palm's inner
     side."""
     fingertips: tuple[FingertipSpec, ...]
     """Fingertips, thumb first (length E)."""
     keypoints: tuple[KeypointSpec, ...]
     """Links that follow human keypoints during retargeting."""
-    hand_root: str
+    hand_root: Text
     """Link that carries the whole hand: the arm's inverse kinematics aims at its pose."""
-    self_collision_links: tuple[str, ...] = ()
+    self_collision_links: tuple[Text, ...] = ()
     """Links that collide with each other in physics (retargeting checks every link). Neighbours never do."""
-    collision_exclude: tuple[tuple[str, str], ...] = ()
+    collision_exclude: tuple[tuple[Text, Text], ...] = ()
     """Further pairs of links that never collide, in physics and in retargeting."""
-    table_exclude: tuple[str, ...] = ()
+    table_exclude: tuple[Text, ...] = ()
     """Links that never collide with the table (the base stands on it)."""
     gravity_compensated: bool = True
     """Whether the robot's own weight is taken off (as an arm's controller does); the object's load stays."""
-    home_std: tuple[float, float] = (0.075, 0.10)
+    home_std: tuple[Number, Number] = (0.075, 0.10)
     """Spread of the home configuration: standard deviation of arm and hand joints [rad], the paper's Table IX."""
     placement: PlacementSpec | None = field(default=None, repr=False)
     """Where ``base_pos`` and ``base_quat`` come from, if a search found them; no part of the :attr:`fingerprint`."""

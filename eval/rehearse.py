@@ -25,7 +25,7 @@ from xreset.eval.plots import COLORS, svg
 from xreset.eval.policy_spec import PolicySpec, load_policy
 from xreset.eval.rollout import Episode, episode_of, episode_starts, play_rounds
 from xreset.eval.sensitivity import SWEEPS, Property, amount, chosen, nominal_task, read_rows
-from xreset.eval.stress import COSTLY, Point, Stress, by_property, draw_curves, plot_size, sweep
+from xreset.eval.stress import COSTLY, Stress, by_property, draw_curves, plot_size, sweep
 from xreset.eval.trial import Engine, Trial, engine, load_trial
 from xreset.files import claim_folder, write_json, write_whole
 from xreset.inputs import Data
@@ -85,14 +85,6 @@ CRITERIA = (
 training; the bounds are this project's choice."""
 LEAST = 0.5
 """Task progress without faults, below which a policy is not worth a robot."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Verdict:
-    """Whether a policy may be tried on a robot, and why."""
-
-    sentence: str
-    reasons: tuple[str, ...]
 
 
 def rehearse(
@@ -230,8 +222,8 @@ def _play(
     return tuple(found[item] for item in sorted(found))
 
 
-def judge(found: Sequence[Rehearsal]) -> Verdict:
-    """Return whether the policy may be tried on a robot.
+def judge(found: Sequence[Rehearsal]) -> tuple[str, list[str]]:
+    """Return whether the policy may be tried on a robot, in a sentence, and the reasons against it.
 
     It may if no engine shows a loss beyond :data:`CRITERIA`, and each at least :data:`LEAST` without faults.
     """
@@ -257,16 +249,14 @@ def judge(found: Sequence[Rehearsal]) -> Verdict:
                 )
                 reasons = against if low > 100 * most else unsure
                 reasons.append(text)
+    sentence = "Ready for a first, careful trial on a robot."
     if against:
-        return Verdict(sentence="Not ready for a robot.", reasons=(*against, *unsure))
-    if unsure:
-        return Verdict(
-            sentence="Not shown to be ready: some losses are too large, or chance. Play more episodes.",
-            reasons=tuple(unsure),
-        )
-    if tried < len(CRITERIA) * len(found):
-        return Verdict(sentence="No verdict: not every fault that decides was tried.", reasons=())
-    return Verdict(sentence="Ready for a first, careful trial on a robot.", reasons=())
+        sentence = "Not ready for a robot."
+    elif unsure:
+        sentence = "Not shown to be ready: some losses are too large, or chance. Play more episodes."
+    elif tried < len(CRITERIA) * len(found):
+        sentence = "No verdict: not every fault that decides was tried."
+    return sentence, [*against, *unsure]
 
 
 def limits(found: Sequence[Stress]) -> list[tuple[str, list[str]]]:
@@ -279,22 +269,14 @@ def limits(found: Sequence[Stress]) -> list[tuple[str, list[str]]]:
 
 def page(found: Sequence[Rehearsal]) -> str:
     """Return the page of a rehearsal, in HTML."""
-    rows = []
-    for name, curves in by_property(found).items():
-        points: dict[str, list[Point | None]] = {}
-        for i, each in enumerate(curves):
-            for point in each.points if each else ():
-                if each and point.value != each.nominal:
-                    points.setdefault(amount(each.unit, point.value), [None] * len(found))[i] = point
-        for size, cells in points.items():
-            rows.append((name.replace("-", " "), size, cells))
+    sentence, reasons = judge(found)
     return render(
         "rehearsal.html.j2",
-        verdict=judge(found),
+        sentence=sentence,
+        reasons=reasons,
         found=found,
         colors=COLORS,
         limits=limits(found),
-        rows=rows,
         chart=svg(lambda figure: draw_curves(figure, found), plot_size(found), "rehearsal"),
         costly=COSTLY,
     )

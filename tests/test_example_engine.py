@@ -177,7 +177,7 @@ class DrakeTest(EngineTest):
     engine = "drake"
     checks = """
         state_round_trip links_after_set nothing_stays masked_set mass_properties drive_equation free_spin
-        object_gravity object_wrench resting_weight object_mass held_object tip_friction broken_world
+        object_gravity object_wrench resting_weight set_as_built held_object tip_friction broken_world
     """
 
     def test_checks_of_the_suite(self):

@@ -123,13 +123,13 @@ class VerdictTest(unittest.TestCase):
         )
 
     def test_verdicts(self):
-        self.assertEqual(judge([self.card()]).sentence, "Ready for a first, careful trial on a robot.")
-        bad = judge([self.card(), self.card("sapien", action_delay_67=0.2)])
-        self.assertEqual(bad.sentence, "Not ready for a robot.")
-        self.assertRegex(bad.reasons[0], "sapien: action delay 67 ms costs 20.0 points .95 %: 20 to 20.. At most 4")
-        weak = judge([replace(self.card(), task_progress=0.3)])
-        self.assertIn("only 30 % without any fault", weak.reasons[0])
-        self.assertIn("No verdict", judge([replace(self.card(), curves=self.card().curves[:3])]).sentence)
+        self.assertEqual(judge([self.card()]), ("Ready for a first, careful trial on a robot.", []))
+        sentence, reasons = judge([self.card(), self.card("sapien", action_delay_67=0.2)])
+        self.assertEqual(sentence, "Not ready for a robot.")
+        self.assertRegex(reasons[0], "sapien: action delay 67 ms costs 20.0 points .95 %: 20 to 20.. At most 4")
+        _, reasons = judge([replace(self.card(), task_progress=0.3)])
+        self.assertIn("only 30 % without any fault", reasons[0])
+        self.assertIn("No verdict", judge([replace(self.card(), curves=self.card().curves[:3])])[0])
 
     def test_the_page_has_every_fault(self):
         text = page([self.card(), self.card("sapien", action_delay_67=0.2, action_delay_133=0.4)])

@@ -91,16 +91,6 @@ def rest_and_bounce(bench: Bench) -> Measured:
     }
 
 
-def object_mass(bench: Bench) -> Measured:
-    """Give the objects other masses, then set a state: the table must carry those masses."""
-    worlds = bench.worlds()
-    mass = bench.masses * torch.tensor([2.0, 0.5, 1.5, 0.7])
-    worlds.set_parameter("object_mass", mass, [0, 2, 3])
-    worlds.set_parameter("object_mass", mass, [1])
-    worlds.advance(bench.start(), _SETTLE)
-    return {"vertical force": worlds.contacts().table_force[:, 2] / (GRAVITY * mass) - 1.0}
-
-
 def set_as_built(bench: Bench) -> Measured:
     """Set mass and friction in some worlds and build others with them: objects must do the same in both.
 

@@ -1,4 +1,4 @@
-"""Checks of the robot: kinematics, mass properties, drives, limits, weight. All but two run with any robot.
+"""Checks of the robot: mass properties, drives, limits, weight. All but two run with any robot.
 
 Joints move in free space here: the robot's links collide neither with one another nor with the table.
 """
@@ -13,54 +13,20 @@ import torch
 from scipy.integrate import solve_ivp
 from torch import Tensor
 
-from xreset.backends.conformance.harness import Bench, Worlds, finite_limits, named, replace_fields, rotation_angle
+from xreset.backends.conformance.harness import Bench, Worlds, finite_limits, named, replace_fields
 from xreset.backends.conformance.results import Measured, Skipped
 from xreset.backends.conformance.scene import without_collisions
 from xreset.backends.rigid import mechanism, object_inertia
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.rotations import matrix_to_quat
 from xreset.geometry.urdf import robot_tree
 from xreset.physics import State
 from xreset.spec import GRAVITY, JointSpec, SceneSpec
 
-_CONFIGURATIONS = 200
 _WAY = 0.2  # rad, of a joint's step and of the amplitude of its sine
 _SLIDE_WAY = 0.02  # m, the same of a prismatic joint
 _DURATION = 1.5  # s
 _FREQUENCY = 1.0  # Hz
 _DRIVE_SCALES = ((1.0, 1.0, 1.0), (0.7, 1.4, 1.0), (1.3, 0.8, 0.5))  # of stiffness, damping and effort limit
-
-# Kinematics -----------------------------------------------------------------------------------------------------------
-
-
-def forward_kinematics(bench: Bench) -> Measured:
-    """Set many configurations and compare palm and fingertips with the URDF's kinematics and the reference engine's."""
-    random = torch.Generator().manual_seed(7)
-    lower, upper = finite_limits(bench.kinematics)
-    q = lower + (upper - lower) * torch.rand(_CONFIGURATIONS, len(lower), generator=random, dtype=torch.float64)
-    q = q.float().double()  # what an interface in single precision can carry
-
-    def links_of(worlds: Worlds) -> tuple[Tensor, Tensor]:
-        start = bench.start()
-        pos = []
-        quat = []
-        for some in q.split(bench.NUM_WORLDS):
-            worlds.set(replace_fields(start, joint_pos=some, joint_target=some))
-            links = worlds.links()
-            pos.append(links.pos.double())
-            quat.append(links.quat.double())
-        return torch.cat(pos), torch.cat(quat)
-
-    pos, quat = links_of(bench.worlds())
-    poses = bench.kinematics.link_poses(q, bench.scene.robot.tracked_links)
-    with bench.reference(bench.scene, bench.which) as reference:
-        pos_there, quat_there = links_of(reference)
-    return {
-        "pos against the URDF": pos - poses[..., :3, 3],
-        "angle against the URDF": rotation_angle(quat, matrix_to_quat(poses[..., :3, :3])),
-        "pos against MuJoCo": pos - pos_there,
-        "angle against MuJoCo": rotation_angle(quat, quat_there),
-    }
 
 
 def mass_properties(bench: Bench) -> Measured:

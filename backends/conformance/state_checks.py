@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+
 import torch
 from torch import Tensor
 
@@ -24,11 +26,15 @@ def state_round_trip(bench: Bench) -> Measured:
 
 
 def links_after_set(bench: Bench) -> Measured:
-    """Set a random state and compare the tracked links with the URDF's kinematics, without a step."""
+    """Set random states and compare the tracked links with the URDF's kinematics, without a step."""
     worlds = bench.worlds()
-    state = bench.random_state(seed=2)
-    worlds.set(state)
-    return _link_errors(bench.kinematics, state, worlds.links())
+    errors = defaultdict(list)
+    for seed in range(100, 110):
+        state = bench.random_state(seed)
+        worlds.set(state)
+        for what, error in _link_errors(bench.kinematics, state, worlds.links()).items():
+            errors[what].append(error)
+    return {what: torch.stack(rows) for what, rows in errors.items()}
 
 
 def links_after_steps(bench: Bench) -> Measured:
@@ -104,10 +110,10 @@ def _errors_on_the_way(bench: Bench, which: Tensor) -> Measured:
     """Return the errors of some tracked links' poses, [T, N, ...], while every joint moves."""
     worlds = bench.worlds()
     worlds.set_targets(bench.start().joint_pos + small_motion(bench.kinematics))
-    errors = {"pos": [], "angle": []}
+    errors = defaultdict(list)
     for _ in range(6):
         worlds.step(4)
         now = _link_errors(bench.kinematics, worlds.state(), worlds.links())
-        for what, rows in errors.items():
-            rows.append(now[what][:, which])
+        for what in ("pos", "angle"):
+            errors[what].append(now[what][:, which])
     return {what: torch.stack(rows) for what, rows in errors.items()}

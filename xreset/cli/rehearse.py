@@ -63,9 +63,9 @@ def rehearse(
     for name, limits in rehearsal.limits(found):
         table.add_row(name, *limits)
     console.print(table)
-    verdict = rehearsal.judge(found)
-    console.print(verdict.sentence, style="bold")
-    for reason in verdict.reasons:
+    sentence, reasons = rehearsal.judge(found)
+    console.print(sentence, style="bold")
+    for reason in reasons:
         console.print(reason)
     console.print(f"page and results in {folder}")
 

@@ -28,20 +28,6 @@ BONES = np.column_stack((PARENTS, np.arange(1, 21)))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Human:
-    """The demonstrating hand in each row."""
-
-    keypoints: np.ndarray
-    """[N, 21, 3] NaN where not annotated."""
-    touching: np.ndarray
-    """[N, 21] bool: keypoints in contact with the object."""
-
-    def select(self, rows: np.ndarray) -> Human:
-        """Return the hands of some rows."""
-        return Human(keypoints=self.keypoints[rows], touching=self.touching[rows])
-
-
-@dataclass(frozen=True, kw_only=True)
 class View:
     """Everything that is shown of a file, in the table frame."""
 
@@ -67,8 +53,6 @@ class View:
     """[S, 3]"""
     goal_quat: np.ndarray
     """[S, 4]"""
-    contact: np.ndarray
-    """[N] bool: the human touches the object in this row; of a bank: has touched it by then."""
     post_contact: np.ndarray
     """[N] bool: at or after the sequence's first contact."""
     reason: tuple[str, ...]
@@ -83,7 +67,10 @@ class View:
     """[N] mean distance of the robot's fingertips from the human's [m]."""
     wrist_error: np.ndarray | None = None
     """[N] distance of the hand from its target [m]."""
-    human: Human | None = None
+    human_keypoints: np.ndarray | None = None
+    """[N, 21, 3] of the demonstrating hand; NaN where not annotated."""
+    human_touching: np.ndarray | None = None
+    """[N, 21] bool: keypoints in contact with the object."""
 
     def choose(self, *, sequence: int | None = None, reason: str | None = None) -> np.ndarray:
         """Return the indices of the rows of a sequence, or with a reason, in order; may be empty.
@@ -116,17 +103,12 @@ class View:
         state = GOOD[self.kind]
         if reason := self.reason[row]:
             state = reason if self.robot is None else f"not valid: {reason}"
-        phase = PHASES[int(self.post_contact[row])]
-        if self.contact[row] and self.kind != "reset states":
-            phase += ", human touches"
-            if self.human is not None:
-                phase += f" ({self.human.touching[row].sum()} keypoints)"
         lines = [
             state,
             self.objects[self.object_index[row]].name,
             f"sequence {sequence}: {self.sequence_name[sequence]}",
             f"frame {int(self.frame[row])}",
-            phase,
+            PHASES[int(self.post_contact[row])],
         ]
         if self.hand_error is not None and self.wrist_error is not None and np.isfinite(self.hand_error[row]):
             tips = 1e3 * self.hand_error[row]

@@ -14,7 +14,7 @@ from xreset.errors import XResetError
 from xreset.geometry.surface import Surface
 from xreset.inputs import Inputs, load_inputs
 from xreset.objects.catalogue import canonical_name
-from xreset.pictures.view.data import Human, View
+from xreset.pictures.view.data import View
 from xreset.resets.bank import ResetBank
 from xreset.resets.goals import GoalSet
 from xreset.retarget.file import Retargeted
@@ -58,23 +58,22 @@ def load_view(
             raise XResetError(f"{path} holds no state: physics rejected all of them.")
         view = _bank_view(data, inputs)
     if demos is not None:
-        view = replace(view, human=_human_of(path, demos, view))
+        view = replace(view, **_human_of(path, demos, view))
     return view
 
 
 def _demos_view(demos: Demos, inputs: Inputs) -> View:
     demos, human = _human(demos, inputs.objects)
-    contact = np.asarray(human.touching.any(axis=1))
+    contact = human["human_touching"].any(axis=1)
     touched = [np.logical_or.accumulate(contact[demos.frames(s)]) for s in range(len(demos))]
     return View(
         kind="demonstrations",
         robot=None,
         **_motion(demos, inputs.objects),
-        contact=contact,
         post_contact=np.concatenate(touched),
         reason=tuple("" if valid else "not annotated" for valid in demos.hand_valid),
         reasons=("not annotated",),
-        human=human,
+        **human,
     )
 
 
@@ -106,7 +105,6 @@ def _retargeted_view(data: Retargeted, inputs: Inputs) -> View:
         kind="robot trajectories",
         robot=inputs.robot,
         **_motion(data, inputs.objects),
-        contact=data.contact,
         post_contact=data.post_contact,
         reason=tuple("" if reason == 0 else data.reason_names[reason] for reason in data.reason.tolist()),
         reasons=data.reason_names[1:],
@@ -131,7 +129,6 @@ def _bank_view(bank: ResetBank, inputs: Inputs) -> View:
         object_quat=bank.object_quat_wxyz,
         goal_pos=bank.goal_pos,
         goal_quat=bank.goal_quat_wxyz,
-        contact=bank.post_contact,
         post_contact=bank.post_contact,
         reason=("",) * bank.num_states,
         reasons=(),
@@ -154,19 +151,19 @@ def _at_home(goals: GoalSet, robot: RobotSpec) -> GoalSet:
     )
 
 
-def _human(demos: Demos, objects: Sequence[ObjectSpec]) -> tuple[Demos, Human]:
-    """Return the demonstrations with the objects on the table, as retargeting uses them, and their hands with
-    contacts."""
+def _human(demos: Demos, objects: Sequence[ObjectSpec]) -> tuple[Demos, dict[str, Any]]:
+    """Return the demonstrations with the objects on the table, as retargeting uses them, and the fields of a view of
+    their hands."""
     demos = rest_on_table(demos, objects)
     keypoints = np.where(demos.hand_valid[:, None, None], demos.hand_keypoints.astype(np.float64), np.nan)
     surfaces = {spec.name: Surface(spec) for spec in objects if spec.name in demos.object_name}
     _, touching = human_contacts(demos, surfaces, RetargetConfig().contact_distance)
-    return demos, Human(keypoints=keypoints, touching=touching)
+    return demos, {"human_keypoints": keypoints, "human_touching": touching}
 
 
-def _human_of(path: Path, demos_path: Path, view: View) -> Human:
-    """Return the hands of a view's rows, found in demonstrations by the name of the sequence and the frame within
-    it."""
+def _human_of(path: Path, demos_path: Path, view: View) -> dict[str, np.ndarray]:
+    """Return the fields of the hands of a view's rows, found in demonstrations by the name of the sequence and the
+    frame within it."""
     demos = read_demos(demos_path)
     used = [view.sequence_name[number] for number in np.unique(view.sequence)]
     missing = sorted(set(used) - set(demos.sequence_name.tolist()))
@@ -184,4 +181,4 @@ def _human_of(path: Path, demos_path: Path, view: View) -> Human:
             " Give the demonstrations that the file was made from."
         )
     _, human = _human(demos, view.objects)
-    return human.select(demos.frame_offsets[index] + view.frame)
+    return {name: values[demos.frame_offsets[index] + view.frame] for name, values in human.items()}

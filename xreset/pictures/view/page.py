@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
+from html import escape
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -13,7 +15,6 @@ from xreset.pictures.meshes import GOAL_COLOR, OBJECT_COLOR, Color, rgb
 from xreset.pictures.view.colors import HUMAN_COLOR, REACHED_COLOR, TOUCH_COLOR, reason_color
 from xreset.pictures.view.data import BONES, GOOD, View
 from xreset.pictures.view.server import RobotMeshes, WebPage
-from xreset.pictures.view.timeline import bar
 
 _ALL = "all"
 _IDLE = 0.1
@@ -116,7 +117,11 @@ class Page(WebPage):
             self.show()
 
     def _show_choice(self) -> None:
-        self._bar.content = bar([self.view.reason[row] for row in self._rows])
+        slots = ""
+        for reason, group in groupby(self.view.reason[row] for row in self._rows):
+            color = f"rgb{rgb(reason_color(reason))}"
+            slots += f'<div title="{escape(reason)}" style="flex:{len(list(group))};background:{color}"></div>'
+        self._bar.content = f'<div style="display:flex;height:12px;margin:0.6em 1em 0">{slots}</div>'
 
     def _step(self, by: int) -> None:
         with self._lock:
@@ -177,14 +182,17 @@ class _Scene:
             self._robot.place(view.joint_pos[row], reason_color(reason) if reason else None)
 
     def _show_human(self, row: int) -> None:
-        human = self._view.human
-        visible = human is not None and np.isfinite(human.keypoints[row]).all()
+        view = self._view
+        keypoints = np.full((21, 3), np.nan, np.float32)
+        touching = np.zeros(21, dtype=bool)
+        if view.human_keypoints is not None and view.human_touching is not None:
+            keypoints = view.human_keypoints[row].astype(np.float32)
+            touching = view.human_touching[row]
+        visible = np.isfinite(keypoints).all()
         self._keypoints.visible = visible
         self._bones.visible = visible
-        if human is None or not visible:
+        if not visible:
             return
-        keypoints = human.keypoints[row].astype(np.float32)
-        touching = human.touching[row]
         colors = np.where(touching[:, None], rgb(TOUCH_COLOR), rgb(HUMAN_COLOR))
         self._keypoints.points = keypoints
         self._keypoints.colors = colors.astype(np.uint8)

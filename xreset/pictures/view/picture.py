@@ -7,7 +7,7 @@ import numpy as np
 from xreset.description import load_robot
 from xreset.pictures.render import Points, Renderer, pose_matrix
 from xreset.pictures.view.colors import HUMAN_COLOR, REACHED_COLOR, TOUCH_COLOR, reason_color
-from xreset.pictures.view.data import BONES, Human, View
+from xreset.pictures.view.data import BONES, View
 from xreset.plugins import robot_names
 from xreset.spec import SceneSpec
 
@@ -31,8 +31,8 @@ class Drawer:
         sequence = view.sequence[row]
         reason = view.reason[row]
         points = []
-        if view.human is not None:
-            points += _human_points(view.human, row)
+        if view.human_keypoints is not None and view.human_touching is not None:
+            points += _human_points(view.human_keypoints[row], view.human_touching[row])
         if view.fingertips is not None:
             points.append(Points(pos=view.fingertips[row], color=REACHED_COLOR, radius=0.003))
         return self._renderer.draw(
@@ -45,9 +45,7 @@ class Drawer:
         )
 
 
-def _human_points(human: Human, row: int) -> list[Points]:
-    keypoints = human.keypoints[row]
-    touching = human.touching[row]
+def _human_points(keypoints: np.ndarray, touching: np.ndarray) -> list[Points]:
     start = keypoints[BONES[:, 0]]
     end = keypoints[BONES[:, 1]]
     dots = np.linspace(start, end, _BONE_DOTS)[1:-1]

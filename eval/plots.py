@@ -16,7 +16,6 @@ from xreset.errors import needs
 from xreset.files import write_whole
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6d3b", "#666666")
@@ -67,15 +66,6 @@ def svg(draw: Callable[[Figure], None], size: tuple[float, float], salt: str) ->
     for attribute in ("width", "height"):
         text = re.sub(rf'(<svg[^>]*?) {attribute}="[^"]*"', r"\1", text, count=1)
     return text.strip()
-
-
-def percent_axis(ax: Axes, which: str) -> None:
-    """Set an axis, ``x`` or ``y``, to 0 to 100 percent, with grid lines."""
-    axis = ax.xaxis if which == "x" else ax.yaxis
-    (ax.set_xlim if which == "x" else ax.set_ylim)(0, 104)
-    axis.set_ticks(range(0, 101, 25))
-    axis.set_major_formatter(lambda value, _: f"{value:.0f} %")
-    ax.grid(axis="x" if which == "x" else "y", color=INK, alpha=0.12)
 
 
 @contextmanager

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 import rich.console
 from rich.table import Table
-from rich.text import Text
 
 from xreset.eval.stats import mean_of_known
 
@@ -17,13 +16,8 @@ if TYPE_CHECKING:
     from xreset.eval.results import DemoResult, EvalResult
 
 
-@dataclass(frozen=True, kw_only=True)
-class Rows:
-    """A table of text."""
-
-    title: str = ""
-    head: tuple[str, ...]
-    body: tuple[tuple[str, ...], ...]
+Rows = Sequence[Sequence[str]]
+"""A table of text; the first row is its head."""
 
 
 def escape(text: str) -> str:
@@ -36,19 +30,9 @@ def escape(text: str) -> str:
 def markdown(rows: Rows, escape: Callable[[str], str] = escape) -> str:
     """Return a table in Markdown."""
     lines = ""
-    for cells in (rows.head, ("---",) * len(rows.head), *rows.body):
+    for cells in (rows[0], ["---"] * len(rows[0]), *rows[1:]):
         lines += "| " + " | ".join(map(escape, cells)) + " |\n"
     return lines
-
-
-def rich_table(rows: Rows) -> Table:
-    """Return a table for a terminal; a first cell without text continues the row above."""
-    table = Table(title=rows.title, title_justify="left")
-    for i, name in enumerate(rows.head):
-        table.add_column(Text(name), justify="right" if i > 1 else "left", overflow="fold")
-    for line in rows.body:
-        table.add_row(*map(Text, line))
-    return table
 
 
 METRICS = {
@@ -80,13 +64,18 @@ def caption(policies: Iterable[str]) -> str:
 
 
 def success_text(share: float | None) -> str:
-    """Return the published success as text; None or NaN: an earlier version did not measure it."""
-    return "missing" if share is None or isnan(share) else f"{share:.1%}"
+    """Return the published success as text; None: an earlier version did not measure it."""
+    return "missing" if share is None else f"{share:.1%}"
 
 
 def distance_text(distance: float | None) -> str:
-    """Return the published distance [m] as text; None or NaN: an earlier version did not measure it."""
-    return "missing" if distance is None or isnan(distance) else f"{100 * distance:.1f} cm"
+    """Return the published distance [m] as text; None: an earlier version did not measure it."""
+    return "missing" if distance is None else f"{100 * distance:.1f} cm"
+
+
+def estimate_text(mean: float, low: float, high: float) -> str:
+    """Return an estimate and its interval as percent, or cm, such as ``93.2 (88-98)``; ``-`` if it is not known."""
+    return "-" if isnan(mean) else f"{100 * mean:.1f} ({100 * low:.0f}-{100 * high:.0f})"
 
 
 @dataclass(frozen=True)

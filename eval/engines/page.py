@@ -15,7 +15,7 @@ from jinja2 import UndefinedError
 from xreset.backends.conformance.results import SCHEMA as CONFORMANCE
 from xreset.errors import FileFormatError, XResetError
 from xreset.eval.pages import render
-from xreset.eval.table import Rows, markdown
+from xreset.eval.table import markdown
 from xreset.files import read_json
 from xreset.physics import Capability
 from xreset.text import shown
@@ -161,4 +161,4 @@ def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
     def escape(cell: str) -> str:
         return " ".join(cell.replace("|", "\\|").split())
 
-    return markdown(Rows(head=head, body=tuple(rows)), escape=escape) if rows else ""
+    return markdown([head, *rows], escape=escape) if rows else ""

@@ -34,29 +34,18 @@ MOMENTS = 6
 
 @dataclass(frozen=True, kw_only=True)
 class Clip:
-    """One episode in one engine, as a film at the episode's own speed."""
+    """One episode in one engine, drawn."""
 
-    engine: str
     episode: Any
     """Row of the table of episodes."""
     frames: np.ndarray
     """[T, H, W, 3] uint8"""
+    times: np.ndarray
+    """[T] time of each frame [s]."""
     fps: float
-    """Frames per second."""
+    """Frames per second of a film at the episode's own speed."""
     finite: bool
-    """False if the state stopped being finite: the film stands still from there on."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Strip:
-    """One episode as a row of pictures."""
-
-    episode: Any
-    """Row of the table of episodes."""
-    picture: np.ndarray
-    """[H, MOMENTS * W, 3] uint8"""
-    times: tuple[float, ...]
-    """[MOMENTS] time of each picture [s]."""
+    """False if the state stopped being finite: from there on, the last finite state is shown."""
 
 
 # Which episodes -------------------------------------------------------------------------------------------------------
@@ -156,16 +145,11 @@ def camera_for(traces: Sequence[Trace], *, distance: float = 1.0) -> Camera:
     """
     start = traces[0].object_pos[0].astype(float)
     goal = traces[0].goal_pos.astype(float)
-    away = float(np.clip(0.75 + 1.2 * np.linalg.norm(goal - start), 0.85, 1.3))
-    return camera_at((start + goal) / 2 + (0.0, 0.0, 0.06), distance * away)
-
-
-def camera_at(center: np.ndarray, distance: float) -> Camera:
-    """Return a camera in the default direction that looks at a point [3] from a distance [m]."""
+    center = (start + goal) / 2 + (0.0, 0.0, 0.06)
     default = Camera()
     away = np.subtract(default.eye, default.target)
-    eye = center + away / np.linalg.norm(away) * distance
-    return Camera(eye=tuple(eye.tolist()), target=tuple(center.tolist()), fov=default.fov)
+    away *= distance * np.clip(0.75 + 1.2 * np.linalg.norm(goal - start), 0.85, 1.3) / np.linalg.norm(away)
+    return Camera(eye=tuple((center + away).tolist()), target=tuple(center.tolist()), fov=default.fov)
 
 
 def finite_states(trace: Trace) -> np.ndarray:
@@ -203,40 +187,39 @@ def policy_cameras(robot: RobotSpec, obj: ObjectSpec, vision: VisionConfig | Non
 
 
 def draw_clip(
-    engine: str,
     episode: Any,
     trace: Trace,
     robot: RobotSpec,
     obj: ObjectSpec,
     camera: Camera,
     eyes: Cameras | None = None,
+    *,
+    strip: bool = False,
 ) -> Clip:
-    """Draw a trace as a film. After a state that is not finite, the film shows the last finite one."""
-    interval = float(trace.time[1] - trace.time[0]) if len(trace.time) > 1 else 1.0 / FRAMES_PER_SECOND
+    """Draw a trace.
+
+    Args:
+        strip: draw :data:`MOMENTS` states, evenly over the episode, in place of a film.
+    """
+    interval = float(trace.time[1] - trace.time[0])
     every = max(1, round(1.0 / (FRAMES_PER_SECOND * interval)))
+    rows = np.arange(0, len(trace.time), every)
+    size = SIZE
+    if strip:
+        rows = np.linspace(0, len(trace.time) - 1, MOMENTS).round().astype(int)
+        size = STRIP_SIZE
     finite = finite_states(trace)
-    last = len(finite) - 1 if finite.all() else max(int(np.argmin(finite)) - 1, 0)
-    rows = np.minimum(np.arange(0, len(trace.time), every), last).tolist()
-    renderer = Renderer(SceneSpec(robot=robot, objects=(obj,)), size=SIZE, camera=camera)
-    pictures = {row: draw_state(renderer, trace, row, eyes) for row in set(rows)}
-    frames = np.stack([pictures[row] for row in rows])
-    return Clip(engine=engine, episode=episode, frames=frames, fps=1.0 / (every * interval), finite=bool(finite.all()))
-
-
-def draw_strip(episode: Any, trace: Trace, robot: RobotSpec, obj: ObjectSpec, eyes: Cameras | None = None) -> Strip:
-    """Draw an episode's strip; states that are not finite are grey."""
-    camera = camera_for([trace], distance=0.7)
-    renderer = Renderer(SceneSpec(robot=robot, objects=(obj,)), size=STRIP_SIZE, camera=camera)
-    finite = finite_states(trace)
-    rows = np.linspace(0, len(trace.time) - 1, MOMENTS).round().astype(int).tolist()
-    pictures = []
-    for row in rows:
-        if finite[row]:
-            pictures.append(draw_state(renderer, trace, row, eyes))
-        else:
-            pictures.append(np.full_like(pictures[0], 128))  # the first state is finite: the episode began with it
-    times = tuple(float(trace.time[row]) for row in rows)
-    return Strip(episode=episode, picture=np.concatenate(pictures, axis=1), times=times)
+    last = len(finite) - 1 if finite.all() else int(np.argmin(finite)) - 1
+    drawn = np.minimum(rows, last).tolist()
+    renderer = Renderer(SceneSpec(robot=robot, objects=(obj,)), size=size, camera=camera)
+    pictures = {row: draw_state(renderer, trace, row, eyes) for row in set(drawn)}
+    return Clip(
+        episode=episode,
+        frames=np.stack([pictures[row] for row in drawn]),
+        times=trace.time[rows],
+        fps=1.0 / (every * interval),
+        finite=bool(finite.all()),
+    )
 
 
 def encode_mp4(frames: np.ndarray, fps: float, *, keyframes: int | None = None) -> bytes:

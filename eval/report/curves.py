@@ -20,12 +20,18 @@ from xreset.eval.results import Table
 
 X = Literal["minutes", "steps", "iterations"]
 """Horizontal axis of a learning curve."""
+AXES: dict[X, tuple[str, float, int]] = {
+    "minutes": ("minutes of training", 1.0, 1),
+    "steps": ("million environment steps", 1e-6, 1),
+    "iterations": ("iterations of training", 1.0, 0),
+}
+"""Label of an axis, factor to its unit, and digits in tables."""
 _SPEED = ["speed/collect_seconds", "speed/learn_seconds", "speed/env_steps_per_second"]
 
 
 def amounts(training: Training, x: X) -> Table:
-    """Return how much of ``x`` had been done after each iteration: iterations, environment steps, or minutes, with the
-    iteration as index, rising.
+    """Return how much of ``x`` had been done after each iteration, in the unit of :data:`AXES`, with the iteration as
+    index, rising.
 
     Raises:
         RunError: the training did not log its speed.
@@ -40,7 +46,7 @@ def amounts(training: Training, x: X) -> Table:
         )
     speed = curves[_SPEED].dropna()
     seconds = speed[_SPEED[0]] + speed[_SPEED[1]]
-    each = seconds / 60 if x == "minutes" else seconds * speed[_SPEED[2]]
+    each = seconds / 60 if x == "minutes" else seconds * speed[_SPEED[2]] * 1e-6
     return (each * np.diff(speed.index, prepend=0)).cumsum()
 
 

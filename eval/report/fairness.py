@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
@@ -97,38 +97,20 @@ def begun(trainings: Sequence[Training]) -> list[str]:
     return found
 
 
-def health(found: Table) -> list[str]:
-    """Return a sentence for each score (:func:`xreset.eval.report.groups.scores`) with episodes in which the engine
-    broke down or dropped contacts."""
+def health(label: str, episodes: Iterable[tuple[Any, Table]]) -> list[str]:
+    """Return a sentence for each engine in which it broke down or dropped contacts.
+
+    Args:
+        label: whose episodes they are.
+        episodes: :func:`xreset.eval.report.groups.by_engine`.
+    """
     sentences = []
-    for row in found.to_dict("records"):
-        if row["nonfinite"] or row["overflow"]:
+    for engine, own in episodes:
+        nonfinite = int(own["nonfinite"].sum())
+        overflow = int(own["overflow"].sum())
+        if nonfinite or overflow:
             sentences.append(
-                f"Of {row['episodes']} episodes of {row['group']} in {row['engine']}, {row['nonfinite']} stopped being "
-                f"finite and {row['overflow']} dropped contacts: that figure means little."
+                f"Of {len(own)} episodes of {label} in {engine}, {nonfinite} stopped being finite and {overflow} "
+                "dropped contacts: that figure means little."
             )
-    return sentences
-
-
-def missing(trainings: Sequence[Training], tags: Sequence[str]) -> list[str]:
-    """Return what some of the trainings lack."""
-    with_curves = [t for t in trainings if len(t.curves)]
-    evaluated = [t for t in trainings if t.results]
-    lacking = {
-        "No learning curves": [t for t in trainings if t.curves.empty],
-        "No evaluation results": [t for t in trainings if not t.results],
-        "No run.json, so its configuration is not known": [t for t in trainings if not t.facts],
-        "No lift.json, so the first success from home is not known": [t for t in with_curves if t.lift is None],
-        "No published success, which an earlier version did not measure": [
-            t for t in evaluated if t.episodes["published_success"].isna().any()
-        ],
-    }
-    for tag in tags:
-        lacking[f"No curve {tag}"] = [t for t in with_curves if tag not in t.curves]
-    for engine in sorted(set().union(*(t.results for t in trainings))):
-        lacking[f"Not evaluated in {engine}"] = [t for t in evaluated if engine not in t.results]
-    sentences = []
-    for what, without in lacking.items():
-        if without:
-            sentences.append(f"{what}: {', '.join(t.label for t in without)}.")
     return sentences

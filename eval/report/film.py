@@ -19,7 +19,7 @@ from xreset.eval.report.clips import (
     policy_cameras,
     recorded,
 )
-from xreset.eval.report.read import ReportData, collect
+from xreset.eval.report.read import ReportData, collect, results_in
 from xreset.eval.results import Table, mesh_folder, read_traces
 from xreset.files import write_whole
 from xreset.objects.catalogue import load_object
@@ -43,14 +43,16 @@ def draw_best(shown: Table, robot: RobotSpec, meshes: Path | None, vision: Visio
         camera = camera_for([best[0].trace])
         obj = load_object(episode.object, meshes)
         eyes = policy_cameras(robot, obj, vision)
-        clips.append(draw_clip(episode.engine, episode, episode.trace, robot, obj, camera, eyes))
+        clips.append(draw_clip(episode, episode.trace, robot, obj, camera, eyes))
     return clips
 
 
 def read_recorded(data: ReportData, robot: RobotSpec) -> Table:
     """Return the recorded episodes of a report; see :func:`xreset.eval.report.clips.recorded`."""
-    traces = {engine: read_traces(data.folder, engine, robot.joint_names) for engine in data.engines}
-    return recorded(data.episodes, traces)
+    training = data.training
+    folder = results_in(training.folder)
+    traces = {engine: read_traces(folder, engine, robot.joint_names) for engine in training.results}
+    return recorded(training.episodes, traces)
 
 
 def make_film(
@@ -74,14 +76,14 @@ def make_film(
     data = collect(folder)
     spec = load_robot(robot or data.robot)
     shown = read_recorded(data, spec)
-    meshes = mesh_folder(objects, data.results[0].objects_folder)
+    meshes = mesh_folder(objects, data.first.objects_folder)
     columns = {}
     for name, own in shown.groupby("object"):
         if clips := draw_best(own, spec, meshes):
             columns[str(name)] = clips
     if not columns:
         raise RunError(
-            f"no demonstration in {data.folder} was recorded in every engine. Evaluate all engines in one command."
+            f"no demonstration in {folder} was recorded in every engine. Evaluate all engines in one command."
         )
     every = list(chain(*columns.values()))
     length = max(len(clip.frames) for clip in every)
@@ -90,8 +92,8 @@ def make_film(
         column = []
         for clip in clips:
             half = clip.frames[np.minimum(np.arange(length), len(clip.frames) - 1), ::2, ::2]
-            label = f"{short_name(name)}, {clip.engine}"
+            label = f"{short_name(name)}, {clip.episode.engine}"
             column.append(np.stack([add_caption(picture, [label], 1) for picture in half]))
         films.append(np.concatenate(column, axis=1))
     write_whole(out, encode_mp4(np.concatenate(films, axis=2), every[-1].fps))
-    return data.engines, tuple(columns)
+    return tuple(data.training.results), tuple(columns)

@@ -12,8 +12,9 @@ import pandas as pd
 
 from xreset.eval.report.fairness import uneven
 from xreset.eval.report.read import Training
-from xreset.eval.results import Table, mean, means
+from xreset.eval.results import Table, mean
 from xreset.eval.stats import crossed_bootstrap_ci95
+from xreset.eval.table import METRICS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,32 +79,21 @@ def _label(labels: Sequence[str]) -> str:
 
 
 def scores(groups: Iterable[Group]) -> Table:
-    """Return a row for each group and engine in which it was evaluated: group (its label), engine, and the entries of
-    :func:`score`."""
+    """Return a row for each group, engine and metric of :data:`~xreset.eval.table.METRICS`: group (its label), engine,
+    metric, mean, low and high (:func:`estimate`); NaN where an earlier version did not measure the metric."""
     rows = []
     for group in groups:
-        evaluated = [m.episodes for m in group.members if m.results]
-        episodes: Table = pd.concat(evaluated) if evaluated else pd.DataFrame({"engine": []})
-        for engine, own in episodes.groupby("engine"):
-            rows.append({"group": group.label, "engine": engine} | score(own))
-    return pd.DataFrame(rows)
+        for engine, own in by_engine(group.members):
+            for metric in METRICS:
+                value, (low, high) = estimate(own, metric)
+                rows.append((group.label, engine, metric, value, low, high))
+    return pd.DataFrame(rows, columns=["group", "engine", "metric", "mean", "low", "high"])
 
 
-def score(episodes: Table) -> dict[str, Any]:
-    """Return the score of a group in one engine, from the episodes of all its trainings there: the means of all
-    metrics; ``task_progress_ci95`` and ``published_success_ci95``, as :func:`estimate` gives them; ``each``, the mean
-    task progress of every training by its label; and the numbers of episodes, of those that were not finite
-    (``nonfinite``) and of those in which the engine dropped contacts (``overflow``)."""
-    found: dict[str, Any] = means(episodes)
-    for metric in ("task_progress", "published_success"):
-        if found[metric] is not None:
-            found[f"{metric}_ci95"] = estimate(episodes, metric)[1]
-    return found | {
-        "each": episodes.groupby("run", sort=False)["task_progress"].mean().to_dict(),
-        "nonfinite": int(episodes["nonfinite"].sum()),
-        "overflow": int(episodes["overflow"].sum()),
-        "episodes": len(episodes),
-    }
+def by_engine(members: Iterable[Training]) -> Sequence[tuple[Any, Table]]:
+    """Return every engine in which trainings were evaluated, with the episodes of all of them there."""
+    evaluated = [member.episodes for member in members if member.results]
+    return list(pd.concat(evaluated).groupby("engine")) if evaluated else []
 
 
 def estimate(episodes: Table, metric: str) -> tuple[float, tuple[float, float]]:

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from xreset.description import load_robot
 from xreset.errors import RunError, XResetError
 from xreset.eval.pages import render
 from xreset.eval.report import fairness, tables
-from xreset.eval.report.clips import Clip, Strip, draw_strip, policy_cameras, worst_episodes
-from xreset.eval.report.curves import X
+from xreset.eval.report.clips import Clip, camera_for, draw_clip, policy_cameras, worst_episodes
+from xreset.eval.report.curves import AXES, X
 from xreset.eval.report.figures import write_picture
 from xreset.eval.report.film import draw_best, read_recorded
-from xreset.eval.report.groups import Group, grouped, scores, singles
+from xreset.eval.report.groups import by_engine, grouped, scores, singles
 from xreset.eval.report.page import page
 from xreset.eval.report.read import ReportData, Training, collect, read_trainings
 from xreset.eval.results import mesh_folder
-from xreset.eval.table import Rows, caption
+from xreset.eval.table import caption
 from xreset.files import claim_folder, write_whole
 from xreset.objects.catalogue import load_object
 
@@ -57,45 +57,28 @@ def make_report(
     return out / "index.html", data
 
 
-def _draw(data: ReportData, robot: str | None, objects: Path | None) -> tuple[list[Clip], list[Strip]]:
+def _draw(data: ReportData, robot: str | None, objects: Path | None) -> tuple[list[Clip], list[Clip]]:
     """Draw one episode in every engine, and the failures in the first engine."""
     spec = load_robot(robot or data.robot)
     shown = read_recorded(data, spec)
-    meshes = mesh_folder(objects, data.results[0].objects_folder)
+    meshes = mesh_folder(objects, data.first.objects_folder)
     vision = data.run.config.task.vision if data.run else None
     clips = draw_best(shown, spec, meshes, vision)
     if not clips:
         raise XResetError("no demonstration was recorded in every engine. Evaluate all engines in one command.")
     strips = []
-    for episode in worst_episodes(shown[shown["engine"] == data.engines[0]], _FAILURES).itertuples():
+    for episode in worst_episodes(shown[shown["engine"] == data.first.backend], _FAILURES).itertuples():
         obj = load_object(episode.object, meshes)
-        strips.append(draw_strip(episode, episode.trace, spec, obj, policy_cameras(spec, obj, vision)))
+        camera = camera_for([episode.trace], distance=0.7)
+        eyes = policy_cameras(spec, obj, vision)
+        strips.append(draw_clip(episode, episode.trace, spec, obj, camera, eyes, strip=True))
     return clips, strips
-
-
-@dataclass(frozen=True, kw_only=True)
-class Comparison:
-    """A comparison that was written."""
-
-    picture: Path
-    page: Path
-    groups: tuple[Group, ...]
-    results: Rows
-    """Empty if nothing was evaluated."""
-    lifted: Rows
-    """When each training passed 1, 10 and 50 % success from home; empty if it is not known of any."""
-    different: Rows
-    """Fields in which the trainings differ; without a column if none has a configuration or curves."""
-    notes: tuple[str, ...]
-    """What is unfair, missing or doubtful."""
-    captions: tuple[str, ...]
-    """Explanation of the figures."""
 
 
 def compare(
     runs: Sequence[str], out: Path, *, x: X = "minutes", curves: Sequence[str] = (), apart: bool = False
-) -> Comparison:
-    """Write ``compare.png`` and ``compare.md``.
+) -> Path:
+    """Write ``compare.png`` and ``compare.md``, and return the path of the latter.
 
     Args:
         runs: folders, as ``FOLDER`` or ``LABEL=FOLDER``.
@@ -109,30 +92,27 @@ def compare(
         XResetError: the files cannot be written, or a package for curves or plots is missing.
     """
     trainings = read_trainings(runs)
-    groups, notes = (singles(trainings), ()) if apart else grouped(trainings)
+    groups, reasons = (singles(trainings), ()) if apart else grouped(trainings)
     tags = choose_curves(trainings, curves)
     found = scores(groups)
-    notes = (
-        *notes,
-        *fairness.uneven(trainings),
-        *fairness.begun(trainings),
-        *fairness.health(found),
-        *fairness.missing(trainings, tags),
-    )
-    made = Comparison(
-        picture=out / "compare.png",
-        page=out / "compare.md",
+    notes = [*reasons, *fairness.uneven(trainings), *fairness.begun(trainings)]
+    policies = []
+    for group in groups:
+        notes += fairness.health(group.label, by_engine(group.members))
+        policies += [result.policy for result in group.members[0].results.values()]
+    content = render(
+        "compare.md.j2",
         groups=groups,
+        notes=notes,
+        versions=caption(policies),
         results=tables.results(groups, found),
+        x=AXES[x][0],
         lifted=tables.lifted(groups, x),
         different=tables.different(groups),
-        notes=notes,
-        captions=tuple(_captions(trainings, groups)),
     )
-    content = render("compare.md.j2", **vars(made))
-    write_picture(made.picture, groups, tags, found, x)
-    write_whole(made.page, content)
-    return made
+    write_picture(out / "compare.png", groups, tags, found, x)
+    write_whole(out / "compare.md", content)
+    return out / "compare.md"
 
 
 def choose_curves(trainings: Sequence[Training], wanted: Sequence[str]) -> tuple[str, ...]:
@@ -151,24 +131,3 @@ def choose_curves(trainings: Sequence[Training], wanted: Sequence[str]) -> tuple
             "Choose with --curve."
         )
     return chosen
-
-
-def _captions(trainings: Sequence[Training], groups: Sequence[Group]) -> list[str]:
-    captions = []
-    policies = []
-    for training in trainings:
-        policies += [result.policy for result in training.results.values()]
-    if policies:
-        captions.append("From home at full gravity. The 95 % interval is a bootstrap over demonstrations.")
-        captions.append(caption(policies))
-    for group in groups:
-        if len(group.members) > 1:
-            captions.append(
-                f"{group.label} is {len(group.members)} trainings that differ in the seed only "
-                f"({', '.join(m.label for m in group.members)}): curves are their mean, bands go from the lowest to "
-                "the highest, and intervals are bootstraps over trainings and demonstrations, which are too narrow "
-                "for few trainings."
-            )
-    if any(t.lift for t in trainings):
-        captions.append(tables.LIFTED)
-    return captions

@@ -7,10 +7,12 @@ import hashlib
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from xreset.eval.pages import percent, render
 from xreset.eval.plots import COLORS
-from xreset.eval.report.clips import Clip, Strip, count_failures, encode_mp4
-from xreset.eval.report.figures import charts, object_progress
+from xreset.eval.report.clips import Clip, count_failures, encode_mp4
+from xreset.eval.report.figures import draw_training
 from xreset.eval.report.read import ReportData
 from xreset.eval.stress import by_property
 from xreset.eval.table import FIGURES, caption
@@ -18,19 +20,24 @@ from xreset.files import code_version
 from xreset.pictures.render import encode_png
 
 
-def page(data: ReportData, clips: Sequence[Clip], strips: Sequence[Strip] = ()) -> str:
+def page(data: ReportData, clips: Sequence[Clip], strips: Sequence[Clip] = ()) -> str:
     """Return the whole page; clips, and strips of failures, may be empty. The page runs no script but its own."""
     script = render("report.js")
-    first = data.episodes_in(data.engines[0])
+    episodes = data.training.episodes
+    first = episodes[episodes["engine"] == data.first.backend]
+    results = list(data.training.results.values())
     demonstrations: dict[str, list[Any]] = {}
-    for i, result in enumerate(data.results):
+    for i, result in enumerate(results):
         for row in result.per_demo:
-            demonstrations.setdefault(row.sequence, [None] * len(data.results))[i] = row
+            demonstrations.setdefault(row.sequence, [None] * len(results))[i] = row
+    objects = episodes.pivot_table(index="object", columns="engine", values="task_progress")
     return render(
         "report.html.j2",
         data=data,
+        results=results,
+        engines=list(data.training.results),
         figures=FIGURES,
-        versions=caption(result.policy for result in data.results),
+        versions=caption(result.policy for result in results),
         headline=headline(data),
         code_version=code_version(),
         colors=COLORS,
@@ -39,10 +46,11 @@ def page(data: ReportData, clips: Sequence[Clip], strips: Sequence[Strip] = ()) 
         clips=clips,
         strips=strips,
         mp4=lambda clip: _base64(encode_mp4(clip.frames, clip.fps)),
-        png=lambda strip: _base64(encode_png(strip.picture)),
+        png=lambda strip: _base64(encode_png(np.hstack(strip.frames))),
         failed=len(first),
         failures={what: count for what, count in count_failures(first).items() if count},
-        charts=charts(object_progress(data.episodes), data.curves),
+        objects=objects,
+        curves=draw_training(data.training.curves),
         stressed=by_property(data.stress),
         demonstrations=demonstrations,
     )
@@ -54,7 +62,7 @@ def _base64(content: bytes) -> str:
 
 def headline(data: ReportData) -> str:
     """Return the result in one or two sentences."""
-    ranked = sorted(data.results, key=lambda s: -s.task_progress.mean)
+    ranked = sorted(data.training.results.values(), key=lambda s: -s.task_progress.mean)
     text = f"Task progress is {', '.join(f'{percent(s.task_progress.mean)} in {s.backend}' for s in ranked)}."
     if data.run is not None and len(ranked) > 1:
         text += f" The policy was trained in {data.run.backend}."

@@ -4,13 +4,13 @@ results."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from xreset.errors import FileFormatError, RunError, XResetError, needs
+from xreset.errors import FileFormatError, RunError, needs
 from xreset.eval.report.clips import missed_by_student
 from xreset.eval.report.fairness import POLICY_CONDITIONS, uneven
 from xreset.eval.results import EvalResult, Table, read_evaluation
@@ -48,20 +48,10 @@ class Training:
 class ReportData:
     """Results of one policy in several engines, and how it was trained."""
 
-    name: str
-    """Name of the run or folder."""
-    folder: Path
-    """Folder of the results."""
-    results: tuple[EvalResult, ...]
-    """The result of every engine, in order of name."""
-    episodes: Table
-    """Episodes in all engines."""
+    training: Training
+    """The policy's results, named after the run or the folder."""
     run: RunInfo | None
-    """The training; None for baselines, and where ``run.json`` cannot be read."""
-    trained_with: str | None
-    """Version of xreset that the policy was trained with."""
-    curves: Table
-    """What :func:`read_curves` returns."""
+    """The training's configuration; None for baselines, and where ``run.json`` cannot be read."""
     choice: Choice | None = None
     """How the evaluated policy was chosen among the run's checkpoints."""
     stress: tuple[Stress, ...] = ()
@@ -70,23 +60,14 @@ class ReportData:
     """What the reader must know before comparing engines, or what is missing."""
 
     @property
-    def engines(self) -> tuple[str, ...]:
-        """Names of the engines."""
-        return tuple(s.backend for s in self.results)
+    def first(self) -> EvalResult:
+        """The result of the first engine."""
+        return next(iter(self.training.results.values()))
 
     @property
     def robot(self) -> str:
         """Name or folder of the robot."""
-        return self.results[0].robot if self.run is None else self.run.robot
-
-    @property
-    def title(self) -> str:
-        """What was evaluated."""
-        return f"{self.results[0].policy} on {self.results[0].robot}"
-
-    def episodes_in(self, engine: str) -> Table:
-        """Return the episodes in one engine."""
-        return self.episodes[self.episodes["engine"] == engine]
+        return self.first.robot if self.run is None else self.run.robot
 
 
 def collect(folder: Path) -> ReportData:
@@ -99,59 +80,31 @@ def collect(folder: Path) -> ReportData:
         RunError: the folder does not exist or holds no results.
         FileFormatError: a file is damaged or of another version.
     """
-    is_run = (folder / "run.json").is_file()
-    results = results_in(folder)
-    evaluation = read_evaluation(results, name_of(folder))
-    if not evaluation:
-        policy = str(folder) if is_run else "POLICY"
-        out = "" if is_run else f" --out {results}"
-        raise RunError(
-            f"{results} holds no evaluation results. "
-            f"Make them first: xreset eval {policy} --backend mujoco --demos DEMOS{out}"
-        )
-    episodes = evaluation.to_frame()
-    by_engine = {result.backend: result for result in evaluation}
-    notes = []
-    curves: Table = pd.DataFrame()
-    try:
-        curves = read_curves(folder)
-    except XResetError as error:
-        notes.append(str(error))
-    evaluated = Training(
-        label=name_of(folder), folder=folder, facts={}, curves=curves, results=by_engine, episodes=episodes
-    )
-    notes = uneven([evaluated], POLICY_CONDITIONS) + notes
+    training = read_training(name_of(folder), folder)
+    if not training.results:
+        raise RunError(f"{folder} holds no evaluation results. {_evaluate(folder)}")
+    notes = uneven([training], POLICY_CONDITIONS)
     run = None
-    trained_with = None
-    if is_run:
+    if training.facts:
         try:
             run = read_run(folder)
-            trained_with = str(read_json(folder / "run.json", RUN_SCHEMA, keep_version=True).get("xreset"))
         except FileFormatError as error:  # results outlive a change of the training's configuration
             notes.append(f"The training is not described here: {error}")
     if run is not None and run.teacher is not None:
         if taught := read_evaluation(folder / "teacher"):
-            notes.append(missed_by_student(episodes, taught.to_frame()))
+            notes.append(missed_by_student(training.episodes, taught.to_frame()))
         else:
             notes.append(
                 "The teacher was not evaluated from the same starts. Make its results first: "
                 f"xreset eval {folder / TEACHER} --out {folder / 'teacher'} --demos DEMOS"
             )
-    choice = read_choice(results.parent)
-    if choice is not None and choice.policy_hash not in {s.inputs.get("policy") for s in evaluation}:
+    policies = {result.inputs.get("policy") for result in training.results.values()}
+    place = results_in(folder).parent
+    choice = read_choice(place)
+    if choice is not None and choice.policy_hash not in policies:
         choice = None
-    return ReportData(
-        name=name_of(folder),
-        folder=results,
-        results=tuple(evaluation),
-        episodes=episodes,
-        run=run,
-        trained_with=trained_with,
-        curves=curves,
-        choice=choice,
-        stress=read_stress(results.parent / "stress", evaluation[0].inputs.get("policy")),
-        notes=tuple(notes),
-    )
+    data = ReportData(training=training, run=run, choice=choice, notes=tuple(notes))
+    return replace(data, stress=read_stress(place / "stress", data.first.inputs.get("policy")))
 
 
 def results_in(folder: Path) -> Path:
@@ -275,7 +228,7 @@ def read_training(label: str, folder: Path, results: Path | None = None) -> Trai
     if not evaluation and curves.empty and lift is None:
         raise RunError(
             f"{folder} holds neither learning curves (events.out.tfevents.*) nor evaluation results. "
-            f"Evaluate it first: xreset eval {folder} --backend mujoco --demos DEMOS"
+            + _evaluate(folder)
         )
     file = folder / "run.json"
     return Training(
@@ -287,6 +240,13 @@ def read_training(label: str, folder: Path, results: Path | None = None) -> Trai
         episodes=evaluation.to_frame(),
         lift=lift,
     )
+
+
+def _evaluate(folder: Path) -> str:
+    """Return what to do where results are missing."""
+    if (folder / "run.json").is_file():
+        return f"Make them first: xreset eval {folder} --demos DEMOS"
+    return f"Make them first: xreset eval POLICY --demos DEMOS --out {folder}"
 
 
 def _split(text: str) -> tuple[str, Path]:

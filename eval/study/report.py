@@ -58,7 +58,7 @@ def write_page(plan: Plan, out: Path) -> Page:
         tables=tables,
         metrics=tuple(fill(plan, table) for table in every_metric),
         notes=tuple(dict.fromkeys(notes)),
-        runs=Rows(head=_HEAD, body=tuple(_run_row(run, trained.get(run.name)) for run in plan.runs)),
+        runs=[_HEAD, *(_run_row(run, trained.get(run.name)) for run in plan.runs)],
     )
     compared = _compare(plan, out)
     versions = caption(run.runs.policy or "" for run in plan.runs)
@@ -94,8 +94,7 @@ def _unfair(plan: Plan, table: FilledTable, trained: dict[str, Lift]) -> Iterato
     single = []
     for name, episodes in table.episodes.items():
         if len(episodes):
-            faults = episodes.groupby("engine")[["nonfinite", "overflow"]].sum().reset_index()
-            yield from fairness.health(faults.assign(group=name, episodes=len(episodes)))
+            yield from fairness.health(name, episodes.groupby("engine"))
             if plan.study.runs[name].policy is None and episodes["run"].nunique() == 1:
                 single.append(name)
     if single:

@@ -56,7 +56,7 @@ class FilledTable:
     def as_rows(self, engine: str) -> Rows:
         """Return the table of one engine."""
         text = self.wide(engine)["text"]
-        return Rows(head=(self.unit, *text.columns), body=tuple(text.itertuples(name=None)))
+        return [(self.unit, *text.columns), *text.itertuples(name=None)]
 
     def versions(self, engine: str) -> str:
         """Return the engine's versions in which the runs were evaluated."""

@@ -9,7 +9,6 @@ import tyro
 
 from xreset.cli._common import Several
 from xreset.cli._terminal import console
-from xreset.eval import table
 
 
 def compare(
@@ -34,18 +33,14 @@ def compare(
         apart: Show runs that differ only in their seed separately.
         out: Folder for compare.png and compare.md.
     """
+    from rich.markdown import Markdown
+
     from xreset.eval.report import make
 
     with console.status("reading"):
-        made = make.compare(runs, out, x=x, curves=curve, apart=apart)
-    for rows in (made.results, made.lifted, made.different):
-        if rows.body:
-            console.print(table.rich_table(rows))
-    for caption in made.captions:
-        console.print(caption)
-    for note in made.notes:
-        console.print(f"note: {note}", style="yellow")
-    console.print(f"picture: {made.picture}\npage:    {made.page}")
+        page = make.compare(runs, out, x=x, curves=curve, apart=apart)
+    console.print(Markdown(page.read_text()))
+    console.print(f"page: {page}")
 
 
 COMMAND = compare

@@ -35,7 +35,7 @@ def report(
         run = results_folder(str(run))
     with console.status("drawing clips"):
         html, data = make.make_report(run, out, robot=robot, objects=objects)
-    console.print(table.results_table(data.results))
+    console.print(table.results_table(list(data.training.results.values())))
     console.print(page.headline(data))
     for note in data.notes:
         console.print(f"note: {note}", style="yellow")

@@ -115,6 +115,7 @@ def errors(demos: Demos, objects: Mapping[str, ObjectSpec], options: Options, co
     beyond = 0.0
     hands = HandMotions(demos, robot, specs, RetargetConfig(hand=config), device=options.device)
     for sequences, _, motion in hands.batches():
+        followed = hand.keypoints(**vars(motion)).numpy()
         beyond = max(
             beyond,
             float(torch.maximum(hand.kinematics.lower - motion.joints, motion.joints - hand.kinematics.upper).max()),
@@ -122,7 +123,7 @@ def errors(demos: Demos, objects: Mapping[str, ObjectSpec], options: Options, co
         for slot, i in enumerate(sequences):
             rows = on_table.frames(i)
             seen = on_table.hand_valid[rows]
-            robot_points = motion.keypoints[slot, : len(seen)].numpy()
+            robot_points = followed[slot, : len(seen)]
             human = on_table.hand_keypoints[rows][:, keypoint]
             contact_points, contact = points[rows][:, keypoint], touching[rows][:, keypoint] & seen[:, None]
             off = np.linalg.norm(robot_points - human, axis=-1)[seen]

@@ -1,7 +1,6 @@
 """Surfaces, convex shapes, and the distances of a robot from itself and the table."""
 
 import unittest
-from types import SimpleNamespace
 
 import numpy as np
 import torch
@@ -16,10 +15,8 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import box, half_spaces, hull, shape_mesh
 from xreset.geometry.solids import link_field, signed_distance
 from xreset.geometry.surface import Surface, keypoint_contacts
-from xreset.retarget.collisions import colliding_links
 from xreset.retarget.hand.clearance import Objects, too_near
 from xreset.retarget.hand.model import HandModel
-from xreset.retarget.validity import REASONS
 from xreset.spec import Geometry, Shape, TableSpec
 
 
@@ -172,15 +169,6 @@ class SelfCollisionTest(unittest.TestCase):
         for configuration, a, b in near:
             self.assertEqual(configuration, 1)
             self.assertIn("right_index", a + b)
-
-    def test_self_collision_names_the_links(self):
-        reason = np.array([0, REASONS.index("self collision")])
-        result = SimpleNamespace(joint_pos=self.home_and(*self.CROSSED), reason=reason)
-        found = colliding_links(result, self.robot)  # pyright: ignore[reportArgumentType]
-        self.assertTrue(any("middle" in a and "ring" in b for a, b in found), found)
-        self.assertEqual(set(found.values()), {1})
-        result.reason = np.zeros(2)
-        self.assertEqual(colliding_links(result, self.robot), {})  # pyright: ignore[reportArgumentType]
 
     def test_one_link_is_kept_out_of_another(self):
         model = HandModel(self.robot)

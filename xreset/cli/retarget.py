@@ -44,7 +44,7 @@ def retarget(
     """
     from xreset import description
     from xreset.demos import align, archive, plausible
-    from xreset.retarget import collisions, file, pipeline
+    from xreset.retarget import file, pipeline
 
     spec = description.load_robot(robot)
     chosen = archive.read_demos(demos)
@@ -64,20 +64,8 @@ def retarget(
         inputs={"demos": file_hash(demos), "robot": spec.fingerprint}
         | {f"object {s.name}": s.source for s in specs.values()},
     )
-
-    colliding = collisions.colliding_links(result, spec, config.thresholds)
-    write_accounts(
-        accounts_path(out),
-        of="frames",
-        rows=result.accounts(),
-        self_collision=[{"links": list(pair), "frames": n} for pair, n in colliding.items()],
-    )
+    write_accounts(accounts_path(out), of="frames", rows=result.accounts())
     console.print(_table(result))
-    if colliding:
-        console.print(_meeting(colliding))
-        console.print(
-            "List links that meet in every position of their joints under collision.exclude in the robot.toml."
-        )
     for index in np.flatnonzero(align.on_something(archive.levelled(chosen), specs)):
         console.print(
             f"{chosen.sequence_name[index]}: the object starts on top of something that is not in the scene; "
@@ -115,14 +103,6 @@ def _table(result: file.Retargeted) -> Table:
             f"{1e3 * result.hand_error[mine].mean():.1f}" if mine.any() else "-",
             described(annotated.lost),
         )
-    return table
-
-
-def _meeting(colliding: dict[tuple[str, str], int]) -> Table:
-    """Return a table of the links that collide with each other, and in how many frames."""
-    table = Table("links that meet", "frames", title="self collision")
-    for pair, frames in colliding.items():
-        table.add_row(" and ".join(pair), str(frames))
     return table
 
 

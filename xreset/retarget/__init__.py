@@ -5,5 +5,5 @@
     motion.joint_pos[motion.valid]                  # robot states that may become resets
 
 Modules: ``pipeline`` (the whole); ``hand`` and ``arm``, each with ``solve``, ``cost``, ``model`` and ``config``;
-``least_squares`` (the solver of both); ``validity``, ``collisions`` and ``file``.
+``least_squares`` (the solver of both); ``validity`` and ``file``.
 """

@@ -7,14 +7,40 @@ Shape letters: B problems, R of them that are not done; S chains (sequences), T 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from math import inf
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor
 
 from xreset.geometry.rotations import matvec
-from xreset.tensors import where
+from xreset.tensors import Tensors, where
+
+
+@dataclass(frozen=True)
+class Quadratic(Tensors):
+    """Costs [B], and their Gauss-Newton approximation by n variables."""
+
+    cost: Tensor
+    """[B]"""
+    gradient: Tensor
+    """[B, n] half the gradient."""
+    curvature: Tensor
+    """[B, n, n] half the Gauss-Newton Hessian: symmetric, positive semidefinite."""
+
+    @staticmethod
+    def of_residuals(residuals: Tensor, jacobian: Tensor) -> Quadratic:
+        """Return the sum of the squares of residuals [B, R] with their derivatives [B, R, n]."""
+        return Quadratic(residuals.square().sum(1), matvec(jacobian.mT, residuals), jacobian.mT @ jacobian)
+
+    def __add__(self, other: Self) -> Self:
+        """Return the sum of two costs of the same variables."""
+        return self.map(torch.add, other)
+
+    def __mul__(self, weight: float) -> Self:
+        """Return the cost with a weight."""
+        return self.map(lambda x: weight * x)
 
 
 def minimize(
@@ -25,7 +51,7 @@ def minimize(
     iterations: int,
     *,
     damping_range: tuple[float, float] = (0.0, inf),
-) -> tuple[Any, Tensor]:
+) -> Any:
     """Take damped Gauss-Newton steps; a problem keeps those that lower its cost, and takes no more time when it is
     done.
 
@@ -39,7 +65,7 @@ def minimize(
         damping_range: smallest and largest damping.
 
     Returns:
-        The best x found, and its cost [B].
+        The best x found.
     """
     first = x if isinstance(x, Tensor) else next(iter(vars(x).values()))
     rows = torch.arange(len(first), device=first.device)
@@ -47,7 +73,6 @@ def minimize(
     best = x.clone()
     now = x
     here = evaluate(x, rows)
-    cost = here.cost.clone()
     for _ in range(iterations):
         trial = step(now, here, damping)
         there = evaluate(trial, rows)
@@ -57,7 +82,6 @@ def minimize(
         now = where(better, trial, now)
         here = where(better, there, here)
         best[rows] = now
-        cost[rows] = here.cost
         if not bool(left.any()):
             break
         if not bool(left.all()):
@@ -65,7 +89,7 @@ def minimize(
             damping = damping[left]
             now = now[left]
             here = here[left]
-    return best, cost
+    return best
 
 
 def free_to_move(x: Tensor, gradient: Tensor, lower: Tensor, upper: Tensor) -> Tensor:

@@ -24,8 +24,8 @@ from xreset.retarget.arm.solve import track
 from xreset.retarget.file import Retargeted
 from xreset.retarget.hand.config import HandConfig
 from xreset.retarget.hand.jaw import jaw_keypoints
-from xreset.retarget.hand.model import HandModel, HandTargets
-from xreset.retarget.hand.solve import HandMotion, retarget_hand
+from xreset.retarget.hand.model import HandModel, HandState, HandTargets
+from xreset.retarget.hand.solve import retarget_hand
 from xreset.retarget.validity import REASONS, Thresholds, classify
 from xreset.spec import ObjectSpec, RobotSpec
 from xreset.tensors import one_thread
@@ -36,9 +36,6 @@ _THUMB = slice(1, 5)
 """Keypoints of the thumb."""
 _FINGERS = slice(5, None)
 """Keypoints of the other fingers."""
-
-Progress = Callable[[float, int], None]
-"""Called with the sequences done and the sequences in all, after each batch."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +89,7 @@ def retarget_demos(
     objects: Sequence[ObjectSpec],
     config: RetargetConfig | None = None,
     *,
-    progress: Callable[[float, int], None] = lambda done, total: None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
     device: str = "cpu",
 ) -> Retargeted:
     """Retarget demonstrations. Sequences are independent of one another, and only the arguments decide the result.
@@ -174,7 +171,7 @@ def wrist_paths(
     objects: Sequence[ObjectSpec],
     config: RetargetConfig | None = None,
     *,
-    progress: Progress = lambda done, total: None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[ArmTargets]:
     """Return the paths that hand retargeting demands of the arm, in batches. Arguments and errors as in
     :func:`retarget_demos`."""
@@ -220,8 +217,8 @@ class HandMotions:
         self._keypoints = np.where(demos.hand_valid[:, None, None], demos.hand_keypoints, 0.0).astype(np.float64)
 
     def batches(
-        self, progress: Progress = lambda done, total: None
-    ) -> Iterator[tuple[list[int], HandTargets, HandMotion]]:
+        self, progress: Callable[[int, int], None] = lambda done, total: None
+    ) -> Iterator[tuple[list[int], HandTargets, HandState]]:
         """Retarget the hand alone, in batches of those sequences that have a hand: sequences, the hand's targets, its
         motion."""
         demos = self.demos
@@ -265,9 +262,10 @@ class HandMotions:
         )
 
 
-def _arm_targets(hand: HandModel, arm: ArmModel, targets: HandTargets, motion: HandMotion) -> ArmTargets:
+def _arm_targets(hand: HandModel, arm: ArmModel, targets: HandTargets, motion: HandState) -> ArmTargets:
     """Return the path that a hand's motion demands of the arm."""
-    tips_off = (motion.keypoints - targets.keypoints)[:, :, hand.is_tip.cpu()].norm(dim=-1)
+    followed = hand.keypoints(**vars(motion.to(hand.device))).to(targets.keypoints.device)
+    tips_off = (followed - targets.keypoints)[:, :, hand.is_tip.cpu()].norm(dim=-1)
     return ArmTargets(
         root_pos=motion.root_pos,
         root_quat=motion.root_quat,

@@ -10,36 +10,20 @@ Shape letters: B batch (sequences, branches or restarts), n arm joints, C carrie
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
 from xreset.geometry.rotations import (
     matrix_to_quat,
-    matvec,
     quat_conjugate,
     quat_multiply,
     quat_to_axis_angle,
 )
 from xreset.retarget.arm.model import ArmProblem
-from xreset.retarget.least_squares import free_to_move, minimize
-from xreset.tensors import Tensors
+from xreset.retarget.least_squares import Quadratic, free_to_move, minimize
 
 _CONVERGED = 1e-5
 """Steps smaller than this end the iteration [rad or m]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ArmSystem(Tensors):
-    """Cost and its Gauss-Newton approximation."""
-
-    cost: Tensor
-    """[B]"""
-    hessian: Tensor
-    """[B, n, n] half the Gauss-Newton Hessian."""
-    gradient: Tensor
-    """[B, n] half the gradient."""
 
 
 def solve(frame: ArmProblem, q: Tensor, iterations: int, previous: Tensor | None = None) -> Tensor:
@@ -56,23 +40,23 @@ def solve(frame: ArmProblem, q: Tensor, iterations: int, previous: Tensor | None
     """
     model = frame.model
 
-    def evaluate(q: Tensor, _: Tensor) -> ArmSystem:
+    def evaluate(q: Tensor, _: Tensor) -> Quadratic:
         return system(frame, q, previous)
 
-    def step(q: Tensor, here: ArmSystem, damping: Tensor) -> Tensor:
+    def step(q: Tensor, here: Quadratic, damping: Tensor) -> Tensor:
         free = free_to_move(q, here.gradient, model.lower, model.upper)
-        ridge = damping[:, None] * here.hessian.diagonal(dim1=-2, dim2=-1).clamp_min(1e-3) * free + (1.0 - free)
-        H = here.hessian * free[:, :, None] * free[:, None, :] + torch.diag_embed(ridge)
+        ridge = damping[:, None] * here.curvature.diagonal(dim1=-2, dim2=-1).clamp_min(1e-3) * free + (1.0 - free)
+        H = here.curvature * free[:, :, None] * free[:, None, :] + torch.diag_embed(ridge)
         moved = q + torch.linalg.solve(H, -here.gradient * free)
         return torch.minimum(torch.maximum(moved, model.lower), model.upper)
 
     def done(before: Tensor, after: Tensor, *_: Tensor) -> Tensor:  # all together: the batch keeps its size
         return ((after - before).abs() < _CONVERGED).all().expand(len(before))
 
-    return minimize(q, evaluate, step, done, iterations, damping_range=(1e-9, 1e9))[0]
+    return minimize(q, evaluate, step, done, iterations, damping_range=(1e-9, 1e9))
 
 
-def system(frame: ArmProblem, q: Tensor, previous: Tensor | None = None) -> ArmSystem:
+def system(frame: ArmProblem, q: Tensor, previous: Tensor | None = None) -> Quadratic:
     """Compute the cost of one frame and its Gauss-Newton approximation at ``q`` [B, n]; arguments as of
     :func:`solve`."""
     model = frame.model
@@ -102,6 +86,4 @@ def system(frame: ArmProblem, q: Tensor, previous: Tensor | None = None) -> ArmS
     value = scale * (config.table_margin - low.height)
     residuals.append(q.new_zeros(linear.shape[:2]).index_put(at, value))
     jacobians.append(q.new_zeros(linear[:, :, 0].shape).index_put(at, -scale * lift[:, 2]))
-    r = torch.cat(residuals, dim=1)
-    J = torch.cat(jacobians, dim=1)
-    return ArmSystem(cost=r.square().sum(1), hessian=J.mT @ J, gradient=matvec(J.mT, r))
+    return Quadratic.of_residuals(torch.cat(residuals, dim=1), torch.cat(jacobians, dim=1))

@@ -17,8 +17,9 @@ from torch import Tensor
 from xreset.geometry.balls import STAND_IN
 from xreset.geometry.collision import height_above_table
 from xreset.geometry.fields import DistanceFields
+from xreset.geometry.kinematics import PointJacobian
 from xreset.geometry.rotations import matvec, quat_to_matrix
-from xreset.retarget.hand.model import Bodies, HandModel
+from xreset.retarget.hand.model import HandModel
 from xreset.tensors import Tensors
 
 
@@ -69,7 +70,7 @@ class Objects(NamedTuple):
 
 def too_near(
     model: HandModel,
-    bodies: Bodies,
+    bodies: PointJacobian,
     objects: Objects,
     considered: Tensor,
     object_clearance: float,
@@ -104,7 +105,7 @@ def _moved(rot: Tensor, pos: Tensor, points: Tensor) -> Tensor:
     return x * points[:, :1] + y * points[:, 1:2] + z * points[:, 2:] + pos[:, None]
 
 
-def _below_table(model: HandModel, bodies: Bodies, bounds: Tensor, considered: Tensor) -> Iterator[Distances]:
+def _below_table(model: HandModel, bodies: PointJacobian, bounds: Tensor, considered: Tensor) -> Iterator[Distances]:
     balls = model.balls
     candidates = (bounds[..., 2] < balls.bound_radii) & considered[:, None]
     for link, own in enumerate(balls.slices):
@@ -121,7 +122,7 @@ def _below_table(model: HandModel, bodies: Bodies, bounds: Tensor, considered: T
 
 def _in_object(
     model: HandModel,
-    bodies: Bodies,
+    bodies: PointJacobian,
     bounds: Tensor,
     objects: Objects,
     considered: Tensor,
@@ -148,7 +149,7 @@ def _in_object(
 
 def _in_each_other(
     model: HandModel,
-    bodies: Bodies,
+    bodies: PointJacobian,
     bounds: Tensor,
     considered: Tensor,
     self_depth: float,
@@ -192,7 +193,7 @@ def _in_each_other(
         yield Distances(frame=row, value=value, slope=slope, number=number)
 
 
-def pad_distances(model: HandModel, bodies: Bodies, objects: Objects, frame: Tensor) -> tuple[Tensor, Tensor]:
+def pad_distances(model: HandModel, bodies: PointJacobian, objects: Objects, frame: Tensor) -> tuple[Tensor, Tensor]:
     """Compute how far a jaw's pads are from the object.
 
     Args:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from xreset.geometry.kinematics import PointJacobian
 from xreset.geometry.rotations import (
     matvec,
     quat_conjugate,
@@ -28,25 +29,20 @@ from xreset.retarget.hand.clearance import (
     too_near,
 )
 from xreset.retarget.hand.config import HandConfig
-from xreset.retarget.hand.model import Bodies, HandModel, HandState, HandTargets
-from xreset.tensors import Tensors
+from xreset.retarget.hand.model import HandModel, HandState, HandTargets
+from xreset.retarget.least_squares import Quadratic
 
 _FRAMES_PER_CHUNK = {"cpu": 256, "cuda": 2048}
 """On a CPU as many as fit its caches; on a GPU enough to fill it."""
 
 
 @dataclass(frozen=True)
-class HandSystem(Tensors):
-    """Cost and its Gauss-Newton approximation, a symmetric block-tridiagonal system per sequence."""
+class HandSystem(Quadratic):
+    """Cost [S], half the gradient [S, T, n], and the diagonal blocks [S, T, n, n] of half the Gauss-Newton Hessian, a
+    block-tridiagonal matrix."""
 
-    cost: Tensor
-    """[S]"""
-    diagonal: Tensor
-    """[S, T, n, n] diagonal blocks."""
     coupling: Tensor
     """[S, T-1, n] diagonals of the blocks next to the diagonal."""
-    gradient: Tensor
-    """[S, T, n] half the gradient."""
 
 
 def system(model: HandModel, targets: HandTargets, config: HandConfig, state: HandState) -> HandSystem:
@@ -55,9 +51,7 @@ def system(model: HandModel, targets: HandTargets, config: HandConfig, state: Ha
     rows = torch.arange(sequences, device=state.joints.device)
     size = max(1, _FRAMES_PER_CHUNK[state.joints.device.type] // frames)
     chunks = [_frames(model, targets[part], config, state[part]) for part in rows.split(size)]
-    cost, gradient, diagonal = (
-        torch.cat(parts).unflatten(0, (sequences, frames)) for parts in zip(*chunks, strict=True)
-    )
+    single = Quadratic.cat(chunks).map(lambda x: x.unflatten(0, (sequences, frames)))
 
     turn = quat_to_axis_angle(quat_multiply(state.root_quat[:, 1:], quat_conjugate(state.root_quat[:, :-1])))
     changes = torch.cat((state.joints.diff(dim=1), state.root_pos.diff(dim=1), turn), dim=-1)
@@ -66,27 +60,26 @@ def system(model: HandModel, targets: HandTargets, config: HandConfig, state: Ha
     limit = torch.full_like(weight, float("inf"))
     limit[:joints] = config.jump_limit
     change = terms.change(changes, weight, limit, config.jump_weight)
-    diagonal.diagonal(dim1=-2, dim2=-1)[:, 1:] += change.curvature
-    diagonal.diagonal(dim1=-2, dim2=-1)[:, :-1] += change.curvature
-    gradient[:, 1:] += change.gradient
-    gradient[:, :-1] -= change.gradient
+    diagonal = single.curvature.diagonal(dim1=-2, dim2=-1)
+    diagonal[:, 1:] += change.curvature
+    diagonal[:, :-1] += change.curvature
+    single.gradient[:, 1:] += change.gradient
+    single.gradient[:, :-1] -= change.gradient
     return HandSystem(
-        cost=cost.sum(1) + change.cost.sum(1),
-        diagonal=diagonal,
+        cost=single.cost.sum(1) + change.cost.sum(1),
+        gradient=single.gradient,
+        curvature=single.curvature,
         coupling=-change.curvature,
-        gradient=gradient,
     )
 
 
-def _frames(
-    model: HandModel, targets: HandTargets, config: HandConfig, state: HandState
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Compute the cost [B], half the gradient [B, n] and half the Gauss-Newton Hessian [B, n, n] of single frames."""
+def _frames(model: HandModel, targets: HandTargets, config: HandConfig, state: HandState) -> Quadratic:
+    """Compute the cost [B] of single frames and its approximation."""
     scale = config.length_scale
     frames = targets.annotated.shape[1]
     annotated = targets.annotated.flatten()
     bodies = model.bodies(*(value.flatten(0, 1) for value in vars(state).values()))
-    cost, gradient, hessian = _keypoint_terms(model, targets, config, bodies)
+    found = _keypoint_terms(model, targets, config, bodies)
 
     objects = Objects.at(
         targets.object_pos.flatten(0, 1),
@@ -103,11 +96,7 @@ def _frames(
         config.self_depth,
     )
     value, slope = _by_frame(near, len(annotated))
-    value = value / scale
-    slope = slope / scale
-    cost = cost + config.clearance_weight * value.square().sum(1)
-    gradient = gradient + config.clearance_weight * matvec(slope.mT, value)
-    hessian = hessian + config.clearance_weight * (slope.mT @ slope)
+    found = found + Quadratic.of_residuals(value / scale, slope / scale) * config.clearance_weight
 
     if config.pad_weight and len(model.pad_balls):
         held = (targets.held & targets.annotated).flatten().nonzero()[:, 0]
@@ -119,16 +108,14 @@ def _frames(
             config.pad_weight * model.pad_shares,
             config.pad_reach / scale,
         )
-        cost[held] += pads.cost
-        gradient[held] += matvec(slope.mT, pads.gradient)
-        hessian[held] += (slope.mT * pads.curvature[:, None]) @ slope
-    return cost, gradient, hessian
+        found.cost[held] += pads.cost
+        found.gradient[held] += matvec(slope.mT, pads.gradient)
+        found.curvature[held] += (slope.mT * pads.curvature[:, None]) @ slope
+    return found
 
 
-def _keypoint_terms(
-    model: HandModel, targets: HandTargets, config: HandConfig, bodies: Bodies
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Compute the terms of the keypoints and of the bones between them; results as in :func:`_frames`."""
+def _keypoint_terms(model: HandModel, targets: HandTargets, config: HandConfig, bodies: PointJacobian) -> Quadratic:
+    """Compute the terms of the keypoints and of the bones between them."""
     scale = config.length_scale
     x, J = (values / scale for values in model.keypoints_of(bodies))
     human = targets.keypoints.flatten(0, 1) / scale
@@ -155,9 +142,11 @@ def _keypoint_terms(
     curvature = torch.cat((on_bones.curvature, on_points.curvature), dim=1)
     slope = torch.cat((on_bones.gradient, on_points.gradient), dim=1)
     rows = moves.flatten(1, 2)
-    gradient = matvec(rows.mT, slope.flatten(1, 2))
-    hessian = rows.mT @ (curvature @ moves).flatten(1, 2)
-    return on_bones.cost + on_points.cost, gradient, hessian
+    return Quadratic(
+        cost=on_bones.cost + on_points.cost,
+        gradient=matvec(rows.mT, slope.flatten(1, 2)),
+        curvature=rows.mT @ (curvature @ moves).flatten(1, 2),
+    )
 
 
 def _by_frame(distances: Distances, frames: int) -> tuple[Tensor, Tensor]:

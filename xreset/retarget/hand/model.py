@@ -19,7 +19,7 @@ from xreset.errors import RobotError
 from xreset.geometry.balls import hand_balls
 from xreset.geometry.collision import SelfCollision
 from xreset.geometry.fields import DistanceFields
-from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.kinematics import Kinematics, PointJacobian
 from xreset.geometry.rotations import matvec, quat_to_matrix
 from xreset.spec import FINGERS, KEYPOINTS, RobotSpec, TableSpec
 from xreset.tensors import Tensors
@@ -62,20 +62,6 @@ class HandState(Tensors):
     """[S, T, 3]"""
     root_quat: Tensor
     """[S, T, 4]"""
-
-
-@dataclass(frozen=True)
-class Bodies:
-    """Links of the hand and how they move with the variables."""
-
-    pos: Tensor
-    """[B, L, 3]"""
-    rot: Tensor
-    """[B, L, 3, 3]"""
-    linear: Tensor
-    """[B, L, 3, n] derivative of the position."""
-    angular: Tensor
-    """[B, L, 3, n] angular velocity per variable."""
 
 
 class HandModel:
@@ -177,7 +163,7 @@ class HandModel:
         """[..., P, 3] positions of the keypoint links."""
         return self.kinematics.points(joints, self.links, base=_pose(root_pos, root_quat))
 
-    def bodies(self, joints: Tensor, root_pos: Tensor, root_quat: Tensor) -> Bodies:
+    def bodies(self, joints: Tensor, root_pos: Tensor, root_quat: Tensor) -> PointJacobian:
         """Compute the links of the hand at joints [B, J] and root poses, and their Jacobians.
 
         Variables: joints, then translation of the root, then rotation of the root about its origin (both along the
@@ -186,25 +172,23 @@ class HandModel:
         links = self.kinematics.jacobian(joints, self._bodies, base=_pose(root_pos, root_quat))
         identity = torch.eye(3, dtype=links.pos.dtype, device=links.pos.device).expand(*links.pos.shape[:-1], 3, 3)
         turn = torch.linalg.cross(identity, (links.pos - root_pos[:, None])[..., None, :])  # row i: e_i x r
-        return Bodies(
-            pos=links.pos,
-            rot=links.rot,
+        return links._replace(
             linear=torch.cat((links.linear, identity, turn.mT), dim=-1),
             angular=torch.cat((links.angular, torch.zeros_like(identity), identity), dim=-1),
         )
 
-    def keypoints_of(self, bodies: Bodies) -> tuple[Tensor, Tensor]:
+    def keypoints_of(self, bodies: PointJacobian) -> tuple[Tensor, Tensor]:
         """Return keypoints [B, P, 3] and their Jacobian [B, P, 3, n]."""
         return bodies.pos[:, self._keypoint_bodies], bodies.linear[:, self._keypoint_bodies]
 
-    def ball_centers(self, bodies: Bodies, frame: Tensor, ball: Tensor) -> Tensor:
+    def ball_centers(self, bodies: PointJacobian, frame: Tensor, ball: Tensor) -> Tensor:
         """[..., 3] centers in the world of balls [...] in frames [...]."""
         body = self.group_body[self.balls.link[ball]]
         return bodies.pos[frame, body] + matvec(bodies.rot[frame, body], self.balls.centers[ball])
 
     def point_slope(
         self,
-        bodies: Bodies,
+        bodies: PointJacobian,
         frame: Tensor,
         body: Tensor,
         point: Tensor,

@@ -11,7 +11,7 @@ Shape letters: S sequences padded to T frames, P mapped keypoints, J hand joints
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -30,21 +30,11 @@ from xreset.retarget.hand.model import HandModel, HandState, HandTargets
 from xreset.retarget.least_squares import free_to_move, minimize, solve_chain
 
 
-@dataclass(frozen=True, kw_only=True)
-class HandMotion(HandState):
-    """A hand's motion; joints are within their limits."""
-
-    keypoints: Tensor
-    """[S, T, P, 3] the robot's keypoints."""
-    cost: Tensor
-    """[S] final cost."""
-
-
 def retarget_hand(
     model: HandModel,
     targets: HandTargets,
     config: HandConfig | None = None,
-) -> HandMotion:
+) -> HandState:
     """Find hand motions that minimize the cost; sequences are independent of one another.
 
     Args:
@@ -53,16 +43,14 @@ def retarget_hand(
         config: weights and limits.
 
     Returns:
-        The motions, on the targets' device.
+        The motions, on the targets' device; joints are within their limits.
     """
     config = config or HandConfig()
     home = targets.keypoints.device
     targets = targets.to(model.device)
     if model.is_jaw and config.jaw == "analytic":
         rows = torch.arange(len(targets.annotated), device=model.device)[:, None]
-        state = jaw_state(model, targets.keypoints[rows, _nearest_annotated(targets.annotated)])
-        keypoints = model.keypoints(**vars(state))
-        return HandMotion(**vars(state), keypoints=keypoints, cost=keypoints.new_zeros(len(keypoints))).to(home)
+        return jaw_state(model, targets.keypoints[rows, _nearest_annotated(targets.annotated)]).to(home)
     root_pos, root_quat = _align_root(model, targets)
     joints = model.kinematics.clamp(model.home).expand(*targets.annotated.shape, -1)
     state = HandState(joints, root_pos, root_quat)
@@ -71,13 +59,12 @@ def retarget_hand(
             stage = replace(
                 config, clearance_weight=share * config.clearance_weight, iterations=config.growth_iterations
             )
-            state, _ = _minimize(model, targets, stage, state)
-    state, cost = _minimize(model, targets, config, state)
-    return HandMotion(**vars(state), keypoints=model.keypoints(**vars(state)), cost=cost).to(home)
+            state = _minimize(model, targets, stage, state)
+    return _minimize(model, targets, config, state).to(home)
 
 
-def _minimize(model: HandModel, targets: HandTargets, config: HandConfig, start: HandState) -> tuple[HandState, Tensor]:
-    """Return the best state that is found from a first guess, and its cost [S]."""
+def _minimize(model: HandModel, targets: HandTargets, config: HandConfig, start: HandState) -> HandState:
+    """Return the best state that is found from a first guess."""
 
     def evaluate(state: HandState, rows: Tensor) -> HandSystem:
         return system(model, targets[rows], config, state)
@@ -137,8 +124,8 @@ def _limited_step(model: HandModel, state: HandState, here: HandSystem, damping:
     upper = model.kinematics.upper
     free = torch.ones_like(here.gradient)
     free[..., :count] = free_to_move(state.joints, here.gradient[..., :count], lower, upper)
-    size = here.diagonal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-6)
+    size = here.curvature.diagonal(dim1=-2, dim2=-1).clamp_min(1e-6)
     root = size[..., count:].unflatten(-1, (2, 3)).mean(-1).repeat_interleave(3, dim=-1)
     ridge = damping[:, None, None] * torch.cat((size[..., :count], root), dim=-1) * free + (1.0 - free)
-    H = here.diagonal * free[..., :, None] * free[..., None, :] + torch.diag_embed(ridge)
+    H = here.curvature * free[..., :, None] * free[..., None, :] + torch.diag_embed(ridge)
     return solve_chain(H, here.coupling * free[:, 1:] * free[:, :-1], -here.gradient * free)

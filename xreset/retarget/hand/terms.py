@@ -1,38 +1,24 @@
 """The cost of one frame of hand retargeting, term by term (the paper, appendix D.b).
 
-Every term is a function of points: of the robot's keypoints, or of the vectors between them. It returns its cost, half
-its gradient and half its Gauss-Newton Hessian by each point. The chain rule through the hand's kinematics comes after
-(``cost``). Lengths are divided by a length scale, so they are comparable to the radians of other terms.
+Every term is a function of points: of the robot's keypoints, or of the vectors between them. It returns its cost [B],
+half its gradient [B, K, 3] and half its Gauss-Newton Hessian [B, K, 3, 3] by each point. The chain rule through the
+hand's kinematics comes after (``cost``). Lengths are divided by a length scale, so they are comparable to the radians
+of other terms.
 
 Shape letters: B frames, K points.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
+
+from xreset.retarget.least_squares import Quadratic
 
 _TINY = 1e-9
 
 
-class Term(NamedTuple):
-    """A cost and how it changes with its variables, points unless a function says otherwise."""
-
-    cost: Tensor
-    """[B]"""
-    gradient: Tensor
-    """[B, K, 3] half the gradient."""
-    curvature: Tensor
-    """[B, K, 3, 3] half the Gauss-Newton Hessian: symmetric, positive semidefinite."""
-
-    def __add__(self, other: Term) -> Term:  # type: ignore[override]
-        """Return the sum of two terms of the same points."""
-        return Term(*(mine + its for mine, its in zip(self, other, strict=True)))
-
-
-def difference(x: Tensor, target: Tensor, weight: Tensor) -> Term:
+def difference(x: Tensor, target: Tensor, weight: Tensor) -> Quadratic:
     """E = w |x - h|^2 for every point: positions, or vectors between keypoints, against those of the human hand.
 
     Args:
@@ -43,14 +29,14 @@ def difference(x: Tensor, target: Tensor, weight: Tensor) -> Term:
     off = x - target
     w = weight[..., None]
     identity = torch.eye(3, dtype=x.dtype, device=x.device)
-    return Term(
+    return Quadratic(
         (weight * off.square().sum(-1)).sum(-1),
         w * off,
         w[..., None] * identity,
     )
 
 
-def direction(x: Tensor, target: Tensor, weight: Tensor) -> Term:
+def direction(x: Tensor, target: Tensor, weight: Tensor) -> Quadratic:
     """E = w |u - v|^2 with u = x / |x| and v = h / |h|: twice w (1 - cosine) of the angle between two vectors.
 
     du = (I - u u^T) dx / |x|. Arguments as in :func:`difference`.
@@ -61,14 +47,14 @@ def direction(x: Tensor, target: Tensor, weight: Tensor) -> Term:
     w = weight[..., None]
     across = torch.eye(3, dtype=x.dtype, device=x.device) - u[..., :, None] * u[..., None, :]
     gradient = w / length * (u * (u * v).sum(-1, keepdim=True) - v)
-    return Term(
+    return Quadratic(
         (weight * (u - v).square().sum(-1)).sum(-1),
         gradient,
         (w / length.square())[..., None] * across,
     )
 
 
-def contact(x: Tensor, contact_point: Tensor, weight: Tensor, margin: float, knee: float) -> Term:
+def contact(x: Tensor, contact_point: Tensor, weight: Tensor, margin: float, knee: float) -> Quadratic:
     """The paper's contact term, E = w [|c - x| - margin]_+, with its corner rounded, as iteratively reweighted least
     squares.
 
@@ -90,10 +76,10 @@ def contact(x: Tensor, contact_point: Tensor, weight: Tensor, margin: float, kne
     pull = weight / (2.0 * excess.clamp_min(knee)) * (excess > 0)
     n = gap / distance[..., None]
     curvature = pull[..., None, None] * n[..., :, None] * n[..., None, :]
-    return Term(cost.sum(-1), (pull * excess)[..., None] * n, curvature)
+    return Quadratic(cost.sum(-1), (pull * excess)[..., None] * n, curvature)
 
 
-def attraction(distance: Tensor, weight: Tensor, reach: float) -> Term:
+def attraction(distance: Tensor, weight: Tensor, reach: float) -> Quadratic:
     """E = w c^2/3 [1 - (1 - (d/c)^2)^3], w c^2/3 beyond c: w d^2 near 0, and no pull from afar.
 
     Tukey's biweight (Beaton and Tukey, Technometrics 16, 1974), as iteratively reweighted least squares: its weight is
@@ -110,10 +96,10 @@ def attraction(distance: Tensor, weight: Tensor, reach: float) -> Term:
     left = (1.0 - (distance / reach).square()).clamp_min(0.0)
     pull = weight * left.square()
     cost = weight * reach**2 / 3.0 * (1.0 - left**3)
-    return Term(cost.sum(-1), pull * distance, pull)
+    return Quadratic(cost.sum(-1), pull * distance, pull)
 
 
-def change(d: Tensor, weight: Tensor, limit: Tensor, excess_weight: float) -> Term:
+def change(d: Tensor, weight: Tensor, limit: Tensor, excess_weight: float) -> Quadratic:
     """Change of variables between neighboring frames: E = w d^2 + W [|d| - limit]_+^2.
 
     The first part is the paper's smoothness. The second is a wall against jumps, for which the first is too soft.
@@ -130,4 +116,4 @@ def change(d: Tensor, weight: Tensor, limit: Tensor, excess_weight: float) -> Te
     excess = (d.abs() - limit).clamp_min(0.0)
     cost = (weight * d.square() + excess_weight * excess.square()).sum(-1)
     gradient = weight * d + excess_weight * excess * d.sign()
-    return Term(cost, gradient, weight + excess_weight * (excess > 0))
+    return Quadratic(cost, gradient, weight + excess_weight * (excess > 0))

@@ -39,6 +39,8 @@ from xreset.task.config import (
     evaluation_task,
 )
 from xreset.task.observations import layout
+from xreset.task.randomization import Drawn
+from xreset.task.tracker import Tracker
 
 try:
     from xreset.backends.mujoco import MujocoBackend
@@ -328,7 +330,7 @@ class RobustnessTest(WithEnv):
         faulty = replace(QUIET, randomization=replace(live.randomization, tracker=tracker, hand_latency=(0.0, 4.0)))
         for scale in (0.0, 0.5):
             env = self.make(faulty)
-            env.variation.set_fault_scale(scale)
+            env.variation.fault_scale.fill_(scale)
             env.reset()
             kept = env.variation.lasting
             for name in ("commands.delay", "poses.delay", "proprio.delay", "lost_actions", "tracker.bias"):
@@ -342,9 +344,17 @@ class RobustnessTest(WithEnv):
                     self.assertLess(float((seen - pos).norm(dim=-1).max()), 1e-6)
 
     def test_a_delay_jitters_within_its_range(self):
-        env = self.make(self.task(observation_latency=(2.0, 2.0), tracker=TrackerConfig(jitter=3.0)))
-        delay = [env.variation._tracker._jittered_delay(env.generator) for _ in range(50)]
-        low, high = torch.stack(delay).aminmax()
+        drawn = Drawn(200, torch.device("cpu"))
+        config = RandomizationConfig(observation_latency=(2.0, 2.0), tracker=TrackerConfig(jitter=3.0))
+        tracker = Tracker(drawn, config, torch.ones(()))
+        generator = torch.Generator().manual_seed(0)
+        for value, kept in drawn.draw(generator):
+            kept.copy_(value)
+        upright = torch.tensor([1.0, 0, 0, 0]).expand(200, 4)
+        for step in range(4):
+            now = torch.full((200, 3), float(step))
+            seen, _ = tracker.observe(now, upright, torch.full((200,), step == 0), generator)
+        low, high = (now - seen).aminmax()
         self.assertTrue(float(low) < 0.5 and float(high) == 2.0)
 
     def test_pushes_change_velocities_by_what_they_say(self):

@@ -46,11 +46,10 @@ def reading(
     zero3, quats = torch.zeros(1, 3), IDENTITY.expand(1, 4, 4)
     joints = torch.zeros(1, 2)
     force = torch.tensor(press)[None, :, None] * torch.tensor([0.0, 0.6, 0.8])
+    state = State.at_rest(joints, torch.as_tensor(pos)[None], torch.as_tensor(quat)[None])
     return Reading(
-        state=State(
-            joint_pos=joints, joint_vel=joints, joint_target=joints,
-            object_pos=torch.as_tensor(pos)[None], object_quat=torch.as_tensor(quat)[None], object_linvel=zero3, object_angvel=zero3,
-        ),
+        state=state,
+        task_state=state,
         links=Links(pos=torch.zeros(1, 4, 3), quat=quats, linvel=torch.zeros(1, 4, 3), angvel=torch.zeros(1, 4, 3)),
         contacts=Contacts(tip_force=force, tip_touch=force.norm(dim=-1) > 0, table_force=zero3),
         health=Health(nonfinite=torch.tensor([nonfinite]), overflow=torch.tensor([overflow])),

@@ -80,6 +80,10 @@ class RewardTest(unittest.TestCase):
             "action": torch.zeros(4),
             "previous_action": torch.zeros(4),
             "out_of_bounds": torch.tensor(False),
+            "palm_distance": torch.tensor(0.2),
+            "points": torch.zeros(4, 3),
+            "is_arm": torch.tensor([True, True, False, False]),
+            "success_position": torch.tensor(0.02),
         } | changes
         x = {k: v if k in ("is_arm", "success_position") else v[None] for k, v in x.items()}
         state = State.at_rest(torch.zeros(1, 4), x.pop("object_pos"), x.pop("object_quat"))
@@ -138,7 +142,6 @@ class RewardTest(unittest.TestCase):
                 palm_distance=torch.tensor(palm),
                 object_pos=torch.tensor([0.5, 0.3 + d, 0.1]),
                 points=points,
-                is_arm=torch.tensor([True, True, False, False]),
                 action=torch.tensor([0.5, 0, 0.5, 0]),
             )
             expected = -2.5 * min(3 * tips, 3) - 2.5 * min(palm, 0.5) - 0.005 * 0.5 - 0.05 * 0.25 - 0.005 * 0.25
@@ -274,7 +277,7 @@ class ActionTest(WithRobot):
 class LatencyTest(unittest.TestCase):
     def test_values_come_late_and_are_mixed_between_whole_steps(self):
         line = DelayLine(torch.zeros(4, 1), 2.0)
-        line.delay.copy_(torch.tensor([0.0, 1.0, 1.5, 2.0]))
+        line.delay.copy_(torch.tensor([[0.0], [1.0], [1.5], [2.0]]))
         line.fill(torch.ones(4, dtype=torch.bool), torch.zeros(4, 1))
         heard = [line.push(torch.full((4, 1), float(value)))[:, 0].tolist() for value in (10, 20, 30)]
         self.assertEqual(heard, [[10, 0, 0, 0], [20, 10, 5, 0], [30, 20, 15, 10]])

@@ -116,6 +116,7 @@ class ManipulationEnv:
         sequence: [N] demonstration of each world.
         bank_state: [N] bank state that each world's episode began with, -1 for home.
         gravity_fraction: [N] share of the object's weight that acts.
+        success_position: [] limit of success [m], ``task.reward.success_position`` unless it is filled with another.
         nonfinite_count: [] number of episodes that ended because a number was not finite.
         overflow_count: [] number of episodes that ended because the engine dropped contacts.
         variation: differences between the worlds, such as masses and delays.
@@ -153,16 +154,13 @@ class ManipulationEnv:
 
         self._cloud_points = per_object(lambda o: surface_points(o, task.observation.cloud_points))
         self._surface_points = per_object(lambda o: surface_points(o, task.distance_points))
+        self._metric_points = per_object(metric_points)
         self._center = None
         if task.object_frame == "center":
             self._center = per_object(center)
             self._cloud_points = self._cloud_points - self._center[:, None]
-        self._success_position: Tensor | None = None
-        self._metric_points = None
-        if task.reward.needs_points:
-            self._metric_points = per_object(metric_points)
-            if self._center is not None:
-                self._metric_points = self._metric_points - self._center[:, None]
+            self._metric_points = self._metric_points - self._center[:, None]
+        self.success_position = torch.tensor(task.reward.success_position, device=self.device)
         lower = self.actions.lower
         upper = self.actions.upper
         self._joint_lower = torch.where(lower.isfinite(), lower, -torch.pi)
@@ -318,12 +316,6 @@ class ManipulationEnv:
         for name, value in before.items():
             lasting[name][others] = value[others]
 
-    def set_success_position(self, limit: float) -> None:
-        """Replace ``task.reward.success_position`` [m]. The first call must come before the first step."""
-        if self._success_position is None:
-            self._success_position = torch.zeros((), device=self.device)
-        self._success_position.fill_(limit)
-
     def reading(self) -> Reading:
         """Return the present physical state and what follows from it."""
         return Reading.of(self.backend, self._surface_points, self._bad_action, self._center)
@@ -438,10 +430,10 @@ class ManipulationEnv:
                 action=self._action,
                 previous_action=self._previous_action,
                 out_of_bounds=lost,
-                palm_distance=self._palm_distance(reading) if self.task.reward.needs_palm else None,
+                palm_distance=self._palm_distance(reading),
                 points=self._metric_points,
                 is_arm=self.actions.is_arm,
-                success_position=self._success_position,
+                success_position=self.success_position,
             ),
             self.task.reward,
         )

@@ -143,9 +143,9 @@ class TrainingRunner:
         """Set what changes during a run to its values at a share of the run."""
         schedule = self.config.schedule
         if schedule.success_position:
-            self.env.set_success_position(value_at(schedule.success_position, progress))
+            self.env.success_position.fill_(value_at(schedule.success_position, progress))
         if schedule.faults:
-            self.env.variation.set_fault_scale(value_at(schedule.faults, progress))
+            self.env.variation.fault_scale.fill_(value_at(schedule.faults, progress))
         if schedule.teacher and isinstance(self.alg, SequenceDistillation):
             self.alg.teacher_share = value_at(schedule.teacher, progress)
 

@@ -195,16 +195,6 @@ class RewardConfig(Checked):
     scale: Positive[Finite[float]] = 0.01
     """Factor on the total (Table VIII)."""
 
-    @property
-    def needs_palm(self) -> bool:
-        """Whether the palm's distance to the object counts."""
-        return self.contact == "near" or self.palm_proximity != 0
-
-    @property
-    def needs_points(self) -> bool:
-        """Whether the mean distance of surface points to the goal counts."""
-        return self.success_shape == "points" or self.points != 0
-
 
 @dataclass(frozen=True, kw_only=True)
 class TerminationConfig(Checked):

@@ -24,8 +24,8 @@ class DelayLine:
         """
         self.values = torch.zeros(like.shape[0], math.ceil(longest) + 1, like.shape[1], device=like.device)
         """[N, K, D]"""
-        self.delay = torch.zeros(like.shape[0], *([like.shape[1]] if by_column else []), device=like.device)
-        """[N] steps, or [N, D]."""
+        self.delay = torch.zeros_like(like if by_column else like[:, :1])
+        """[N, 1] steps, or [N, D]."""
 
     def fill(self, fresh: Tensor, value: Tensor) -> None:
         """Make a value [N, D] the whole past of the worlds of a mask [N]."""
@@ -35,11 +35,10 @@ class DelayLine:
         """Add the newest value [N, D] and return the delayed one [N, D], interpolated between whole steps.
 
         Args:
-            delay: [N] delay in this step; None: :attr:`delay`.
+            delay: delay in this step, like :attr:`delay`; None: this attribute.
         """
         self.values.copy_(torch.cat((value[:, None], self.values[:, :-1]), dim=1))
         delay = self.delay if delay is None else delay
-        delay = delay.view(len(value), -1)
         whole = delay.floor()
         at = whole.long()[:, None].expand(-1, 1, value.shape[1])
         newer = self.values.gather(1, at)[:, 0]

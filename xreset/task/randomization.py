@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -39,8 +40,15 @@ class Drawn:
             self._samples.append((sample, buffer))
         return buffer
 
-    def delay_line(self, name: str, line: DelayLine, sample: Sample | None) -> DelayLine:
-        """Add a delay line whose delays are drawn, and return it."""
+    def ranged(self, name: str, limits: tuple[float, float], *shape: int) -> Tensor:
+        """Add a buffer [N, ...] with a uniform number of a range for each world, and return it."""
+        return self.keep(name, self.zeros(*shape), partial(sample_range, self.num_worlds, limits))
+
+    def delay_line(
+        self, name: str, width: int, longest: float, sample: Sample | None, *, by_column: bool = False
+    ) -> DelayLine:
+        """Add a :class:`DelayLine` of [N, ``width``] whose delays are drawn, and return it."""
+        line = DelayLine(self.zeros(width), longest, by_column=by_column)
         self.keep(f"{name}.values", line.values)
         self.keep(f"{name}.delay", line.delay, sample)
         return line

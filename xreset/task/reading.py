@@ -24,31 +24,26 @@ class Reading:
     """Health of the engine. A world that was given an action that is not finite counts as not finite."""
     tip_distance: Tensor
     """[N, E] distance from each fingertip to the object's surface points [m]."""
-    center: Tensor | None = None
-    """[N, 3] origin of each world's object in the task, in its mesh frame [m]; None: the mesh's origin."""
-
-    @property
-    def task_state(self) -> State:
-        """The state with the object's origin where the task has it (``TaskConfig.object_frame``)."""
-        if self.center is None:
-            return self.state
-        arm = quat_rotate(self.state.object_quat, self.center)
-        return replace(
-            self.state,
-            object_pos=self.state.object_pos + arm,
-            object_linvel=self.state.object_linvel + torch.linalg.cross(self.state.object_angvel, arm),
-        )
+    task_state: State
+    """The state with the object's origin where the task has it (``TaskConfig.object_frame``)."""
 
     @classmethod
-    def of(cls, backend: Backend, surface_points: Tensor, bad_action: Tensor, center: Tensor | None = None) -> Self:
+    def of(cls, backend: Backend, surface_points: Tensor, bad_action: Tensor, center: Tensor | None) -> Self:
         """Read a backend.
 
         Args:
             surface_points: [N, P, 3] on each world's object, in its mesh frame [m].
             bad_action: [N] bool, worlds that were given an action that is not finite.
-            center: the field of this name.
+            center: [N, 3] origin of each world's object in the task, in its mesh frame [m]; None: the mesh's origin.
         """
-        state = backend.state()
+        state = task_state = backend.state()
+        if center is not None:
+            arm = quat_rotate(state.object_quat, center)
+            task_state = replace(
+                state,
+                object_pos=state.object_pos + arm,
+                object_linvel=state.object_linvel + torch.linalg.cross(state.object_angvel, arm),
+            )
         links = backend.links()
         health = backend.health()
         local = quat_rotate_inverse(state.object_quat[:, None], links.pos[:, 1:] - state.object_pos[:, None])
@@ -58,7 +53,7 @@ class Reading:
             contacts=backend.contacts(),
             health=replace(health, nonfinite=health.nonfinite | bad_action),
             tip_distance=torch.cdist(local, surface_points).amin(dim=-1),
-            center=center,
+            task_state=task_state,
         )
 
 

@@ -48,14 +48,14 @@ class RewardInput:
     previous_action: Tensor
     out_of_bounds: Tensor
     """[N] bool"""
-    palm_distance: Tensor | None = None
-    """[N] distance from the palm to the object's surface [m]; None: no term of the configuration needs it."""
-    points: Tensor | None = None
-    """[N, 64, 3] :func:`xreset.objects.sampling.metric_points` of each world's object, in its frame; None: likewise."""
-    is_arm: Tensor | None = None
-    """[J] bool; None: the arm's actions are penalised like the hand's."""
-    success_position: Tensor | None = None
-    """[] limit of a schedule in place of the configuration's [m]; None: the configuration's."""
+    palm_distance: Tensor
+    """[N] distance from the palm to the object's surface [m]."""
+    points: Tensor
+    """[N, 64, 3] :func:`xreset.objects.sampling.metric_points` of each world's object, in its frame [m]."""
+    is_arm: Tensor
+    """[J] bool"""
+    success_position: Tensor
+    """[] largest distance to the goal that counts as success [m]: the configuration's, or a schedule's."""
 
     @property
     def object_pos(self) -> Tensor:
@@ -146,24 +146,23 @@ def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
     if c.contact == "opposing":
         gate = contact_gate(x.tip_force, c.contact_threshold, opposing=True)
     if c.contact == "near":
-        gate = (x.tip_distance.sum(dim=-1) <= c.near_tips) & (_given(x.palm_distance) <= c.near_palm)
+        gate = (x.tip_distance.sum(dim=-1) <= c.near_tips) & (x.palm_distance <= c.near_palm)
     position_error = (x.object_pos - x.goal_pos).norm(dim=-1)
     rotation_error = quat_angle(x.object_quat, x.goal_quat)
-    success_position = c.success_position if x.success_position is None else x.success_position
-    success = gate & (position_error < success_position) & (rotation_error < c.success_rotation)
+    success = gate & (position_error < x.success_position) & (rotation_error < c.success_rotation)
     gate_f = gate.to(position_error.dtype)
     success_reward = c.success * success.to(gate_f.dtype)
     distance = position_error
-    if c.needs_points:
-        distance = mean_distance(x.object_pos, x.object_quat, x.goal_pos, x.goal_quat, _given(x.points))
+    if c.points or c.success_shape == "points":
+        distance = mean_distance(x.object_pos, x.object_quat, x.goal_pos, x.goal_quat, x.points)
     if c.success_shape == "points":
-        success = gate & (distance <= success_position)
+        success = gate & (distance <= x.success_position)
         success_reward = c.success * success.to(gate_f.dtype) / (1.0 + 10.0 * distance)
     change = (x.action - x.previous_action).square()
     if c.action_rate_arm is None:
         action_rate = c.action_rate * change.sum(dim=-1)
     else:
-        action_rate = (torch.where(_given(x.is_arm), c.action_rate_arm, c.action_rate) * change).sum(dim=-1)
+        action_rate = (torch.where(x.is_arm, c.action_rate_arm, c.action_rate) * change).sum(dim=-1)
     reach = x.best_reach if c.reach_distance == "best" else x.tip_distance.mean(dim=-1)
     terms = {
         "reach": c.reach * (1.0 - torch.tanh(reach / c.reach_width)),
@@ -179,19 +178,13 @@ def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
     if c.proximity:
         terms["proximity"] = c.proximity * x.tip_distance.sum(dim=-1).clamp_max(c.proximity_cap)
     if c.palm_proximity:
-        terms["palm_proximity"] = c.palm_proximity * _given(x.palm_distance).clamp_max(c.palm_proximity_cap)
+        terms["palm_proximity"] = c.palm_proximity * x.palm_distance.clamp_max(c.palm_proximity_cap)
     if c.points:
         terms["points"] = c.points * gate_f * (1.0 - distance / c.points_zero)
     for name, weight in c.own.items():
         terms[name] = weight * _checked(name, own_term(name)(x), position_error)
     total = c.scale * torch.stack(list(terms.values())).sum(dim=0)
     return Reward(total=total, terms=terms, grasped=grasped, gate=gate, success=success)
-
-
-def _given(value: Tensor | None) -> Tensor:
-    if value is None:
-        raise ValueError("the reward needs palm_distance, points or is_arm with this configuration")
-    return value
 
 
 def _checked(name: str, value: Tensor, like: Tensor) -> Tensor:

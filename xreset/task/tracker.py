@@ -16,8 +16,14 @@ from xreset.task.randomization import Drawn, sample_range
 class Tracker:
     """Fixed buffers of N worlds. What is off costs nothing and draws no random number."""
 
-    def __init__(self, faults: Drawn, config: RandomizationConfig) -> None:
-        """Allocate, and have what lasts for an episode drawn with the other ``faults``."""
+    def __init__(self, faults: Drawn, config: RandomizationConfig, fault_scale: Tensor) -> None:
+        """Allocate, and have what lasts for an episode drawn with the other ``faults``.
+
+        Args:
+            faults: what is drawn at each reset.
+            config: what to draw.
+            fault_scale: [] factor on errors and losses of single poses.
+        """
         self._config = config
         c = config.tracker if config.enabled else TrackerConfig()
         self._limits = torch.tensor(
@@ -26,11 +32,8 @@ class Tracker:
         )
         self._delays: DelayLine | None = None
         if config.draws("observation_latency"):
-            self._delays = faults.delay_line(
-                "poses",
-                DelayLine(faults.zeros(7), config.observation_latency[1]),
-                partial(sample_range, faults.num_worlds, config.observation_latency),
-            )
+            delay = partial(sample_range, faults.num_worlds, config.observation_latency)
+            self._delays = faults.delay_line("poses", 7, config.observation_latency[1], delay)
         self._bias: Tensor | None = None
         if c.has_errors:
             zero = faults.zeros(6)
@@ -40,8 +43,7 @@ class Tracker:
             self._wait = faults.keep("tracker.wait", faults.zeros())
             self._last = faults.keep("tracker.last", faults.zeros(7))
         self._tracker = c
-        self.fault_scale: Tensor | float = 1.0
-        """[] factor on errors and losses of single poses; those of an episode are scaled where they are drawn."""
+        self._fault_scale = fault_scale
 
     def observe(self, pos: Tensor, quat: Tensor, fresh: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Return position [N, 3] and orientation [N, 4] as they are observed.
@@ -53,7 +55,7 @@ class Tracker:
             generator: random numbers.
         """
         if self._bias is not None:
-            error = self._bias + self.fault_scale * self._limits[1] * _symmetric(self._bias, generator)
+            error = self._bias + self._fault_scale * self._limits[1] * _symmetric(self._bias, generator)
             pos = pos + error[:, :3]
             quat = quat_multiply(quat_from_axis_angle(error[:, 3:]), quat)
         if self._wait is not None:
@@ -61,9 +63,8 @@ class Tracker:
             pose = torch.where(arrives[:, None], torch.cat((pos, quat), dim=-1), self._last)
             self._last.copy_(pose)
             c = self._tracker
-            lost = (
-                torch.rand(self._wait.shape, generator=generator, device=generator.device) < c.loss * self.fault_scale
-            )
+            chance = torch.rand(self._wait.shape, generator=generator, device=generator.device)
+            lost = chance < c.loss * self._fault_scale
             pause = sample_range(len(pos), c.loss_steps, generator).round()
             until_next = sample_range(len(pos), c.interval, generator).round() + torch.where(lost, pause, 0.0)
             self._wait.copy_(torch.where(arrives, until_next, self._wait) - 1.0)
@@ -75,16 +76,12 @@ class Tracker:
         # Of a rotation's two quaternions the one near the last is kept, so that interpolation takes the short way.
         pose = torch.cat((pos, torch.where(opposite, -quat, quat)), dim=-1)
         self._delays.fill(fresh, pose)
-        pos, quat = self._delays.push(pose, self._jittered_delay(generator)).split((3, 4), dim=-1)
+        delay = self._delays.delay
+        if self._tracker.jitter:
+            delay = delay + self._fault_scale * self._tracker.jitter * _symmetric(delay, generator)
+            delay = delay.clamp(0.0, self._config.observation_latency[1])
+        pos, quat = self._delays.push(pose, delay).split((3, 4), dim=-1)
         return pos, torch.nn.functional.normalize(quat, dim=-1)
-
-    def _jittered_delay(self, generator: torch.Generator) -> Tensor | None:
-        """Return the delay of this step's pose [N]; None: as drawn for the episode."""
-        jitter = self._tracker.jitter
-        if self._delays is None or not jitter:
-            return None
-        delay = self._delays.delay + self.fault_scale * jitter * _symmetric(self._delays.delay, generator)
-        return delay.clamp(0.0, self._config.observation_latency[1])
 
 
 def _symmetric(like: Tensor, generator: torch.Generator) -> Tensor:

@@ -35,7 +35,7 @@ class Variation:
         force_gain: [N, 1, 1] factor on the observed forces; None: 1.
         pushes: pushes on object and arm; None: there are none.
         lasting: all buffers by name, for a snapshot.
-        fault_scale: [] factor on delays, lost actions, faults of the tracker and the probability of pushes; None: 1.
+        fault_scale: [] factor on delays, lost actions, faults of the tracker and the probability of pushes.
     """
 
     def __init__(self, backend: Backend, config: RandomizationConfig, is_arm: Tensor, proprio_width: int) -> None:
@@ -84,56 +84,38 @@ class Variation:
             )
         self.force_gain: Tensor | None = None
         if c.draws("force_gain"):
-            self.force_gain = self._physical.keep(
-                "force_gain",
-                self._physical.zeros(1, 1),
-                partial(sample_range, n, c.force_gain),
-            )
+            self.force_gain = self._physical.ranged("force_gain", c.force_gain, 1, 1)
+        self.fault_scale = torch.ones((), device=backend.device)
         faults = Drawn(n, backend.device)
         self._faults = faults
         self._commands: DelayLine | None = None
         if c.draws("action_latency", "hand_latency"):
 
             def delay(generator: torch.Generator) -> Tensor:
-                of_arm = sample_range(n, c.action_latency, generator)
-                if c.hand_latency is None:
-                    return of_arm
-                of_hand = sample_range(n, c.hand_latency, generator)
-                return torch.where(is_arm, of_arm[:, None], of_hand[:, None])
+                of_arm = sample_range(n, c.action_latency, generator)[:, None]
+                of_hand = of_arm
+                if c.hand_latency is not None:
+                    of_hand = sample_range(n, c.hand_latency, generator)[:, None]
+                return torch.where(is_arm, of_arm, of_hand)
 
             longest = max(c.action_latency[1], (c.hand_latency or (0.0, 0.0))[1])
-            line = DelayLine(faults.zeros(len(is_arm)), longest, by_column=c.hand_latency is not None)
-            self._commands = faults.delay_line("commands", line, delay)
-        self._tracker = Tracker(faults, c)
+            self._commands = faults.delay_line("commands", len(is_arm), longest, delay, by_column=True)
+        self._tracker = Tracker(faults, c, self.fault_scale)
         self._proprio: DelayLine | None = None
         if c.draws("proprio_latency"):
-            line = DelayLine(faults.zeros(proprio_width), c.proprio_latency[1])
-            self._proprio = faults.delay_line("proprio", line, partial(sample_range, n, c.proprio_latency))
+            age = partial(sample_range, n, c.proprio_latency)
+            self._proprio = faults.delay_line("proprio", proprio_width, c.proprio_latency[1], age)
         self._lost_actions: Tensor | None = None
         if c.draws("lost_actions"):
-            self._lost_actions = faults.keep(
-                "lost_actions",
-                faults.zeros(1),
-                partial(sample_range, n, c.lost_actions),
-            )
+            self._lost_actions = faults.ranged("lost_actions", c.lost_actions, 1)
         self.pushes = Pushes(faults, backend, c.push, is_arm) if pushed else None
-        self.fault_scale: Tensor | None = None
         self.lasting = self._physical.lasting | faults.lasting
-
-    def set_fault_scale(self, scale: float) -> None:
-        """Set the factor on all faults of a real loop. The first call must come before the first step."""
-        if self.fault_scale is None:
-            self.fault_scale = torch.ones((), device=self._faults.device)
-            self._tracker.fault_scale = self.fault_scale
-        self.fault_scale.fill_(scale)
 
     def draw(self, generator: torch.Generator) -> list[tuple[Tensor, Tensor]]:
         """Draw for every world; return pairs of the drawn values [N, ...] and the buffer that they belong to."""
         drawn = self._physical.draw(generator)
         faults = self._faults.draw(generator)
-        if self.fault_scale is not None:
-            faults = [(value * self.fault_scale, kept) for value, kept in faults]
-        return drawn + faults
+        return drawn + [(value * self.fault_scale, kept) for value, kept in faults]
 
     def begin(self, fresh: Tensor, target: Tensor) -> None:
         """Fill the delay line of the worlds of a mask [N] with the start's joint targets [N, J]."""

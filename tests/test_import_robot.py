@@ -311,25 +311,22 @@ class Toy(WithFolder):
         def asset(text):
             return MJCF.replace("<worldbody>", f"<asset>{text}</asset><worldbody>")
 
-        copies = '<replicate count="30000"><replicate count="30000"><geom size="0.01"/></replicate></replicate></body>'
+        copies = '<replicate count="30000"><geom size="0.01"/></replicate></body>'
         for words, text in (
             ("orientation that is not finite", MJCF.replace('euler="0 0 0.9"', 'euler="-inf 0 0"')),
             (
                 "size 1e-300 m. Expected at least 1e-06 m",
                 MJCF.replace('size="0.018 0.007 0.007"', 'size="1e-300 1e-300 1e-300"'),
             ),
+            ("has a hfield", asset('<hfield name="h" nrow="40000" ncol="40000" size="1 1 1 1"/>')),
+            ("has a flexcomp", asset('<flexcomp name="f" count="3000 3000 100"/>')),
+            ("has a replicate", MJCF.replace("</body></worldbody>", f"{copies}</worldbody>")),
             (
-                "hfield elements have 1.6e.09 entries",
-                asset('<hfield name="h" nrow="40000" ncol="40000" size="1 1 1 1"/>'),
-            ),
-            (
-                "texture elements have 9e.08",
+                "a texture has 9e.08 entries",
                 asset('<texture name="h" type="2d" builtin="flat" width="30000" height="30000"/>'),
             ),
-            ("flexcomp elements have 9e.08", asset('<flexcomp name="f" count="3000 3000 100"/>')),
-            ("nkey is 2000000000, expected", MJCF.replace("<worldbody>", '<size nkey="2000000000"/><worldbody>')),
-            ("nuser_body is 1e8, expected", MJCF.replace("<worldbody>", '<size nuser_body="1e8"/><worldbody>')),
-            ("replicates up to 9e.08", MJCF.replace("</body></worldbody>", f"{copies}</worldbody>")),
+            ("a size has 2e.09 entries", MJCF.replace("<worldbody>", '<size nkey="2000000000"/><worldbody>')),
+            ("a size has 1e.08 entries", MJCF.replace("<worldbody>", '<size nuser_body="1e8"/><worldbody>')),
             ("Give the file that includes it", "<mujocoinclude/>"),
         ):
             with self.subTest(words), self.assertRaisesRegex(RobotError, words):

@@ -7,7 +7,6 @@ positions of the joints that are coupled to it are solved for, and straight line
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import mujoco
@@ -46,50 +45,16 @@ class Line(NamedTuple):
     offset: float
 
 
-@dataclass(kw_only=True)
-class Couplings:
-    """How joints of a model follow others; joints by their numbers."""
-
-    lines: dict[int, Line] = field(default_factory=dict)
-    """Follower -> its line; sources follow nothing."""
-    notes: list[str] = field(default_factory=list)
-    problems: list[str] = field(default_factory=list)
-    """What cannot be stated by straight lines, each with a remedy."""
-
-    def lever(self, pull: Pull) -> tuple[int, float]:
-        """Return the driven joint of an actuator, and by how much the actuator's length changes with it."""
-        lever = 0.0
-        source = next(iter(pull))
-        for joint, share in pull.items():
-            line = self.lines.get(joint, Line(joint, 1.0, 0.0))
-            source = line.source
-            lever += share * line.multiplier
-        return source, lever
-
-
 def joint_name(model: mujoco.MjModel, joint: int) -> str:
     """Return the name of a joint, or one made from its number."""
     return model.joint(joint).name or f"joint{joint}"
 
 
-def read_couplings(model: mujoco.MjModel, pulls: Sequence[Pull]) -> Couplings:
-    """Return how the joints of a compiled model follow others.
-
-    Args:
-        model: the model; its options change.
-        pulls: what its actuators move.
-    """
-    found = Couplings()
-    mechanism = _Mechanism(model, pulls)
-    for group in mechanism.groups():
-        mechanism.couple(group, found)
-    return found
-
-
-class _Mechanism:
-    """The hinges and slides of a model (Q of them), and what couples them."""
+class Couplings:
+    """How the hinges and slides of a compiled model (Q of them) follow others."""
 
     def __init__(self, model: mujoco.MjModel, pulls: Sequence[Pull]) -> None:
+        """Find the couplings of a model, whose options change; ``pulls`` are what its actuators move."""
         model.opt.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         self.model = model
@@ -114,95 +79,110 @@ class _Mechanism:
                 rows.append(row)
         self.shared = np.stack(rows)
         """[S, Q] products with the positions are 0 where tendons pull all their joints alike."""
+        self.lines: dict[int, Line] = {}
+        """Follower -> its line, joints by their numbers; sources follow nothing."""
+        self.notes: list[str] = []
+        self.problems: list[str] = []
+        """What cannot be stated by straight lines, each with a remedy."""
+        for group in self._groups():
+            self._couple(group)
 
-    def gaps(self, q: np.ndarray) -> np.ndarray:
+    def lever(self, pull: Pull) -> tuple[int, float]:
+        """Return the driven joint of an actuator, and by how much the actuator's length changes with it."""
+        lever = 0.0
+        source = next(iter(pull))
+        for joint, share in pull.items():
+            line = self.lines.get(joint, Line(joint, 1.0, 0.0))
+            source = line.source
+            lever += share * line.multiplier
+        return source, lever
+
+    def _gaps(self, q: np.ndarray) -> np.ndarray:
         """Return how far the equalities [E] are from being met at positions [Q]."""
         self.data.qpos[self.address] = q
         mujoco.mj_fwdPosition(self.model, self.data)
         return self.data.efc_pos[: self.data.ne].copy()
 
-    def jacobian(self, q: np.ndarray) -> np.ndarray:
+    def _jacobian(self, q: np.ndarray) -> np.ndarray:
         """[E, Q]"""
-        count = len(self.gaps(q))
+        count = len(self._gaps(q))
         dofs = self.model.jnt_dofadr[self.joints]
         return self.data.efc_J.reshape(-1, self.model.nv)[:count, dofs]
 
-    def groups(self) -> list[np.ndarray]:
+    def _groups(self) -> list[np.ndarray]:
         """Return joints that depend on each other, by their indices."""
         if not len(self.joints):
             return []
         away = np.random.default_rng(0).uniform(0.01, 0.1, len(self.joints))
-        rows = np.abs(np.vstack((self.jacobian(self.start + away), self.shared))) > 1e-9
+        rows = np.abs(np.vstack((self._jacobian(self.start + away), self.shared))) > 1e-9
         bound = rows.any(axis=0)
         _, labels = connected_components(rows.T.astype(int) @ rows.astype(int))
         return [np.flatnonzero((labels == label) & bound) for label in np.unique(labels[bound])]
 
-    def couple(self, group: np.ndarray, found: Couplings) -> None:
+    def _couple(self, group: np.ndarray) -> None:
         """Add the lines of joints that depend on each other."""
         drives = [joint for joint in dict.fromkeys(self.driven) if joint in group]
-        jacobian = self.jacobian(self.start)[:, group]
-        rows = np.abs(jacobian).max(axis=1, initial=0) > 1e-9
-        free_motions = len(group) - np.linalg.matrix_rank(jacobian, tol=1e-6)
+        jacobian = self._jacobian(self.start)[:, group]
         listed = ", ".join(self.names[i] for i in group)
-        if len(drives) > 1 and free_motions > 1:
+        if len(drives) > 1 and len(group) - np.linalg.matrix_rank(jacobian, tol=1e-6) > 1:
             names = ", ".join(self.names[i] for i in drives)
-            found.problems.append(
+            self.problems.append(
                 f"the coupled joints {listed}, which {len(drives)} drives move ({names}), expected one. Use the "
                 "maker's URDF with mimic joints, or state the couplings as equalities of two joints"
             )
             return
         if len(group) == 1:
             joint = int(self.joints[group[0]])
-            found.lines[joint] = Line(joint, 0.0, float(self.closed(group, self.start)[0]))
-            found.notes.append(f"{listed} is fixed, because an equality holds it in place")
+            self.lines[joint] = Line(joint, 0.0, float(self._closed(group, self.start)[0]))
+            self.notes.append(f"{listed} is fixed, because an equality holds it in place")
             return
         source = drives[0] if drives else group[0]
         followers = group[group != source]
         values = np.linspace(self.lower[source], self.upper[source], _SAMPLES)
-        lines = {}
         straight = np.tile(self.start, (_SAMPLES, 1))
         straight[:, source] = values
-        tracks = []
+        solved = straight.copy()
         before = self.start
-        for value in values:
-            before = before.copy()
-            before[source] = value
-            before[followers] = self.closed(followers, before)
-            tracks.append(before[followers])
-        for follower, track in zip(followers, np.transpose(tracks), strict=True):
+        for q in solved:
+            q[followers] = before[followers]
+            q[followers] = self._closed(followers, q)
+            before = q
+        lines = {}
+        for follower in followers:
+            track = solved[:, follower]
             multiplier = 0.0
             offset = float(track.mean())
             if np.ptp(track) > _STILL:
                 multiplier, offset = (np.polyfit(values, track, 1).round(_DIGITS) + 0.0).tolist()
             straight[:, follower] = multiplier * values + offset
             lines[int(self.joints[follower])] = Line(int(self.joints[source]), multiplier, offset)
-        opened, off = self.misfit(straight, rows)
+        opened, off = self._misfit(straight, np.abs(jacobian).max(axis=1, initial=0) > 1e-9)
         if opened > _OPEN or off > _CURVED:
-            found.problems.append(
+            self.problems.append(
                 f"the coupled joints {listed}, which do not move in proportion. Straight lines are "
                 f"{off:.2g} rad (m) off and leave gaps of {1e3 * opened:.1f} mm in closed loops. Give equalities a "
                 "polycoef with two numbers, remove the bar that closes a loop, or use the maker's URDF"
             )
             return
-        found.lines |= lines
+        self.lines |= lines
         names = ", ".join(self.names[i] for i in followers)
-        found.notes.append(
+        self.notes.append(
             f"coupled joints: {names} with {self.names[source]}; closed loops stay closed within {1e3 * opened:.2f} mm"
         )
 
-    def misfit(self, positions: np.ndarray, rows: np.ndarray) -> tuple[float, float]:
+    def _misfit(self, positions: np.ndarray, rows: np.ndarray) -> tuple[float, float]:
         """Return the widest gap of a closed loop [m], and the most that another equality is off [rad or m].
 
         Args:
             positions: [V, Q] positions that are tried.
             rows: [E] bool: the equalities that count.
         """
-        gaps = np.max([np.abs(self.gaps(q)) for q in positions], axis=0, initial=0)
+        gaps = np.max([np.abs(self._gaps(q)) for q in positions], axis=0, initial=0)
         kinds = self.model.eq_type[self.data.efc_id[: len(gaps)]]
         is_loop = np.isin(kinds, (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)))
         return float(gaps[rows & is_loop].max(initial=0)), float(gaps[rows & ~is_loop].max(initial=0))
 
-    def closed(self, free: np.ndarray, start: np.ndarray) -> np.ndarray:
+    def _closed(self, free: np.ndarray, start: np.ndarray) -> np.ndarray:
         """Return positions of the free joints that meet what couples them, while the others stay at ``start`` [Q]."""
         q = start.copy()
 
@@ -211,7 +191,7 @@ class _Mechanism:
             outside = x - np.clip(x, self.lower[free], self.upper[free])
             return np.concatenate(
                 (
-                    _EQUALITY * self.gaps(q),
+                    _EQUALITY * self._gaps(q),
                     _PULL * (self.shared @ q),
                     _LIMIT * outside,
                     self.stiffness[free] * (x - self.rest[free]),

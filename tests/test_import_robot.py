@@ -206,6 +206,7 @@ class Toy(WithFolder):
         shadow = HAND
         for old, new in (("f1", "rh_LF"), ("f2", "rh_MF"), ("f3", "rh_TH"), ("thumb", "rh_FF")):
             shadow = shadow.replace(f"{old}_a", f"{new}proximal").replace(f"{old}_b", f"{new}middle")
+            shadow = shadow.replace(f"{old}_", f"{new}J")
         links = {tip.name: tip.contact_links[0] for tip in load_robot(self.imported(shadow)).fingertips}
         codes = {"thumb": "TH", "index": "FF", "middle": "MF", "little": "LF"}
         self.assertEqual(links, {finger: f"rh_{code}middle" for finger, code in codes.items()})

@@ -281,7 +281,7 @@ class Registry(unittest.TestCase):
     def test_check_warns_of_drives_that_swing_or_are_too_fast(self):
         self.edit("robot.toml", "kd = 28.3", "kd = 1.0")
         self.edit("robot.toml", "kd = 55.3", "kd = 500.0")
-        self.assertRegex(self.errors("warning"), r"'joint1' has the damping ratio 0\.\d+ at home and will swing")
+        self.assertRegex(self.errors("warning"), r"'joint1' has the damping ratio 0\.\d+ at home. It swings")
         self.assertRegex(self.errors("warning"), r"'finger_joint1': kd = 500")
 
     def test_command_fails_on_errors_only(self):

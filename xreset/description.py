@@ -57,7 +57,6 @@ def read_description(path: Path) -> RobotSpec:
 _FIELDS = {
     "base.pos": "base_pos",
     "base.quat": "base_quat",
-    "base.placement": "placement",
     "hand.root": "hand_root",
     "hand.palm": "palm",
     "collision.self": "self_collision_links",
@@ -78,6 +77,7 @@ def _fields(data: dict[str, Any], folder: Path) -> dict[str, Any]:
                 values[_FIELDS.get(name, name)] = value
     arm, hand = RobotSpec.home_std
     values.setdefault("home_std", [values.pop("home_std.arm", arm), values.pop("home_std.hand", hand)])
+    values.pop("base.placement", None)  # how it was found, in files of 0.2.0
     if isinstance(data.get("urdf"), str):
         values["urdf"] = (folder / data["urdf"]).resolve()
     if isinstance(data.get("keypoints"), dict):

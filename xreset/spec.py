@@ -115,20 +115,6 @@ class KeypointSpec:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlacementSpec:
-    """How good a robot's base placement is, and how it was found (``xreset robots place``)."""
-
-    reached: Number
-    """Share of wrist poses that the arm reaches, each on its own."""
-    followed: Number
-    """Share of annotated frames that are valid when the arm follows the motions."""
-    frames: int
-    """Annotated frames of those motions."""
-    command: Text
-    """What found it."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class RobotSpec:
     """A robot: a URDF and one small typed description. See :func:`xreset.load_robot`."""
 
@@ -163,8 +149,6 @@ class RobotSpec:
     """Whether the robot's own weight is taken off (as an arm's controller does); the object's load stays."""
     home_std: tuple[Number, Number] = (0.075, 0.10)
     """Spread of the home configuration: standard deviation of arm and hand joints [rad], the paper's Table IX."""
-    placement: PlacementSpec | None = field(default=None, repr=False)
-    """Where ``base_pos`` and ``base_quat`` come from, if a search found them; no part of the :attr:`fingerprint`."""
     meshes: tuple[Path, ...] = field(default=(), repr=False, compare=False)
     """Mesh files of the URDF's collision shapes."""
     like: str = field(default="", repr=False)

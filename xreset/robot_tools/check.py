@@ -27,7 +27,7 @@ from xreset.spec import RobotSpec, SceneSpec
 
 Level = Literal["ok", "skipped", "warning", "error"]
 
-MIN_CLEARANCE = 0.005
+_MIN_CLEARANCE = 0.005
 """Clearance [m] from the table that the home configuration should have."""
 _SAMPLES = 200
 _LIMIT_SLACK = 1e-3
@@ -86,14 +86,10 @@ def check(name_or_folder: str | Path) -> list[Finding]:
     q = _around_home(spec)
     found += _topic("drives", _drives(spec), "damping ratios at home are between 0.5 and 5")
     found += _topic("frames", _frames(spec, tree), "the palm frame is in the palm, and looks along the fingers")
-    found += _topic("fingers", _fingers(spec, tree), "the thumb can oppose every other fingertip")
+    found += _topic("fingers", _fingers(spec, tree), "no fingertip opposes the others more than the thumb")
     found += _topic("home and table", _above_table(spec, q))
     found += _topic("home and self", _free_of_itself(spec, q))
     found += _topic("retargeting", _size(spec))
-    if spec.placement is not None:
-        place = spec.placement
-        stated = f"reaches {place.reached:.1%} and follows {place.followed:.1%} of {place.frames} frames"
-        found.append(Finding("ok", "placement", f"{stated}, says {DESCRIPTION}: {place.command}"))
     return found
 
 
@@ -101,7 +97,11 @@ Problems = Iterator[tuple[Level, str]]
 
 
 def _topic(topic: str, problems: Problems, otherwise: str = "") -> list[Finding]:
-    found = [Finding(level, topic, message) for level, message in problems]
+    """Return the findings of a topic; what needs a package that is not installed is skipped."""
+    try:
+        found = [Finding(level, topic, message) for level, message in problems]
+    except XResetError as error:
+        return [Finding("skipped", topic, str(error))]
     return found or [Finding("ok", topic, otherwise)]
 
 
@@ -154,21 +154,25 @@ def _mimics(spec: RobotSpec, tree: RobotTree) -> Problems:
 
 
 def _links(spec: RobotSpec, tree: RobotTree) -> Problems:
-    known = {link.name: link for link in tree.links}
-    wanted = [("hand.root", spec.hand_root), ("hand.palm", spec.palm)]
+    wanted = {
+        "hand": [spec.hand_root, spec.palm],
+        "keypoints": [point.link for point in spec.keypoints],
+        "collision.self": spec.self_collision_links,
+        "collision.exclude": sum(spec.collision_exclude, ()),
+        "collision.table_exclude": spec.table_exclude,
+    }
     for tip in spec.fingertips:
-        wanted += [(f"fingertip {tip.name!r}", link) for link in (tip.link, *tip.contact_links)]
-    wanted += [(f"keypoint {point.keypoint!r}", point.link) for point in spec.keypoints]
-    wanted += [("collision.self", link) for link in spec.self_collision_links]
-    for pair in spec.collision_exclude:
-        wanted += [("collision.exclude", link) for link in pair]
-    wanted += [("collision.table_exclude", link) for link in spec.table_exclude]
-    absent = [(where, link) for where, link in wanted if link not in known]
-    for where, link in absent:
-        yield "error", f"{where}: the URDF has no link {link!r}. Choose from: {', '.join(known)}."
+        wanted[f"fingertip {tip.name!r}"] = [tip.link, *tip.contact_links]
+    known = {link.name: link for link in tree.links}
+    absent = False
+    for where, links in wanted.items():
+        for link in links:
+            if link not in known:
+                absent = True
+                yield "error", f"{where}: the URDF has no link {link!r}. Choose from: {', '.join(known)}."
     if absent:
         return
-    inside = set(tree.below(spec.hand_root)[1:])
+    inside = tree.below(spec.hand_root)[1:]
     for tip in spec.fingertips:
         if not any(known[link].collisions for link in tip.contact_links):
             links = ", ".join(tip.contact_links)
@@ -193,18 +197,13 @@ def _inertias(tree: RobotTree) -> Problems:
                 yield "error", text
             continue
         moments = ", ".join(f"{moment:.3g}" for moment in np.linalg.eigvalsh(link.inertia))
+        has = f"{name!r} has the principal moments {moments} kg m^2"
         if not is_solid(link):
-            yield (
-                "error",
-                f"{name!r} has the principal moments {moments} kg m^2. Expected those of a solid body: positive ones, "
-                "the largest at most the sum of the others.",
-            )
+            text = "Expected those of a solid body: positive ones, the largest at most the sum of the others."
+            yield "error", f"{has}. {text}"
         elif not plausible(link):
-            yield (
-                "warning",
-                f"{name!r} has the principal moments {moments} kg m^2; {link.mass:.3g} kg of its size can have "
-                f"{largest_moment(link):.2g} at most. Is it a placeholder? `xreset robots import` replaces such.",
-            )
+            text = f"{link.mass:.3g} kg of its size can have {largest_moment(link):.2g} at most"
+            yield "warning", f"{has}; {text}. Is it a placeholder? `xreset robots import` replaces such."
 
 
 # Physics --------------------------------------------------------------------------------------------------------------
@@ -215,11 +214,9 @@ def _drives(spec: RobotSpec) -> Problems:
     ratios = damping_ratio(spec, spec.home)
     inertias = drive_inertia(spec, spec.home)
     for joint, ratio, inertia in zip(spec.joints, ratios, inertias, strict=True):
-        has = f"{joint.name!r} has the damping ratio"
-        if ratio < 0.5:
-            yield "warning", f"{has} {ratio:.2f} at home and will swing; 0.7 to 1.5 is usual: raise kd."
-        if ratio > 5:
-            yield "warning", f"{has} {ratio:.1f} at home and will creep; 0.7 to 1.5 is usual: lower kd."
+        if not 0.5 <= ratio <= 5:
+            text = "It swings below 0.5 and creeps above 5; 0.7 to 1.5 is usual. Change kd."
+            yield "warning", f"{joint.name!r} has the damping ratio {ratio:.2f} at home. {text}"
         if joint.drive.kd * step > inertia:
             yield (
                 "warning",
@@ -295,8 +292,6 @@ def _thumb(spec: RobotSpec) -> Problems:
             "more often: is that the thumb? Then import again with "
             f"--thumb {tips[best]}, or make it the first fingertip, with keypoint thumb4.",
         )
-    elif not meetings[0, 1:].all():
-        yield "ok", f"the thumb can meet {met[0]} pad to pad"
 
 
 def _around_home(spec: RobotSpec) -> torch.Tensor:
@@ -310,23 +305,18 @@ def _around_home(spec: RobotSpec) -> torch.Tensor:
 
 def _above_table(spec: RobotSpec, q: torch.Tensor) -> Problems:
     height = table_clearance(spec, q)
-    clearance = float(height[0])
-    share = 100 * float((height < 0).double().mean())
+    share = float((height < 0).double().mean())
     level: Level = "ok"
-    if clearance < 0:
+    if height[0] < 0:
         level = "error"
-    elif clearance < MIN_CLEARANCE or share > 1:
+    elif height[0] < _MIN_CLEARANCE or share > 0.01:
         level = "warning"
-    yield level, f"lowest at {clearance * 1e3:.0f} mm above the table; {share:.0f} % of the spread below it"
+    yield level, f"lowest at {1e3 * height[0]:.0f} mm above the table; {100 * share:.0f} % of the spread below it"
 
 
 def _free_of_itself(spec: RobotSpec, q: torch.Tensor) -> Problems:
     kinematics = Kinematics(spec)
-    try:
-        collision = SelfCollision(spec, kinematics)
-    except XResetError as error:
-        yield "skipped", str(error)
-        return
+    collision = SelfCollision(spec, kinematics)
     for pair in collision.overlapping_at_home:
         yield "error", f"{' and '.join(pair)} overlap at home: move home, or add the pair to collision.exclude."
     near = collision.near(kinematics.link_poses(q).numpy(), 0.0)
@@ -334,21 +324,14 @@ def _free_of_itself(spec: RobotSpec, q: torch.Tensor) -> Problems:
     if share > 20:
         pairs = Counter(f"{a} and {b}" for _, a, b in near).most_common(_LISTED)
         often = ", ".join(f"{pair} ({100 * count / len(q):.0f} %)" for pair, count in pairs)
-        text = (
-            f"{share:.0f} % of the spread around home touches itself: {often}; episodes that start so are pushed "
-            "apart. Move home away, spread less (home_std), or exclude what always meets."
-        )
-        yield "warning", text
+        text = "episodes that start so are pushed apart. Move home away, spread less, or exclude what always meets."
+        yield "warning", f"{share:.0f} % of the spread around home touches itself: {often}; {text}"
     elif not collision.overlapping_at_home:
         yield "ok", f"free at home; {share:.0f} % of the spread around it touches itself"
 
 
 def _size(spec: RobotSpec) -> Problems:
     """Say what retargeting makes of the collision shapes, and the memory that it will take."""
-    try:
-        model = HandModel(spec)
-    except XResetError as error:
-        yield "skipped", str(error)
-        return
+    model = HandModel(spec)
     size = f"{len(model.balls.radii)} balls on {len(model.balls.links)} links of the hand"
     yield "ok", f"{size}; about {predicted_gigabytes(model):.1f} GB"

@@ -19,17 +19,16 @@ from xreset.robot_tools.opposition import closing_range, opposition
 from xreset.spec import FingertipSpec, KeypointSpec, RobotSpec
 
 _FINGERS = ("index", "middle", "ring", "little")
-_WORDS = {
-    "thumb": ("thumb",),
-    "index": ("index", "forefinger"),
-    "ring": ("ring",),
-    "little": ("little", "pinky", "pinkie"),
-    "middle": ("middle",),
+_NAMES = {
+    "thumb": ("thumb", "th"),
+    "index": ("index|forefinger", "ff"),
+    "ring": ("ring", "rf"),
+    "little": ("little|pink", "lf"),
+    "middle": ("middle", "mf"),
 }
-"""With which words in the names of a finger's links and joints begin; "middle" may also be a bone."""
-_CODES = {"th": "thumb", "ff": "index", "mf": "middle", "rf": "ring", "lf": "little"}
-"""Fingers in names such as ``rh_FFdistal`` and ``THJ5``, as the Shadow hand has them."""
-_CODE = re.compile(r"(?<![a-z])(th|ff|mf|rf|lf)(?=j\d|base|hub|knuckle|metacarpal|proximal|middle|distal|tip)")
+"""What words in the names of a finger's links and joints begin with, and the codes in names such as ``rh_FFdistal`` and
+``THJ5``, as the Shadow hand has them; "middle" may also be a bone, so it comes last."""
+_BONE = r"(?=j\d|base|hub|knuckle|metacarpal|proximal|middle|distal|tip)"
 _HUMAN = (0.0, 0.45, 0.73)
 """Positions of a human finger's joints between its first one and its tip: knuckle, middle joint, last joint (rounded
 averages)."""
@@ -58,6 +57,8 @@ class Finger:
     joints: tuple[str, ...]
     rest: tuple[str, ...]
     """Links fixed to the last one."""
+    points: np.ndarray
+    """[links + 1, 3] its joints, in the middle of the finger, and its tip in the frame of the hand's root, straight."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,29 +110,26 @@ def find_hand(tree: RobotTree, folder: Path, thumb: str | None, notes: list[str]
     )
 
 
-def _carrier(tree: RobotTree, link: str) -> str:
-    """Return the first link from ``link`` on that has shapes, or more than one child."""
-    while not tree.link(link).collisions:
-        children = [joint for joint in tree.joints if joint.parent == link]
-        if len(children) != 1 or children[0].type != "fixed":
-            break
-        link = children[0].child
-    return link
-
-
 def _palm_link(tree: RobotTree, notes: list[str]) -> str:
-    """Return the link after which the fingers part; joints before it are those of a wrist."""
+    """Return the link after which the fingers part: the first one with shapes, or with more than one child, behind the
+    joints of a wrist."""
     wrist = []
-    link = _carrier(tree, tree.root)
+    link = tree.root
     while True:
-        body = tree.moving_ancestor(link)
-        inside = tree.below(link)[1:]
-        first = [j for j in tree.joints if j.type != "fixed" and j.child in inside]
-        first = [joint for joint in first if tree.moving_ancestor(joint.parent) == body]
-        if len(first) != 1:
-            break
-        wrist.append(first[0].name)
-        link = _carrier(tree, first[0].child)
+        children = [joint for joint in tree.joints if joint.parent == link]
+        is_carrier = tree.link(link).collisions or len(children) != 1
+        if is_carrier:
+            inside = tree.below(link)[1:]
+            body = tree.moving_ancestor(link)
+            children = []
+            for joint in tree.joints:
+                if joint.type != "fixed" and joint.child in inside and tree.moving_ancestor(joint.parent) == body:
+                    children.append(joint)
+            if len(children) != 1:
+                break
+        if children[0].type != "fixed":
+            wrist.append(children[0].name)
+        link = children[0].child
     if wrist:
         notes.append(
             f"{', '.join(wrist)} move the whole hand: they are the last joints of the arm. To keep a wrist still, make "
@@ -148,7 +146,8 @@ def _find_fingers(spec: RobotSpec, tree: RobotTree, at: Poses, thumb: str | None
             f"below {spec.hand_root!r} there are {len(chains)} chains of moving links, expected a thumb and at least "
             "one finger."
         )
-    first = _find_thumb(spec, tree, at, chains, thumb, notes)
+    chains = [replace(chain, points=_points(tree, chain, at)) for chain in chains]
+    first = _find_thumb(spec, at, chains, thumb, notes)
     others = [chain for chain in chains if chain is not first]
     names = {chain.name for chain in others}
     if not names <= set(_FINGERS) or len(names) < len(others):
@@ -156,10 +155,10 @@ def _find_fingers(spec: RobotSpec, tree: RobotTree, at: Poses, thumb: str | None
             raise RobotError(
                 f"the hand has {len(others)} fingers beside the thumb; xreset knows {', '.join(_FINGERS)}."
             )
-        bases = np.array([at[chain.links[0]][:3, 3] for chain in others])
+        bases = np.array([chain.points[0] for chain in others])
         middle = bases.mean(axis=0)
         across = np.linalg.svd(bases - middle)[2][0]
-        across *= np.sign((_end(tree, first, at) - middle) @ across) or 1.0
+        across *= np.sign((first.points[-1] - middle) @ across) or 1.0
         order = np.argsort(-(bases @ across), kind="stable")
         others = [replace(others[i], name=name) for i, name in zip(order, _FINGERS, strict=False)]
         listed = "; ".join(f"{finger.name} is {finger.links[-1]}" for finger in others)
@@ -168,9 +167,7 @@ def _find_fingers(spec: RobotSpec, tree: RobotTree, at: Poses, thumb: str | None
     return [replace(first, name="thumb"), *others]
 
 
-def _find_thumb(
-    spec: RobotSpec, tree: RobotTree, at: Poses, chains: list[Finger], thumb: str | None, notes: list[str]
-) -> Finger:
+def _find_thumb(spec: RobotSpec, at: Poses, chains: list[Finger], thumb: str | None, notes: list[str]) -> Finger:
     """Return the chain with the stated link or joint, the one that is called so, or the one that opposes the others."""
     known = "; ".join(", ".join(chain.links) for chain in chains)  # noqa: XR002
     if thumb is None:
@@ -181,8 +178,9 @@ def _find_thumb(
             raise RobotError(f"--thumb {thumb!r} is in {len(marked)} fingers; their links are {known}.")
     if len(marked) == 1:
         return marked[0]
-    tips = np.array([_in_link(at[chain.links[-1]], _end(tree, chain, at)) for chain in chains])
-    scores = np.sqrt(opposition(spec, [chain.links[-1] for chain in chains], tips)).sum(axis=1)
+    ends = [chain.links[-1] for chain in chains]
+    tips = np.array([_in_link(at[chain.links[-1]], chain.points[-1]) for chain in chains])
+    scores = np.sqrt(opposition(spec, ends, tips)).sum(axis=1)
     first = int(scores.argmax())
     if scores[first] == 0 and len(chains) > 2:
         raise RobotError(f"no finger can oppose the others. Name a link of the thumb with --thumb: {known}.")
@@ -203,7 +201,8 @@ def _chains(tree: RobotTree, hand_root: str) -> list[Finger]:
             joints = [moved_by[name] for name in links]
             fixed_joints = [joint.name for joint in tree.joints if joint.child in rest]
             name = _stated_finger(" ".join((*links, *joints, *rest, *fixed_joints)))
-            chains.append(Finger(name=name, links=tuple(links), joints=tuple(joints), rest=tuple(rest)))
+            finger = Finger(name=name, links=tuple(links), joints=tuple(joints), rest=tuple(rest), points=np.empty(0))
+            chains.append(finger)
     return chains
 
 
@@ -228,10 +227,8 @@ def _without_bars(spec: RobotSpec, chains: list[Finger], notes: list[str]) -> li
 def _stated_finger(names: str) -> str:
     """Return the finger that the names of links and joints state, or an empty text."""
     text = re.sub("(?<=[a-z])(?=[A-Z][a-z])", "_", names).lower()  # leftThumb
-    if code := _CODE.search(text):
-        return _CODES[code[1]]
-    for finger, words in _WORDS.items():
-        if re.search(rf"(?<![a-z])({'|'.join(words)})", text):
+    for finger, (words, code) in _NAMES.items():
+        if re.search(rf"(?<![a-z])({words}|{code}{_BONE})", text):
             return finger
     return ""
 
@@ -243,24 +240,24 @@ def _find_palm(
     drives = _drives_of(fingers[0], spec) | _drives_of(fingers[1], spec)
     is_jaw = len(fingers) == 2 and len(drives) == 1
     along = fingers if is_jaw else fingers[1:]
-    bases = np.array([_on_axis(tree, finger.links[0], straight) for finger in along])
-    ends = np.array([_end(tree, finger, straight) for finger in along])
+    bases = np.array([finger.points[0] for finger in along])
+    ends = np.array([finger.points[-1] for finger in along])
     x = ((ends - bases) / np.linalg.norm(ends - bases, axis=1, keepdims=True)).mean(axis=0)
     x /= np.linalg.norm(x)
     bent = {}
     moved = np.zeros(3)
     for finger in fingers:
-        for name in finger.joints:
-            if name not in spec.joint_names:
-                continue
-            joint = tree.joint(name)
+        last = finger.links[-1]
+        end = finger.points[-1]
+        for joint in [tree.joint(name) for name in finger.joints if name in spec.joint_names]:
+            name = joint.name
             closing = closing_range(joint.lower, joint.upper)
             if closing is None:
                 continue
             bent[name] = _BEND * closing
             if finger.name != "thumb":
-                at = link_places(spec, {name: float(np.clip(0.0, joint.lower, joint.upper)) + 0.5 * closing})
-                moved += _end(tree, finger, at) - _end(tree, finger, straight)
+                T = link_places(spec, {name: float(np.clip(0.0, joint.lower, joint.upper)) + 0.5 * closing})[last]
+                moved += T[:3, :3] @ _in_link(straight[last], end) + T[:3, 3] - end
     z = moved - (moved @ x) * x
     if is_jaw:
         z = np.cross(x, ends[1] - ends[0])  # as in a right hand, whose thumb is against the palm's y
@@ -286,8 +283,7 @@ def _with_frames(
     keypoints = [KeypointSpec(keypoint="wrist", link="wrist_frame")]
     for finger in fingers:
         last = finger.links[-1]
-        end = _end(tree, finger, straight)
-        T = transform(straight[last][:3, :3].T @ palm[:3, :3], _in_link(straight[last], end))
+        T = transform(straight[last][:3, :3].T @ palm[:3, :3], _in_link(straight[last], finger.points[-1]))
         tip = FingertipSpec(
             name=finger.name,
             link=f"{finger.name}_tip_frame",
@@ -296,10 +292,9 @@ def _with_frames(
         )
         tips.append(tip)
         frames.append((tip.link, last, T))
-        joints = np.array([_on_axis(tree, name, straight) for name in finger.links])
-        for keypoint, near in _keypoint_joints(finger, joints, end).items():
+        for keypoint, near in _keypoint_joints(finger).items():
             link = finger.links[near]
-            beside = _in_link(straight[link], joints[near])
+            beside = _in_link(straight[link], finger.points[near])
             if np.linalg.norm(beside) > _BESIDE:
                 frames.append((f"{keypoint}_frame", link, transform(np.eye(3), beside)))
                 link = f"{keypoint}_frame"
@@ -312,11 +307,10 @@ def _with_frames(
     return tree, tips, keypoints
 
 
-def _keypoint_joints(finger: Finger, joints: np.ndarray, end: np.ndarray) -> dict[str, int]:
+def _keypoint_joints(finger: Finger) -> dict[str, int]:
     """Return the index of the joint that is where a human finger's joint is, by keypoint; a joint serves once, and in
     order."""
-    steps = np.linalg.norm(np.diff([*joints, end], axis=0), axis=1)
-    along = np.concatenate(([0.0], np.cumsum(steps)))
+    along = np.cumsum([0.0, *np.linalg.norm(np.diff(finger.points, axis=0), axis=1)])
     share = along[:-1] / along[-1]
     found = {}
     first = 0
@@ -345,37 +339,35 @@ def surface(tree: RobotTree, links: Iterable[str], at: Poses) -> np.ndarray:
     return np.concatenate(points)
 
 
+def _points(tree: RobotTree, finger: Finger, at: Poses) -> np.ndarray:
+    """[links + 1, 3] the joints and the tip of a finger.
+
+    A joint is the point of its axis that is nearest to the middle of its link's shapes: makers put origins anywhere
+    along an axis. The tip is a fixed link called so, or the point of the shapes that is farthest from the last joint.
+    """
+    points = [_on_axis(tree, link, at, surface(tree, [link], at)) for link in finger.links]
+    tips = [name for name in finger.rest if "tip" in name.lower()]
+    if tips:
+        return np.array([*points, at[tips[0]][:3, 3]])
+    last = finger.links[-1]
+    cloud = surface(tree, (last, *finger.rest), at)
+    if not len(cloud):
+        raise RobotError(f"the last link of a finger, {last!r}, has no collision shape, so it can touch nothing.")
+    middle = _middle(cloud)
+    away = middle - _on_axis(tree, last, at, cloud)
+    away /= max(float(np.linalg.norm(away)), 1e-9)
+    return np.array([*points, middle + away * float(((cloud - middle) @ away).max())])
+
+
 def _middle(points: np.ndarray) -> np.ndarray:
     """[3] middle of the bounding box."""
     return (points.max(axis=0) + points.min(axis=0)) / 2
 
 
-def _end(tree: RobotTree, finger: Finger, at: Poses) -> np.ndarray:
-    """[3] the tip of a finger in the hand root's frame: a fixed link called so, or the point of its shapes farthest
-    from its last joint."""
-    last = finger.links[-1]
-    for name in finger.rest:
-        if "tip" in name.lower():
-            return at[name][:3, 3]
-    cloud = surface(tree, (last, *finger.rest), at)
+def _on_axis(tree: RobotTree, link: str, at: Poses, cloud: np.ndarray) -> np.ndarray:
+    """[3] the point of the axis before a link that is nearest to the middle of points; the origin if there is none."""
+    origin = at[link][:3, 3]
     if not len(cloud):
-        raise RobotError(f"the last link of a finger, {last!r}, has no collision shape, so it can touch nothing.")
-    middle = _middle(cloud)
-    away = middle - _axis_point(tree, last, at, middle)
-    away /= max(float(np.linalg.norm(away)), 1e-9)
-    return middle + away * float(((cloud - middle) @ away).max())
-
-
-def _on_axis(tree: RobotTree, link: str, at: Poses) -> np.ndarray:
-    """[3] the point of the axis before a link that is nearest to the middle of its shapes: makers put origins anywhere
-    along an axis."""
-    cloud = surface(tree, [link], at)
-    if not len(cloud):
-        return at[link][:3, 3]
-    return _axis_point(tree, link, at, _middle(cloud))
-
-
-def _axis_point(tree: RobotTree, link: str, at: Poses, near: np.ndarray) -> np.ndarray:
-    """[3] the point of the axis before a link that is nearest to a point."""
+        return origin
     axis = at[link][:3, :3] @ next(joint.axis for joint in tree.joints if joint.child == link)
-    return at[link][:3, 3] + axis * float((near - at[link][:3, 3]) @ axis)
+    return origin + axis * float((_middle(cloud) - origin) @ axis)

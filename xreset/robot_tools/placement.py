@@ -3,7 +3,6 @@ description."""
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -71,16 +70,15 @@ def write_placement(path: Path, robot: RobotSpec, best: Finalist, command: str) 
             f"robot {robot.name!r}: no placement has a home. Put base.pos = {pos} and base.quat = {quat} into {path}, "
             "and choose a home of the arm's joints there: look at it with xreset robots check --picture."
         )
-    figures = f"reached = {best.reached:.3f}, followed = {best.followed:.3f}, frames = {best.frames}"
-    stated = f"placement = {{ {figures}, command = {json.dumps(command, ensure_ascii=False)} }}"
-    edits = [(r"^quat *=.*()$", f"\n{stated}")]
+    figures = f"reaches {100 * best.reached:.1f} % and follows {100 * best.followed:.1f} % of {best.frames} frames"
+    edits = [(r"^quat *=.*()$", f"\n# Placement: {figures}: {' '.join(command.split())}")]
     if best.robot != robot:  # else not a digit may change: it would be another robot
         edits += [(r"^pos *= *(.*)$", pos), (r"^quat *= *(.*)$", quat)]
         for joint in best.robot.joints:
             if joint.group == "arm":
                 pattern = rf'name *= *"{re.escape(joint.name)}".*?\bhome *= *([-+.\deE]+)'
                 edits.append((pattern, f"{joint.home:.3f}"))
-    text = re.sub(r"^placement *=.*\n", "", path.read_text(), flags=re.MULTILINE)
+    text = re.sub(r"^(# Placement:|placement *=).*\n", "", path.read_text(), flags=re.MULTILINE)
     for pattern, new in edits:
         match = re.search(pattern, text, flags=re.MULTILINE)
         if match is None:

@@ -11,8 +11,7 @@ valid frames wins, because the first frame does not show which branch lasts. Whe
 backwards from the last frame: the branch that reaches the goal may look worse than others at the start. Where the wrist
 is still missed, some of those frames are solved again and followed both ways, and all paths are spliced into one.
 
-Shape letters: S sequences, T frames, K paths of a sequence, B paths of all, C chosen frames, n arm joints, G links with
-support points.
+Shape letters: S sequences, T frames, K paths of a sequence, B paths of all, C chosen frames, n arm joints.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ def track(
     problem = ArmProblem(
         **vars(targets),
         model=model,
-        hand_poses=model.hand_poses(targets.hand_joints),
+        support=model.support_points(targets.hand_joints),
         thresholds=thresholds,
         config=config or ArmConfig(),
     )
@@ -194,7 +193,7 @@ def _first_frames(problem: ArmProblem) -> Tensor:
     model = problem.model
     config = problem.config
     home = model.home
-    sequences = len(problem.hand_poses)
+    sequences = len(problem.support)
     generator = torch.Generator().manual_seed(config.seed)  # every sequence gets the same starts
     spread = torch.rand(config.restarts, len(home), generator=generator, dtype=home.dtype) * 2.0 - 1.0
     spread[0] = 0.0

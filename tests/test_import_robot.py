@@ -316,7 +316,7 @@ class Toy(WithFolder):
         for words, text in (
             ("orientation that is not finite", MJCF.replace('euler="0 0 0.9"', 'euler="-inf 0 0"')),
             (
-                "size 1e-300 m. Expected at least 1e-06 m",
+                "size 1e-300 m, expected 1e-06 m or more",
                 MJCF.replace('size="0.018 0.007 0.007"', 'size="1e-300 1e-300 1e-300"'),
             ),
             ("has a hfield", asset('<hfield name="h" nrow="40000" ncol="40000" size="1 1 1 1"/>')),
@@ -388,10 +388,13 @@ class Toy(WithFolder):
         self.assertLess(np.linalg.eigvalsh(tree.link("f1_a").inertia).max(), 1e-4)
 
     def test_errors_leave_nothing(self):
+        entities = f'<!ENTITY e0 "{80 * "a"}">'
+        for number in range(1, 8):
+            entities += f'<!ENTITY e{number} "{10 * f"&e{number - 1};"}">'
         for hand, options, words in (
             (_hand(_finger("f1")), {}, "expected a thumb and at least one finger"),
             ("nothing", {}, "cannot be read as XML"),
-            (f'<!DOCTYPE robot [<!ENTITY a "b">]>{HAND}', {}, "has a DOCTYPE. Remove it"),
+            (f"<!DOCTYPE robot [{entities}]><robot>&e7;</robot>", {}, "limit on input amplification"),
             (HAND, {"thumb": "f9"}, "--thumb 'f9' is in 0 fingers"),
         ):
             with self.assertRaisesRegex(RobotError, words):

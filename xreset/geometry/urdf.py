@@ -114,11 +114,10 @@ class RobotTree:
         return self._named("joint", self.joints, name)
 
     def _named(self, kind: str, parts, name: str):
-        for part in parts:
-            if part.name == name:
-                return part
-        known = ", ".join(part.name for part in parts)
-        raise RobotError(f"robot {self.name!r} has no {kind} {name!r}. Choose from: {known}.")
+        by_name = {part.name: part for part in parts}
+        if name not in by_name:
+            raise RobotError(f"robot {self.name!r} has no {kind} {name!r}. Choose from: {', '.join(by_name)}.")
+        return by_name[name]
 
     def below(self, root: str) -> list[str]:
         """Return the link ``root`` and all links that it carries."""
@@ -148,9 +147,8 @@ def link_meshes(robot: RobotSpec) -> list[trimesh.Trimesh | None]:
     import trimesh
 
     meshes = []
-    tree = robot_tree(robot)
-    for name in tree.link_names:
-        shapes = [shape_mesh(shape, coarse=True) for shape in tree.link(name).collisions]
+    for link in robot_tree(robot).links:
+        shapes = [shape_mesh(shape, coarse=True) for shape in link.collisions]
         meshes.append(trimesh.util.concatenate(shapes) if shapes else None)
     return meshes
 
@@ -174,21 +172,10 @@ def load_urdf(path: str | Path) -> RobotTree:
     return _load(path, tuple(file.stat().st_mtime_ns for file in files))
 
 
-class _NoDoctype(ElementTree.TreeBuilder):
-    """Refuses document types, whose entities can grow to any size."""
-
-    def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
-        raise ValueError("it has a DOCTYPE. Remove it; a robot's file needs none")
-
-
 def parse_xml(path: Path) -> Element:
-    """Return the root element of a file.
-
-    Raises:
-        RobotError: the file cannot be read, or has a document type.
-    """
+    """Return the root element of a file, or raise ``RobotError``; expat refuses entities that grow to any size."""
     try:
-        return ElementTree.parse(path, ElementTree.XMLParser(target=_NoDoctype())).getroot()
+        return ElementTree.parse(path).getroot()
     except (OSError, ElementTree.ParseError, ValueError, LookupError) as error:  # the last two: encodings
         raise RobotError(f"{path} cannot be read as XML: {shown(str(error))}") from error
 
@@ -208,116 +195,105 @@ def _load(path: Path, changed: tuple[int, ...]) -> RobotTree:
         raise RobotError(f"{path} is MJCF, not URDF; `xreset robots import` makes a robot of it.")
     if xml.tag != "robot":
         raise RobotError(f"{path} starts with <{shown(xml.tag)[1:-1]}>, which is not a URDF. Expected <robot>.")
-    robot = _parsed(xml, path)
     try:
         with np.errstate(invalid="ignore"):  # check_tree refuses what is not finite
-            links = {}
-            for each in robot.links:
-                link = _link(each, path)
-                if link.name in links:
-                    raise RobotError(f"{path}: the link name {shown(link.name)} occurs twice.")
-                links[link.name] = link
-            joints = {}
-            for each in robot.joints:
-                joint = _joint(each, path)
-                if joint.child in joints:
-                    raise RobotError(f"{path}: link {joint.child!r} is the child of two joints, expected one.")
-                joints[joint.child] = joint
-            tree = _ordered(robot.name or path.stem, links, joints, path)
-    except (ValueError, TypeError, KeyError, AttributeError, IndexError) as error:
+            robot = _parsed(xml)
+            links = [_link(link, path) for link in robot.links]
+            joints = [_joint(joint) for joint in robot.joints]
+        tree = _ordered(robot.name or path.stem, links, joints)
+        check_tree(tree)
+    except RobotError as error:
+        raise RobotError(f"{path} cannot be read as a URDF: {error}") from error
+    except Exception as error:  # yourdfpy raises whatever its parsing meets
         raise RobotError(f"{path} cannot be read as a URDF: {shown(f'{type(error).__name__}: {error}')}") from error
-    check_tree(tree, path)
     return tree
 
 
-def _parsed(xml: Element, path: Path) -> yourdfpy.Robot:
+def _parsed(xml: Element) -> yourdfpy.Robot:
     """Return what yourdfpy reads from a URDF; capsules, which it does not know, become cylinders of negative radius."""
     import yourdfpy
 
     for shape in xml.iterfind("link/collision/geometry/*"):
         if shape.get("radius", "").strip().startswith("-"):
-            raise RobotError(f"{path} has a {shown(shape.tag)} of negative radius.")
+            raise RobotError(f"a {shown(shape.tag)} has a negative radius.")
         if shape.tag == "capsule":
             shape.tag = "cylinder"
             shape.set("radius", f"-{shape.get('radius')}")
     for joint in xml.iterfind("joint"):
         for end in ("parent", "child"):
             if joint.find(end) is None:
-                raise RobotError(f"{path}: joint {shown(joint.get('name', ''))} has no {end} link.")
-    try:
-        with np.errstate(invalid="ignore"):
-            return yourdfpy.URDF.load(
-                io.BytesIO(ElementTree.tostring(xml)),
-                build_scene_graph=False,
-                load_meshes=False,
-                filename_handler=lambda name: name,
-            ).robot
-    except Exception as error:  # yourdfpy raises whatever its parsing meets
-        raise RobotError(f"{path} cannot be read as a URDF: {shown(f'{type(error).__name__}: {error}')}") from error
+                raise RobotError(f"joint {shown(joint.get('name', ''))} has no {end} link.")
+    file = io.BytesIO(ElementTree.tostring(xml))
+    return yourdfpy.URDF.load(
+        file, build_scene_graph=False, load_meshes=False, filename_handler=lambda name: name
+    ).robot
 
 
-def _ordered(name: str, links: dict[str, Link], joints: dict[str, Joint], path: Path) -> RobotTree:
-    """Return the tree of links by name and joints by child, parents before children."""
-    for joint in joints.values():
+def _ordered(name: str, links: list[Link], joints: list[Joint]) -> RobotTree:
+    """Return the tree, parents before children."""
+    link_by_name = {link.name: link for link in links}
+    joint_above = {joint.child: joint for joint in joints}
+    if len(link_by_name) < len(links):
+        raise RobotError("a link name occurs twice.")
+    if len(joint_above) < len(joints):
+        raise RobotError("a link is the child of two joints, expected one.")
+    for joint in joints:
         for end in (joint.parent, joint.child):
-            if end not in links:
-                raise RobotError(f"{path}: joint {joint.name!r} names link {end!r}, which the file does not define.")
-    roots = [link for link in links if link not in joints]
+            if end not in link_by_name:
+                raise RobotError(f"joint {joint.name!r} names link {end!r}, which the file does not define.")
+    roots = [link for link in link_by_name if link not in joint_above]
     if len(roots) != 1:
-        raise RobotError(f"{path}: expected one root link, found {len(roots)} ({', '.join(roots) or 'none'}).")
+        raise RobotError(f"expected one root link, found {len(roots)} ({', '.join(roots) or 'none'}).")
     order: list[str] = []
     stack = list(roots)
     while stack:
         parent = stack.pop()
         order.append(parent)
-        children = [joint.child for joint in joints.values() if joint.parent == parent]
+        children = [joint.child for joint in joints if joint.parent == parent]
         stack.extend(reversed(children))
     if len(order) != len(links):
-        raise RobotError(f"{path}: links {sorted(set(links) - set(order))} are not connected to the root {roots[0]!r}.")
+        raise RobotError(f"links {sorted(set(link_by_name) - set(order))} are not connected to the root {roots[0]!r}.")
     return RobotTree(
         name=name,
         root=roots[0],
-        links=tuple(links[link] for link in order),
-        joints=tuple(joints[link] for link in order[1:]),
+        links=tuple(link_by_name[link] for link in order),
+        joints=tuple(joint_above[link] for link in order[1:]),
     )
 
 
-def check_tree(tree: RobotTree, path: Path) -> None:
+def check_tree(tree: RobotTree) -> None:
     """Raise ``RobotError`` for numbers that are not finite or too large; limits of continuous joints may be
     infinite."""
     for link in tree.links:
         parts = [link.com, link.inertia, link.mass]
-        least = math.inf
         for shape in link.collisions:
-            sizes = np.array(shape.geometry.size)
-            parts += [shape.T_body_shape, sizes]
-            if shape.geometry.kind == "hull":
-                parts.append(shape.geometry.vertices)
-            elif shape.geometry.kind == "capsule":
-                sizes = sizes + np.array((0.0, _SMALLEST))  # its half length may be 0
-            least = min(least, sizes.min(initial=math.inf))
-        if not all((np.abs(part) < _LARGEST).all() for part in parts):
-            raise RobotError(f"{path}: link {link.name!r} has a number that is not finite, or far too large.")
-        if least < _SMALLEST:
+            geometry = shape.geometry
+            parts += [shape.T_body_shape, geometry.size]
+            if geometry.vertices is not None:
+                parts.append(geometry.vertices)
+            positive = geometry.size[:1] if geometry.kind == "capsule" else geometry.size  # a capsule may be a ball
+            least = min(positive, default=math.inf)
+            if least < _SMALLEST:
+                raise RobotError(
+                    f"link {link.name!r} has a shape of size {least:g} m, expected {_SMALLEST:g} m or more."
+                )
+        if link.mass < 0 or not all((np.abs(part) < _LARGEST).all() for part in parts):
             raise RobotError(
-                f"{path}: link {link.name!r} has a shape of size {least:g} m. Expected at least {_SMALLEST:g} m."
+                f"link {link.name!r} has a negative mass, or a number that is not finite or far too large."
             )
-        if link.mass < 0:
-            raise RobotError(f"{path}: link {link.name!r} has the mass {link.mass} kg, expected 0 or more.")
     for joint in tree.joints:
         numbers = [*joint.axis, joint.effort, joint.stiffness, joint.rotor]
         if not ((np.abs(joint.T_parent_joint) < _LARGEST).all() and np.isfinite(numbers).all()):
-            raise RobotError(f"{path}: joint {joint.name!r} has a number that is not finite, or far too large.")
+            raise RobotError(f"joint {joint.name!r} has a number that is not finite, or far too large.")
         if math.isnan(joint.velocity) or not joint.lower <= joint.upper:
             raise RobotError(
-                f"{path}: joint {joint.name!r} has the limits {joint.lower} to {joint.upper}. "
-                "Expected the lower one first."
+                f"joint {joint.name!r} has the limits {joint.lower} to {joint.upper}. Expected the lower one first."
             )
 
 
-def _checked_name(name: str | None, path: Path) -> str:
+def _checked_name(name: str | None) -> str:
     if not name or not is_plain(name):
-        raise RobotError(f"{path}: the name {shown(name)} is empty or contains control characters.")
+        raise RobotError(f"the name {shown(name)} is empty or contains control characters.")
     return name
 
 
@@ -327,7 +303,7 @@ def _pose(origin: np.ndarray | None) -> np.ndarray:
 
 
 def _link(link: yourdfpy.Link, path: Path) -> Link:
-    name = _checked_name(link.name, path)
+    name = _checked_name(link.name)
     mass = 0.0
     com = np.zeros(3)
     inertia = np.zeros((3, 3))
@@ -359,16 +335,14 @@ def _geometry(geometry: yourdfpy.Geometry, link: str, path: Path) -> Geometry:
         return Geometry(kind="capsule" if radius < 0 else "cylinder", size=size)
     if geometry.mesh is not None:
         return _mesh_hull(geometry.mesh, link, path)
-    raise RobotError(f"{path}: link {link!r} has a collision without a geometry.")
+    raise RobotError(f"link {link!r} has a collision without a geometry.")
 
 
 def _mesh_hull(mesh: yourdfpy.Mesh, link: str, path: Path) -> Geometry:
     name = mesh.filename
     file = find_mesh(name, path)
     if file is None:
-        raise RobotError(
-            f"{path}: link {link!r} uses the mesh {shown(name)}, which is not in its folders. Put it there."
-        )
+        raise RobotError(f"link {link!r} uses the mesh {shown(name)}, which is not in its folders. Put it there.")
     try:
         vertices = np.asarray(load_mesh(file).vertices)
         if not (np.abs(vertices) < _LARGEST).all():
@@ -376,9 +350,7 @@ def _mesh_hull(mesh: yourdfpy.Mesh, link: str, path: Path) -> Geometry:
         scale = 1.0 if mesh.scale is None else np.asarray(mesh.scale, dtype=float)
         return hull(vertices * np.broadcast_to(scale, 3), HULL_TOLERANCE).geometry
     except (ObjectError, ValueError) as error:
-        raise RobotError(
-            f"{path}: link {link!r} uses the mesh {name!r}, which cannot be read: {shown(str(error))}"
-        ) from error
+        raise RobotError(f"link {link!r} uses the mesh {name!r}, which cannot be read: {shown(str(error))}") from error
 
 
 def find_mesh(name: str, urdf: Path) -> Path | None:
@@ -399,19 +371,17 @@ def find_mesh(name: str, urdf: Path) -> Path | None:
     return None
 
 
-def _joint(joint: yourdfpy.Joint, path: Path) -> Joint:
-    name = _checked_name(joint.name, path)
+def _joint(joint: yourdfpy.Joint) -> Joint:
+    name = _checked_name(joint.name)
     kind = joint.type
     if kind not in ("revolute", "continuous", "prismatic", "fixed"):
-        raise RobotError(
-            f"{path}: joint {name!r} has type {kind!r}; supported are revolute, continuous, prismatic and fixed."
-        )
+        raise RobotError(f"joint {name!r} has type {kind!r}; supported are revolute, continuous, prismatic and fixed.")
     axis = np.array([1.0, 0, 0]) if joint.axis is None else np.asarray(joint.axis, dtype=float)
     if axis.shape != (3,):
         raise ValueError(f"joint {name!r} has an axis of {axis.size} numbers, expected 3 numbers")
     length = float(np.linalg.norm(axis))
     if kind != "fixed" and not length > _SHORTEST_AXIS:
-        raise RobotError(f"{path}: joint {name!r} has the axis {axis}, expected a direction.")
+        raise RobotError(f"joint {name!r} has the axis {axis}, expected a direction.")
     limits = {}
     limit = joint.limit
     if limit is not None:
@@ -424,10 +394,11 @@ def _joint(joint: yourdfpy.Joint, path: Path) -> Joint:
             limits["upper"] = float(limit.upper or 0)
     mimic = None
     if joint.mimic is not None:
-        numbers = {name: float(getattr(joint.mimic, name)) for name in ("multiplier", "offset")}
-        if not np.isfinite(list(numbers.values())).all():
-            raise RobotError(f"{path}: joint {name!r} follows another by a number that is not finite.")
-        mimic = MimicSpec(joint=name, source=joint.mimic.joint, **numbers)
+        multiplier = joint.mimic.multiplier or 0.0
+        offset = joint.mimic.offset or 0.0
+        if not math.isfinite(multiplier + offset):
+            raise RobotError(f"joint {name!r} follows another by a number that is not finite.")
+        mimic = MimicSpec(joint=name, source=joint.mimic.joint, multiplier=multiplier, offset=offset)
     return Joint(
         name=name,
         type="revolute" if kind == "continuous" else kind,

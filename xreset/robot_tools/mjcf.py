@@ -13,7 +13,7 @@ import numpy as np
 
 from xreset.errors import ObjectError, RobotError
 from xreset.geometry.shapes import hull, transform
-from xreset.geometry.urdf import HULL_TOLERANCE, Joint, Link, RobotTree
+from xreset.geometry.urdf import HULL_TOLERANCE, Joint, Link, RobotTree, check_tree
 from xreset.geometry.urdf_writer import fixed, frame
 from xreset.robot_tools.couplings import SLIDE, Couplings, Pull, joint_name
 from xreset.spec import Geometry, MimicSpec, Shape
@@ -65,7 +65,9 @@ def read_mjcf(path: Path, root: ElementTree.Element, notes: list[str]) -> RobotT
             stated["rotor"] = float(model.dof_armature[model.jnt_dofadr[joint]])
         name = joint_name(model, joint)
         joints[name] = replace(joints[name], **stated)
-    return replace(tree, joints=tuple(joints.values()))
+    tree = replace(tree, joints=tuple(joints.values()))
+    check_tree(tree)
+    return tree
 
 
 def _refuse(path: Path, problems: list[str]) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from xreset.errors import RobotError
 from xreset.geometry.shapes import mass_properties, surface_of
-from xreset.geometry.urdf import Link, RobotTree, check_tree, load_urdf, parse_xml
+from xreset.geometry.urdf import Link, RobotTree, load_urdf, parse_xml
 from xreset.geometry.urdf_writer import FRAME_INERTIA, FRAME_MASS, fixed
 
 _DENSITY = 1000.0
@@ -51,7 +51,6 @@ def read_source(path: str | Path, notes: list[str]) -> RobotTree:
                 "mujoco"
             ) from error
         tree = read_mjcf(path, root, notes)
-        check_tree(tree, path)
     else:
         tree = load_urdf(path)
     return _with_masses(_with_limits(tree, path, notes), notes)

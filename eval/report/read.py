@@ -293,14 +293,14 @@ def run_facts(run: dict[str, Any], file: Path) -> dict[str, str]:
         "num_envs": str(run.get("num_envs")),
         "seed": str(run["seed"]),
         "xreset": str(run.get("xreset")).partition("+")[0],
-        **dict(_flat(run["config"])),
+        **{name: f"{x:.6g}" if isinstance(x, float) else str(x) for name, x in flat(run["config"])},
     }
 
 
-def _flat(data: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the entries of a nested configuration: name and text."""
+def flat(data: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the entries of nested dictionaries: names, joined by dots, and values."""
     for name, value in data.items():
         if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{name}.")
+            yield from flat(value, f"{prefix}{name}.")
         else:
-            yield prefix + name, f"{value:.6g}" if isinstance(value, float) else str(value)
+            yield prefix + name, value

@@ -15,11 +15,12 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from xreset.checks import from_dict, merged
 from xreset.demos.archive import read_demos
-from xreset.errors import DemoError, FileFormatError, ObjectError, RunError
+from xreset.errors import RunError
+from xreset.eval.results import EvalResult, read_result
 from xreset.eval.study.file import Data, Evaluation, Runs, Study
 from xreset.eval.study.subset import Subset, refuse_other
 from xreset.files import file_hash, is_claimed
@@ -30,9 +31,6 @@ from xreset.learning.run import checkpoints, latest_checkpoint, read_run
 from xreset.objects.catalogue import canonical_names, object_names
 from xreset.plugins import backend_status
 from xreset.text import short_name
-
-if TYPE_CHECKING:
-    from xreset.eval.results import EvalResult
 
 _ENOUGH = 0.97
 """Share of the minutes from which a training counts as done: to start again would cost more than what is left."""
@@ -251,36 +249,22 @@ def eval_step(
     Args:
         key: name of the evaluation.
         engines: engines of the evaluation that are installed.
-
-    Raises:
-        RunError: there are results of another evaluation under this name.
     """
     folder = run.folder / key
     demos = subset.demos
     if run.runs.policy == "ik":
         demos = subset.folder / Path(run.runs.robot).name / "retargeted.npz"
-    wanted: dict[str, Any] = {
-        "robot": Path(run.runs.robot).name,
-        "seed": evaluation.seed,
-        "episodes_per_demo": evaluation.episodes,
-    }
-    for engine in evaluation.engines:
-        result = _result(folder, engine)
-        if result is not None:
-            found = {name: getattr(result, name) for name in wanted}
-            if demos.is_file():
-                found["demos"] = result.inputs.get("demos", "")[:12]
-                wanted["demos"] = file_hash(demos)[:12]
-            refuse_other(f"{folder / engine}.json is an evaluation of another kind", "evaluation", found, wanted)
 
     def missing() -> list[str]:
-        """Return the engines without a result of this policy."""
+        """Return the engines without a result of this policy and evaluation."""
         policy = run.folder / "policy.onnx"
-        digest = file_hash(policy) if run.config is not None and policy.is_file() else None
+        inputs = {"policy": policy} if run.config is not None and policy.is_file() else {}
+        hashes = {name: file_hash(file) for name, file in (inputs | {"demos": demos}).items() if file.is_file()}
         engines_left = []
         for engine in engines:
-            result = _result(folder, engine)
-            if result is None or result.inputs.get("policy") != digest:
+            file = folder / f"{engine}.json"
+            result = read_result(file) if file.is_file() else None
+            if result is None or not _is_of(result, evaluation, hashes):
                 engines_left.append(engine)
         return engines_left
 
@@ -318,11 +302,10 @@ def eval_step(
     )
 
 
-def _result(folder: Path, engine: str) -> EvalResult | None:
-    from xreset.eval.results import read_result  # imports torch, which the command's help must not wait for
-
-    file = folder / f"{engine}.json"
-    return read_result(file) if file.is_file() else None
+def _is_of(result: EvalResult, evaluation: Evaluation, hashes: dict[str, str]) -> bool:
+    """Return whether a result is of these episodes, and of files with these hashes."""
+    same = result.seed == evaluation.seed and result.episodes_per_demo == evaluation.episodes
+    return same and hashes.items() <= result.inputs.items()
 
 
 # The plan -------------------------------------------------------------------------------------------------------------
@@ -372,7 +355,7 @@ def make_plan(study: Study, name: str, *, given: Path, out: Path, only: Iterable
     Raises:
         RunError: a run is unknown, or the folder of a run or an evaluation has another configuration.
         FileFormatError: a file of the data is missing or damaged, or a change of the recipe names an unknown key.
-        DemoError: the data do not have an object.
+        ObjectError: the data do not have an object.
     """
     unknown = sorted(set(only) - set(study.runs))
     if unknown:
@@ -386,7 +369,7 @@ def make_plan(study: Study, name: str, *, given: Path, out: Path, only: Iterable
         name=name,
         given=given,
         out=out,
-        objects={key: _objects_of(key, data, given) for key, data in study.data.items()},
+        objects={key: _objects_of(data, given) for key, data in study.data.items()},
         unavailable={engine: reason for engine, reason in reasons.items() if reason is not None},
     )
     for group in study.runs:
@@ -426,7 +409,8 @@ def _add_evaluation(plan: Plan, run: Run, key: str, training: str | None) -> Non
     """Add the step of an evaluation, if the run has objects of it and an engine is installed."""
     evaluation = plan.study.evaluations[key]
     data = evaluation.data or run.runs.data
-    wanted = _official_names(f"evaluations.{key}", evaluation.objects, plan.objects[data])
+    known = plan.objects[data]
+    wanted = canonical_names(evaluation.objects, known) or known
     objects = [name for name in wanted if evaluation.unseen or name in run.objects]
     if not objects:
         return
@@ -443,36 +427,26 @@ def _add_evaluation(plan: Plan, run: Run, key: str, training: str | None) -> Non
         plan.add(step)
 
 
-def _objects_of(name: str, data: Data, given: Path) -> tuple[str, ...]:
+def _objects_of(data: Data, given: Path) -> tuple[str, ...]:
     """Return the names of the objects of the data."""
     if data.demos is None:
         return object_names()
-    for key, file in (("demos", data.demos), ("meshes", data.meshes)):
-        if file is not None and not (given / file).exists():
-            raise FileFormatError(
-                f"there is no {given / file} (data.{name}.{key}). Put it there, or give its folder with --data."
-            )
     return tuple(sorted(set(read_demos(given / data.demos).object_name.tolist())))
-
-
-def _official_names(where: str, objects: tuple[str, ...], known: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the official names of objects; all known ones if none is given."""
-    try:
-        return canonical_names(objects, known) or known
-    except ObjectError as error:
-        raise DemoError(f"{where}.objects: {error}") from None
 
 
 def _runs(plan: Plan, group: str) -> Iterator[Run]:
     """Yield the runs of a group."""
     spec = plan.study.runs[group]
-    objects = _official_names(f"runs.{group}", spec.objects, plan.objects[spec.data])
+    known = plan.objects[spec.data]
+    objects = canonical_names(spec.objects, known) or known
     if spec.policy is not None:
         subset = plan.subset(spec.data, objects, spec.per_object)
         yield Run(group=group, runs=spec, seed=0, objects=objects, folder=plan.out / group, subset=subset)
         return
     changed = merged(asdict(starting_config(spec.recipe)), spec.config)
     config = from_dict(TrainConfig, changed, f"runs.{group}.config")
+    if config.task.reward.own:
+        raise RunError(f"runs.{group}.config.task.reward.own names code, which a study may not. Use xreset train.")
     if spec.steps is not None:
         iterations = round(spec.steps / (spec.num_envs * spec.gpus * config.ppo.horizon))
         config = replace(config, iterations=max(1, iterations))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from xreset.eval.study.file import TableSpec
 from xreset.eval.study.paper import paper_training
 from xreset.eval.study.plan import Plan, Run
 from xreset.eval.study.tables import FilledTable, draw, fill
-from xreset.eval.table import Rows, caption
+from xreset.eval.table import caption
 from xreset.files import write_whole
 from xreset.learning.clock import Lift, read_lift
 from xreset.text import short_name
@@ -25,45 +24,38 @@ _ALIKE = 0.05
 _HEAD = ("run", "objects", "seed", "minutes", "million steps", "iterations", "from home 10 % after")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Page:
-    """The page that was written."""
+def write_page(plan: Plan, out: Path) -> tuple[Path, list[str]]:
+    """Write ``study.md``, its pictures, and comparisons of the trainings of each object.
 
-    path: Path
-    tables: tuple[FilledTable, ...]
-    metrics: tuple[FilledTable, ...]
-    """Every metric of the same runs, over all objects."""
-    notes: tuple[str, ...]
-    """What makes the figures incomparable, doubtful or incomplete."""
-    runs: Rows
-
-
-def write_page(plan: Plan, out: Path) -> Page:
-    """Write ``study.md``, its pictures, and comparisons of the trainings of each object."""
+    Returns:
+        The page, and what makes its figures incomparable, doubtful or incomplete.
+    """
     trained = {run.name: run.trained() for run in plan.runs if run.config is not None}
-    tables = tuple(fill(plan, table) for table in plan.study.tables)
+    tables = [fill(plan, table) for table in plan.study.tables]
     every_metric: list[TableSpec] = []
     for table in plan.study.tables:
         title = f"Every metric, {table.evaluation}"
         spec = TableSpec(runs=table.runs, title=title, evaluation=table.evaluation, rows="metric")
         if spec not in every_metric:
             every_metric.append(spec)
-    notes = [*_incomplete(plan)]
+    found = [*_incomplete(plan)]
     for i, table in enumerate(tables, 1):
-        notes += [f"{table.title}: {note}" for note in _unfair(plan, table, trained)]
+        found += [f"{table.title}: {note}" for note in _unfair(plan, table, trained)]
         if table.engines:
             draw(out / f"table-{i}.png", table)
-    page = Page(
-        path=out / "study.md",
+    notes = list(dict.fromkeys(found))
+    content = render(
+        "study.md.j2",
+        plan=plan,
         tables=tables,
-        metrics=tuple(fill(plan, table) for table in every_metric),
-        notes=tuple(dict.fromkeys(notes)),
+        metrics=[fill(plan, table) for table in every_metric],
+        notes=notes,
         runs=[_HEAD, *(_run_row(run, trained.get(run.name)) for run in plan.runs)],
+        compared=_compare(plan, out),
+        versions=caption(run.runs.policy or "" for run in plan.runs),
     )
-    compared = _compare(plan, out)
-    versions = caption(run.runs.policy or "" for run in plan.runs)
-    write_whole(page.path, render("study.md.j2", plan=plan, compared=compared, versions=versions, **vars(page)))
-    return page
+    write_whole(out / "study.md", content)
+    return out / "study.md", notes
 
 
 def _incomplete(plan: Plan) -> Iterator[str]:

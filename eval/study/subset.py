@@ -10,6 +10,7 @@ from typing import Any
 from xreset.demos.archive import read_demos, write_demos
 from xreset.demos.synth import synthesize
 from xreset.errors import RunError
+from xreset.eval.report.read import flat
 from xreset.eval.study.file import Data
 from xreset.files import file_hash, read_json, write_json
 from xreset.text import short_name, shown
@@ -68,7 +69,6 @@ class Subset:
         file = self.folder / "subset.json"
         if file.is_file():
             made = read_json(file, SUBSET_SCHEMA)
-            made.pop("schema", None)
             refuse_other(f"{self.folder} was made otherwise", "data", made, self.definition)
 
     def make(self) -> None:
@@ -91,14 +91,11 @@ def refuse_other(problem: str, what: str, found: dict[str, Any], wanted: dict[st
     Raises:
         RunError: an entry differs; the message names it.
     """
-    for name in sorted({*found, *wanted}):
-        old = found.get(name)
-        new = wanted.get(name)
-        if isinstance(old, dict) and isinstance(new, dict):
-            nested = {f"{name}.{key}": value for key, value in old.items()}
-            refuse_other(problem, what, nested, {f"{name}.{key}": value for key, value in new.items()})
-        elif old != new:
+    old = dict(flat(found))
+    new = dict(flat(wanted))
+    for name in sorted({*old, *new}):
+        if old.get(name) != new.get(name):
             raise RunError(
-                f"{problem}: {name} is {shown(old)} there and {shown(new)} in the study. "
+                f"{problem}: {name} is {shown(old.get(name))} there and {shown(new.get(name))} in the study. "
                 f"Nothing was changed; give the {what} another name, or choose another --out."
             )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain, product
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,11 @@ from xreset.eval.plots import picture
 from xreset.eval.report.figures import draw_bars
 from xreset.eval.report.groups import estimate
 from xreset.eval.report.read import Training, read_training
-from xreset.eval.results import Table, measured
+from xreset.eval.results import Table
 from xreset.eval.study.file import TableSpec
 from xreset.eval.study.paper import ALL, PaperTable, paper_tables
 from xreset.eval.study.plan import Plan
-from xreset.eval.table import METRICS, Rows
+from xreset.eval.table import METRICS, Rows, estimate_text
 from xreset.objects.catalogue import canonical_name
 from xreset.text import short_name
 
@@ -33,7 +34,7 @@ class FilledTable:
     title: str
     cells: Table
     """One row for each figure: engine, row and column (names as they are shown), mean, low and high (95 % interval;
-    shares, or m; NaN if it was not evaluated or measured), paper and paper_error (percent), text."""
+    shares, or m; NaN if it was not evaluated or measured), the paper's figure (percent), text."""
     trainings: dict[str, list[Training]]
     """Run of the study -> its evaluated trainings."""
     episodes: dict[str, Table]
@@ -84,33 +85,24 @@ def fill(plan: Plan, table: TableSpec) -> FilledTable:
         objects = {key["object"]} if key["object"] != ALL else set(objects_of(plan, run, table))
         own = _episodes_with(episodes[run], engine, objects)
         cell: dict[str, Any] = {"engine": engine, "row": _shown(row_axis, row), "column": _shown(column_axis, column)}
-        if len(own) and measured(own, key["metric"]) is not None:
-            mean, (low, high) = estimate(own, key["metric"])
-            cell |= {"mean": mean, "low": low, "high": high}
-        if figure := stated.get((key["method"], key["object"], key["metric"])):
-            cell["paper"], cell["paper_error"] = figure
-        cells.append(cell | {"text": _text(cell)})
-    names = ["engine", "row", "column", "mean", "low", "high", "paper", "paper_error", "text"]
+        mean, (low, high) = estimate(own, key["metric"]) if len(own) else (nan, (nan, nan))
+        figure = stated.get((key["method"], key["object"], key["metric"]))
+        text = estimate_text(mean, low, high)
+        if figure is not None:
+            text += f", paper {figure[0]:.1f}"
+            if figure[1] is not None:
+                text += f" \N{PLUS-MINUS SIGN} {figure[1]:.1f}"
+        cell |= {"mean": mean, "low": low, "high": high, "paper": figure[0] if figure else nan, "text": text}
+        cells.append(cell)
+    names = ["engine", "row", "column", "mean", "low", "high", "paper", "text"]
     return FilledTable(
         title=table.title or (paper.title if paper else METRICS[table.metric]),
-        cells=pd.DataFrame(cells, columns=names).astype(dict.fromkeys(names[3:8], float)),
+        cells=pd.DataFrame(cells, columns=names),
         trainings=trainings,
         episodes=episodes,
         paper=paper is not None,
         unit="cm" if fixed.get("metric") == "least_distance" else "%",
     )
-
-
-def _text(cell: dict[str, Any]) -> str:
-    """Return the text of a cell: ``93.2 (88-98), paper 90.8 ± 1.5``."""
-    text = "-"
-    if "mean" in cell:
-        text = f"{100 * cell['mean']:.1f} ({100 * cell['low']:.0f}-{100 * cell['high']:.0f})"
-    if "paper" in cell:
-        text += f", paper {cell['paper']:.1f}"
-    if cell.get("paper_error") is not None:
-        text += f" \N{PLUS-MINUS SIGN} {cell['paper_error']:.1f}"
-    return text
 
 
 def trainings_of(plan: Plan, group: str, evaluation: str) -> list[Training]:

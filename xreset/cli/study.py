@@ -62,10 +62,10 @@ def study(
             subset.make()
         problems = launch.launch(todo, [step for step in wanted if not step.done()], per_gpu=per_gpu, say=console.print)
     if only in ("all", "tables"):
-        page = report.write_page(planned(), out / "reports" / todo.name)
-        for note in page.notes:
+        page, notes = report.write_page(planned(), out / "reports" / todo.name)
+        for note in notes:
             console.print(f"note: {note}", style="yellow")
-        console.print(f"page: {page.path}")
+        console.print(f"page: {page}")
     if problems:
         raise RunError("\n".join([f"{len(problems)} steps failed. Finished steps are kept.", *problems]))
 

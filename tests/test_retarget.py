@@ -7,13 +7,12 @@ import json
 import tempfile
 import unittest
 from pathlib import Path
-from typing import Any, ClassVar
 
 import numpy as np
 import torch
 
 from tests.data import data_dir
-from tests.toy_retarget import FLOAT, arm_targets, box_object, check_gradient, hand_targets, slope
+from tests.toy_retarget import FLOAT, arm_targets, box_object, check_gradient, hand_targets
 from tests.toy_robot import toy_hand_arm, toy_motion
 from xreset import robots
 from xreset.cli.retarget import retarget as command
@@ -61,28 +60,6 @@ class ChainTest(unittest.TestCase):
 
 
 class TermTest(unittest.TestCase):
-    def check(self, term, x):
-        """The half gradient of a term at x [B, ...] is half the derivative of its cost."""
-        found = term(x)
-        for index in torch.ones_like(x[0]).nonzero().tolist():
-            at = (slice(None), *index)
-            assert_close(found.gradient[at], slope(lambda x: term(x).cost, x, at) / 2, atol=1e-8, rtol=1e-6)
-        return found
-
-    def test_every_gradient_is_the_derivative_of_its_cost(self):
-        generator = torch.Generator().manual_seed(0)
-        x, target = torch.randn(2, 4, 3, 3, dtype=FLOAT, generator=generator)
-        weight = torch.rand(4, 3, dtype=FLOAT, generator=generator)
-        gap = torch.tensor([0.05, 0.11, 0.5], dtype=FLOAT)[:, None] * torch.nn.functional.normalize(x, dim=-1)
-        for term, at in (
-            (lambda x: terms.difference(x, target, weight), x),
-            (lambda x: terms.direction(x, target, weight), x),
-            (lambda x: terms.contact(x, target, weight, 0.1, 0.02), target + gap),
-        ):
-            found = self.check(term, at)
-            self.assertGreaterEqual(torch.linalg.eigvalsh(found.curvature).min().item(), -1e-12)
-        self.check(lambda d: terms.attraction(d, weight[0], 1.0), torch.tensor([[0.1, -0.3, 1.2]], dtype=FLOAT))
-
     def test_contact_costs_nothing_within_the_margin_and_is_linear_beyond_the_knee(self):
         x = torch.tensor([[[0.05, 0.0, 0.0], [0.11, 0.0, 0.0], [0.5, 0.0, 0.0]]], dtype=FLOAT)
         found = terms.contact(x, torch.zeros_like(x), torch.tensor([[1.0, 3.0, 5.0]], dtype=FLOAT), 0.1, 0.02)
@@ -92,8 +69,9 @@ class TermTest(unittest.TestCase):
         limit = torch.tensor([0.2, 0.2, torch.inf], dtype=FLOAT)
         weight = torch.tensor([2.0, 3.0, 4.0], dtype=FLOAT)
         d = torch.tensor([[0.1, -0.3, 0.5]], dtype=FLOAT)
-        found = self.check(lambda d: terms.change(d, weight, limit, 100.0), d)
+        found = terms.change(d, weight, limit, 100.0)
         assert_close(found.curvature, torch.tensor([[2.0, 103.0, 4.0]], dtype=FLOAT))
+        assert_close(found.gradient, torch.tensor([[0.2, -10.9, 2.0]], dtype=FLOAT))
         self.assertAlmostEqual(found.cost.item(), 2 * 0.01 + 3 * 0.09 + 4 * 0.25 + 100 * 0.01)
 
 
@@ -213,21 +191,6 @@ class HandTest(unittest.TestCase):
                 HandModel(dataclasses.replace(self.robot, **changes))
 
 
-class ConfigTest(unittest.TestCase):
-    def test_numbers_out_of_range_are_refused_by_name(self):
-        config: Any
-        for config, name, value in (
-            (HandConfig, "jump_weight", -1.0),
-            (HandConfig, "contact_knee", 0.0),
-            (HandConfig, "object_clearance", np.nan),
-            (HandConfig, "clearance_growth", (0.1, np.nan)),
-            (ArmConfig, "restarts", 0),
-        ):
-            with self.subTest(name), self.assertRaisesRegex(ValueError, f"^{name} is .*, expected"):
-                config(**{name: value})
-        HandConfig(object_clearance=-0.001, jump_limit=np.inf)  # deeper than the surface; no limit
-
-
 class ArmTest(unittest.TestCase):
     CONFIG = ArmConfig(restarts=12, branches=2)
 
@@ -276,43 +239,29 @@ class ArmTest(unittest.TestCase):
 
 
 class ValidityTest(unittest.TestCase):
-    GOOD: ClassVar = {
-        "annotated": True,
-        "hand_error": 0.005,
-        "wrist_position": 0.001,
-        "wrist_orientation": 0.01,
-        "at_limit": False,
-        "arm_jump": 0.1,
-        "table_clearance": 0.01,
-        "self_clearance": 0.01,
-    }
-    BAD: ClassVar = {
-        "not annotated": {"annotated": False},
-        "hand error": {"hand_error": 0.05},
-        "joint limit": {"wrist_position": 0.02, "at_limit": True},
-        "wrist position": {"wrist_position": 0.02},
-        "wrist orientation": {"wrist_orientation": 0.2},
-        "arm jump": {"arm_jump": 0.5},
-        "table collision": {"table_clearance": -0.01},
-        "self collision": {"self_clearance": -0.01},
-    }
-
-    def reason(self, **changes) -> str:
-        measures = Measures(**{name: torch.tensor([value]) for name, value in (self.GOOD | changes).items()})
-        return REASONS[int(classify(measures, Thresholds()))]
-
     def test_every_reason_can_be_reached_and_the_first_counts(self):
-        self.assertEqual(self.reason(), "valid")
-        self.assertEqual(self.reason(at_limit=True), "valid")  # a limit alone does no harm
-        self.assertEqual(list(self.BAD), list(REASONS[1:]))
+        good = {"annotated": True, "at_limit": False, "arm_jump": 0.1, "table_clearance": 0.01, "self_clearance": 0.01}
+        good |= dict.fromkeys(("hand_error", "wrist_position", "wrist_orientation"), 0.001)
+
+        def reason(**changes) -> str:
+            measures = Measures(**{name: torch.tensor([value]) for name, value in (good | changes).items()})
+            return REASONS[int(classify(measures, Thresholds()))]
+
+        self.assertEqual(reason(), "valid")
+        self.assertEqual(reason(at_limit=True), "valid")  # a limit alone does no harm
         everything = {}
-        for name, changes in reversed(self.BAD.items()):
+        for name, changes in (
+            ("self collision", {"self_clearance": -0.01}),
+            ("table collision", {"table_clearance": -0.01}),
+            ("arm jump", {"arm_jump": 0.5}),
+            ("wrist orientation", {"wrist_orientation": 0.2}),
+            ("wrist position", {"wrist_position": 0.02}),
+            ("joint limit", {"wrist_position": 0.02, "at_limit": True}),
+            ("hand error", {"hand_error": float("nan")}),
+            ("not annotated", {"annotated": False}),
+        ):
             everything |= changes
-            self.assertEqual(self.reason(**changes), name)
-            self.assertEqual(self.reason(**everything), name)
-        for name, value in self.GOOD.items():
-            if isinstance(value, float):
-                self.assertNotEqual(self.reason(**{name: float("nan")}), "valid", name)
+            self.assertEqual((reason(**changes), reason(**everything)), (name, name))
 
 
 class PipelineTest(unittest.TestCase):

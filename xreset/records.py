@@ -122,7 +122,7 @@ def read_npz(
                 f"found {', '.join(sorted(set(members) - {'schema'}))}."
             )
         arrays = archive.read([name for name in own if name in members])
-    problem = _wrong_shape(arrays, own) or _wrong_value(arrays, schema)
+    problem = _wrong_shape(arrays, own) or wrong_value(arrays, schema)
     if problem is None and check is not None:
         problem = check(arrays)
     if problem is not None:
@@ -243,7 +243,8 @@ def _wrong_shape(arrays: Mapping[str, np.ndarray], schema: Schema) -> str | None
 _KINDS = {"f": "floating-point", "i": "integer", "b": "bool", "U": "text"}
 
 
-def _wrong_value(arrays: Mapping[str, np.ndarray], schema: Schema) -> str | None:
+def wrong_value(arrays: Mapping[str, np.ndarray], schema: Schema) -> str | None:
+    """Return what is wrong with the values of arrays whose types and shapes are right, or None."""
     for name, field in schema.items():
         array = arrays.get(name)
         if array is None or array.dtype.kind == "b":

@@ -200,8 +200,7 @@ def split(file: Source, *, out: Path, rest: Path, selection: Flat[Selection] = S
 
 
 def merge(files: Sources, *, out: Path) -> None:
-    """Merge archives. A sequence that several archives hold is kept once; archives that contradict each other are
-    refused.
+    """Merge archives of one frame rate, whose sequences have different names.
 
     Args:
         files: Archives of demonstrations.

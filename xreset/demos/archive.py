@@ -18,7 +18,18 @@ from scipy.spatial.transform import Rotation
 from xreset.checks import is_rigid
 from xreset.errors import DemoError, ObjectError
 from xreset.objects.catalogue import canonical_names, load_object, object_names, official_name
-from xreset.records import POSITION, RATE, UNIT_TOLERANCE, Field, arrays_of, offsets_problem, read_record, write_record
+from xreset.records import (
+    POSITION,
+    RATE,
+    UNIT_TOLERANCE,
+    Field,
+    arrays_of,
+    offsets_problem,
+    read_record,
+    schema_of,
+    write_record,
+    wrong_value,
+)
 from xreset.spec import ObjectSpec
 from xreset.text import shown
 
@@ -84,11 +95,11 @@ class Demos(ObjectMotions):
     wrist_quat_wxyz: Annotated[np.ndarray, Field(("F", 4), "f", within=None)]
     """[F, 4] orientation of MANO's root: a right hand's fingers point along its -x, its palm faces -y; NaN where not
     annotated."""
-    object_pos: Annotated[np.ndarray, Field(("F", 3), "f", within=None)]
+    object_pos: Annotated[np.ndarray, Field(("F", 3), "f", within=POSITION)]
     """[F, 3] origin of the object's mesh frame."""
-    object_quat_wxyz: Annotated[np.ndarray, Field(("F", 4), "f", within=None)]
+    object_quat_wxyz: Annotated[np.ndarray, Field(("F", 4), "f", unit=True)]
     """[F, 4]"""
-    fps: Annotated[float, Field((), "f", within=None, dtype=np.float32)]
+    fps: Annotated[float, Field((), "f", within=RATE, dtype=np.float32)]
     """Frames per second."""
     subjects: Annotated[np.ndarray, Field(("B",), "U")] | None = None
     """[B] the subjects that ``T_level_from_table`` is given for."""
@@ -247,19 +258,17 @@ def one_sequence(
 
 
 def merge_demos(parts: Sequence[Demos]) -> Demos:
-    """Join several sets of demonstrations, one after another, levelled. A sequence that is in several of them is kept
-    once.
+    """Join several sets of demonstrations, one after another, levelled.
 
     Raises:
-        DemoError: there is nothing to join, or the parts contradict each other: in their frame rates, or in a sequence
-            of the same name.
+        DemoError: there is nothing to join, the parts differ in their frame rates, or two sequences have the same name.
     """
     if not parts:
         raise DemoError("There are no demonstrations to join.")
     rates = sorted({round(float(part.fps), 3) for part in parts})
     if len(rates) > 1:
         raise DemoError(f"Demonstrations in one file must have one frame rate, but these have the frame rates {rates}.")
-    parts = _without_repeats([levelled(part) for part in parts])
+    parts = [levelled(part) for part in parts]
     joined = {}
     for name in _PER_SEQUENCE + _PER_FRAME:
         joined[name] = np.concatenate([getattr(part, name) for part in parts])
@@ -311,23 +320,6 @@ def levelled(demos: Demos) -> Demos:
     )
 
 
-def _without_repeats(parts: Sequence[Demos]) -> list[Demos]:
-    """Return the sequences of the parts one by one, each name once."""
-    kept: dict[str, Demos] = {}
-    for part in parts:
-        for i, name in enumerate(part.sequence_name.tolist()):
-            one = part.select(indices=[i])
-            first = kept.setdefault(name, one)
-            if first is not one and _content(first) != _content(one):
-                raise DemoError(f"There are two different sequences of the name {name!r}. Rename one.")
-    return list(kept.values())
-
-
-def _content(demos: Demos) -> list[Any]:
-    texts = [getattr(demos, name).tolist() for name in _PER_SEQUENCE]
-    return texts + [getattr(demos, name).tobytes() for name in _PER_FRAME]
-
-
 def read_demos(path: str | Path) -> Demos:
     """Read an archive; all of it is checked before any of it is used. Objects get their official names.
 
@@ -375,13 +367,14 @@ def _offsets(lengths: Sequence[int] | np.ndarray) -> np.ndarray:
 
 
 def _check(demos: Demos) -> None:
-    problem = _problem(arrays_of(demos))
+    arrays = arrays_of(demos)
+    problem = wrong_value(arrays, schema_of(Demos)) or _problem(arrays)
     if problem:
         raise DemoError(f"The demonstrations cannot be used: {problem}")
 
 
 def _problem(arrays: Mapping[str, Any]) -> str | None:
-    """Return the first thing that is wrong with the values, or None. Types and shapes have been checked."""
+    """Return the first contradiction, or None. Types, shapes and the fields' own ranges have been checked."""
     offsets = np.asarray(arrays["frame_offsets"])
     names = arrays["sequence_name"]
     problem = offsets_problem(arrays, len(arrays["object_pos"]))
@@ -391,44 +384,25 @@ def _problem(arrays: Mapping[str, Any]) -> str | None:
     if wrong_side.any():
         i = int(np.argmax(wrong_side))
         return f"sequence {i} ({names[i]!s}) has hand_side {str(arrays['hand_side'][i])!r}, expected 'right' or 'left'."
-    if not RATE[0] <= arrays["fps"] <= RATE[1]:
-        return f"fps is {arrays['fps']}, expected a number from {RATE[0]:g} to {RATE[1]:g}."
     level = arrays.get("T_level_from_table")
     if (arrays.get("subjects") is None) != (level is None):
         return "subjects and T_level_from_table belong together, but one of them is missing."
     if level is not None and not all(is_rigid(T) for T in np.asarray(level, dtype=float)):
         return "T_level_from_table has a matrix that is not a rotation and translation."
-    for problem, wrong in _wrong_in_frames(arrays).items():
-        bad = wrong.reshape(len(wrong), -1).any(axis=1)
-        if bad.any():
-            frame = int(np.argmax(bad))
-            sequence = int(np.searchsorted(offsets, frame, side="right")) - 1
-            return f"{problem} First in frame {frame - offsets[sequence]} of sequence {sequence} ({names[sequence]!s})."
-    return None
-
-
-def _wrong_in_frames(arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return a sentence for each kind of problem -> [F, ...] bool, where it occurs."""
-    valid = np.asarray(arrays["hand_valid"])
     # the values of the hand's arrays do not matter in frames without a hand
+    valid = np.asarray(arrays["hand_valid"])
     hand = np.where(valid[:, None, None], arrays["hand_keypoints"], 0.0)
-    wrist = np.where(valid[:, None], arrays["wrist_quat_wxyz"], [1.0, 0.0, 0.0, 0.0])
     with np.errstate(invalid="ignore"):
-        size = np.linalg.norm(hand[:, 1:] - hand[:, :1], axis=2)
-    hint = "If the hand is unknown there, set hand_valid to False."
-    far = f"not finite, or more than {POSITION[1]:g} m from the table."
-    problems = {
-        f"object_pos is {far}": _beyond(arrays["object_pos"], POSITION[1]),
-        f"hand_keypoints is not finite. {hint}": ~np.isfinite(hand),
-        f"hand_keypoints are more than {_HAND} m from the wrist. Are these millimetres?": _beyond(size, _HAND),
-        f"hand_keypoints is {far}": _beyond(hand, POSITION[1]),
-    }
-    for name, quats, advice in (("object_quat_wxyz", arrays["object_quat_wxyz"], ""), ("wrist_quat_wxyz", wrist, hint)):
-        off = _beyond(np.linalg.norm(quats, axis=1) - 1, UNIT_TOLERANCE)
-        problems[f"{name} is not a unit quaternion. {advice}".strip()] = off
-    return problems
-
-
-def _beyond(values: np.ndarray, limit: float) -> np.ndarray:
-    """Return where values are larger than the limit, or NaN."""
-    return ~(np.abs(values) <= limit)
+        size = np.linalg.norm(hand[:, 1:] - hand[:, :1], axis=2).max(axis=1)
+        length = np.linalg.norm(arrays["wrist_quat_wxyz"], axis=1)
+    for problem, fits in (
+        (f"hand_keypoints are not finite or more than {_HAND} m from the wrist. Are these millimetres?", size <= _HAND),
+        ("hand_keypoints are far from the table.", np.abs(hand[:, 0]).max(axis=1) <= POSITION[1]),
+        ("wrist_quat_wxyz is not a unit quaternion.", ~valid | (np.abs(length - 1) <= UNIT_TOLERANCE)),
+    ):
+        if not fits.all():
+            frame = int(np.argmin(fits))
+            sequence = int(np.searchsorted(offsets, frame, side="right")) - 1
+            where = f"First in frame {frame - offsets[sequence]} of sequence {sequence} ({names[sequence]!s})."
+            return f"{problem} {where} If the hand is unknown there, set hand_valid to False."
+    return None

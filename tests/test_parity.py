@@ -113,7 +113,7 @@ class Episodes(unittest.TestCase):
         self.home = torch.as_tensor(self.robot.home)[None]
 
     def test_fingertips_move_towards_and_away_from_the_opposite_ones(self):
-        for name, distance in (("ur7e-sharpa", 0.01), ("ur7e-sharpa", -0.01), ("openarm", 0.01), ("openarm", -0.005)):
+        for name, distance in (("ur7e-sharpa", 0.01), ("openarm", -0.005)):
             kinematics = Kinematics(robots.load(name))
             home = torch.as_tensor(kinematics.robot.home)[None]
             q = moved_fingertips(kinematics, home, distance)
@@ -311,14 +311,12 @@ class Comparing(unittest.TestCase):
 
     def test_outcomes_are_mixed(self):
         """Else an engine in which nothing, or everything, is carried would agree."""
+        floor = {metric.metric: metric for metric in self.result.floor.metrics}["press, total"]
+        self.assertTrue(floor.ok)
+        self.assertGreater(floor.measured or 0.0, 0.0)
         outcomes = self.result.reference.carried
         self.assertEqual(set(outcomes["closing"]), {True, False})
         self.assertEqual(set(outcomes["hold 0.5"] + outcomes["hold 0.8"]), {True, False})
-
-    def test_the_timestep_matters_little(self):
-        metrics = {metric.metric: metric for metric in self.result.floor.metrics}
-        self.assertTrue(metrics["press, total"].ok)
-        self.assertGreater(metrics["press, total"].measured or 0.0, 0.0)
 
     def test_what_differs_is_seen(self):
         for name, missed in (
@@ -336,12 +334,6 @@ class Comparing(unittest.TestCase):
         self.assertGreaterEqual(len(closed), 2, labels)
         self.assertNotIn(self.result.floor.engine.name, closed)
 
-    def test_results_are_json(self):
-        data = json.loads(json.dumps(self.result.as_dict(), allow_nan=False))
-        self.assertEqual(data["schema"], "xreset-parity/1")
-        self.assertFalse(data["ok"])
-        self.assertEqual(len(data["grasps"]["hold"]), len(data["engines"][0]["carried"]["hold 0.5"]))
-
     def test_the_exit_code_of_the_command_says_the_verdict(self):
         folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
         path = folder / "retargeted.npz"
@@ -353,7 +345,9 @@ class Comparing(unittest.TestCase):
             self.assertEqual(found, code)
             self.assertIn("press, fingertip", text)
             self.assertIn("missed: heavy: hold, outcome" if code else "all targets met", text)
-            self.assertEqual(json.loads((folder / "parity.json").read_text())["ok"], not code)
+            data = json.loads((folder / "parity.json").read_text())
+            self.assertEqual((data["schema"], data["ok"]), ("xreset-parity/1", not code))
+        self.assertEqual(len(data["grasps"]["hold"]), len(data["reference"]["carried"]["hold 0.5"]))
         for said, words in (
             ("there is no ", [folder / "none.npz"]),
             ("--grasps is 0, expected a whole number from 1", [path, "--grasps", 0]),

@@ -207,7 +207,7 @@ class Pictures(WithFiles):
             yellow.append(((picture > [240, 190, -1]) & (picture < [256, 256, 60])).all(axis=-1).any())
         self.assertEqual(yellow, [False, True, False])
 
-    def test_png_from_the_command_line(self):
+    def test_png_and_film_from_the_command_line(self):
         out = self.folder / "view.png"
         code, text = run("view", self.retargeted, "--png", out, "--sequence", 1, "--frame", 1)
         self.assertEqual(code, 0, text)
@@ -215,17 +215,13 @@ class Pictures(WithFiles):
         expected = self.folder / "expected.png"
         write_png(expected, Drawer(load_view(self.retargeted), size=(960, 720), smooth=True).draw(5))
         self.assertEqual(out.read_bytes(), expected.read_bytes())
+        if find_spec("imageio_ffmpeg"):
+            film = self.folder / "view.mp4"
+            self.assertIn("2 frames", run("view", self.bank, "--mp4", film, "--sequence", 0)[1])
+            self.assertEqual(film.read_bytes()[4:8], b"ftyp")
         code, text = run("view", self.retargeted, "--png", out, "--frame", 4)
         self.assertEqual(code, 1)
         self.assertIn("Frame 4 does not exist", text)
-
-    @unittest.skipUnless(find_spec("imageio_ffmpeg"), "imageio-ffmpeg is not installed")
-    def test_mp4_from_the_command_line(self):
-        out = self.folder / "view.mp4"
-        code, text = run("view", self.bank, "--mp4", out, "--sequence", 0)
-        self.assertEqual(code, 0, text)
-        self.assertIn("2 frames", text)
-        self.assertEqual(out.read_bytes()[4:8], b"ftyp")
 
     def test_without_viser_the_message_says_what_to_install(self):
         with mock.patch.dict(sys.modules, {"viser": None}):
@@ -271,13 +267,6 @@ class Served(WithFiles):
         page._step(1)
         page.show()
         self.assertEqual(page.row, 5)
-
-    def test_a_bank_is_filtered(self):
-        page = self.page(self.bank)
-        self.assertEqual((page.row, page._frame.max), (0, 5))
-        page._sequence.value = "1: demo_b"
-        page._choose()
-        self.assertEqual(page.row, 2)
         page._rows = page._rows[:0]
         page.show()
         self.assertIn("nothing", page._text.content)

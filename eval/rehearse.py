@@ -211,7 +211,7 @@ def _play(
                 result.update(reading, out_of_bounds(reading.task_state.object_pos, table, env.task.termination))
 
             seeds = [(trial.seed, int(sequence[item]), int(repetition[item])) for item in r.items]
-            driver = FaultyDriver(env, [fault] * env.num_envs, seeds, look, real_time=real_time)
+            driver = FaultyDriver(env, fault, seeds, look, real_time=real_time)
             outcome = Runner(controller, driver).run(env.max_episode_length * controller.dt)
             for world in r.fresh:
                 item = int(r.items[world])

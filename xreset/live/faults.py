@@ -66,12 +66,12 @@ class Faults(Checked):
 
 
 class FaultyDriver(EngineDriver):
-    """Worlds of an environment, each with its own faults."""
+    """Worlds of an environment with the same faults, each with draws of its own."""
 
     def __init__(
         self,
         env: ManipulationEnv,
-        faults: Sequence[Faults],
+        faults: Faults,
         seeds: Sequence[Sequence[int]],
         look: Callable[[int], None] = lambda step: None,
         *,
@@ -81,8 +81,8 @@ class FaultyDriver(EngineDriver):
 
         Args:
             env: the worlds.
-            faults: faults of each world.
-            seeds: seed of each world's faults.
+            faults: faults of all worlds.
+            seeds: seed of each world's draws.
             look: called with (control steps done) after every control step.
             real_time: whether the simulation waits for the wall clock.
         """
@@ -97,42 +97,34 @@ class FaultyDriver(EngineDriver):
             """[N, ...] uniform numbers in [-1, 1); the same ones whatever the faults are."""
             return np.stack([generator.uniform(-1.0, 1.0, shape) for generator in generators])
 
-        def each(name: str) -> np.ndarray:
-            return np.array([getattr(fault, name) for fault in faults])
-
-        share = np.where(each("drawn_delays")[:, None], (drawn(3) + 1.0) / 2.0, 1.0)
-        self._interval = np.maximum(1, np.round(each("tracker_interval") / self._dt).astype(int))
-        jitter = each("pose_jitter")[:, None] * drawn(steps)
-        self._pose_delay = np.maximum(0.0, (each("pose_delay") * share[:, 0])[:, None] + jitter)
-        bias = (
-            drawn(1, 6) * np.repeat(np.stack((each("position_bias"), each("angle_bias")), axis=1), 3, axis=1)[:, None]
-        )
-        noise = np.repeat(np.stack((each("position_noise"), each("angle_noise")), axis=1), 3, axis=1)[:, None]
-        self._error = bias + noise * drawn(steps, 6)
-        self._lost = self._gaps(each("lost_frames"), drawn(int(seconds / Faults.LOSS_PERIOD) + 1), steps)
-        delay = np.where(
-            env.actions.is_arm.cpu().numpy(),
-            *((each(f"{part}_delay") * share[:, 1 + i])[:, None] for i, part in enumerate(("arm", "hand"))),
-        )
+        share = (drawn(3, 1) + 1.0) / 2.0
+        if not faults.drawn_delays:
+            share = np.ones_like(share)
+        self._interval = max(1, round(faults.tracker_interval / self._dt))
+        self._pose_delay = np.maximum(0.0, faults.pose_delay * share[:, 0] + faults.pose_jitter * drawn(steps))
+        bias = np.repeat((faults.position_bias, faults.angle_bias), 3)
+        noise = np.repeat((faults.position_noise, faults.angle_noise), 3)
+        self._error = bias * drawn(1, 6) + noise * drawn(steps, 6)
+        self._lost = self._gaps(faults.lost_frames, drawn(int(seconds / Faults.LOSS_PERIOD) + 1), steps)
+        is_arm = env.actions.is_arm.cpu().numpy()
+        delay = np.where(is_arm, faults.arm_delay * share[:, 1], faults.hand_delay * share[:, 2])
         self._delay = np.round(delay / scene.timestep).astype(np.int64)
-        self._missed = (drawn(steps) + 1.0) / 2.0 < each("missed_deadlines")[:, None]
-        self._plan_pushes(each("object_push"), each("arm_push"), drawn, steps)
+        self._missed = (drawn(steps) + 1.0) / 2.0 < faults.missed_deadlines
+        self._plan_pushes(faults, drawn, steps)
         self._frames: list[dict[str, np.ndarray]] = []
         self._shown: dict[str, np.ndarray] = {}
         self._sent: list[tuple[np.ndarray, np.ndarray]] = []
         self._current = env.joint_target.cpu().numpy().copy()
 
-    def _gaps(self, length: np.ndarray, where: np.ndarray, steps: int) -> np.ndarray:
+    def _gaps(self, length: float, where: np.ndarray, steps: int) -> np.ndarray:
         """[N, C] whether the pose of a step is lost."""
         period = Faults.LOSS_PERIOD
-        start = period * np.arange(where.shape[1]) + (where + 1.0) / 2.0 * np.maximum(0.0, period - length)[:, None]
+        start = period * np.arange(where.shape[1]) + (where + 1.0) / 2.0 * max(0.0, period - length)
         time = np.arange(steps)[None, :, None] * self._dt
-        inside = (time >= start[:, None]) & (time < start[:, None] + length[:, None, None])
+        inside = (time >= start[:, None]) & (time < start[:, None] + length)
         return inside.any(axis=2)
 
-    def _plan_pushes(
-        self, velocity: np.ndarray, torque: np.ndarray, drawn: Callable[..., np.ndarray], steps: int
-    ) -> None:
+    def _plan_pushes(self, faults: Faults, drawn: Callable[..., np.ndarray], steps: int) -> None:
         """Set the changes of the object's velocity [N, C, 3] and the offsets of the targets [N, C, J]."""
         robot = self.env.backend.scene.robot
         count = int(steps * self._dt / Faults.PUSH_PERIOD) + 1
@@ -147,8 +139,8 @@ class FaultyDriver(EngineDriver):
         self._offset = np.zeros((len(step), steps, len(reach)))
         world, event = np.nonzero(step < steps)
         at = step[world, event]
-        self._velocity[world, at] = velocity[world, None] * direction[world, event]
-        self._offset[world, at] = torque[world, None] * offset[world, event]
+        self._velocity[world, at] = faults.object_push * direction[world, event]
+        self._offset[world, at] = faults.arm_push * offset[world, event]
 
     @property
     def _step(self) -> int:

@@ -23,44 +23,40 @@ class Kinematics:
 
     def links(self, joint_pos: Array, joint_vel: Array) -> Links:
         """Return the links of joint positions and velocities [N, J]."""
-        count = len(joint_pos)
-        joint_pos = joint_pos.astype(np.float64)
-        joint_vel = joint_vel.astype(np.float64)
-        base = np.array(self._chain["base"])
-        rotations = [np.tile(base[:3, :3], (count, 1, 1))]
-        positions = [np.tile(base[:3, 3], (count, 1))]
-        velocities = [np.zeros((count, 3))]
-        spins = [np.zeros((count, 3, 3))]  # matrices W with W @ v = angular velocity x v
+        poses = [np.tile(np.array(self._chain["base"]), (len(joint_pos), 1, 1))]
         for step in self._steps:
-            parent = step["parent"]
-            rotation = rotations[parent] @ step["origin"][:3, :3]
-            arm = rotations[parent] @ step["origin"][:3, 3]
-            spin = spins[parent]
-            drift = 0.0
+            pose = poses[step["parent"]] @ step["origin"]
             if step["joint"] is not None:
-                value = (step["multiplier"] * joint_pos[:, step["joint"]] + step["offset"])[:, None]
-                speed = (step["multiplier"] * joint_vel[:, step["joint"]])[:, None]
+                value = step["multiplier"] * joint_pos[:, step["joint"], None].astype(np.float64) + step["offset"]
+                rotation = pose[:, :3, :3]
                 if step["type"] == "prismatic":
-                    axis = rotation @ step["axis"]
-                    arm = arm + axis * value
-                    drift = axis * speed
-                else:
-                    spin = spin + speed[:, None] * (rotation @ step["cross"] @ rotation.transpose(0, 2, 1))
-                    # Rodrigues' formula
-                    turn = np.sin(value)[:, None] * step["cross"] + (1.0 - np.cos(value))[:, None] * step["twice"]
-                    rotation = rotation + rotation @ turn
-            rotations.append(rotation)
-            positions.append(positions[parent] + arm)
-            velocities.append(velocities[parent] + (spins[parent] @ arm[..., None])[..., 0] + drift)
-            spins.append(spin)
+                    pose[:, :3, 3] += value * (rotation @ step["axis"])
+                else:  # Rodrigues' formula
+                    angle = value[:, None]
+                    pose[:, :3, :3] += rotation @ (np.sin(angle) * step["cross"] + (1 - np.cos(angle)) * step["twice"])
+            poses.append(pose)
         palm = self._chain["palm"]
-        spin = spins[palm]
+        palm_pos = poses[palm][:, :3, 3]
+        linvel = np.zeros_like(palm_pos)
+        angvel = np.zeros_like(palm_pos)
+        index = palm
+        while index > 0:
+            step = self._steps[index - 1]
+            if step["joint"] is not None:
+                speed = step["multiplier"] * joint_vel[:, step["joint"], None].astype(np.float64)
+                axis = speed * (poses[index][:, :3, :3] @ step["axis"])
+                if step["type"] == "prismatic":
+                    linvel += axis
+                else:
+                    angvel += axis
+                    linvel += np.cross(axis, palm_pos - poses[index][:, :3, 3])
+            index = step["parent"]
         return Links(
-            palm_pos=positions[palm].astype(np.float32),
-            palm_quat=_quaternion(rotations[palm]).astype(np.float32),
-            palm_linvel=velocities[palm].astype(np.float32),
-            palm_angvel=np.stack((spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]), axis=1).astype(np.float32),
-            tip_pos=np.stack([positions[tip] for tip in self._chain["tips"]], axis=1).astype(np.float32),
+            palm_pos=palm_pos.astype(np.float32),
+            palm_quat=_quaternion(poses[palm][:, :3, :3]).astype(np.float32),
+            palm_linvel=linvel.astype(np.float32),
+            palm_angvel=angvel.astype(np.float32),
+            tip_pos=np.stack([poses[tip][:, :3, 3] for tip in self._chain["tips"]], axis=1).astype(np.float32),
         )
 
 

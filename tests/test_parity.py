@@ -18,15 +18,16 @@ from xreset import robots
 from xreset.errors import DemoError
 from xreset.eval.engines.actions import grasp_and_lift
 from xreset.eval.engines.agreement import Metric, carried, compare, outcome_metric, palm_distance, press_metrics
-from xreset.eval.engines.episodes import (
+from xreset.eval.engines.grasps import (
     GraspMotion,
+    Grasps,
     carried_palm,
     closing_episode,
+    find_grasps,
     lifting_targets,
     moved_fingertips,
     squeezed,
 )
-from xreset.eval.engines.grasps import Grasps, find_grasps
 from xreset.eval.engines.recording import Recording
 from xreset.eval.trial import engine
 from xreset.geometry.kinematics import Kinematics

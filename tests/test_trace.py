@@ -18,9 +18,8 @@ from tests.toy_bank import SOUP, SPAM
 from tests.toy_grasp import recording
 from xreset.errors import DemoError, FileFormatError, XResetError
 from xreset.eval.engines.actions import Actions, from_file, read_actions, recorded_actions, write_actions
-from xreset.eval.engines.divergence import THRESHOLDS, Divergence, differences
 from xreset.eval.engines.recording import Recording
-from xreset.eval.engines.replay import TraceResult, trace
+from xreset.eval.engines.replay import THRESHOLDS, Divergence, TraceResult, differences, trace
 from xreset.eval.engines.trace_view import rich_table, sentences, write_plot
 from xreset.eval.results import write_results
 from xreset.eval.rollout import roll_out

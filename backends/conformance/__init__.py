@@ -17,7 +17,6 @@ from pathlib import Path
 
 from xreset.backends.conformance import (
     contact_checks,
-    friction_checks,
     grasp_checks,
     motion_checks,
     robot_checks,
@@ -33,7 +32,7 @@ from xreset.spec import RobotSpec
 
 __all__ = ["CHECKS", "SCHEMA", "Bench", "Check", "CheckResult", "MakeBackend", "Measure", "run", "scene"]
 
-_MODULES = (state_checks, world_checks, robot_checks, motion_checks, contact_checks, friction_checks, grasp_checks)
+_MODULES = (state_checks, world_checks, robot_checks, motion_checks, contact_checks, grasp_checks)
 _TABLE = tomllib.loads(Path(__file__).with_name("checks.toml").read_text())
 
 

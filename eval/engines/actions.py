@@ -19,8 +19,7 @@ import torch
 
 from xreset.description import load_robot
 from xreset.errors import DemoError, FileFormatError
-from xreset.eval.engines.episodes import STANDARD, closing_episode
-from xreset.eval.engines.grasps import Grasps, find_grasps
+from xreset.eval.engines.grasps import STANDARD, Grasps, closing_episode, find_grasps
 from xreset.eval.engines.recording import Recording
 from xreset.eval.results import TRACE_SCHEMA, mesh_folder, read_result, read_traces
 from xreset.eval.rollout import Trace

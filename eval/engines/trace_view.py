@@ -10,8 +10,7 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from xreset.eval.engines.divergence import THRESHOLDS, Divergence
-from xreset.eval.engines.replay import PERTURBATION, EngineTrace, TraceResult
+from xreset.eval.engines.replay import PERTURBATION, THRESHOLDS, Divergence, EngineTrace, TraceResult
 from xreset.eval.plots import COLORS, picture
 
 _SHOWN = {

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import fields
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from typing import Any, ClassVar, get_args
@@ -65,8 +65,10 @@ _SET_PER_WORLD = (
 They, and all that MuJoCo derives from them, must be batched, or every world gets the values of world 0.
 """
 
-_VECTORS = {"friction": wp.vec3, "object_com": wp.vec3, "inertia": wp.vec3, "com": wp.vec3, "invweight": wp.vec2}
-"""Types of the parameters and nominal values that are no plain numbers, for Warp."""
+_TYPES = dict.fromkeys(("pos", "linvel", "angvel", "object_pos", "object_linvel", "object_angvel"), wp.vec3)
+_TYPES |= dict.fromkeys(("tip_force", "table_force", "friction", "object_com", "inertia", "com"), wp.vec3)
+_TYPES |= {"quat": wp.quat, "object_quat": wp.quat, "invweight": wp.vec2}
+"""Types for Warp of values that are no plain numbers."""
 
 _SOLVER_ITERATIONS = 8
 """Most Newton iterations; worlds that have converged stop earlier, but a step waits for the slowest. With 8 the
@@ -151,11 +153,8 @@ class MujocoWarpBackend(Backend):
 
     def set_state(self, state: State, worlds: Tensor | None = None) -> None:
         self._must_be_open()
-        index = self._selected(worlds)
-        for name, value in self._checked_state(state, len(index)).items():
-            self._coming[name][index] = value
-        self._mask.zero_()
-        self._mask[index] = True
+        index = self._choose(worlds)
+        self._coming[index] = self._checked_state(state, len(index))
         with self._on_stream():
             self._run("begin")
 
@@ -165,7 +164,8 @@ class MujocoWarpBackend(Backend):
 
     def set_joint_targets(self, targets: Tensor) -> None:
         self._must_be_open()
-        self._ctrl.copy_(self._checked("joint_target", targets, self._ctrl.shape))
+        present = self._state.joint_target
+        present.copy_(self._checked("joint_target", targets, present.shape))
 
     def step(self, substeps: int | None = None) -> None:
         self._must_be_open()
@@ -196,8 +196,7 @@ class MujocoWarpBackend(Backend):
             present = self._parameters[name]
             mine = self._mask.view(-1, *[1] * (present.ndim - 1))
             torch.where(mine, self._checked(name, value, present.shape), present, out=present)
-        for name, value in self._checked_state(state, self.num_worlds).items():
-            self._coming[name].copy_(value)
+        self._coming.map(Tensor.copy_, self._checked_state(state, self.num_worlds))
         with self._on_stream():
             self._run("begin")
 
@@ -218,11 +217,9 @@ class MujocoWarpBackend(Backend):
 
     def _set(self, name: Parameter, value: Tensor, worlds: Tensor | None) -> None:
         self._must_be_open()
-        index = self._selected(worlds)
+        index = self._choose(worlds)
         present = self._parameters[name]
         present[index] = self._checked(name, value, (len(index), *present.shape[1:]))
-        self._mask.zero_()
-        self._mask[index] = True
         with self._on_stream():
             self._run("parameters")
 
@@ -241,13 +238,15 @@ class MujocoWarpBackend(Backend):
     def _allocate(self) -> None:
         """Allocate the arrays that the worlds are read into, and name the arrays that setters write to."""
         n = self.num_worlds
-        robot = self.scene.robot
+        tips = len(self.scene.robot.fingertips)
         at = self._at
+
+        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+            return torch.zeros(n, *shape, dtype=dtype, device=self.device)
 
         def ints(values: np.ndarray) -> Any:
             return wp.array(values.astype(np.int32), dtype=int)
 
-        self._out = kernels.outputs(n, len(robot.joints), len(robot.fingertips))
         joints = at.joints
         self._addresses = [ints(at.qpos[joints.driven]), ints(at.dof[joints.driven])]
         self._mimic = [ints(at.qpos[joints.mimic]), ints(at.dof[joints.mimic]), ints(joints.source)]
@@ -260,18 +259,18 @@ class MujocoWarpBackend(Backend):
         self._geom_role = ints(at.geom_role)
         self._friction_columns = ints(at.friction_column)
 
-        self._ctrl = wp.to_torch(self._data.ctrl)
         self._xfrc_applied = wp.to_torch(self._data.xfrc_applied)
         self._overflow = wp.to_torch(self._data.overflow)
-        view = {name: wp.to_torch(array) for name, array in self._out.items()}
-        view["joint_target"] = self._ctrl
-        self._nonfinite = view["nonfinite"]
-        self._state = State(**{field.name: view[field.name] for field in fields(State)})
-        self._links = Links(**{field.name: view[f"link_{field.name}"] for field in fields(Links)})
-        self._contacts = Contacts(**{field.name: view[field.name] for field in fields(Contacts)})
+        self._coming = State.initial(self.scene, self.object_index).to(self.device)
+        self._state = replace(self._coming.clone(), joint_target=wp.to_torch(self._data.ctrl))
+        self._nonfinite = zeros(dtype=torch.bool)
+        links = {name: zeros(1 + tips, 3) for name in ("pos", "linvel", "angvel")}
+        self._links = Links(quat=zeros(1 + tips, 4), **links)
+        self._contacts = Contacts(
+            tip_force=zeros(tips, 3), tip_touch=zeros(tips, dtype=torch.bool), table_force=zeros(3)
+        )
         self._every_world = torch.arange(n, device=self.device)
-        self._mask = torch.zeros(n, dtype=torch.bool, device=self.device)
-        self._coming = {field.name: torch.zeros_like(view[field.name]) for field in fields(State)}
+        self._mask = zeros(dtype=torch.bool)
         self._name_parameters()
 
     def _name_parameters(self) -> None:
@@ -327,7 +326,7 @@ class MujocoWarpBackend(Backend):
     def _read_contacts(self) -> None:
         """Read the forces of the last step's contacts; their arrays stay until the next step."""
         d = self._data
-        outputs = [self._out[name] for name in ("tip_force", "tip_touch", "table_force")]
+        outputs = _arrays(vars(self._contacts))
         for array in outputs:
             array.zero_()
         contact = d.contact
@@ -343,33 +342,31 @@ class MujocoWarpBackend(Backend):
         """Translate positions and velocities of joints, object and links."""
         m = self._model
         d = self._data
-        out = self._out
         mjw.com_vel(m, d)
-        state = ("joint_pos", "joint_vel", "object_pos", "object_quat", "object_linvel", "object_angvel", "nonfinite")
+        state = {name: value for name, value in vars(self._state).items() if name != "joint_target"}
         wp.launch(
             kernels.read_state,
             dim=self.num_worlds,
             inputs=[*self._addresses, self._at.object_qpos, self._at.object_dof, d.qpos, d.qvel],
-            outputs=[out[name] for name in state],
+            outputs=_arrays(state | {"nonfinite": self._nonfinite}),
         )
         wp.launch(
             kernels.read_links,
-            dim=out["link_pos"].shape,
+            dim=self._links.pos.shape[:2],
             inputs=[*self._link_arrays, m.body_rootid, d.xpos, d.xquat, d.cvel, d.subtree_com],
-            outputs=[out[name] for name in ("link_pos", "link_quat", "link_linvel", "link_angvel")],
+            outputs=_arrays(vars(self._links)),
         )
 
     def _write_parameters(self) -> None:
         """Write the parameters of the worlds of the mask into the engine's model."""
         m = self._model
         values = {name: self._parameters[name] for name in get_args(Parameter)} | self._nominal
-        arrays = [wp.from_torch(value, dtype=_VECTORS.get(name)) for name, value in values.items()]
         wp.launch(
             kernels.write_parameters,
             dim=self.num_worlds,
             inputs=[
                 wp.from_torch(self._mask),
-                *arrays,
+                *_arrays(values),
                 self._friction_columns,
                 MIN_FRICTION,
                 self._at.object_body,
@@ -389,18 +386,13 @@ class MujocoWarpBackend(Backend):
     def _write_state(self) -> None:
         """Write the coming state of the worlds of the mask."""
         d = self._data
-        out = self._out
         at = self._at
-        values = []
-        for name, value in self._coming.items():
-            vector = {"object_quat": wp.quat}.get(name, wp.vec3) if name.startswith("object") else None
-            values.append(wp.from_torch(value, dtype=vector))
         wp.launch(
             kernels.write_state,
             dim=self.num_worlds,
             inputs=[
                 wp.from_torch(self._mask),
-                *values,
+                *_arrays(vars(self._coming)),
                 *self._addresses,
                 *self._mimic,
                 at.object_qpos,
@@ -414,7 +406,7 @@ class MujocoWarpBackend(Backend):
                 d.qacc_warmstart,
                 d.xfrc_applied,
                 d.overflow,
-                *(out[name] for name in ("nonfinite", "tip_force", "tip_touch", "table_force")),
+                *_arrays({"nonfinite": self._nonfinite} | vars(self._contacts)),
             ],
         )
 
@@ -423,17 +415,26 @@ class MujocoWarpBackend(Backend):
 
     # Checking ---------------------------------------------------------------------------------------------------------
 
-    def _selected(self, worlds: Tensor | None) -> Tensor:
-        if worlds is None:
-            return self._every_world
-        return torch.as_tensor(worlds, dtype=torch.int64, device=self.device)
+    def _choose(self, worlds: Tensor | None) -> Tensor:
+        """Set the mask of the worlds to change, and return their indices [M]."""
+        index = self._every_world
+        if worlds is not None:
+            index = torch.as_tensor(worlds, dtype=torch.int64, device=self.device)
+        self._mask.zero_()
+        self._mask[index] = True
+        return index
 
-    def _checked_state(self, state: State, rows: int) -> dict[str, Tensor]:
+    def _checked_state(self, state: State, rows: int) -> State:
         checked = {}
-        for name, present in self._coming.items():
+        for name, present in vars(self._coming).items():
             checked[name] = self._checked(name, getattr(state, name), (rows, *present.shape[1:]))
-        return checked
+        return State(**checked)
 
     def _must_be_open(self) -> None:
         if self._data is None:
             raise XResetError(f"The backend {self.name!r} is closed. Build a new one.")
+
+
+def _arrays(values: Mapping[str, Tensor]) -> list[Any]:
+    """Return Warp's views of named tensors."""
+    return [wp.from_torch(value, dtype=_TYPES.get(name)) for name, value in values.items()]

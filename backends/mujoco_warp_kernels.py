@@ -10,8 +10,6 @@ MuJoCo.
 
 from __future__ import annotations
 
-from typing import Any
-
 import warp as wp
 
 from xreset.backends.mjcf_model import OBJECT
@@ -283,25 +281,3 @@ def read_contacts(
         wp.atomic_add(tip_force, world, other, force)
         if local[0] > 0.0:
             tip_touch[world, other] = True
-
-
-def outputs(num_worlds: int, joints: int, tips: int) -> dict[str, Any]:
-    """Return the arrays that the kernels read the worlds into; links are the palm and the fingertips."""
-    n = num_worlds
-    links = (num_worlds, 1 + tips)
-    return {
-        "joint_pos": wp.zeros((n, joints), dtype=float),
-        "joint_vel": wp.zeros((n, joints), dtype=float),
-        "object_pos": wp.zeros(n, dtype=wp.vec3),
-        "object_quat": wp.zeros(n, dtype=wp.quat),
-        "object_linvel": wp.zeros(n, dtype=wp.vec3),
-        "object_angvel": wp.zeros(n, dtype=wp.vec3),
-        "nonfinite": wp.zeros(n, dtype=wp.bool),
-        "link_pos": wp.zeros(links, dtype=wp.vec3),
-        "link_quat": wp.zeros(links, dtype=wp.quat),
-        "link_linvel": wp.zeros(links, dtype=wp.vec3),
-        "link_angvel": wp.zeros(links, dtype=wp.vec3),
-        "tip_force": wp.zeros((n, tips), dtype=wp.vec3),
-        "tip_touch": wp.zeros((n, tips), dtype=wp.bool),
-        "table_force": wp.zeros(n, dtype=wp.vec3),
-    }

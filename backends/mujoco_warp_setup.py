@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields
+from functools import partial
 from typing import Any
 
 import mujoco_warp as mjw
@@ -51,7 +52,7 @@ def engine_step(device: Any, model: Any) -> Callable[[Any, Any], None]:
         return mjw.step
     implicit = model.opt.integrator == mjw.IntegratorType.IMPLICITFAST
     if implicit and source_digest(*step.ORIGINAL) == step.KNOWN_STEP:
-        return step.ForkedStep(device)
+        return partial(step.forked_step, wp.Stream(device) if device.is_cuda else None)
     return mjw.step
 
 

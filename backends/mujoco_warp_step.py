@@ -14,7 +14,7 @@ from mujoco_warp._src import forward
 from mujoco_warp._src.smooth import tendon_armature
 
 ORIGINAL = (forward.step, forward._forward, forward.fwd_position)
-"""The engine's functions that :class:`ForkedStep` replaces."""
+"""The engine's functions that :func:`forked_step` replaces."""
 KNOWN_STEP = "f65bf1f9a5f3ba09"
 """Digest of their source."""
 
@@ -41,23 +41,22 @@ def finish(m: Any, d: Any) -> None:
     mjw.implicit(m, d)
 
 
-class ForkedStep:
-    """``mujoco_warp.step`` after its kinematics: those of the present positions must be there."""
+def forked_step(second: wp.Stream | None, m: Any, d: Any) -> None:
+    """Queue ``mujoco_warp.step`` after its kinematics, which must be there, on Warp's current stream and a second one.
 
-    def __init__(self, device: Any) -> None:
-        """Make the second stream."""
-        self._second = wp.Stream(device) if device.is_cuda else None
-
-    def __call__(self, m: Any, d: Any) -> None:
-        """Queue the step on Warp's current stream."""
-        if self._second is None:
+    Args:
+        second: None: there are no streams, as on the CPU.
+        m: the engine's model.
+        d: the engine's data.
+    """
+    if second is None:
+        smooth_dynamics(m, d)
+        constraints(m, d)
+    else:
+        main = wp.get_stream()
+        second.wait_stream(main)
+        with wp.ScopedStream(second, sync_enter=False):
             smooth_dynamics(m, d)
-            constraints(m, d)
-        else:
-            main = wp.get_stream()
-            self._second.wait_stream(main)
-            with wp.ScopedStream(self._second, sync_enter=False):
-                smooth_dynamics(m, d)
-            constraints(m, d)
-            main.wait_stream(self._second)
-        finish(m, d)
+        constraints(m, d)
+        main.wait_stream(second)
+    finish(m, d)

@@ -107,7 +107,7 @@ class DistillTest(unittest.TestCase):
         self.assertEqual(actions[0].shape, (2, env.num_actions))
         self.assertFalse(torch.allclose(actions[0], actions[1]))
         self.assertTrue(torch.equal(actions[0], actions[2]))
-        with self.assertRaisesRegex(PolicyError, "other cameras"):
+        with self.assertRaisesRegex(PolicyError, "another set of cameras"):
             check_contract("it", policy.contract, self.robot, replace(env.task, vision=replace(IMAGES, interval=1)))
 
     def test_the_student_learns_the_teachers_actions_and_resumes(self):

@@ -163,7 +163,7 @@ class FromABankTest(unittest.TestCase):
         objects = [xreset.load_object(name) for name in bank.object_names]
         with xreset.make_env(xreset.load_robot("openarm"), objects, bank, num_envs=1) as env:
             for arguments, message in (
-                (("soup-can", env, "film.mp4"), "trained with another robot: ur7e-sharpa, here it is openarm"),
+                (("soup-can", env, "film.mp4"), "trained with another robot .robot: 'ur7e-sharpa', here 'openarm'"),
                 (("no-such-policy", env, "film.mp4"), "no-such-policy"),
             ):
                 with self.subTest(message), self.assertRaisesRegex(xreset.XResetError, message):

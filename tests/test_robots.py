@@ -129,7 +129,7 @@ class Fingerprint(unittest.TestCase):
         other = load(folder)
         task = TaskConfig()
         check_contract("p.onnx", policy_contract(robot, task, ()), other, task)
-        with self.assertRaisesRegex(PolicyError, "another robot: other, here it is openarm"):
+        with self.assertRaisesRegex(PolicyError, "another robot .robot: 'other', here 'openarm'"):
             check_contract("p.onnx", policy_contract(other, task, ()), robot, task)
 
 

@@ -600,25 +600,25 @@ class PolicyTest(WithRobot):
             check_contract("p.onnx", contract, self.robot, task)
 
     def test_refusals_name_what_differs(self):
-        self.refused("another robot: openarm, here it is toy.*--robot openarm", robot="openarm")
+        self.refused("another robot .robot: 'openarm', here 'toy'.*--robot openarm", robot="openarm")
         self.refused("schema is 'xreset-policy/9', expected one of 'xreset-policy/1'", schema="xreset-policy/9")
         self.refused("another joint order", joint_names=list(reversed(self.robot.joint_names)))
         self.refused("another fingertips", fingertip_names=["index", "thumb"])
-        self.refused("another version of 'toy'", robot_fingerprint="00")
-        self.refused("another version of 'toy'", robot_fingerprint="")
+        self.refused("another version of the robot", robot_fingerprint="00")
+        self.refused("another version of the robot", robot_fingerprint="")
         fewer = replace(self.TASK, observation=replace(self.TASK.observation, cloud_history=3))
-        self.refused("observation layout .perception.cloud: 960 in the policy, 576 here", task=fewer)
+        self.refused("observation layout .perception.cloud: 960, here 576", task=fewer)
         extra = policy_contract(self.robot, self.TASK, ())["observation_layout"]
         self.refused(
-            r"policy.tactile: 4 in the policy, None here",
+            r"policy.tactile: 4, here None",
             observation_layout=extra | {"policy": extra["policy"] | {"tactile": 4}},
         )
         home = replace(self.TASK, action=ActionConfig(hand_zero="home"))
-        self.refused("another action mapping .hand_zero: 'middle' in the policy, 'home' here", task=home)
+        self.refused("another action mapping .hand_zero: 'middle', here 'home'", task=home)
         scaled = replace(self.TASK, observation=replace(self.TASK.observation, cloud_scale=5.0))
-        self.refused("other scales of observations .cloud_scale: 1.0 in the policy, 5.0 here", task=scaled)
+        self.refused("another scale of observations .cloud_scale: 1.0, here 5.0", task=scaled)
         self.refused(
-            "another time between actions .s.: 0.01666.*, here it is 0.02083", task=replace(self.TASK, substeps=5)
+            "another time between actions .control_dt: 0.01666.*, here 0.02083", task=replace(self.TASK, substeps=5)
         )
 
     def test_policies_without_training(self):

@@ -7,7 +7,7 @@ and control rate. Running one needs neither warp nor rsl-rl.
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
@@ -73,47 +73,45 @@ def check_contract(source: str, contract: dict[str, Any], robot: RobotSpec, task
     Raises:
         PolicyError: names the first thing that differs.
     """
-    trained = read_contract(source, contract).task
-    here = policy_contract(robot, task, ())
-    if robot.like and contract["robot_fingerprint"] == robot.like:
-        here |= {key: contract[key] for key in ("robot", "robot_fingerprint")}
-    for what, key, fix in (
-        ("robot", "robot", f"Use --robot {contract['robot']}."),
-        ("joint order", "joint_names", f"Use --robot {contract['robot']}."),
-        ("fingertips", "fingertip_names", f"Use --robot {contract['robot']}."),
-        (f"version of {robot.name!r}", "robot_fingerprint", "Its URDF or description has changed. Train again."),
-        ("time between actions [s]", "control_dt", "Use the run's own configuration."),
-    ):
-        if contract[key] != here[key]:
-            raise PolicyError(
-                f"{source} was trained with another {what}: {contract[key]}, here it is {here[key]}. {fix}"
-            )
-    for what, of_policy, of_task in (
-        ("another observation layout", _widths(contract), _widths(here)),
-        ("another action mapping", asdict(trained.action), asdict(task.action)),
-        ("other scales of observations", _scales(trained), _scales(task)),
-        ("another frame of objects", *({"object_frame": t.object_frame} for t in (trained, task))),
-        ("other cameras", asdict(trained.vision), asdict(task.vision)),
-    ):
-        names = [name for name in of_policy | of_task if of_policy.get(name) != of_task.get(name)]
+    trained = read_contract(source, contract)
+    here = read_contract("this task", policy_contract(robot, task, ()))
+    if robot.like and trained.robot_fingerprint == robot.like:
+        here = replace(here, robot=trained.robot, robot_fingerprint=robot.like)
+    use_robot = f"Use --robot {trained.robot}."
+    fixes = {
+        "robot": use_robot,
+        "joint order": use_robot,
+        "fingertips": use_robot,
+        "version of the robot": "Its URDF or description has changed. Train again.",
+    }
+    of_task = _meaning(here)
+    for part, of_policy in _meaning(trained).items():
+        names = [name for name in of_policy | of_task[part] if of_policy.get(name) != of_task[part].get(name)]
         if names:
-            differing = [f"{n}: {of_policy.get(n)!r} in the policy, {of_task.get(n)!r} here" for n in names]
-            raise PolicyError(
-                f"{source} was trained with {what} ({'; '.join(differing)}). Use the run's own configuration."
-            )
+            differing = [f"{n}: {of_policy.get(n)!r}, here {of_task[part].get(n)!r}" for n in names]
+            fix = fixes.get(part, "Use the run's own configuration.")
+            raise PolicyError(f"{source} was trained with another {part} ({'; '.join(differing)}). {fix}")
 
 
-def _widths(contract: dict[str, Any]) -> dict[str, int]:
-    """Return the width of every term of a contract's observations, keyed by group and term."""
+def _meaning(contract: Contract) -> dict[str, dict[str, Any]]:
+    """Return what gives observations and actions their meaning: entries by name, by part of the contract."""
+    task = asdict(contract.task)
+    del task["observation"]["noise"]
     widths = {}
-    for group, terms in contract["observation_layout"].items():
+    for group, terms in contract.observation_layout.items():
         widths |= {f"{group}.{term}": width for term, width in terms.items()}
-    return widths
-
-
-def _scales(task: TaskConfig) -> dict[str, Any]:
-    """Return what gives observations their meaning: all of their configuration except the noise."""
-    return {name: value for name, value in asdict(task.observation).items() if name != "noise"}
+    return {
+        "robot": {"robot": contract.robot},
+        "joint order": {"joint_names": contract.joint_names},
+        "fingertips": {"fingertip_names": contract.fingertip_names},
+        "version of the robot": {"robot_fingerprint": contract.robot_fingerprint},
+        "time between actions": {"control_dt": contract.control_dt},
+        "observation layout": widths,
+        "action mapping": task["action"],
+        "scale of observations": task["observation"],
+        "frame of objects": {"object_frame": task["object_frame"]},
+        "set of cameras": task["vision"],
+    }
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -436,7 +436,7 @@ class TypedTest(unittest.TestCase):
             (r"widths\[1\] is 2.5, expected int", good | {"widths": [1, 2.5]}),
             ("name is 3, expected str", good | {"name": 3}),
             ("configuration is 3, expected an object", 3),
-            (r"widths\[0\] is an integer of 15001 bits, expected int", good | {"widths": [2**15000]}),
+            (r"widths\[0\] is a number of thousands of digits, expected int", good | {"widths": [2**15000]}),
             (r"pair is .{1,200}, expected a list", good | {"pair": {str(i): ["x" * 1000] * 1000 for i in range(1000)}}),
         ):
             with self.subTest(words), self.assertRaisesRegex(FileFormatError, words):

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import cache
@@ -110,18 +110,26 @@ def read_npz(
     path = Path(path)
     must_exist(path, what)
     own = dict(schema)
-    with _archive(path, f"cannot be read as {what}") as archive:
-        members = archive.sizes
+    arrays: dict[str, np.ndarray] = {}
+    sizes: dict[str, int] = {}
+    with _opened(path, f"cannot be read as {what}") as (archive, packed):
         if schema_name is not None:
-            check_schema(path, archive.stated_schema(), schema_name)
+            check_schema(path, _stated_schema(archive, packed), schema_name)
             own |= {"schema": Field((), "U"), "meta": Field((), "U", required=False)}
-        missing = [name for name, field in own.items() if field.required and name not in members]
+        missing = [name for name, field in own.items() if field.required and name not in packed]
         if missing:
             raise FileFormatError(
                 f"{path} is not valid as {what}: it has no array {missing[0]!r}; "
-                f"found {', '.join(sorted(set(members) - {'schema'}))}."
+                f"found {', '.join(sorted(set(packed) - {'schema'}))}."
             )
-        arrays = archive.read([name for name in own if name in members])
+        names = [name for name in own if name in packed]
+        _check_size(path, {name: packed[name] for name in names})
+        for name in names:
+            array = np.asanyarray(archive[name])
+            # the size of an item as _native gives it
+            sizes[name] = array.size * max(array.dtype.itemsize, {"i": 8, "u": 8, "f": 4}.get(array.dtype.kind, 1))
+            _check_size(path, sizes)
+            arrays[name] = _native(path, name, array)
     problem = _wrong_shape(arrays, own) or wrong_value(arrays, schema)
     if problem is None and check is not None:
         problem = check(arrays)
@@ -138,60 +146,37 @@ def npz_schema(path: str | Path) -> str:
     """
     path = Path(path)
     must_exist(path, "one of xreset's npz files")
-    with _archive(path, "is not one of xreset's npz files") as archive:
-        stated = archive.stated_schema()
+    with _opened(path, "is not one of xreset's npz files") as (archive, packed):
+        stated = _stated_schema(archive, packed)
     if stated is None:
         raise FileFormatError(f"{path} is not one of xreset's npz files: it states no schema. Is it the right file?")
     return stated
 
 
 @contextmanager
-def _archive(path: Path, failure: str) -> Iterator[_Archive]:
-    """Open an npz file; whatever zipfile, zlib and numpy raise at damage becomes one error."""
+def _opened(path: Path, failure: str) -> Iterator[tuple[Mapping[str, Any], dict[str, int]]]:
+    """Yield the arrays of an npz file, and the size of each, unpacked [bytes]; whatever zipfile, zlib and numpy raise
+    at damage becomes one error."""
     try:
         with zipfile.ZipFile(path) as file:
             sizes = {member.filename.removesuffix(".npy"): member.file_size for member in file.infolist()}
         with np.load(path, allow_pickle=False) as arrays:
-            yield _Archive(path, arrays, sizes)
+            yield arrays, sizes
     except XResetError:
         raise
     except Exception as error:
-        reason = str(error) if isinstance(error, zipfile.BadZipFile | OSError | _BadArray) else "its content is broken"
         if str(error).startswith("Object arrays"):  # numpy's refusal
             raise FileFormatError(f"{path} {failure}: it holds Python objects, and objects are never read.") from error
+        reason = str(error) if isinstance(error, zipfile.BadZipFile | OSError) else "its content is broken"
         raise FileFormatError(f"{path} {failure}: {reason}. It is damaged or truncated, or not an npz file.") from error
 
 
-class _BadArray(ValueError):
-    """An array of an npz file does not hold numbers or text."""
-
-
-@dataclass(frozen=True)
-class _Archive:
-    path: Path
-    arrays: Mapping[str, Any]
-    sizes: Mapping[str, int]
-    """Size of each array in the archive, unpacked [bytes]."""
-
-    def stated_schema(self) -> str | None:
-        if self.sizes.get("schema", 1 << 20) > 4096:
-            return None
-        array = self.arrays["schema"]
-        is_text = isinstance(array, np.ndarray) and array.dtype.kind == "U" and not array.shape
-        return str(array) if is_text else None
-
-    def read(self, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """Read arrays as native int64, float32, float64, bool or text."""
-        _check_size(self.path, {name: self.sizes[name] for name in names})
-        sizes = {}
-        arrays = {}
-        for name in names:
-            array = np.asanyarray(self.arrays[name])
-            # the size of an item as _native gives it
-            sizes[name] = array.size * max(array.dtype.itemsize, {"i": 8, "u": 8, "f": 4}.get(array.dtype.kind, 1))
-            _check_size(self.path, sizes)
-            arrays[name] = _native(name, array)
-        return arrays
+def _stated_schema(arrays: Mapping[str, Any], sizes: Mapping[str, int]) -> str | None:
+    if sizes.get("schema", 1 << 20) > 4096:
+        return None
+    array = arrays["schema"]
+    is_text = isinstance(array, np.ndarray) and array.dtype.kind == "U" and not array.shape
+    return str(array) if is_text else None
 
 
 def _check_size(path: Path, sizes: Mapping[str, int]) -> None:
@@ -203,12 +188,12 @@ def _check_size(path: Path, sizes: Mapping[str, int]) -> None:
         )
 
 
-def _native(name: str, array: np.ndarray) -> np.ndarray:
+def _native(path: Path, name: str, array: np.ndarray) -> np.ndarray:
     kind = array.dtype.kind
-    if kind not in "fiubU":
-        raise _BadArray(f"the array {shown(name)} holds {array.dtype}, expected numbers, bool or text")
-    if array.dtype == np.uint64 and (array > np.iinfo(np.int64).max).any():
-        raise _BadArray(f"the array {shown(name)} holds integers of more than 63 bits")
+    is_large = array.dtype == np.uint64 and (array > np.iinfo(np.int64).max).any()
+    if kind not in "fiubU" or is_large:
+        what = "integers of more than 63 bits" if is_large else array.dtype
+        raise FileFormatError(f"{path}: the array {name!r} holds {what}, expected numbers, bool or text.")
     if kind in "iu":
         return array.astype(np.int64)
     if kind == "f":

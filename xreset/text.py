@@ -6,25 +6,19 @@ import re
 import reprlib
 from typing import Any
 
-
-class _Repr(reprlib.Repr):
-    def __init__(self) -> None:
-        super().__init__()
-        self.maxlevel = 2
-        self.maxdict = 4
-        self.maxstring = 80
-        self.maxother = 80
-
-    def repr_int(self, x: int, level: int) -> str:
-        return super().repr_int(x, level) if x.bit_length() < 10_000 else f"an integer of {x.bit_length()} bits"
-
-
-_REPR = _Repr()
+_REPR = reprlib.Repr()
+_REPR.maxlevel = 2
+_REPR.maxdict = 4
+_REPR.maxstring = 80
+_REPR.maxother = 80
 
 
 def shown(value: Any) -> str:
     """Return a value as Python writes it, shortened: the content of a file may have any size."""
-    text = _REPR.repr(value)
+    try:
+        text = _REPR.repr(value)
+    except ValueError:  # Python refuses to write thousands of digits
+        text = "a number of thousands of digits"
     return text if len(text) <= 200 else f"{text[:160]}...{text[-30:]}"
 
 

@@ -30,23 +30,18 @@ STAGE_SCORES = (0.0, 0.33, 0.66, 1.0)
 """Task progress of: no stage, approach, grasp, reorientation."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class MetricsConfig:
-    """Thresholds of the published success and of the draft's stages."""
-
-    published_distance: float = 0.02
-    """Largest mean distance of the surface points to the goal that is a success [m]."""
-
-    approach_distance: float = 0.05
-    """[m]"""
-    lift: float = 0.01
-    """[m]"""
-    contact_force: float = 0.1
-    """Force [N] from which a finger counts as in contact. Not in the paper."""
-    goal_distance: float = 0.02
-    """[m]"""
-    goal_angle: float = 0.2617993877991494
-    """[rad], 15 degrees."""
+PUBLISHED_DISTANCE = 0.02
+"""Largest mean distance of the surface points to the goal that is a success of the published paper [m]."""
+APPROACH_DISTANCE = 0.05
+"""[m]"""
+LIFT = 0.01
+"""[m]"""
+CONTACT_FORCE = 0.1
+"""Force [N] from which a finger counts as in contact. Not in the paper."""
+GOAL_DISTANCE = 0.02
+"""[m]"""
+GOAL_ANGLE = 0.2617993877991494
+"""[rad], 15 degrees."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,9 +69,7 @@ class MetricPoints(Tensors):
 class EpisodeMetrics:
     """Metrics of one episode in N worlds, accumulated step by step; a world that has ended no longer changes them."""
 
-    def __init__(
-        self, start: Reading, goal_pos: Tensor, goal_quat: Tensor, points: MetricPoints, config: MetricsConfig
-    ) -> None:
+    def __init__(self, start: Reading, goal_pos: Tensor, goal_quat: Tensor, points: MetricPoints) -> None:
         """Start with the first reading.
 
         Args:
@@ -85,7 +78,6 @@ class EpisodeMetrics:
             goal_quat: [N, 4]
             points: of each world's object.
         """
-        self._config = config
         self._points = points
         self._goal_pos = goal_pos.clone()
         self._goal_quat = goal_quat.clone()
@@ -124,7 +116,7 @@ class EpisodeMetrics:
     @property
     def published_success(self) -> Tensor:
         """[N] bool"""
-        return self.least_distance <= self._config.published_distance
+        return self.least_distance <= PUBLISHED_DISTANCE
 
     @property
     def reorientation_progress(self) -> Tensor:
@@ -138,15 +130,14 @@ class EpisodeMetrics:
         return torch.tensor(STAGE_SCORES, device=stage.device)[stage]
 
     def _look(self, reading: Reading) -> None:
-        c = self._config
         state = reading.task_state
         live = ~self._ended
-        self.approach |= live & (reading.tip_distance.amin(dim=-1) <= c.approach_distance)
-        lifted = state.object_pos[:, 2] - self._start_height >= c.lift
-        self.grasp |= live & lifted & contact_gate(reading.contacts.tip_force, c.contact_force)
+        self.approach |= live & (reading.tip_distance.amin(dim=-1) <= APPROACH_DISTANCE)
+        lifted = state.object_pos[:, 2] - self._start_height >= LIFT
+        self.grasp |= live & lifted & contact_gate(reading.contacts.tip_force, CONTACT_FORCE)
         position_error = (state.object_pos - self._goal_pos).norm(dim=-1)
         angle = quat_angle(state.object_quat, self._goal_quat)
-        at_goal = live & (position_error <= c.goal_distance) & (angle <= c.goal_angle)
+        at_goal = live & (position_error <= GOAL_DISTANCE) & (angle <= GOAL_ANGLE)
         self.reorient = at_goal  # only the last reading counts; a world that ended early is not at its goal
         self.reorient_once |= at_goal
         self._best = torch.where(live, torch.minimum(self._best, self._keypoint_distance(reading)), self._best)

@@ -19,7 +19,7 @@ import numpy as np
 from xreset.demos.synth import synthesize
 from xreset.env import ManipulationEnv
 from xreset.errors import XResetError
-from xreset.eval.metrics import EpisodeMetrics, MetricsConfig
+from xreset.eval.metrics import EpisodeMetrics
 from xreset.eval.pages import render
 from xreset.eval.plots import COLORS, svg
 from xreset.eval.policy_spec import PolicySpec, load_policy
@@ -203,7 +203,7 @@ def _play(
             env = r.env
             controller = make_controller(env, actor)
             begin(controller, env)
-            result = EpisodeMetrics(env.reading(), env.goal_pos, env.goal_quat, r.points, MetricsConfig())
+            result = EpisodeMetrics(env.reading(), env.goal_pos, env.goal_quat, r.points)
 
             def look(step: int, env: ManipulationEnv = env, result: EpisodeMetrics = result) -> None:
                 reading = env.reading()

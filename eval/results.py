@@ -19,7 +19,7 @@ from xreset.checks import Checked, NotNegative, Positive, Range, Share, from_dic
 from xreset.errors import FileFormatError
 from xreset.eval.rollout import Episode, Rollouts, Trace
 from xreset.eval.stats import bootstrap_ci95
-from xreset.eval.table import METRICS, table_text
+from xreset.eval.table import table_text
 from xreset.files import read_json, write_json
 from xreset.records import POSITION, UNIT_TOLERANCE, Field, read_npz, write_npz
 
@@ -198,11 +198,6 @@ def measured(episodes: Table, metric: str) -> float | None:
     return None if np.isnan(value) else value
 
 
-def means(episodes: Table) -> dict[str, float | None]:
-    """Return the mean of every metric of :data:`~xreset.eval.table.METRICS`; None where it was not measured."""
-    return {metric: measured(episodes, metric) for metric in METRICS}
-
-
 def summarize(rollouts: Rollouts, **about: Any) -> EvalResult:
     """Return the means, intervals and faults of the episodes of one engine.
 
@@ -246,10 +241,9 @@ def _ci95(episodes: Table, metric: str) -> tuple[float, float]:
 
 def _rates(episodes: Table) -> dict[str, Any]:
     """Return the means that a result and each of its demonstrations state, by field."""
-    known = means(episodes)
     stages = ("approach", "grasp", "reorient", "published_success")
-    others = {name: known[name] for name in ("reorientation_progress", "least_distance")}
-    return {f"{stage}_rate": known[stage] for stage in stages} | others
+    rates = {f"{stage}_rate": measured(episodes, stage) for stage in stages}
+    return rates | {name: measured(episodes, name) for name in ("reorientation_progress", "least_distance")}
 
 
 def mesh_folder(given: Path | None, recorded: str | None) -> Path | None:

@@ -16,7 +16,7 @@ import torch
 
 from xreset.checks import NotNegative, Share
 from xreset.env import ManipulationEnv
-from xreset.eval.metrics import EpisodeMetrics, MetricPoints, MetricsConfig
+from xreset.eval.metrics import EpisodeMetrics, MetricPoints
 from xreset.eval.trial import Engine, Trial
 from xreset.policy import Policy
 from xreset.resets.bank import ResetBank
@@ -28,8 +28,6 @@ from xreset.task.terminations import out_of_bounds
 TRACE_INTERVAL = 0.05
 """Time between the states of a trace [s]."""
 
-Look = Callable[[int, Reading], None]
-"""Called with (control steps done, reading) at the start of an episode and after every control step."""
 Progress = Callable[[int, int], None]
 """Called with (control steps done, control steps in all)."""
 
@@ -132,10 +130,22 @@ def roll_out(
 
     with closing(play_rounds(engine, trial, objects, start)) as rounds:
         for r in rounds:
-            recorder = _Recorder(r.env, [world for world in r.fresh if repetition[r.items[world]] == 0])
-            result, spent = r.play(policy, recorder.look, progress)
-            steps += r.env.max_episode_length * r.env.num_envs
-            seconds += spent
+            env = r.env
+            length = env.max_episode_length
+            recorder = _Recorder(env, [world for world in r.fresh if repetition[r.items[world]] == 0])
+            policy.begin(env)
+            reading = env.reading()
+            result = EpisodeMetrics(reading, env.task_goal_pos, env.goal_quat, r.points)
+            recorder.look(0, reading)
+            for step in range(1, length + 1):
+                before = time.perf_counter()
+                reading, _ = env.advance(policy.act(env.get_observations()))
+                lost = out_of_bounds(reading.task_state.object_pos, env.backend.scene.table, env.task.termination)
+                result.update(reading, lost)
+                seconds += time.perf_counter() - before
+                recorder.look(step, reading)
+                progress(r.number * length + step, r.total * length)
+            steps += length * env.num_envs
             traces += recorder.traces(trial.names)
             for world in r.fresh:
                 item = int(r.items[world])
@@ -162,16 +172,6 @@ class Round:
     total: int
     """Number of rounds."""
 
-    def play(self, policy: Policy, look: Look, progress: Progress) -> tuple[EpisodeMetrics, float]:
-        """Play one episode in every world; see :func:`play`."""
-        length = self.env.max_episode_length
-
-        def watch(step: int, reading: Reading) -> None:
-            look(step, reading)
-            progress(self.number * length + step, self.total * length)
-
-        return play(policy, self.env, self.points, watch)
-
 
 def play_rounds(
     engine: Engine, trial: Trial, object_index: list[int], start: Callable[[np.ndarray], Reset]
@@ -190,33 +190,6 @@ def play_rounds(
             env.reset(start=start(items).to(env.device))
             worlds = np.flatnonzero(fresh).tolist()
             yield Round(env=env, points=points, items=items, fresh=worlds, number=number, total=len(plan.rounds))
-
-
-def play(policy: Policy, env: ManipulationEnv, points: MetricPoints, look: Look) -> tuple[EpisodeMetrics, float]:
-    """Play one episode in every world, from its present state.
-
-    Args:
-        policy: what acts; it starts fresh.
-        env: the worlds, just reset.
-        points: the metric's points of each world's object.
-        look: called at the start and after every control step.
-
-    Returns:
-        The metrics of the episodes, and the seconds that they took without ``look``.
-    """
-    policy.begin(env)
-    reading = env.reading()
-    result = EpisodeMetrics(reading, env.task_goal_pos, env.goal_quat, points, MetricsConfig())
-    look(0, reading)
-    seconds = 0.0
-    for step in range(1, env.max_episode_length + 1):
-        before = time.perf_counter()
-        reading, _ = env.advance(policy.act(env.get_observations()))
-        lost = out_of_bounds(reading.task_state.object_pos, env.backend.scene.table, env.task.termination)
-        result.update(reading, lost)
-        seconds += time.perf_counter() - before
-        look(step, reading)
-    return result, seconds
 
 
 def episode_starts(distribution: ResetDistribution, sequence: np.ndarray, repetition: np.ndarray, seed: int) -> Reset:

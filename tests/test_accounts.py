@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from xreset.accounts import accounts, accounts_path, described, with_totals, write_accounts
+from xreset.accounts import accounts, accounts_path, described, write_accounts
 
 
 class AccountsTest(unittest.TestCase):
@@ -20,7 +20,7 @@ class AccountsTest(unittest.TestCase):
 
     def test_every_item_is_kept_or_lost_for_one_reason(self):
         phases = ("pre-contact", "post-contact")
-        rows = with_totals(self.rows)
+        rows = self.rows
         expected = [(name, phase) for name in ("box", "can") for phase in phases]
         self.assertEqual(
             [(r.object_name, r.phase) for r in rows], [*expected, *(("all", p) for p in (*phases, "both"))]

@@ -18,7 +18,7 @@ from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_hand_arm
 from xreset.env import ManipulationEnv, make_scene, object_origins
 from xreset.errors import CapabilityError
-from xreset.eval.metrics import EpisodeMetrics, MetricPoints, MetricsConfig
+from xreset.eval.metrics import EpisodeMetrics, MetricPoints
 from xreset.eval.rollout import roll_out
 from xreset.eval.trial import Engine, Trial
 from xreset.geometry.rotations import quat_rotate
@@ -505,7 +505,7 @@ class ObjectFrameTest(WithEnv):
             _, reward, *_ = env.step(action)
             found += [flat, action, reward]
         points = MetricPoints.of((spec,) * N, task.object_frame)
-        metrics = EpisodeMetrics(env.reading(), env.task_goal_pos, env.goal_quat, points, MetricsConfig())
+        metrics = EpisodeMetrics(env.reading(), env.task_goal_pos, env.goal_quat, points)
         return [*found, metrics.final_distance, metrics.final_position_error, metrics.final_angle, metrics._best]
 
     def test_the_frame_of_a_mesh_does_not_matter(self):

@@ -17,7 +17,7 @@ from tests.toy_results import OBJECTS, toy_rollouts, toy_summary
 from xreset.checks import from_dict
 from xreset.errors import FileFormatError, XResetError
 from xreset.eval.evaluate import evaluate
-from xreset.eval.metrics import EpisodeMetrics, MetricPoints, MetricsConfig
+from xreset.eval.metrics import EpisodeMetrics, MetricPoints
 from xreset.eval.policy_spec import PolicySpec, load_policy
 from xreset.eval.results import EvalResult, read_results, read_traces, write_results
 from xreset.eval.rollout import Episode, roll_out
@@ -67,7 +67,7 @@ def turned(degrees: float) -> torch.Tensor:
 
 def episode(*steps: Reading, start: Reading | None = None, lost_at: int | None = None) -> EpisodeMetrics:
     """The metrics of an episode; at step ``lost_at`` the object leaves the scene."""
-    metrics = EpisodeMetrics(start or reading(), GOAL[None], IDENTITY[None], POINTS, MetricsConfig())
+    metrics = EpisodeMetrics(start or reading(), GOAL[None], IDENTITY[None], POINTS)
     for i, step in enumerate(steps):
         metrics.update(step, torch.tensor([i == lost_at]))
     return metrics

@@ -61,13 +61,13 @@ class Episodes(Case):
         folders = [self.evaluate("a"), self.evaluate("b")]
         self.assertEqual(len(read_recorded(folders, backends=["sapien"]).episodes), 4)
 
-    def test_an_episode_ends_where_its_engine_broke_down(self):
+    def test_an_episode_whose_engine_broke_down_is_left_out(self):
         broken = toy_rollouts(self.robot.home).traces[0].object_pos.copy()
         broken[3:] = np.nan
         with self.assertLogs("xreset.eval.export.recorded", "WARNING") as log:
             recording = read_recorded([self.evaluate(change=self.change_first(object_pos=broken))], backends=["mujoco"])
-        self.assertIn("ends at 0.10 s", log.output[0])
-        self.assertEqual(list(map(len, recording.episodes["action"])), [3, 5])
+        self.assertIn("demonstration 0 is left out", log.output[0])
+        self.assertEqual(list(map(len, recording.episodes["action"])), [5])
 
     def test_refusals(self):
         def changed(name: str, **changes):

@@ -89,7 +89,7 @@ class InTheBrowser(unittest.TestCase):
         self.browser.press("Take the object away")
         self.until(lambda: "The object is away" in self.browser.text(), "the object to be away")
         self.browser.press("Put the object back")
-        self.until(lambda: session._homing, "the robot to go home")
+        self.until(lambda: not session.away, "the object to be back")
         problems = [text for text in self.browser.problems if "passive event listener" not in text]  # viser's own
         self.assertEqual(problems, [])
         self.browser.resize(390, 844, phone=True)

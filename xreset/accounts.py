@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -48,37 +49,29 @@ class Account:
 
 
 def accounts(object_name: np.ndarray, post_contact: np.ndarray, reason: np.ndarray) -> list[Account]:
-    """Return an account of every object and phase, objects in alphabetical order.
+    """Return an account of every object and phase, objects in alphabetical order; then the sums over all objects: of
+    each phase, and of both.
 
     Args:
         object_name: [N] text.
         post_contact: [N] bool
         reason: [N] text: why it is lost, empty where it is kept.
     """
+    of_phase: dict[Phase, np.ndarray] = {
+        "pre-contact": ~post_contact,
+        "post-contact": post_contact,
+        "both": np.ones(len(reason), dtype=bool),
+    }
+    names = np.unique(object_name).tolist()
     rows = []
-    phases: tuple[Phase, ...] = ("pre-contact", "post-contact")
-    for name in np.unique(object_name).tolist():
-        for is_post, phase in enumerate(phases):
-            chosen = (object_name == name) & (post_contact == is_post)
-            counts = Counter(reason[chosen].tolist())
-            kept = counts.pop("", 0)
-            rows.append(Account(object_name=name, phase=phase, kept=kept, lost=dict(counts.most_common())))
+    for name, phase in [*product(names, list(of_phase)[:2]), *product(["all"], of_phase)]:
+        chosen = of_phase[phase]
+        if name != "all":
+            chosen = chosen & (object_name == name)
+        counts = Counter(reason[chosen].tolist())
+        kept = counts.pop("", 0)
+        rows.append(Account(object_name=name, phase=phase, kept=kept, lost=dict(counts.most_common())))
     return rows
-
-
-def with_totals(rows: Sequence[Account]) -> list[Account]:
-    """Return the accounts, then the sums over all objects: of each phase, and of both."""
-    sums = []
-    phases: tuple[Phase, ...] = ("pre-contact", "post-contact", "both")
-    for phase in phases:
-        kept = 0
-        lost: Counter[str] = Counter()
-        for row in rows:
-            if phase in (row.phase, "both"):
-                kept += row.kept
-                lost.update(row.lost)
-        sums.append(Account(object_name="all", phase=phase, kept=kept, lost=dict(lost.most_common())))
-    return [*rows, *sums]
 
 
 def described(lost: dict[str, int]) -> str:
@@ -94,7 +87,7 @@ def accounts_path(path: Path) -> Path:
 def write_accounts(path: Path, *, of: str, rows: Sequence[Account], **more: Any) -> None:
     """Write accounts as JSON: ``of`` what (such as ``frames``), and ``more`` by name."""
     written = []
-    for row in with_totals(rows):
+    for row in rows:
         written.append(
             {
                 "object_name": row.object_name,

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +49,7 @@ class Recording:
     """Frames per second."""
     episodes: Table
     """One row for each recorded episode (:func:`xreset.eval.results.episode_table`), with further columns: ``task`` in
-    words; ``trace``, its finite states [T]; ``action`` [T, J], joint targets: the last target before the next frame, of
+    words; ``trace``, its states [T]; ``action`` [T, J], joint targets: the last target before the next frame, of
     the last frame its own; ``meshes``, folder of the object's mesh or None: a stand-in. Joint positions in rad
     (prismatic: m), poses in the world frame (z up, table top at z = 0), quaternions (w, x, y, z)."""
 
@@ -69,7 +69,7 @@ def read_recorded(
 ) -> Recording:
     """Read the recorded episodes of evaluations: the first of each demonstration and engine.
 
-    An episode in which the engine broke down ends at its last finite state, and is left out if that is its first state.
+    An episode in which the engine broke down is left out, with a warning.
 
     Args:
         folders: run folders, or folders that ``xreset eval`` wrote into.
@@ -101,16 +101,15 @@ def read_recorded(
                 trace = episode.pop("trace")
                 action = _actions(trace, results / f"{engine}.trace.npz")
                 intervals.setdefault(round(float(np.median(np.diff(trace.time))), 6), results)
-                last = _finite_frames(trace, action, f"{results}, {engine}")
-                if last < 2:
+                if not (finite_states(trace).all() and np.isfinite(action).all()):
+                    logging.getLogger(__name__).warning(
+                        "%s, %s, demonstration %d is left out: its engine broke down.", results, engine, trace.sequence
+                    )
                     continue
-                cut = {}
-                for field in ("time", "joint_pos", "object_pos", "object_quat"):
-                    cut[field] = getattr(trace, field)[:last]
                 episode |= {
                     "task": task.replace("{object}", short_name(trace.object)),
-                    "trace": replace(trace, **cut),
-                    "action": action[:last],
+                    "trace": trace,
+                    "action": action,
                     "meshes": mesh_folder(objects, result.objects_folder),
                 }
                 rows.append(episode)
@@ -143,19 +142,6 @@ def _actions(trace: Trace, file: Path) -> np.ndarray:
     if every < 1:
         raise FileFormatError(f"{file} has {steps} actions for {frames} states, expected as many or more.")
     return trace.joint_target[np.minimum(np.arange(1, frames + 1) * every - 1, steps - 1)]
-
-
-def _finite_frames(trace: Trace, action: np.ndarray, where: str) -> int:
-    """Return the number of frames before the first that is not finite, and warn if there is one."""
-    finite = finite_states(trace) & np.isfinite(action).all(axis=1)
-    if finite.all():
-        return len(finite)
-    last = int(np.argmin(finite))
-    fate = "is left out" if last < 2 else f"ends at {trace.time[last - 1]:.2f} s"
-    logging.getLogger(__name__).warning(
-        "%s, demonstration %d: its states stop being finite, so it %s.", where, trace.sequence, fate
-    )
-    return last
 
 
 def _rate(interval: float) -> float:

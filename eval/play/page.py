@@ -13,7 +13,6 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from xreset.errors import XResetError
 from xreset.eval.play.record import draw_film, last_moments, write_trace
@@ -140,8 +139,8 @@ class Page(WebPage):
         except XResetError as error:
             self._tell("Restarted", str(error))
         if self._retry.value and self.session.dropped:
-            self._tell("Dropped", "The robot goes home and tries again.")
-            self.session.put_back()
+            self._tell("Dropped", "The robot tries again from home.")
+            self.session.begin()
 
     def _tell(self, title: str, text: str) -> None:
         for client in self._server.get_clients().values():
@@ -167,9 +166,6 @@ class Page(WebPage):
             below = LOOK_AT - (0.0, 0.0, 0.3)
             client.camera.position = below + 1.4 * (self._server.initial_camera.position - LOOK_AT)
             client.camera.look_at = below
-        others = len(self._server.get_clients()) - 1
-        if others > 0:
-            self._tell("A shared robot", f"{others + 1} visitors are here. All of them move the same robot.")
 
     def _part(self, client: Any) -> None:
         if self._holder == client.client_id:
@@ -241,25 +237,11 @@ class Page(WebPage):
     async def _turn(self, event: Any) -> None:
         self._holder = event.client_id
         self._turning = event.phase != "end"
-        rings = Rotation.from_quat(event.target.wxyz, scalar_first=True)
-        if event.phase == "start":
-            self._goal_in_rings = rings.inv() * Rotation.from_quat(self._goal.wxyz, scalar_first=True)
-        turned = rings * self._goal_in_rings
-        self._wish(self._move_goal, self._goal.position.copy(), turned.as_quat(scalar_first=True))
+        self._wish(self._move_goal, self._goal.position.copy(), event.target.wxyz.copy())
 
     def _move_goal(self, pos: np.ndarray, quat: np.ndarray) -> None:
         self._hint.visible = False
         self.session.move_goal(pos, quat)
-
-    def _towards_visitor(self) -> np.ndarray:
-        """Return an orientation of the rings [4] in which the first visitor sees none of them from its edge."""
-        visitors = list(self._server.get_clients().values())
-        camera = visitors[0].camera if visitors else self._server.initial_camera
-        to_camera = camera.position - self._goal.position
-        corner = np.ones(3)
-        up = (0.0, 0.0, 1.0)
-        rings = Rotation.align_vectors([to_camera, up], [corner, up], weights=[np.inf, 1.0])[0]
-        return rings.as_quat(scalar_first=True)
 
     def _draw(self) -> None:
         """Show the present state."""
@@ -277,7 +259,7 @@ class Page(WebPage):
             self._handle.position = self._goal.position + self._beside
             if not self._turning:
                 self._rings.position = self._goal.position
-                self._rings.wxyz = self._towards_visitor()
+                self._rings.wxyz = self._goal.wxyz
             if self._see.value:
                 self._points.points = session.cloud().astype(np.float32)
         self._drawn = time.monotonic()
@@ -298,7 +280,7 @@ class Page(WebPage):
         self._speed = gui.add_slider("speed", 0.1, 1.0, 0.1, 1.0)
         self._take = gui.add_button("Take the object away")
         self._take.on_click(lambda _: self._wish(self._take_or_put))
-        self._retry = gui.add_checkbox("try again", True, hint="Put a dropped object back, after the robot went home.")
+        self._retry = gui.add_checkbox("try again", True, hint="Begin again from home once the object was dropped.")
         self._object = gui.add_dropdown("object", ("",))
         self._engine = gui.add_dropdown("engine", backend_names())
         self._policies = {
@@ -358,7 +340,7 @@ class Page(WebPage):
 
     def _take_or_put(self) -> None:
         if self.session.away or self.session.lost:
-            self.session.put_back()
+            self.session.begin()
         else:
             self.session.take_away()
 

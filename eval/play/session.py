@@ -49,8 +49,6 @@ DROPPED_SECONDS = 3.0
 """An object that no finger touches for so long, far from its goal, counts as dropped [s]."""
 DROPPED_DISTANCE = 0.05
 """[m]"""
-NEAR_HOME = 0.15
-"""Distance from home at which every joint has arrived there [rad, m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,7 +223,6 @@ class Session:
     def _begin(self) -> None:
         self.away = False
         self._taken = False
-        self._homing = False
         self._touched = self.time
         self._pull: _Pull | None = None
         self.history.clear()
@@ -237,7 +234,7 @@ class Session:
             XResetError: the engine's numbers are no longer finite; a new episode has begun.
         """
         observations = self.env.get_observations()
-        action = self._home_action() if self._homing else self._player.act(observations)
+        action = self._player.act(observations)
         reading, reward = self.env.advance(action, self._apply_pull())
         self.time += self.control_dt
         if bool(reading.health.nonfinite):
@@ -266,7 +263,7 @@ class Session:
             success=bool(reward.success),
         )
         self.history.append(moment)
-        if self.away or self._homing or self._pull is not None or moment.tip_force.any():
+        if self.away or self._pull is not None or moment.tip_force.any():
             self._touched = self.time
         return moment
 
@@ -274,7 +271,7 @@ class Session:
     def dropped(self) -> bool:
         """Whether the robot has lost the object or never grasped it, and the user has neither pulled nor taken it."""
         if self.away:
-            return not self._taken and not self._homing
+            return not self._taken
         long_ago = self.time - self._touched > DROPPED_SECONDS
         return long_ago and self.history[-1].distance > DROPPED_DISTANCE
 
@@ -333,7 +330,7 @@ class Session:
         self._pull = None
 
     def take_away(self) -> None:
-        """Take the object out of everybody's reach, until :meth:`put_back`. The policy observes it there."""
+        """Take the object out of everybody's reach, until :meth:`begin`. The policy observes it there."""
         self._taken = True
         self._remove_object()
 
@@ -341,31 +338,8 @@ class Session:
         self.away = True
         if self._pull is not None and self._pull.link is None:
             self.release()
-        self._place_object(torch.tensor([AWAY]), self.env.backend.state().object_quat)
-
-    def put_back(self) -> None:
-        """Put the object where its demonstration begins. Before, the robot goes home, as before every episode."""
-        self._homing = True
-
-    def _home_action(self) -> Tensor:
-        """[1, J] the action that brings the robot home; once it is there, the object is put back."""
-        env = self.env
-        home = torch.as_tensor(self.policy.robot.home, dtype=torch.float32, device=env.device)
-        if bool(((env.backend.state().joint_pos - home).abs() < NEAR_HOME).all()):
-            self._homing = False
-            self._taken = False
-            self.away = False
-            self._touched = self.time
-            pos, quat = env.resets.start_pose(env.sequence)
-            self._place_object(pos, quat)
-            self._player.begin(env)
-        return env.actions.action_for(home[None], env.joint_target)
-
-    def _place_object(self, pos: Tensor, quat: Tensor) -> None:
-        """Set the object down at rest at a pose [1, 3], [1, 4]; the robot goes on as it is."""
         state = self.env.backend.state().clone()
-        state.object_pos.copy_(pos)
-        state.object_quat.copy_(quat)
+        state.object_pos.copy_(torch.tensor([AWAY]))
         state.object_linvel.zero_()
         state.object_angvel.zero_()
         self.env.backend.set_state(state)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from rich.table import Table
 
-from xreset.accounts import accounts_path, described, with_totals, write_accounts
+from xreset.accounts import accounts_path, described, write_accounts
 from xreset.cli._terminal import Console, Progress
 from xreset.files import file_hash
 from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
@@ -106,9 +106,7 @@ def resets(
 
 def _accepted(data: file.Retargeted, bank: banks.ResetBank, title: str) -> Table:
     """How many states of each object and phase are kept."""
-    annotated = {
-        (row.object_name, row.phase): row.without("not annotated").total for row in with_totals(data.accounts())
-    }
+    annotated = {(row.object_name, row.phase): row.without("not annotated").total for row in data.accounts()}
     table = Table(
         "object",
         "phase",
@@ -119,7 +117,7 @@ def _accepted(data: file.Retargeted, bank: banks.ResetBank, title: str) -> Table
         "rejected because of",
         title=title,
     )
-    for row in with_totals(bank.accounts()):
+    for row in bank.accounts():
         frames = annotated.get((row.object_name, row.phase), 0)
         table.add_row(
             row.object_name,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from rich.table import Table
 
-from xreset.accounts import accounts_path, described, with_totals, write_accounts
+from xreset.accounts import accounts_path, described, write_accounts
 from xreset.cli._common import Objects, Source
 from xreset.cli._terminal import Progress, console
 from xreset.files import file_hash
@@ -89,7 +89,7 @@ def _table(result: file.Retargeted) -> Table:
         title=f"retargeted to {result.robot}",
     )
     names = result.object_name[result.sequence_of_frame]
-    for row in with_totals(result.accounts()):
+    for row in result.accounts():
         mine = result.annotated & ((names == row.object_name) | (row.object_name == "all"))
         if row.phase != "both":
             mine &= result.post_contact == (row.phase == "post-contact")

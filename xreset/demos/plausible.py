@@ -18,7 +18,7 @@ _ALONG = 0.9
 """Cosine of wrist and fingers: at least 0.983 in 270 sequences of DexYCB; 0.35 and -0.67 at the median if read in a
 wrong order."""
 _SAME_PLACE = 0.02
-"""Distance from the start within which the goal counts as reached [m] (:class:`xreset.eval.metrics.MetricsConfig`)."""
+"""Distance from the start within which the goal counts as reached [m] (:data:`xreset.eval.metrics.GOAL_DISTANCE`)."""
 _SAME_TURN = np.radians(15.0)
 """The same for the angle [rad]."""
 

@@ -8,7 +8,6 @@ finger, where the palm looks, which links follow which human keypoint, drives, h
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -94,14 +93,16 @@ def import_robot(
         notes.append(f"the hand is carried by the arm's link {flange!r} (--flange says another)")
     arm_tree = bare(arm_tree, arm_tree.link(flange).name, notes)
     ahead = _out_of_flange(arm_tree, flange)
-    along = f"the flange's {_axis_name(ahead)} axis"
+    sign = "-" if ahead.sum() < 0 else ""
+    along = f"the flange's {sign}{'xyz'[int(np.abs(ahead).argmax())]} axis"
     hand_tree = renamed(read_source(hand, notes), arm_tree)
     with atomic_folder(out) as work:
         found = find_hand(hand_tree, work, thumb, notes)
         if rpy is None:
-            rpy = _turned(np.eye(3), found.palm[:3, 0], ahead)
+            rpy = _turned(found.palm[:3, 0], ahead)
             if any(rpy):
-                notes.append(f"the hand is turned by --rpy {_angles(rpy)}: its fingers point along {along}")
+                angles = " ".join(f"{angle:g}" for angle in rpy)
+                notes.append(f"the hand is turned by --rpy {angles}: its fingers point along {along}")
         if offset is None:
             distance = _stand_off(found, rpy, ahead)
             offset = tuple((distance * ahead).tolist())
@@ -122,7 +123,12 @@ def import_robot(
         spec = replace(spec, collision_exclude=tuple(pairs))
         (work / DESCRIPTION).write_text(description_text(spec, notes))
         load_robot(work)
-    return Imported(folder=out, guessed=tuple(notes), to_say=(_mounting(flange, ahead, T, T @ found.palm), *_TO_SAY))
+    T_flange_palm = T @ found.palm
+    mounting = (
+        f"how the hand is mounted (--offset, --rpy): its fingers point along ({_vector(T_flange_palm[:3, 0])}) of "
+        f"{flange!r}, its inner side along ({_vector(T_flange_palm[:3, 2])}). The angle about {along} is yours to know"
+    )
+    return Imported(folder=out, guessed=tuple(notes), to_say=(mounting, *_TO_SAY))
 
 
 _TO_SAY = (
@@ -156,38 +162,16 @@ def _out_of_flange(arm: RobotTree, flange: str) -> np.ndarray:
     return sign * axis.round() + 0.0
 
 
-def _axis_name(axis: np.ndarray) -> str:
-    return ("-" if axis.sum() < 0 else "") + "xyz"[int(np.abs(axis).argmax())]
-
-
-def _mounting(flange: str, ahead: np.ndarray, T_flange_hand: np.ndarray, T_flange_palm: np.ndarray) -> str:
-    """Return how the hand is mounted, and the angles that let its fingers point out of the arm."""
-    fingers = T_flange_palm[:3, 0]
-    text = (
-        f"how the hand is mounted (--offset, --rpy): now its fingers point along ({_vector(fingers)}) of {flange!r}, "
-        f"its inner side along ({_vector(T_flange_palm[:3, 2])})"
-    )
-    name = _axis_name(ahead)
-    if fingers @ ahead > _ALONG:
-        return f"{text}. The angle about {name} is yours to know: --rpy turns the hand as it is mounted on your arm"
-    angles = _turned(T_flange_hand[:3, :3], fingers, ahead)
-    return f"{text}; for fingers along its {name} axis: --rpy {_angles(angles)}"
-
-
-def _turned(R: np.ndarray, fingers: np.ndarray, ahead: np.ndarray) -> tuple[float, float, float]:
-    """Return roll, pitch and yaw of a frame with rotation R after the shortest turn of the fingers' direction to the
-    one ahead; zeros where they nearly point there."""
+def _turned(fingers: np.ndarray, ahead: np.ndarray) -> tuple[float, float, float]:
+    """Return roll, pitch and yaw of the shortest turn of the fingers' direction to the one ahead; zeros where they
+    nearly point there."""
     if fingers @ ahead > _ALONG:
         return (0.0, 0.0, 0.0)
     if np.abs(fingers).max() > 0.95:
         fingers = fingers.round()  # along an axis, as far as fingers are straight
     turn = Rotation.align_vectors([ahead], [fingers])[0]
-    roll, pitch, yaw = (np.round(roll_pitch_yaw(turn.as_matrix() @ R), 4) + 0.0).tolist()
+    roll, pitch, yaw = (np.round(roll_pitch_yaw(turn.as_matrix()), 4) + 0.0).tolist()
     return roll, pitch, yaw
-
-
-def _angles(angles: Iterable[float]) -> str:
-    return " ".join(f"{angle:g}" for angle in angles)
 
 
 def _vector(values: np.ndarray) -> str:

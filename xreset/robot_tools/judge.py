@@ -141,45 +141,45 @@ def judge(
     """
     squeeze = squeeze or SqueezeConfig(force=5.0, reach=0.01)
     height = bank.object_pos[:, 2] - bank.start_pos[bank.sequence_index, 2]
-    lifted = np.flatnonzero(bank.post_contact & (height > LIFT))
-    if not len(lifted):
+    lifted = bank.with_states(np.flatnonzero(bank.post_contact & (height > LIFT)))
+    if not lifted.num_states:
         raise RobotError(
             f"robot {robot.name!r}: the bank has no state in which an object is in the air. Look at the reasons of "
             "xreset resets and xreset retarget."
         )
-    object_name = bank.object_name[lifted]
-    arrays = (bank.joint_pos, bank.object_pos, bank.object_quat_wxyz)
-    fingers = fingers_of(robot, objects, object_name, *(array[lifted] for array in arrays))
-    chosen = _tightest(fingers, object_name, bank.sequence_index[lifted], states, squeeze.reach)
+    fingers = fingers_of(
+        robot, objects, lifted.object_name, lifted.joint_pos, lifted.object_pos, lifted.object_quat_wxyz
+    )
+    chosen = _tightest(fingers, lifted, states, squeeze.reach)
     if not len(chosen):
         raise RobotError(
             f"robot {robot.name!r}: in no lifted state are the thumb and another finger within "
             f"{1e3 * squeeze.reach:g} mm of the object. Check the fingertips' frames (xreset robots check --picture), "
             "or raise --squeeze.reach."
         )
-    targets = squeeze_targets(robot, fingers, bank.joint_pos[lifted], squeeze)[chosen]
-    rows = lifted[chosen]
-    object_name = object_name[chosen]
-    used = [spec for spec in objects if spec.name in object_name]
+    targets = squeeze_targets(robot, fingers, lifted.joint_pos, squeeze)[chosen]
+    tried = lifted.with_states(chosen)
+    count = len(chosen)
+    used = [spec for spec in objects if spec.name in tried.object_name]
     names = [spec.name for spec in used]
     scene = SceneSpec(robot=robot, objects=tuple(used))
-    index = np.array([names.index(name) for name in object_name.tolist()])
-    joint_pos, object_pos, object_quat = (torch.as_tensor(array[rows], dtype=torch.float32) for array in arrays)
-    start = State.at_rest(joint_pos, object_pos, object_quat, torch.as_tensor(targets))
-    moments = torch.cat((joint_pos, object_pos, object_quat), dim=1)[:, None].numpy()
+    index = np.array([names.index(name) for name in tried.object_name.tolist()])
+    poses = (torch.as_tensor(array) for array in (tried.joint_pos, tried.object_pos, tried.object_quat_wxyz, targets))
+    start = State.at_rest(*poses)
+    moments = torch.cat((start.joint_pos, start.object_pos, start.object_quat), dim=1)[:, None].numpy()
     judged = []
     shots: dict[str, np.ndarray] = {}
     for number, name in enumerate(backends):
         table = probe(
             name, scene, index, start, partial(_play, Kinematics(robot)), gravity=0.0, steps=_CLOSE_STEPS,
             num_envs=num_envs, device=device,
-            progress=lambda done, number=number: progress(number * len(rows) + done, len(backends) * len(rows)),
+            progress=lambda done, number=number: progress(number * count + done, len(backends) * count),
         )  # fmt: skip
         reached = table[:, 0] > 0
         passed = table[:, 1 : 1 + len(PHASES)] > 0
         later = table[:, 1 + len(PHASES) :].reshape(len(table), len(PHASES), -1)
-        groups = {label: np.flatnonzero(object_name == label) for label in names}
-        for label, mine in {**groups, "all": np.arange(len(rows))}.items():
+        groups = {label: np.flatnonzero(tried.object_name == label) for label in names}
+        for label, mine in {**groups, "all": np.arange(count)}.items():
             counts = dict(zip(PHASES, passed[mine].sum(axis=0).tolist(), strict=True))
             fails = int((~reached[mine]).sum())
             judged.append(Judged(backend=name, object_name=label, tried=len(mine), arm_fails=fails, **counts))
@@ -191,18 +191,18 @@ def judge(
     return Judgement(robot=robot.name, rows=tuple(judged), without=tuple(without), shots=shots)
 
 
-def _tightest(fingers: Fingers, objects: np.ndarray, sequence: np.ndarray, count: int, reach: float) -> np.ndarray:
+def _tightest(fingers: Fingers, bank: ResetBank, count: int, reach: float) -> np.ndarray:
     """Return rows of the states that grasp most tightly, ``count`` of each object, from its sequences in turn."""
     thumb = fingers.gap[:, fingers.finger == 0].amin(dim=-1)
     other = fingers.gap[:, fingers.finger != 0].amin(dim=-1)
     gap = torch.maximum(thumb, other).numpy()
     rank = np.zeros(len(gap), dtype=int)
-    for number in np.unique(sequence):
-        mine = np.flatnonzero(sequence == number)
+    for number in np.unique(bank.sequence_index):
+        mine = np.flatnonzero(bank.sequence_index == number)
         rank[mine[np.argsort(gap[mine], kind="stable")]] = np.arange(len(mine))
     chosen = []
-    for name in np.unique(objects):
-        mine = np.flatnonzero((objects == name) & (gap < reach))
+    for name in np.unique(bank.object_name):
+        mine = np.flatnonzero((bank.object_name == name) & (gap < reach))
         chosen += mine[np.lexsort((gap[mine], rank[mine]))][:count].tolist()
     return np.array(sorted(chosen), dtype=np.int64)
 
@@ -215,10 +215,10 @@ def _play(kinematics: Kinematics, backend: Backend, start: State) -> Tensor:
     joints = start.joint_pos.double()
     palm = kinematics.link_poses(joints, [kinematics.robot.palm])[:, 0]
     up, up_error = arm_path(kinematics, joints, palm, rise=HEIGHT, turn=0.0)
-    right, right_error = arm_path(kinematics, up[-1], palm, rise=HEIGHT, turn=TURN)
+    right, turn_error = arm_path(kinematics, up[-1], palm, rise=HEIGHT, turn=TURN)
     left, left_error = arm_path(kinematics, up[-1], palm, rise=HEIGHT, turn=-TURN)
-    turn = torch.where((right_error <= left_error)[:, None], right, left)
-    turn_error = torch.minimum(right_error, left_error)
+    turn = torch.where((turn_error <= left_error)[:, None], right, left)
+    turn_error = turn_error.minimum(left_error)
     pos, quat = _relative(start.object_pos, start.object_quat, palm[:, :3, 3], matrix_to_quat(palm[:, :3, :3]))
     kept = torch.ones(len(joints), dtype=torch.bool)
     passed = []

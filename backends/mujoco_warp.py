@@ -65,7 +65,9 @@ _SET_PER_WORLD = (
 They, and all that MuJoCo derives from them, must be batched, or every world gets the values of world 0.
 """
 
-_TYPES = dict.fromkeys(("pos", "linvel", "angvel", "object_pos", "object_linvel", "object_angvel"), wp.vec3)
+_TYPES: dict[str, Any] = dict.fromkeys(
+    ("pos", "linvel", "angvel", "object_pos", "object_linvel", "object_angvel"), wp.vec3
+)
 _TYPES |= dict.fromkeys(("tip_force", "table_force", "friction", "object_com", "inertia", "com"), wp.vec3)
 _TYPES |= {"quat": wp.quat, "object_quat": wp.quat, "invweight": wp.vec2}
 """Types for Warp of values that are no plain numbers."""
@@ -264,8 +266,9 @@ class MujocoWarpBackend(Backend):
         self._coming = State.initial(self.scene, self.object_index).to(self.device)
         self._state = replace(self._coming.clone(), joint_target=wp.to_torch(self._data.ctrl))
         self._nonfinite = zeros(dtype=torch.bool)
-        links = {name: zeros(1 + tips, 3) for name in ("pos", "linvel", "angvel")}
-        self._links = Links(quat=zeros(1 + tips, 4), **links)
+        self._links = Links(
+            pos=zeros(1 + tips, 3), quat=zeros(1 + tips, 4), linvel=zeros(1 + tips, 3), angvel=zeros(1 + tips, 3)
+        )
         self._contacts = Contacts(
             tip_force=zeros(tips, 3), tip_touch=zeros(tips, dtype=torch.bool), table_force=zeros(3)
         )

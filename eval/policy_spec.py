@@ -14,9 +14,9 @@ from xreset.errors import PolicyError
 from xreset.eval.baselines import KinematicRetargeting
 from xreset.files import file_hash
 from xreset.learning.choice import read_choice
-from xreset.learning.run import read_run
+from xreset.learning.run import policy_file, read_run
 from xreset.objects.catalogue import object_names
-from xreset.policies import results_folder, shipped
+from xreset.policies import results_folder
 from xreset.policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_contract
 from xreset.resets.bank import ResetBank
 from xreset.retarget.file import Retargeted
@@ -149,24 +149,17 @@ def load_policy(policy: str | Path, *, robot: str | Path | None = None, seed: in
     path = Path(policy)
     objects_folder = None
     if os.path.isdir(path):
-        from xreset.learning.export import ensure_policy
-
         run = read_run(path)
-        file = ensure_policy(path)
-        folder = path
         objects_folder = Path(run.objects) if run.objects else None
         robot = robot or run.robot
+    file = policy_file(policy, also=BASELINES)
+    folder = file.parent
+    if os.path.isdir(path):
         name = path.name
-    elif path.suffix == ".onnx" or os.path.exists(path):
-        file = path
-        folder = path.parent
+    elif file == path:
         name = path.stem
-    elif name in shipped():
-        file = shipped()[name]
-        folder = results_folder(name)
     else:
-        known = ", ".join((*BASELINES, *shipped()))
-        raise PolicyError(f"Unknown policy {name!r}. Give a run folder, a .onnx file, or one of: {known}.")
+        folder = results_folder(name)
     contract = OnnxPolicy(file).contract
     spec = load_robot(robot or contract["robot"])
     task = from_dict(TaskConfig, contract["task"], f"{file}: task")

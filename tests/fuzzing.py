@@ -80,7 +80,7 @@ def readers() -> Iterator[dict[str, Reader]]:
     from xreset.eval.results import read_episodes, read_evaluation, read_result, read_traces, write_results
     from xreset.eval.study.file import SHIPPED, read_study
     from xreset.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
-    from xreset.learning.clock import LiftClock, read_lift
+    from xreset.learning.clock import Lift, read_lift, write_lift
     from xreset.objects.catalogue import load_object
     from xreset.objects.meshes import read_mesh
     from xreset.objects.properties import properties_of
@@ -137,7 +137,7 @@ def readers() -> Iterator[dict[str, Reader]]:
         (folder / "compared.json").write_bytes((folder / "run.json").read_bytes())
         add("run.json, compared", "compared.json", lambda p: run_facts(read_json(p), p), "json")
         add("lift.json", "lift.json", lambda p: read_lift(p.parent), "json")
-        LiftClock(folder).tick(0.2, iteration=10, env_steps=1000, seconds=60.0)
+        write_lift(folder, Lift().after(0.2, iteration=10, env_steps=1000, seconds=60.0))
         writer = SummaryWriter(log_dir=str(folder / "curves"))
         for step in range(4):
             writer.add_scalar("episode/return", 0.1 * step, step)

@@ -20,7 +20,7 @@ from xreset.eval.report.groups import grouped, scores
 from xreset.eval.report.make import compare
 from xreset.eval.report.read import read_curves, read_training, read_trainings
 from xreset.eval.stats import bootstrap_ci95, crossed_bootstrap_ci95
-from xreset.learning.clock import Lift, LiftClock, Passing
+from xreset.learning.clock import Lift, Passing, write_lift
 from xreset.learning.config import TrainConfig
 from xreset.task.config import ResetConfig, TaskConfig, TerminationConfig
 
@@ -183,7 +183,7 @@ class LiftTest(Compared):
             return {"iteration": round(10 * minutes), "env_steps": round(1e6 * minutes), "minutes": minutes}
 
         folder = self.write_run(name, **changes)
-        LiftClock(folder, Lift(passed=tuple(Passing(share=s, **at(t)) for s, t in passed), **at(end))).write()
+        write_lift(folder, Lift(passed=tuple(Passing(share=s, **at(t)) for s, t in passed), **at(end)))
         return name
 
     def test_seeds_are_one_row(self):

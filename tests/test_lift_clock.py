@@ -11,47 +11,31 @@ import torch
 
 from xreset.errors import FileFormatError, XResetError
 from xreset.files import write_json
-from xreset.learning.clock import FILE, Lift, LiftClock, read_lift
+from xreset.learning.clock import FILE, Lift, read_lift, write_lift
 from xreset.learning.log import TrainingLog
 
 
-class LiftClockTest(unittest.TestCase):
+class LiftTest(unittest.TestCase):
     def setUp(self):
-        folder = tempfile.TemporaryDirectory()
-        self.addCleanup(folder.cleanup)
-        self.folder = Path(folder.name)
+        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
 
-    def run_clock(self, clock: LiftClock, shares: list[float], begin: int = 0) -> None:
+    def after(self, lift: Lift, shares: list[float], begin: int = 0) -> Lift:
         for i, share in enumerate(shares, begin + 1):
-            clock.tick(share, iteration=i, env_steps=1000 * i, seconds=30.0 * i)
+            lift = lift.after(share, iteration=i, env_steps=1000 * i, seconds=30.0 * i)
+        return lift
 
     def test_the_first_passing_of_each_mark_is_kept(self):
-        clock = LiftClock(self.folder)
-        self.run_clock(clock, [0.0, 0.009, 0.2, 0.05, 0.11, 0.6, 0.3])
-        clock.write()
+        write_lift(self.folder, self.after(Lift(), [0.0, 0.009, 0.2, 0.05, 0.11, 0.6, 0.3]))
         lift = read_lift(self.folder)
         self.assertEqual([(p.share, p.iteration, p.env_steps, p.minutes) for p in lift.passed],
                          [(0.01, 3, 3000, 1.5), (0.1, 3, 3000, 1.5), (0.5, 6, 6000, 3.0)])  # fmt: skip
         self.assertEqual((lift.iteration, lift.env_steps, lift.minutes, lift.success_from_home), (7, 7000, 3.5, 0.3))
 
-    def test_a_passing_is_on_disk_at_once(self):
-        clock = LiftClock(self.folder)
-        self.run_clock(clock, [0.0])
-        self.assertFalse((self.folder / FILE).exists())
-        self.run_clock(clock, [0.02], begin=1)
-        self.assertEqual([p.share for p in read_lift(self.folder).passed], [0.01])
-
     def test_a_resumed_run_forgets_what_came_after_its_checkpoint(self):
-        clock = LiftClock(self.folder)
-        self.run_clock(clock, [0.0, 0.02, 0.0, 0.3])
-        again = LiftClock(self.folder)
-        again.resume(3)
-        self.assertEqual([(p.share, p.iteration) for p in again.lift.passed], [(0.01, 2)])
-        self.run_clock(again, [0.0, 0.4], begin=3)
-        self.assertEqual([(p.share, p.iteration) for p in read_lift(self.folder).passed], [(0.01, 2), (0.1, 5)])
-        fresh = LiftClock(self.folder)
-        fresh.resume(0)
-        self.assertEqual(fresh.lift, Lift())
+        again = self.after(Lift(), [0.0, 0.02, 0.0, 0.3]).up_to(3)
+        self.assertEqual([(p.share, p.iteration) for p in again.passed], [(0.01, 2)])
+        again = self.after(again, [0.0, 0.4], begin=3)
+        self.assertEqual([(p.share, p.iteration) for p in again.passed], [(0.01, 2), (0.1, 5)])
 
     def test_earlier_runs_and_damaged_files(self):
         self.assertEqual(read_lift(self.folder), Lift())
@@ -75,6 +59,7 @@ class CurvesTest(unittest.TestCase):
                 curves = TrainingLog(folder, 2, "cpu", 5, project)
                 curves.add(torch.ones(2), torch.zeros(2), log)
                 curves.write(3, 10, 1.0, {"speed/env_steps_per_second": 2.0})
+                self.assertEqual(len(read_lift(folder).passed), 3, "a passing is on disk at once")
                 curves.close(stopped=False)
                 self.assertEqual(online.init.called, project is not None)
             self.assertEqual(online.init.call_args.kwargs["project"], "project")

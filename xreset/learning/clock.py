@@ -6,7 +6,7 @@ within minutes. So trainings are compared by this time.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from xreset.checks import NotNegative, Share, from_dict
@@ -44,32 +44,21 @@ class Lift:
     success_from_home: Share[float] = 0.0
     """Share in the last iteration."""
 
+    def up_to(self, iteration: int) -> Lift:
+        """Return the contents without what came after an iteration."""
+        return Lift(passed=tuple(p for p in self.passed if p.iteration <= iteration))
 
-@dataclass
-class LiftClock:
-    """Keeps ``lift.json`` of a run."""
-
-    folder: Path
-    lift: Lift = field(default_factory=Lift)
-
-    def resume(self, iteration: int) -> None:
-        """Continue from the file, if there is one, without what came after ``iteration``."""
-        if iteration:
-            passed = read_lift(self.folder).passed
-            self.lift = Lift(passed=tuple(p for p in passed if p.iteration <= iteration))
-
-    def tick(self, share: float, *, iteration: int, env_steps: int, seconds: float) -> None:
-        """Record an iteration's share of success from home."""
+    def after(self, share: float, *, iteration: int, env_steps: int, seconds: float) -> Lift:
+        """Return the contents after another iteration, with the share of success from home in it."""
         now = {"iteration": iteration, "env_steps": env_steps, "minutes": seconds / 60}
-        known = {p.share for p in self.lift.passed}
-        new = tuple(Passing(share=s, **now) for s in SHARES if s not in known and share >= s)
-        self.lift = Lift(passed=(*self.lift.passed, *new), success_from_home=share, **now)
-        if new:
-            self.write()
+        known = {p.share for p in self.passed}
+        new = [Passing(share=s, **now) for s in SHARES if s not in known and share >= s]
+        return Lift(passed=(*self.passed, *new), success_from_home=share, **now)
 
-    def write(self) -> None:
-        """Write the file."""
-        write_json(self.folder / FILE, {"schema": SCHEMA} | asdict(self.lift))
+
+def write_lift(folder: Path, lift: Lift) -> None:
+    """Write a run's ``lift.json``."""
+    write_json(folder / FILE, {"schema": SCHEMA} | asdict(lift))
 
 
 def read_lift(folder: Path) -> Lift:

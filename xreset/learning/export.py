@@ -15,13 +15,11 @@ from typing import TYPE_CHECKING, Any
 import torch
 from tensordict import TensorDict
 
-from xreset.errors import PolicyError
 from xreset.files import atomic_write, code_version, file_hash
 from xreset.learning.checkpoint import must_fit, read_checkpoint
 from xreset.learning.choice import read_choice
 from xreset.learning.model import ExportedPolicy, PointNetLstmModel, make_actor
 from xreset.learning.run import checkpoints, latest_checkpoint, read_run
-from xreset.policies import shipped
 from xreset.policy import INPUTS, METADATA_KEY, OUTPUTS, observation_shapes
 
 if TYPE_CHECKING:
@@ -125,25 +123,6 @@ def ensure_policy(out: Path) -> Path:
     if not policy.exists() or not _is_of(policy, checkpoint):
         export_checkpoint(out, checkpoint, policy)
     return policy
-
-
-def policy_file(policy: str | Path) -> Path:
-    """Return the file of a policy: a run folder's, an exported one, or one that ships with xreset, in this order.
-
-    Raises:
-        PolicyError: there is none of that name.
-    """
-    path = Path(policy)
-    if path.is_dir():
-        return ensure_policy(path)
-    if path.suffix == ".onnx" or path.exists():
-        return path
-    files = shipped()
-    if str(policy) not in files:
-        raise PolicyError(
-            f"Unknown policy {str(policy)!r}. Give a run folder, a .onnx file, or one of: {', '.join(files)}."
-        )
-    return files[str(policy)]
 
 
 def _is_of(policy: Path, checkpoint: Path) -> bool:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from xreset.errors import needs
 from xreset.files import read_json
-from xreset.learning.clock import LiftClock
+from xreset.learning.clock import Lift, read_lift, write_lift
 
 RECENT = 20
 """Iterations over which returns and lengths of episodes are averaged."""
@@ -23,12 +23,17 @@ class TrainingLog:
     """Sums on the device during an iteration, so that nothing waits for a GPU; one line and one set of curves after
     it."""
 
-    def __init__(self, folder: Path, num_envs: int, device: str, total: int, wandb: str | None = None) -> None:
+    def __init__(
+        self, folder: Path, num_envs: int, device: str, total: int, wandb: str | None = None, *, done: int = 0
+    ) -> None:
         """Start the log of a run.
 
         Args:
             folder: run folder.
+            num_envs: number of worlds.
+            device: where rewards are.
             total: number of iterations in all.
+            done: number of iterations that have been done. What was logged after them is forgotten.
             wandb: project of Weights & Biases to which the curves and ``run.json`` are sent; None: nothing is sent.
 
         Raises:
@@ -43,7 +48,8 @@ class TrainingLog:
             self._online = init(
                 project=wandb, name=folder.name, dir=str(folder), config=read_json(folder / "run.json"), reinit=True
             )
-        self.clock = LiftClock(folder)
+        self._folder = folder
+        self._lift = read_lift(folder).up_to(done) if done else Lift()
         self._curves = SummaryWriter(str(folder))
         self._returns = torch.zeros(num_envs, device=device)
         self._lengths = torch.zeros(num_envs, device=device)
@@ -88,7 +94,10 @@ class TrainingLog:
         if self._online is not None:
             self._online.log(curves, step=iteration)
         from_home = means["task/success_from_home"]
-        self.clock.tick(from_home, iteration=iteration, env_steps=env_steps, seconds=elapsed)
+        before = self._lift
+        self._lift = before.after(from_home, iteration=iteration, env_steps=env_steps, seconds=elapsed)
+        if self._lift.passed != before.passed:
+            write_lift(self._folder, self._lift)
         if time.monotonic() - self._last_line > _LINE_SECONDS or iteration == self._total:
             self._last_line = time.monotonic()
             print(
@@ -106,6 +115,6 @@ class TrainingLog:
         self._curves.close()
         if self._online is not None:
             self._online.finish()
-        self.clock.write()
+        write_lift(self._folder, self._lift)
         if stopped:
             print("stopped after the current iteration; a checkpoint is written.")

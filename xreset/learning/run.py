@@ -13,6 +13,7 @@ RUN/eval/, RUN/report/       made by ``xreset eval`` and ``xreset report``
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from xreset.checks import Checked, NotNegative, Positive, from_dict
 from xreset.errors import FileFormatError, PolicyError, RunError
 from xreset.files import read_json, write_json
 from xreset.learning.config import TrainConfig
+from xreset.policies import shipped
 from xreset.text import shown
 
 SCHEMA = "xreset-run/1"
@@ -96,3 +98,27 @@ def latest_checkpoint(folder: Path) -> Path:
     if not found:
         raise RunError(f"{folder} has no checkpoint yet. Train it: xreset train --out {folder} --resume")
     return found[-1]
+
+
+def policy_file(policy: str | Path, *, also: Sequence[str] = ()) -> Path:
+    """Return the file of a policy: a run folder's, an exported one, or one that ships with xreset, in this order.
+
+    Args:
+        policy: folder, file or name.
+        also: further names that the error lists.
+
+    Raises:
+        PolicyError: there is none of that name.
+    """
+    if os.path.isdir(policy):
+        from xreset.learning.export import ensure_policy  # rsl-rl, which playing a file does not need
+
+        return ensure_policy(Path(policy))
+    path = Path(policy)
+    if path.suffix == ".onnx" or os.path.exists(path):
+        return path
+    files = shipped()
+    if str(policy) not in files:
+        known = ", ".join((*also, *files))
+        raise PolicyError(f"Unknown policy {str(policy)!r}. Give a run folder, a .onnx file, or one of: {known}.")
+    return files[str(policy)]

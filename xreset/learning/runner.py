@@ -91,8 +91,7 @@ class TrainingRunner:
         obs = env.get_observations()
         log = None
         if self.processes.is_main:
-            log = TrainingLog(self.folder, env.num_envs, self.device, total, self.wandb)
-            log.clock.resume(self.iteration)
+            log = TrainingLog(self.folder, env.num_envs, self.device, total, self.wandb, done=self.iteration)
         saved_at = self.iteration
         steps = self.config.ppo.horizon * env.num_envs * self.processes.count
         begin = time.perf_counter()

@@ -20,9 +20,9 @@ from xreset.files import claim_folder, file_hash, write_whole
 from xreset.inputs import Inputs, load_inputs
 from xreset.learning.config import TrainConfig
 from xreset.learning.distributed import Processes, leave
-from xreset.learning.export import export_onnx, policy_file
+from xreset.learning.export import export_onnx
 from xreset.learning.recipes import default_recipe, own_terms_flag, starting_config, student_config
-from xreset.learning.run import TEACHER, RunInfo, checkpoints, latest_checkpoint, read_run, write_run
+from xreset.learning.run import TEACHER, RunInfo, checkpoints, latest_checkpoint, policy_file, read_run, write_run
 from xreset.learning.runner import TrainingRunner
 from xreset.plugins import backend_class, device_for
 from xreset.policy import OnnxPolicy, check_contract, policy_contract

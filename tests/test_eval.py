@@ -240,17 +240,12 @@ class ResultsTest(unittest.TestCase):
 
     def test_summary(self):
         s = toy_summary()
-        self.assertEqual((s.backend, s.robot, s.policy, s.seed, s.episodes), ("mujoco", "toy", "zero", 3, 4))
-        self.assertEqual(s.objects, (SOUP, SPAM))
-        self.assertAlmostEqual(s.task_progress.mean, (1 + 0.33 + 0.66) / 4)
-        low, high = s.task_progress.ci95
-        self.assertEqual((low, high), (0.33, 0.665))  # two demonstrations: the interval spans their means
+        self.assertEqual((s.objects, s.episodes, s.task_progress.mean), ((SOUP, SPAM), 4, 0.4975))
+        self.assertEqual(s.task_progress.ci95, (0.33, 0.665), "two demonstrations: the interval spans their means")
         self.assertEqual((s.approach_rate, s.grasp_rate, s.reorient_rate), (0.75, 0.5, 0.25))
-        self.assertAlmostEqual(s.reorientation_progress, 0.375)
+        self.assertEqual(s.reorientation_progress, 0.375)
         self.assertEqual(vars(s.health), {"nonfinite": 1, "overflow": 1, "out_of_bounds": 1})
-        self.assertEqual(s.control_steps_per_second, 1234.6)
-        self.assertEqual([d.sequence for d in s.per_demo], ["demo_0", "demo_1"])
-        self.assertAlmostEqual(s.per_demo[0].task_progress, 0.665)
+        self.assertEqual([(d.sequence, d.task_progress) for d in s.per_demo], [("demo_0", 0.665), ("demo_1", 0.33)])
         self.assertEqual((s.per_demo[1].grasp_rate, s.per_demo[1].object, s.per_demo[1].episodes), (0.5, SPAM, 2))
 
     def test_what_is_no_result_is_refused(self):

@@ -280,10 +280,12 @@ class NpzTest(InFolder):
         with zipfile.ZipFile(self.file) as archive:
             info = archive.getinfo("points.npy")
         flipped[info.header_offset + 60 + info.compress_size // 2] ^= 0xFF
-        np.save(self.folder / "x.npy", np.zeros(3))
-        array = (self.folder / "x.npy").read_bytes()
-        damaged = {"half": whole[: len(whole) // 2], "empty": b"", "text": b"hello", "array": array, "bits": flipped}
-        for name, content in damaged.items():
+        for name, content in {
+            "half": whole[: len(whole) // 2],
+            "empty": b"",
+            "text": b"hello",
+            "bits": flipped,
+        }.items():
             with self.subTest(name):
                 self.file.write_bytes(content)
                 with self.refused("cannot be read as a test file", "damaged or truncated"):
@@ -331,12 +333,10 @@ class NpzTest(InFolder):
                 self.read()
 
     def test_numbers_are_native(self):
-        for offsets in (np.array([0, 1, 4], dtype=">u4"), np.array([0, 1, 4], dtype=np.uint64)):
-            for points in (ARRAYS["points"].astype(np.longdouble), ARRAYS["points"].astype(">f8")):
-                self.write(offsets=offsets, points=points)
-                found = self.read()
-                self.assertEqual((found["offsets"].dtype, found["points"].dtype), (np.dtype("=i8"), np.dtype("=f8")))
-                np.testing.assert_array_equal(found["points"], ARRAYS["points"])
+        self.write(offsets=np.array([0, 1, 4], dtype=">u4"), points=ARRAYS["points"].astype(np.longdouble))
+        found = self.read()
+        self.assertEqual((found["offsets"].dtype, found["points"].dtype), (np.dtype("=i8"), np.dtype("=f8")))
+        np.testing.assert_array_equal(found["points"], ARRAYS["points"])
         self.write(offsets=np.array([0, 1, 2**63], dtype=np.uint64))
         with self.refused("more than 63 bits"):
             self.read()
@@ -403,9 +403,6 @@ class TypedTest(unittest.TestCase):
         task = TaskConfig(timestep=0.01)
         self.assertEqual(from_dict(TaskConfig, json.loads(json.dumps(asdict(task)))), task)
 
-    def test_an_integer_is_a_float(self):
-        self.assertIsInstance(from_dict(Outer, asdict(self.GOOD) | {"pair": [0, 1]}).pair[0], float)
-
     def test_what_is_missing_takes_its_default(self):
         """Files outlive the fields that are added after them; what has no default must be there."""
         data = asdict(TaskConfig(timestep=0.01))
@@ -470,19 +467,14 @@ class BankTest(InFolder):
                 self.assertEqual(type(getattr(found, name)), type(value), name)
                 np.testing.assert_array_equal(getattr(found, name), value, name)
 
-    def test_a_bank_without_a_state_still_has_starts_and_goals(self):
-        none = np.zeros(6, dtype=bool)
-        write_bank(self.file, toy_bank(self.robot).with_states(none), config={}, inputs={})
-        found = read_bank(self.file, robot=self.robot)
-        self.assertEqual((found.num_states, len(found.goal_pos)), (0, 3))
-
-    def test_some_of_the_states(self):
+    def test_some_of_the_states_and_none(self):
         bank = toy_bank(self.robot)
         chosen = bank.with_states(np.array([True, False, False, False, True, False]))
         np.testing.assert_array_equal(chosen.sequence_index, [0, 2])
-        np.testing.assert_array_equal(chosen.frame_index, [3, 5])
         np.testing.assert_array_equal(chosen.joint_pos, bank.joint_pos[[0, 4]])
-        self.assertEqual(chosen.sequence_name.tolist(), ["demo_a", "demo_b", "demo_c"])
+        write_bank(self.file, bank.with_states(np.zeros(6, dtype=bool)), config={}, inputs={})
+        found = read_bank(self.file, robot=self.robot)
+        self.assertEqual((found.num_states, len(found.goal_pos)), (0, 3), "starts and goals are left")
 
     def test_a_bank_of_the_robot_before_it_was_changed(self):
         self.write()
@@ -499,17 +491,11 @@ class BankTest(InFolder):
             return {name: array}
 
         for words, changes in (
-            ("'joint_pos' holds non-finite", with_value("joint_pos", (2, 1), np.nan)),
-            ("'goal_pos' holds non-finite", with_value("goal_pos", (0, 1), np.inf)),
-            ("'goal_quat_wxyz' holds quaternions that are not unit", with_value("goal_quat_wxyz", 1, [2, 0, 0, 0])),
             ("'sequence_index' points beyond the 3 sequences", with_value("sequence_index", 1, 3)),
-            ("'sequence_index' points beyond the 3 sequences", with_value("sequence_index", 1, -1)),
             ("another object than its sequence", with_value("object_name", 0, SPAM)),
             (f"does not list \\['{SPAM}'\\]", {"object_names": (SOUP,), "object_sources": ("stand-in",)}),
             ("'rejected_sequence_index' points beyond the 3 sequences", with_value("rejected_sequence_index", 0, 7)),
             ("'rejected_reason' points beyond the 2 reasons", with_value("rejected_reason", 0, 2)),
-            ("'object_sources' has shape", {"object_sources": ("stand-in",)}),
-            ("but L = 6", {"post_contact": np.ones(5, dtype=bool)}),
             ("but J = 7", {"joint_pos": np.zeros((6, 8), dtype=np.float32)}),
         ):
             self.write(**changes)

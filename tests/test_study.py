@@ -125,14 +125,8 @@ class PaperTest(unittest.TestCase):
         for (*each, average), two in zip(methods, tables["II"].values.values(), strict=True):
             self.assertAlmostEqual(sum(each) / 9, average, delta=0.06)
             self.assertEqual(average, two[0])
-        for number in ("VI", "VII"):
-            for method, (*each, average) in tables[number].values.items():
-                with self.subTest(number, method=method):
-                    self.assertAlmostEqual(sum(each) / 3, average, delta=0.06)
         for table in tables.values():
             self.assertTrue(all(0 <= value <= 100 for value, _ in table.figures().values()))
-        self.assertEqual(tables["III"].figures()["80", SOUP, "grasp"], (100.0, None))
-        self.assertNotIn(("80", SOUP, "grasp"), tables["IV"].figures())
         self.assertEqual(nine.figures()["Ours", SOUP, "task_progress"], (90.8, 1.5))
 
 

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import tyro
 
+from xreset.accounts import Account, described
 from xreset.cli import INVOCATION
-from xreset.cli._terminal import Progress, console
+from xreset.cli._terminal import Progress, console, show_table
 from xreset.plugins import backend_names, backend_status
 
 if TYPE_CHECKING:
@@ -92,3 +93,12 @@ def this_command() -> str:
     if "--json" in words:
         del words[(i := words.index("--json")) : i + 2]
     return shlex.join(["xreset", *(Path(word).name if Path(word).exists() else word for word in words)])
+
+
+def show_accounts(rows: Sequence[Account], title: str) -> None:
+    """Print how many frames or states of each object and phase are kept, and why the others are not."""
+    table = [("object", "phase", "in all", "kept", "others")]
+    for row in rows:
+        kept = f"{row.kept} ({row.share:.0%})" if row.total else "0"
+        table.append((row.object_name, row.phase, str(row.total), kept, described(row.lost)))
+    show_table(table, title=title)

@@ -6,11 +6,12 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import rich.console
 import rich.progress
+from rich.table import Table
 from rich.text import Text
 
 
@@ -35,6 +36,10 @@ console = Console()
 """Where commands print."""
 
 
+_FIGURES = ("", *"-+.0123456789")
+"""How the text of a figure begins."""
+
+
 class Progress(rich.progress.Progress):
     """Progress bars, which vanish at the end."""
 
@@ -52,3 +57,14 @@ class Progress(rich.progress.Progress):
         """Add a bar; returns the function that moves it: (done, in all)."""
         task = self.add_task(what, total=None)
         return lambda done, total: self.update(task, completed=done, total=total)
+
+
+def show_table(rows: Sequence[Sequence[str | Text]], **options: Any) -> None:
+    """Print a table whose first row is its head, with columns of figures to the right; ``options`` are rich's."""
+    table = Table(**options)
+    for number, name in enumerate(rows[0]):
+        figures = number > 0 and all(str(row[number])[:1] in _FIGURES for row in rows[1:])
+        table.add_column(name, justify="right" if figures else "left")
+    for row in rows[1:]:
+        table.add_row(*row)
+    console.print(table)

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from rich.table import Table
 
 from xreset.checks import Options
 from xreset.cli._common import Flat, Source, Sources
-from xreset.cli._terminal import Progress, console
+from xreset.cli._terminal import Progress, console, show_table
 from xreset.errors import DemoError
 from xreset.files import file_hash
 
@@ -283,10 +282,7 @@ def _save(made: Demos, out: Path, config: dict[str, Any], **inputs: Path) -> Non
 def _print_summary(demos: Demos, path: Path) -> None:
     from xreset.demos.plausible import doubts, start_to_goal
 
-    table = Table(caption="right, left: sequences. hand: frames with a hand. lift, goal: medians, from the start pose")
-    table.add_column("object", no_wrap=True)
-    for column in ("right", "left", "frames", "hand", "lift, cm", "goal, cm", "goal, deg"):
-        table.add_column(column, justify="right")
+    table = [("object", "right", "left", "frames", "hand", "lift, cm", "goal, cm", "goal, deg")]
     for name in sorted(set(demos.object_name.tolist())):
         own = demos.select(objects=[name])
         right = np.count_nonzero(own.hand_side == "right")
@@ -294,17 +290,9 @@ def _print_summary(demos: Demos, path: Path) -> None:
         height = own.object_pos[:, 2]
         lift = np.median(np.maximum.reduceat(height, first) - height[first])
         distance, angle = map(np.median, start_to_goal(own))
-        table.add_row(
-            name,
-            str(right),
-            str(len(own) - right),
-            str(own.num_frames),
-            f"{own.hand_valid.mean():.0%}",
-            f"{100 * lift:.1f}",
-            f"{100 * distance:.1f}",
-            f"{np.degrees(angle):.0f}",
-        )
-    console.print(table)
+        counts = (f"{right}", f"{len(own) - right}", f"{own.num_frames}", f"{own.hand_valid.mean():.0%}")
+        table.append((name, *counts, f"{100 * lift:.1f}", f"{100 * distance:.1f}", f"{np.degrees(angle):.0f}"))
+    show_table(table, caption="right, left: sequences. hand: frames with a hand. lift, goal: medians, from the start")
     console.print(f"{path}: {demos.num_sequences} sequences, {demos.num_frames} frames at {demos.fps:g} per second")
     for doubt in doubts(demos):
         console.print(f"note: {doubt}", style="yellow")

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rich.table import Table
-
 from xreset.cli._common import Source
-from xreset.cli._terminal import Console
+from xreset.cli._terminal import console, show_table
 from xreset.errors import ObjectError
 from xreset.objects.properties import Properties
 from xreset.spec import ObjectSpec
@@ -21,10 +19,10 @@ def list_(*, objects: Path | None = None) -> None:
     """
     from xreset.objects import catalogue
 
-    table = _table()
+    table = [_HEAD]
     for name in catalogue.object_names(objects):
-        table.add_row(*_cells(catalogue.load_object(name, objects)))
-    Console().print(table)
+        table.append(_cells(catalogue.load_object(name, objects)))
+    show_table(table)
 
 
 def import_(
@@ -74,8 +72,7 @@ def import_(
         raise ObjectError("A mesh file needs a folder of objects to go into. Add --out.")
     else:
         files = {name or path.stem: path}
-    console = Console()
-    table = _table("mass from", "deviation, mm")
+    table = [(*_HEAD, "mass from", "deviation, mm")]
     found = []
     with console.status("") as status:
         for object_name, file in files.items():
@@ -84,9 +81,9 @@ def import_(
                 result = meshes.import_with_notes(file, object_name)
             else:
                 result = meshes.add_mesh(file, out, object_name, scale=scale, properties=properties)
-            table.add_row(*_cells(result.obj), result.mass_source, f"{1e3 * result.deviation:.1f}")
+            table.append((*_cells(result.obj), result.mass_source, f"{1e3 * result.deviation:.1f}"))
             found.append(result)
-    console.print(table)
+    show_table(table)
     for result in found:
         for note in (*result.notes, result.hollows()):
             if note:
@@ -100,15 +97,7 @@ def import_(
         console.print(f"{png}: meshes and their pieces")
 
 
-def _table(*more: str) -> Table:
-    table = Table()
-    for column in ("object", "alias"):
-        table.add_column(column, no_wrap=True)
-    for column in ("kg", "size, mm", "pieces"):
-        table.add_column(column, justify="right", no_wrap=True)
-    for column in more:
-        table.add_column(column, justify="right")
-    return table
+_HEAD: tuple[str, ...] = ("object", "alias", "kg", "size, mm", "pieces")
 
 
 def _cells(obj: ObjectSpec) -> tuple[str, ...]:
@@ -138,7 +127,7 @@ def make(*, out: Path, count: int = 40, seed: int = 0) -> None:
     from xreset.objects import procedural
 
     written = procedural.make_shapes(out, count, seed)
-    Console().print(f"{out}: {len(written)} shapes")
+    console.print(f"{out}: {len(written)} shapes")
 
 
 COMMAND = {"list": list_, "import": import_, "make": make}

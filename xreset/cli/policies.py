@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from rich.table import Table
-
-from xreset.cli._terminal import console
+from xreset.cli._terminal import console, show_table
 from xreset.policies import card, shipped
 
 
@@ -26,10 +24,10 @@ def list_() -> None:
         for what, text in facts.items():
             console.print(f"  {what + ':':9} {text}")
         engines = list({engine: None for by_engine in about.results.values() for engine in by_engine})  # noqa: XR002
-        table = Table("task progress", *engines)
+        table = [("task progress", *engines)]
         for episodes, by_engine in about.results.items():
-            table.add_row(episodes, *(by_engine.get(engine, "") for engine in engines))
-        console.print(table)
+            table.append((episodes, *(by_engine.get(engine, "") for engine in engines)))
+        show_table(table)
 
 
 COMMAND = {"list": list_}

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rich.table import Table
-
 from xreset.cli._common import Flat, Policy, Several, chosen_engines, engine_bars, usable_engines
-from xreset.cli._terminal import console
+from xreset.cli._terminal import console, show_table
 from xreset.eval.setting import Setting
 
 
@@ -57,12 +55,9 @@ def rehearse(
             out=folder,
             progress=progress,
         )
-    table = Table("fault", title=f"{spec.name}: the smallest fault that costs ten points of task progress")
-    for card in found:
-        table.add_column(f"{card.backend}, {100 * card.task_progress:.0f} % without", justify="right")
-    for name, limits in rehearsal.limits(found):
-        table.add_row(name, *limits)
-    console.print(table)
+    table = [("fault", *(f"{card.backend}, {100 * card.task_progress:.0f} % without" for card in found))]
+    table += [(name, *limits) for name, limits in rehearsal.limits(found)]
+    show_table(table, title=f"{spec.name}: the smallest fault that costs ten points of task progress")
     sentence, reasons = rehearsal.judge(found)
     console.print(sentence, style="bold")
     for reason in reasons:

@@ -4,20 +4,15 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
-from rich.table import Table
 
-from xreset.accounts import accounts_path, described, write_accounts
-from xreset.cli._common import Objects, Source
+from xreset.accounts import accounts_path, write_accounts
+from xreset.cli._common import Objects, Source, show_accounts
 from xreset.cli._terminal import Progress, console
 from xreset.files import file_hash
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.hand.config import HandConfig
-
-if TYPE_CHECKING:
-    from xreset.retarget import file
 
 
 def retarget(
@@ -42,22 +37,25 @@ def retarget(
         hand: Weights of hand retargeting.
         arm: Weights and effort of the arm's inverse kinematics.
     """
-    from xreset import description
-    from xreset.demos import align, archive, plausible
-    from xreset.retarget import file, pipeline
+    from xreset.demos.align import on_something
+    from xreset.demos.archive import demo_objects, levelled, read_demos
+    from xreset.demos.plausible import doubts
+    from xreset.description import load_robot
+    from xreset.retarget.file import write_retargeted
+    from xreset.retarget.pipeline import RetargetConfig, retarget_demos
 
-    spec = description.load_robot(robot)
-    chosen = archive.read_demos(demos)
+    spec = load_robot(robot)
+    chosen = read_demos(demos)
     if max_per_object is not None:
         chosen = chosen.select(max_per_object=max_per_object)
-    for doubt in plausible.doubts(chosen):
+    for doubt in doubts(chosen):
         console.print(f"note: {doubt}", style="yellow")
-    specs = archive.demo_objects(chosen, objects)
-    config = pipeline.RetargetConfig(hand=hand, arm=arm)
+    specs = demo_objects(chosen, objects)
+    config = RetargetConfig(hand=hand, arm=arm)
     with Progress() as bar:
         count = bar.count("sequences")
-        result = pipeline.retarget_demos(chosen, spec, list(specs.values()), config, progress=count, device=device)
-    file.write_retargeted(
+        result = retarget_demos(chosen, spec, list(specs.values()), config, progress=count, device=device)
+    write_retargeted(
         out,
         result,
         config={"retarget": asdict(config), "robot": robot, "max_per_object": max_per_object},
@@ -65,8 +63,12 @@ def retarget(
         | {f"object {s.name}": s.source for s in specs.values()},
     )
     write_accounts(accounts_path(out), of="frames", rows=result.accounts())
-    console.print(_table(result))
-    for index in np.flatnonzero(align.on_something(archive.levelled(chosen), specs)):
+    annotated = [row.without("not annotated") for row in result.accounts()]
+    show_accounts(annotated, f"annotated frames retargeted to {result.robot}: those that are valid")
+    tips = result.hand_error[result.annotated]
+    if len(tips):
+        console.print(f"fingertips are {1e3 * tips.mean():.1f} mm from the human's on average")
+    for index in np.flatnonzero(on_something(levelled(chosen), specs)):
         console.print(
             f"{chosen.sequence_name[index]}: the object starts on top of something that is not in the scene; "
             "it was not lowered to the table."
@@ -74,36 +76,6 @@ def retarget(
     console.print(
         f"{int(result.valid.sum())} valid frames of {len(result.valid)} in {out}; counts in {accounts_path(out)}"
     )
-
-
-def _table(result: file.Retargeted) -> Table:
-    """Return a table of kept and lost frames, by object and phase."""
-    table = Table(
-        "object",
-        "phase",
-        "frames",
-        "annotated",
-        "valid",
-        "fingertips [mm]",
-        "invalid because of",
-        title=f"retargeted to {result.robot}",
-    )
-    names = result.object_name[result.sequence_of_frame]
-    for row in result.accounts():
-        mine = result.annotated & ((names == row.object_name) | (row.object_name == "all"))
-        if row.phase != "both":
-            mine &= result.post_contact == (row.phase == "post-contact")
-        annotated = row.without("not annotated")
-        table.add_row(
-            row.object_name,
-            row.phase,
-            str(row.total),
-            str(annotated.total),
-            f"{row.kept} ({annotated.share:.0%})" if annotated.total else "0",
-            f"{1e3 * result.hand_error[mine].mean():.1f}" if mine.any() else "-",
-            described(annotated.lost),
-        )
-    return table
 
 
 COMMAND = retarget

@@ -6,12 +6,11 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from rich.table import Table
 from rich.text import Text
 
 from xreset import __version__
 from xreset.cli._common import AllEngines, Device, Objects, Robot, RobotName, Source, this_command, usable_engines
-from xreset.cli._terminal import Progress, console
+from xreset.cli._terminal import Progress, console, show_table
 from xreset.errors import RobotError
 from xreset.files import write_json
 from xreset.plugins import robot_names
@@ -24,16 +23,16 @@ def list_robots() -> None:
     """List robots: built-in ones and those of installed packages."""
     from xreset import description
 
-    table = Table("robot", "joints (arm + hand)", "fingertips", "folder")
+    table = [("robot", "joints (arm + hand)", "fingertips", "folder")]
     for name in robot_names():
         try:
             spec = description.load_robot(name)
         except RobotError as error:  # one broken plugin must not hide the others
-            table.add_row(name, "-", "-", f"broken: {error}")
+            table.append((name, "-", "-", f"broken: {error}"))
             continue
         joints = f"{len(spec.arm_indices)} + {len(spec.hand_indices)}"
-        table.add_row(name, joints, ", ".join(spec.fingertip_names), str(description.robot_folder(name)))
-    console.print(table)
+        table.append((name, joints, ", ".join(spec.fingertip_names), str(description.robot_folder(name))))
+    show_table(table)
 
 
 def check(robot: RobotName, /, *, picture: Path | None = None) -> None:
@@ -142,18 +141,19 @@ def place(
             bar.update(task, completed=done, description=f"placements (best yet reaches {reached:.0%})")
 
         found = places.place(spec, paths, avoid, search, report)
-    table = Table("", "follows", "reaches", "dexterity", "base.pos", "base.quat", "home", title="placements")
+    table = [("follows", "reaches", "dexterity", "base.pos", "base.quat", "home")]
     for finalist in found:
-        table.add_row(
-            "best" if finalist is found[0] else "runner-up",
-            f"{finalist.followed:.1%}",
-            f"{finalist.reached:.1%}",
-            f"{finalist.dexterity:.3f}",
-            f"[{_digits(finalist.robot.base_pos)}]",
-            f"[{_digits(finalist.robot.base_quat)}]",
-            finalist.home_rule or "not found",
+        table.append(
+            (
+                f"{finalist.followed:.1%}",
+                f"{finalist.reached:.1%}",
+                f"{finalist.dexterity:.3f}",
+                f"[{_digits(finalist.robot.base_pos)}]",
+                f"[{_digits(finalist.robot.base_quat)}]",
+                finalist.home_rule or "not found",
+            )
         )
-    console.print(table)
+    show_table(table, title="placements, the best one first")
     console.print(f"arm at home in the best: {_digits(found[0].robot.home[spec.arm_indices])}")
     console.print(f"of {found[0].frames} annotated frames of {chosen.num_sequences} sequences")
     if write:
@@ -201,11 +201,11 @@ def judge(
             loaded.bank, loaded.robot, loaded.objects, names, states=states, squeeze=squeeze, num_envs=num_envs,
             device=device, progress=bar.count(f"states in {', '.join(names)}"),
         )  # fmt: skip
-    table = Table("object", "states", *names, title=f"{found.robot}: states that hold, also lift, also turn the object")
+    table = [("object", "states", *names)]
     for label in dict.fromkeys(row.object_name for row in found.rows):
         mine = [row for row in found.rows if row.object_name == label]
-        table.add_row(label, str(mine[0].tried), *(f"{row.hold}, {row.lift}, {row.turn}" for row in mine))
-    console.print(table)
+        table.append((label, str(mine[0].tried), *(f"{row.hold}, {row.lift}, {row.turn}" for row in mine)))
+    show_table(table, title=f"{found.robot}: states that hold, also lift, also turn the object")
     if fails := found.rows[-1].arm_fails:
         console.print(f"the arm cannot raise or turn the hand that far in {fails} of {found.rows[-1].tried} states")
     if found.without:

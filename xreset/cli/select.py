@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from rich.table import Table
-
 from xreset.cli._common import Flat, Several, Source, chosen_engines
-from xreset.cli._terminal import console
+from xreset.cli._terminal import console, show_table
 from xreset.eval.setting import Setting
 
 
@@ -46,19 +44,15 @@ def select(
 
     setting = replace(setting, seed=selection.SEED if starts is None else starts)
     choice = selection.select(folder, engines, demos, setting, most=most, episodes=episodes, progress=say)
-    table = Table("checkpoint", title="task progress", title_justify="left")
-    for e in engines:
-        table.add_column(e.name, justify="right")
-    table.add_column("worst", justify="right")
+    names = [engine.name for engine in engines]
+    table = [("checkpoint", *names, "worst")]
     for candidate in choice.candidates:
-        cells = [
-            f"{100 * candidate.task_progress[e.name]:.1f} %" if e.name in candidate.task_progress else ""
-            for e in engines
-        ]
+        scores = {name: f"{100 * score:.1f} %" for name, score in candidate.task_progress.items()}
         mark = " (chosen)" if candidate.name == choice.chosen else ""
-        at_most = "" if len(candidate.task_progress) == len(engines) else "at most "
-        table.add_row(candidate.name + mark, *cells, f"{at_most}{100 * candidate.worst:.1f} %")
-    console.print(table)
+        at_most = "" if len(scores) == len(names) else "at most "
+        worst = f"{at_most}{100 * candidate.worst:.1f} %"
+        table.append((candidate.name + mark, *(scores.get(name, "") for name in names), worst))
+    show_table(table, title="task progress")
     console.print(f"chosen: {choice.sentence()}")
     console.print(f"recorded in {folder / 'choice.json'}")
 

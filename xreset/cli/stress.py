@@ -5,10 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.table import Table
-
 from xreset.cli._common import Engines, Flat, PolicyOrBaseline, Several, chosen_engines, engine_bars
-from xreset.cli._terminal import console
+from xreset.cli._terminal import console, show_table
 from xreset.eval.setting import Setting
 
 if TYPE_CHECKING:
@@ -46,10 +44,7 @@ def stress(
     with engine_bars([e.name for e in engines]) as progress:
         found = sweeps.stress(spec, played, engines, folder, sweeps=properties, repetitions=episodes, progress=progress)
     sweeps.write_plot(folder / "stress.png", found, f"{spec.name}: robustness")
-    table = Table("property", title=f"{spec.name}: task progress, and its difference to the same episodes (95 %)")
-    table.add_column("value", justify="right")
-    for result in found:
-        table.add_column(result.backend, justify="right", no_wrap=True)
+    table = [("property", "value", *(result.backend for result in found))]
     by_option = [{curve.property: curve for curve in result.curves} for result in found]  # noqa: XR002
     for prop in properties:
         values = sorted({*prop.values, prop.nominal})
@@ -60,11 +55,8 @@ def stress(
                     cells.append(_cell(curves[prop.option].points[i], value == prop.nominal))
                 else:
                     cells.append("cannot be set")
-            factor = prop.unit == "x"
-            named = prop.option if factor else f"{prop.option} [{prop.unit}]"
-            amount = f"x {value:g}" if factor else f"{value:g}"
-            table.add_row("" if i else named, amount, *cells, end_section=i == len(values) - 1)
-    console.print(table)
+            table.append((prop.option, f"{value:g} {prop.unit}", *cells))
+    show_table(table, title=f"{spec.name}: task progress, and its difference to the same episodes (95 %)")
     for result in found:
         if result.left_out:
             console.print(f"left out in {result.backend}, which cannot set them: {', '.join(result.left_out)}")

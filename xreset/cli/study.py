@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from xreset.cli._common import Name, Several
-from xreset.cli._terminal import Console
+from xreset.cli._terminal import console
 from xreset.errors import RunError
 from xreset.eval.study import file as files
 
@@ -41,7 +41,6 @@ def study(
     from xreset.eval.study import launch, plan, report
 
     path = files.study_path(file)
-    console = Console()
 
     def planned() -> plan.Plan:
         return plan.make_plan(files.read_study(path), path.stem, given=data, out=out, only=run)

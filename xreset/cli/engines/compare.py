@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.table import Table
 from rich.text import Text
 
 from xreset.cli._common import AllEngines, Device, Objects, Robot, Several, Source, this_command, usable_engines
-from xreset.cli._terminal import Progress, console
+from xreset.cli._terminal import Progress, console, show_table
 from xreset.files import code_version, file_hash, write_json
 
 if TYPE_CHECKING:
@@ -60,7 +59,7 @@ def compare(
             grasps=grasps,
             progress=lambda doing, done, total: bar.update(task, description=doing, completed=done, total=total),
         )
-    console.print(_table(result))
+    _print(result)
     for tested in (result.reference, result.floor, *result.engines):
         if tested.broken:
             console.print(
@@ -77,22 +76,21 @@ def compare(
     console.print("all targets met", style="bold green")
 
 
-def _table(result: agreement.Parity) -> Table:
+def _print(result: agreement.Parity) -> None:
     columns: tuple[agreement.EngineParity, ...] = (result.floor, *result.engines)
     holds = [flags for name, flags in result.reference.carried.items() if name != "closing"]
     held = sum(map(sum, holds))
     tried = sum(map(len, holds))
-    table = Table(
-        "against " + result.reference.engine.name,
-        "target",
-        *(f"{tested.engine.name}\n{tested.engine.version}, {tested.engine.device}" for tested in columns),
-        title=f"{result.robot.name}, {len(result.objects)} objects: {len(result.closing)} closings, {tried} holds, "
-        f"of which {result.reference.engine.name} carries {sum(result.reference.carried['closing'])} and {held}",
-    )
+    reference = result.reference.engine.name
+    heads = [f"{tested.engine.name}\n{tested.engine.version}, {tested.engine.device}" for tested in columns]
+    table: list[tuple[str | Text, ...]] = [(f"against {reference}", "target", *heads)]
     for i, row in enumerate(result.floor.metrics):
         cells = [_cell(tested.metrics[i]) for tested in columns]
-        table.add_row(row.metric, f"{row.sense} {_number(row.target, row.unit)}", *cells)
-    return table
+        table.append((row.metric, f"{row.sense} {_number(row.target, row.unit)}", *cells))
+    grasps = f"{result.robot.name}, {len(result.objects)} objects: {len(result.closing)} closings, {tried} holds"
+    show_table(
+        table, title=f"{grasps}, of which {reference} carries {sum(result.reference.carried['closing'])} and {held}"
+    )
 
 
 def _cell(metric: agreement.Metric) -> Text:

@@ -161,6 +161,7 @@ class PoolBackend(Backend):
         object_index: Tensor | None = None,
         device: str = "cpu",
         workers: int | None = None,
+        **world_options: Any,
     ) -> None:
         """Build the worlds.
 
@@ -171,6 +172,7 @@ class PoolBackend(Backend):
             device: ``cpu``.
             workers: number of processes; 0 runs the worlds in this process. Default: one per usable core, but no more
                 than worlds; this process if there is only one world.
+            world_options: further keywords of the world class (picklable).
 
         Raises:
             CapabilityError: the device is not the CPU.
@@ -189,7 +191,7 @@ class PoolBackend(Backend):
         jobs = []
         for worlds in np.array_split(np.arange(num_worlds), max(min(workers, num_worlds), 1)):
             held = tuple(self.object_index[worlds].tolist())
-            jobs.append(Job(self.name, self.world_class, scene, int(worlds[0]), held))
+            jobs.append(Job(self.name, self.world_class, world_options, scene, int(worlds[0]), held))
         if workers == 0:
             self._arrays = arrays_in(bytearray(layout.itemsize), layout)
             self._team: LocalWorlds | WorkerTeam = LocalWorlds(jobs[0], self._arrays)

@@ -91,6 +91,7 @@ class Job:
 
     backend: str
     world_class: type[World]
+    options: Mapping[str, Any]
     scene: SceneSpec
     first: int
     object_index: tuple[int, ...]
@@ -163,7 +164,7 @@ class LocalWorlds:
 
     def _build(self, i: int, _) -> None:
         job = self._job
-        self._worlds.append(job.world_class(job.scene, job.object_index[i]))
+        self._worlds.append(job.world_class(job.scene, job.object_index[i], **job.options))
         self._set_state(i, _)
 
     def _set_state(self, i: int, _) -> None:

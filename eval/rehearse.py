@@ -24,7 +24,7 @@ from xreset.eval.pages import render
 from xreset.eval.plots import COLORS, svg
 from xreset.eval.policy_spec import PolicySpec, load_policy
 from xreset.eval.rollout import Episode, episode_of, episode_starts, play_rounds
-from xreset.eval.sensitivity import SWEEPS, Property, amount, chosen, nominal_task, read_rows
+from xreset.eval.sensitivity import FAULTS, SWEEPS, Property, amount, chosen, nominal_task
 from xreset.eval.stress import COSTLY, Stress, by_property, draw_curves, plot_size, sweep
 from xreset.eval.trial import Engine, Trial, engine, load_trial
 from xreset.files import claim_folder, write_json, write_whole
@@ -38,23 +38,6 @@ from xreset.task.terminations import out_of_bounds
 SCHEMA = "xreset-rehearsal/1"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Fault(Property):
-    """A fault between policy and robot. The fields are explained in ``properties.toml``."""
-
-    nominal: float = 0.0
-    scaled: dict[str, float]
-    fixed: dict[str, Any] = field(default_factory=dict)
-
-    def at(self, value: float) -> Faults:
-        """Return the fault at one value; ``ValueError`` if it cannot have the value."""
-        changes = dict(self.fixed)
-        for name, factor in self.scaled.items():
-            changes[name] = factor * value
-        return Faults(**changes)
-
-
-FAULTS = read_rows("faults", Fault)
 _PHYSICAL = {prop.name: prop for prop in SWEEPS}
 PROPERTIES: tuple[Property, ...] = (
     *FAULTS,
@@ -170,10 +153,11 @@ def _setting(trial: Trial, prop: Property | None, value: float) -> tuple[Trial, 
     task = nominal_task(trial.task)
     if prop is None:
         return replace(trial, task=task), Faults()
-    if not isinstance(prop, Fault):
+    if not prop.scaled:
         return replace(trial, task=prop.set_in(task, value)), Faults()
+    sizes: dict[str, Any] = {name: factor * value for name, factor in prop.scaled.items()}
     try:
-        return replace(trial, task=task), prop.at(value)
+        return replace(trial, task=task), Faults(**prop.fixed, **sizes)
     except ValueError as error:
         raise XResetError(f"{prop.option} {amount(prop.unit, value)} cannot be tried: {error}.") from None
 

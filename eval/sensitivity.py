@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -59,7 +59,7 @@ class Effect:
 
 @dataclass(frozen=True, kw_only=True)
 class Property:
-    """One physical property. The fields are explained in ``properties.toml``."""
+    """One physical property, or a fault of a rehearsal. The fields are explained in ``properties.toml``."""
 
     name: str
     task_field: str = ""
@@ -73,6 +73,8 @@ class Property:
     absolute: bool = False
     shown_unit: str = ""
     of_cameras: bool = False
+    scaled: dict[str, float] = field(default_factory=dict)
+    fixed: dict[str, Any] = field(default_factory=dict)
 
     @property
     def option(self) -> str:
@@ -80,7 +82,7 @@ class Property:
         return self.name.replace(" ", "-")
 
     @property
-    def field(self) -> str:
+    def changed_field(self) -> str:
         """Field of the task's randomization."""
         return self.task_field or self.name.replace(" ", "_")
 
@@ -98,12 +100,9 @@ class Property:
         if self.unit == "ms":
             value /= 1000 * task.timestep * task.substeps  # the task counts control steps
         try:
-            return replace(task, randomization=replace(task.randomization, **{self.field: (value, value)}))
+            return replace(task, randomization=replace(task.randomization, **{self.changed_field: (value, value)}))
         except ValueError as error:
             raise XResetError(f"{self.option} {amount(self.unit, value)} cannot be tried: {error}.") from None
-
-
-_Row = TypeVar("_Row", bound=Property)
 
 
 def amount(unit: str, value: float) -> str:
@@ -116,16 +115,18 @@ TABLE = tomllib.loads(Path(__file__).with_name("properties.toml").read_text())
 """The tables ``properties`` and ``faults``, by name of the row."""
 
 
-def read_rows(table: str, kind: type[_Row]) -> tuple[_Row, ...]:
+def _rows(table: str) -> tuple[Property, ...]:
     """Return the rows of a table, in its order."""
     rows = []
     for name, row in TABLE[table].items():
         values = tuple(row.get("values", ()))
-        rows.append(kind(**row | {"name": name, "values": values}))
+        rows.append(Property(**row | {"name": name, "values": values}))
     return tuple(rows)
 
 
-PROPERTIES = read_rows("properties", Property)
+PROPERTIES = _rows("properties")
+FAULTS = _rows("faults")
+"""Faults between a policy and a robot."""
 SWEEPS = tuple(p for p in PROPERTIES if p.values)
 """The properties that can be swept."""
 COMPARED = {p.name: p for p in PROPERTIES if p.measured}

@@ -10,7 +10,7 @@ import tempfile
 import textwrap
 import time
 import unittest
-from dataclasses import fields, replace
+from dataclasses import fields
 from itertools import product
 from pathlib import Path
 from unittest import mock
@@ -39,9 +39,8 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 class ToyWorld(World):
     """Joints jump to their targets; the object moves at its velocity plus force / mass; readings follow the state."""
 
-    def __init__(self, scene: SceneSpec, object_index: int) -> None:
-        if scene.table.center[0] < 0:
-            raise TypeError("not such a table")
+    def __init__(self, scene: SceneSpec, object_index: int, *, gain: float = 1.0) -> None:
+        self.gain = gain
         self.scene = scene
         self.object_index = object_index
         self.mass = scene.objects[object_index].mass
@@ -64,7 +63,7 @@ class ToyWorld(World):
         self.state["joint_target"] = targets
 
     def step(self, n):
-        self.state["joint_pos"] = self.state["joint_target"]
+        self.state["joint_pos"] = self.gain * self.state["joint_target"]
         self.state["object_linvel"] = self.state["object_linvel"] + n * self.force / self.mass
         self.state["object_pos"] = self.state["object_pos"] + n * self.state["object_linvel"]
         self.contact = np.array([0.0, 0.0, float(n)])
@@ -250,12 +249,14 @@ class PoolTest(unittest.TestCase):
         with self.assertRaisesRegex(CapabilityError, "CPU only"):
             ToyBackend(toy_scene(), 1, device="cuda")
 
-    def test_a_failing_constructor(self):
-        made = toy_scene()
-        made = replace(made, table=replace(made.table, center=(-1.0, 0.0)))
+    def test_options_reach_the_worlds(self):
+        with ToyBackend(toy_scene(), 2, workers=0, gain=3.0) as pool:
+            pool.set_joint_targets(torch.ones(2, 2))
+            pool.step(1)
+            torch.testing.assert_close(pool.state().joint_pos, torch.full((2, 2), 3.0))
         for workers in (0, 1):
             with self.subTest(workers=workers), self.assertRaisesRegex(RuntimeError, "world 0, build: TypeError"):
-                ToyBackend(made, 2, workers=workers)
+                ToyBackend(toy_scene(), 2, workers=workers, nonsense=1)
 
 
 class DeathTest(unittest.TestCase):

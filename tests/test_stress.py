@@ -35,8 +35,10 @@ class StressedTest(unittest.TestCase):
             value = prop.values[0]
             found = prop.set_in(nominal_task(task), value)
             set_to = 3.0 if prop.unit == "ms" else value  # 50 ms are three control steps
-            np.testing.assert_allclose(getattr(found.randomization, prop.field), (set_to, set_to))
-            self.assertEqual(replace(found.randomization, **{prop.field: getattr(plain, prop.field)}), plain)
+            np.testing.assert_allclose(getattr(found.randomization, prop.changed_field), (set_to, set_to))
+            self.assertEqual(
+                replace(found.randomization, **{prop.changed_field: getattr(plain, prop.changed_field)}), plain
+            )
             self.assertEqual(found.reset, task.reset)
 
     def test_values_of_ones_own(self):

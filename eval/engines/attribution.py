@@ -213,7 +213,7 @@ def change_towards(prop: Property, a: float, b: float, task: TaskConfig, engine:
     if prop.needs != "friction":
         return prop.set_in(task, ratio)
     material = task.randomization.friction[0]
-    other = ratio * (material + getattr(task.randomization, prop.field)) - material
+    other = ratio * (material + getattr(task.randomization, prop.changed_field)) - material
     if other < 0:
         return "less than half of the object's own coefficient, which no other material gives"
-    return replace(task, randomization=replace(task.randomization, **{prop.field: other}))
+    return replace(task, randomization=replace(task.randomization, **{prop.changed_field: other}))

@@ -50,6 +50,8 @@ _SHADOW_BIAS = 0.0015
 """Distance from a surface at which a ray to the light starts, so that a surface does not shade itself [m]."""
 _NEAR = 0.02
 """Overlays nearer to the camera are not drawn [m]."""
+_AXIS_DOTS = 24
+"""Dots along an axis of a link."""
 _LINE = 16
 """Height of a line of a caption [pixels]."""
 
@@ -101,16 +103,6 @@ class Points:
     """[m]"""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Frames:
-    """Coordinate axes drawn over the picture (x red, y green, z blue)."""
-
-    poses: np.ndarray
-    """[P, 4, 4] world frame."""
-    length: float = 0.03
-    """[m]"""
-
-
 class Renderer:
     """Draws one scene again and again. The meshes are prepared once."""
 
@@ -149,7 +141,6 @@ class Renderer:
         object_index: int = 0,
         robot_tint: Color | None = None,
         points: Sequence[Points] = (),
-        frames: Sequence[Frames] = (),
         camera: Camera | None = None,
     ) -> np.ndarray:
         """Draw one state.
@@ -161,7 +152,6 @@ class Renderer:
             object_index: index into the scene's objects.
             robot_tint: color to mix into the robot's own (:func:`tint`).
             points: dots on top.
-            frames: axes on top.
             camera: for this picture instead of the renderer's.
 
         Returns:
@@ -177,12 +167,17 @@ class Renderer:
         if goal_pose is not None:
             goal = place(self._objects[object_index], GOAL_COLOR, np.asarray(goal_pose))
         image = _image(join(parts), goal, camera, self.size, self._smooth)
-        _draw_overlays(image, camera, points, frames)
+        _draw_points(image, camera, points)
         return np.asarray(image.reduce(2))
 
-    def link_frames(self, joint_pos: np.ndarray, links: Sequence[str], *, length: float = 0.03) -> Frames:
-        """Return the axes of links, for :meth:`draw`; ``RobotError`` for an unknown link."""
-        return Frames(poses=self._link_poses(joint_pos, links), length=length)
+    def link_frames(self, joint_pos: np.ndarray, links: Sequence[str], *, length: float = 0.03) -> list[Points]:
+        """Return the axes of links as lines of dots (x red, y green, z blue); ``RobotError`` for an unknown link."""
+        poses = self._link_poses(joint_pos, links)
+        lines = []
+        for axis, color in enumerate(AXIS_COLORS):
+            tips = poses[:, :3, 3] + length * poses[:, :3, axis]
+            lines.append(Points(pos=np.linspace(poses[:, :3, 3], tips, _AXIS_DOTS), color=color, radius=0.0))
+        return lines
 
     def _link_poses(self, joint_pos: np.ndarray, links: Sequence[str] | None = None) -> np.ndarray:
         joints = torch.as_tensor(np.asarray(joint_pos), dtype=torch.float64)
@@ -302,20 +297,12 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def _draw_overlays(image: Image.Image, camera: Camera, points: Sequence[Points], frames: Sequence[Frames]) -> None:
+def _draw_points(image: Image.Image, camera: Camera, points: Sequence[Points]) -> None:
     pen = ImageDraw.Draw(image)
     for some in points:
         pos = np.asarray(some.pos, dtype=float).reshape(-1, 3)
         pixels, depth = camera.project(pos[np.isfinite(pos).all(axis=1)], image.size)
         radii = camera.focal_length(image.height) * some.radius / depth
-        for center, radius in zip(pixels, radii.clip(3.0), strict=True):
-            pen.circle(center.tolist(), radius + 2, fill=(13, 13, 13))
-            pen.circle(center.tolist(), radius, fill=rgb(some.color))
-    for some in frames:
-        for pose in np.asarray(some.poses, dtype=float):
-            tips = pose[:3, 3] + some.length * pose[:3, :3].T
-            farthest_first = np.argsort(-(tips @ camera.axes()[2]))
-            for axis in farthest_first:
-                line, _ = camera.project(np.stack((pose[:3, 3], tips[axis])), image.size)
-                if len(line) == 2:
-                    pen.line(line.ravel().tolist(), fill=rgb(AXIS_COLORS[axis]), width=5)
+        for margin, color in ((2, (13, 13, 13)), (0, rgb(some.color))):
+            for center, radius in zip(pixels, radii.clip(3.0), strict=True):
+                pen.circle(center.tolist(), radius + margin, fill=color)

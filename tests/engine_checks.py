@@ -123,26 +123,6 @@ class EngineChecks:
         self.assertGreater(max(presses), 3.0)
         self.assertLess(max(errors), 0.01 * max(presses))
 
-    def test_a_grasp_has_the_same_future_whatever_was_before(self):
-        backend, start = self.grasp()
-
-        def future(b: PoolBackend) -> torch.Tensor:
-            b.set_state(start)
-            rows = []
-            for _ in range(10):
-                b.step()
-                rows.append(torch.cat([b.state().joint_pos[0], b.state().object_pos[0], b.contacts().tip_force[0, 0]]))
-            return torch.stack(rows)
-
-        first = future(backend)
-        away = start.clone()
-        away.object_pos[0] = torch.tensor([0.57, 0.3, 0.05])
-        away.joint_target[0, -1] = 0.0
-        backend.set_state(away)
-        backend.step(50)
-        torch.testing.assert_close(future(backend), first, rtol=0, atol=0)
-        torch.testing.assert_close(future(self.make(scene())), first, rtol=0, atol=0)
-
     def test_only_the_links_named_collide_with_one_another(self):
         jaw = JOINT["jaw_a_slide"]
         for links, blocked in ((("jaw_a", "pad_b"), True), ((), False)):

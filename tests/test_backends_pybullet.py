@@ -13,11 +13,10 @@ import torch
 
 from tests.data import PYBULLET
 from tests.engine_checks import JOINT, EngineChecks
-from xreset.backends.conformance.scene import gripper, objects, scene, shape
-from xreset.backends.pybullet import PybulletBackend, PybulletWorld, _engine
+from xreset.backends.conformance.scene import objects, scene, shape
+from xreset.backends.pybullet import PybulletBackend, _engine
 from xreset.backends.rigid import mechanism
-from xreset.errors import BackendUnavailableError, ObjectError
-from xreset.geometry.dynamics import mass_matrix
+from xreset.errors import BackendUnavailableError
 from xreset.spec import Geometry, Shape
 
 
@@ -25,17 +24,6 @@ from xreset.spec import Geometry, Shape
 class PybulletTest(EngineChecks, unittest.TestCase):
     backend_class = PybulletBackend
     one_step = mock.patch("xreset.backends.pybullet.INTERNAL_STEPS", 1)
-
-    def test_bullets_mass_matrix_is_the_robots(self):
-        world = PybulletWorld(scene(), 0)
-        self.addCleanup(world.close)
-        robot = gripper()
-        q = robot.home + np.array([0.02, -0.1, 0.3, 0.2, 0.005])
-        drives = world._drives
-        full = drives._mass_matrix(drives._joints.spread(q, q)[0])
-        # Mimic joints move with their source: M = S^T M_all S with q_all = S q + constant.
-        S = np.stack([drives._joints.spread(q, e)[1] for e in np.eye(5)], axis=1)
-        np.testing.assert_allclose(S.T @ full @ S, mass_matrix(robot, q), rtol=1e-6, atol=1e-9)
 
     def test_a_hull_touches_where_it_is(self):
         """Round pads hold a box, its hull, and the hulls of its halves, all off their frames' origins, alike."""
@@ -80,11 +68,6 @@ class PybulletTest(EngineChecks, unittest.TestCase):
                     moved[:3, 3] += side * T[:3, axis]
                     pieces.append(hull(half, moved))
                 self.assertAlmostEqual(opening(*pieces), box, delta=5e-5)
-
-    def test_an_impossible_object_is_refused(self):
-        bad = replace(scene().objects[0], inertia=np.diag([1e-4, 1e-4, 1e-3]))
-        with self.assertRaisesRegex(ObjectError, "'brick' has principal moments"):
-            PybulletBackend(replace(scene(), objects=(bad,)), 1)
 
     def test_the_import_prints_nothing(self):
         code = "from xreset.backends.pybullet import PybulletBackend as B; print(B.engine_version())"

@@ -126,8 +126,8 @@ class ExampleTest(unittest.TestCase):
                 self.assertNotRegex(file.read_text(), r"from xreset\..* import .*\b_\w", file.name)
 
 
-class EngineTest(unittest.TestCase):
-    """The quick checks of the suite. Skipped where the engine is not installed."""
+class EngineTest:
+    """The quick checks of the suite, mixed into a ``unittest.TestCase``. Skipped where the engine is not installed."""
 
     engine: ClassVar[str]
     checks: ClassVar[str]
@@ -146,7 +146,7 @@ class EngineTest(unittest.TestCase):
     def make(self, scene, num_worlds, *, object_index=None):
         return self.backend(scene, num_worlds, object_index=object_index, workers=0)
 
-    def check_suite(self):
+    def test_checks_of_the_suite(self: unittest.TestCase):  # pyright: ignore[reportGeneralTypeIssues]
         for result in run(self.make, only=self.checks.split()):
             with self.subTest(result.name):
                 self.assertEqual(result.verdict, "passed", f"{result.worst} {result.problem}")
@@ -154,15 +154,12 @@ class EngineTest(unittest.TestCase):
             self.assertIn(known.check, {check.name for check in CHECKS})
 
 
-class NewtonTest(EngineTest):
+class NewtonTest(EngineTest, unittest.TestCase):
     engine = "newton"
     checks = """
         state_round_trip links_after_set nothing_stays mass_properties free_spin object_gravity object_wrench
         resting_weight held_object tip_friction broken_world
     """
-
-    def test_checks_of_the_suite(self):
-        self.check_suite()
 
     def test_what_it_lacks_is_refused(self):
         stiff = scene().robot
@@ -173,15 +170,12 @@ class NewtonTest(EngineTest):
             self.make(replace(scene(), robot=replace(stiff, joints=joints)), 1)
 
 
-class DrakeTest(EngineTest):
+class DrakeTest(EngineTest, unittest.TestCase):
     engine = "drake"
     checks = """
         state_round_trip links_after_set nothing_stays masked_set mass_properties drive_equation free_spin
         object_gravity object_wrench resting_weight set_as_built held_object tip_friction broken_world
     """
-
-    def test_checks_of_the_suite(self):
-        self.check_suite()
 
     def test_a_pair_has_its_friction(self):
         from xreset_drake.model import OBJECT_FRICTION, friction_of_other  # pyright: ignore[reportMissingImports]

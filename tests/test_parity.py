@@ -255,23 +255,18 @@ class Numbers(unittest.TestCase):
         total, tip = press_metrics(recording(tip_force=force), recording(), steps=2)
         self.assertEqual((tip.n, tip.measured), (4, 0.0), "a finger that presses in one engine only counts")
 
-    def test_nothing_to_compare_misses_the_target(self):
+    def test_outcomes_and_nothing_to_compare(self):
+        high = torch.zeros(3, 2, 3)
+        high[-1, :, 2] = torch.tensor([0.06, 0.04])
+        up = recording(object_pos=high)
+        self.assertEqual(carried(up, 0.1).tolist(), [True, False])
+        self.assertFalse(carried(replace(up, broken=torch.tensor([True, False])), 0.1).any())
+        metric = outcome_metric("closing, outcome", [up], [recording(object_pos=high.flip(1))], 0.1)
+        self.assertEqual((metric.measured, metric.n, metric.ok), (0.0, 2, False))
         none = recording(tip_force=torch.zeros(3, 2, 2, 3))
         for metric in press_metrics(none, none, steps=1):
             self.assertFalse(metric.ok)
             self.assertIsNone(metric.measured)
-
-    def test_outcomes(self):
-        high = torch.zeros(3, 2, 3)
-        high[-1, :, 2] = torch.tensor([0.06, 0.04])
-        self.assertEqual(carried(recording(object_pos=high), 0.1).tolist(), [True, False])
-        self.assertEqual(
-            carried(recording(object_pos=high, broken=torch.tensor([True, False])), 0.1).tolist(), [False, False]
-        )
-        metric = outcome_metric(
-            "closing, outcome", [recording(object_pos=high)], [recording(object_pos=high.flip(1))], 0.1
-        )
-        self.assertEqual((metric.measured, metric.n, metric.ok), (0.0, 2, False))
 
     def test_object_in_palm(self):
         quarter = quat_from_axis_angle(torch.tensor([0.0, 0.0, math.pi / 2]))

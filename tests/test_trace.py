@@ -67,28 +67,25 @@ class DivergenceTest(unittest.TestCase):
         for d in compare(recording(), recording()).values():
             self.assertEqual((d.time, d.where, d.end, d.largest), (None, "", 0.0, 0.0))
 
-    def test_a_joint_is_named_with_time_and_size(self):
+    def test_joints_position_and_orientation(self):
         joint = torch.zeros(20, 1, 5)
         joint[7:, 0, 3] = 0.03  # turn
         joint[12, 0, 1] = 0.05  # swing, for one step
-        d = compare(recording(joint_pos=joint), recording())["joints"]
+        pos = torch.zeros(20, 1, 3)
+        pos[10:, 0, 1] = 0.006
+        quat = torch.tensor([1.0, 0, 0, 0]).repeat(20, 1, 1)
+        quat[15:] = -quat_from_axis_angle(torch.tensor([0.0, 0.0, math.radians(6)]))  # its sign means nothing
+        found = compare(recording(joint_pos=joint, object_pos=pos, object_quat=quat), recording())
+        d = found["joints"]
         self.assertEqual(d.where, "turn")
         assert_near((d.time, d.end, d.largest), (8 * DT, 0.03, 0.05))
+        assert_near((found["object position"].time, found["object position"].end), (11 * DT, 0.006))
+        orientation = found["object orientation"]
+        assert_near((orientation.time, orientation.end), (16 * DT, math.radians(6)))
         joint = torch.zeros(20, 1, 5)
         joint[5:, 0, 0] = 0.003  # lift: 3 mm of a prismatic joint count as 30 mrad
         d = compare(recording(joint_pos=joint), recording())["joints"]
         assert_near((d.time, d.largest), (6 * DT, 0.03))
-
-    def test_position_and_orientation(self):
-        pos = torch.zeros(20, 1, 3)
-        quat = torch.tensor([1.0, 0, 0, 0]).repeat(20, 1, 1)
-        pos[10:, 0, 1] = 0.006
-        turn = quat_from_axis_angle(torch.tensor([0.0, 0.0, math.radians(6)]))
-        quat[15:] = -turn  # the sign of a quaternion means nothing
-        found = compare(recording(object_pos=pos, object_quat=quat), recording())
-        assert_near((found["object position"].time, found["object position"].end), (11 * DT, 0.006))
-        orientation = found["object orientation"]
-        assert_near((orientation.time, orientation.end), (16 * DT, math.radians(6)))
 
     def test_contacts_must_differ_for_a_while_and_name_the_finger(self):
         force = torch.zeros(20, 1, 2, 3)

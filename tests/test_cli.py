@@ -11,52 +11,32 @@ from tests.command import xreset as run
 from xreset.cli import COMMANDS
 from xreset.cli.engines import COMMANDS as ENGINES
 
-HEAVY = (
-    "torch",
-    "warp",
-    "mujoco",
-    "mujoco_warp",
-    "pybullet",
-    "sapien",
-    "matplotlib",
-    "trimesh",
-    "scipy",
-    "rsl_rl",
-    "tyro",
-    "numpy",
-)
+HEAVY = {"torch", "warp", "mujoco", "mujoco_warp", "pybullet", "sapien", "matplotlib", "trimesh", "scipy", "rsl_rl"}
 
 
 def modules_after(code: str) -> set[str]:
     """Top-level modules that are loaded after running some code in a new interpreter."""
-    code += "; import sys, json; print('\\n' + json.dumps(sorted({m.split('.')[0] for m in sys.modules})))"
+    code += "\nimport sys, json; print('\\n' + json.dumps(sorted({m.split('.')[0] for m in sys.modules})))"
     out = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
     return set(json.loads(out.strip().splitlines()[-1]))
 
 
 class LightnessTest(unittest.TestCase):
     def test_import_loads_nothing_heavy(self):
-        self.assertFalse(modules_after("import xreset") & set(HEAVY))
+        self.assertFalse(modules_after("import xreset") & (HEAVY | {"numpy"}))
 
     def test_help_loads_nothing_heavy(self):
-        self.assertFalse(modules_after("from xreset.cli import main; main(['--help'])") & set(HEAVY))
+        self.assertFalse(modules_after("from xreset.cli import main; main(['--help'])") & (HEAVY | {"tyro", "numpy"}))
 
     def test_help_of_every_command_loads_nothing_heavy(self):
         commands = [[name] for name in COMMANDS] + [["engines", name] for name in ENGINES]
         code = (
-            "import sys\nfrom xreset.cli import main\nloaded = {}\n"
+            "from xreset.cli import main\n"
             f"for words in {commands}:\n"
             "  try: main([*words, '--help'])\n"
             "  except SystemExit as end: assert not end.code, words\n"
-            f"  for name in {{*{HEAVY}}} & {{*sys.modules}} - {{'tyro', 'numpy'}}: loaded.setdefault(name, ' '.join(words))\n"
-            "print(loaded)"
         )
-        self.assertEqual(
-            subprocess.run(
-                [sys.executable, "-c", code], check=True, capture_output=True, text=True
-            ).stdout.splitlines()[-1],
-            "{}",
-        )
+        self.assertFalse(modules_after(code) & HEAVY)
 
 
 class UsageTest(unittest.TestCase):
@@ -78,31 +58,16 @@ class UsageTest(unittest.TestCase):
         self.assertNotIn("Traceback", err)
 
     def test_impossible_options_are_refused_before_work_begins(self):
-        long, demos = "x" * 300, ("--demos", "none.npz")
         for words, argv in (
             (
                 r"--seed is -1, expected a whole number from 0 to 4294967295",
                 ("demos", "synth", "--out", "x.npz", "--seed", "-1"),
             ),
-            (r"--seed is 9{20}, expected", ("eval", "zero", "--robot", "openarm", *demos, "--seed", "9" * 20)),
-            (r"--seed is -1, expected", ("train", "--out", "x", "--seed", "-1")),
+            (r"--seed is 9{20}, expected", ("eval", "zero", "--demos", "none.npz", "--seed", "9" * 20)),
             (r"--num-envs is 0, expected a whole number from 1", ("train", "--out", "x", "--num-envs", "0")),
-            (r"--num-envs is -3, expected", ("resets", "none.npz", "--out", "x.npz", "--num-envs", "-3")),
-            (r"--iterations is 0, expected", ("train", "--out", "x", "--iterations", "0")),
             (r"--minutes is not a number", ("train", "--out", "x", "--minutes", "nan")),
             (r"Unknown device 'quantum'; expected cpu, cuda or", ("train", "--out", "x", "--device", "quantum")),
-            (
-                r"Unknown device 'quantum'; expected cpu, cuda or",
-                ("retarget", "none.npz", "--robot", "openarm", "--out", "x.npz", "--device", "quantum"),
-            ),
-            (
-                r"fps is 1000000000.0, expected 1 to 100000 sequences and 5 to 1000",
-                ("demos", "synth", "--out", "x.npz", "--fps", "1e9"),
-            ),
-            (r"(File name too long|there is no)", ("demos", "info", long)),
-            (r"Unknown policy", ("eval", long, *demos)),
-            (r"Unknown robot", ("robots", "check", long)),
-            (r"(File name too long|there is no)", ("train", "--out", "x", "--robot", "openarm", "--resets", long)),
+            (r"(File name too long|there is no)", ("demos", "info", "x" * 300)),
             (r"Nothing was overwritten", ("retarget", "d.npz", "--robot", "openarm", "--out", "./d.npz")),
         ):
             with self.subTest(" ".join(argv)[:80]):
@@ -136,15 +101,9 @@ class UsageTest(unittest.TestCase):
 
     def test_naming_engines_replaces_the_default(self):
         for given, expected in (((), ["mujoco"]), (("sapien", "pybullet", "sapien"), ["sapien", "pybullet"])):
-            argv = [
-                "eval",
-                "zero",
-                "--robot",
-                "openarm",
-                "--demos",
-                "x.npz",
-                *(w for name in given for w in ("--backend", name)),
-            ]
+            argv = ["eval", "zero", "--robot", "openarm", "--demos", "x.npz"]
+            for name in given:
+                argv += ["--backend", name]
             with mock.patch("xreset.eval.evaluate.evaluate", side_effect=KeyboardInterrupt) as evaluate:
                 self.assertEqual(run(*argv)[0], 130)
             self.assertEqual(list(evaluate.call_args.args[2]), expected)

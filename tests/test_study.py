@@ -459,8 +459,6 @@ class WholeTest(unittest.TestCase):
         policy.write_bytes(content + b" ")
         self.assertEqual(plan.steps["eval x-reset-seed0"].left(), "in mujoco", "another policy is evaluated again")
         self.assertTrue(plan.steps["train x-reset-seed0"].done())
-        with self.assertRaisesRegex(RunError, "has a policy and no checkpoint"):
-            self.plan(("steps = 128", "steps = 256")).steps["train x-reset-seed0"].commands()
 
     def test_a_dry_run_prints_the_plan(self):
         code, said, _ = run("study", "seconds", "--out", str(self.folder / "none"), "--dry-run")

@@ -50,7 +50,7 @@ class Checked:
 
     def __post_init__(self) -> None:
         wrong = []
-        for name, marks in _marks(type(self)).items():
+        for name, marks in marks_of(type(self)).items():
             value = getattr(self, name)
             wrong += [f"{name} is {shown(value)}, expected {rule.expected}" for rule in _broken(marks, value)]
         if wrong:
@@ -62,7 +62,7 @@ class Options:
 
 
 @cache
-def _marks(cls: type) -> dict[str, list[Any]]:
+def marks_of(cls: type) -> dict[str, list[Any]]:
     """Field name -> what its annotation holds in addition to the type."""
     marks = {}
     for name, hint in get_type_hints(cls, include_extras=True).items():

@@ -15,10 +15,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
 
+from xreset.checks import marks_of
 from xreset.errors import FileFormatError, XResetError
 from xreset.files import RAISE_LIMIT, atomic_write, check_schema, code_version, max_bytes, must_exist
 from xreset.text import is_plain, shown
@@ -288,13 +289,10 @@ def schema_of(cls: type) -> Schema:
 
     A field whose default is None may be missing.
     """
-    hints = get_type_hints(cls, include_extras=True)
+    marks = marks_of(cls)
     schema = {}
     for f in fields(cls):
-        hint = hints[f.name]
-        parts = get_args(hint) if get_origin(hint) is Union else (hint,)
-        marks = [mark for part in parts for mark in getattr(part, "__metadata__", ())]  # noqa: XR002
-        field = next(mark for mark in marks if isinstance(mark, Field))
+        field = next(mark for mark in marks[f.name] if isinstance(mark, Field))
         schema[f.name] = replace(field, required=f.default is not None)
     return schema
 

@@ -244,23 +244,26 @@ class Session:
             self._remove_object()  # an object that has fallen off the table does not fall for ever
         state = reading.state
         self.terms = tuple(reward.terms)
+        values = {
+            "joint_pos": state.joint_pos,
+            "joint_vel": state.joint_vel,
+            "joint_target": self.env.joint_target,
+            "object_pos": state.object_pos,
+            "object_quat": state.object_quat,
+            "goal_pos": self.env.goal_pos,
+            "goal_quat": self.env.goal_quat,
+            "tip_force": reading.contacts.tip_force,
+            "action": action,
+            "inputs": torch.cat((observations["policy"], observations["proprio"]), dim=-1),
+            "reward": torch.stack(list(reward.terms.values()), dim=-1),
+        }
         moment = Moment(
             time=self.time,
             engine=self.engine,
-            joint_pos=_copied(state.joint_pos),
-            joint_vel=_copied(state.joint_vel),
-            joint_target=_copied(self.env.joint_target),
-            object_pos=_copied(state.object_pos),
-            object_quat=_copied(state.object_quat),
-            goal_pos=_copied(self.env.goal_pos),
-            goal_quat=_copied(self.env.goal_quat),
-            tip_force=_copied(reading.contacts.tip_force),
-            action=_copied(action),
-            inputs=_copied(torch.cat((observations["policy"], observations["proprio"]), dim=-1)),
-            reward=_copied(torch.stack(list(reward.terms.values()), dim=-1)),
             distance=float((state.object_pos - self.env.goal_pos).norm()),
             angle=float(quat_angle(state.object_quat, self.env.goal_quat)),
             success=bool(reward.success),
+            **{name: value[0].detach().cpu().numpy().copy() for name, value in values.items()},
         )
         self.history.append(moment)
         if self.away or self._pull is not None or moment.tip_force.any():
@@ -399,11 +402,6 @@ class Session:
 
     def _make_env(self, policy: PolicySpec, inputs: Inputs, engine: str) -> ManipulationEnv:
         return policy.make_env(inputs.objects, inputs.bank, engine=engine, seed=self._seed)
-
-
-def _copied(value: Tensor) -> np.ndarray:
-    """The row of the only world, as numpy."""
-    return value[0].detach().cpu().numpy().copy()
 
 
 def _usual(names: Sequence[str]) -> str:

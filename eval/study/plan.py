@@ -62,11 +62,6 @@ class Run:
         """The run's reset bank."""
         return self.subset.folder / Path(self.runs.robot).name / "resets.npz"
 
-    @property
-    def begun(self) -> bool:
-        """Whether the training has a checkpoint, or a policy that was copied here without checkpoints."""
-        return bool(checkpoints(self.folder)) or (self.folder / "policy.onnx").is_file()
-
     def trained(self) -> Lift:
         """Return how far the training has come: from its newest checkpoint, or else its lift clock."""
         if not checkpoints(self.folder):
@@ -90,7 +85,7 @@ class Run:
 
     def check(self) -> None:
         """Refuse a folder with a run of another configuration. The length may differ: a run can be continued."""
-        if self.config is None or not self.begun:
+        if self.config is None or not (self.folder / "run.json").is_file():
             return
         info = read_run(self.folder)
         found: dict[str, Any] = {name: getattr(info, name) for name in ("robot", "backend", "num_envs", "seed")}
@@ -185,11 +180,6 @@ def train_step(run: Run, needs: tuple[str, ...]) -> Step:
             options["minutes"] = f"{spec.minutes - run.trained().minutes:.4g}"
         more = ["--resume"]
         if not checkpoints(run.folder):
-            if run.begun:
-                raise RunError(
-                    f"{run.folder} cannot be continued: it has a policy and no checkpoint. "
-                    "Bring its checkpoints, or choose another --out."
-                )
             options |= {
                 "robot": spec.robot,
                 "resets": run.bank,
@@ -272,8 +262,6 @@ def eval_step(
         policy = [str(run.folder)]
         if run.runs.policy:
             policy = [run.runs.policy, "--robot", run.runs.robot]
-        elif run.begun and not checkpoints(run.folder):
-            policy = [str(run.folder / "policy.onnx")]
         options = {
             "demos": demos,
             "episodes": evaluation.episodes,

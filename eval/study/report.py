@@ -12,16 +12,15 @@ from xreset.eval.report.make import compare
 from xreset.eval.report.read import Training
 from xreset.eval.study.file import TableSpec
 from xreset.eval.study.paper import paper_training
-from xreset.eval.study.plan import Plan, Run
+from xreset.eval.study.plan import Plan
 from xreset.eval.study.tables import FilledTable, draw, fill
 from xreset.eval.table import caption
 from xreset.files import write_whole
-from xreset.learning.clock import Lift, read_lift
+from xreset.learning.clock import Lift
 from xreset.text import short_name
 
 _ALIKE = 0.05
 """Trainings whose lengths differ by a smaller share are of equal length."""
-_HEAD = ("run", "objects", "seed", "minutes", "million steps", "iterations", "from home 10 % after")
 
 
 def write_page(plan: Plan, out: Path) -> tuple[Path, list[str]]:
@@ -50,7 +49,6 @@ def write_page(plan: Plan, out: Path) -> tuple[Path, list[str]]:
         tables=tables,
         metrics=[fill(plan, table) for table in every_metric],
         notes=notes,
-        runs=[_HEAD, *(_run_row(run, trained.get(run.name)) for run in plan.runs)],
         compared=_compare(plan, out),
         versions=caption(run.runs.policy or "" for run in plan.runs),
     )
@@ -102,25 +100,7 @@ def _unfair(plan: Plan, table: FilledTable, trained: dict[str, Lift]) -> Iterato
         listing = ", ".join(f"{name} {steps:.3g}" for name, steps in lengths.items())
         yield f"not of equal length (million environment steps: {listing})."
     if table.paper:
-        yield f"the paper's policies took {paper_training()}; ours as listed under Runs."
-
-
-def _run_row(run: Run, now: Lift | None) -> tuple[str, ...]:
-    objects = str(len(run.objects))
-    if len(run.objects) < 4:
-        objects = ", ".join(map(short_name, run.objects))
-    if run.config is None or now is None:
-        return (run.name, objects, *["-"] * 5)
-    passed = {p.share: f"{p.minutes:.1f} min" for p in read_lift(run.folder).passed}
-    return (
-        run.name,
-        objects,
-        str(run.seed),
-        f"{now.minutes:.1f}",
-        f"{now.env_steps / 1e6:.3g}",
-        f"{now.iteration} of {run.config.iterations}",
-        passed.get(0.1, "-"),
-    )
+        yield f"the paper's policies took {paper_training()}; ours as in the comparisons below."
 
 
 def _compare(plan: Plan, out: Path) -> list[str]:

@@ -8,12 +8,10 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from xreset.errors import RunError
 from xreset.eval.policy_spec import load_policy
 from xreset.eval.results import mesh_folder
 from xreset.eval.rollout import roll_out
@@ -21,14 +19,15 @@ from xreset.eval.setting import Setting
 from xreset.eval.trial import Engine, load_trial
 from xreset.files import file_hash, write_whole
 from xreset.learning.choice import Candidate, Choice, write_choice
-from xreset.learning.run import checkpoints, read_run
+from xreset.learning.export import export_checkpoint
+from xreset.learning.run import checkpoints, latest_checkpoint, read_run
 
 SEED = 1_000_003
 """Seed of the starts that decide; evaluations use 0 by default."""
 
 
 def candidates_in(folder: Path, most: int) -> list[Path]:
-    """Return checkpoints of a run folder, or exported policies of another folder, the newest first.
+    """Return checkpoints of a run folder, the newest first.
 
     Args:
         most: largest number, spread evenly over all; the newest is among them.
@@ -36,11 +35,8 @@ def candidates_in(folder: Path, most: int) -> list[Path]:
     Raises:
         RunError: there is none.
     """
-    found = checkpoints(folder) if (folder / "run.json").is_file() else sorted(folder.glob("*.onnx"))
-    if not found:
-        raise RunError(
-            f"{folder} has no checkpoints and no exported policies (.onnx): there is nothing to choose from."
-        )
+    latest_checkpoint(folder)  # refuses a folder without any
+    found = checkpoints(folder)
     picks = np.linspace(len(found) - 1, 0, min(most, len(found))).round().astype(int)
     return [found[i] for i in picks]
 
@@ -53,44 +49,38 @@ def select(
     *,
     most: int = 8,
     episodes: int = 2,
-    progress: Callable[[str, str, float | None], None] = lambda name, engine, score: None,
+    progress: Callable[[str, str, float], None] = lambda name, engine, score: None,
 ) -> Choice:
-    """Play the checkpoints and write ``FOLDER/choice.json``; a run's ``policy.onnx`` becomes the chosen one.
+    """Play the checkpoints and write ``RUN/choice.json``; the run's ``policy.onnx`` becomes the chosen one.
 
     The newest is played in all engines. Another is given up as soon as its score in one engine is below the best so
     far, because its worst score can only become lower. The engine in which the best does worst comes first.
 
     Args:
-        folder: run folder, or a folder of exported policies.
+        folder: run folder.
         demos: demonstrations whose starts and goals are played.
         setting: robot, meshes, seed of the starts, worlds.
         most: checkpoints at most.
-        progress: called with (candidate, engine, task progress) before (None) and after each.
+        progress: called with (candidate, engine, task progress).
 
     Raises:
         RunError: there is nothing to choose from.
     """
     found = candidates_in(folder, most)
-    is_run = (folder / "run.json").is_file()
-    if is_run:
-        setting = replace(setting, objects=mesh_folder(setting.objects, read_run(folder).objects))
+    meshes = mesh_folder(setting.objects, read_run(folder).objects)
     played: list[Candidate] = []
     best: Candidate | None = None
     with tempfile.TemporaryDirectory(prefix="xreset-") as scratch:
         files: dict[str, Path] = {}
         for path in found:
-            file = files[path.name] = Path(scratch) / f"{path.stem}.onnx" if is_run else path
-            if is_run:
-                from xreset.learning.export import export_checkpoint  # rsl-rl, which exported policies do not need
-
-                export_checkpoint(folder, path, file)
+            file = files[path.name] = Path(scratch) / f"{path.stem}.onnx"
+            export_checkpoint(folder, path, file)
             policy = load_policy(file, robot=setting.robot)
-            trial = load_trial(policy, demos, objects=setting.objects, seed=setting.seed, num_envs=setting.num_envs)
+            trial = load_trial(policy, demos, objects=meshes, seed=setting.seed, num_envs=setting.num_envs)
             scores: dict[str, float] = {}
             bar = best.worst if best else -1.0
             order = engines if best is None else sorted(engines, key=lambda e, b=best: b.task_progress[e.name])
             for engine in order:
-                progress(path.name, engine.name, None)
                 rollouts = roll_out(policy.start(None), engine, trial, repetitions=episodes)
                 scores[engine.name] = float(np.mean([e.task_progress for e in rollouts.episodes]))
                 progress(path.name, engine.name, scores[engine.name])
@@ -112,6 +102,5 @@ def select(
         )
         # A kill after this line does no harm: a run whose policy is not the chosen checkpoint's exports it again.
         write_choice(folder, choice)
-        if is_run:
-            write_whole(folder / "policy.onnx", files[best.name].read_bytes())
+        write_whole(folder / "policy.onnx", files[best.name].read_bytes())
     return choice

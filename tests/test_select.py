@@ -23,25 +23,26 @@ from xreset.learning.choice import Choice, read_choice
 from xreset.task.config import TaskConfig
 
 SCORES = {
-    "300.onnx": {"a": 0.90, "b": 0.60, "c": 0.80},
-    "200.onnx": {"a": 0.80, "b": 0.75, "c": 0.75},
-    "100.onnx": {"a": 0.95, "b": 0.95, "c": 0.70},
-    "050.onnx": {"a": 0.99, "b": 0.10, "c": 0.99},
+    "300.pt": {"a": 0.90, "b": 0.60, "c": 0.80},
+    "200.pt": {"a": 0.80, "b": 0.75, "c": 0.75},
+    "100.pt": {"a": 0.95, "b": 0.95, "c": 0.70},
+    "050.pt": {"a": 0.99, "b": 0.10, "c": 0.99},
 }
 
 
 class SelectTest(unittest.TestCase):
     def setUp(self):
         self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
+        (self.folder / "checkpoints").mkdir()
         for name in SCORES:
-            (self.folder / name).write_bytes(name.encode())
+            (self.folder / "checkpoints" / name).write_bytes(name.encode())
         self.demos = self.folder / "demos.npz"
         self.demos.write_bytes(b"demos")
         self.played: list[tuple[str, str, int]] = []
 
     def choose(self, **options) -> Choice:
         def load_policy(path: Path, robot: str | None):
-            return SimpleNamespace(start=lambda motion: path.name)
+            return SimpleNamespace(start=lambda motion: f"{path.stem}.pt")
 
         def load_trial(policy, demos, seed: int, **_):
             return SimpleNamespace(seed=seed)
@@ -50,8 +51,13 @@ class SelectTest(unittest.TestCase):
             self.played.append((policy, engine.name, trial.seed))
             return SimpleNamespace(episodes=episodes([SCORES[policy][engine.name]] * repetitions))
 
+        def export(folder: Path, checkpoint: Path, file: Path):
+            file.write_bytes(checkpoint.read_bytes())
+
         engines = [SimpleNamespace(name=name, version="1") for name in "abc"]
+        run = SimpleNamespace(objects=None)
         patches = {"load_policy": load_policy, "load_trial": load_trial, "roll_out": rolled}
+        patches |= {"export_checkpoint": export, "read_run": lambda folder: run}
         with mock.patch.multiple("xreset.eval.select", **patches):
             return select(self.folder, engines, self.demos, Setting(seed=SEED), **options)  # pyright: ignore[reportArgumentType]
 
@@ -61,19 +67,19 @@ class SelectTest(unittest.TestCase):
         self.assertEqual({seed for *_, seed in self.played}, {SEED})
         self.assertEqual(
             choice.sentence(),
-            "200.onnx, 75.0 % in its worst engine (b), of 4 checkpoints in 3 engines; the newest, 300.onnx, has 60.0 %.",
+            "200.pt, 75.0 % in its worst engine (b), of 4 checkpoints in 3 engines; the newest, 300.pt, has 60.0 %.",
         )
         order = {name: "".join(e for other, e, _ in self.played if other == name) for name in SCORES}
         # where the best is worst comes first; one that cannot win is given up
-        self.assertEqual(order, {"300.onnx": "abc", "200.onnx": "bca", "100.onnx": "bc", "050.onnx": "b"})
-        with mock.patch.dict(SCORES, {"100.onnx": SCORES["200.onnx"]}):
-            self.assertEqual(self.choose().chosen, "200.onnx", "of equals the newer one")
+        self.assertEqual(order, {"300.pt": "abc", "200.pt": "bca", "100.pt": "bc", "050.pt": "b"})
+        with mock.patch.dict(SCORES, {"100.pt": SCORES["200.pt"]}):
+            self.assertEqual(self.choose().chosen, "200.pt", "of equals the newer one")
 
     def test_some_of_many_are_spread_over_all(self):
         names = [path.name for path in candidates_in(self.folder, 2)]
-        self.assertEqual(names, ["300.onnx", "050.onnx"])
+        self.assertEqual(names, ["300.pt", "050.pt"])
         self.assertEqual(len(candidates_in(self.folder, 9)), 4)
-        with self.assertRaisesRegex(RunError, "no exported policies"):
+        with self.assertRaisesRegex(RunError, "no checkpoint"):
             candidates_in(self.folder / "nowhere", 2)
 
     def test_the_starts_that_decided_are_not_reported(self):
@@ -98,27 +104,22 @@ class SelectTest(unittest.TestCase):
         replace(policy, hash="another").check_seed(SEED)
 
     def test_the_choice_is_recorded_before_the_policy_is_replaced(self):
-        (self.folder / "run.json").write_text("{}")
         policy = self.folder / "policy.onnx"
         policy.write_bytes(b"of the newest")
-        export = mock.Mock(side_effect=lambda folder, path, file: file.write_bytes(path.read_bytes()))
-        with (
-            mock.patch("xreset.eval.select.read_run", return_value=SimpleNamespace(objects=None)),
-            mock.patch("xreset.eval.select.checkpoints", return_value=sorted(self.folder.glob("*0.onnx"))),
-            mock.patch("xreset.learning.export.export_checkpoint", export),
-            mock.patch("xreset.eval.select.write_whole", side_effect=KeyboardInterrupt),
-            self.assertRaises(KeyboardInterrupt),
-        ):
+        interrupted = mock.patch("xreset.eval.select.write_whole", side_effect=KeyboardInterrupt)
+        with interrupted, self.assertRaises(KeyboardInterrupt):
             self.choose()
-        self.assertEqual(read_choice(self.folder).chosen, "200.onnx")
+        self.assertEqual(read_choice(self.folder).chosen, "200.pt")
         self.assertEqual(policy.read_bytes(), b"of the newest")
+        self.choose()
+        self.assertEqual(policy.read_bytes(), b"200.pt")
 
     def test_a_damaged_choice_is_refused(self):
         self.choose()
         file = self.folder / "choice.json"
         content = json.loads(file.read_text())
         for changes, problem in (
-            ({"chosen": "7.onnx"}, "chosen is '7.onnx', expected one"),
+            ({"chosen": "7.pt"}, "chosen is '7.pt', expected one"),
             ({"seed": -1}, "seed is -1"),
         ):
             file.write_text(json.dumps(content | changes))

@@ -27,7 +27,7 @@ from xreset.demos.synth import synthesize
 from xreset.errors import FileFormatError, ObjectError, RunError
 from xreset.eval.results import write_results
 from xreset.eval.study.file import SHIPPED, read_study, study_path
-from xreset.eval.study.launch import choose_gpus, launch
+from xreset.eval.study.launch import launch
 from xreset.eval.study.paper import paper_tables
 from xreset.eval.study.plan import Plan, Step, config_flags, make_plan
 from xreset.eval.study.report import write_page
@@ -65,6 +65,7 @@ class FileTest(InFolder):
             (head + "[runs.a]\nseeds = [0, 0]\n", r"runs\.a\.seeds is \[0, 0\], expected one or more"),
             (head + "[runs.a]\nseeds = [99999999999999]\n", r"runs\.a\.seeds is \[99999999999999\]"),
             (head + "[runs.a]\nminutes = inf\n", r"runs\.a\.minutes is inf"),
+            (head + "[runs.a]\ngpus = 4\n", r"runs\.a\.gpus is 4\. This option was removed"),
             (head + "[runs.a]\ndata = 'real'\n", r"runs\.a\.data is 'real', expected one of 'toy'"),
             (head + "[runs.a]\nweights = 'b'\n[runs.b]\n", r"runs\.a\.weights is 'b', expected one of none"),
             (head + "[runs.a]\nrobot = '..'\n", r"runs\.a: robot is '\.\.', expected the name"),
@@ -171,14 +172,6 @@ class PlanTest(InFolder):
         self.assertEqual(config, train.run.config)
         self.assertEqual(list(config_flags({"a": {"b_c": True}})), ["--config.a.b-c"])
 
-    def test_several_gpus_are_torchrun(self):
-        plan = self.plan(HEAD + DATA + RUN + "[runs.a]\ndevice = 'cuda'\ngpus = 4\nminutes = 8\n")
-        (command,) = plan.steps["train a-seed0"].commands()
-        self.assertEqual(
-            command[1:8], ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "4", "-m", "xreset"]
-        )
-        self.assertEqual(plan.steps["train a-seed0"].gpus, 4)
-
     def test_what_does_not_fit_is_refused(self):
         for text, error, message in (
             (
@@ -222,17 +215,6 @@ class PlanTest(InFolder):
             self.plan(HEAD + DATA + RUN + "[runs.a]\n", only=("b",))
 
 
-class PlacesTest(unittest.TestCase):
-    def test_gpus_are_shared_as_told(self):
-        for free, count, expected in (
-            ([2, 5, 2], 1, [2]),  # with more free places
-            ([2, 5, 2, 5], 2, [2, 5]),
-            ([5, 5], 2, None),
-            ([], 0, []),
-        ):
-            self.assertEqual(choose_gpus(free, count), expected)
-
-
 class LaunchTest(InFolder):
     def launch(self, *steps: Step, gpus: tuple[int, ...] = ()) -> tuple[list[str], list[str]]:
         plan = mock.Mock(spec=Plan, out=self.out, steps={s.name: s for s in steps})
@@ -243,8 +225,8 @@ class LaunchTest(InFolder):
         ):
             return launch(plan, steps, say=said.append), said
 
-    def step(self, name: str, command: str, *needs: str, gpus: int = 0) -> Step:
-        return shell_step(name, self.folder / name, command, *needs, gpus=gpus)
+    def step(self, name: str, command: str, *needs: str, gpu: bool = False) -> Step:
+        return shell_step(name, self.folder / name, command, *needs, gpu=gpu)
 
     def test_steps_are_done_in_their_order_and_failures_are_named(self):
         problems, said = self.launch(
@@ -252,13 +234,13 @@ class LaunchTest(InFolder):
             self.step("a", "touch done"),
             self.step("c", "echo it is broken; exit 3"),
             self.step("d", "touch done", "c"),
-            self.step("e", "touch done", gpus=64),
+            self.step("e", "touch done", gpu=True),
             self.step("f", "true"),
         )
         self.assertTrue((self.folder / "b" / "done").exists())
         self.assertLess(said.index("a: done"), said.index("b: done"))
         for expected in (
-            "^e cannot start: it needs 64 GPUs, this machine has 0",
+            "^e cannot start: it needs a GPU, this machine has none",
             r"^c: it is broken\. Its output: .*c\.log$",
             "^d cannot start: c is not done",
             "^f: it ended before it was done",
@@ -266,21 +248,16 @@ class LaunchTest(InFolder):
             self.assertEqual(sum(bool(re.search(expected, problem)) for problem in problems), 1, expected)
         self.assertEqual(len(problems), 4)
 
-    def test_each_step_sees_its_own_gpus_and_a_waiting_one_is_not_asked_again_and_again(self):
+    def test_each_step_sees_its_own_gpu_and_a_waiting_one_is_not_asked_again_and_again(self):
         say = "echo $CUDA_VISIBLE_DEVICES > gpus; sleep 0.3; touch done"
-        waits = self.step("d", say, gpus=2)
+        waits = self.step("d", say, gpu=True)
         left = mock.Mock(side_effect=waits.left)
-        problems, said = self.launch(
-            self.step("a", say, gpus=1),
-            self.step("b", say, gpus=1),
-            self.step("c", say),
-            replace(waits, left=left),
-            gpus=(2, 5),
-        )
+        steps = [self.step("a", say, gpu=True), self.step("b", say, gpu=True), self.step("c", say)]
+        problems, said = self.launch(*steps, replace(waits, left=left), gpus=(2, 5))
         self.assertEqual(problems, [])
         a, b, c, d = ((self.folder / name / "gpus").read_text().strip() for name in "abcd")
-        self.assertEqual((sorted((a, b)), c, d), (["2", "5"], "", "2,5"))
-        self.assertIn("d: begun on GPU 2, 5", said)
+        self.assertEqual((sorted((a, b)), c), (["2", "5"], ""))
+        self.assertIn(f"d: begun on GPU {d}", said)
         self.assertEqual(left.call_count, 2, "before its turn and at its end: a training reads its checkpoint for it")
 
     def test_a_step_that_another_process_runs_is_waited_for(self):

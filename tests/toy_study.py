@@ -7,7 +7,7 @@ from pathlib import Path
 from xreset.eval.study.plan import Step
 
 
-def shell_step(name: str, writes: Path, command: str, *needs: str, gpus: int = 0) -> Step:
+def shell_step(name: str, writes: Path, command: str, *needs: str, gpu: bool = False) -> Step:
     """Return a step that is done when its folder holds ``done``."""
     return Step(
         name=name,
@@ -16,5 +16,5 @@ def shell_step(name: str, writes: Path, command: str, *needs: str, gpus: int = 0
         left=lambda: "" if (writes / "done").exists() else "to do",
         commands=lambda: [["sh", "-c", f"mkdir -p {writes} && cd {writes} && {command}"]],
         needs=needs,
-        gpus=gpus,
+        gpu=gpu,
     )

@@ -34,7 +34,7 @@ import re
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from xreset.checks import Checked, Finite, Positive, Rule, from_dict, merged
 from xreset.errors import FileFormatError, RunError
@@ -125,6 +125,7 @@ class Evaluation(Checked):
 class Runs(Checked):
     """Trainings that differ in seed (and, with ``alone``, object), or a baseline."""
 
+    REMOVED: ClassVar[dict[str, Any]] = {"gpus": 1}
     data: str
     robot: str = "ur7e-sharpa"
     objects: tuple[str, ...] = ()
@@ -151,10 +152,7 @@ class Runs(Checked):
     both train alone."""
     backend: str = "mujoco-warp"
     device: Literal["cuda", "cpu"] = "cuda"
-    gpus: Positive[int] = 1
-    """Processes, each with a GPU and ``num_envs`` worlds of its own."""
     num_envs: Positive[int] = 4096
-    """Worlds of each process."""
     evaluations: tuple[str, ...] = ()
     """Names of the evaluations; empty: all."""
 

@@ -12,7 +12,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -34,17 +33,6 @@ def visible_gpus() -> tuple[int, ...]:
     return tuple(numbers[:count] or range(count))
 
 
-def choose_gpus(free: Sequence[int], count: int) -> list[int] | None:
-    """Return different GPUs for a step, those with the most free places first; None if too few are free.
-
-    Args:
-        free: GPUs, each as often as it has free places.
-        count: GPUs of the step.
-    """
-    chosen = sorted(gpu for gpu, _ in Counter(free).most_common(count))
-    return chosen if len(chosen) == count else None
-
-
 def launch(plan: Plan, steps: Sequence[Step], *, per_gpu: int = 1, say: Callable[[str], None] = print) -> list[str]:
     """Run steps, each as soon as the steps that it needs are done.
 
@@ -55,19 +43,24 @@ def launch(plan: Plan, steps: Sequence[Step], *, per_gpu: int = 1, say: Callable
         What failed, or cannot start: sentences.
     """
     gpus = visible_gpus()
-    free = list(gpus) * per_gpu
-    waiting = {step.name: step for step in steps}
-    running: dict[str, tuple[Step, Future[str], list[int]]] = {}
+    free: list[int | None] = [*gpus * per_gpu, None]  # None: the CPU, on which steps come one at a time
+    problems = []
+    waiting = {}
+    for step in steps:
+        if step.gpu and not gpus:
+            problems.append(f"{step.name} cannot start: it needs a GPU, this machine has none.")
+        else:
+            waiting[step.name] = step
+    running: dict[str, tuple[Step, Future[str], int | None]] = {}
     processes: list[subprocess.Popen] = []
-    problems: list[str] = []
     busy: set[str] = set()
 
     def collect() -> None:
         """Note which steps have ended."""
-        for name, (step, job, used) in list(running.items()):
+        for name, (step, job, place) in list(running.items()):
             if job.done():
                 del running[name]
-                free.extend(used)
+                free.append(place)
                 problem = job.result()
                 if step.busy():  # another process was faster
                     waiting[name] = step
@@ -80,34 +73,26 @@ def launch(plan: Plan, steps: Sequence[Step], *, per_gpu: int = 1, say: Callable
 
     def begin(step: Step) -> None:
         """Start a step if a place is free, unless it is done, in progress elsewhere, or cannot start."""
-        used = choose_gpus(free, step.gpus)
-        if not step.gpus and any(not other.gpus for other, *_ in running.values()):
-            used = None  # steps on the CPU come one at a time
-        if step.gpus > len(gpus):
-            waiting.pop(step.name)
-            problems.append(
-                f"{step.name} cannot start: it needs {step.gpus} GPU{'s' * (step.gpus > 1)}, this machine has "
-                f"{len(gpus)}."
-            )
-        elif step.busy():
+        places = [place for place in free if (place is not None) == step.gpu]
+        if step.busy():
             if step.name not in busy:
                 say(f"{step.name}: in progress in another process; waiting for its end")
             busy.add(step.name)
-        elif used is not None:  # only now, because a training reads its newest checkpoint to say what is left
+        elif places:  # only now, because a training reads its newest checkpoint to say what is left
             waiting.pop(step.name)
             undone = [need for need in step.needs if not plan.steps[need].done()]
             if undone:
                 problems.append(f"{step.name} cannot start: {', '.join(undone)} is not done.")
             elif not step.done():
-                for gpu in used:
-                    free.remove(gpu)
-                job = pool.submit(_run, step, used, log_of(plan.out, step.name), processes)
-                running[step.name] = (step, job, used)
-                say(f"{step.name}: begun{' on GPU ' if used else ''}{', '.join(map(str, used))}")
+                place = max(places, key=places.count)  # the GPU with the most free places
+                free.remove(place)
+                job = pool.submit(_run, step, place, log_of(plan.out, step.name), processes)
+                running[step.name] = (step, job, place)
+                say(f"{step.name}: begun{'' if place is None else f' on GPU {place}'}")
 
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        with ThreadPoolExecutor(len(free) + 1) as pool:
+        with ThreadPoolExecutor(len(free)) as pool:
             try:
                 while waiting or running:
                     collect()
@@ -125,9 +110,9 @@ def launch(plan: Plan, steps: Sequence[Step], *, per_gpu: int = 1, say: Callable
     return problems
 
 
-def _run(step: Step, gpus: Sequence[int], log: Path, processes: list[subprocess.Popen]) -> str:
+def _run(step: Step, gpu: int | None, log: Path, processes: list[subprocess.Popen]) -> str:
     """Run a step's commands one after another while they succeed, and return what went wrong, in a line."""
-    environment = os.environ | {"CUDA_VISIBLE_DEVICES": ",".join(map(str, gpus))}
+    environment = os.environ | {"CUDA_VISIBLE_DEVICES": "" if gpu is None else str(gpu)}
     log.parent.mkdir(parents=True, exist_ok=True)
     try:
         commands = step.commands()
@@ -160,6 +145,4 @@ def log_of(out: Path, name: str) -> Path:
 
 def shown_command(command: Sequence[str]) -> str:
     """Return a command as a user would type it."""
-    text = shlex.join(command)
-    python = shlex.quote(sys.executable)
-    return text.replace(f"{python} -m torch.distributed.run", "torchrun").replace(f"{python} -m xreset", "xreset")
+    return shlex.join(command).replace(f"{shlex.quote(sys.executable)} -m xreset", "xreset")

@@ -88,15 +88,12 @@ class Run:
         if self.config is None or not (self.folder / "run.json").is_file():
             return
         info = read_run(self.folder)
-        found: dict[str, Any] = {name: getattr(info, name) for name in ("robot", "backend", "num_envs", "seed")}
+        wanted = {name: getattr(self.runs, name) for name in ("robot", "backend", "num_envs")} | {"seed": self.seed}
+        found: dict[str, Any] = {name: getattr(info, name) for name in wanted}
         found["stand-ins"] = info.objects is None
         found["other networks to begin with"] = info.weights is not None
         found["config"] = _without_length(info.config)
-        wanted = {
-            "robot": self.runs.robot,
-            "backend": self.runs.backend,
-            "num_envs": self.runs.num_envs,
-            "seed": self.seed,
+        wanted |= {
             "stand-ins": self.subset.data.meshes is None,
             "other networks to begin with": self.weights is not None,
             "config": _without_length(self.config),
@@ -125,7 +122,7 @@ class Step:
     """Returns the commands to run next, in order."""
     needs: tuple[str, ...] = ()
     """Names of the steps before it."""
-    gpus: int = 0
+    gpu: bool = False
     run: Run | None = None
     """The run that is trained or evaluated."""
     objects: tuple[str, ...] = ()
@@ -192,11 +189,7 @@ def train_step(run: Run, needs: tuple[str, ...]) -> Step:
             if run.weights is not None:
                 options["weights"] = run.weights
             more = [*run.subset.mesh_options, *config_flags(spec.config)]
-        start = _XRESET
-        if spec.gpus > 1:
-            processes = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(spec.gpus)]
-            start = [sys.executable, *processes, *_XRESET[1:]]
-        return [[*start, "train", *_options(options), *more]]
+        return [[*_XRESET, "train", *config_flags(options, "--"), *more]]
 
     return Step(
         name=f"train {run.name}",
@@ -205,21 +198,13 @@ def train_step(run: Run, needs: tuple[str, ...]) -> Step:
         left=run.left,
         commands=commands,
         needs=needs,
-        gpus=spec.gpus if spec.device == "cuda" else 0,
+        gpu=spec.device == "cuda",
         run=run,
     )
 
 
-def _options(values: dict[str, Any]) -> list[str]:
-    """Return ``--NAME VALUE`` for each option."""
-    options = []
-    for name, value in values.items():
-        options += [f"--{name}", str(value)]
-    return options
-
-
 def config_flags(changes: dict[str, Any], prefix: str = "--config.") -> Iterator[str]:
-    """Yield changes of a configuration as options of ``xreset train``."""
+    """Yield values, by default changes of a configuration, as options of a command."""
     for name, value in changes.items():
         flag = name.replace("_", "-")
         if isinstance(value, dict):
@@ -269,7 +254,7 @@ def eval_step(
             "num-envs": evaluation.num_envs,
             "out": folder,
         }
-        command = [*_XRESET, "eval", *policy, *_options(options), *subset.mesh_options]
+        command = [*_XRESET, "eval", *policy, *config_flags(options, "--"), *subset.mesh_options]
         for engine in missing():
             command += ["--backend", engine]
         return [command]
@@ -384,8 +369,8 @@ def _check_folders(plan: Plan) -> None:
     """Raise ``RunError`` if two parts of the study would have the same folder."""
     owned = [(plan.out / name, "the study") for name in ("data", "logs", "reports")]
     owned += [(subset.folder, f"data.{subset.name}") for subset in plan.subsets]
-    owned += [(run.folder, f"runs.{run.group}") for run in plan.runs]
-    owned += [(run.bank.parent, f"the robot {run.runs.robot}") for run in plan.runs]
+    for run in plan.runs:
+        owned += [(run.folder, f"runs.{run.group}"), (run.bank.parent, f"the robot {run.runs.robot}")]
     owners: dict[Path, str] = {}
     for folder, owner in owned:
         first = owners.setdefault(folder, owner)
@@ -436,7 +421,7 @@ def _runs(plan: Plan, group: str) -> Iterator[Run]:
     if config.task.reward.own:
         raise RunError(f"runs.{group}.config.task.reward.own names code, which a study may not. Use xreset train.")
     if spec.steps is not None:
-        iterations = round(spec.steps / (spec.num_envs * spec.gpus * config.ppo.horizon))
+        iterations = round(spec.steps / (spec.num_envs * config.ppo.horizon))
         config = replace(config, iterations=max(1, iterations))
     for chosen in [(name,) for name in objects] if spec.alone else [objects]:
         for seed in spec.seeds:

@@ -26,7 +26,7 @@ def select(
     ones. The episodes use other starts than xreset eval.
 
     Args:
-        folder: Run folder, or a folder of exported policies (.onnx).
+        folder: Run folder.
         demos: Demonstrations whose starts and goals are played.
         backend: Physics engine; give it again for more engines. Default: mujoco, pybullet and sapien.
         most: Largest number of checkpoints to play, spread over the training; the newest is included.
@@ -38,9 +38,8 @@ def select(
 
     engines = chosen_engines(backend or ("mujoco", "pybullet", "sapien"), setting.device)
 
-    def say(name: str, engine: str, score: float | None) -> None:
-        if score is not None:
-            console.print(f"{name} in {engine}: {100 * score:.1f} %")
+    def say(name: str, engine: str, score: float) -> None:
+        console.print(f"{name} in {engine}: {100 * score:.1f} %")
 
     setting = replace(setting, seed=selection.SEED if starts is None else starts)
     choice = selection.select(folder, engines, demos, setting, most=most, episodes=episodes, progress=say)

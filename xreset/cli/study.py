@@ -51,7 +51,7 @@ def study(
         for step in wanted:
             after = [need for need in step.needs if not todo.steps[need].done()]
             waits = f", after {', '.join(after)}" if after else ""
-            console.print(f"{step.name}: {step.left() or 'done'} ({step.gpus or 'no'} GPU{waits})")
+            console.print(f"{step.name}: {step.left() or 'done'} ({'a' if step.gpu else 'no'} GPU{waits})")
             for command in [] if step.done() else step.commands():
                 console.print(f"    {launch.shown_command(command)}")
         return

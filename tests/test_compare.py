@@ -200,7 +200,7 @@ class LiftTest(Compared):
 class GroupTest(Compared):
     def groups(self, *names: str) -> tuple[list[tuple[str, int]], str]:
         groups, notes = grouped([self.training(name) for name in names])
-        return [(g.label, len(g.members)) for g in groups], " ".join(notes)
+        return [(label, len(members)) for label, members in groups.items()], " ".join(notes)
 
     def test_what_differs_in_the_seed_only_is_one(self):
         seeds = []

@@ -11,7 +11,7 @@ import numpy as np
 
 from xreset.eval.plots import COLORS, INK, picture, svg
 from xreset.eval.report.curves import AXES, X, line
-from xreset.eval.report.groups import Group
+from xreset.eval.report.groups import Groups
 from xreset.eval.results import Table
 
 if TYPE_CHECKING:
@@ -121,7 +121,7 @@ def draw_scores(ax: Axes, found: Table, order: Sequence[str]) -> None:
     ax.set_title("task progress from home, 95 % interval", fontsize="medium", loc="left")
 
 
-def write_picture(path: Path, groups: Sequence[Group], tags: Sequence[str], found: Table, x: X) -> None:
+def write_picture(path: Path, groups: Groups, tags: Sequence[str], found: Table, x: X) -> None:
     """Write the picture of a comparison.
 
     Args:
@@ -130,7 +130,7 @@ def write_picture(path: Path, groups: Sequence[Group], tags: Sequence[str], foun
     """
     from matplotlib.lines import Line2D
 
-    order = [group.label for group in groups]
+    order = list(groups)
     rows = ceil(len(tags) / 2)
     heights = [_PANEL * rows] if tags else []
     if not found.empty:
@@ -143,7 +143,7 @@ def write_picture(path: Path, groups: Sequence[Group], tags: Sequence[str], foun
             for ax in panels[len(tags) :]:
                 ax.set_axis_off()
             for ax, tag in zip(panels, tags, strict=False):
-                lines = {g.label: line(g.members, tag, x) for g in groups}
+                lines = {label: line(members, tag, x) for label, members in groups.items()}
                 known = {label: curve for label, curve in lines.items() if curve is not None}
                 draw_lines(ax, tag, known, x, order)
         if not found.empty:

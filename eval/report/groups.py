@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
 from os.path import commonprefix
 from typing import Any
 
@@ -16,17 +15,11 @@ from xreset.eval.results import Table, mean
 from xreset.eval.stats import crossed_bootstrap_ci95
 from xreset.eval.table import METRICS
 
-
-@dataclass(frozen=True, kw_only=True)
-class Group:
-    """One line of the picture and one row of the table."""
-
-    label: str
-    members: tuple[Training, ...]
-    """One training, or several that differ in their seed only."""
+Groups = dict[str, Sequence[Training]]
+"""Label -> one training, or several that differ in their seed only: one line of the picture, rows of the table."""
 
 
-def grouped(trainings: Sequence[Training]) -> tuple[tuple[Group, ...], tuple[str, ...]]:
+def grouped(trainings: Sequence[Training]) -> tuple[Groups, list[str]]:
     """Group trainings of the same configuration that have different seeds and were evaluated alike.
 
     Returns:
@@ -37,56 +30,54 @@ def grouped(trainings: Sequence[Training]) -> tuple[tuple[Group, ...], tuple[str
     for training in trainings:
         shared = [fact for fact in training.facts.items() if fact[0] not in ("seed", "iterations")]
         alike.setdefault(tuple(shared) or training.label, []).append(training)
-    groups = []
+    found: list[Sequence[Training]] = []
     notes = []
     for members in alike.values():
-        names = [m.label for m in members]
         reasons = uneven(members)
         seeds = {m.facts.get("seed") for m in members}
         if len(seeds) < len(members):
             reasons = ["Some have the same seed, too."]
         if reasons:
-            groups += singles(members)
-            notes.append(f"{', '.join(names)} have the same configuration and are not grouped. {reasons[0]}")
+            found += singles(members).values()
+            names = ", ".join(m.label for m in members)
+            notes.append(f"{names} have the same configuration and are not grouped. {reasons[0]}")
         else:
-            groups.append(Group(label=_label(names), members=tuple(members)))
-    if len({group.label for group in groups}) < len(groups):  # shortened names may be equal
-        groups = [replace(group, label=" + ".join(m.label for m in group.members)) for group in groups]  # noqa: XR002
-    return tuple(groups), tuple(notes)
+            found.append(members)
+    groups = {_label(members): members for members in found}
+    if len(groups) < len(found):  # shortened names may be equal
+        groups = {_whole_label(members): members for members in found}
+    return groups, notes
 
 
-def members_of(groups: Iterable[Group]) -> list[Training]:
-    """Return the trainings of all groups."""
-    members = []
-    for group in groups:
-        members += group.members
-    return members
-
-
-def singles(trainings: Sequence[Training]) -> tuple[Group, ...]:
+def singles(trainings: Sequence[Training]) -> Groups:
     """Return a group for each training."""
-    return tuple(Group(label=training.label, members=(training,)) for training in trainings)
+    return {training.label: [training] for training in trainings}
 
 
-def _label(labels: Sequence[str]) -> str:
+def _whole_label(members: Sequence[Training]) -> str:
+    return " + ".join(member.label for member in members)
+
+
+def _label(members: Sequence[Training]) -> str:
     """Return what the names have in common: ``soup-seed0`` and ``soup-seed1`` are ``soup``."""
+    labels = [member.label for member in members]
     if len(labels) == 1:
         return labels[0]
     common = commonprefix(labels)  # noqa: RUF071 (of texts, not of paths)
     if any(label[len(common) :][:1].isdigit() for label in labels):
         common = common.rstrip("0123456789")
-    return re.sub(r"[-_. ]+(seed|s)?[-_. ]*$", "", common) or " + ".join(labels)
+    return re.sub(r"[-_. ]+(seed|s)?[-_. ]*$", "", common) or _whole_label(members)
 
 
-def scores(groups: Iterable[Group]) -> Table:
+def scores(groups: Groups) -> Table:
     """Return a row for each group, engine and metric of :data:`~xreset.eval.table.METRICS`: group (its label), engine,
     metric, mean, low and high (:func:`estimate`); NaN where an earlier version did not measure the metric."""
     rows = []
-    for group in groups:
-        for engine, own in by_engine(group.members):
+    for label, members in groups.items():
+        for engine, own in by_engine(members):
             for metric in METRICS:
                 value, (low, high) = estimate(own, metric)
-                rows.append((group.label, engine, metric, value, low, high))
+                rows.append((label, engine, metric, value, low, high))
     return pd.DataFrame(rows, columns=["group", "engine", "metric", "mean", "low", "high"])
 
 

@@ -92,20 +92,20 @@ def compare(
         XResetError: the files cannot be written, or a package for curves or plots is missing.
     """
     trainings = read_trainings(runs)
-    groups, reasons = (singles(trainings), ()) if apart else grouped(trainings)
+    groups, reasons = (singles(trainings), []) if apart else grouped(trainings)
     tags = choose_curves(trainings, curves)
     found = scores(groups)
     notes = [*reasons, *fairness.uneven(trainings), *fairness.begun(trainings)]
     policies = []
-    for group in groups:
-        notes += fairness.health(group.label, by_engine(group.members))
-        policies += [result.policy for result in group.members[0].results.values()]
+    for label, members in groups.items():
+        notes += fairness.health(label, by_engine(members))
+        policies += [result.policy for result in members[0].results.values()]
     content = render(
         "compare.md.j2",
         groups=groups,
         notes=notes,
         versions=caption(policies),
-        results=tables.results(groups, found),
+        results=tables.results(trainings, found),
         x=AXES[x][0],
         lifted=tables.lifted(groups, x),
         different=tables.different(groups),

@@ -8,7 +8,7 @@ from scipy.stats import binomtest
 
 from xreset.errors import RunError
 from xreset.eval.report.curves import AXES, X, amounts
-from xreset.eval.report.groups import Group, members_of
+from xreset.eval.report.groups import Groups
 from xreset.eval.report.read import Training
 from xreset.eval.results import Table
 from xreset.eval.table import METRICS, Rows, estimate_text
@@ -17,7 +17,7 @@ from xreset.learning.clock import SHARES, Lift
 _LIFT_FIELDS: dict[X, str] = {"minutes": "minutes", "steps": "env_steps", "iterations": "iteration"}
 
 
-def results(groups: Sequence[Group], found: Table) -> Rows:
+def results(trainings: Sequence[Training], found: Table) -> Rows:
     """Return a row for each group and metric, and a column for each engine; ``-`` where it was not evaluated or
     measured.
 
@@ -26,7 +26,7 @@ def results(groups: Sequence[Group], found: Table) -> Rows:
     """
     head = ["", ""]
     for engine in sorted(found["engine"].unique()):
-        versions = {m.results[engine].backend_version for m in members_of(groups) if engine in m.results}
+        versions = {m.results[engine].backend_version for m in trainings if engine in m.results}
         head.append(f"{engine} {', '.join(sorted(versions))}")
     texts = [estimate_text(*values) for values in found[["mean", "low", "high"]].to_numpy()]
     cells = found.assign(text=texts).pivot_table("text", ["group", "metric"], "engine", "first", "-", sort=False)
@@ -36,15 +36,15 @@ def results(groups: Sequence[Group], found: Table) -> Rows:
     return rows
 
 
-def lifted(groups: Sequence[Group], x: X) -> Rows:
+def lifted(groups: Groups, x: X) -> Rows:
     """Return one row for each group, one column for each share of success: how many of its trainings passed it, and
     when each did."""
     rows = [["", "runs", *(f"{100 * share:g} %" for share in SHARES)]]
-    for group in groups:
-        clocks = [m.lift for m in group.members if m.lift is not None and m.lift.iteration]
+    for label, members in groups.items():
+        clocks = [m.lift for m in members if m.lift is not None and m.lift.iteration]
         if clocks:
             cells = [_lifted(clocks, share, x) for share in SHARES]
-            rows.append([group.label, str(len(group.members)), *cells])
+            rows.append([label, str(len(members)), *cells])
     return rows
 
 
@@ -61,24 +61,28 @@ def _lifted(clocks: Sequence[Lift], share: float, x: X) -> str:
     return f"{hits / len(clocks):.0%} ({100 * low:.0f}-{100 * high:.0f}); {', '.join(times)}"
 
 
-def different(groups: Sequence[Group]) -> Rows:
+def different(groups: Groups) -> Rows:
     """Return the fields in which trainings differ, a column for each group, and how long each was trained.
 
     Baselines, which have no configuration, have no column.
     """
-    columns = [g for g in groups if g.members[0].facts or len(g.members[0].curves)]
-    facts = {member.label: member.facts | _lengths(member) for member in members_of(columns)}
+    facts: dict[str, list[dict[str, str]]] = {}
     names: dict[str, None] = {}
-    for known in facts.values():
-        names |= dict.fromkeys(known)
-    rows = [["", *(group.label for group in columns)]]
+    for label, members in groups.items():
+        if members[0].facts or len(members[0].curves):
+            facts[label] = [member.facts | _lengths(member) for member in members]
+            for known in facts[label]:
+                names |= dict.fromkeys(known)
+    lengths = [label for label, *_ in AXES.values()]
+    rows = [["", *facts]]
     for name in names:
         cells = []
-        for group in columns:
-            texts = [facts[member.label].get(name, "-") for member in group.members]
+        described = set()
+        for columns in facts.values():
+            texts = [known.get(name, "-") for known in columns]
             cells.append("; ".join(dict.fromkeys(texts)))
-        described = {facts[member.label].get(name, "-") for member in members_of(columns) if member.facts}
-        if len(described) > 1 or name in [label for label, *_ in AXES.values()]:
+            described.update(text for text, known in zip(texts, columns, strict=True) if "seed" in known)
+        if len(described) > 1 or name in lengths:
             rows.append([name, *cells])
     return rows
 

@@ -180,6 +180,8 @@ def _tumble(bench: Bench, worlds: Worlds, which: Sequence[int]) -> tuple[State, 
     return worlds.state(), torch.zeros(len(which), 3)
 
 
+# Friction -------------------------------------------------------------------------------------------------------------
+
 _CASES = [(mu, degrees) for mu in (0.2, 0.5, 0.8, 1.2) for degrees in (0, 45)]  # noqa: XR002
 """Coefficient with the table, and direction of motion."""
 _DISTANCE = 0.2  # m that every object slides

@@ -152,6 +152,8 @@ def _in_turns(motion: Retargeted, rows: np.ndarray, *, last_first: bool) -> np.n
     return table.sort_values("turn", kind="stable")["row"].to_numpy()
 
 
+# Trying grasps --------------------------------------------------------------------------------------------------------
+
 _FINGER_STEPS = 4
 _FINGER_DAMPING = 0.02
 """[m] Small against a finger's length, by which one radian moves its tip."""

@@ -25,6 +25,12 @@ from xreset.geometry.urdf import robot_tree
 from xreset.physics import State
 from xreset.spec import RobotSpec
 
+SCHEMA = "xreset-divergence/1"
+PERTURBED = 4
+"""Perturbed starts in the reference. Long contact is chaotic: what such a start does to the reference itself is no
+fault of an engine."""
+PERTURBATION = 1e-6
+"""Each joint [rad, m] and each coordinate of the object [m] is moved by plus or minus this."""
 THRESHOLDS = {
     "joints": 0.02,
     "object position": 0.005,
@@ -155,12 +161,7 @@ def _averaged(force: np.ndarray, dt: float) -> np.ndarray:
     return pd.DataFrame(force).rolling(steps, min_periods=1).mean().to_numpy()
 
 
-SCHEMA = "xreset-divergence/1"
-PERTURBED = 4
-"""Perturbed starts in the reference. Long contact is chaotic: what such a start does to the reference itself is no
-fault of an engine."""
-PERTURBATION = 1e-6
-"""Each joint [rad, m] and each coordinate of the object [m] is moved by plus or minus this."""
+# Replays --------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -227,13 +227,6 @@ class ResetTest(WithEnv):
         # the drives hold the new joint positions
         self.assertTrue(torch.equal(env.joint_target[1], env.backend.state().joint_pos[1]))
 
-    def test_every_world_times_out_in_the_end(self):
-        env = self.make()
-        for step in range(env.max_episode_length):
-            _, _, done, extras = env.step(torch.zeros(N, 7))
-            self.assertEqual(bool(done.any()), step == env.max_episode_length - 1)
-        self.assertEqual((done.tolist(), extras["time_outs"].tolist()), ([1] * N, [1.0] * N))
-
     def test_starts_come_from_the_distribution_and_may_press(self):
         """Drives begin with the bank's targets; from home they hold the joints."""
         task = replace(TASK, reset=ResetConfig(demo_probability=1.0))

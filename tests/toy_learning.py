@@ -82,11 +82,11 @@ def bank() -> ResetBank:
 
 
 def random_policy(seed: int, backend: Backend) -> Shares:
-    """What uniform actions do in two episodes."""
+    """What uniform actions do in one episode."""
     env = environment(seed, backend)
     policy = RandomPolicy(env.num_actions, seed)
     logs = []
-    for _ in range(2 * env.max_episode_length):
+    for _ in range(env.max_episode_length):
         *_, extras = env.step(policy.act(env.get_observations()))
         logs.append(extras["log"])
     return Shares.of(lambda name: np.mean([log[name] for log in logs]))
@@ -96,21 +96,11 @@ def trained(
     seed: int,
     backend: Backend,
     config: TrainConfig = CONFIG,
-    *,
-    change: Callable[[TrainingRunner], None] = lambda runner: None,
 ) -> tuple[Shares, int]:
-    """What a training does in its last iterations, and its steps in all worlds.
-
-    Args:
-        seed: of all that is random.
-        backend: worlds of :func:`scene`.
-        config: of the training.
-        change: called with the runner before it begins: to break it.
-    """
+    """What a training does in its last iterations in the backend's worlds of :func:`scene`, and its steps in all worlds."""
     torch.manual_seed(seed)
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(StringIO()):
         runner = TrainingRunner(environment(seed, backend), config, Path(folder))
-        change(runner)
         runner.learn(config.iterations, init_at_random_ep_len=True)
         curves = read_curves(Path(folder))
     return Shares.of(lambda name: curves[name].iloc[-LAST:].mean()), runner.env_steps

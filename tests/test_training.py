@@ -4,7 +4,6 @@ import io
 import json
 import math
 import os
-import resource
 import shutil
 import signal
 import sys
@@ -358,23 +357,6 @@ class TrainingTest(unittest.TestCase):
                 self.assertEqual(read_run(out).seed, 3 if is_resumed else 5)
                 self.assertEqual(len(checkpoints(out)), 2)
                 self.assertFalse([f.name for f in out.rglob("*") if f.name.endswith((".part", ".old", ".lock"))])
-
-    def test_a_full_disk_ends_a_training_in_one_sentence_and_it_goes_on(self):
-        out = self.train("full", config=replace(CONFIG, iterations=1))
-        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-        self.addCleanup(resource.setrlimit, resource.RLIMIT_FSIZE, limits)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))  # enough for the curves, not for a checkpoint
-        unchanged = mock.patch("xreset.learning.train.write_run")
-        with (
-            unchanged,
-            self.assertRaisesRegex(XResetError, r"cannot write .*\.pt: File too large. Nothing was changed"),
-        ):
-            self.resume(out, iterations=3)
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        self.assertEqual(newest(out).iteration, 1)
-        self.assertFalse([f.name for f in out.rglob("*.part")])
-        self.resume(out, iterations=2)
-        self.assertEqual(newest(out).iteration, 2)
 
     def test_too_little_memory_is_said(self):
         few = "4 worlds on cpu need more memory.*--num-envs"

@@ -29,6 +29,7 @@ from xreset.task.reading import Reading, step_log
 from xreset.task.rewards import Reward, RewardInput, compute_reward, own_term
 from xreset.task.terminations import episode_steps, out_of_bounds
 from xreset.task.variation import Variation
+from xreset.tensors import where
 
 if TYPE_CHECKING:
     from tensordict import TensorDict
@@ -179,17 +180,20 @@ class ManipulationEnv:
         def mask() -> Tensor:
             return zeros(dtype=torch.bool)
 
-        self.goal_pos = zeros(3)
-        self.goal_quat = zeros(4)
-        self.gravity_fraction = zeros()
-        self.sequence = zeros(dtype=torch.long)
-        self.bank_state = torch.full_like(self.sequence, -1)
+        self._new_start = self.resets.sample(self.backend.object_index, torch.Generator(device=self.device)).clone()
+        episode = self._new_start.clone()
+        self.goal_pos = episode.goal_pos
+        self.goal_quat = episode.goal_quat
+        self.gravity_fraction = episode.gravity_fraction
+        self.sequence = episode.sequence
+        self.bank_state = episode.state
+        self._target = episode.joint_target
+        self._episode = episode
         self.nonfinite_count = torch.zeros((), dtype=torch.long, device=self.device)
         self.overflow_count = self.nonfinite_count.clone()
         self._episode_length = zeros(dtype=torch.long)
         self._action = zeros(self.num_actions)
         self._previous_action = zeros(self.num_actions)
-        self._target = zeros(self.num_actions)
         self._sent_target = zeros(self.num_actions)
         self._best_reach = zeros()
         self._reward = zeros()
@@ -200,7 +204,6 @@ class ManipulationEnv:
         # Worlds to reset, and worlds whose episode is over and that wait for a reset.
         self._reset_mask = mask()
         self._over = mask()
-        self._new_start = self.resets.sample(self.backend.object_index, torch.Generator(device=self.device)).clone()
         robot = self.backend.scene.robot
         proprio = obs.layout(len(robot.joints), len(robot.fingertips), self.task.observation)["proprio"]
         randomization = self.task.randomization
@@ -463,14 +466,9 @@ class ManipulationEnv:
         for new, old in (
             *self.variation.draw(self.generator),
             *(self.vision.draw(self.generator) if self.vision is not None else ()),
-            (start.goal_pos, self.goal_pos),
-            (start.goal_quat, self.goal_quat),
-            (start.gravity_fraction, self.gravity_fraction),
-            (start.sequence, self.sequence),
-            (start.state, self.bank_state),
-            (start.joint_target, self._target),
         ):
-            old.copy_(torch.where(fresh.view(-1, *[1] * (old.ndim - 1)), new, old))
+            old.copy_(where(fresh, new, old))
+        self._episode.map(Tensor.copy_, where(fresh, start, self._episode))
         for cleared in (self._episode_length, self._previous_action, self._reward, self._over):
             cleared.masked_fill_(fresh.view(-1, *[1] * (cleared.ndim - 1)), 0)
 

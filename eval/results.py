@@ -10,12 +10,12 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import pandas as pd
 
-from xreset.checks import Checked, NotNegative, Positive, Range, Share, from_dict
+from xreset.checks import Checked, NotNegative, Positive, Range, Rule, Share, from_dict
 from xreset.errors import FileFormatError
 from xreset.eval.rollout import Episode, Rollouts, Trace
 from xreset.eval.stats import bootstrap_ci95
@@ -100,10 +100,10 @@ class EpisodeFaults(Checked):
 class EvalResult(Checked):
     """Contents of ``eval/ENGINE.json``: one policy in one engine."""
 
-    backend: str
+    backend: Annotated[str, Rule("an engine's name", lambda name: bool(name) and "/" not in name)]
     backend_version: str
     robot: str
-    objects: tuple[str, ...]
+    objects: Annotated[tuple[str, ...], Rule("one object or more", bool)]
     """Object names, sorted."""
     objects_folder: str | None
     """Folder of meshes; None: the stand-ins."""
@@ -117,7 +117,7 @@ class EvalResult(Checked):
     reorient_rate: Share[float]
     reorient_once_rate: Share[float]
     reorientation_progress: Share[float]
-    per_demo: tuple[DemoResult, ...]
+    per_demo: Annotated[tuple[DemoResult, ...], Rule("one demonstration or more", bool)]
     health: EpisodeFaults
     control_steps_per_second: Positive[float]
     inputs: dict[str, str]
@@ -131,13 +131,6 @@ class EvalResult(Checked):
     """95 % bootstrap interval over demonstrations."""
     least_distance: NotNegative[float] | None = None
     """Mean of :attr:`~xreset.eval.rollout.Episode.least_distance` [m]."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.objects or not self.per_demo:
-            raise ValueError("it names no object or no demonstration")
-        if "/" in self.backend or not self.backend:
-            raise ValueError(f"backend is {self.backend!r}, expected an engine's name")
 
 
 class Evaluation(list[EvalResult]):

@@ -414,12 +414,9 @@ class DrawTest(Compared):
     def test_bars_are_as_long_as_the_results(self):
         self.write_results("a", rollouts_with(1.0, 0.5, 0.5, 0.0), ("mujoco", "sapien"))
         self.write_results("b", rollouts_with(0.2, 0.2, 0.2, 0.2), ("sapien",))
-        found = scores(grouped([self.training(n) for n in "ab"])[0])
-        ax = self.draw(draw_scores, found, ["a", "b"])
+        ax = self.draw(draw_scores, scores(grouped([self.training(n) for n in "ab"])[0]), ["a", "b"])
         np.testing.assert_allclose([bar.get_height() for bar in ax.patches], [50, 50, np.nan, 20])
         self.assertEqual([label.get_text() for label in ax.get_xticklabels()], ["mujoco", "sapien"])
-        at = [bar.get_x() + bar.get_width() / 2 for bar in ax.patches]
-        self.assertTrue(at[0] < 0 and at[1] < 1 < at[3])
 
 
 class CommandTest(Compared):

@@ -198,19 +198,12 @@ class PlanTest(InFolder):
         plan = self.plan(HEAD + "[data.toy]\ndemos = 'climbs.npz'\n[runs.a]\ndata = 'toy'\nalone = true\n")
         self.assertEqual([run.folder.resolve().parent for run in plan.runs], [self.out.resolve()])
         self.assertEqual({s.folder.resolve().parent for s in plan.subsets}, {self.out.resolve() / "data"})
-        other = "[data.toy-5]\nsynthetic_per_object = 1\n"
         for message, text in (
-            ("data.toy-5 and data.toy would both", other + "[runs.a]\ndata='toy-5'\n[runs.b]\nper_object=5\n"),
             ("runs.a and runs.a-seed0 would both", "[runs.a]\n[runs.a-seed0]\npolicy = 'ik'\n"),
             ("the study and runs.logs would both", "[runs.logs]\npolicy = 'ik'\n"),
         ):
-            text = HEAD + DATA + RUN.replace('objects = ["soup", "spam"]\n', "") + text
-            if "toy-5" in text:
-                for name in ("toy", "toy-5"):
-                    text = text.replace(f"[data.{name}]\nsynthetic_per_object = 1", f"[data.{name}]\ndemos = 'd.npz'")
-                write_demos(self.folder / "d.npz", demos)
             with self.subTest(message), self.assertRaisesRegex(RunError, message):
-                self.plan(text)
+                self.plan(HEAD + DATA + RUN + text)
         with self.assertRaisesRegex(RunError, "has no runs b; it has a"):
             self.plan(HEAD + DATA + RUN + "[runs.a]\n", only=("b",))
 

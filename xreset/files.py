@@ -16,7 +16,6 @@ import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
-from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import IO, Any
 
@@ -222,8 +221,7 @@ def _lock(path: Path, *, required: bool = False) -> int | None:
 def code_version() -> str:
     """Return the version of xreset and the commit that is running, as files record them: ``0.2.0+g1a2b3c4d5e6f``.
 
-    ``.dirty`` is added if files of the checkout were changed. There is no commit in a package that was not installed
-    from a repository.
+    ``.dirty`` is added if files of the checkout were changed. Outside a checkout there is no commit.
     """
     root = Path(__file__).parent.parent
     commit = ""
@@ -235,10 +233,6 @@ def code_version() -> str:
                 [*command, "--abbrev=12", "--exclude=*"], capture_output=True, text=True, timeout=20, env=environment
             )
             commit = found.stdout.strip()
-    else:
-        with suppress(PackageNotFoundError, ValueError, AttributeError):  # no package, or one without such an origin
-            origin = json.loads(distribution("xreset").read_text("direct_url.json") or "{}")
-            commit = str(origin.get("vcs_info", {}).get("commit_id", ""))[:12]
     return f"{__version__}+g{commit}" if commit else __version__
 
 

@@ -14,7 +14,6 @@ The world frame is the master camera's; the table frame is the AprilTag's. Objec
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,24 +34,6 @@ _Poses = Mapping[str, np.ndarray]
 """Camera serial, or ``apriltag`` -> pose [4, 4] in the world frame."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Sequence:
-    """A sequence's folder and its meta.yml."""
-
-    folder: Path
-    extrinsics: str
-    side: str
-    object_name: str
-    object_index: int
-    num_objects: int
-    num_frames: int
-    serials: tuple[str, ...]
-
-    @property
-    def name(self) -> str:
-        return f"{self.folder.parent.name}/{self.folder.name}"
-
-
 def read_dexycb(root: str | Path, *, progress: Callable[[int, int], None] = lambda done, total: None) -> Demos:
     """Read all sequences below a DexYCB folder, in the table frame.
 
@@ -64,7 +45,7 @@ def read_dexycb(root: str | Path, *, progress: Callable[[int, int], None] = lamb
         DemoError: the folder is not in DexYCB's layout, or parts of a sequence are missing or contradict each other.
     """
     root = Path(root)
-    found = [_read_meta(path) for path in sorted(root.glob("*/*/meta.yml"))]
+    found = sorted(root.glob("*/*/meta.yml"))
     if not found:
         raise DemoError(
             f"There is no DexYCB sequence in {root}: expected SUBJECT/SEQUENCE/meta.yml below it, such as"
@@ -72,21 +53,25 @@ def read_dexycb(root: str | Path, *, progress: Callable[[int, int], None] = lamb
         )
     calibrations: dict[str, _Poses] = {}
     parts = []
-    for sequence in found:
-        if sequence.extrinsics not in calibrations:
-            calibrations[sequence.extrinsics] = _read_extrinsics(root, sequence.extrinsics)
-        parts.append(_read(sequence, calibrations[sequence.extrinsics]))
+    for path in found:
+        meta = _read_meta(path)
+        calibration = str(meta["extrinsics"])
+        if calibration not in calibrations:
+            calibrations[calibration] = _read_extrinsics(root, calibration)
+        parts.append(_read(path.parent, meta, calibrations[calibration]))
         progress(len(parts), len(found))
     return merge_demos(parts)
 
 
-def _read(sequence: _Sequence, extrinsics: _Poses) -> Demos:
+def _read(folder: Path, meta: Mapping[str, Any], extrinsics: _Poses) -> Demos:
     T_table_world = np.linalg.inv(extrinsics["apriltag"])
     turn = Rotation.from_matrix(T_table_world[:3, :3])
-    path = sequence.folder / "pose.npz"
-    frames = sequence.num_frames
-    pose_object, pose_hand = _read_npz(path, {"pose_y": (frames, sequence.num_objects, 7), "pose_m": (frames, 1, 51)})
-    pose_object = pose_object[:, sequence.object_index]
+    path = folder / "pose.npz"
+    frames = meta["num_frames"]
+    objects = meta["ycb_ids"]
+    grasped = meta["ycb_grasp_ind"]
+    pose_object, pose_hand = _read_npz(path, {"pose_y": (frames, len(objects), 7), "pose_m": (frames, 1, 51)})
+    pose_object = pose_object[:, grasped]
     pose_hand = pose_hand[:, 0]
     if not (np.abs(pose_object) < 1e3).all() or not (np.abs(pose_hand) < 1e3).all():
         raise DemoError(f"{path} holds numbers that are not finite, or far too large. Unpack it again.")
@@ -94,14 +79,15 @@ def _read(sequence: _Sequence, extrinsics: _Poses) -> Demos:
     if unknown.any():
         raise DemoError(f"{path}: frame {np.argmax(unknown)} has no object pose.")
 
-    keypoints = np.stack([_read_joints(sequence, frame, extrinsics) for frame in range(frames)])
+    cameras = {serial: extrinsics[serial] for serial in meta["serials"] if serial in extrinsics}
+    keypoints = np.stack([_read_joints(folder, frame, cameras) for frame in range(frames)])
     valid = np.isfinite(keypoints).all(axis=(1, 2)) & (pose_hand != 0).any(axis=1)
     keypoints[~valid] = np.nan
     return one_sequence(
-        name=sequence.name,
-        subject=sequence.folder.parent.name,
-        object_name=sequence.object_name,
-        side=sequence.side,
+        name=f"{folder.parent.name}/{folder.name}",
+        subject=folder.parent.name,
+        object_name=NAME_OF_ID[objects[grasped]],
+        side=meta["mano_sides"][0],
         fps=FPS,
         keypoints=_transform(T_table_world, keypoints),
         wrist=turn * Rotation.from_rotvec(pose_hand[valid, :3]) if valid.any() else None,
@@ -114,50 +100,36 @@ def _transform(T: np.ndarray, points: np.ndarray) -> np.ndarray:
     return points @ T[:3, :3].T + T[:3, 3]
 
 
-def _read_joints(sequence: _Sequence, frame: int, extrinsics: _Poses) -> np.ndarray:
+def _read_joints(folder: Path, frame: int, cameras: _Poses) -> np.ndarray:
     """[21, 3] hand joints in the world frame, from the first camera with labels of this frame; NaN without a hand.
 
     DexYCB's joint order is this project's keypoint order. All cameras' labels come from one fit: one camera is enough.
     """
-    calibrated = [serial for serial in sequence.serials if serial in extrinsics]
-    if not calibrated:
-        raise DemoError(
-            f"sequence {sequence.name}: no camera of meta.yml ({', '.join(sequence.serials)}) is in"
-            f" extrinsics_{sequence.extrinsics}; the"
-            " calibration folder does not belong to these sequences. Download DexYCB's calibration archive again."
-        )
-    for serial in calibrated:
-        path = sequence.folder / serial / f"labels_{frame:06d}.npz"
+    for serial, pose in cameras.items():
+        path = folder / serial / f"labels_{frame:06d}.npz"
         if path.is_file():
             (joints,) = _read_npz(path, {"joint_3d": (1, 21, 3)})
             if (joints == -1).all():
                 return np.full((21, 3), np.nan)
-            return _transform(extrinsics[serial], joints[0])
+            return _transform(pose, joints[0])
     raise DemoError(
-        f"sequence {sequence.name}: no camera ({', '.join(calibrated)}) has labels_{frame:06d}.npz, but meta.yml says"
-        f" {sequence.num_frames} frames. Unpack at least one camera's folder of this sequence completely."
+        f"{folder}: no calibrated camera ({', '.join(cameras) or 'none of meta.yml is'}) has labels_{frame:06d}.npz."
+        " Unpack at least one camera's folder of this sequence completely, and DexYCB's calibration archive."
     )
 
 
-def _read_meta(path: Path) -> _Sequence:
+def _read_meta(path: Path) -> dict[str, Any]:
+    """Return the entries of a sequence's meta.yml: texts, and the numbers as integers."""
     meta = _read_yaml(path)
     try:
-        ids = [int(number) for number in meta["ycb_ids"]]
-        index = int(meta["ycb_grasp_ind"])
-        frames = int(meta["num_frames"])
-        (side,) = meta["mano_sides"]
-        if index < 0 or frames < 1 or side not in SIDES:
+        meta["ycb_ids"] = [int(number) for number in meta["ycb_ids"]]
+        meta |= {name: int(meta[name]) for name in ("ycb_grasp_ind", "num_frames")}
+        known = NAME_OF_ID[meta["ycb_ids"][meta["ycb_grasp_ind"]]]
+        if meta["ycb_grasp_ind"] < 0 or meta["num_frames"] < 1 or meta["mano_sides"] not in [[side] for side in SIDES]:
             raise ValueError("a number or a side is out of range")
-        return _Sequence(
-            folder=path.parent,
-            extrinsics=str(meta["extrinsics"]),
-            side=side,
-            object_name=NAME_OF_ID[ids[index]],
-            object_index=index,
-            num_objects=len(ids),
-            num_frames=frames,
-            serials=tuple(map(str, meta["serials"])),
-        )
+        if not (known and meta["extrinsics"] and all(isinstance(serial, str) for serial in meta["serials"])):
+            raise ValueError("a text is missing")
+        return meta
     except (LookupError, TypeError, ValueError) as error:
         raise DemoError(
             f"{path} is not a meta.yml of DexYCB, with extrinsics, mano_sides, num_frames, serials, ycb_grasp_ind and"

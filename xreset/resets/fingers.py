@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from xreset.geometry.balls import link_balls
+from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
+from xreset.geometry.rotations import matvec, quat_rotate, quat_rotate_inverse
 from xreset.geometry.surface import Surface
 from xreset.resets.config import SqueezeConfig
 from xreset.spec import ObjectSpec, RobotSpec
@@ -76,27 +77,22 @@ def fingers_of(
         finger += [number] * len(tip.contact_links)
     kinematics = Kinematics(robot)
     poses = kinematics.link_poses(q, links)
-    surfaces = {obj.name: Surface(obj) for obj in objects if obj.name in object_name}
+    names = [obj.name for obj in objects]
+    fields = DistanceFields.join([Surface(obj).field for obj in objects])
+    which = torch.tensor([names.index(name) for name in object_name], dtype=torch.long)
     gap = q.new_zeros(len(q), len(links))
     point = q.new_zeros(len(q), len(links), 3)
     inward = torch.zeros_like(point)
     for g, link in enumerate(links):
         centers, radii = _balls(kinematics, link)
         R = poses[:, g, :3, :3]
-        p = poses[:, g, :3, 3]
-        for name, surface in surfaces.items():
-            mine = torch.as_tensor(object_name == name)
-            world = centers @ R[mine].transpose(-1, -2) + p[mine, None]
-            turn = quat[mine, None].expand(-1, len(centers), 4)
-            local = quat_rotate_inverse(turn, world - pos[mine, None])
-            distance, gradient = surface.signed_distance(local.flatten(0, 1))
-            distance, nearest = (distance.view(-1, len(centers)) - radii).min(dim=-1)
-            gradient = gradient.view(-1, len(centers), 3)[torch.arange(len(nearest)), nearest]
-            into = -quat_rotate(quat[mine], torch.nn.functional.normalize(gradient, dim=-1))
-            into_link = (R[mine].transpose(-1, -2) @ into[..., None])[..., 0]
-            gap[mine, g] = distance
-            inward[mine, g] = into
-            point[mine, g] = centers[nearest] + radii[nearest, None] * into_link
+        world = centers @ R.mT + poses[:, g, None, :3, 3]
+        local = quat_rotate_inverse(quat[:, None].expand(-1, len(centers), 4), world - pos[:, None])
+        distance, gradient = fields.signed_distance(local.flatten(0, 1), which.repeat_interleave(len(centers)))
+        gap[:, g], nearest = (distance.view(-1, len(centers)) - radii).min(dim=-1)
+        gradient = gradient.view(-1, len(centers), 3)[torch.arange(len(nearest)), nearest]
+        inward[:, g] = -quat_rotate(quat, torch.nn.functional.normalize(gradient, dim=-1))
+        point[:, g] = centers[nearest] + radii[nearest, None] * matvec(R.mT, inward[:, g])
     return Fingers(links=tuple(links), finger=torch.tensor(finger), gap=gap, point=point, inward=inward)
 
 

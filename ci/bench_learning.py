@@ -10,7 +10,7 @@ import argparse
 import json
 import sys
 import time
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 from benchlib import Options
@@ -42,8 +42,8 @@ def run(options: Options, console: Console) -> None:
         config, backend = CONFIG, make_backend("mujoco", scene(), WORLDS, workers=0)
     with backend:
         began = time.perf_counter()
-        shares, steps = trained(seed, backend, config)
-    figures = asdict(shares) | {"env_steps": steps, "seconds": round(time.perf_counter() - began, 1)}
+        figures, steps = trained(seed, backend, config)
+    figures = figures | {"env_steps": steps, "seconds": round(time.perf_counter() - began, 1)}
     kind = options.device.partition(":")[0]
     band: dict[str, list[float]] | None = json.loads(BAND.read_text()).get(kind)
     outside = [name for name, (low, high) in (band or {}).items() if not low <= figures[name] <= high]

@@ -3,6 +3,7 @@
 import tempfile
 import unittest
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from unittest import mock
 
@@ -13,12 +14,11 @@ from tests.toy_bank import SOUP, toy_bank
 from tests.toy_robot import toy_hand_arm
 from xreset.backends.pool import PoolBackend
 from xreset.cameras.config import CameraConfig, DepthNoise, VisionConfig
-from xreset.env import ManipulationEnv, make_scene
+from xreset.env import make_env, make_scene
 from xreset.errors import BackendUnavailableError, RobotError, XResetError
 from xreset.objects.catalogue import load_objects
 from xreset.physics import State
 from xreset.plugins import backend_class, backend_names, make_backend
-from xreset.resets.distribution import ResetDistribution
 from xreset.task.config import ObservationConfig, RandomizationConfig, TaskConfig, evaluation_task
 
 try:
@@ -154,18 +154,14 @@ class TestCameras(unittest.TestCase):
 class TestVisionInTheEnvironment(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
-        folder = tempfile.TemporaryDirectory()
-        cls.addClassCleanup(folder.cleanup)
-        cls.bank = toy_bank(toy_hand_arm(Path(folder.name)))
-        cls.robot = toy_hand_arm(Path(folder.name))
+        cls.robot = toy_hand_arm(Path(cls.enterClassContext(tempfile.TemporaryDirectory())))
+        cls.bank = toy_bank(cls.robot)
         cls.objects = tuple(load_objects(list(cls.bank.object_names), None))
 
     def make(self, vision: VisionConfig, **changes):
         task = replace(evaluation_task(TASK), vision=vision, **changes)
-        backend = make_backend("mujoco", make_scene(self.robot, self.objects, task), 2, workers=0)
-        self.addCleanup(backend.close)
-        resets = ResetDistribution(self.bank, self.robot, self.bank.object_names, task.reset, "cpu")
-        return ManipulationEnv(backend, task, resets)
+        with mock.patch("xreset.env.make_backend", partial(make_backend, workers=0)):
+            return self.enterContext(make_env(self.robot, self.objects, self.bank, task, num_envs=2))
 
     def play(self, env, steps: int) -> list[torch.Tensor]:
         views = [env.get_observations()["view"]]

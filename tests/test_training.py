@@ -24,7 +24,7 @@ from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_goals import toy_goals
 from xreset import robots
 from xreset.cli import main
-from xreset.errors import BackendUnavailableError, FileFormatError, RunError, XResetError
+from xreset.errors import FileFormatError, RunError, XResetError
 from xreset.files import claim, file_hash
 from xreset.learning.checkpoint import Checkpoint, load_moments, read_checkpoint
 from xreset.learning.choice import Candidate, Choice, write_choice
@@ -312,9 +312,6 @@ class TrainingTest(unittest.TestCase):
         ):
             with self.subTest(words), self.assertRaisesRegex(XResetError, words):
                 self.train("refused", **options)
-        broken = mock.patch("xreset.env.make_backend", side_effect=BackendUnavailableError("no GPU"))
-        with broken, self.assertRaisesRegex(BackendUnavailableError, "no GPU"):
-            train(self.bank, out=self.folder / "refused", **self.options())
         with claim(self.folder / "refused"), self.assertRaisesRegex(XResetError, "nother (command|process) is writing"):
             self.train("refused")
         self.assertFalse((self.folder / "refused" / "run.json").exists())

@@ -8,7 +8,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable
 from contextlib import redirect_stdout
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
@@ -48,19 +48,13 @@ CONFIG = TrainConfig(
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Shares:
-    """Of all worlds' control steps."""
+def shares(mean: Callable[[str], float]) -> dict[str, float]:
+    """Return the shares of all worlds' control steps with both fingers on the brick, and with the brick at the goal.
 
-    grasped: float
-    """With both fingers on the brick."""
-    success: float
-    """At the goal besides."""
-
-    @classmethod
-    def of(cls, mean: Callable[[str], float]) -> Shares:
-        """Take the mean of each curve."""
-        return cls(grasped=float(mean("task/grasped")), success=float(mean("task/success")))
+    Args:
+        mean: name of a curve -> its mean.
+    """
+    return {name: float(mean(f"task/{name}")) for name in ("grasped", "success")}
 
 
 def bank() -> ResetBank:
@@ -81,7 +75,7 @@ def bank() -> ResetBank:
     )
 
 
-def random_policy(seed: int, backend: Backend) -> Shares:
+def random_policy(seed: int, backend: Backend) -> dict[str, float]:
     """What uniform actions do in one episode."""
     env = environment(seed, backend)
     policy = RandomPolicy(env.num_actions, seed)
@@ -89,21 +83,21 @@ def random_policy(seed: int, backend: Backend) -> Shares:
     for _ in range(env.max_episode_length):
         *_, extras = env.step(policy.act(env.get_observations()))
         logs.append(extras["log"])
-    return Shares.of(lambda name: np.mean([log[name] for log in logs]))
+    return shares(lambda name: np.mean([log[name] for log in logs]))
 
 
 def trained(
     seed: int,
     backend: Backend,
     config: TrainConfig = CONFIG,
-) -> tuple[Shares, int]:
+) -> tuple[dict[str, float], int]:
     """What a training does in its last iterations in the backend's worlds of :func:`scene`, and its steps in all worlds."""
     torch.manual_seed(seed)
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(StringIO()):
         runner = TrainingRunner(environment(seed, backend), config, Path(folder))
         runner.learn(config.iterations, init_at_random_ep_len=True)
         curves = read_curves(Path(folder))
-    return Shares.of(lambda name: curves[name].iloc[-LAST:].mean()), runner.env_steps
+    return shares(lambda name: curves[name].iloc[-LAST:].mean()), runner.env_steps
 
 
 def scene() -> SceneSpec:

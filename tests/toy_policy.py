@@ -19,7 +19,6 @@ def write_policy(
     *,
     lstm: int | str = 8,
     actions: int | None = None,
-    kind: int = TensorProto.FLOAT,
     outputs: int = 3,
     value: float = 0.5,
     metadata: str | None = None,
@@ -31,7 +30,6 @@ def write_policy(
         contract: says how wide its inputs and actions are.
         lstm: units.
         actions: how many it gives, if not those of the contract.
-        kind: type of its first input.
         outputs: how many of the three it has.
         value: of every weight.
         metadata: in place of the contract.
@@ -47,18 +45,14 @@ def write_policy(
         "h_in": [1, "n", lstm],
         "c_in": [1, "n", lstm],
     }
-    inputs = [
-        helper.make_tensor_value_info(name, kind if name == "flat" else TensorProto.FLOAT, shape)
-        for name, shape in shapes.items()
-    ]
+    inputs = [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in shapes.items()]
     given = [
         helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in ("actions", "h_out", "c_out")[:outputs]
     ]
     width = len(contract["joint_names"]) if actions is None else actions
     weights = numpy_helper.from_array(np.full((flat, width), value, dtype=np.float32), "w")
     nodes = [
-        helper.make_node("Cast", ["flat"], ["x"], to=TensorProto.FLOAT),
-        helper.make_node("MatMul", ["x", "w"], ["actions"]),
+        helper.make_node("MatMul", ["flat", "w"], ["actions"]),
         helper.make_node("Identity", ["h_in"], ["h_out"]),
         helper.make_node("Identity", ["c_in"], ["c_out"]),
     ]

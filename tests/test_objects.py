@@ -250,14 +250,12 @@ class MeshImport(InFolder):
 
     def test_archives_and_gltf_are_bounded(self):
         content = self.write(BOX).read_bytes() + b"#" * (2 << 20)
-        for name in ("mesh.zip", "mesh.3mf"):
-            with zipfile.ZipFile(self.folder / name, "w", zipfile.ZIP_DEFLATED) as archive:
-                archive.writestr("mesh.obj", content)
+        with zipfile.ZipFile(self.folder / "mesh.3mf", "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("mesh.obj", content)
         header = {"asset": {"version": "2.0"}, "accessors": [{"componentType": 5126, "type": "VEC3", "count": 10**9}]}
         (self.folder / "huge.gltf").write_text(json.dumps(header))
         for name, limit, words in (
-            ("mesh.zip", 16 << 20, "is an archive. Unpack it"),
-            ("mesh.3mf", 16 << 20, "takes 32 MB"),
+            ("mesh.3mf", 16 << 20, "is an archive. Unpack it"),
             ("huge.gltf", 1 << 30, "takes 22888 MB"),
         ):
             with (

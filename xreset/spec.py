@@ -173,12 +173,12 @@ class RobotSpec:
     @property
     def arm_indices(self) -> np.ndarray:
         """Indices of the arm's joints in joint order."""
-        return np.array([i for i, joint in enumerate(self.joints) if joint.group == "arm"], dtype=np.int64)
+        return np.flatnonzero([joint.group == "arm" for joint in self.joints])
 
     @property
     def hand_indices(self) -> np.ndarray:
         """Indices of the hand's joints in joint order."""
-        return np.array([i for i, joint in enumerate(self.joints) if joint.group == "hand"], dtype=np.int64)
+        return np.flatnonzero([joint.group == "hand" for joint in self.joints])
 
     @property
     def tracked_links(self) -> tuple[str, ...]:

@@ -149,19 +149,15 @@ class Kinematics:
     def _chain(self, joints: Sequence[Joint], moving: Sequence[Joint]) -> None:
         """Set the steps from each link to the next, and which joints move which link."""
         row = {joint.name: i for i, joint in enumerate(moving)}
-        self._turns = [joint.type == "revolute" for joint in moving]
+        self._moving = moving
         self._steps: list[_Step] = []
-        self._above = [{0}]
-        """Each link and the links above it."""
-        self._ancestry = torch.zeros(len(self.link_names), len(moving), dtype=torch.bool)
+        self._above = torch.eye(len(self.link_names), dtype=torch.bool)
+        """[L, L] whether a link (first) is another one (second), or is carried by it."""
         for i, joint in enumerate(joints, start=1):
             parent = self._link_index[joint.parent]
-            self._above.append(self._above[parent] | {i})
-            self._ancestry[i] = self._ancestry[parent]
+            self._above[i] |= self._above[parent]
             R = joint.T_parent_joint[:3, :3]
             rotations = R
-            if joint.type != "fixed":
-                self._ancestry[i, row[joint.name]] = True
             if joint.type == "revolute":
                 K = np.cross(np.eye(3), joint.axis)  # K v = axis x v
                 rotations = np.concatenate((R, R @ K, R @ K @ K), axis=1)
@@ -179,10 +175,10 @@ class Kinematics:
     def _moved_by_joints(self, links: tuple[int, ...]) -> list[tuple[int, Tensor]]:
         """Return the moving joints that move any of the links, each with the positions of these links in ``links``."""
         moved = []
-        for joint, moves in enumerate(self._ancestry[list(links)].unbind(1)):
-            rows = moves.nonzero()[:, 0]
+        for row, joint in enumerate(self._moving):
+            rows = self._above[links, self._link_index[joint.child]].nonzero()[:, 0]
             if len(rows):
-                moved.append((joint, rows.to(self.device)))
+                moved.append((row, rows.to(self.device)))
         return moved
 
     def link_index(self, name: str) -> int:
@@ -263,7 +259,7 @@ class Kinematics:
         angular = torch.zeros_like(linear)
         for column, (joint, rows) in enumerate(moved):
             axis = axes[joint][:, None]
-            if self._turns[joint]:
+            if self._moving[joint].type == "revolute":
                 lever = pos[:, rows] - origins[joint][:, None]
                 linear[..., column][:, rows] = torch.linalg.cross(axis, lever)
                 angular[..., column][:, rows] = axis.expand(-1, len(rows), -1)
@@ -298,9 +294,9 @@ class Kinematics:
         positions = {0: base[:, :3, 3]}
         axes: dict[int, Tensor] = {}
         origins: dict[int, Tensor] = {}
-        needed = set().union(*(self._above[i] for i in wanted))
+        needed = self._above[list(wanted)].any(dim=0).tolist()
         for i, step in enumerate(self._steps, start=1):
-            if i not in needed:
+            if not needed[i]:
                 continue
             parent = rotations[step.parent]
             origin = positions[step.parent] + parent @ step.offset

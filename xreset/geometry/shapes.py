@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 _MOST_HULL_POINTS = 300
 """Number of points in a hull that every engine accepts."""
 _ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz")
-_UNPACKED = 16
-"""Bytes of memory per byte of a zipped mesh format, such as 3MF."""
 _PER_VERTEX_BYTE = 8
 """Bytes of memory of a mesh per byte of its vertices: faces, and copies on the way."""
 _GLTF_NUMBERS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -122,13 +120,10 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
 
     if not os.path.isfile(path):
         raise ObjectError(f"There is no mesh at {shown(str(path))}.")
-    if path.suffix.lower() in _ARCHIVES:
+    if path.suffix.lower() in _ARCHIVES or zipfile.is_zipfile(path):
         raise ObjectError(f"{path} is an archive. Unpack it, and give the mesh.")
     try:
         size = path.stat().st_size
-        if zipfile.is_zipfile(path):  # the archive states the sizes, and zipfile reads no more than these
-            with zipfile.ZipFile(path) as archive:
-                size = _UNPACKED * sum(member.file_size for member in archive.infolist())
         if path.suffix.lower() in (".gltf", ".glb"):
             size = max(size, _gltf_size(path))
         _check_memory(path, size)

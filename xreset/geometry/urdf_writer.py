@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
+import trimesh
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
@@ -99,11 +100,10 @@ def write_meshes(tree: RobotTree, folder: Path) -> None:
             geometry = shape.geometry
             if geometry.vertices is None or geometry.faces is None:
                 continue
-            lines = [f"v {_text(vertex)}" for vertex in geometry.vertices]
-            lines += [f"f {a} {b} {c}" for a, b, c in geometry.faces + 1]
             file = folder / _mesh_name(link.name, number)
             file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_text("\n".join(lines) + "\n")
+            mesh = trimesh.Trimesh(geometry.vertices, geometry.faces, process=False)
+            mesh.export(file, digits=9, include_normals=False, header="")
 
 
 def _mesh_name(link: str, number: int) -> str:

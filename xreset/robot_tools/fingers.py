@@ -69,8 +69,8 @@ class Hand:
     """Its links, with frames for palm, wrist, fingertips and keypoints."""
     root: str
     """Link after which the fingers part."""
-    places: Poses
-    """Link -> pose [4, 4] in the frame of the tree's root, with a straight wrist."""
+    body: np.ndarray
+    """[V, 3] vertices of the shapes that are fixed to the tree's root, in its frame."""
     palm: np.ndarray
     """[4, 4] pose of the palm in the frame of the tree's root, with a straight wrist."""
     palm_in_hand: np.ndarray
@@ -98,10 +98,11 @@ def find_hand(tree: RobotTree, folder: Path, thumb: str | None, notes: list[str]
     palm, bent = _find_palm(spec, tree, straight, fingers)
     tree, tips, keypoints = _with_frames(tree, root, fingers, palm, straight)
     T_root_hand = np.linalg.inv(straight[tree.root])
+    body = [name for name in straight if tree.moving_ancestor(name) == tree.root]
     return Hand(
         tree=tree,
         root=root,
-        places={name: T_root_hand @ T for name, T in straight.items()},
+        body=_surface(tree, body, {name: T_root_hand @ straight[name] for name in body}),
         palm=T_root_hand @ palm,
         palm_in_hand=palm,
         tips=tuple(tips),
@@ -330,7 +331,7 @@ def _in_link(pose: np.ndarray, point: np.ndarray) -> np.ndarray:
     return pose[:3, :3].T @ (point - pose[:3, 3])
 
 
-def surface(tree: RobotTree, links: Iterable[str], at: Poses) -> np.ndarray:
+def _surface(tree: RobotTree, links: Iterable[str], at: Poses) -> np.ndarray:
     """[V, 3] vertices of the shapes of links in the hand root's frame."""
     points = [np.zeros((0, 3))]
     for name in links:
@@ -345,12 +346,12 @@ def _points(tree: RobotTree, finger: Finger, at: Poses) -> np.ndarray:
     A joint is the point of its axis that is nearest to the middle of its link's shapes: makers put origins anywhere
     along an axis. The tip is a fixed link called so, or the point of the shapes that is farthest from the last joint.
     """
-    points = [_on_axis(tree, link, at, surface(tree, [link], at)) for link in finger.links]
+    points = [_on_axis(tree, link, at, _surface(tree, [link], at)) for link in finger.links]
     tips = [name for name in finger.rest if "tip" in name.lower()]
     if tips:
         return np.array([*points, at[tips[0]][:3, 3]])
     last = finger.links[-1]
-    cloud = surface(tree, (last, *finger.rest), at)
+    cloud = _surface(tree, (last, *finger.rest), at)
     if not len(cloud):
         raise RobotError(f"the last link of a finger, {last!r}, has no collision shape, so it can touch nothing.")
     middle = _middle(cloud)

@@ -56,19 +56,16 @@ def hold_near(robot: RobotSpec, T_world_root: np.ndarray) -> tuple[RobotSpec, st
         hand_error=zero,
         hand_clearance=zero,
     )
-    low = None
-    for rows in (slice(0, 1), slice(1, count)):
-        joints, measures = track(model, targets[rows], Thresholds())
-        height = table_clearance(robot, model.full(joints[:, 0], hand))
-        for index in np.flatnonzero(classify(measures, Thresholds())[:, 0] == 0).tolist():
-            step = (100 * steps[rows][index]).tolist()
-            moved = f", moved by ({', '.join(f'{value:.0f}' for value in step)}) cm" if any(step) else ""
-            positions = rounded(joints[index, 0].numpy(), model.lower.numpy(), model.upper.numpy())
-            home = (_with_arm_at(robot, positions), moved)
-            if height[index] > _CLEAR:
-                return home
-            low = low or home
-    return low
+    joints, measures = track(model, targets, Thresholds())
+    reached = np.flatnonzero(classify(measures, Thresholds())[:, 0] == 0)
+    if not len(reached):
+        return None
+    height = table_clearance(robot, model.full(joints[reached, 0], hand))
+    chosen = int(reached[(height > _CLEAR).numpy().argmax()])  # the first one, if all are low
+    step = (100 * steps[chosen]).tolist()
+    moved = f", moved by ({', '.join(f'{value:.0f}' for value in step)}) cm" if any(step) else ""
+    positions = rounded(joints[chosen, 0].numpy(), model.lower.numpy(), model.upper.numpy())
+    return _with_arm_at(robot, positions), moved
 
 
 def _with_arm_at(robot: RobotSpec, positions: np.ndarray) -> RobotSpec:

@@ -24,7 +24,7 @@ from xreset.geometry.shapes import surface_of
 from xreset.geometry.urdf import RobotTree
 from xreset.geometry.urdf_writer import axes, pose, roll_pitch_yaw
 from xreset.robot_tools.draft import description_text, draft_spec
-from xreset.robot_tools.fingers import Hand, find_hand, surface
+from xreset.robot_tools.fingers import Hand, find_hand
 from xreset.robot_tools.homes import hold_near
 from xreset.robot_tools.sources import bare, combined, last_link, read_source, renamed
 from xreset.spec import RobotSpec, SceneSpec
@@ -180,9 +180,7 @@ def _vector(values: np.ndarray) -> str:
 
 def _stand_off(hand: Hand, rpy: tuple[float, float, float], ahead: np.ndarray) -> float:
     """Distance [m] by which a hand's body would reach behind the flange's origin if its root were there."""
-    body = [name for name in hand.tree.link_names if hand.tree.moving_ancestor(name) == hand.tree.root]
-    vertices = surface(hand.tree, body, hand.places)
-    depth = -(vertices @ pose(rpy=rpy)[:3, :3].T @ ahead)
+    depth = -(hand.body @ pose(rpy=rpy)[:3, :3].T @ ahead)
     return round(float(depth.max(initial=0.0)), 3)
 
 

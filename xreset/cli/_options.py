@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial, wraps
@@ -74,14 +75,13 @@ def _check(options: dict[str, Any]) -> None:
 
 def check_device(device: str) -> None:
     """Refuse an unknown device, and a GPU that this machine does not have."""
-    kind, _, number = device.partition(":")
-    if kind not in ("cpu", "cuda") or not (number.isdecimal() or (not number and ":" not in device)):
+    if not re.fullmatch("cpu|cuda(:[0-9]{1,3})?", device):
         raise XResetError(f"Unknown device {device!r}; expected cpu, cuda or one of several GPUs, such as cuda:1.")
-    if kind == "cuda":
+    if device != "cpu":
         import torch
 
         count = torch.cuda.device_count()
-        if int(number or 0) >= count:
+        if int(device.partition(":")[2] or 0) >= count:
             raise XResetError(
                 f"--device is {device}, but torch finds {count} GPUs. Check nvidia-smi, or use --device cpu."
             )

@@ -204,6 +204,10 @@ class EngineTest(unittest.TestCase):
                 flat = torch.cat((seen["policy"], seen["proprio"]), dim=1)
                 recorded.append((flat.numpy(), seen["perception"].numpy().copy()))
                 env.advance(torch.from_numpy(action))
+            moving = EngineDriver(env).read()
+            found = make_controller(env, actor).kinematics.links(moving.joint_pos, moving.joint_vel)
+            for name in ("palm_pos", "palm_linvel", "palm_angvel"):
+                np.testing.assert_allclose(getattr(found, name), getattr(moving.links, name), atol=2e-4, err_msg=name)
             env.reset(start=start)
             controller = make_controller(env, actor)
             driver = EngineDriver(env)

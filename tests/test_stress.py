@@ -113,18 +113,18 @@ class CurveTest(unittest.TestCase):
 
 class CommandTest(unittest.TestCase):
     def test_a_card_from_the_command_line(self):
-        """A hand that does nothing, two demonstrations and one value: files, table, picture; and an engine that cannot set drives."""
+        """A hand that does nothing, one demonstration and one value: files, table, picture; and an engine that cannot set drives."""
         from xreset.backends.mujoco import MujocoBackend
 
         folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
         demos = folder / "demos.npz"
-        xreset("demos", "synth", "--objects", SOUP, "--per-object", 2, "--out", demos)
+        xreset("demos", "synth", "--objects", SOUP, "--per-object", 1, "--out", demos)
         options = ("--robot", "openarm", "--demos", demos, "--episodes", 1, "--out", folder)
         sweeps = ("--property", "arm-stiffness=0.5", "--property", "action-latency=1")
         with mock.patch.object(MujocoBackend, "capabilities", MujocoBackend.capabilities - {"drives"}):
             _, out, _ = xreset("stress", "zero", *options, *sweeps)
         (card,) = read_stress(folder)
-        self.assertEqual((card.schema, card.policy, card.episodes), ("xreset-stress/1", "zero", 2))
+        self.assertEqual((card.schema, card.policy, card.episodes), ("xreset-stress/1", "zero", 1))
         self.assertEqual(card.left_out, ("arm-stiffness",))
         (curve,) = card.curves
         self.assertEqual((curve.property, [p.value for p in curve.points]), ("action-latency", [0.0, 1.0]))

@@ -56,6 +56,7 @@ class Controller:
         step_size: [J] farthest that a relative target moves in a control step; 0 for joints with absolute targets.
         action: [N, J] the last action.
         target: [N, J] the present joint targets.
+        kinematics: palm and fingertips from joint positions.
     """
 
     def __init__(self, contract: dict[str, Any], actor: OnnxActor | Any = None) -> None:
@@ -68,7 +69,7 @@ class Controller:
         self.contract = contract
         self.dt: float = contract["control_dt"]
         self._actor = actor
-        self._kinematics = Kinematics(contract["kinematics"])
+        self.kinematics = Kinematics(contract["kinematics"])
         joints = contract["joints"]
 
         def column(name: str, otherwise: float) -> Array:
@@ -147,7 +148,7 @@ class Controller:
     def observe(self, reading: Reading) -> tuple[Array, Array]:
         """Return the policy's inputs: [N, F] flat, and the cloud [N, H, P, K]."""
         o = self.contract["observation"]
-        links = reading.links or self._kinematics.links(reading.joint_pos, reading.joint_vel)
+        links = reading.links or self.kinematics.links(reading.joint_pos, reading.joint_vel)
         count = len(self.target)
         force = reading.tip_force
         if force is None:

@@ -63,7 +63,7 @@ class FileTest(InFolder):
             ("about = 'x'", "states schema None, expected 'xreset-study/1'"),
             (head + "[runs.a]\nminuets = 3\n", r"runs\.a does not fit Runs \(unknown: minuets \(minutes\?\)\)"),
             (head + "[runs.a]\nseeds = [0, 0]\n", r"runs\.a\.seeds is \[0, 0\], expected one or more"),
-            (head + "[runs.a]\nseeds = [99999999999999]\n", r"runs\.a\.seeds is \[99999999999999\]"),
+            (head + "[runs.a]\nseeds = [99999999999999]\n", r"runs\.a\.seeds\[0\] is 99999999999999, expected a whole"),
             (head + "[runs.a]\nminutes = inf\n", r"runs\.a\.minutes is inf"),
             (head + "[runs.a]\ngpus = 4\n", r"runs\.a\.gpus is 4\. This option was removed"),
             (head + "[runs.a]\ndata = 'real'\n", r"runs\.a\.data is 'real', expected one of 'toy'"),

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from math import degrees
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -147,11 +148,11 @@ class Page(WebPage):
             client.add_notification(title, text, auto_close_seconds=8.0)
 
     @contextmanager
-    def _loading(self, what: str) -> Iterator[None]:
+    def _loading(self) -> Iterator[None]:
         """Show that something is being loaded, and restore the controls from the session, whatever happened."""
         notes = []
         for client in self._server.get_clients().values():
-            notes.append(client.add_notification(f"Loading {what}", "", loading=True, with_close_button=False))
+            notes.append(client.add_notification("Loading", "", loading=True, with_close_button=False))
         try:
             yield
         finally:
@@ -308,13 +309,8 @@ class Page(WebPage):
             trace = gui.add_button("Numbers (npz)")
             trace.on_click(lambda event: self._wish(self._save_trace, event.client))
         self._show_choices()
-        for control, choose in (
-            (self._object, self._choose_object),
-            (self._engine, self._choose_engine),
-            (self._policy, self._choose_policy),
-            (self._robot_name, self._choose_robot),
-        ):
-            control.on_update(lambda _, choose=choose: self._wish(choose))
+        for control in (self._object, self._engine, self._policy, self._robot_name):
+            control.on_update(lambda _: self._wish(self._choose))
 
     def _show_choices(self) -> None:
         """Let the controls say what the session is."""
@@ -344,32 +340,24 @@ class Page(WebPage):
         else:
             self.session.take_away()
 
-    def _choose_object(self) -> None:
-        name = self._names[self._object.value]
-        if name != self.session.object_name:
-            with self._loading(self._object.value):
-                self.session.choose_object(name)
-                self._make_scene()
-
-    def _choose_engine(self) -> None:
-        if self._engine.value != self.session.engine:
-            with self._loading(self._engine.value):
-                self.session.choose_engine(self._engine.value)
-
-    def _choose_policy(self) -> None:
-        name = self._policy.value
-        if name != self.session.policy.name:
-            robot = self.session.policy.robot.name if name == NOBODY else None
-            self._open(name, robot)
-
-    def _choose_robot(self) -> None:
+    def _choose(self) -> None:
+        """Open what the controls say, unless it is open already."""
+        session = self.session
         robot = self._robot_name.value
-        if robot != self.session.policy.robot.name:
-            self._open(NOBODY, robot)
-
-    def _open(self, name: str, robot: str | None) -> None:
-        with self._loading(robot or name):
-            self.session.choose_policy(self._policies[name], robot=robot)
+        policy = self._policy.value
+        thing = self._names[self._object.value]
+        if robot != session.policy.robot.name:
+            choice = partial(session.choose_policy, NOBODY, robot=robot)
+        elif policy != session.policy.name:
+            choice = partial(session.choose_policy, self._policies[policy], robot=robot if policy == NOBODY else None)
+        elif thing != session.object_name:
+            choice = partial(session.choose_object, thing)
+        elif self._engine.value != session.engine:
+            choice = partial(session.choose_engine, self._engine.value)
+        else:
+            return
+        with self._loading():
+            choice()
             self._make_scene()
 
     def _write(self) -> None:

@@ -13,8 +13,6 @@ from xreset.text import short_name
 if TYPE_CHECKING:
     from xreset.eval.report.read import Training
 
-POLICY_CONDITIONS = ("policy", "policy file")
-"""Conditions in which the engines of one policy must agree."""
 _CONDITIONS = ("objects", "robot", "object meshes", "number of episodes", "seed of the evaluation")
 _PLAYED_TASK = ("task.termination.", "task.reset.spawn_", "task.reset.home_noise", "task.timestep")
 """Fields of a training's task that its evaluation keeps (:func:`xreset.task.config.evaluation_task`) and that make it
@@ -22,19 +20,16 @@ easier or harder."""
 _SAME_NAMES = " Their sequences have the same names: if one was made from the other, as for ik, they are comparable."
 
 
-def uneven(trainings: Sequence[Training], further: Sequence[str] = ()) -> list[str]:
-    """Return a sentence for each condition besides the policy in which evaluations differ; none if all were evaluated
-    alike.
-
-    Args:
-        further: further conditions to compare, of :data:`POLICY_CONDITIONS`.
-    """
+def uneven(trainings: Sequence[Training]) -> list[str]:
+    """Return a sentence for each condition in which evaluations differ; none if all were evaluated alike. A single
+    training has the same policy in all engines; several have their own."""
     table = _condition_table(trainings)
     if table.empty:
         return []
     tasks = sorted(name for name in table if name.startswith(_PLAYED_TASK))
     found = []
-    for name in (*_CONDITIONS, *tasks, *further):
+    policy = ("policy", "policy file") if len(trainings) == 1 else ()
+    for name in (*_CONDITIONS, *tasks, *policy):
         found += _difference(table, name, name)
     if table["objects"].nunique() == 1:
         same_names = table["sequences"].nunique() == 1

@@ -12,7 +12,7 @@ import pandas as pd
 
 from xreset.errors import FileFormatError, RunError, needs
 from xreset.eval.report.clips import missed_by_student
-from xreset.eval.report.fairness import POLICY_CONDITIONS, uneven
+from xreset.eval.report.fairness import uneven
 from xreset.eval.results import EvalResult, Table, read_evaluation
 from xreset.eval.stress import Stress, read_stress
 from xreset.files import read_json
@@ -83,7 +83,7 @@ def collect(folder: Path) -> ReportData:
     training = read_training(name_of(folder), folder)
     if not training.results:
         raise RunError(f"{folder} holds no evaluation results. {_evaluate(folder)}")
-    notes = uneven([training], POLICY_CONDITIONS)
+    notes = uneven([training])
     run = None
     if training.facts:
         try:

@@ -53,10 +53,6 @@ _LARGEST_SEED = 2**32 - 1
 Seed = Annotated[int, Rule(f"a whole number from 0 to {_LARGEST_SEED}", lambda x: 0 <= x <= _LARGEST_SEED)]
 
 
-def _are_seeds(seeds: tuple[int, ...]) -> bool:
-    return len(seeds) > 0 and len(set(seeds)) == len(seeds) and min(seeds) >= 0 and max(seeds) <= _LARGEST_SEED
-
-
 Axis = Literal["run", "object", "metric"]
 
 
@@ -139,9 +135,7 @@ class Runs(Checked):
     recipe: str = "minutes"
     config: dict[str, Any] = field(default_factory=dict)
     """Changes of the recipe, nested as the configuration is."""
-    seeds: Annotated[tuple[int, ...], Rule(f"one or more numbers from 0 to {_LARGEST_SEED}, each once", _are_seeds)] = (
-        0,
-    )
+    seeds: Annotated[tuple[Seed, ...], Rule("one or more, each once", lambda x: 0 < len(x) == len(set(x)))] = (0,)
     minutes: Positive[Finite[float]] | None = None
     """Minutes of training, without compiling."""
     steps: Positive[Finite[float]] | None = None

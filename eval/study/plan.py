@@ -27,7 +27,7 @@ from xreset.files import file_hash, is_claimed
 from xreset.learning.clock import Lift, read_lift
 from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import starting_config
-from xreset.learning.run import checkpoints, latest_checkpoint, read_run
+from xreset.learning.run import checkpoints, read_run
 from xreset.objects.catalogue import canonical_names, object_names
 from xreset.plugins import backend_status
 from xreset.text import short_name
@@ -63,13 +63,8 @@ class Run:
         return self.subset.folder / Path(self.runs.robot).name / "resets.npz"
 
     def trained(self) -> Lift:
-        """Return how far the training has come: from its newest checkpoint, or else its lift clock."""
-        if not checkpoints(self.folder):
-            return read_lift(self.folder)
-        from xreset.learning.checkpoint import read_checkpoint
-
-        content = read_checkpoint(latest_checkpoint(self.folder))
-        return Lift(iteration=content.iteration, env_steps=content.env_steps, minutes=content.elapsed / 60)
+        """Return how far the training has come, which it notes with every checkpoint."""
+        return read_lift(self.folder)
 
     def left(self) -> str:
         """Return how far an unfinished training has come, in words; empty if it is finished."""

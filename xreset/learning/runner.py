@@ -124,6 +124,8 @@ class TrainingRunner:
                 if self.iteration % self.config.save_interval == 0:
                     self.save_checkpoint()
                     saved_at = self.iteration
+                    if log is not None:
+                        log.clock.write()
         if self.iteration != saved_at or not self.iteration:
             self.save_checkpoint()
         if log is not None:

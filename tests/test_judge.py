@@ -80,7 +80,7 @@ class Judge(unittest.TestCase):
         words = f"--robot gripper --backend mujoco --squeeze.force 4 --json {folder}/judge.json --picture {folder}/judge.png"
         with redirect_stdout(io.StringIO()) as output:
             main(["robots", "judge", str(folder / "bank.npz"), *words.split()])
-        self.assertRegex(output.getvalue(), r"brick +│ 3 +│ 3, 3, 0")
+        self.assertRegex(output.getvalue(), r"brick +│ +3 +│ 3, 3, 0")
         self.assertEqual(json.loads((folder / "judge.json").read_text())["rows"][0]["lift"], 3)
         self.assertEqual(Image.open(folder / "judge.png").size[0], 4 * judging._TILE[0])
 

@@ -245,7 +245,7 @@ class LaunchTest(InFolder):
         say = "echo $CUDA_VISIBLE_DEVICES > gpus; sleep 0.3; touch done"
         waits = self.step("d", say, gpu=True)
         left = mock.Mock(side_effect=waits.left)
-        steps = [self.step("a", say, gpu=True), self.step("b", say, gpu=True), self.step("c", say)]
+        steps = [self.step("c", say), self.step("a", say, gpu=True), self.step("b", say, gpu=True)]
         problems, said = self.launch(*steps, replace(waits, left=left), gpus=(2, 5))
         self.assertEqual(problems, [])
         a, b, c, d = ((self.folder / name / "gpus").read_text().strip() for name in "abcd")

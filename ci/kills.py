@@ -6,121 +6,150 @@ A file under its final name must always be whole, and at the end no leftover may
 from __future__ import annotations
 
 import argparse
-import os
 import random
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 XRESET = [sys.executable, "-m", "xreset"]
-SMALL = [
-    *(
-        "--config.model.lstm",
-        "16",
-        "--config.model.mlp",
-        "16",
-        "--config.model.pointnet",
-        "8",
-        "8",
-        "--config.ppo.horizon",
-        "8",
-    ),
-    *(
-        "--config.ppo.minibatch-size",
-        "64",
-        "--config.save-interval",
-        "2",
-        "--config.task.observation.cloud-points",
-        "16",
-    ),
-]
+LEFTOVERS = (".part", ".lock", ".partial")
+SHARED_MEMORY = Path("/dev/shm")
+
+SMALL = ["--config.save-interval", 2, "--config.task.observation.cloud-points", 16, "--config.model.lstm", 16]
+SMALL += ["--config.model.mlp", 16, "--config.model.pointnet", 8, 8, "--config.ppo.horizon", 8]
+SMALL += ["--config.ppo.minibatch-size", 64]
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command that is killed."""
+
+    name: str
+    arguments: list
+    result: Path
+    """A file that exists when the command has ended."""
+    checkpoints: Path | None = None
+    """Folder of a training's checkpoints. No kill may make them fewer."""
+    resume: list | None = None
+    """The arguments that continue a training once it has a checkpoint."""
+
+    def now(self) -> list:
+        """Return the arguments for the files that there are."""
+        return self.resume if self.resume and self.saved() else self.arguments
+
+    def saved(self) -> int:
+        """Return how many checkpoints there are."""
+        return len(list(self.checkpoints.glob("[0-9]*.pt"))) if self.checkpoints else 0
+
+
+def commands(folder: Path) -> list[Command]:
+    """Return the commands in the order in which each finds the files that it needs."""
+    demos = folder / "demos.npz"
+    motion = folder / "retargeted.npz"
+    bank = folder / "bank.npz"
+    run = folder / "run"
+    eyes = folder / "eyes"
+    studies = folder / "studies"
+    where = ["--backend", "mujoco", "--device", "cpu", "--num-envs", 4]
+    resume = ["train", "--out", run, "--resume"]
+    watch = ["--out", eyes, "--resets", bank, "--iterations", 60, "--vision.width", 8, "--vision.height", 8]
+    return [
+        Command("demos synth", ["demos", "synth", "--out", demos, "--objects", "soup", "--per-object", 2], demos),
+        Command("retarget", ["retarget", demos, "--robot", "openarm", "--out", motion], motion),
+        Command("resets", ["resets", motion, "--out", bank], bank),
+        Command(
+            "train",
+            ["train", "--out", run, "--robot", "openarm", "--resets", bank, *where, "--iterations", 60, *SMALL],
+            run / "policy.onnx",
+            run / "checkpoints",
+            resume,
+        ),
+        Command("train --resume", [*resume, "--iterations", 120], run / "policy.onnx", run / "checkpoints"),
+        Command("eval", ["eval", run, "--demos", demos, "--episodes", 4], run / "eval" / "mujoco.json"),
+        Command(
+            "stress",
+            ["stress", run, "--demos", demos, "--backend", "mujoco", "--property", "object-mass"],
+            run / "stress" / "mujoco.json",
+        ),
+        Command(
+            "rehearse",
+            ["rehearse", run, "--demos", demos, "--backend", "mujoco", "--fault", "pose-delay"],
+            run / "rehearsal" / "mujoco.json",
+        ),
+        Command(
+            "distill",
+            ["distill", run, *watch, *where],
+            eyes / "policy.onnx",
+            eyes / "checkpoints",
+            ["distill", "--out", eyes, "--resume"],
+        ),
+        Command("report", ["report", run], run / "report" / "index.html"),
+        Command(
+            "export deploy",
+            ["export", "deploy", run, "--out", folder / "deploy"],
+            folder / "deploy" / "contract.json",
+        ),
+        Command("study", ["study", "seconds", "--out", studies], studies / "reports" / "seconds" / "study.md"),
+    ]
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=10, help="of each command")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--command", action="append", default=[], help="kill only this command; again for more")
     options = parser.parse_args()
     chance = random.Random(options.seed)
-    shared = set(Path("/dev/shm").glob("xreset-*"))
-    rows, failed = [], False
+    shared = set(SHARED_MEMORY.glob("xreset-*"))
+    rows = []
+    failed = False
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        demos, moved, bank, run = (folder / f for f in ("demos.npz", "retargeted.npz", "bank.npz", "run"))
-        subprocess.run(
-            [*XRESET, "demos", "synth", "--out", demos, "--objects", "soup", "--per-object", "2"],
-            check=True,
-            capture_output=True,
-        )
-        train = [
-            "train",
-            "--out",
-            run,
-            "--robot",
-            "openarm",
-            "--resets",
-            bank,
-            "--backend",
-            "mujoco",
-            "--device",
-            "cpu",
-            "--num-envs",
-            "4",
-        ]
-        train += ["--iterations", "60", *SMALL]
-        verbs: dict[str, tuple[Path, Callable[[], list]]] = {
-            "retarget": (moved, lambda: ["retarget", demos, "--robot", "openarm", "--out", moved]),
-            "resets": (bank, lambda: ["resets", moved, "--out", bank]),
-            "train": (run / "policy.onnx", lambda: train),
-            "train --resume": (run / "policy.onnx", lambda: ["train", "--out", run, "--resume", "--iterations", "120"]),
-            "eval": (run / "eval" / "mujoco.json", lambda: ["eval", run, "--demos", demos, "--episodes", "4"]),
-        }
-        for verb, (result, command) in verbs.items():
-            seconds, killed, before, ended = 20.0, 0, 0, 0
-            while killed < options.kills and ended < 3:
-                argv = resume(command(), run) if verb == "train" else command()
-                delay = chance.uniform(0.2, seconds)
-                if attempt(argv, delay) is None:
-                    killed += 1
-                else:
-                    ended, seconds = ended + 1, max(2.0, 0.7 * seconds)
-                if verb.startswith("train"):
-                    found = len(list((run / "checkpoints").glob("[0-9]*.pt")))
-                    failed |= found < before
-                    before = found
-            argv = resume(command(), run) if verb == "train" else command()
-            done = attempt(argv, None)
-            left = [
-                p.name for p in folder.rglob("*") if p.name.endswith((".part", ".lock")) or p.name.endswith(".partial")
-            ]
-            good = done == 0 and result.exists() and not left
+        for command in commands(folder):
+            wanted = options.kills if not options.command or command.name in options.command else 0
+            killed, good = kill(command, wanted, chance)
+            left = sorted(path.name for path in folder.rglob("*") if path.name.endswith(LEFTOVERS))
+            good &= command.result.exists() and not left
             failed |= not good
-            rows.append(f"| {verb} | {killed} | {'yes' if good else 'NO'} | {', '.join(left) or '-'} |")
+            rows.append(f"| {command.name} | {killed} | {'yes' if good else 'NO'} | {', '.join(left) or '-'} |")
             print(rows[-1], flush=True)
-    orphans = set(Path("/dev/shm").glob("xreset-*")) - shared
+    orphans = set(SHARED_MEMORY.glob("xreset-*")) - shared
     print("| command | kills | then went on to its end | left behind |\n|---|---|---|---|", *rows, sep="\n")
     print(f"\nfiles in shared memory that the next start removes: {len(orphans)}; seed {options.seed}")
     return int(failed)
 
 
-def resume(argv: list, run: Path) -> list:
-    """The same command, or ``--resume`` once there is a checkpoint."""
-    return ["train", "--out", run, "--resume"] if list((run / "checkpoints").glob("[0-9]*.pt")) else argv
+def kill(command: Command, wanted: int, chance: random.Random) -> tuple[int, bool]:
+    """Kill a command, then let it end.
+
+    Returns:
+        How often it was killed (fewer than wanted if it is quicker than the kills), and whether it ended well and lost no checkpoint.
+    """
+    seconds = 20.0
+    killed = 0
+    ended = 0
+    saved = 0
+    good = True
+    while killed < wanted and ended < 3:
+        if attempt(command.now(), chance.uniform(0.2, seconds)) is None:
+            killed += 1
+        else:
+            ended += 1
+            seconds = max(2.0, 0.7 * seconds)
+        good &= command.saved() >= saved
+        saved = command.saved()
+    return killed, good and attempt(command.now(), None) == 0
 
 
-def attempt(argv: list, delay: float | None) -> int | None:
-    """Exit status, or None if it was killed after ``delay`` seconds; an error is shown."""
+def attempt(arguments: list, delay: float | None) -> int | None:
+    """Return the exit status, or None if the command was killed after ``delay`` seconds. An error is shown."""
+    line = [*XRESET, *map(str, arguments)]
     process = subprocess.Popen(
-        [*XRESET, *map(str, argv)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        start_new_session=True,
-        env=os.environ,
-        text=True,
+        line, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True, text=True
     )
     try:
         said, _ = process.communicate(timeout=delay)
@@ -130,7 +159,7 @@ def attempt(argv: list, delay: float | None) -> int | None:
         time.sleep(0.3)  # workers notice that their input has ended
         return None
     if process.returncode:
-        print(f"xreset {' '.join(map(str, argv))}\n{said}")
+        print(f"xreset {' '.join(line[3:])}\n{said}")
     return process.returncode
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -36,6 +37,8 @@ class Command:
     """Folder of a training's checkpoints. No kill may make them fewer."""
     resume: list | None = None
     """The arguments that continue a training once it has a checkpoint."""
+    once: bool = False
+    """Whether the command refuses to make its result again, so that it is removed first."""
 
     def now(self) -> list:
         """Return the arguments for the files that there are."""
@@ -92,6 +95,7 @@ def commands(folder: Path) -> list[Command]:
             "export deploy",
             ["export", "deploy", run, "--out", folder / "deploy"],
             folder / "deploy" / "contract.json",
+            once=True,
         ),
         Command("study", ["study", "seconds", "--out", studies], studies / "reports" / "seconds" / "study.md"),
     ]
@@ -135,6 +139,7 @@ def kill(command: Command, wanted: int, chance: random.Random) -> tuple[int, boo
     saved = 0
     good = True
     while killed < wanted and ended < 3:
+        remove_if_once(command)
         if attempt(command.now(), chance.uniform(0.2, seconds)) is None:
             killed += 1
         else:
@@ -142,7 +147,14 @@ def kill(command: Command, wanted: int, chance: random.Random) -> tuple[int, boo
             seconds = max(2.0, 0.7 * seconds)
         good &= command.saved() >= saved
         saved = command.saved()
+    remove_if_once(command)
     return killed, good and attempt(command.now(), None) == 0
+
+
+def remove_if_once(command: Command) -> None:
+    """Remove the folder of a command that makes a new one, if it is complete."""
+    if command.once and command.result.exists():
+        shutil.rmtree(command.result.parent)
 
 
 def attempt(arguments: list, delay: float | None) -> int | None:

@@ -307,6 +307,8 @@ class DexYCB(InFolder):
             (self.sequence / "meta.yml").write_text(f"extrinsics: {tag}\n")
             self.refused("not a meta.yml")
         self.assertFalse(marker.exists())
+        (self.sequence / "meta.yml").write_text("[" * 5000)
+        self.refused("not valid YAML")
 
 
 class RealData(unittest.TestCase):

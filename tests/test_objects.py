@@ -254,9 +254,14 @@ class MeshImport(InFolder):
             archive.writestr("mesh.obj", content)
         header = {"asset": {"version": "2.0"}, "accessors": [{"componentType": 5126, "type": "VEC3", "count": 10**9}]}
         (self.folder / "huge.gltf").write_text(json.dumps(header))
+        scene = trimesh.Scene(BOX)
+        for i in range(50):
+            scene.add_geometry(scene.geometry["geometry_0"], node_name=f"copy {i}", geom_name="geometry_0")
+        (self.folder / "copies.glb").write_bytes(scene.export(file_type="glb"))
         for name, limit, words in (
             ("mesh.3mf", 16 << 20, "is an archive. Unpack it"),
             ("huge.gltf", 1 << 30, "takes 22888 MB"),
+            ("copies.glb", 50_000, "more than XRESET_MAX_FILE_MB"),
         ):
             with (
                 self.subTest(name),

@@ -90,7 +90,10 @@ class Played(unittest.TestCase):
         moment = self.steps(4.0)
         np.testing.assert_allclose(moment.object_pos, AWAY, atol=1e-3)
         self.assertTrue(session.away and session.lost and not session.dropped)
-        session.begin()
+        goal = moment.goal_pos + np.array((0.03, 0.0, 0.0))
+        session.move_goal(goal, moment.goal_quat)
+        session.begin(keep_goal=True)
+        np.testing.assert_allclose(session.step().goal_pos, goal, atol=1e-6)
         self.assertFalse(session.away or session.lost)
         self.assertLess(self.steps(4.0).distance, 0.05)
 

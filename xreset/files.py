@@ -16,6 +16,7 @@ import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import IO, Any
 
@@ -221,7 +222,8 @@ def _lock(path: Path, *, required: bool = False) -> int | None:
 def code_version() -> str:
     """Return the version of xreset and the commit that is running, as files record them: ``0.2.0+g1a2b3c4d5e6f``.
 
-    ``.dirty`` is added if files of the checkout were changed. Outside a checkout there is no commit.
+    ``.dirty`` is added if files of the checkout were changed. A package that was not installed from a repository has no
+    commit.
     """
     root = Path(__file__).parent.parent
     commit = ""
@@ -233,6 +235,10 @@ def code_version() -> str:
                 [*command, "--abbrev=12", "--exclude=*"], capture_output=True, text=True, timeout=20, env=environment
             )
             commit = found.stdout.strip()
+    else:
+        with suppress(PackageNotFoundError, ValueError, AttributeError):  # no package, or one of another origin
+            origin = json.loads(distribution("xreset").read_text("direct_url.json") or "{}")
+            commit = str(origin.get("vcs_info", {}).get("commit_id", ""))[:12]
     return f"{__version__}+g{commit}" if commit else __version__
 
 

@@ -141,7 +141,7 @@ class Page(WebPage):
             self._tell("Restarted", str(error))
         if self._retry.value and self.session.dropped:
             self._tell("Dropped", "The robot tries again from home.")
-            self.session.begin()
+            self.session.begin(keep_goal=True)
 
     def _tell(self, title: str, text: str) -> None:
         for client in self._server.get_clients().values():
@@ -336,7 +336,7 @@ class Page(WebPage):
 
     def _take_or_put(self) -> None:
         if self.session.away or self.session.lost:
-            self.session.begin()
+            self.session.begin(keep_goal=True)
         else:
             self.session.take_away()
 

@@ -214,9 +214,16 @@ class Session:
         """Duration of a control step [s]."""
         return self.env.backend.scene.control_dt
 
-    def begin(self) -> None:
-        """Begin anew: the robot at home, and a start and a goal drawn from the demonstrations."""
+    def begin(self, *, keep_goal: bool = False) -> None:
+        """Begin anew: the robot at home, and a start and a goal drawn from the demonstrations.
+
+        Args:
+            keep_goal: Draw a start only, and leave the goal where it is.
+        """
+        goal = (self.env.goal_pos[0].clone(), self.env.goal_quat[0].clone())
         self.env.reset()
+        if keep_goal:
+            self.env.goal_pos[0], self.env.goal_quat[0] = goal
         self._player.begin(self.env)
         self._begin()
 

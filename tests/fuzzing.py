@@ -115,10 +115,12 @@ def readers() -> Iterator[dict[str, Reader]]:
         write_actions(
             path,
             Actions(
-                scene=SceneSpec(robot=openarm, objects=(soup,)), label="x", start=start,
-                joint_target=home.repeat(3, 1), phases=(("a", 0.0),),
+                scene=SceneSpec(robot=openarm, objects=(soup,)),
+                label="x",
+                start=start,
+                joint_target=home.repeat(3, 1),
             ),
-        )  # fmt: skip
+        )
 
         rollouts = toy_rollouts()
         write_results(folder, toy_summary(rollouts=rollouts), rollouts, ("a", "b", "c"))
@@ -254,11 +256,17 @@ def readers() -> Iterator[dict[str, Reader]]:
         path.write_bytes(pickle.dumps(frame, protocol=2))
 
         # several files that contradict each other
+        others = toy_demos()
+        others = replace(others, sequence_name=np.array([f"other-{name}" for name in others.sequence_name]))
         may = ("hand_keypoints", "wrist_quat_wxyz", "hand_error", "wrist_error")
-        path = add("two archives", "more.npz", lambda p: merge_demos([read_demos(p), toy_demos()]), "npz", may)
+        path = add("two archives", "more.npz", lambda p: merge_demos([read_demos(p), others]), "npz", may)
         write_demos(path, toy_demos())
         path = add(
-            "motion and archive", "seen.npz", lambda p: load_view(p, demos=folder / "demos.npz"), "npz", (*may, "human")
+            "motion and archive",
+            "seen.npz",
+            lambda p: load_view(p, demos=folder / "demos.npz"),
+            "npz",
+            (*may, "human_keypoints"),
         )
         write_retargeted(path, toy_retargeted(openarm), config={}, inputs={})
         (folder / "both").mkdir()

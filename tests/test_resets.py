@@ -105,6 +105,9 @@ class FilterTest(unittest.TestCase):
                 (SOUP, "post-contact", 1, 1, {}),
                 (SPAM, "pre-contact", 2, 2, {}),
                 (SPAM, "post-contact", 0, 0, {}),
+                ("all", "pre-contact", 3, 4, {"object linear velocity": 1}),
+                ("all", "post-contact", 1, 1, {}),
+                ("all", "both", 4, 5, {"object linear velocity": 1}),
             ],
         )
 

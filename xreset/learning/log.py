@@ -97,7 +97,7 @@ class TrainingLog:
         before = self._lift
         self._lift = before.after(from_home, iteration=iteration, env_steps=env_steps, seconds=elapsed)
         if self._lift.passed != before.passed:
-            write_lift(self._folder, self._lift)
+            self.write_lift()
         if time.monotonic() - self._last_line > _LINE_SECONDS or iteration == self._total:
             self._last_line = time.monotonic()
             print(
@@ -110,11 +110,15 @@ class TrainingLog:
         self._sums = 0.0
         self._steps = 0
 
+    def write_lift(self) -> None:
+        """Write the lift clock's file."""
+        write_lift(self._folder, self._lift)
+
     def close(self, *, stopped: bool) -> None:
         """End the files; ``stopped`` says whether the training ended before its last iteration."""
         self._curves.close()
         if self._online is not None:
             self._online.finish()
-        write_lift(self._folder, self._lift)
+        self.write_lift()
         if stopped:
             print("stopped after the current iteration; a checkpoint is written.")

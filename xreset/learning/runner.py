@@ -125,7 +125,7 @@ class TrainingRunner:
                     self.save_checkpoint()
                     saved_at = self.iteration
                     if log is not None:
-                        log.clock.write()
+                        log.write_lift()
         if self.iteration != saved_at or not self.iteration:
             self.save_checkpoint()
         if log is not None:

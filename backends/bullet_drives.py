@@ -25,7 +25,9 @@ class BulletDrives:
     with armature on the light links of a hand.
     """
 
-    def __init__(self, client: Any, body: int, robot: Mechanism, dt: float, mass_matrix_steps: int) -> None:
+    def __init__(
+        self, client: Any, body: int, robot: Mechanism, dt: float, mass_matrix_steps: int
+    ) -> None:
         self._p = client
         self._body = body
         self._dt = dt
@@ -51,15 +53,21 @@ class BulletDrives:
         inertia = 1.0 / np.diag(np.linalg.inv(M))[joints.mimic]
         self._stiffness = inertia / dt**2  # critically damped, as stiff as one step can feel
         self._damping = 2.0 * inertia / dt
-        self._coupling = self._J.T @ ((dt**2 * self._stiffness + dt * self._damping)[:, None] * self._J)
+        self._coupling = self._J.T @ (
+            (dt**2 * self._stiffness + dt * self._damping)[:, None] * self._J
+        )
 
         # Bullet's joints start with a motor that brakes them.
-        client.setJointMotorControlArray(body, self._links, client.VELOCITY_CONTROL, forces=np.zeros(count))
+        client.setJointMotorControlArray(
+            body, self._links, client.VELOCITY_CONTROL, forces=np.zeros(count)
+        )
 
     def reset(self, position: np.ndarray, velocity: np.ndarray, target: np.ndarray) -> None:
         """Set positions, velocities and targets [J] of the actuated joints; mimic joints follow."""
         q, v = self._joints.spread(position, velocity)
-        self._p.resetJointStatesMultiDof(self._body, self._links, q[:, None].tolist(), v[:, None].tolist())
+        self._p.resetJointStatesMultiDof(
+            self._body, self._links, q[:, None].tolist(), v[:, None].tolist()
+        )
         self.target = target
         """[J] drive targets."""
         self._mass_matrix_age = 0
@@ -81,13 +89,19 @@ class BulletDrives:
         joints = self._joints
         dt = self._dt
         wanted = self._kp * (self.target - q[self.driven]) - self._kd * v[self.driven]
-        given = np.minimum(np.maximum(wanted, -self._effort), self._effort)  # np.clip takes three times as long
+        given = np.minimum(
+            np.maximum(wanted, -self._effort), self._effort
+        )  # np.clip takes three times as long
         tau = given @ joints.shares
         if len(joints.mimic):
-            lag = joints.multiplier * q[self.driven[joints.source]] + joints.offset - q[joints.mimic]
+            lag = (
+                joints.multiplier * q[self.driven[joints.source]] + joints.offset - q[joints.mimic]
+            )
             rate = self._J @ v
             tau -= self._J.T @ (self._stiffness * (lag + dt * rate) + self._damping * rate)
-        bias = np.array(self._p.calculateInverseDynamics(self._body, q.tolist(), v.tolist(), [0.0] * len(q)))
+        bias = np.array(
+            self._p.calculateInverseDynamics(self._body, q.tolist(), v.tolist(), [0.0] * len(q))
+        )
         net = tau - bias
         if self._last_step is not None:
             last_velocity, last_net = self._last_step
@@ -97,13 +111,17 @@ class BulletDrives:
             self._factorise(q, saturated)
         self._mass_matrix_age = (self._mass_matrix_age + 1) % self._mass_matrix_steps
         if joints.has_dry_friction:
-            stopping = -(v / dt + self._inverse @ net)[self.driven] / np.diag(self._inverse)[self.driven]
+            stopping = (
+                -(v / dt + self._inverse @ net)[self.driven] / np.diag(self._inverse)[self.driven]
+            )
             brake = np.clip(stopping, -joints.friction_loss, joints.friction_loss)
             tau[self.driven] += brake
             net[self.driven] += brake
         tau -= self._added @ (self._inverse @ net)
         self._last_step = (v, tau - bias)
-        self._p.setJointMotorControlArray(self._body, self._links, self._p.TORQUE_CONTROL, forces=tau.tolist())
+        self._p.setJointMotorControlArray(
+            self._body, self._links, self._p.TORQUE_CONTROL, forces=tau.tolist()
+        )
 
     def _mass_matrix(self, q: np.ndarray) -> np.ndarray:
         return np.array(self._p.calculateMassMatrix(self._body, q.tolist()))

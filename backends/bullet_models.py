@@ -54,7 +54,8 @@ def robot_parts(robot: Mechanism) -> list[Part]:
         for link in dict.fromkeys((body.name, *(item.link for item in body.shapes))):
             groups = link_groups([item.shape for item in body.shapes if item.link == link])
             parts = [
-                Part(body=i, link=link, shapes=group, owner=robot.tip_of.get(link, OTHER_LINK)) for group in groups
+                Part(body=i, link=link, shapes=group, owner=robot.tip_of.get(link, OTHER_LINK))
+                for group in groups
             ]
             if link == body.name:
                 moving.append(parts.pop(0))
@@ -62,7 +63,9 @@ def robot_parts(robot: Mechanism) -> list[Part]:
     return moving + fixed
 
 
-WEIGHTLESS = Inertia(mass=1e-9, com=np.zeros(3), quat=np.array([1.0, 0, 0, 0]), moments=np.full(3, 1e-14))
+WEIGHTLESS = Inertia(
+    mass=1e-9, com=np.zeros(3), quat=np.array([1.0, 0, 0, 0]), moments=np.full(3, 1e-14)
+)
 """Inertia of fixed pieces, whose mass is counted in their body: Bullet would invent one for a link without."""
 
 
@@ -113,7 +116,9 @@ def _link(name: str, inertia: Inertia, shapes: Sequence[Shape], folder: Path) ->
     ]
     for i, shape in enumerate(shapes):
         geometry = _geometry(shape, folder / f"{name}_{i}.obj")
-        pose = np.eye(4) if shape.geometry.kind == "hull" else shape.T_body_shape  # vertices of a hull are moved
+        pose = (
+            np.eye(4) if shape.geometry.kind == "hull" else shape.T_body_shape
+        )  # vertices of a hull are moved
         text.append(f"<collision>{_origin(pose)}<geometry>{geometry}</geometry></collision>")
     return "".join([*text, "</link>"])
 

@@ -26,7 +26,15 @@ from xreset.backends.mjcf_model import (
     body_name,
     pos_quat,
 )
-from xreset.backends.rigid import OTHER_LINK, TABLE, Inertia, Mechanism, MovingJoints, mechanism, object_inertia
+from xreset.backends.rigid import (
+    OTHER_LINK,
+    TABLE,
+    Inertia,
+    Mechanism,
+    MovingJoints,
+    mechanism,
+    object_inertia,
+)
 from xreset.errors import ObjectError, XResetError
 from xreset.geometry.urdf import Joint
 from xreset.physics import KnownDifference
@@ -40,7 +48,9 @@ _HIT_SELF = 4
 _IMPRATIO = 10.0
 _SOLIMP = (0.95, 0.99, 0.001, 0.5, 2.0)
 _SOLIMP_MIMIC = (0.99, 0.999, 0.001, 0.5, 2.0)
-_STIFF_MIMIC = 0.8  # share of a mimic joint's lag that the next step takes away; its rate goes wholly
+_STIFF_MIMIC = (
+    0.8  # share of a mimic joint's lag that the next step takes away; its rate goes wholly
+)
 _CONDIM = 4
 _ROLLING = 1e-4  # MuJoCo wants a positive number although condim 4 does not use it
 _ARENA = 16 << 20  # bytes for contacts and constraints of one MjData
@@ -53,7 +63,11 @@ _GEOM_TYPES = {
     "hull": mujoco.mjtGeom.mjGEOM_MESH,
 }
 _PARKED_SIZE = 1e-6
-_PARKED_POS = (0.0, 0.0, 1e3)  # in the object's frame: out of everything's reach wherever the object is
+_PARKED_POS = (
+    0.0,
+    0.0,
+    1e3,
+)  # in the object's frame: out of everything's reach wherever the object is
 
 
 _PATTERS = (
@@ -62,7 +76,12 @@ _PATTERS = (
 )
 _SLOPES = [(mu, degrees) for mu in (0.5, 0.8, 1.2) for degrees in (0, 45)]  # noqa: XR002
 KNOWN_DIFFERENCES = tuple(
-    KnownDifference(check="slope", measure=f"acceleration, mu {mu}, {degrees} degrees", bound=1.5, reason=_PATTERS)
+    KnownDifference(
+        check="slope",
+        measure=f"acceleration, mu {mu}, {degrees} degrees",
+        bound=1.5,
+        reason=_PATTERS,
+    )
     for mu, degrees in _SLOPES
 )
 """Checks that both MuJoCo backends miss: at mu = 1.2 and 0.5 m/s, a 40 mm high box was seen to hop by 3.6 mm."""
@@ -241,7 +260,9 @@ def _add_joint(element: mujoco.MjsBody, joint: Joint, scene: SceneSpec) -> None:
     limited = bool(np.isfinite(joint.lower) and np.isfinite(joint.upper))
     element.add_joint(
         name=joint.name,
-        type=mujoco.mjtJoint.mjJNT_HINGE if joint.type == "revolute" else mujoco.mjtJoint.mjJNT_SLIDE,
+        type=mujoco.mjtJoint.mjJNT_HINGE
+        if joint.type == "revolute"
+        else mujoco.mjtJoint.mjJNT_SLIDE,
         axis=joint.axis,
         limited=limited,
         range=(joint.lower, joint.upper) if limited else (0.0, 0.0),
@@ -260,7 +281,13 @@ def _limit_self_collision(
     MuJoCo excludes whole bodies. Where only some links of two bodies may collide, the bodies are excluded and the geoms
     of those links are paired.
     """
-    friction = (scene.friction.link, scene.friction.link, scene.friction.torsional, _ROLLING, _ROLLING)
+    friction = (
+        scene.friction.link,
+        scene.friction.link,
+        scene.friction.torsional,
+        _ROLLING,
+        _ROLLING,
+    )
     for i, j in combinations(range(len(geoms)), 2):
         pairs = list(product(geoms[i], geoms[j]))
         allowed = [(a, b) for a, b in pairs if robot.may_collide(geoms[i][a], geoms[j][b])]
@@ -269,11 +296,18 @@ def _limit_self_collision(
         spec.add_exclude(bodyname1=body_name(robot.bodies[i]), bodyname2=body_name(robot.bodies[j]))
         for a, b in allowed:
             spec.add_pair(
-                geomname1=a, geomname2=b, condim=_CONDIM, friction=friction, solref=_solref(scene), solimp=_SOLIMP
+                geomname1=a,
+                geomname2=b,
+                condim=_CONDIM,
+                friction=friction,
+                solref=_solref(scene),
+                solimp=_SOLIMP,
             )
 
 
-def _add_drives(spec: mujoco.MjSpec, scene: SceneSpec, joints: MovingJoints, names: Sequence[str]) -> None:
+def _add_drives(
+    spec: mujoco.MjSpec, scene: SceneSpec, joints: MovingJoints, names: Sequence[str]
+) -> None:
     """Add the drives: on joints, and on joints that others follow through a tendon: see
     :func:`~xreset.geometry.dynamics.drive_shares`."""
     offset = np.zeros(joints.count)
@@ -320,21 +354,27 @@ def _padded(values: Sequence[float], length: int = mujoco.mjNGAIN) -> np.ndarray
 # Object ---------------------------------------------------------------------------------------------------------------
 
 
-def _add_object(spec: mujoco.MjSpec, scene: SceneSpec, index: int, slots_for: Sequence[int]) -> set[str]:
+def _add_object(
+    spec: mujoco.MjSpec, scene: SceneSpec, index: int, slots_for: Sequence[int]
+) -> set[str]:
     """Add the object and empty slots; return the names of the geoms that are parked."""
     thing = scene.objects[index]
     hulls: dict[int, list[str]] = {}
     slots: Counter[str] = Counter()
     for i in sorted({*slots_for, index}):
         hulls[i] = _add_hulls(spec, scene.objects[i], i)
-        slots |= Counter(piece.geometry.kind for piece in scene.objects[i].pieces)  # the larger of the two counts
+        slots |= Counter(
+            piece.geometry.kind for piece in scene.objects[i].pieces
+        )  # the larger of the two counts
     spare = next(filter(None, chain.from_iterable(hulls.values())), "")
 
     # MuJoCo ignores gravcomp unless it is set while compiling.
     body = spec.worldbody.add_body(name="object", gravcomp=1.0, explicitinertial=True)
     inertia = object_inertia(thing)
     _set_inertia(body, replace(inertia, com=inertia.com + _ASIDE))
-    body.add_joint(name="object", type=mujoco.mjtJoint.mjJNT_FREE, align=mujoco.mjtAlignFree.mjALIGNFREE_FALSE)
+    body.add_joint(
+        name="object", type=mujoco.mjtJoint.mjJNT_FREE, align=mujoco.mjtAlignFree.mjALIGNFREE_FALSE
+    )
     parked = set()
     common = {"contype": _HIT_OBJECT, "conaffinity": 0, **_contact(0.0, scene)}
     for kind, geom_type in _GEOM_TYPES.items():
@@ -348,7 +388,12 @@ def _add_object(spec: mujoco.MjSpec, scene: SceneSpec, index: int, slots_for: Se
                 parked.add(name)
                 mesh = spare if kind == "hull" else ""
                 body.add_geom(
-                    name=name, type=geom_type, pos=_PARKED_POS, size=(_PARKED_SIZE,) * 3, meshname=mesh, **common
+                    name=name,
+                    type=geom_type,
+                    pos=_PARKED_POS,
+                    size=(_PARKED_SIZE,) * 3,
+                    meshname=mesh,
+                    **common,
                 )
     return parked
 
@@ -387,7 +432,13 @@ def _geometry(shape: Shape, mesh: str) -> dict:
     pos, quat = pos_quat(shape.T_body_shape)
     size = np.zeros(3)
     size[: len(shape.geometry.size)] = shape.geometry.size
-    return {"type": _GEOM_TYPES[shape.geometry.kind], "pos": pos, "quat": quat, "size": size, "meshname": mesh}
+    return {
+        "type": _GEOM_TYPES[shape.geometry.kind],
+        "pos": pos,
+        "quat": quat,
+        "size": size,
+        "meshname": mesh,
+    }
 
 
 def _add_mesh(spec: mujoco.MjSpec, name: str, hull: Geometry) -> str:

@@ -84,10 +84,17 @@ def add_sensors(spec: mujoco.MjSpec, robot: Mechanism, roles: dict[str, int]) ->
     for i, link in enumerate(robot.robot.tracked_links):
         body, T = robot.frames[link]
         pos, quat = pos_quat(T)
-        site = spec.body(body_name(robot.bodies[body])).add_site(name=f"link/{i}", pos=pos, quat=quat)
+        site = spec.body(body_name(robot.bodies[body])).add_site(
+            name=f"link/{i}", pos=pos, quat=quat
+        )
         sites.append(site.name)
     kind = mujoco.mjtSensor
-    for quantity in (kind.mjSENS_FRAMEPOS, kind.mjSENS_FRAMEQUAT, kind.mjSENS_FRAMELINVEL, kind.mjSENS_FRAMEANGVEL):
+    for quantity in (
+        kind.mjSENS_FRAMEPOS,
+        kind.mjSENS_FRAMEQUAT,
+        kind.mjSENS_FRAMELINVEL,
+        kind.mjSENS_FRAMEANGVEL,
+    ):
         for name in sites:
             spec.add_sensor(type=quantity, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=name)
     tips = {geom: role for geom, role in roles.items() if role >= 0}

@@ -36,7 +36,9 @@ class MujocoWorld(World):
     """
 
     def __init__(self, scene: SceneSpec, object_index: int) -> None:
-        if mujoco.get_mju_user_warning() is None:  # the default writes a log file into the current folder
+        if (
+            mujoco.get_mju_user_warning() is None
+        ):  # the default writes a log file into the current folder
             mujoco.set_mju_user_warning(lambda _: None)
         self._at = at = _compiled(scene, object_index)
         self._model = model = copy(at.model)  # each world has parameters of its own
@@ -46,7 +48,9 @@ class MujocoWorld(World):
         self._sensing = model.opt.disableflags | mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self._silent = self._sensing | mujoco.mjtDisableBit.mjDSBL_SENSOR
         self._option.disableflags = self._silent
-        self._ahead = False  # whether the first half of the next step is done, with the present parameters
+        self._ahead = (
+            False  # whether the first half of the next step is done, with the present parameters
+        )
         self._overflowed = False
         self._overflows = 0
 
@@ -55,8 +59,12 @@ class MujocoWorld(World):
         self._qpos = data.qpos
         self._qvel = data.qvel
         self._wrench = data.xfrc_applied[at.object_body]
-        self._object_pos, self._object_quat = np.split(data.qpos[at.object_qpos : at.object_qpos + 7], [3])
-        self._object_linvel, self._object_spin = np.split(data.qvel[at.object_dof : at.object_dof + 6], [3])
+        self._object_pos, self._object_quat = np.split(
+            data.qpos[at.object_qpos : at.object_qpos + 7], [3]
+        )
+        self._object_linvel, self._object_spin = np.split(
+            data.qvel[at.object_dof : at.object_dof + 6], [3]
+        )
         self._joint_qpos = at.qpos[at.joints.driven]
         self._joint_dof = at.dof[at.joints.driven]
         links = len(at.link_body)
@@ -66,7 +74,9 @@ class MujocoWorld(World):
         self._links = (pos, quat, linvel, angvel)
         self._geom_forces = tip_forces.reshape(-1, 3)
         mine = at.sensed_tip == np.arange(links - 1)[:, None]
-        self._sum_by_tip = -mine.astype(np.float64)  # minus, because the forces of the object are sensed
+        self._sum_by_tip = -mine.astype(
+            np.float64
+        )  # minus, because the forces of the object are sensed
         self._full = [data.warning[int(kind)] for kind in _FULL]
         self._com = object_inertia(scene.objects[object_index]).com
         self._q_ones = np.ones(model.nq)
@@ -77,12 +87,16 @@ class MujocoWorld(World):
         mujoco.mj_resetData(self._model, self._data)
         self._overflowed = False
         self._overflows = 0
-        self._qpos[at.qpos], self._qvel[at.dof] = at.joints.spread(state["joint_pos"], state["joint_vel"])
+        self._qpos[at.qpos], self._qvel[at.dof] = at.joints.spread(
+            state["joint_pos"], state["joint_vel"]
+        )
         self._ctrl[:] = state["joint_target"]
         self._object_pos[:] = state["object_pos"]
         self._object_quat[:] = quat = state["object_quat"] / np.linalg.norm(state["object_quat"])
         self._object_linvel[:] = state["object_linvel"]
-        self._object_spin[:] = _rotate(quat * np.array([1.0, -1.0, -1.0, -1.0]), state["object_angvel"])
+        self._object_spin[:] = _rotate(
+            quat * np.array([1.0, -1.0, -1.0, -1.0]), state["object_angvel"]
+        )
         self._ahead = False
 
     def get_state(self) -> dict[str, np.ndarray]:
@@ -93,7 +107,9 @@ class MujocoWorld(World):
             "object_pos": self._object_pos,
             "object_quat": self._object_quat,
             "object_linvel": self._object_linvel,
-            "object_angvel": _rotate(self._object_quat, self._object_spin),  # a free joint's is in the body's frame
+            "object_angvel": _rotate(
+                self._object_quat, self._object_spin
+            ),  # a free joint's is in the body's frame
         }
 
     def set_joint_targets(self, targets: np.ndarray) -> None:
@@ -132,7 +148,12 @@ class MujocoWorld(World):
         found = []
         for i in (*self._at.moving_bodies, self._at.object_body):
             found.append(
-                Inertia(mass=m.body_mass[i], com=m.body_ipos[i], quat=m.body_iquat[i], moments=m.body_inertia[i])
+                Inertia(
+                    mass=m.body_mass[i],
+                    com=m.body_ipos[i],
+                    quat=m.body_iquat[i],
+                    moments=m.body_inertia[i],
+                )
             )
         return found
 
@@ -143,11 +164,15 @@ class MujocoWorld(World):
         nominal = self._at.model
         model.body_mass[body] = inertia.mass
         model.body_subtreemass[body] = inertia.mass
-        model.body_subtreemass[0] = nominal.body_subtreemass[0] + inertia.mass - nominal.body_mass[body]
+        model.body_subtreemass[0] = (
+            nominal.body_subtreemass[0] + inertia.mass - nominal.body_mass[body]
+        )
         model.body_inertia[body] = inertia.moments
         model.body_ipos[body] = nominal.body_ipos[body] + (inertia.com - self._com)
         growth = inertia.mass / nominal.body_mass[body]
-        turning = inertia.moments[0] / (growth * nominal.body_inertia[body, 0])  # exactly 1 if only the mass changed
+        turning = inertia.moments[0] / (
+            growth * nominal.body_inertia[body, 0]
+        )  # exactly 1 if only the mass changed
         model.body_invweight0[body] = nominal.body_invweight0[body] / (growth, growth * turning)
         self._ahead = False
 

@@ -68,7 +68,9 @@ They, and all that MuJoCo derives from them, must be batched, or every world get
 _TYPES: dict[str, Any] = dict.fromkeys(
     ("pos", "linvel", "angvel", "object_pos", "object_linvel", "object_angvel"), wp.vec3
 )
-_TYPES |= dict.fromkeys(("tip_force", "table_force", "friction", "object_com", "inertia", "com"), wp.vec3)
+_TYPES |= dict.fromkeys(
+    ("tip_force", "table_force", "friction", "object_com", "inertia", "com"), wp.vec3
+)
 _TYPES |= {"quat": wp.quat, "object_quat": wp.quat, "invweight": wp.vec2}
 """Types for Warp of values that are no plain numbers."""
 
@@ -120,7 +122,9 @@ class MujocoWarpBackend(Backend):
         Raises:
             BackendUnavailableError: the device does not exist.
         """
-        super().__init__(scene, num_worlds, object_index=object_index, device=existing_device(device))
+        super().__init__(
+            scene, num_worlds, object_index=object_index, device=existing_device(device)
+        )
         held = self.object_index.unique().tolist()
         scenes = {i: compile_scene(scene, i, slots_for=held) for i in held}
         self._at = at = next(iter(scenes.values()))
@@ -213,7 +217,9 @@ class MujocoWarpBackend(Backend):
         axes = quat_to_matrix(of_bodies("body_iquat"))
         moments = torch.diag_embed(of_bodies("body_inertia"))
         inertia = axes @ moments @ axes.mT
-        return MassProperties(mass=of_bodies("body_mass"), com=of_bodies("body_ipos"), inertia=inertia)
+        return MassProperties(
+            mass=of_bodies("body_mass"), com=of_bodies("body_ipos"), inertia=inertia
+        )
 
     # Physical parameters ----------------------------------------------------------------------------------------------
 
@@ -228,7 +234,9 @@ class MujocoWarpBackend(Backend):
     def set_object_wrench(self, force: Tensor, torque: Tensor) -> None:
         self._must_be_open()
         wrench = torch.cat((torch.as_tensor(force), torch.as_tensor(torque)), dim=-1)
-        self._xfrc_applied[:, self._at.object_body] = self._checked("wrench", wrench, (self.num_worlds, 6))
+        self._xfrc_applied[:, self._at.object_body] = self._checked(
+            "wrench", wrench, (self.num_worlds, 6)
+        )
 
     def close(self) -> None:
         """Free the worlds' memory once nobody else holds a view of it."""
@@ -252,7 +260,10 @@ class MujocoWarpBackend(Backend):
         joints = at.joints
         self._addresses = [ints(at.qpos[joints.driven]), ints(at.dof[joints.driven])]
         self._mimic = [ints(at.qpos[joints.mimic]), ints(at.dof[joints.mimic]), ints(joints.source)]
-        self._mimic += [wp.array(joints.multiplier, dtype=float), wp.array(joints.offset, dtype=float)]
+        self._mimic += [
+            wp.array(joints.multiplier, dtype=float),
+            wp.array(joints.offset, dtype=float),
+        ]
         self._link_arrays = [
             ints(at.link_body),
             wp.array(at.link_pos, dtype=wp.vec3),
@@ -267,7 +278,10 @@ class MujocoWarpBackend(Backend):
         self._state = replace(self._coming.clone(), joint_target=wp.to_torch(self._data.ctrl))
         self._nonfinite = zeros(dtype=torch.bool)
         self._links = Links(
-            pos=zeros(1 + tips, 3), quat=zeros(1 + tips, 4), linvel=zeros(1 + tips, 3), angvel=zeros(1 + tips, 3)
+            pos=zeros(1 + tips, 3),
+            quat=zeros(1 + tips, 4),
+            linvel=zeros(1 + tips, 3),
+            angvel=zeros(1 + tips, 3),
         )
         self._contacts = Contacts(
             tip_force=zeros(tips, 3), tip_touch=zeros(tips, dtype=torch.bool), table_force=zeros(3)
@@ -333,7 +347,15 @@ class MujocoWarpBackend(Backend):
         for array in outputs:
             array.zero_()
         contact = d.contact
-        found = [d.nacon, d.naconmax, d.njmax, contact.worldid, contact.geom, contact.frame, contact.efc_address]
+        found = [
+            d.nacon,
+            d.naconmax,
+            d.njmax,
+            contact.worldid,
+            contact.geom,
+            contact.frame,
+            contact.efc_address,
+        ]
         wp.launch(
             kernels.read_contacts,
             dim=d.naconmax,

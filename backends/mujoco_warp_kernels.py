@@ -90,7 +90,9 @@ def write_state(
     quat = object_quat[world]
     length = wp.sqrt(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3])
     unit = wp.quat(quat[0] / length, quat[1] / length, quat[2] / length, quat[3] / length)
-    turn = _rotate(_conjugate(unit), object_angvel[world])  # a free joint's angular velocity is in the body's frame
+    turn = _rotate(
+        _conjugate(unit), object_angvel[world]
+    )  # a free joint's angular velocity is in the body's frame
     for k in range(3):
         qpos[world, object_qpos + k] = object_pos[world][k]
         qvel[world, object_dof + k] = object_linvel[world][k]
@@ -161,7 +163,9 @@ def write_parameters(
         slide = min_friction
         if column < 3:
             slide = wp.max(friction[world][column], min_friction)
-        geom_friction[world, g] = wp.vec3(slide, torsional_friction[world], geom_friction[world, g][2])
+        geom_friction[world, g] = wp.vec3(
+            slide, torsional_friction[world], geom_friction[world, g][2]
+        )
     for j in range(nominal_drive.shape[0]):
         stiffness = drives[world, 0, j] * nominal_drive[j, 0]
         effort = drives[world, 2, j] * nominal_drive[j, 2]
@@ -201,7 +205,9 @@ def read_state(
     object_pos[world] = wp.vec3(qpos[world, q], qpos[world, q + 1], qpos[world, q + 2])
     object_quat[world] = quat
     object_linvel[world] = wp.vec3(qvel[world, v], qvel[world, v + 1], qvel[world, v + 2])
-    object_angvel[world] = _rotate(quat, wp.vec3(qvel[world, v + 3], qvel[world, v + 4], qvel[world, v + 5]))
+    object_angvel[world] = _rotate(
+        quat, wp.vec3(qvel[world, v + 3], qvel[world, v + 4], qvel[world, v + 5])
+    )
     for i in range(qpos.shape[1]):
         if not wp.isfinite(qpos[world, i]):
             nonfinite[world] = True
@@ -236,7 +242,9 @@ def read_links(
     pos[world, k] = point
     quat[world, k] = _multiply(turn, link_quat[k])
     angvel[world, k] = omega
-    linvel[world, k] = wp.spatial_bottom(velocity) + wp.cross(omega, point - subtree_com[world, body_rootid[body]])
+    linvel[world, k] = wp.spatial_bottom(velocity) + wp.cross(
+        omega, point - subtree_com[world, body_rootid[body]]
+    )
 
 
 @wp.kernel(enable_backward=False)

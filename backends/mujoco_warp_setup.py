@@ -78,7 +78,9 @@ def existing_device(name: str) -> str:
     index = torch.cuda.current_device() if device.index is None else device.index
     count = torch.cuda.device_count()
     if index >= count:
-        raise BackendUnavailableError(f"Unknown device 'cuda:{index}'. This machine has {count} CUDA devices.")
+        raise BackendUnavailableError(
+            f"Unknown device 'cuda:{index}'. This machine has {count} CUDA devices."
+        )
     return f"cuda:{index}"
 
 
@@ -90,7 +92,9 @@ def contact_room(pieces: int) -> tuple[int, int, int]:
     training; with 96, 64 and 340 it was 16 of 92 million. Room costs a little time: a step of the soup can took 1.3 %
     less with 128 rows than with 220 (H200, 4,096 worlds).
     """
-    more = min(2 * (pieces - 1), 32)  # contacts; only pieces that face a finger or the table have any
+    more = min(
+        2 * (pieces - 1), 32
+    )  # contacts; only pieces that face a finger or the table have any
     return 64 + more, 32 + more, 220 + 4 * more
 
 
@@ -103,12 +107,16 @@ def differing_fields(models: list[Any]) -> list[str]:
         if not shape or shape[0] != "*" or not hasattr(first, field.name):
             continue
         value = np.asarray(getattr(first, field.name))
-        if not all(np.array_equal(value, np.asarray(getattr(other, field.name))) for other in others):
+        if not all(
+            np.array_equal(value, np.asarray(getattr(other, field.name))) for other in others
+        ):
             names.append(field.name)
     return names
 
 
-def fill_batched(model: Any, scenes: dict[int, SceneModel], object_index: Tensor, names: list[str]) -> None:
+def fill_batched(
+    model: Any, scenes: dict[int, SceneModel], object_index: Tensor, names: list[str]
+) -> None:
     """Give each world of ``model`` its object's values of the fields in which the objects differ.
 
     Args:
@@ -127,7 +135,11 @@ def fill_batched(model: Any, scenes: dict[int, SceneModel], object_index: Tensor
                 value[scene.parked] = -1  # no mesh in this world
             values.append(value)
         view = wp.to_torch(getattr(model, name))
-        table = torch.as_tensor(np.stack(values), device=row.device).to(view.dtype).reshape(len(order), *view.shape[1:])
+        table = (
+            torch.as_tensor(np.stack(values), device=row.device)
+            .to(view.dtype)
+            .reshape(len(order), *view.shape[1:])
+        )
         view.copy_(table[row])
 
 

@@ -191,14 +191,18 @@ class PoolBackend(Backend):
         jobs = []
         for worlds in np.array_split(np.arange(num_worlds), max(min(workers, num_worlds), 1)):
             held = tuple(self.object_index[worlds].tolist())
-            jobs.append(Job(self.name, self.world_class, world_options, scene, int(worlds[0]), held))
+            jobs.append(
+                Job(self.name, self.world_class, world_options, scene, int(worlds[0]), held)
+            )
         if workers == 0:
             self._arrays = arrays_in(bytearray(layout.itemsize), layout)
             self._team: LocalWorlds | WorkerTeam = LocalWorlds(jobs[0], self._arrays)
         else:
             self._team = WorkerTeam(jobs, layout)
             self._arrays = self._team.arrays
-        self._close = weakref.finalize(self, self._team.close)  # also runs when the interpreter exits
+        self._close = weakref.finalize(
+            self, self._team.close
+        )  # also runs when the interpreter exits
         views = {name: torch.from_numpy(array) for name, array in self._arrays.items()}
         self._state = State(**{name: views[name] for name in STATE_FIELDS})
         self._links = Links(**{field.name: views[f"link_{field.name}"] for field in fields(Links)})
@@ -268,7 +272,9 @@ class PoolBackend(Backend):
             return np.arange(self.num_worlds)
         index = torch.as_tensor(worlds, dtype=torch.long).detach().cpu().numpy()
         if index.ndim != 1 or (index.size and (index.min() < 0 or index.max() >= self.num_worlds)):
-            raise ValueError(f"worlds must be a list of indices in 0..{self.num_worlds - 1}, found {worlds}")
+            raise ValueError(
+                f"worlds must be a list of indices in 0..{self.num_worlds - 1}, found {worlds}"
+            )
         return index
 
     def _rows(self, name: str, value: Tensor, rows: int) -> np.ndarray:

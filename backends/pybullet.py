@@ -105,7 +105,9 @@ class PybulletWorld(World):
         table = p.createCollisionShape(
             p.GEOM_BOX, halfExtents=scene.table.half_size, flags=_GEOM_INITIALIZE_SAT_FEATURES
         )
-        self._table = p.createMultiBody(0.0, table, basePosition=(*scene.table.center, -scene.table.half_size[2]))
+        self._table = p.createMultiBody(
+            0.0, table, basePosition=(*scene.table.center, -scene.table.half_size[2])
+        )
         for link, part in enumerate(self._parts):
             self._remove_defaults(self._robot, link, part.shapes)
         for link, group in zip(self._pieces_of_object, groups, strict=True):
@@ -159,7 +161,13 @@ class PybulletWorld(World):
 
     def step(self, n: int) -> None:
         p = self._p
-        weight = np.array([0.0, 0.0, self._inertia.mass * (-GRAVITY * self.gravity_fraction - self._world_gravity)])
+        weight = np.array(
+            [
+                0.0,
+                0.0,
+                self._inertia.mass * (-GRAVITY * self.gravity_fraction - self._world_gravity),
+            ]
+        )
         force = (weight + self.force).tolist()
         turned = bool(self.torque.any())
         for _ in range(n * INTERNAL_STEPS):
@@ -186,7 +194,11 @@ class PybulletWorld(World):
             _, first, second, first_link, second_link, _, _, normal, _, press, *friction = contact
             if self._object not in (first, second):
                 continue
-            force = press * np.array(normal) + friction[0] * np.array(friction[1]) + friction[2] * np.array(friction[3])
+            force = (
+                press * np.array(normal)
+                + friction[0] * np.array(friction[1])
+                + friction[2] * np.array(friction[3])
+            )
             body = second
             link = second_link
             if first != self._object:  # the force is on the first body
@@ -201,10 +213,14 @@ class PybulletWorld(World):
 
     def mass_properties(self) -> list[Inertia]:
         """See :meth:`World.mass_properties`. The object is loaded in the frame of its inertia."""
-        found = [self._inertia_of(self._robot, link) for link in range(1, len(self._mechanism.bodies))]
+        found = [
+            self._inertia_of(self._robot, link) for link in range(1, len(self._mechanism.bodies))
+        ]
         thing = self._inertia_of(self._object, -1)
         own = self._inertia
-        in_mesh = replace(thing, com=own.com + rotate(own.quat, thing.com), quat=multiply(own.quat, thing.quat))
+        in_mesh = replace(
+            thing, com=own.com + rotate(own.quat, thing.com), quat=multiply(own.quat, thing.quat)
+        )
         return [*found, in_mesh]
 
     def _inertia_of(self, body: int, link: int) -> Inertia:
@@ -233,7 +249,9 @@ class PybulletWorld(World):
             self._set_surface(self._object, piece, 1.0, 0.0)
         self._set_surface(self._table, -1, table, self._torsional)
         for i, part in enumerate(self._parts):
-            self._set_surface(self._robot, i, link if part.owner == OTHER_LINK else tip, self._torsional)
+            self._set_surface(
+                self._robot, i, link if part.owner == OTHER_LINK else tip, self._torsional
+            )
 
     def _set_surface(self, body: int, link: int, friction: float, torsional: float) -> None:
         self._p.changeDynamics(body, link, lateralFriction=friction, spinningFriction=torsional)
@@ -281,7 +299,11 @@ class PybulletWorld(World):
         T = np.linalg.inv(inertial_frame(self._inertia))
         shapes = []
         for group in groups:
-            shapes.append(self._shape([replace(shape, T_body_shape=T @ shape.T_body_shape) for shape in group]))
+            shapes.append(
+                self._shape(
+                    [replace(shape, T_body_shape=T @ shape.T_body_shape) for shape in group]
+                )
+            )
         n = len(shapes) - 1
         origin = [(0.0, 0.0, 0.0)] * n
         upright = [(0.0, 0.0, 0.0, 1.0)] * n
@@ -312,12 +334,19 @@ class PybulletWorld(World):
         p = self._p
         if is_hull(shapes):
             vertices = moved_vertices(shapes[0]).tolist()
-            index = p.createCollisionShape(p.GEOM_MESH, vertices=vertices, flags=_GEOM_INITIALIZE_SAT_FEATURES)
+            index = p.createCollisionShape(
+                p.GEOM_MESH, vertices=vertices, flags=_GEOM_INITIALIZE_SAT_FEATURES
+            )
             alone = p.createMultiBody(0.0, index)
             p.changeDynamics(alone, -1, collisionMargin=0.0)
             p.removeBody(alone)
             return index
-        kinds = {"box": p.GEOM_BOX, "sphere": p.GEOM_SPHERE, "capsule": p.GEOM_CAPSULE, "cylinder": p.GEOM_CYLINDER}
+        kinds = {
+            "box": p.GEOM_BOX,
+            "sphere": p.GEOM_SPHERE,
+            "capsule": p.GEOM_CAPSULE,
+            "cylinder": p.GEOM_CYLINDER,
+        }
         sizes = [(*shape.geometry.size, 0.0, 0.0)[:3] for shape in shapes]
         rotations = [Rotation.from_matrix(shape.T_body_shape[:3, :3]) for shape in shapes]
         return p.createCollisionShapeArray(

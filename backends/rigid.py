@@ -40,7 +40,9 @@ class Inertia:
         axes = np.stack([rotate(self.quat, axis) for axis in np.eye(3)])
         return axes.T @ (self.moments[:, None] * axes)
 
-    def changed(self, *, mass: float | None = None, scale: float = 1.0, offset: np.ndarray | float = 0.0) -> Inertia:
+    def changed(
+        self, *, mass: float | None = None, scale: float = 1.0, offset: np.ndarray | float = 0.0
+    ) -> Inertia:
         """Return the inertia with another mass.
 
         Args:
@@ -49,7 +51,12 @@ class Inertia:
             offset: [3] by how much the centre of mass moves [m].
         """
         mass = self.mass if mass is None else mass
-        return replace(self, mass=mass, com=self.com + offset, moments=self.moments * (scale * mass / self.mass))
+        return replace(
+            self,
+            mass=mass,
+            com=self.com + offset,
+            moments=self.moments * (scale * mass / self.mass),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,7 +160,12 @@ def mechanism(robot: RobotSpec) -> Mechanism:
                 shapes.append(LinkShape(link=link.name, shape=moved))
         inertia = None if joint is None else _fused_inertia(robot, links, frames)
         body = Body(
-            name=links[0].name, parent=parent, joint=joint, T_parent_body=T, inertia=inertia, shapes=tuple(shapes)
+            name=links[0].name,
+            parent=parent,
+            joint=joint,
+            T_parent_body=T,
+            inertia=inertia,
+            shapes=tuple(shapes),
         )
         bodies.append(body)
     return Mechanism(robot=robot, bodies=tuple(bodies), frames=frames)
@@ -163,7 +175,9 @@ class TrackedFrames:
     """The tracked links of a robot as frames on its bodies."""
 
     def __init__(self, robot: Mechanism) -> None:
-        self.bodies, frames = map(list, zip(*(robot.frames[link] for link in robot.robot.tracked_links), strict=True))
+        self.bodies, frames = map(
+            list, zip(*(robot.frames[link] for link in robot.robot.tracked_links), strict=True)
+        )
         """[K] index of the body of each tracked link."""
         inertias = [robot.bodies[body].inertia for body in self.bodies]
         com = np.array([np.zeros(3) if inertia is None else inertia.com for inertia in inertias])
@@ -233,7 +247,9 @@ def object_inertia(spec: ObjectSpec) -> Inertia:
     return principal(spec.mass, spec.com, spec.inertia, ObjectError, f"the object {spec.name!r}")
 
 
-def principal(mass: float, com: np.ndarray, inertia: np.ndarray, error: type[XResetError], what: str) -> Inertia:
+def principal(
+    mass: float, com: np.ndarray, inertia: np.ndarray, error: type[XResetError], what: str
+) -> Inertia:
     """Return the principal moments and axes of an inertia matrix [3, 3] about the centre of mass.
 
     Raises:
@@ -251,7 +267,12 @@ def principal(mass: float, com: np.ndarray, inertia: np.ndarray, error: type[XRe
             "none above the sum of the others."
         )
     axes[:, 0] *= np.sign(np.linalg.det(axes))
-    return Inertia(mass=float(mass), com=np.asarray(com, dtype=float), quat=matrix_to_quat(axes), moments=moments)
+    return Inertia(
+        mass=float(mass),
+        com=np.asarray(com, dtype=float),
+        quat=matrix_to_quat(axes),
+        moments=moments,
+    )
 
 
 def _check_names(robot: RobotSpec, tree: RobotTree) -> None:
@@ -264,10 +285,14 @@ def _check_names(robot: RobotSpec, tree: RobotTree) -> None:
     known = [*robot.joint_names, *(mimic.joint for mimic in robot.mimics)]
     for name in (*known, *(mimic.source for mimic in robot.mimics)):
         if tree.joint(name).type == "fixed":
-            raise RobotError(f"{who} {name!r} is driven or mimics another, but it is fixed in the URDF.")
+            raise RobotError(
+                f"{who} {name!r} is driven or mimics another, but it is fixed in the URDF."
+            )
     for mimic in robot.mimics:
         if mimic.source not in robot.joint_names:
-            raise RobotError(f"{who} {mimic.joint!r} mimics {mimic.source!r}, expected a driven joint.")
+            raise RobotError(
+                f"{who} {mimic.joint!r} mimics {mimic.source!r}, expected a driven joint."
+            )
     for joint in tree.joints:
         if joint.type != "fixed" and joint.name not in known:
             raise RobotError(
@@ -275,7 +300,9 @@ def _check_names(robot: RobotSpec, tree: RobotTree) -> None:
             )
 
 
-def _fused_inertia(robot: RobotSpec, links: list[Link], frames: dict[str, tuple[int, np.ndarray]]) -> Inertia:
+def _fused_inertia(
+    robot: RobotSpec, links: list[Link], frames: dict[str, tuple[int, np.ndarray]]
+) -> Inertia:
     mass = sum(link.mass for link in links)
     com = np.zeros(3)
     inertia = np.zeros((3, 3))
@@ -289,7 +316,9 @@ def _fused_inertia(robot: RobotSpec, links: list[Link], frames: dict[str, tuple[
             R = T[:3, :3]
             r = point - com  # parallel axes
             inertia += R @ link.inertia @ R.T + link.mass * (r @ r * np.eye(3) - np.outer(r, r))
-    return principal(mass, com, inertia, RobotError, f"robot {robot.name!r}: the link {links[0].name!r}")
+    return principal(
+        mass, com, inertia, RobotError, f"robot {robot.name!r}: the link {links[0].name!r}"
+    )
 
 
 # Contacts -------------------------------------------------------------------------------------------------------------
@@ -299,7 +328,9 @@ OTHER_LINK = -2
 """What touches the object: these, or the index of a fingertip."""
 
 
-def sum_contacts(tips: int, contacts: Iterable[tuple[int, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def sum_contacts(
+    tips: int, contacts: Iterable[tuple[int, np.ndarray]]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return tip force [E, 3], tip touch [E] and table force [3], given what touches the object and with which
     force."""
     tip_force = np.zeros((tips, 3))
@@ -367,7 +398,11 @@ def nearer(q: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 
 def friction_forces(
-    arms: np.ndarray, normal_forces: np.ndarray, coefficients: np.ndarray, force: np.ndarray, torque: np.ndarray
+    arms: np.ndarray,
+    normal_forces: np.ndarray,
+    coefficients: np.ndarray,
+    force: np.ndarray,
+    torque: np.ndarray,
 ) -> np.ndarray:
     """Friction forces [n, 3] that explain a force and torque [3] on a body, given its contacts.
 

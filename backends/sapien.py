@@ -87,7 +87,9 @@ class SapienWorld(World):
         self._quat = np.array(state["object_quat"])
         self._object.entity.pose = self._sapien.Pose(state["object_pos"], self._quat)
         omega = state["object_angvel"]
-        self._object.linear_velocity = state["object_linvel"] + cross(omega, rotate(self._quat, self._inertia.com))
+        self._object.linear_velocity = state["object_linvel"] + cross(
+            omega, rotate(self._quat, self._inertia.com)
+        )
         self._object.angular_velocity = omega
         self._last_step = None
 
@@ -102,7 +104,8 @@ class SapienWorld(World):
             "joint_target": self._joints.target,
             "object_pos": pose.p,
             "object_quat": self._quat,
-            "object_linvel": self._object.linear_velocity - cross(omega, rotate(self._quat, self._inertia.com)),
+            "object_linvel": self._object.linear_velocity
+            - cross(omega, rotate(self._quat, self._inertia.com)),
             "object_angvel": omega,
         }
 
@@ -111,7 +114,9 @@ class SapienWorld(World):
 
     def step(self, n: int) -> None:
         body = self._object
-        force = self.force - np.array([0.0, 0.0, self._inertia.mass * GRAVITY * self.gravity_fraction])
+        force = self.force - np.array(
+            [0.0, 0.0, self._inertia.mass * GRAVITY * self.gravity_fraction]
+        )
         for remaining in reversed(range(n)):
             self._joints.brake()
             body.add_force_torque(force, self.torque)
@@ -147,7 +152,12 @@ class SapienWorld(World):
             frame = body.cmass_local_pose
             com = frame.p.astype(float)
             found.append(
-                Inertia(mass=body.mass, com=com, quat=frame.q.astype(float), moments=body.inertia.astype(float))
+                Inertia(
+                    mass=body.mass,
+                    com=com,
+                    quat=frame.q.astype(float),
+                    moments=body.inertia.astype(float),
+                )
             )
         return found
 
@@ -156,7 +166,9 @@ class SapienWorld(World):
         self._set_inertia(self._object, inertia)
 
     def set_friction(self, friction: np.ndarray) -> None:
-        self._friction: dict[str, float] = dict(zip(("tip", "link", "table"), friction.tolist(), strict=True))
+        self._friction: dict[str, float] = dict(
+            zip(("tip", "link", "table"), friction.tolist(), strict=True)
+        )
         for name, mu in self._friction.items():
             self._materials[name].static_friction = 2.0 * mu
             self._materials[name].dynamic_friction = 2.0 * mu
@@ -177,7 +189,9 @@ class SapienWorld(World):
         body = self._sapien.physx.PhysxRigidStaticComponent()
         shape = Shape(geometry=Geometry(kind="box", size=scene.table.half_size))
         self._attach(body, shape, TABLE, (TABLE_BIT, OBJECT_BIT))
-        self._add(body, "table", self._sapien.Pose([*scene.table.center, -scene.table.half_size[2]]))
+        self._add(
+            body, "table", self._sapien.Pose([*scene.table.center, -scene.table.half_size[2]])
+        )
 
     def _add_object(self, pieces: Sequence[Shape]) -> Any:
         body = self._sapien.physx.PhysxRigidDynamicComponent()
@@ -210,7 +224,9 @@ class SapienWorld(World):
             links.append(link)
         base = self._sapien.Pose(robot.base_pos, robot.base_quat)
         for link, body in zip(links, self._mechanism.bodies, strict=True):
-            self._add(link, body.name, base)  # the pose of the root decides; joints place the others
+            self._add(
+                link, body.name, base
+            )  # the pose of the root decides; joints place the others
         return links
 
     def _set_joint(self, made: Any, joint: Joint, T_parent_body: np.ndarray) -> None:
@@ -235,9 +251,15 @@ class SapienWorld(World):
         elif geometry.kind == "sphere":
             made = physx.PhysxCollisionShapeSphere(radius=size[0], material=material)
         elif geometry.kind == "hull":
-            made = physx.PhysxCollisionShapeConvexMesh(vertices=geometry.vertices, scale=np.ones(3), material=material)
+            made = physx.PhysxCollisionShapeConvexMesh(
+                vertices=geometry.vertices, scale=np.ones(3), material=material
+            )
         else:
-            kind = physx.PhysxCollisionShapeCapsule if geometry.kind == "capsule" else physx.PhysxCollisionShapeCylinder
+            kind = (
+                physx.PhysxCollisionShapeCapsule
+                if geometry.kind == "capsule"
+                else physx.PhysxCollisionShapeCylinder
+            )
             made = kind(radius=size[0], half_length=size[1], material=material)
             T = T.copy()
             T[:3, :3] = T[:3, :3] @ _x_to(np.array([0.0, 0.0, 1.0]))  # PhysX has them along x
@@ -313,8 +335,12 @@ class SapienWorld(World):
         omega = angvel.astype(np.float64)
         inertia = R @ self._inertia.matrix @ R.T
         gained = self._inertia.mass * (self._object.linear_velocity - linvel) / self._dt
-        turned = inertia @ (self._object.angular_velocity - omega) / self._dt + cross(omega, inertia @ omega)
-        return gained - force - contact_forces.sum(axis=0), turned - torque - cross(arms, contact_forces).sum(axis=0)
+        turned = inertia @ (self._object.angular_velocity - omega) / self._dt + cross(
+            omega, inertia @ omega
+        )
+        return gained - force - contact_forces.sum(axis=0), turned - torque - cross(
+            arms, contact_forces
+        ).sum(axis=0)
 
 
 _SLOPES = [(mu, degrees) for mu in (0.8, 1.2) for degrees in (0, 45)]  # noqa: XR002
@@ -323,7 +349,9 @@ _CREEPS = (
     "position iterations would bring it to 0.4 mm/s, at twice the time"
 )
 KNOWN_DIFFERENCES = tuple(
-    KnownDifference(check="slope", measure=f"creep, mu {mu}, {degrees} degrees", bound=1e-3, reason=_CREEPS)
+    KnownDifference(
+        check="slope", measure=f"creep, mu {mu}, {degrees} degrees", bound=1e-3, reason=_CREEPS
+    )
     for mu, degrees in _SLOPES
 )
 """Checks that PhysX misses with these settings."""

@@ -71,7 +71,9 @@ class SapienJoints:
         """Set the drive targets [J]."""
         self.target = targets
         followers = self._moving.multiplier * targets[self._moving.source] + self._moving.offset
-        for set_target, target in zip(self._set_target, (*targets.tolist(), *followers.tolist()), strict=True):
+        for set_target, target in zip(
+            self._set_target, (*targets.tolist(), *followers.tolist()), strict=True
+        ):
             set_target(target)
 
     def brake(self) -> None:
@@ -83,7 +85,9 @@ class SapienJoints:
         if not self._moving.has_dry_friction:
             return
         position, velocity = self.read()
-        drive = np.clip(self._kp * (self.target - position) - self._kd * velocity, -self._effort, self._effort)
+        drive = np.clip(
+            self._kp * (self.target - position) - self._kd * velocity, -self._effort, self._effort
+        )
         loss = self._moving.friction_loss
         torque = np.zeros(self._moving.count)
         torque[self._driven] = np.clip(-self._inertia * velocity / self._dt - drive, -loss, loss)
@@ -116,7 +120,12 @@ def _couple(articulation: Any, joints: Mapping[str, Any], mimic: MimicSpec) -> N
             # PhysX scales the tendon's force by the inverse rates; the rates themselves jam the joints.
             inverse = [rate and 1.0 / rate for rate in rates]
             articulation.create_fixed_tendon(
-                chain, rates, inverse, rest_length=mimic.offset, stiffness=_TENDON_STIFFNESS, damping=_TENDON_DAMPING
+                chain,
+                rates,
+                inverse,
+                rest_length=mimic.offset,
+                stiffness=_TENDON_STIFFNESS,
+                damping=_TENDON_DAMPING,
             )
             return
     raise RobotError(

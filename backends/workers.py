@@ -103,7 +103,9 @@ class WorldFailure(Exception):
     ``kind`` is set for errors that the user can fix.
     """
 
-    def __init__(self, world: int, kind: type[XResetError] | None, message: str, trace: str) -> None:
+    def __init__(
+        self, world: int, kind: type[XResetError] | None, message: str, trace: str
+    ) -> None:
         super().__init__(world, kind, message, trace)
         self.world = world
         self.kind = kind
@@ -141,8 +143,14 @@ class LocalWorlds:
         Raises:
             WorldFailure: a world raised.
         """
-        rows = range(len(self._job.object_index)) if worlds is None else (worlds - self._job.first).tolist()
-        self._given = {name: self._arrays[name].astype(np.float64) for name in _GIVEN.get(method, ())}
+        rows = (
+            range(len(self._job.object_index))
+            if worlds is None
+            else (worlds - self._job.first).tolist()
+        )
+        self._given = {
+            name: self._arrays[name].astype(np.float64) for name in _GIVEN.get(method, ())
+        }
         action = getattr(self, f"_{method}")
         row = 0
         try:
@@ -155,7 +163,9 @@ class LocalWorlds:
             known = isinstance(error, XResetError)
             message = str(error) if known else f"{type(error).__name__}: {error}"
             world = self._job.first + row
-            raise WorldFailure(world, type(error) if known else None, message, traceback.format_exc()) from error
+            raise WorldFailure(
+                world, type(error) if known else None, message, traceback.format_exc()
+            ) from error
 
     def close(self) -> None:
         """Close the worlds."""
@@ -332,7 +342,11 @@ class _Worker:
         self.hang_up()
         self.wait()
         code = self._process.returncode
-        how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+        how = (
+            f"was ended by {signal.Signals(-code).name}"
+            if code < 0
+            else f"ended with exit code {code}"
+        )
         return (
             f"A worker process of the backend {self.job.backend!r} {how} during {command!r}; it ran worlds "
             f"{self.first} to {self.stop - 1}. Its messages are on standard error. After SIGKILL, it may have run out "
@@ -363,7 +377,9 @@ def serve(pipe: int, memory: int) -> None:
             except WorldFailure as error:
                 failure = pickle.dumps(error)
             except Exception:
-                failure = pickle.dumps(XResetError(f"A worker process failed:\n{traceback.format_exc()}"))
+                failure = pickle.dumps(
+                    XResetError(f"A worker process failed:\n{traceback.format_exc()}")
+                )
             connection.send_bytes(failure)
             if worlds is None:
                 return

@@ -20,12 +20,16 @@ from xreset.retarget.arm.solve import track
 from xreset.retarget.pipeline import wrist_paths
 from xreset.retarget.validity import Measures, Thresholds
 
-SOLVED = Thresholds(hand_error=np.inf, wrist_position=0.005, wrist_orientation=float(np.radians(5.0)))
+SOLVED = Thresholds(
+    hand_error=np.inf, wrist_position=0.005, wrist_orientation=float(np.radians(5.0))
+)
 _SAMPLE = 1000
 
 
 def add_arguments(group: _ArgumentGroup) -> None:
-    group.add_argument("--arm-demos", type=Path, help="demonstrations (default: one synthetic one per object)")
+    group.add_argument(
+        "--arm-demos", type=Path, help="demonstrations (default: one synthetic one per object)"
+    )
     group.add_argument("--arm-objects", type=Path, help="folder of their meshes")
 
 
@@ -44,26 +48,41 @@ def run(options: Options, console: Console) -> None:
     )
 
     above = [path.annotated & (path.root_pos[..., 2] > 0) for path in paths]
-    solved = torch.cat([_follows(found, 1e9)[mask] for found, mask in zip(measures, above, strict=True)])
-    free = torch.cat([_follows(found, SOLVED.table_depth)[mask] for found, mask in zip(measures, above, strict=True)])
+    solved = torch.cat(
+        [_follows(found, 1e9)[mask] for found, mask in zip(measures, above, strict=True)]
+    )
+    free = torch.cat(
+        [
+            _follows(found, SOLVED.table_depth)[mask]
+            for found, mask in zip(measures, above, strict=True)
+        ]
+    )
     chosen = torch.as_tensor(np.random.default_rng(0).permutation(len(free))[:_SAMPLE])
     alone = ArmTargets(
         **{
-            name: torch.cat([getattr(p, name)[mask] for p, mask in zip(paths, above, strict=True)])[chosen][:, None]
+            name: torch.cat([getattr(p, name)[mask] for p, mask in zip(paths, above, strict=True)])[
+                chosen
+            ][:, None]
             for name in vars(paths[0])
         }
     )
     config = replace(ArmConfig(), restarts=16, reseeds=0, collision_weight=0.0)
-    within = _follows(track(model, alone, replace(SOLVED, table_depth=1e9, self_depth=1e9), config)[1], 1e9)[:, 0]
+    within = _follows(
+        track(model, alone, replace(SOLVED, table_depth=1e9, self_depth=1e9), config)[1], 1e9
+    )[:, 0]
     console.print(f"wrist above the table in {len(free)} annotated frames")
-    console.print(f"followed to 5 mm and 5 degrees: {_share(solved)}; and free of table and self: {_share(free)}")
+    console.print(
+        f"followed to 5 mm and 5 degrees: {_share(solved)}; and free of table and self: {_share(free)}"
+    )
     console.print(f"within reach by 16 restarts on each of {len(chosen)} frames: {_share(within)}")
     console.print(f"of these followed and free: {_share(free[chosen][within])}")
 
 
 def _follows(found: Measures, depth: float) -> torch.Tensor:
     """[S, T] whether the wrist is where it should be, no deeper than ``depth`` [m] in table or self."""
-    near = (found.wrist_position <= SOLVED.wrist_position) & (found.wrist_orientation <= SOLVED.wrist_orientation)
+    near = (found.wrist_position <= SOLVED.wrist_position) & (
+        found.wrist_orientation <= SOLVED.wrist_orientation
+    )
     return near & (found.table_clearance >= -depth) & (found.self_clearance >= -depth)
 
 

@@ -28,7 +28,9 @@ from xreset.task.config import TaskConfig
 
 
 def add_arguments(group) -> None:
-    group.add_argument("--pixels", type=int, default=64, help="width and height of an image (default: 64)")
+    group.add_argument(
+        "--pixels", type=int, default=64, help="width and height of an image (default: 64)"
+    )
 
 
 def run(options: Options, console: Console) -> None:
@@ -38,25 +40,45 @@ def run(options: Options, console: Console) -> None:
     worlds = options.num_envs
     task = TaskConfig()
     seeing = replace(task, vision=VisionConfig(cameras=(FRONT,), width=pixels, height=pixels))
-    columns = ["engine", "device", "rays [1/s]", "images [1/s]", "env without [1/s]", "env with [1/s]", "share"]
-    table = Table(*columns, title=f"cameras: {options.robot}, {worlds} worlds, {pixels} x {pixels} pixels")
+    columns = [
+        "engine",
+        "device",
+        "rays [1/s]",
+        "images [1/s]",
+        "env without [1/s]",
+        "env with [1/s]",
+        "share",
+    ]
+    table = Table(
+        *columns, title=f"cameras: {options.robot}, {worlds} worlds, {pixels} x {pixels} pixels"
+    )
     with tempfile.TemporaryDirectory() as folder:
         bank = motion(robot, Path(folder))
         for name, device in engines(options, console):
-            rays, images = (worlds * each for each in _images(seeing, robot, objects, worlds, device, options.seconds))
+            rays, images = (
+                worlds * each
+                for each in _images(seeing, robot, objects, worlds, device, options.seconds)
+            )
             steps = []
             for variant in (task, seeing):
-                with make_env(robot, objects, bank, variant, engine=name, num_envs=worlds, device=device) as env:
+                with make_env(
+                    robot, objects, bank, variant, engine=name, num_envs=worlds, device=device
+                ) as env:
                     action = torch.zeros(worlds, env.num_actions, device=env.device)
                     steps.append(
-                        worlds * rate(lambda env=env, action=action: env.step(action), options.seconds, device)
+                        worlds
+                        * rate(
+                            lambda env=env, action=action: env.step(action), options.seconds, device
+                        )
                     )
             cells = [f"{value:,.0f}" for value in (rays, images, *steps)]
             table.add_row(name, device, *cells, f"{1 - steps[1] / steps[0]:.0%}")
     console.print(table)
 
 
-def _images(task: TaskConfig, robot, objects, worlds: int, device: str, seconds: float) -> tuple[float, float]:
+def _images(
+    task: TaskConfig, robot, objects, worlds: int, device: str, seconds: float
+) -> tuple[float, float]:
     """Times per second that all worlds take their images: rays alone, and with errors."""
     scene = make_scene(robot, objects, task)
     index = torch.zeros(worlds, dtype=torch.long, device=device)

@@ -23,7 +23,11 @@ _DEPTHS = (0.001, 0.003, 0.005)
 
 
 def add_arguments(group: _ArgumentGroup) -> None:
-    group.add_argument("--depth-file", type=Path, help="what xreset retarget made (default: the section is left out)")
+    group.add_argument(
+        "--depth-file",
+        type=Path,
+        help="what xreset retarget made (default: the section is left out)",
+    )
     group.add_argument("--depth-objects", type=Path, help="folder of meshes")
 
 
@@ -33,7 +37,9 @@ def run(options: Options, console: Console) -> None:
         console.print("depth: left out. Give --depth-file and --depth-objects.")
         return
     robot, states = robots.load(options.robot), read_retargeted(path)
-    specs = load_objects(sorted(set(states.object_name.tolist())), folder if isinstance(folder, Path) else None)
+    specs = load_objects(
+        sorted(set(states.object_name.tolist())), folder if isinstance(folder, Path) else None
+    )
     links, name, depth = depths(states, robot, {spec.name: spec for spec in specs})
     table = Table(
         "",
@@ -67,7 +73,9 @@ def depths(
     request.enable_signed_distance = True
     kinematics = Kinematics(robot)
     links = [
-        link for link in Kinematics(robot, root=robot.hand_root).link_names if kinematics.tree.link(link).collisions
+        link
+        for link in Kinematics(robot, root=robot.hand_root).link_names
+        if kinematics.tree.link(link).collisions
     ]
     T_links = kinematics.link_poses(torch.as_tensor(states.joint_pos), links).numpy()
     T_objects = np.tile(np.eye(4), (len(states.valid), 1, 1))
@@ -75,8 +83,13 @@ def depths(
         quat_to_matrix(torch.as_tensor(states.object_quat_wxyz)).numpy(),
         states.object_pos,
     )
-    hand = [[_prepared(coal, shape) for shape in kinematics.tree.link(link).collisions] for link in links]
-    pieces = {name: [_prepared(coal, shape) for shape in spec.pieces] for name, spec in objects.items()}
+    hand = [
+        [_prepared(coal, shape) for shape in kinematics.tree.link(link).collisions]
+        for link in links
+    ]
+    pieces = {
+        name: [_prepared(coal, shape) for shape in spec.pieces] for name, spec in objects.items()
+    }
     names = states.object_name[states.sequence_of_frame]
     frames = np.flatnonzero(states.valid)
     depth = np.zeros((len(frames), len(links)))
@@ -87,7 +100,8 @@ def depths(
                     a, b = T_links[frame, k], T_objects[frame]
                     if np.linalg.norm(a @ center - b @ middle) < radius + reach:
                         poses = [
-                            coal.Transform3s(T[:3, :3].copy(), T[:3, 3].copy()) for T in (a @ T_shape, b @ T_piece)
+                            coal.Transform3s(T[:3, :3].copy(), T[:3, 3].copy())
+                            for T in (a @ T_shape, b @ T_piece)
                         ]
                         result.clear()
                         distance = coal.distance(shape, poses[0], piece, poses[1], request, result)

@@ -28,20 +28,27 @@ def run(options: Options, console: Console) -> None:
     robot, task = robots.load(options.robot), TaskConfig()
     scene = make_scene(robot, tuple(load_objects([OBJECT], None)), task)
     columns = ["engine", "device", "backend", "env (of backend)"]
-    table = Table(*columns, title=f"env: control steps per second, {options.robot}, {options.num_envs} worlds")
+    table = Table(
+        *columns, title=f"env: control steps per second, {options.robot}, {options.num_envs} worlds"
+    )
     with tempfile.TemporaryDirectory() as folder:
         bank = motion(robot, Path(folder))
         for name, device in engines(options, console):
             with make_backend(name, scene, options.num_envs, device=device) as backend:
                 wrapped = rate(backend.step, options.seconds, device) * options.num_envs
                 env = ManipulationEnv(
-                    backend, task, ResetDistribution(bank, robot, bank.object_names, task.reset, backend.device)
+                    backend,
+                    task,
+                    ResetDistribution(bank, robot, bank.object_names, task.reset, backend.device),
                 )
                 action = torch.zeros(options.num_envs, env.num_actions, device=backend.device)
                 stepped = (
-                    rate(lambda env=env, action=action: env.step(action), options.seconds, device) * options.num_envs
+                    rate(lambda env=env, action=action: env.step(action), options.seconds, device)
+                    * options.num_envs
                 )
-                table.add_row(name, device, f"{wrapped:,.0f}", f"{stepped:,.0f} ({stepped / wrapped:.2f})")
+                table.add_row(
+                    name, device, f"{wrapped:,.0f}", f"{stepped:,.0f} ({stepped / wrapped:.2f})"
+                )
     console.print(table)
 
 

@@ -35,7 +35,10 @@ def run(options: Options, console: Console) -> None:
     if gpu:
         ppo = replace(CONFIG.ppo, minibatch_size=8192, precision="bfloat16")
         config = replace(
-            CONFIG, model=ModelConfig(initial_std=CONFIG.model.initial_std), ppo=ppo, iterations=_GPU_ITERATIONS
+            CONFIG,
+            model=ModelConfig(initial_std=CONFIG.model.initial_std),
+            ppo=ppo,
+            iterations=_GPU_ITERATIONS,
         )
         backend = make_backend("mujoco-warp", scene(), _GPU_WORLDS, device=options.device)
     else:
@@ -46,15 +49,27 @@ def run(options: Options, console: Console) -> None:
     figures = figures | {"env_steps": steps, "seconds": round(time.perf_counter() - began, 1)}
     kind = options.device.partition(":")[0]
     band: dict[str, list[float]] | None = json.loads(BAND.read_text()).get(kind)
-    outside = [name for name, (low, high) in (band or {}).items() if not low <= figures[name] <= high]
-    verdict = "no band is stored" if band is None else f"outside: {', '.join(outside)}" if outside else "inside"
+    outside = [
+        name for name, (low, high) in (band or {}).items() if not low <= figures[name] <= high
+    ]
+    verdict = (
+        "no band is stored"
+        if band is None
+        else f"outside: {', '.join(outside)}"
+        if outside
+        else "inside"
+    )
     print(
         json.dumps(
-            {"device": kind, "seed": seed, "worlds": backend.num_worlds} | figures | {"band": band, "verdict": verdict},
+            {"device": kind, "seed": seed, "worlds": backend.num_worlds}
+            | figures
+            | {"band": band, "verdict": verdict},
             indent=2,
         )
     )
     if band is None:
-        console.print(f"There is no band for {kind} yet: put one into {BAND.name}, from three seeds or more.")
+        console.print(
+            f"There is no band for {kind} yet: put one into {BAND.name}, from three seeds or more."
+        )
     if outside:
         raise SystemExit(1)

@@ -59,11 +59,19 @@ def run(options: Options, console: Console) -> None:
     robot, task = robots.load(options.robot), TaskConfig()
     scene = make_scene(robot, tuple(load_objects([OBJECT], None)), task)
     grasp = held_grasp(robot, scene.objects)
-    grasp = State(**{f.name: getattr(grasp, f.name).expand(options.num_envs, -1).contiguous() for f in fields(State)})
+    grasp = State(
+        **{
+            f.name: getattr(grasp, f.name).expand(options.num_envs, -1).contiguous()
+            for f in fields(State)
+        }
+    )
     pools = sorted({1, min(2, usable_cores()), min(usable_cores(), options.num_envs)})
     processes = [column for n in pools for column in (f"{n} process{'es' * (n > 1)}", "of raw")]
     columns = ["engine", "device", "readings", "bare", "raw", *processes, "held"]
-    table = Table(*columns, title=f"physics: control steps per second, {options.robot}, {options.num_envs} worlds")
+    table = Table(
+        *columns,
+        title=f"physics: control steps per second, {options.robot}, {options.num_envs} worlds",
+    )
     for name, device in engines(options, console):
         if issubclass(backend_class(name), PoolBackend):
             for cells in _pooled(name, scene, grasp, pools, options.seconds):
@@ -89,12 +97,16 @@ def _held(backend: Backend, grasp: State) -> str:
     return f"{int((up & (fingers > 1)).sum())} of {len(up)}, by {float(fingers.float().mean()):.1f} fingers"
 
 
-def _batched(name: str, scene: SceneSpec, grasp: State, device: str, seconds: float) -> tuple[float, float, str]:
+def _batched(
+    name: str, scene: SceneSpec, grasp: State, device: str, seconds: float
+) -> tuple[float, float, str]:
     """Bare and wrapped rate of a backend that steps all worlds at once."""
     with make_backend(name, scene, len(grasp.joint_pos), device=device) as backend:
         _start(backend, grasp)
         with backend._on_stream():  # pyright: ignore[reportAttributeAccessIssue]
-            bare = rate(lambda: [backend._run("step") for _ in range(scene.substeps)], seconds, device)  # pyright: ignore[reportAttributeAccessIssue]
+            bare = rate(
+                lambda: [backend._run("step") for _ in range(scene.substeps)], seconds, device
+            )  # pyright: ignore[reportAttributeAccessIssue]
         _start(backend, grasp)
         wrapped = rate(lambda: _control_step(backend, grasp, "all"), seconds, device)
         return bare * backend.num_worlds, wrapped * backend.num_worlds, _held(backend, grasp)
@@ -110,7 +122,9 @@ class _Spent:
     """[s] of all processes."""
 
 
-def _pooled(name: str, scene: SceneSpec, grasp: State, pools: Sequence[int], seconds: float) -> list[list[str]]:
+def _pooled(
+    name: str, scene: SceneSpec, grasp: State, pools: Sequence[int], seconds: float
+) -> list[list[str]]:
     """Rows of the table for an engine that runs a world at a time, one for each kind of readings."""
     n = len(grasp.joint_pos)
     kinds: tuple[Readings, ...] = ("state", "all")
@@ -120,11 +134,16 @@ def _pooled(name: str, scene: SceneSpec, grasp: State, pools: Sequence[int], sec
         backends += [make_backend(name, scene, n, workers=workers) for workers in pools]  # pyright: ignore[reportArgumentType]
         loop = _LOOPS.get(name, _world_loop)
         targets = grasp.joint_target.double().numpy()
-        raw = {kind: [loop(world, targets[i], scene, kind) for i, world in enumerate(worlds)] for kind in kinds}
+        raw = {
+            kind: [loop(world, targets[i], scene, kind) for i, world in enumerate(worlds)]
+            for kind in kinds
+        }
 
         def start() -> None:
             for i, world in enumerate(worlds):
-                world.set_state({f.name: getattr(grasp, f.name)[i].double().numpy() for f in fields(State)})
+                world.set_state(
+                    {f.name: getattr(grasp, f.name)[i].double().numpy() for f in fields(State)}
+                )
             for _ in range(_SETTLE):
                 _each(raw["state"])
             for backend in backends:
@@ -133,13 +152,18 @@ def _pooled(name: str, scene: SceneSpec, grasp: State, pools: Sequence[int], sec
         start()
         steps = max(1, round(_SLICE / _spent(partial(_each, raw["state"]), 3, ()).wall))
         contenders: dict[tuple[int | str, Readings], Callable[[], _Spent]] = {
-            ("bare", "state"): partial(_within, _step_function(name, worlds[0]), partial(_each, raw["state"]), steps)
+            ("bare", "state"): partial(
+                _within, _step_function(name, worlds[0]), partial(_each, raw["state"]), steps
+            )
         }
         for kind in kinds:
             contenders["raw", kind] = partial(_spent, partial(_each, raw[kind]), steps, ())
             for workers, backend in zip(pools, backends, strict=True):
                 contenders[workers, kind] = partial(
-                    _spent, partial(_control_step, backend, grasp, kind), steps, _process_ids(backend)
+                    _spent,
+                    partial(_control_step, backend, grasp, kind),
+                    steps,
+                    _process_ids(backend),
                 )
         turns: list[dict[Any, _Spent]] = []
         end = time.perf_counter() + seconds * len(contenders)
@@ -153,13 +177,18 @@ def _pooled(name: str, scene: SceneSpec, grasp: State, pools: Sequence[int], sec
         def cells(kind: Readings) -> list[str]:
             row = [
                 kind,
-                f"{n / _median(t['bare', kind].cpu for t in turns):,.0f}" if ("bare", kind) in contenders else "",
+                f"{n / _median(t['bare', kind].cpu for t in turns):,.0f}"
+                if ("bare", kind) in contenders
+                else "",
             ]
             row.append(f"{n / _median(t['raw', kind].cpu for t in turns):,.0f}")
             for workers in pools:
                 cpu = _median(t["raw", kind].cpu / t[workers, kind].cpu for t in turns)
                 wall = _median(t["raw", kind].wall / t[workers, kind].wall for t in turns) / workers
-                row += [f"{n / _median(t[workers, kind].wall for t in turns):,.0f}", f"{cpu:.2f} ({wall:.2f})"]
+                row += [
+                    f"{n / _median(t[workers, kind].wall for t in turns):,.0f}",
+                    f"{cpu:.2f} ({wall:.2f})",
+                ]
             return [*row, held]
 
         return [cells(kind) for kind in kinds]
@@ -227,7 +256,9 @@ def _within(function: tuple[object, str], step: Callable[[], object], steps: int
 # The loops that a user would write --------------------------------------------------------------------------------------------------------
 
 
-def _mujoco_loop(world: Any, targets: np.ndarray, scene: SceneSpec, kind: Readings) -> Callable[[], object]:
+def _mujoco_loop(
+    world: Any, targets: np.ndarray, scene: SceneSpec, kind: Readings
+) -> Callable[[], object]:
     import mujoco
 
     model, data, bodies = world._model, world._data, world._at.link_body
@@ -243,7 +274,9 @@ def _mujoco_loop(world: Any, targets: np.ndarray, scene: SceneSpec, kind: Readin
     return loop
 
 
-def _pybullet_loop(world: Any, targets: np.ndarray, scene: SceneSpec, kind: Readings) -> Callable[[], object]:
+def _pybullet_loop(
+    world: Any, targets: np.ndarray, scene: SceneSpec, kind: Readings
+) -> Callable[[], object]:
     from xreset.backends.pybullet import INTERNAL_STEPS
 
     p, drives, tracked = world._p, world._drives, world._frames.bodies
@@ -270,9 +303,15 @@ def _pybullet_loop(world: Any, targets: np.ndarray, scene: SceneSpec, kind: Read
     return loop
 
 
-def _sapien_loop(world: Any, targets: np.ndarray, scene: SceneSpec, kind: Readings) -> Callable[[], object]:
+def _sapien_loop(
+    world: Any, targets: np.ndarray, scene: SceneSpec, kind: Readings
+) -> Callable[[], object]:
     thing, joints, tracked = world._object, world._joints, world._tracked
-    articulation, drives, brakes = joints._articulation, joints._drives, joints._moving.has_dry_friction
+    articulation, drives, brakes = (
+        joints._articulation,
+        joints._drives,
+        joints._moving.has_dry_friction,
+    )
     weight, nothing = np.array([0.0, 0.0, -GRAVITY * scene.objects[0].mass]), np.zeros(3)
 
     def motion(body: Any) -> tuple[np.ndarray, ...]:
@@ -291,18 +330,28 @@ def _sapien_loop(world: Any, targets: np.ndarray, scene: SceneSpec, kind: Readin
                 world._last_step = (*motion_before, weight, nothing)
             world._system.step()  # set_state makes a new one
         state = articulation.qpos, articulation.qvel, *motion(thing)
-        return state if kind == "state" else (state, [motion(body) for body in tracked], world.contacts())
+        return (
+            state
+            if kind == "state"
+            else (state, [motion(body) for body in tracked], world.contacts())
+        )
 
     return loop
 
 
-def _world_loop(world: World, targets: np.ndarray, scene: SceneSpec, kind: Readings) -> Callable[[], object]:
+def _world_loop(
+    world: World, targets: np.ndarray, scene: SceneSpec, kind: Readings
+) -> Callable[[], object]:
     """Of an engine that is not known here."""
 
     def loop() -> object:
         world.set_joint_targets(targets)
         world.step(scene.substeps)
-        return world.get_state() if kind == "state" else (world.get_state(), world.links(), world.contacts())
+        return (
+            world.get_state()
+            if kind == "state"
+            else (world.get_state(), world.links(), world.contacts())
+        )
 
     return loop
 

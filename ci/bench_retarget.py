@@ -25,7 +25,15 @@ from xreset.spec import ObjectSpec
 _CONTACT = 0.020
 _EDGE = 0.005
 _LONGEST = 74
-_REFERENCE = ("PyRoki, same weights", "14.8 / 25.4", "16.1", "18.5", "16-61 %", "0.10-0.32", "45 per sequence")
+_REFERENCE = (
+    "PyRoki, same weights",
+    "14.8 / 25.4",
+    "16.1",
+    "18.5",
+    "16-61 %",
+    "0.10-0.32",
+    "45 per sequence",
+)
 """Measured on two CPU cores with the Sharpa hand on the same nine sequences, after 70 s of compiling."""
 _CONFIGS = {
     "default": HandConfig(),
@@ -70,11 +78,19 @@ def run(options: Options, console: Console) -> None:
     objects = demo_objects(demos, folder)
     nine = one_per_object(demos)
     table = Table(
-        "", "fingertips: mean / p95 [mm]", "keypoints", "contacts", "beyond 20 mm", "largest jump [rad]", "time [s]"
+        "",
+        "fingertips: mean / p95 [mm]",
+        "keypoints",
+        "contacts",
+        "beyond 20 mm",
+        "largest jump [rad]",
+        "time [s]",
     )
     for name, config in _CONFIGS.items():
         found: list[Errors] = []
-        seconds = seconds_of(lambda found=found, config=config: found.append(errors(nine, objects, options, config)))
+        seconds = seconds_of(
+            lambda found=found, config=config: found.append(errors(nine, objects, options, config))
+        )
         table.add_row(name, *_row(found[0]), f"{seconds:.0f} for {len(nine)}")
     table.add_row(*_REFERENCE)
     console.print(table)
@@ -85,7 +101,9 @@ def run(options: Options, console: Console) -> None:
         raise AssertionError(f"a hand joint is {found[0].beyond_limits} rad beyond its limits")
     whole = seconds_of(
         lambda: list(
-            HandMotions(demos, robots.load(options.robot), list(objects.values()), device=options.device).batches()
+            HandMotions(
+                demos, robots.load(options.robot), list(objects.values()), device=options.device
+            ).batches()
         )
     )
     console.print(
@@ -98,12 +116,18 @@ def one_per_object(demos: Demos) -> Demos:
     chosen: dict[str, int] = {}
     for i, name in enumerate(demos.object_name.tolist()):
         rows = demos.frames(i)
-        if name not in chosen and demos.hand_valid[rows].all() and rows.stop - rows.start <= _LONGEST:
+        if (
+            name not in chosen
+            and demos.hand_valid[rows].all()
+            and rows.stop - rows.start <= _LONGEST
+        ):
             chosen[name] = i
     return demos.select(indices=[chosen[name] for name in sorted(chosen)])
 
 
-def errors(demos: Demos, objects: Mapping[str, ObjectSpec], options: Options, config: HandConfig) -> Errors:
+def errors(
+    demos: Demos, objects: Mapping[str, ObjectSpec], options: Options, config: HandConfig
+) -> Errors:
     """Retarget the hand and measure."""
     robot = robots.load(options.robot)
     hand = HandModel(robot)
@@ -118,38 +142,64 @@ def errors(demos: Demos, objects: Mapping[str, ObjectSpec], options: Options, co
         followed = hand.keypoints(**vars(motion)).numpy()
         beyond = max(
             beyond,
-            float(torch.maximum(hand.kinematics.lower - motion.joints, motion.joints - hand.kinematics.upper).max()),
+            float(
+                torch.maximum(
+                    hand.kinematics.lower - motion.joints, motion.joints - hand.kinematics.upper
+                ).max()
+            ),
         )
         for slot, i in enumerate(sequences):
             rows = on_table.frames(i)
             seen = on_table.hand_valid[rows]
             robot_points = followed[slot, : len(seen)]
             human = on_table.hand_keypoints[rows][:, keypoint]
-            contact_points, contact = points[rows][:, keypoint], touching[rows][:, keypoint] & seen[:, None]
+            contact_points, contact = (
+                points[rows][:, keypoint],
+                touching[rows][:, keypoint] & seen[:, None],
+            )
             off = np.linalg.norm(robot_points - human, axis=-1)[seen]
-            jumps = np.abs(np.diff(motion.joints[slot, : len(seen)].numpy(), axis=0))[seen[1:] & seen[:-1]]
-            to_contact = (np.linalg.norm(x - contact_points, axis=-1)[contact] for x in (robot_points, human))
+            jumps = np.abs(np.diff(motion.joints[slot, : len(seen)].numpy(), axis=0))[
+                seen[1:] & seen[:-1]
+            ]
+            to_contact = (
+                np.linalg.norm(x - contact_points, axis=-1)[contact] for x in (robot_points, human)
+            )
             parts.append((off[:, tip].ravel(), off.ravel(), *to_contact, jumps.ravel()))
-    tips, keypoints, contacts, human_contacts, jumps = (np.concatenate(values) for values in zip(*parts, strict=True))
+    tips, keypoints, contacts, human_contacts, jumps = (
+        np.concatenate(values) for values in zip(*parts, strict=True)
+    )
     return Errors(
-        tips=tips, keypoints=keypoints, contacts=contacts, human=human_contacts, jumps=jumps, beyond_limits=beyond
+        tips=tips,
+        keypoints=keypoints,
+        contacts=contacts,
+        human=human_contacts,
+        jumps=jumps,
+        beyond_limits=beyond,
     )
 
 
-def vertex_contacts(demos: Demos, objects: Mapping[str, ObjectSpec]) -> tuple[np.ndarray, np.ndarray]:
+def vertex_contacts(
+    demos: Demos, objects: Mapping[str, ObjectSpec]
+) -> tuple[np.ndarray, np.ndarray]:
     """Nearest mesh vertex [F, 21, 3] of every keypoint, edges of the mesh being at most 5 mm, and whether it is nearer than 20 mm."""
     import trimesh
 
-    points, touching = np.zeros((demos.num_frames, 21, 3)), np.zeros((demos.num_frames, 21), dtype=bool)
+    points, touching = (
+        np.zeros((demos.num_frames, 21, 3)),
+        np.zeros((demos.num_frames, 21), dtype=bool),
+    )
     vertices = {
-        name: trimesh.remesh.subdivide_to_size(spec.vertices, spec.faces, _EDGE)[0] for name, spec in objects.items()
+        name: trimesh.remesh.subdivide_to_size(spec.vertices, spec.faces, _EDGE)[0]
+        for name, spec in objects.items()
     }
     trees = {name: cKDTree(v) for name, v in vertices.items()}
     for i, name in enumerate(demos.object_name.tolist()):
         rows = demos.frames(i)
         turn = Rotation.from_quat(demos.object_quat_wxyz[rows], scalar_first=True).as_matrix()
         pos = demos.object_pos[rows][:, None]
-        local = np.einsum("fij,fki->fkj", turn, np.nan_to_num(demos.hand_keypoints[rows], nan=1e3) - pos)
+        local = np.einsum(
+            "fij,fki->fkj", turn, np.nan_to_num(demos.hand_keypoints[rows], nan=1e3) - pos
+        )
         distance, nearest = trees[name].query(local)
         points[rows] = np.einsum("fij,fkj->fki", turn, vertices[name][nearest]) + pos
         touching[rows] = distance < _CONTACT

@@ -18,16 +18,37 @@ from xreset.backends.pool import usable_cores
 
 def run(options: Options, console: Console) -> None:
     xreset = [sys.executable, "-m", "xreset"]
-    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2 * usable_cores())]
+    busy = [
+        subprocess.Popen([sys.executable, "-c", "while True: pass"])
+        for _ in range(2 * usable_cores())
+    ]
     table = Table(
-        "", "wall [s]", "CPU [s]", title=f"threads: one demonstration for {options.robot}, {len(busy)} other processes"
+        "",
+        "wall [s]",
+        "CPU [s]",
+        title=f"threads: one demonstration for {options.robot}, {len(busy)} other processes",
     )
     try:
         with tempfile.TemporaryDirectory() as folder:
             demos = Path(folder) / "demos.npz"
-            run_time([*xreset, "demos", "synth", "--objects", OBJECT, "--per-object", "1", "--out", str(demos)])
+            run_time(
+                [
+                    *xreset,
+                    "demos",
+                    "synth",
+                    "--objects",
+                    OBJECT,
+                    "--per-object",
+                    "1",
+                    "--out",
+                    str(demos),
+                ]
+            )
             found = {}
-            for name, changes in (("as it is", {}), ("OMP_NUM_THREADS=1", {"OMP_NUM_THREADS": "1"})):
+            for name, changes in (
+                ("as it is", {}),
+                ("OMP_NUM_THREADS=1", {"OMP_NUM_THREADS": "1"}),
+            ):
                 command = [
                     *xreset,
                     "retarget",
@@ -37,13 +58,20 @@ def run(options: Options, console: Console) -> None:
                     "--out",
                     f"{folder}/{len(found)}.npz",
                 ]
-                environment = {k: v for k, v in os.environ.items() if k != "OMP_NUM_THREADS"} | changes
+                environment = {
+                    k: v for k, v in os.environ.items() if k != "OMP_NUM_THREADS"
+                } | changes
                 before = resource.getrusage(resource.RUSAGE_CHILDREN)
                 wall = seconds_of(
-                    lambda c=command, e=environment: subprocess.run(c, env=e, check=True, stdout=subprocess.DEVNULL)
+                    lambda c=command, e=environment: subprocess.run(
+                        c, env=e, check=True, stdout=subprocess.DEVNULL
+                    )
                 )
                 after = resource.getrusage(resource.RUSAGE_CHILDREN)
-                found[name] = wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+                found[name] = (
+                    wall,
+                    after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
+                )
                 table.add_row(name, *(f"{value:.1f}" for value in found[name]))
     finally:
         for process in busy:

@@ -34,7 +34,11 @@ from xreset.resets.distribution import ResetDistribution
 
 
 def add_arguments(group: argparse._ArgumentGroup) -> None:
-    group.add_argument("--resets", type=Path, help="reset bank (default: one of a synthetic soup-can demonstration)")
+    group.add_argument(
+        "--resets",
+        type=Path,
+        help="reset bank (default: one of a synthetic soup-can demonstration)",
+    )
     group.add_argument("--objects", type=Path, help="folder of real meshes")
     group.add_argument("--precision", default="bfloat16", choices=["float32", "tf32", "bfloat16"])
     group.add_argument("--iterations", type=int, default=5, help="PPO iterations to time")
@@ -55,7 +59,9 @@ def run(options: Options, console: Console) -> None:
             env = ManipulationEnv(
                 backend,
                 config.task,
-                ResetDistribution(inputs.bank, inputs.robot, names, config.task.reset, backend.device),
+                ResetDistribution(
+                    inputs.bank, inputs.robot, names, config.task.reset, backend.device
+                ),
             )
             console.print(_measure(env, config, options, Path(folder)))
 
@@ -72,7 +78,11 @@ def _measure(env: ManipulationEnv, config: TrainConfig, options: Options, folder
     raw, stepped = _physics_and_env(env, act, options)
     backend = env.backend
     with backend._on_stream():
-        still = rate(lambda: [backend._run("step") for _ in range(backend.scene.substeps)], options.seconds, device)
+        still = rate(
+            lambda: [backend._run("step") for _ in range(backend.scene.substeps)],
+            options.seconds,
+            device,
+        )
     env.reset()
     runner = TrainingRunner(env, config, folder / "run")
     runner.learn(2, init_at_random_ep_len=True)
@@ -115,7 +125,9 @@ def _measure(env: ManipulationEnv, config: TrainConfig, options: Options, folder
     return table
 
 
-def _physics_and_env(env: ManipulationEnv, act: Callable[[], torch.Tensor], options: Options) -> tuple[float, float]:
+def _physics_and_env(
+    env: ManipulationEnv, act: Callable[[], torch.Tensor], options: Options
+) -> tuple[float, float]:
     """Control steps per second of the engine's own steps, and of the environment's steps that they are part of."""
     backend, run, marks = env.backend, env.backend._run, []
 
@@ -143,7 +155,10 @@ def _physics_and_env(env: ManipulationEnv, act: Callable[[], torch.Tensor], opti
     finally:
         del backend._run
     ends = zip(marks[::2], marks[1::2], strict=True)
-    seconds = [start.elapsed_time(end) / 1e3 if env.device.type == "cuda" else end - start for start, end in ends]
+    seconds = [
+        start.elapsed_time(end) / 1e3 if env.device.type == "cuda" else end - start
+        for start, end in ends
+    ]
     return 1 / float(np.median(seconds)), stepped
 
 

@@ -85,8 +85,12 @@ def held_grasp(robot: RobotSpec, objects: Sequence[ObjectSpec]) -> State:
     from xreset.geometry.kinematics import Kinematics
     from xreset.retarget.pipeline import rest_on_table, retarget_demos
 
-    moved = retarget_demos(rest_on_table(synthesize([objects[0].name], 1, seed=0), objects), robot, objects)
-    frame = int(np.flatnonzero(moved.valid & (moved.object_pos[:, 2] > moved.object_pos[0, 2] + 0.1))[0])
+    moved = retarget_demos(
+        rest_on_table(synthesize([objects[0].name], 1, seed=0), objects), robot, objects
+    )
+    frame = int(
+        np.flatnonzero(moved.valid & (moved.object_pos[:, 2] > moved.object_pos[0, 2] + 0.1))[0]
+    )
     center = torch.as_tensor(moved.object_pos[frame], dtype=torch.float64)
     position = torch.as_tensor(moved.joint_pos[frame], dtype=torch.float64).requires_grad_()
     poses = Kinematics(robot).link_poses(position, [tip.link for tip in robot.fingertips])

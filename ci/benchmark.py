@@ -34,15 +34,24 @@ def main() -> None:
     known = sections()
     parser = argparse.ArgumentParser(
         prog="ci/benchmark",
-        description="\n".join([__doc__ or "", *(module.__doc__ or "" for module in known.values())]),
+        description="\n".join(
+            [__doc__ or "", *(module.__doc__ or "" for module in known.values())]
+        ),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "sections", nargs="*", metavar="section", help=f"what to measure: {', '.join(known)} (default: all)"
+        "sections",
+        nargs="*",
+        metavar="section",
+        help=f"what to measure: {', '.join(known)} (default: all)",
     )
     parser.add_argument("--robot", default="ur7e-sharpa")
-    parser.add_argument("--backend", action="append", default=[], help="engine; again for more (default: all)")
-    own = ", ".join(f"{name} {module.NUM_ENVS}" for name, module in known.items() if hasattr(module, "NUM_ENVS"))
+    parser.add_argument(
+        "--backend", action="append", default=[], help="engine; again for more (default: all)"
+    )
+    own = ", ".join(
+        f"{name} {module.NUM_ENVS}" for name, module in known.items() if hasattr(module, "NUM_ENVS")
+    )
     parser.add_argument("--num-envs", type=int, help=f"worlds (default: {_NUM_ENVS}; {own})")
     parser.add_argument("--device", default="cpu", help="for the engines that can: cuda")
     parser.add_argument("--seconds", type=float, default=3.0, help="per measurement")
@@ -52,11 +61,15 @@ def main() -> None:
     arguments = vars(parser.parse_args())
     chosen = arguments.pop("sections") or list(known)
     if unknown := set(chosen) - set(known):
-        parser.error(f"there is no section {', '.join(sorted(unknown))}; there are {', '.join(known)}")
+        parser.error(
+            f"there is no section {', '.join(sorted(unknown))}; there are {', '.join(known)}"
+        )
 
     num_envs = arguments.pop("num_envs")
     common = {name: arguments.pop(name) for name in ("robot", "device", "seconds")}
-    options = Options(**common, num_envs=_NUM_ENVS, backends=tuple(arguments.pop("backend")), extra=arguments)
+    options = Options(
+        **common, num_envs=_NUM_ENVS, backends=tuple(arguments.pop("backend")), extra=arguments
+    )
     console = Console(width=160)
     gpu = f", {torch.cuda.get_device_name()}" if options.device.startswith("cuda") else ""
     console.print(f"{platform.machine()}, {usable_cores()} cores{gpu}")

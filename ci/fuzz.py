@@ -42,7 +42,11 @@ def _round(
 
     @seed(number)
     @settings(
-        max_examples=100, deadline=None, database=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck)
+        max_examples=100,
+        deadline=None,
+        database=None,
+        phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
     )
     @given(damages(reader.kind))
     def run(damage):
@@ -87,21 +91,42 @@ def main() -> int:
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     with readers() as found:
-        chosen = {name: reader for name, reader in found.items() if not options.reader or name in options.reader}
-        names = [*chosen, *([COMMAND_LINES] if COMMAND_LINES in (options.reader or [COMMAND_LINES]) else [])]
+        chosen = {
+            name: reader
+            for name, reader in found.items()
+            if not options.reader or name in options.reader
+        }
+        names = [
+            *chosen,
+            *([COMMAND_LINES] if COMMAND_LINES in (options.reader or [COMMAND_LINES]) else []),
+        ]
         counts = {name: Counter() for name in names}
         broken: dict[str, dict[str, bytes]] = {name: {} for name in names}
         slowest = dict.fromkeys(names, 0.0)
         virtual = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (virtual + (GIGABYTES << 30), resource.RLIM_INFINITY))
+        resource.setrlimit(
+            resource.RLIMIT_AS, (virtual + (GIGABYTES << 30), resource.RLIM_INFINITY)
+        )
         end, rounds = time.monotonic() + 60 * options.minutes, 0
         while time.monotonic() < end:
             rounds += 1
             for name, reader in chosen.items():
-                _round(name, reader, counts[name], broken[name], slowest, options.seed * 1_000_003 + rounds, end)
+                _round(
+                    name,
+                    reader,
+                    counts[name],
+                    broken[name],
+                    slowest,
+                    options.seed * 1_000_003 + rounds,
+                    end,
+                )
             if COMMAND_LINES in names:
                 _command_lines(
-                    counts[COMMAND_LINES], broken[COMMAND_LINES], slowest, options.seed * 1_000_003 + rounds, end
+                    counts[COMMAND_LINES],
+                    broken[COMMAND_LINES],
+                    slowest,
+                    options.seed * 1_000_003 + rounds,
+                    end,
                 )
     print(
         "| reader | files or command lines | refused | read and sound, or ran | broken | slowest |\n|---|---|---|---|---|---|"

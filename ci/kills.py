@@ -20,7 +20,14 @@ XRESET = [sys.executable, "-m", "xreset"]
 LEFTOVERS = (".part", ".lock", ".partial")
 SHARED_MEMORY = Path("/dev/shm")
 
-SMALL = ["--config.save-interval", 2, "--config.task.observation.cloud-points", 16, "--config.model.lstm", 16]
+SMALL = [
+    "--config.save-interval",
+    2,
+    "--config.task.observation.cloud-points",
+    16,
+    "--config.model.lstm",
+    16,
+]
 SMALL += ["--config.model.mlp", 16, "--config.model.pointnet", 8, 8, "--config.ppo.horizon", 8]
 SMALL += ["--config.ppo.minibatch-size", 64]
 
@@ -59,20 +66,54 @@ def commands(folder: Path) -> list[Command]:
     studies = folder / "studies"
     where = ["--backend", "mujoco", "--device", "cpu", "--num-envs", 4]
     resume = ["train", "--out", run, "--resume"]
-    watch = ["--out", eyes, "--resets", bank, "--iterations", 60, "--vision.width", 8, "--vision.height", 8]
+    watch = [
+        "--out",
+        eyes,
+        "--resets",
+        bank,
+        "--iterations",
+        60,
+        "--vision.width",
+        8,
+        "--vision.height",
+        8,
+    ]
     return [
-        Command("demos synth", ["demos", "synth", "--out", demos, "--objects", "soup", "--per-object", 2], demos),
+        Command(
+            "demos synth",
+            ["demos", "synth", "--out", demos, "--objects", "soup", "--per-object", 2],
+            demos,
+        ),
         Command("retarget", ["retarget", demos, "--robot", "openarm", "--out", motion], motion),
         Command("resets", ["resets", motion, "--out", bank], bank),
         Command(
             "train",
-            ["train", "--out", run, "--robot", "openarm", "--resets", bank, *where, "--iterations", 60, *SMALL],
+            [
+                "train",
+                "--out",
+                run,
+                "--robot",
+                "openarm",
+                "--resets",
+                bank,
+                *where,
+                "--iterations",
+                60,
+                *SMALL,
+            ],
             run / "policy.onnx",
             run / "checkpoints",
             resume,
         ),
-        Command("train --resume", [*resume, "--iterations", 120], run / "policy.onnx", run / "checkpoints"),
-        Command("eval", ["eval", run, "--demos", demos, "--episodes", 4], run / "eval" / "mujoco.json"),
+        Command(
+            "train --resume",
+            [*resume, "--iterations", 120],
+            run / "policy.onnx",
+            run / "checkpoints",
+        ),
+        Command(
+            "eval", ["eval", run, "--demos", demos, "--episodes", 4], run / "eval" / "mujoco.json"
+        ),
         Command(
             "stress",
             ["stress", run, "--demos", demos, "--backend", "mujoco", "--property", "object-mass"],
@@ -97,7 +138,11 @@ def commands(folder: Path) -> list[Command]:
             folder / "deploy" / "contract.json",
             once=True,
         ),
-        Command("study", ["study", "seconds", "--out", studies], studies / "reports" / "seconds" / "study.md"),
+        Command(
+            "study",
+            ["study", "seconds", "--out", studies],
+            studies / "reports" / "seconds" / "study.md",
+        ),
     ]
 
 
@@ -105,7 +150,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=10, help="of each command")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--command", action="append", default=[], help="kill only this command; again for more")
+    parser.add_argument(
+        "--command", action="append", default=[], help="kill only this command; again for more"
+    )
     options = parser.parse_args()
     chance = random.Random(options.seed)
     shared = set(SHARED_MEMORY.glob("xreset-*"))
@@ -119,11 +166,19 @@ def main() -> int:
             left = sorted(path.name for path in folder.rglob("*") if path.name.endswith(LEFTOVERS))
             good &= command.result.exists() and not left
             failed |= not good
-            rows.append(f"| {command.name} | {killed} | {'yes' if good else 'NO'} | {', '.join(left) or '-'} |")
+            rows.append(
+                f"| {command.name} | {killed} | {'yes' if good else 'NO'} | {', '.join(left) or '-'} |"
+            )
             print(rows[-1], flush=True)
     orphans = set(SHARED_MEMORY.glob("xreset-*")) - shared
-    print("| command | kills | then went on to its end | left behind |\n|---|---|---|---|", *rows, sep="\n")
-    print(f"\nfiles in shared memory that the next start removes: {len(orphans)}; seed {options.seed}")
+    print(
+        "| command | kills | then went on to its end | left behind |\n|---|---|---|---|",
+        *rows,
+        sep="\n",
+    )
+    print(
+        f"\nfiles in shared memory that the next start removes: {len(orphans)}; seed {options.seed}"
+    )
     return int(failed)
 
 

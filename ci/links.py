@@ -13,7 +13,9 @@ _LINK = re.compile(r"\]\(([^)\s#]*)(?:#([^)\s]*))?\)")
 def anchors(page: Path) -> set[str]:
     """What headings are called in links, as GitHub and mkdocs do."""
     headings = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)
-    return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
+    return {
+        re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings
+    }
 
 
 def broken(page: Path) -> list[str]:
@@ -30,7 +32,9 @@ def broken(page: Path) -> list[str]:
 
 def main() -> None:
     """Print what is broken, and exit with 1 if anything is."""
-    pages = subprocess.run(["git", "ls-files", "*.md"], capture_output=True, text=True, check=True).stdout.split()
+    pages = subprocess.run(
+        ["git", "ls-files", "*.md"], capture_output=True, text=True, check=True
+    ).stdout.split()
     problems = [
         problem
         for page in pages

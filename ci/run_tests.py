@@ -69,7 +69,9 @@ def run(name: str) -> Outcome:
     result = unittest.TextTestRunner(stream=text, resultclass=Result, buffer=True).run(suite)
     failed = len(result.failures) + len(result.errors) + len(result.unexpectedSuccesses)
     skipped = [f"skipped {test}: {reason}" for test, reason in result.skipped]
-    return Outcome(name, time.perf_counter() - began, result.passed, failed, skipped, text.getvalue())
+    return Outcome(
+        name, time.perf_counter() - began, result.passed, failed, skipped, text.getvalue()
+    )
 
 
 def run_all(names: list[str], processes: int):
@@ -86,7 +88,12 @@ def run_all(names: list[str], processes: int):
                 yield done.result()
             except BrokenProcessPool:
                 yield Outcome(
-                    name_of[done], 0.0, 0, 1, [], "A test process died here, or in a module that ran beside it.\n"
+                    name_of[done],
+                    0.0,
+                    0,
+                    1,
+                    [],
+                    "A test process died here, or in a module that ran beside it.\n",
                 )
 
 
@@ -102,7 +109,9 @@ def main() -> int:
     outcomes = []
     for outcome in run_all(names, processes):
         outcomes.append(outcome)
-        summary = f"{outcome.passed} passed, {outcome.failed} failed, {len(outcome.skipped)} skipped"
+        summary = (
+            f"{outcome.passed} passed, {outcome.failed} failed, {len(outcome.skipped)} skipped"
+        )
         print(f"{outcome.seconds:7.1f} s  {outcome.name}: {summary}", flush=True)
         if outcome.failed:
             print(outcome.text, flush=True)

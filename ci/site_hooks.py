@@ -5,7 +5,9 @@ from pathlib import Path
 from typing import Any
 
 _STUBS = Path(__file__).parents[1] / "xreset/__init__.pyi"
-_MODULE_OF = {name: module for module, name in re.findall(r"from (\S+) import (\w+)", _STUBS.read_text())}
+_MODULE_OF = {
+    name: module for module, name in re.findall(r"from (\S+) import (\w+)", _STUBS.read_text())
+}
 _ROLE = re.compile(r":(?:func|class|mod|data|attr|meth):<code>~?([^<]*)</code>")
 
 

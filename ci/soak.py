@@ -32,21 +32,29 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=60.0, help="for all engines together")
     parser.add_argument(
-        "--backend", action="append", default=[], help="engine; again for more (default: all that work here)"
+        "--backend",
+        action="append",
+        default=[],
+        help="engine; again for more (default: all that work here)",
     )
     parser.add_argument("--one", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one:
         return soak(options.one, 60 * options.minutes)
-    names = options.backend or [name for name in backend_names() if backend_status(name).reason is None]
+    names = options.backend or [
+        name for name in backend_names() if backend_status(name).reason is None
+    ]
     print(
         "| engine | minutes | control steps of a world | new starts | broken on purpose | memory at first, at the end | |\n"
         + "|---" * 7
         + "|"
     )
-    each = str(options.minutes / len(names))  # each in a process of its own, whose memory is only that engine's
+    each = str(
+        options.minutes / len(names)
+    )  # each in a process of its own, whose memory is only that engine's
     return max(
-        subprocess.run([sys.executable, __file__, "--one", name, "--minutes", each]).returncode for name in names
+        subprocess.run([sys.executable, __file__, "--one", name, "--minutes", each]).returncode
+        for name in names
     )
 
 
@@ -55,9 +63,14 @@ def soak(name: str, seconds: float) -> int:
     scene = make_scene(robot, tuple(load_objects([OBJECT], None)), task)
     chance = torch.Generator().manual_seed(0)
     used, steps, starts, broken = [], 0, 0, 0
-    with tempfile.TemporaryDirectory() as folder, make_backend(name, scene, WORLDS, device="cpu") as backend:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        make_backend(name, scene, WORLDS, device="cpu") as backend,
+    ):
         bank = motion(robot, Path(folder))
-        env = ManipulationEnv(backend, task, ResetDistribution(bank, robot, bank.object_names, task.reset))
+        env = ManipulationEnv(
+            backend, task, ResetDistribution(bank, robot, bank.object_names, task.reset)
+        )
         begin = time.monotonic()
         while time.monotonic() < begin + seconds:
             *_, done, _ = env.step(2 * torch.rand(WORLDS, env.num_actions, generator=chance) - 1)

@@ -58,7 +58,9 @@ def evaluate(
     policy.check_seed(seed)
     if isinstance(engines, str):
         engines = (engines,)
-    chosen = [e if isinstance(e, Engine) else engine(e, device=device) for e in dict.fromkeys(engines)]
+    chosen = [
+        e if isinstance(e, Engine) else engine(e, device=device) for e in dict.fromkeys(engines)
+    ]
     trial = load_trial(policy, demos, objects=objects, seed=seed, num_envs=num_envs, settle=settle)
     folder = Path(out) if out else policy.folder
     results = []
@@ -66,7 +68,9 @@ def evaluate(
     with claim_folder(folder):
         for e in chosen:
             player = policy.start(trial.motion)
-            rollouts = roll_out(player, e, trial, repetitions=episodes, progress=partial(progress, e.name))
+            rollouts = roll_out(
+                player, e, trial, repetitions=episodes, progress=partial(progress, e.name)
+            )
             result = summarize(
                 rollouts,
                 backend=e.name,

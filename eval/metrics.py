@@ -62,14 +62,18 @@ class MetricPoints(Tensors):
 
         return cls(
             keypoints=stacked([keypoints(o, frame) for o in objects]),
-            surface=stacked([metric_points(o) - (center(o) if frame == "center" else 0.0) for o in objects]),
+            surface=stacked(
+                [metric_points(o) - (center(o) if frame == "center" else 0.0) for o in objects]
+            ),
         )
 
 
 class EpisodeMetrics:
     """Metrics of one episode in N worlds, accumulated step by step; a world that has ended no longer changes them."""
 
-    def __init__(self, start: Reading, goal_pos: Tensor, goal_quat: Tensor, points: MetricPoints) -> None:
+    def __init__(
+        self, start: Reading, goal_pos: Tensor, goal_quat: Tensor, points: MetricPoints
+    ) -> None:
         """Start with the first reading.
 
         Args:
@@ -126,7 +130,9 @@ class EpisodeMetrics:
     @property
     def task_progress(self) -> Tensor:
         """[N] score of the highest stage."""
-        stage = torch.where(self.reorient, 3, torch.where(self.grasp, 2, torch.where(self.approach, 1, 0)))
+        stage = torch.where(
+            self.reorient, 3, torch.where(self.grasp, 2, torch.where(self.approach, 1, 0))
+        )
         return torch.tensor(STAGE_SCORES, device=stage.device)[stage]
 
     def _look(self, reading: Reading) -> None:
@@ -138,11 +144,19 @@ class EpisodeMetrics:
         position_error = (state.object_pos - self._goal_pos).norm(dim=-1)
         angle = quat_angle(state.object_quat, self._goal_quat)
         at_goal = live & (position_error <= GOAL_DISTANCE) & (angle <= GOAL_ANGLE)
-        self.reorient = at_goal  # only the last reading counts; a world that ended early is not at its goal
+        self.reorient = (
+            at_goal  # only the last reading counts; a world that ended early is not at its goal
+        )
         self.reorient_once |= at_goal
-        self._best = torch.where(live, torch.minimum(self._best, self._keypoint_distance(reading)), self._best)
+        self._best = torch.where(
+            live, torch.minimum(self._best, self._keypoint_distance(reading)), self._best
+        )
         distance = mean_distance(
-            state.object_pos, state.object_quat, self._goal_pos, self._goal_quat, self._points.surface
+            state.object_pos,
+            state.object_quat,
+            self._goal_pos,
+            self._goal_quat,
+            self._points.surface,
         )
         self.final_distance = torch.where(live, distance, self.final_distance)
         self.final_position_error = torch.where(live, position_error, self.final_position_error)
@@ -152,5 +166,9 @@ class EpisodeMetrics:
     def _keypoint_distance(self, reading: Reading) -> Tensor:
         state = reading.task_state
         return keypoint_distance(
-            state.object_pos, state.object_quat, self._goal_pos, self._goal_quat, self._points.keypoints
+            state.object_pos,
+            state.object_quat,
+            self._goal_pos,
+            self._goal_quat,
+            self._points.keypoints,
         )

@@ -25,14 +25,18 @@ INK = "#010203"
 
 
 @contextmanager
-def picture(path: Path, size: tuple[float, float], *, dpi: int = 120, **style: Any) -> Iterator[Figure]:
+def picture(
+    path: Path, size: tuple[float, float], *, dpi: int = 120, **style: Any
+) -> Iterator[Figure]:
     """Yield a figure that is written as PNG at the end of the block.
 
     Args:
         size: width and height [inches].
         style: matplotlib's settings, with _ in place of the first dot.
     """
-    with figure_style({name.replace("_", ".", 1): value for name, value in style.items()}) as figure_class:
+    with figure_style(
+        {name.replace("_", ".", 1): value for name, value in style.items()}
+    ) as figure_class:
         figure = figure_class(figsize=size, layout="constrained", facecolor="white")
         yield figure
         buffer = io.BytesIO()
@@ -80,6 +84,8 @@ def figure_style(style: dict[str, Any]) -> Iterator[type[Figure]]:
         "axes.spines.right": False,
         "axes.axisbelow": True,
     }
-    base |= dict.fromkeys(("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), INK)
+    base |= dict.fromkeys(
+        ("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), INK
+    )
     with matplotlib.rc_context(base | style):  # pyright: ignore[reportArgumentType]
         yield Figure

@@ -94,7 +94,16 @@ class PolicySpec:
             seed: seed of every random number.
         """
         task = evaluation_task(self.task)
-        return make_env(self.robot, objects, bank, task, engine=engine, num_envs=num_envs, device=device, seed=seed)
+        return make_env(
+            self.robot,
+            objects,
+            bank,
+            task,
+            engine=engine,
+            num_envs=num_envs,
+            device=device,
+            seed=seed,
+        )
 
     def begin(self, env: ManipulationEnv) -> Policy:
         """Return the policy, ready to act in an environment whose episodes have just begun.
@@ -117,7 +126,9 @@ class PolicySpec:
             PolicyError: a baseline has none.
         """
         if self.file is None:
-            raise PolicyError(f"The baseline {self.name!r} is no exported policy. Give a run folder or a .onnx file.")
+            raise PolicyError(
+                f"The baseline {self.name!r} is no exported policy. Give a run folder or a .onnx file."
+            )
         return self.file
 
     def check_seed(self, seed: int) -> None:
@@ -128,10 +139,14 @@ class PolicySpec:
         """
         choice = read_choice(self.folder.parent) if self.hash else None
         if choice is not None and choice.policy_hash == self.hash and choice.seed == seed:
-            raise PolicyError(f"Seed {seed} chose this checkpoint (xreset select). Use another --seed.")
+            raise PolicyError(
+                f"Seed {seed} chose this checkpoint (xreset select). Use another --seed."
+            )
 
 
-def load_policy(policy: str | Path, *, robot: str | Path | None = None, seed: int = 0) -> PolicySpec:
+def load_policy(
+    policy: str | Path, *, robot: str | Path | None = None, seed: int = 0
+) -> PolicySpec:
     """Find the policy that a name means. A file or folder comes before a shipped policy of the same name.
 
     Args:

@@ -131,7 +131,10 @@ def rehearse(
             stopped: Counter[str] = Counter()
 
             def play(
-                prop: Property | None, value: float, place: Engine = place, stopped: Counter[str] = stopped
+                prop: Property | None,
+                value: float,
+                place: Engine = place,
+                stopped: Counter[str] = stopped,
             ) -> tuple[Episode, ...]:
                 changed, fault = _setting(trial, prop, value)
                 return _play(actor, place, changed, fault, episodes, real_time, stopped)
@@ -159,7 +162,9 @@ def _setting(trial: Trial, prop: Property | None, value: float) -> tuple[Trial, 
     try:
         return replace(trial, task=task), Faults(**prop.fixed, **sizes)
     except ValueError as error:
-        raise XResetError(f"{prop.option} {amount(prop.unit, value)} cannot be tried: {error}.") from None
+        raise XResetError(
+            f"{prop.option} {amount(prop.unit, value)} cannot be tried: {error}."
+        ) from None
 
 
 def _play(
@@ -189,17 +194,24 @@ def _play(
             begin(controller, env)
             result = EpisodeMetrics(env.reading(), env.goal_pos, env.goal_quat, r.points)
 
-            def look(step: int, env: ManipulationEnv = env, result: EpisodeMetrics = result) -> None:
+            def look(
+                step: int, env: ManipulationEnv = env, result: EpisodeMetrics = result
+            ) -> None:
                 reading = env.reading()
                 table = env.backend.scene.table
-                result.update(reading, out_of_bounds(reading.task_state.object_pos, table, env.task.termination))
+                result.update(
+                    reading,
+                    out_of_bounds(reading.task_state.object_pos, table, env.task.termination),
+                )
 
             seeds = [(trial.seed, int(sequence[item]), int(repetition[item])) for item in r.items]
             driver = FaultyDriver(env, fault, seeds, look, real_time=real_time)
             outcome = Runner(controller, driver).run(env.max_episode_length * controller.dt)
             for world in r.fresh:
                 item = int(r.items[world])
-                found[item] = episode_of(result, world, bank, int(sequence[item]), int(repetition[item]))
+                found[item] = episode_of(
+                    result, world, bank, int(sequence[item]), int(repetition[item])
+                )
                 reason = outcome.reasons[world]
                 if reason is not None:
                     stopped[re.sub(r"-?\d+\.\d+", "...", reason)] += 1
@@ -216,7 +228,9 @@ def judge(found: Sequence[Rehearsal]) -> tuple[str, list[str]]:
     tried = 0
     for card in found:
         if card.task_progress < LEAST:
-            against.append(f"{card.backend}: only {100 * card.task_progress:.0f} % without any fault.")
+            against.append(
+                f"{card.backend}: only {100 * card.task_progress:.0f} % without any fault."
+            )
         curves = {each.property: each for each in card.curves}
         for option, value, most in CRITERIA:
             for point in curves[option].points if option in curves else ():
@@ -237,7 +251,9 @@ def judge(found: Sequence[Rehearsal]) -> tuple[str, list[str]]:
     if against:
         sentence = "Not ready for a robot."
     elif unsure:
-        sentence = "Not shown to be ready: some losses are too large, or chance. Play more episodes."
+        sentence = (
+            "Not shown to be ready: some losses are too large, or chance. Play more episodes."
+        )
     elif tried < len(CRITERIA) * len(found):
         sentence = "No verdict: not every fault that decides was tried."
     return sentence, [*against, *unsure]
@@ -247,7 +263,9 @@ def limits(found: Sequence[Stress]) -> list[tuple[str, list[str]]]:
     """Return name and, for each engine, the smallest value in words of every fault that costs ten points."""
     rows = []
     for name, curves in by_property(found).items():
-        rows.append((name.replace("-", " "), [each.costs() if each else "cannot be set" for each in curves]))
+        rows.append(
+            (name.replace("-", " "), [each.costs() if each else "cannot be set" for each in curves])
+        )
     return rows
 
 

@@ -176,7 +176,9 @@ def episode_table(result: EvalResult, episodes: Sequence[Episode], run: str = ""
 
 def _table(episodes: Sequence[Episode]) -> Table:
     """Return a row for each episode, with NaN for what was not measured."""
-    table: Table = pd.DataFrame([asdict(e) for e in episodes], columns=[f.name for f in fields(Episode)])
+    table: Table = pd.DataFrame(
+        [asdict(e) for e in episodes], columns=[f.name for f in fields(Episode)]
+    )
     return table.astype({name: float for name in table if table[name].isna().any()})
 
 
@@ -216,11 +218,15 @@ def summarize(rollouts: Rollouts, **about: Any) -> EvalResult:
         objects=tuple(sorted(episodes["object"].unique())),
         episodes=len(episodes),
         episodes_per_demo=1 + int(episodes["repetition"].max()),
-        task_progress=TaskProgress(mean=mean(episodes, "task_progress"), ci95=_ci95(episodes, "task_progress")),
+        task_progress=TaskProgress(
+            mean=mean(episodes, "task_progress"), ci95=_ci95(episodes, "task_progress")
+        ),
         published_success_ci95=_ci95(episodes, "published_success") if is_measured else None,
         reorient_once_rate=mean(episodes, "reorient_once"),
         per_demo=tuple(per_demo),
-        health=EpisodeFaults(**{f.name: int(episodes[f.name].sum()) for f in fields(EpisodeFaults)}),
+        health=EpisodeFaults(
+            **{f.name: int(episodes[f.name].sum()) for f in fields(EpisodeFaults)}
+        ),
         control_steps_per_second=round(rollouts.control_steps_per_second, 1),
         **rates,
         **about,
@@ -236,7 +242,9 @@ def _rates(episodes: Table) -> dict[str, Any]:
     """Return the means that a result and each of its demonstrations state, by field."""
     stages = ("approach", "grasp", "reorient", "published_success")
     rates = {f"{stage}_rate": measured(episodes, stage) for stage in stages}
-    return rates | {name: measured(episodes, name) for name in ("reorientation_progress", "least_distance")}
+    return rates | {
+        name: measured(episodes, name) for name in ("reorientation_progress", "least_distance")
+    }
 
 
 def mesh_folder(given: Path | None, recorded: str | None) -> Path | None:
@@ -250,7 +258,9 @@ def mesh_folder(given: Path | None, recorded: str | None) -> Path | None:
 # Files ----------------------------------------------------------------------------------------------------------------
 
 
-def write_results(folder: Path, summary: EvalResult, rollouts: Rollouts, joint_names: tuple[str, ...]) -> Path:
+def write_results(
+    folder: Path, summary: EvalResult, rollouts: Rollouts, joint_names: tuple[str, ...]
+) -> Path:
     """Write ``ENGINE.json``, ``ENGINE.episodes.json`` and ``ENGINE.trace.npz``; return the path of the first."""
     name = summary.backend
     episodes = [asdict(e) for e in rollouts.episodes]
@@ -260,7 +270,9 @@ def write_results(folder: Path, summary: EvalResult, rollouts: Rollouts, joint_n
     return folder / f"{name}.json"
 
 
-def write_traces(path: Path, traces: Sequence[Trace], joint_names: tuple[str, ...], **others: Any) -> None:
+def write_traces(
+    path: Path, traces: Sequence[Trace], joint_names: tuple[str, ...], **others: Any
+) -> None:
     """Write recorded episodes; ``others``: further arrays, which :func:`read_traces` ignores."""
     arrays = {
         "time": traces[0].time,
@@ -328,7 +340,9 @@ def read_episodes(folder: Path, backend: str) -> tuple[Episode, ...]:
     episodes = read_json(path, EPISODES_SCHEMA).get("episodes")
     if not isinstance(episodes, list):
         raise FileFormatError(f"{path} has no list 'episodes'. Evaluate again.")
-    return tuple(from_dict(Episode, episode, f"{path}: episodes[{i}]") for i, episode in enumerate(episodes))
+    return tuple(
+        from_dict(Episode, episode, f"{path}: episodes[{i}]") for i, episode in enumerate(episodes)
+    )
 
 
 def read_traces(folder: Path, backend: str, joint_names: tuple[str, ...]) -> tuple[Trace, ...]:
@@ -338,7 +352,9 @@ def read_traces(folder: Path, backend: str, joint_names: tuple[str, ...]) -> tup
         FileFormatError: the file is damaged, or its joints are not ``joint_names`` in that order.
     """
     path = folder / f"{backend}.trace.npz"
-    arrays = read_npz(path, TRACE_SCHEMA, _TRACE_FIELDS, what="an evaluation trace", check=_trace_problem)
+    arrays = read_npz(
+        path, TRACE_SCHEMA, _TRACE_FIELDS, what="an evaluation trace", check=_trace_problem
+    )
     found = tuple(arrays["joint_names"].tolist())
     if found != joint_names:
         raise FileFormatError(
@@ -366,7 +382,9 @@ def _trace_problem(arrays: dict[str, np.ndarray]) -> str | None:
     time = arrays["time"]
     if len(time) < 2 or (np.diff(time) <= 0).any():
         return "the times of its frames do not rise."
-    state = np.concatenate((arrays["joint_pos"], arrays["object_pos"], arrays["object_quat_wxyz"]), axis=2)
+    state = np.concatenate(
+        (arrays["joint_pos"], arrays["object_pos"], arrays["object_quat_wxyz"]), axis=2
+    )
     finite = np.isfinite(state).all(axis=2)
     if not finite[:, 0].all():
         return "an episode begins with numbers that are not finite."

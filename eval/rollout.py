@@ -132,7 +132,9 @@ def roll_out(
         for r in rounds:
             env = r.env
             length = env.max_episode_length
-            recorder = _Recorder(env, [world for world in r.fresh if repetition[r.items[world]] == 0])
+            recorder = _Recorder(
+                env, [world for world in r.fresh if repetition[r.items[world]] == 0]
+            )
             policy.begin(env)
             reading = env.reading()
             result = EpisodeMetrics(reading, env.task_goal_pos, env.goal_quat, r.points)
@@ -140,7 +142,9 @@ def roll_out(
             for step in range(1, length + 1):
                 before = time.perf_counter()
                 reading, _ = env.advance(policy.act(env.get_observations()))
-                lost = out_of_bounds(reading.task_state.object_pos, env.backend.scene.table, env.task.termination)
+                lost = out_of_bounds(
+                    reading.task_state.object_pos, env.backend.scene.table, env.task.termination
+                )
                 result.update(reading, lost)
                 seconds += time.perf_counter() - before
                 recorder.look(step, reading)
@@ -149,7 +153,9 @@ def roll_out(
             traces += recorder.traces(trial.names)
             for world in r.fresh:
                 item = int(r.items[world])
-                found[item] = episode_of(result, world, bank, int(sequences[item]), int(repetition[item]))
+                found[item] = episode_of(
+                    result, world, bank, int(sequences[item]), int(repetition[item])
+                )
     return Rollouts(
         episodes=tuple(found[i] for i in sorted(found)),
         traces=tuple(sorted(traces, key=lambda t: t.sequence)),
@@ -189,10 +195,19 @@ def play_rounds(
         for number, (items, fresh) in enumerate(plan):
             env.reset(start=start(items).to(env.device))
             worlds = np.flatnonzero(fresh).tolist()
-            yield Round(env=env, points=points, items=items, fresh=worlds, number=number, total=len(plan.rounds))
+            yield Round(
+                env=env,
+                points=points,
+                items=items,
+                fresh=worlds,
+                number=number,
+                total=len(plan.rounds),
+            )
 
 
-def episode_starts(distribution: ResetDistribution, sequence: np.ndarray, repetition: np.ndarray, seed: int) -> Reset:
+def episode_starts(
+    distribution: ResetDistribution, sequence: np.ndarray, repetition: np.ndarray, seed: int
+) -> Reset:
     """Return one start for each world. Each has random numbers of its own, whatever the engine and number of worlds."""
     parts = []
     for s, r in zip(sequence.tolist(), repetition.tolist(), strict=True):
@@ -202,7 +217,9 @@ def episode_starts(distribution: ResetDistribution, sequence: np.ndarray, repeti
     return Reset.cat(parts)
 
 
-def episode_of(result: EpisodeMetrics, world: int, bank: ResetBank, sequence: int, repetition: int) -> Episode:
+def episode_of(
+    result: EpisodeMetrics, world: int, bank: ResetBank, sequence: int, repetition: int
+) -> Episode:
     """Return the result of one world, which has played a start of a demonstration."""
     values: dict[str, Any] = {}
     for field in fields(Episode):

@@ -76,10 +76,16 @@ def select(
             file = files[path.name] = Path(scratch) / f"{path.stem}.onnx"
             export_checkpoint(folder, path, file)
             policy = load_policy(file, robot=setting.robot)
-            trial = load_trial(policy, demos, objects=meshes, seed=setting.seed, num_envs=setting.num_envs)
+            trial = load_trial(
+                policy, demos, objects=meshes, seed=setting.seed, num_envs=setting.num_envs
+            )
             scores: dict[str, float] = {}
             bar = best.worst if best else -1.0
-            order = engines if best is None else sorted(engines, key=lambda e, b=best: b.task_progress[e.name])
+            order = (
+                engines
+                if best is None
+                else sorted(engines, key=lambda e, b=best: b.task_progress[e.name])
+            )
             for engine in order:
                 rollouts = roll_out(policy.start(None), engine, trial, repetitions=episodes)
                 scores[engine.name] = float(np.mean([e.task_progress for e in rollouts.episodes]))

@@ -100,9 +100,14 @@ class Property:
         if self.unit == "ms":
             value /= 1000 * task.timestep * task.substeps  # the task counts control steps
         try:
-            return replace(task, randomization=replace(task.randomization, **{self.changed_field: (value, value)}))
+            return replace(
+                task,
+                randomization=replace(task.randomization, **{self.changed_field: (value, value)}),
+            )
         except ValueError as error:
-            raise XResetError(f"{self.option} {amount(self.unit, value)} cannot be tried: {error}.") from None
+            raise XResetError(
+                f"{self.option} {amount(self.unit, value)} cannot be tried: {error}."
+            ) from None
 
 
 def amount(unit: str, value: float) -> str:
@@ -156,9 +161,13 @@ def _values(text: str, values: str, prop: Property) -> tuple[float, ...]:
     try:
         numbers = sorted({float(v) for v in values.split(",")} - {prop.nominal})
     except ValueError:
-        raise XResetError(f"{text!r} holds values that are no numbers. Write {prop.option}=VALUE,VALUE...") from None
+        raise XResetError(
+            f"{text!r} holds values that are no numbers. Write {prop.option}=VALUE,VALUE..."
+        ) from None
     if not numbers or not all(0 <= v < math.inf for v in numbers):
-        raise XResetError(f"{text!r}: expected finite values of at least 0, other than the nominal {prop.nominal:g}.")
+        raise XResetError(
+            f"{text!r}: expected finite values of at least 0, other than the nominal {prop.nominal:g}."
+        )
     return tuple(numbers)
 
 
@@ -167,6 +176,10 @@ def nominal_task(task: TaskConfig) -> TaskConfig:
     r = task.randomization
     middle = sum(r.friction) / 2
     still = RandomizationConfig(
-        friction=(middle, middle), mass_scale=(1.0, 1.0), elastomer=r.elastomer, metal=r.metal, table=r.table
+        friction=(middle, middle),
+        mass_scale=(1.0, 1.0),
+        elastomer=r.elastomer,
+        metal=r.metal,
+        table=r.table,
     )
     return replace(task, randomization=still)

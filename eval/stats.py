@@ -71,7 +71,11 @@ def crossed_bootstrap_ci95(
     if (counts == 0).any():
         raise ValueError("every training needs episodes of every demonstration")
     rng = np.random.default_rng(seed)
-    run_times, group_times = (rng.multinomial(n, np.full(n, 1 / n), size=draws) for n in counts.shape)
-    means = ((run_times @ sums) * group_times).sum(axis=1) / ((run_times @ counts) * group_times).sum(axis=1)
+    run_times, group_times = (
+        rng.multinomial(n, np.full(n, 1 / n), size=draws) for n in counts.shape
+    )
+    means = ((run_times @ sums) * group_times).sum(axis=1) / (
+        (run_times @ counts) * group_times
+    ).sum(axis=1)
     low, high = np.percentile(means, [2.5, 97.5])
     return float(low), float(high)

@@ -129,7 +129,9 @@ def stress(
     if not trial.task.vision.cameras:
         sweeps = [prop for prop in sweeps if not prop.of_cameras]
         if not sweeps:
-            raise XResetError(f"The policy {policy.name!r} has no cameras to change. Choose other properties.")
+            raise XResetError(
+                f"The policy {policy.name!r} has no cameras to change. Choose other properties."
+            )
     task = nominal_task(trial.task)
     for prop in sweeps:
         for value in prop.values:
@@ -138,9 +140,13 @@ def stress(
     found = []
     for engine in engines:
 
-        def play(prop: Property | None, value: float, engine: Engine = engine) -> tuple[Episode, ...]:
+        def play(
+            prop: Property | None, value: float, engine: Engine = engine
+        ) -> tuple[Episode, ...]:
             changed = replace(trial, task=task if prop is None else prop.set_in(task, value))
-            return roll_out(policy.start(trial.motion), engine, changed, repetitions=repetitions).episodes
+            return roll_out(
+                policy.start(trial.motion), engine, changed, repetitions=repetitions
+            ).episodes
 
         found.append(sweep(Stress, policy, trial, engine, sweeps, play, out, progress))
     return found
@@ -211,11 +217,18 @@ def read_stress(folder: Path, policy: str | None = None) -> tuple[Stress, ...]:
     Raises:
         FileFormatError: a file is damaged, or of another version.
     """
-    found = [from_dict(Stress, read_json(path, SCHEMA), str(path)) for path in sorted(folder.glob("*.json"))]
-    return tuple(card for card in found if policy is None or card.inputs.get("policy", policy) == policy)
+    found = [
+        from_dict(Stress, read_json(path, SCHEMA), str(path))
+        for path in sorted(folder.glob("*.json"))
+    ]
+    return tuple(
+        card for card in found if policy is None or card.inputs.get("policy", policy) == policy
+    )
 
 
-def curve(prop: Property, nominal: Sequence[Episode], swept: dict[float, Sequence[Episode]]) -> Curve:
+def curve(
+    prop: Property, nominal: Sequence[Episode], swept: dict[float, Sequence[Episode]]
+) -> Curve:
     """Compare the episodes of each value with the nominal ones."""
     every = {prop.nominal: nominal} | swept
     points = []
@@ -277,7 +290,9 @@ def draw_curves(figure: Figure, found: Sequence[Stress]) -> None:
         ax.set_title(name)
         ax.set_ylim(0, 100)
         for card, each, color in zip(found, curves[name], COLORS, strict=False):
-            ax.axhline(100 * (card.task_progress - COSTLY), color=color, linewidth=0.7, linestyle="--")
+            ax.axhline(
+                100 * (card.task_progress - COSTLY), color=color, linewidth=0.7, linestyle="--"
+            )
             if each is not None:
                 _draw(ax, card, each, color)
     axes[0, 0].legend(loc="lower left", fontsize=8)

@@ -151,12 +151,20 @@ def results_table(summaries: Sequence[EvalResult]) -> Table:
     first = summaries[0]
     title = f"{first.policy} on {first.robot}\n"
     title += f"{first.episodes} episodes of {len(first.per_demo)} demonstrations, seed {first.seed}"
-    table = Table("", title=title, title_justify="left", caption=caption([first.policy]), caption_justify="left")
+    table = Table(
+        "",
+        title=title,
+        title_justify="left",
+        caption=caption([first.policy]),
+        caption_justify="left",
+    )
     table.columns[0].no_wrap = True
     for s in summaries:
         table.add_column(s.backend, justify="right", no_wrap=True)
     for row in result_rows(summaries):
-        table.add_row(*row, style="bold" if row[0] in ("task progress", "published success") else None)
+        table.add_row(
+            *row, style="bold" if row[0] in ("task progress", "published success") else None
+        )
     return table
 
 

@@ -63,9 +63,17 @@ def engine(name: str, *, device: str = "cpu", **options: Any) -> Engine:
     used = device_for(name, device)
 
     def make(scene: SceneSpec, num_worlds: int, object_index: Tensor) -> Backend:
-        return make_backend(name, scene, num_worlds, object_index=object_index, device=used, **options)
+        return make_backend(
+            name, scene, num_worlds, object_index=object_index, device=used, **options
+        )
 
-    return Engine(name=name, make=make, version=version, device=used, slow=name in SLOW_ON_CPU and used == "cpu")
+    return Engine(
+        name=name,
+        make=make,
+        version=version,
+        device=used,
+        slow=name in SLOW_ON_CPU and used == "cpu",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +118,9 @@ class Trial:
         return ResetDistribution(self.bank, self.robot, self.names, self.task.reset, device, pivots)
 
     @contextmanager
-    def worlds(self, engine: Engine, object_index: Tensor) -> Iterator[tuple[ManipulationEnv, MetricPoints]]:
+    def worlds(
+        self, engine: Engine, object_index: Tensor
+    ) -> Iterator[tuple[ManipulationEnv, MetricPoints]]:
         """Open an environment in an engine.
 
         Args:
@@ -122,7 +132,12 @@ class Trial:
         """
         with engine.make(self.scene, len(object_index), object_index) as backend:
             env = ManipulationEnv(backend, self.task, self.starts(backend.device), seed=self.seed)
-            yield env, MetricPoints.of(self.objects, self.task.object_frame).to(backend.device)[backend.object_index]
+            yield (
+                env,
+                MetricPoints.of(self.objects, self.task.object_frame).to(backend.device)[
+                    backend.object_index
+                ],
+            )
 
 
 def load_trial(
@@ -147,7 +162,9 @@ def load_trial(
             engine, so that all engines play the same starts. Default: the recorded poses, as in the paper.
     """
     folder = policy.meshes(objects)
-    inputs = load_inputs(source, robot=policy.robot, objects=folder, accept=("demos", "motion", "goals"))
+    inputs = load_inputs(
+        source, robot=policy.robot, objects=folder, accept=("demos", "motion", "goals")
+    )
     hashes = {} if policy.hash is None else {"policy": policy.hash}
     if inputs.hash is not None:
         is_bank = isinstance(inputs.data, ResetBank) and not isinstance(inputs.data, GoalSet)

@@ -15,13 +15,17 @@ def main(out: Path) -> None:
     robot = xreset.load_robot("ur7e-sharpa")
     write_png(out / "robot.png", robot_picture(robot))
 
-    can = xreset.load_object("soup")  # a built-in stand-in; a folder of meshes is the second argument
+    can = xreset.load_object(
+        "soup"
+    )  # a built-in stand-in; a folder of meshes is the second argument
     demos = xreset.synthesize([can.name], 2, seed=0)  # or xreset.read_demos("demos.npz")
     xreset.write_demos(out / "demos.npz", demos)
     view = load_view(out / "demos.npz", demos=None, robot=None, objects=None)
     write_png(out / "demos.png", Drawer(view, smooth=True).draw(row=60))
 
-    print(f"{robot.name}: {len(robot.joints)} joints, fingertips {', '.join(robot.fingertip_names)}")
+    print(
+        f"{robot.name}: {len(robot.joints)} joints, fingertips {', '.join(robot.fingertip_names)}"
+    )
     print(
         f"{can.name}: {can.mass:.2f} kg, {len(can.pieces)} convex pieces; {len(demos)} demonstrations, {demos.num_frames} frames"
     )

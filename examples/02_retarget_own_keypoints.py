@@ -15,7 +15,10 @@ def record(file: Path) -> None:
     seen = hand.hand_valid
     np.savez(
         file,
-        keypoints=1e3 * hand.hand_keypoints[seen],  # [F, 21, 3] wrist, then each finger from base to tip, thumb first
+        keypoints=1e3
+        * hand.hand_keypoints[
+            seen
+        ],  # [F, 21, 3] wrist, then each finger from base to tip, thumb first
         object_pos=1e3 * hand.object_pos[seen],  # [F, 3]
         object_quat_xyzw=np.roll(hand.object_quat_wxyz[seen], -1, axis=1),  # [F, 4]
     )
@@ -38,7 +41,9 @@ def main(out: Path) -> None:
     motion = xreset.retarget_demos(demos, robot, [can])
     bank = xreset.make_bank(motion, robot, [can], num_envs=8)
     xreset.write_bank(out / "bank.npz", bank, config={}, inputs={})
-    print(f"{int(motion.valid.sum())} of {demos.num_frames} frames can be reached, {bank.num_states} states are stable")
+    print(
+        f"{int(motion.valid.sum())} of {demos.num_frames} frames can be reached, {bank.num_states} states are stable"
+    )
 
 
 if __name__ == "__main__":

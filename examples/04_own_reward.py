@@ -17,9 +17,13 @@ from xreset.task.rewards import RewardInput
 
 def upright(x: RewardInput) -> Tensor:
     """[N] cosine of the angle between the object's z axis and the vertical, while it is more than 5 cm above its start."""
-    axis = quat_rotate(x.object_quat, x.object_pos.new_tensor([0.0, 0.0, 1.0]).expand_as(x.object_pos))
+    axis = quat_rotate(
+        x.object_quat, x.object_pos.new_tensor([0.0, 0.0, 1.0]).expand_as(x.object_pos)
+    )
     lifted = x.object_pos[:, 2] - x.start_pos[:, 2] > 0.05
-    return axis[:, 2] * lifted  # no `if` on what a tensor holds: a GPU replays this as part of a graph
+    return (
+        axis[:, 2] * lifted
+    )  # no `if` on what a tensor holds: a GPU replays this as part of a graph
 
 
 def main(bank: Path) -> None:
@@ -29,7 +33,12 @@ def main(bank: Path) -> None:
     term = f"{Path(__file__).stem}:upright"  # module:function
     task = TaskConfig(reward=RewardConfig(own={term: 0.5}))
     with xreset.make_env(robot, objects, states, task, num_envs=16) as env:
-        paid = torch.stack([env.step(torch.zeros(16, env.num_actions))[3]["log"][f"reward/{term}"] for _ in range(10)])
+        paid = torch.stack(
+            [
+                env.step(torch.zeros(16, env.num_actions))[3]["log"][f"reward/{term}"]
+                for _ in range(10)
+            ]
+        )
     print(f"{term} pays {paid.mean():.3f} per step and world, at most 0.5")
 
 

@@ -25,7 +25,10 @@ class KinematicWorld(World):
         self._state["joint_target"] = np.array(targets)
 
     def step(self, n):
-        self._state |= {"joint_pos": self._state["joint_target"], "joint_vel": np.zeros(len(self._robot.joints))}
+        self._state |= {
+            "joint_pos": self._state["joint_target"],
+            "joint_vel": np.zeros(len(self._robot.joints)),
+        }
 
     def links(self):
         q, velocity, links = (

@@ -25,7 +25,9 @@ def main(out: Path, engines: tuple[str, ...] = ("mujoco", "sapien")) -> None:
         axes.bar(places, means, width=0.38, label=f"{result.backend} {result.backend_version}")
         progress = f"task progress {result.task_progress.mean:.0%} in {result.episodes} episodes"
         print(f"{result.policy} in {result.backend}: {progress}")
-    axes.set_xticks([i + 0.2 for i in range(len(parts))], [part.replace("_", "\n") for part in parts])
+    axes.set_xticks(
+        [i + 0.2 for i in range(len(parts))], [part.replace("_", "\n") for part in parts]
+    )
     axes.set(ylim=(0, 1), ylabel="share")
     axes.legend(loc="lower left")
     figure.savefig(out / "progress.png", dpi=150)

@@ -26,13 +26,18 @@ def main(demos: Path, policy: Path | None = None) -> None:
         print(
             f"{group}: {', '.join(f'{name} {width}' for name, width in contract['observation_layout'][group].items())}"
         )
-    print(f"one action for each of {len(contract['joint_names'])} joints, every {contract['control_dt'] * 1e3:.1f} ms")
+    print(
+        f"one action for each of {len(contract['joint_names'])} joints, every {contract['control_dt'] * 1e3:.1f} ms"
+    )
 
     robot = xreset.load_robot(contract["robot"])
     task = evaluation_task(from_dict(TaskConfig, contract["task"]))
     inputs = load_inputs(demos, robot=robot)
     with xreset.make_env(robot, inputs.objects, inputs.bank, task, num_envs=1) as env:
-        lstm = [np.zeros((1, env.num_envs, given.shape[2]), np.float32) for given in session.get_inputs()[2:]]
+        lstm = [
+            np.zeros((1, env.num_envs, given.shape[2]), np.float32)
+            for given in session.get_inputs()[2:]
+        ]
         for _ in range(env.max_episode_length - 1):
             seen = {name: value.numpy() for name, value in env.get_observations().items()}
             flat = np.concatenate((seen["policy"], seen["proprio"]), axis=1)
@@ -44,4 +49,7 @@ def main(demos: Path, policy: Path | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "demos.npz"), Path(sys.argv[2]) if len(sys.argv) > 2 else None)
+    main(
+        Path(sys.argv[1] if len(sys.argv) > 1 else "demos.npz"),
+        Path(sys.argv[2]) if len(sys.argv) > 2 else None,
+    )

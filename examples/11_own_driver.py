@@ -57,7 +57,9 @@ def main(folder: Path, recording: Path, episode: int = 0) -> None:
     robot = ReplayedRobot()
     controller = runtime.load_controller(folder)
     name = robot.object_name
-    controller.begin(controller.points(name), *robot.goal, robot.frames["joint_pos"][0], controller.center(name))
+    controller.begin(
+        controller.points(name), *robot.goal, robot.frames["joint_pos"][0], controller.center(name)
+    )
     outcome = runtime.Runner(controller, robot).run(float(robot.frames["time"][-1]))
     print(f"{outcome.steps} steps; stopped because: {outcome.reason or 'the recording is over'}")
     print(f"targets differ from the recorded ones by {np.mean(robot.errors):.3f} rad")

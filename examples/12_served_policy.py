@@ -29,7 +29,14 @@ def main(url: str = "ws://127.0.0.1:8765", steps: int = 300) -> None:
         home = [joint["home"] for joint in contract["joints"]]
         upright = [1.0, 0.0, 0.0, 0.0]  # w, x, y, z
         name = next(iter(contract["objects"]))
-        ask(begin={"object": name, "goal_pos": [0.5, 0.3, 0.2], "goal_quat": upright, "target": home})
+        ask(
+            begin={
+                "object": name,
+                "goal_pos": [0.5, 0.3, 0.2],
+                "goal_quat": upright,
+                "target": home,
+            }
+        )
         reading = {
             "joint_pos": home,
             "joint_vel": [0.0] * len(home),

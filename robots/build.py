@@ -52,7 +52,10 @@ def robot_tree(figures: Figures) -> RobotTree:
     palm = figures["palm"]
     mimics = {mimic["joint"]: MimicSpec(**mimic) for mimic in figures.get("mimics", [])}
     links = [_link(part) for part in (base, *figures["arm"], palm)]
-    joints = [_joint(part, before.name, mimics) for part, before in zip(figures["arm"], links, strict=False)]
+    joints = [
+        _joint(part, before.name, mimics)
+        for part, before in zip(figures["arm"], links, strict=False)
+    ]
     joints.append(fixed(links[-2].name, palm["name"], _pose(palm)))
     for part in figures["hand"]:
         links.append(_link(part, figures.get("rotor", 0.0)))
@@ -60,7 +63,9 @@ def robot_tree(figures: Figures) -> RobotTree:
     for name, (link, position, x, z) in figures["frames"].items():
         links.append(frame(name))
         joints.append(fixed(link, name, pose(position) @ axes(x=x, z=z)))
-    return RobotTree(name=figures["name"], root=base["name"], links=tuple(links), joints=tuple(joints))
+    return RobotTree(
+        name=figures["name"], root=base["name"], links=tuple(links), joints=tuple(joints)
+    )
 
 
 def robot_urdf(folder: str) -> str:

@@ -24,9 +24,7 @@ _FLAGS = (
     "--enable-unsafe-swiftshader",  # WebGL without a GPU
     "--remote-debugging-port=0", "--window-size=640,600",
 )  # fmt: skip
-INPUT = (
-    "document.getElementById([...document.querySelectorAll('label')].find(e => e.textContent === '{label}').htmlFor)"
-)
+INPUT = "document.getElementById([...document.querySelectorAll('label')].find(e => e.textContent === '{label}').htmlFor)"
 """Control of a page of viser, by its label."""
 _BUTTON = "[...document.querySelectorAll('button')].find(e => e.textContent === '{label}')"
 _OPTION = "[...document.querySelectorAll('[role=option]')].find(e => e.textContent === '{label}' && e.offsetParent)"
@@ -50,14 +48,20 @@ class Browser:
         from websockets.sync.client import connect
 
         self.problems: list[str] = []
-        self._profile = tempfile.TemporaryDirectory(prefix="xreset-chromium-", ignore_cleanup_errors=True)
+        self._profile = tempfile.TemporaryDirectory(
+            prefix="xreset-chromium-", ignore_cleanup_errors=True
+        )
         self._process = subprocess.Popen(
             [program, *_FLAGS, f"--user-data-dir={self._profile.name}", "about:blank"],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
         port_file = Path(self._profile.name) / "DevToolsActivePort"
-        wait_until(lambda: port_file.is_file() and "\n" in port_file.read_text(), "Chromium to start", seconds=60)
+        wait_until(
+            lambda: port_file.is_file() and "\n" in port_file.read_text(),
+            "Chromium to start",
+            seconds=60,
+        )
         port = port_file.read_text().split()[0]
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=20) as answer:
             tab = next(target for target in json.load(answer) if target["type"] == "page")
@@ -93,7 +97,9 @@ class Browser:
             self.problems.append(json.dumps(params["exceptionDetails"])[:500])
         elif event == "Runtime.consoleAPICalled" and params["type"] in ("error", "assert"):
             self.problems.append(
-                " ".join(str(arg.get("value", arg.get("description"))) for arg in params["args"])[:500]
+                " ".join(str(arg.get("value", arg.get("description"))) for arg in params["args"])[
+                    :500
+                ]
             )
         elif event == "Log.entryAdded" and params["entry"]["level"] == "error":
             self.problems.append(f"{params['entry']['text']} ({params['entry'].get('url')})")
@@ -102,7 +108,9 @@ class Browser:
         self.send("Page.navigate", url=url)
 
     def evaluate(self, expression: str) -> Any:
-        result = self.send("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        result = self.send(
+            "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
+        )
         if "exceptionDetails" in result:
             raise AssertionError(f"{expression}: {result['exceptionDetails']}")
         return result["result"].get("value")
@@ -110,7 +118,13 @@ class Browser:
     def key(self, name: str) -> None:
         """Press a key where the focus is."""
         for kind in ("rawKeyDown", "keyUp"):
-            self.send("Input.dispatchKeyEvent", type=kind, key=name, code=name, windowsVirtualKeyCode=_KEYS[name])
+            self.send(
+                "Input.dispatchKeyEvent",
+                type=kind,
+                key=name,
+                code=name,
+                windowsVirtualKeyCode=_KEYS[name],
+            )
 
     def click(self, element: str) -> None:
         """Click the middle of a JavaScript expression's element, once it stays where it is and nothing covers it."""
@@ -130,7 +144,15 @@ class Browser:
 
         x, y, _ = wait_until(still, f"{element} to stay where it is")
         for kind in ("mousePressed", "mouseReleased"):
-            self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
+            self.send(
+                "Input.dispatchMouseEvent",
+                type=kind,
+                x=x,
+                y=y,
+                button="left",
+                buttons=1,
+                clickCount=1,
+            )
 
     def press(self, button: str) -> None:
         """Click a button of viser."""
@@ -153,13 +175,21 @@ class Browser:
         self.send("Input.dispatchMouseEvent", type="mousePressed", x=start[0], y=start[1], **mouse)
         for i in range(1, steps + 1):
             x, y = (a + (b - a) * i / steps for a, b in zip(start, end, strict=True))
-            self.send("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y, button="left", buttons=1)
+            self.send(
+                "Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y, button="left", buttons=1
+            )
             time.sleep(0.2)
         self.send("Input.dispatchMouseEvent", type="mouseReleased", x=end[0], y=end[1], **mouse)
 
     def resize(self, width: int, height: int, *, phone: bool = False) -> None:
         """Give the page a size [pixels]."""
-        self.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=phone)
+        self.send(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=phone,
+        )
 
     def screenshot(self) -> bytes:
         """The page as PNG."""

@@ -14,14 +14,18 @@ from xreset.cli import main
 
 DEFAULT = Path(__file__).resolve().parents[2] / "shared" / "data"
 
-PYBULLET = unittest.skipUnless(find_spec("pybullet"), "PyBullet is not installed: it has wheels for Python 3.11 only")
+PYBULLET = unittest.skipUnless(
+    find_spec("pybullet"), "PyBullet is not installed: it has wheels for Python 3.11 only"
+)
 
 
 def data_dir() -> Path:
     """The folder of real data: ``XRESET_DATA``, or its place next to a development checkout; skips without it."""
     folder = Path(os.environ.get("XRESET_DATA", DEFAULT))
     if not folder.is_dir():
-        raise unittest.SkipTest(f"no real data at {folder}; set XRESET_DATA to the folder with the DexYCB archives")
+        raise unittest.SkipTest(
+            f"no real data at {folder}; set XRESET_DATA to the folder with the DexYCB archives"
+        )
     return folder
 
 

@@ -38,7 +38,9 @@ class EngineChecks:
     one_step: ClassVar[AbstractContextManager] = nullcontext()
     """Makes the engine take a single step per physics step, so that momentum can be balanced."""
 
-    def make(self: unittest.TestCase, what: SceneSpec, num_worlds: int = 1, **options) -> PoolBackend:
+    def make(
+        self: unittest.TestCase, what: SceneSpec, num_worlds: int = 1, **options
+    ) -> PoolBackend:
         backend = self.backend_class(what, num_worlds, workers=0, **options)  # pyright: ignore
         self.addCleanup(backend.close)
         return backend
@@ -65,14 +67,18 @@ class EngineChecks:
         n = int(0.5 * 2.0 * inertia / 0.005 * 240)  # half of the steps until it stops
         self.assertGreater(n, 5)
         backend.step(n)
-        self.assertAlmostEqual(float(backend.state().joint_vel[0, bend]), 2.0 - 0.005 / inertia * n / 240, delta=0.2)
+        self.assertAlmostEqual(
+            float(backend.state().joint_vel[0, bend]), 2.0 - 0.005 / inertia * n / 240, delta=0.2
+        )
         backend.step(n + 12)
         rest = float(backend.state().joint_pos[0, bend])
         backend.step(24)
         self.assertAlmostEqual(float(backend.state().joint_pos[0, bend]), rest, delta=2e-4)
 
     def test_dry_friction_holds_against_a_weak_drive_only(self):
-        backend = self.make(scene(with_drive(gripper(), "finger_b_bend", kp=1.0, kd=0.05, friction_loss=0.05)))
+        backend = self.make(
+            scene(with_drive(gripper(), "finger_b_bend", kp=1.0, kd=0.05, friction_loss=0.05))
+        )
         bend = JOINT["finger_b_bend"]
         start = backend.state().clone()
         for offset, moves in ((0.04, False), (0.2, True)):
@@ -90,7 +96,11 @@ class EngineChecks:
         state = backend.state()
         lag = float(state.joint_pos[0, jaw] - state.joint_target[0, jaw])
         drive = gripper().joints[jaw].drive.kp * lag
-        along = Kinematics(gripper()).link_poses(state.joint_pos[0].double(), ["wrist"])[0, :3, 0].float()
+        along = (
+            Kinematics(gripper())
+            .link_poses(state.joint_pos[0].double(), ["wrist"])[0, :3, 0]
+            .float()
+        )
         force = (backend.contacts().tip_force[0] @ along).abs()
         # Both forces are equal, because the brick does not move: F + 1.1 F = drive.
         torch.testing.assert_close(force, torch.full((2,), drive / 2.1), rtol=0.03, atol=0.0)
@@ -106,7 +116,9 @@ class EngineChecks:
 
         def com_velocity() -> np.ndarray:
             state = backend.state()
-            arm = Rotation.from_quat(state.object_quat[0].numpy(), scalar_first=True).apply(brick.com)
+            arm = Rotation.from_quat(state.object_quat[0].numpy(), scalar_first=True).apply(
+                brick.com
+            )
             return state.object_linvel[0].numpy() + np.cross(state.object_angvel[0].numpy(), arm)
 
         errors = []
@@ -116,7 +128,11 @@ class EngineChecks:
             backend.set_joint_targets(targets)
             before = com_velocity()
             backend.step(1)
-            needed = brick.mass * ((com_velocity() - before) * 240 + [0, 0, GRAVITY]) - [0.5, 0.3, 0.2]
+            needed = brick.mass * ((com_velocity() - before) * 240 + [0, 0, GRAVITY]) - [
+                0.5,
+                0.3,
+                0.2,
+            ]
             forces = backend.contacts().tip_force[0]
             errors.append(np.abs(forces.sum(0).numpy() - needed).max())
             presses.append(float(forces[0].norm()))
@@ -131,7 +147,9 @@ class EngineChecks:
             state.object_pos[:] = torch.tensor([0.9, 0.5, 0.05])
             state.joint_pos[:, jaw] = 0.05
             state.joint_target[:, jaw] = 0.005
-            state.joint_target[:, JOINT["finger_b_bend"]] = torch.tensor([0.6, -0.6])  # to the other jaw, and away
+            state.joint_target[:, JOINT["finger_b_bend"]] = torch.tensor(
+                [0.6, -0.6]
+            )  # to the other jaw, and away
             backend.set_state(state)
             backend.step(240)
             free, other = backend.state().joint_pos[:, jaw].sort().values.tolist()
@@ -144,7 +162,9 @@ class EngineChecks:
     def test_links_collide_with_the_table_unless_excluded(self):
         lowest = []
         for excluded in (("base",), ("base", "jaw_a", "pad_b", "wrist", "column")):
-            backend = self.make(scene(replace(gripper(), table_exclude=excluded, base_pos=(0.57, 0.05, -0.05))))
+            backend = self.make(
+                scene(replace(gripper(), table_exclude=excluded, base_pos=(0.57, 0.05, -0.05)))
+            )
             state = backend.state().clone()
             state.object_pos[0] = torch.tensor([0.9, 0.6, 0.05])
             heights = []

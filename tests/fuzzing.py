@@ -77,7 +77,13 @@ def readers() -> Iterator[dict[str, Reader]]:
     from xreset.eval.engines.page import page
     from xreset.eval.engines.page import read as read_page
     from xreset.eval.report.read import read_curves, run_facts
-    from xreset.eval.results import read_episodes, read_evaluation, read_result, read_traces, write_results
+    from xreset.eval.results import (
+        read_episodes,
+        read_evaluation,
+        read_result,
+        read_traces,
+        write_results,
+    )
     from xreset.eval.study.file import SHIPPED, read_study
     from xreset.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
     from xreset.learning.clock import Lift, read_lift, write_lift
@@ -90,20 +96,32 @@ def readers() -> Iterator[dict[str, Reader]]:
     from xreset.spec import SceneSpec
     from xreset.task.config import ObservationConfig, TaskConfig
 
-    logging.disable(logging.WARNING)  # what is left aside of a file is said; here it would be said ten thousand times
+    logging.disable(
+        logging.WARNING
+    )  # what is left aside of a file is said; here it would be said ten thousand times
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         robot = toy_hand_arm(folder)
         openarm = load_robot("openarm")
         found: dict[str, Reader] = {}
 
-        def add(what: str, file: str, read: Callable[[Path], Any], kind: str, may_hold: tuple[str, ...] = ()) -> Path:
+        def add(
+            what: str,
+            file: str,
+            read: Callable[[Path], Any],
+            kind: str,
+            may_hold: tuple[str, ...] = (),
+        ) -> Path:
             found[what] = Reader(folder / file, read, kind, may_hold)
             return folder / file
 
-        path = add("demonstrations", "demos.npz", read_demos, "npz", ("hand_keypoints", "wrist_quat_wxyz"))
+        path = add(
+            "demonstrations", "demos.npz", read_demos, "npz", ("hand_keypoints", "wrist_quat_wxyz")
+        )
         write_demos(path, toy_demos())
-        path = add("retargeted", "retargeted.npz", read_retargeted, "npz", ("hand_error", "wrist_error"))
+        path = add(
+            "retargeted", "retargeted.npz", read_retargeted, "npz", ("hand_error", "wrist_error")
+        )
         write_retargeted(path, toy_retargeted(openarm), config={}, inputs={})
         path = add("reset bank", "bank.npz", lambda p: read_bank(p, robot=robot), "npz")
         write_bank(path, toy_bank(robot), config={"steps": 8}, inputs={"retargeted": "ab"})
@@ -111,7 +129,9 @@ def readers() -> Iterator[dict[str, Reader]]:
         soup = load_object("soup")
         home = torch.as_tensor(openarm.home, dtype=torch.float32)[None]
         start = State.at_rest(home, torch.tensor([[0.5, 0.3, 0.1]]), torch.tensor([[1.0, 0, 0, 0]]))
-        path = add("actions", "actions.npz", lambda p: read_actions(p, openarm, lambda _: soup), "npz")
+        path = add(
+            "actions", "actions.npz", lambda p: read_actions(p, openarm, lambda _: soup), "npz"
+        )
         write_actions(
             path,
             Actions(
@@ -127,9 +147,17 @@ def readers() -> Iterator[dict[str, Reader]]:
         add("result", "mujoco.json", read_result, "json")
         add("episodes", "mujoco.episodes.json", lambda p: read_episodes(p.parent, "mujoco"), "json")
         may = ("joint_pos", "object_pos", "object_quat", "joint_target")
-        add("trace", "mujoco.trace.npz", lambda p: read_traces(p.parent, "mujoco", ("a", "b", "c")), "npz", may)
+        add(
+            "trace",
+            "mujoco.trace.npz",
+            lambda p: read_traces(p.parent, "mujoco", ("a", "b", "c")),
+            "npz",
+            may,
+        )
 
-        contract = policy_contract(robot, TaskConfig(observation=ObservationConfig(cloud_points=16)), (SOUP,))
+        contract = policy_contract(
+            robot, TaskConfig(observation=ObservationConfig(cloud_points=16)), (SOUP,)
+        )
         info = RunInfo(
             robot="toy", resets="b.npz", resets_hash="ab", objects=None, backend="mujoco", backend_version="4", device="cpu", num_envs=4,
             seed=3, config=TrainConfig(), contract=contract,
@@ -145,7 +173,13 @@ def readers() -> Iterator[dict[str, Reader]]:
             writer.add_scalar("episode/return", 0.1 * step, step)
         writer.close()
         (events,) = (folder / "curves").iterdir()
-        add("event file", f"curves/{events.name}", lambda p: read_curves(p.parent), "bytes", may_hold=("value",))
+        add(
+            "event file",
+            f"curves/{events.name}",
+            lambda p: read_curves(p.parent),
+            "bytes",
+            may_hold=("value",),
+        )
         add("study", "study.toml", read_study, "text", ("config",)).write_bytes(
             (SHIPPED / "first_grasp.toml").read_bytes()
         )
@@ -153,7 +187,9 @@ def readers() -> Iterator[dict[str, Reader]]:
         stored = json.loads((Path(__file__).with_name("engines") / "conformance.json").read_text())
         stored["runs"] = [run | {"checks": run["checks"][:4]} for run in stored["runs"][:2]]
         assert stored["schema"] == CONFORMANCE
-        write_json(add("conformance", "conformance.json", lambda p: page(read_page([p])), "json"), stored)
+        write_json(
+            add("conformance", "conformance.json", lambda p: page(read_page([p])), "json"), stored
+        )
 
         write_policy(add("policy", "policy.onnx", OnnxPolicy, "bytes"), contract)
         weights = {"weight": torch.ones(2, requires_grad=True)}
@@ -179,13 +215,17 @@ def readers() -> Iterator[dict[str, Reader]]:
         add("URDF, imported", "hand.urdf", lambda p: read_source(p, []), "text").write_text(HAND)
         sizes = '<size nkey="1" nuser_body="1"/><asset><texture name="t" type="2d" builtin="flat" width="8" height="8"/></asset>'
         with_sizes = MJCF.replace("<worldbody>", f"{sizes}<worldbody>")
-        add("MJCF, imported", "hand.xml", lambda p: read_source(p, []), "text").write_text(with_sizes)
+        add("MJCF, imported", "hand.xml", lambda p: read_source(p, []), "text").write_text(
+            with_sizes
+        )
 
         calibration = folder / "calibration" / "extrinsics_1" / "extrinsics.yml"
         calibration.parent.mkdir(parents=True)
         poses = {"apriltag": np.eye(4)[:3].ravel().tolist(), "837": np.eye(4)[:3].ravel().tolist()}
         calibration.write_text(yaml.safe_dump({"extrinsics": poses, "master": "837"}))
-        found["DexYCB calibration"] = Reader(calibration, lambda p: _read_extrinsics(folder, "1"), "yaml")
+        found["DexYCB calibration"] = Reader(
+            calibration, lambda p: _read_extrinsics(folder, "1"), "yaml"
+        )
         meta = {
             "extrinsics": "1",
             "mano_sides": ["right"],
@@ -241,7 +281,9 @@ def readers() -> Iterator[dict[str, Reader]]:
             kind = {"stl": "bytes", "glb": "bytes", "gltf": "json"}.get(suffix, "text")
             path = add(f"mesh .{suffix}", f"box.{suffix}", read_mesh, kind)
             box = trimesh.creation.box((0.1, 0.06, 0.04))
-            content = (trimesh.Scene(box) if suffix.startswith("gl") else box).export(file_type=suffix)
+            content = (trimesh.Scene(box) if suffix.startswith("gl") else box).export(
+                file_type=suffix
+            )
             if isinstance(content, dict):  # glTF: a text, and a file with the numbers
                 for name, part in content.items():
                     (folder / name).write_bytes(part)
@@ -249,17 +291,30 @@ def readers() -> Iterator[dict[str, Reader]]:
             path.write_bytes(content.encode() if isinstance(content, str) else content)
         (folder / "box.toml").write_text("mass = 0.1\ntolerance = 0.002\n")
         add("properties", "box.toml", lambda p: properties_of(p.with_suffix(".obj")), "text")
-        frame = {"handJoints3D": None, "objRot": np.zeros((3, 1)), "objTrans": np.zeros(3), "objName": SOUP}
+        frame = {
+            "handJoints3D": None,
+            "objRot": np.zeros((3, 1)),
+            "objTrans": np.zeros(3),
+            "objName": SOUP,
+        }
         path = add(
-            "pickle", "0000.pkl", lambda p: dict(zip(("joints", "pose"), _read_frame(p))), "bytes", ("joints", "pose")
+            "pickle",
+            "0000.pkl",
+            lambda p: dict(zip(("joints", "pose"), _read_frame(p))),
+            "bytes",
+            ("joints", "pose"),
         )
         path.write_bytes(pickle.dumps(frame, protocol=2))
 
         # several files that contradict each other
         others = toy_demos()
-        others = replace(others, sequence_name=np.array([f"other-{name}" for name in others.sequence_name]))
+        others = replace(
+            others, sequence_name=np.array([f"other-{name}" for name in others.sequence_name])
+        )
         may = ("hand_keypoints", "wrist_quat_wxyz", "hand_error", "wrist_error")
-        path = add("two archives", "more.npz", lambda p: merge_demos([read_demos(p), others]), "npz", may)
+        path = add(
+            "two archives", "more.npz", lambda p: merge_demos([read_demos(p), others]), "npz", may
+        )
         write_demos(path, toy_demos())
         path = add(
             "motion and archive",
@@ -271,7 +326,10 @@ def readers() -> Iterator[dict[str, Reader]]:
         write_retargeted(path, toy_retargeted(openarm), config={}, inputs={})
         (folder / "both").mkdir()
         write_results(folder / "both", toy_summary(rollouts=rollouts), rollouts, ("a", "b", "c"))
-        for what, file in (("result and episodes", "mujoco.json"), ("episodes and result", "mujoco.episodes.json")):
+        for what, file in (
+            ("result and episodes", "mujoco.json"),
+            ("episodes and result", "mujoco.episodes.json"),
+        ):
             add(what, f"both/{file}", lambda p: read_evaluation(p.parent) and None, "json")
 
         with_mesh = folder / "meshed" / "robot.urdf"
@@ -321,15 +379,25 @@ def unsound(content: Any, may_hold: tuple[str, ...], name: str = "content") -> s
     """The first number in what was read that is not finite, or the first quaternion that is not unit, by its name."""
     if is_dataclass(content) and not isinstance(content, type):
         parts = ((f.name, getattr(content, f.name)) for f in fields(content))
-        return next((p for n, part in parts if n not in may_hold and (p := unsound(part, may_hold, n))), None)
+        return next(
+            (p for n, part in parts if n not in may_hold and (p := unsound(part, may_hold, n))),
+            None,
+        )
     if isinstance(content, dict):
         return next(
-            (p for n, part in content.items() if n not in may_hold and (p := unsound(part, may_hold, str(n)))), None
+            (
+                p
+                for n, part in content.items()
+                if n not in may_hold and (p := unsound(part, may_hold, str(n)))
+            ),
+            None,
         )
     if isinstance(content, tuple | list):
         return next((p for part in content if (p := unsound(part, may_hold, name))), None)
     array = (
-        np.asarray(content) if isinstance(content, np.ndarray | float) or type(content).__name__ == "Tensor" else None
+        np.asarray(content)
+        if isinstance(content, np.ndarray | float) or type(content).__name__ == "Tensor"
+        else None
     )
     if array is None or array.dtype.kind != "f":
         return None
@@ -397,7 +465,9 @@ def _bytes() -> st.SearchStrategy[Damage]:
     where = st.floats(0, 1, exclude_max=True)
     cut = where.map(lambda at: lambda whole: whole[: int(at * len(whole))])
     insert = st.tuples(where, st.binary(min_size=1, max_size=40)).map(
-        lambda x: lambda whole: whole[: int(x[0] * len(whole))] + x[1] + whole[int(x[0] * len(whole)) :]
+        lambda x: (
+            lambda whole: whole[: int(x[0] * len(whole))] + x[1] + whole[int(x[0] * len(whole)) :]
+        )
     )
     twice = where.map(lambda at: lambda whole: whole + whole[int(at * len(whole)) :])
     flips = st.lists(st.tuples(where, st.integers(0, 255)), min_size=1, max_size=8).map(flip)
@@ -441,7 +511,11 @@ def _words() -> st.SearchStrategy[Damage]:
         def damage(whole: bytes) -> bytes:
             lines = whole.splitlines(keepends=True)
             place = int(at * len(lines))
-            return b"".join([*lines[:place], lines[place] * 20_000, *lines[place + 1 :]]) if lines else whole
+            return (
+                b"".join([*lines[:place], lines[place] * 20_000, *lines[place + 1 :]])
+                if lines
+                else whole
+            )
 
         return damage
 
@@ -466,15 +540,22 @@ def _arrays() -> st.SearchStrategy[Damage]:
                             array.ravel()[int(place * array.size)] = number
                         else:
                             array.ravel()[int(place * array.size)] = (
-                                int(np.nan_to_num(number, posinf=2**31, neginf=-(2**31))) % 2**31 - 5
+                                int(np.nan_to_num(number, posinf=2**31, neginf=-(2**31))) % 2**31
+                                - 5
                             )
                     elif how == "all":
-                        array = np.full(array.shape, number) if array.dtype.kind == "f" else np.zeros_like(array)
+                        array = (
+                            np.full(array.shape, number)
+                            if array.dtype.kind == "f"
+                            else np.zeros_like(array)
+                        )
                     elif how == "type":
                         array = array.astype(kind)
                     elif how == "shape":
                         array = (
-                            array[..., None] if place < 0.3 else array.reshape(-1)[: max(0, int(place * array.size))]
+                            array[..., None]
+                            if place < 0.3
+                            else array.reshape(-1)[: max(0, int(place * array.size))]
                         )
                     elif how == "text":
                         array = np.full(array.shape, "\x1b[31m[/bold]")
@@ -496,7 +577,9 @@ def _arrays() -> st.SearchStrategy[Damage]:
 
         return damage
 
-    hows = st.sampled_from(("number", "number", "all", "type", "type", "shape", "text", "drop", "swap", "bomb", "grow"))
+    hows = st.sampled_from(
+        ("number", "number", "all", "type", "type", "shape", "text", "drop", "swap", "bomb", "grow")
+    )
     where = st.floats(0, 1, exclude_max=True)
     return st.builds(changed, where, hows, st.sampled_from(NUMBERS), st.sampled_from(TYPES), where)
 

@@ -69,7 +69,9 @@ def commands() -> dict[str, list[Action]]:
             if hasattr(module, "COMMANDS"):
                 add(path, module.COMMANDS)
                 continue
-            command: Any = module.command_for([]) if hasattr(module, "command_for") else module.COMMAND
+            command: Any = (
+                module.command_for([]) if hasattr(module, "command_for") else module.COMMAND
+            )
             verbs = command if isinstance(command, dict) else {"": command}
             for verb, function in verbs.items():
                 found[f"{path} {verb}".strip()] = tyro.extras.get_parser(checked(function))._actions
@@ -85,7 +87,9 @@ def draw(random: Random, options: dict[str, list[Action]]) -> list[str]:
     line = [*words.split(), *FIRST.get(words, [])]
     for action in options[words]:
         needed = action.required or not action.option_strings
-        if "--help" in action.option_strings or random.random() > (0.95 if needed else 3 / len(options[words])):
+        if "--help" in action.option_strings or random.random() > (
+            0.95 if needed else 3 / len(options[words])
+        ):
             continue
         if action.option_strings:
             line.append(random.choice(action.option_strings))
@@ -119,9 +123,17 @@ def outcome_of_command(line: list[str]) -> str:
         with chdir(work):
             code, message = _called(line)
         grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory) / 2**20
-        written = {path for path, content in _files(Path(name)).items() if before.get(path) != content}
-        outputs = [(work / value).resolve() for flag, value in pairwise(line) if flag.lstrip("-") in _WRITTEN]
-        stray = sorted(path for path in written if not any(path.is_relative_to(out) for out in outputs))
+        written = {
+            path for path, content in _files(Path(name)).items() if before.get(path) != content
+        }
+        outputs = [
+            (work / value).resolve()
+            for flag, value in pairwise(line)
+            if flag.lstrip("-") in _WRITTEN
+        ]
+        stray = sorted(
+            path for path in written if not any(path.is_relative_to(out) for out in outputs)
+        )
         is_device = (work / "null.npz").is_char_device()
     assert is_device, "it replaced a device"
     assert code in (0, 1, 2), f"exit status {code!r}"
@@ -153,7 +165,9 @@ def _called(line: list[str]) -> tuple[Any, str]:
     except SystemExit as end:
         code = end.code or 0
     except (Exception, TooSlow) as error:
-        raise AssertionError(f"{type(error).__name__}: {str(error)[:200]} {_place(error)}") from error
+        raise AssertionError(
+            f"{type(error).__name__}: {str(error)[:200]} {_place(error)}"
+        ) from error
     finally:
         signal.setitimer(signal.ITIMER_VIRTUAL, 0)
     streams[1].flush()
@@ -162,7 +176,11 @@ def _called(line: list[str]) -> tuple[Any, str]:
 
 def _files(folder: Path) -> dict[Path, bytes]:
     """Return the content of every file below a folder, without the home folder."""
-    paths = [path for path in folder.rglob("*") if path.is_file() and not path.is_relative_to(folder / "home")]
+    paths = [
+        path
+        for path in folder.rglob("*")
+        if path.is_file() and not path.is_relative_to(folder / "home")
+    ]
     return {path.resolve(): path.read_bytes() for path in paths}
 
 
@@ -171,5 +189,7 @@ def _too_slow(*_: object) -> None:
 
 
 def _place(error: BaseException) -> str:
-    own = [frame for frame in traceback.extract_tb(error.__traceback__) if "xreset" in frame.filename]
+    own = [
+        frame for frame in traceback.extract_tb(error.__traceback__) if "xreset" in frame.filename
+    ]
     return f"{Path(own[-1].filename).name}:{own[-1].lineno}" if own else ""

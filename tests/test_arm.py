@@ -31,7 +31,9 @@ except ImportError as error:
     raise unittest.SkipTest(str(error)) from error
 
 assert_close = torch.testing.assert_close
-CONFIG = PlaceConfig(x=(0.2, 0.7), y=(0.4, 0.8), z=(0.4, 0.7), frames=10, candidates=8, rounds=2, elite=1)
+CONFIG = PlaceConfig(
+    x=(0.2, 0.7), y=(0.4, 0.8), z=(0.4, 0.7), frames=10, candidates=8, rounds=2, elite=1
+)
 NOWHERE = np.zeros((0, 3))
 
 
@@ -41,7 +43,9 @@ def wrists_around_home(robot, count: int) -> ArmTargets:
     generator = torch.Generator().manual_seed(0)
     joints = torch.as_tensor(robot.home).repeat(count, 1, 1)
     spread = torch.randn(count, len(robot.arm_indices), generator=generator, dtype=joints.dtype)
-    joints[:, 0, model.arm] = (joints[:, 0, model.arm] + 0.15 * spread).clamp(model.lower, model.upper)
+    joints[:, 0, model.arm] = (joints[:, 0, model.arm] + 0.15 * spread).clamp(
+        model.lower, model.upper
+    )
     return arm_targets(model, joints)
 
 
@@ -62,16 +66,24 @@ class PlaceTest(unittest.TestCase):
         seen = []
         avoid = self.wrists.root_pos[:, 0].numpy()
         best, own = placing.place(
-            self.lost, [self.wrists], avoid, CONFIG, lambda done, reached: seen.append((done, reached))
+            self.lost,
+            [self.wrists],
+            avoid,
+            CONFIG,
+            lambda done, reached: seen.append((done, reached)),
         )
         self.assertEqual((own.robot, own.reached, own.followed), (self.lost, 0.0, 0.0))
         self.assertGreater(best.reached, 0.2)
         # Every path is one frame long here.
         self.assertAlmostEqual(best.followed, best.reached, delta=0.2)
         self.assertEqual(best.frames, 40)
-        self.assertGreaterEqual(np.linalg.norm(avoid - best.robot.base_pos, axis=1).min(), CONFIG.clear)
+        self.assertGreaterEqual(
+            np.linalg.norm(avoid - best.robot.base_pos, axis=1).min(), CONFIG.clear
+        )
         self.assertEqual(seen, sorted(seen))  # the best yet never gets worse
-        self.assertEqual(best.home_rule, "the joints as they were")  # home held the hand three metres up
+        self.assertEqual(
+            best.home_rule, "the joints as they were"
+        )  # home held the hand three metres up
         self.assertEqual(best.robot.joints, self.lost.joints)
 
     def test_a_placement_with_a_home_is_preferred(self):
@@ -92,7 +104,9 @@ class PlaceTest(unittest.TestCase):
         self.assertEqual(placing.reach(self.lost, self.wrists, least)[0], 1 - placing._FIRST / 40)
 
     def test_without_a_round_the_own_placement_is_measured(self):
-        found = placing.place(self.robot, [self.wrists], NOWHERE, dataclasses.replace(CONFIG, rounds=0))
+        found = placing.place(
+            self.robot, [self.wrists], NOWHERE, dataclasses.replace(CONFIG, rounds=0)
+        )
         self.assertEqual([finalist.robot for finalist in found], [self.robot])
 
     def test_home_holds_the_hand_where_it_did(self):
@@ -100,7 +114,8 @@ class PlaceTest(unittest.TestCase):
         placed, rule = placing._with_home(near, self.robot)
         self.assertEqual(rule, "the hand where it was")
         before, after = (
-            Kinematics(spec).link_poses(torch.tensor(spec.home), ["palm"]) for spec in (self.robot, placed)
+            Kinematics(spec).link_poses(torch.tensor(spec.home), ["palm"])
+            for spec in (self.robot, placed)
         )
         assert_close(after, before, atol=5e-3, rtol=0)
 
@@ -109,11 +124,16 @@ class PlaceTest(unittest.TestCase):
         with self.assertRaisesRegex(RobotError, "no frame to reach"):
             placing.place(self.robot, [none], NOWHERE, CONFIG)
         avoid = self.wrists.root_pos.numpy().reshape(-1, 3)
-        with self.assertRaisesRegex(RobotError, "no place in the searched ranges is 9 m away.*Lower --search.clear"):
+        with self.assertRaisesRegex(
+            RobotError, "no place in the searched ranges is 9 m away.*Lower --search.clear"
+        ):
             placing.place(self.robot, [self.wrists], avoid, dataclasses.replace(CONFIG, clear=9.0))
 
     def test_parameters_of_a_placement_come_back(self):
-        for parameters in ((0.1, -0.2, 0.3, 170.0, 40.0, -100.0), (0.0, 0.5, 0.0, -20.0, 179.0, 3.0)):
+        for parameters in (
+            (0.1, -0.2, 0.3, 170.0, 40.0, -100.0),
+            (0.0, 0.5, 0.0, -20.0, 179.0, 3.0),
+        ):
             placed = placing._placed(self.robot, np.array(parameters))
             np.testing.assert_allclose(placing._parameters(placed), parameters, atol=1e-6)
 
@@ -168,14 +188,20 @@ class SpliceTest(unittest.TestCase):
         worth = (torch.rand(1, 3, 5, generator=generator, dtype=FLOAT) > 0.5).double()
         cost = 0.3 * torch.rand(1, 3, 5, generator=generator, dtype=FLOAT)
         annotated = torch.rand(1, 5, generator=generator) > 0.3
-        found = splice(paths, worth=worth, cost=cost, annotated=annotated, jump=0.5, switch_cost=0.2)
+        found = splice(
+            paths, worth=worth, cost=cost, annotated=annotated, jump=0.5, switch_cost=0.2
+        )
 
         def value(chosen: tuple[int, ...]) -> float:
             way = torch.tensor(chosen)
             frames = torch.arange(5)
             jumps = (paths[0, way, frames].diff(dim=0).abs().amax(-1) > 0.5) & annotated[0, :-1]
             switches = 0.2 * (way.diff() != 0).sum()
-            return float((worth - cost)[0, way, frames].sum() - switches - (worth[0, way, frames][1:] * jumps).sum())
+            return float(
+                (worth - cost)[0, way, frames].sum()
+                - switches
+                - (worth[0, way, frames][1:] * jumps).sum()
+            )
 
         best = torch.tensor(max(product(range(3), repeat=5), key=value))
         assert_close(found[0], paths[0, best, torch.arange(5)], atol=0, rtol=0)
@@ -198,22 +224,38 @@ class WritePlacementTest(unittest.TestCase):
         for index, home in enumerate(np.linspace(-0.3, 0.4, 7)):
             joints[index] = dataclasses.replace(joints[index], home=float(home))
         moved = dataclasses.replace(
-            self.robot, base_pos=(0.1, 0.2, 0.3), base_quat=(0.6, 0.0, 0.8, 0.0), joints=tuple(joints)
+            self.robot,
+            base_pos=(0.1, 0.2, 0.3),
+            base_quat=(0.6, 0.0, 0.8, 0.0),
+            joints=tuple(joints),
         )
         self.best = Finalist(
-            robot=moved, reached=0.9123, dexterity=0.5, followed=0.8765, frames=321, home_rule="the hand where it was"
+            robot=moved,
+            reached=0.9123,
+            dexterity=0.5,
+            followed=0.8765,
+            frames=321,
+            home_rule="the hand where it was",
         )
-        self.own = dataclasses.replace(self.best, robot=self.robot, followed=0.75, home_rule="as described")
+        self.own = dataclasses.replace(
+            self.best, robot=self.robot, followed=0.75, home_rule="as described"
+        )
 
     def write(self, best: Finalist, command: str = "x") -> None:
         write_placement(self.file, self.robot, best, command)
 
     def lines(self) -> list[str]:
         """Lines of the description without the figure of its placement."""
-        return [line for line in self.file.read_text().splitlines() if not line.startswith("# Placement")]
+        return [
+            line
+            for line in self.file.read_text().splitlines()
+            if not line.startswith("# Placement")
+        ]
 
     def placements(self) -> list[str]:
-        return [line for line in self.file.read_text().splitlines() if line.startswith("# Placement")]
+        return [
+            line for line in self.file.read_text().splitlines() if line.startswith("# Placement")
+        ]
 
     def test_the_description_reads_back(self):
         for _ in range(2):  # the second one replaces the first
@@ -228,7 +270,9 @@ class WritePlacementTest(unittest.TestCase):
                 '# Placement: reaches 91.2 % and follows 87.6 % of 321 frames: xreset robots place openarm --demos "my demos.npz"'
             ],
         )
-        self.assertEqual([joint.drive for joint in after.joints], [joint.drive for joint in self.robot.joints])
+        self.assertEqual(
+            [joint.drive for joint in after.joints], [joint.drive for joint in self.robot.joints]
+        )
 
     def test_where_the_own_placement_is_best_only_its_figure_is_written(self):
         lines = self.lines()
@@ -236,7 +280,10 @@ class WritePlacementTest(unittest.TestCase):
         after = load(self.folder)
         self.assertEqual(after.fingerprint, self.robot.fingerprint)
         self.assertEqual(self.lines(), lines)
-        self.assertIn(r"# Placement: reaches 91.2 % and follows 75.0 % of 321 frames: a \\g<1> \b", self.placements())
+        self.assertIn(
+            r"# Placement: reaches 91.2 % and follows 75.0 % of 321 frames: a \\g<1> \b",
+            self.placements(),
+        )
 
     def test_a_placement_of_an_earlier_version_is_ignored_and_replaced(self):
         stated = 'placement = { reached = 0.9, followed = 0.8, frames = 3, command = "x" }'
@@ -246,7 +293,9 @@ class WritePlacementTest(unittest.TestCase):
         self.assertNotIn(stated, self.file.read_text())
 
     def test_refusals(self):
-        with self.assertRaisesRegex(RobotError, r"no placement has a home. Put base.pos = \[0.1, 0.2, 0.3\]"):
+        with self.assertRaisesRegex(
+            RobotError, r"no placement has a home. Put base.pos = \[0.1, 0.2, 0.3\]"
+        ):
             self.write(dataclasses.replace(self.best, home_rule=""))
         self.file.write_text(self.file.read_text().replace("pos = [", "position = ["))
         with self.assertRaisesRegex(RobotError, "edit it by hand"):

@@ -21,13 +21,19 @@ from xreset.spec import SceneSpec
 from xreset.task.config import RandomizationConfig, ResetConfig, TaskConfig, TerminationConfig
 from xreset.task.randomization import pair_friction
 
-SCENE = SceneSpec(robot=toy_grasp.robot(), objects=(toy_grasp.brick(),), friction=toy_grasp.FRICTION)
+SCENE = SceneSpec(
+    robot=toy_grasp.robot(), objects=(toy_grasp.brick(),), friction=toy_grasp.FRICTION
+)
 
 TASK = TaskConfig(
-    reset=ResetConfig(demo_probability=0.0, home_gravity_std=0.0, spawn_xy=0.0, spawn_yaw=0.0, home_noise=False),
+    reset=ResetConfig(
+        demo_probability=0.0, home_gravity_std=0.0, spawn_xy=0.0, spawn_yaw=0.0, home_noise=False
+    ),
     termination=TerminationConfig(episode_seconds=0.8),
     # Pair friction is the mean of two materials: 0.9 with the fingertips, and half of it is too little.
-    randomization=RandomizationConfig(enabled=False, friction=(0.9, 0.9), elastomer=0.9, metal=0.5, table=0.5),
+    randomization=RandomizationConfig(
+        enabled=False, friction=(0.9, 0.9), elastomer=0.9, metal=0.5, table=0.5
+    ),
 )
 
 STATED = Measured(
@@ -40,7 +46,9 @@ def mujoco() -> Engine:
     return engine("mujoco", workers=0)
 
 
-def altered(base: Engine, *, friction: float = 1.0, stiffness: float = 1.0, **scene: float) -> Engine:
+def altered(
+    base: Engine, *, friction: float = 1.0, stiffness: float = 1.0, **scene: float
+) -> Engine:
     """The engine with some mistakes: factors on friction and drives, and finer steps."""
 
     def change(asked: SceneSpec) -> SceneSpec:
@@ -55,7 +63,11 @@ def altered(base: Engine, *, friction: float = 1.0, stiffness: float = 1.0, **sc
         return replace(
             asked,
             robot=replace(asked.robot, joints=tuple(joints)),
-            friction=replace(pairs, tip=friction * pairs.tip, torsional=scene.get("torsional", 1.0) * pairs.torsional),
+            friction=replace(
+                pairs,
+                tip=friction * pairs.tip,
+                torsional=scene.get("torsional", 1.0) * pairs.torsional,
+            ),
             timestep=asked.timestep / finer,
             substeps=asked.substeps * finer,
         )
@@ -85,8 +97,12 @@ class ProbesTest(unittest.TestCase):
         for name, value in (vars(STATED) | expected).items():
             # Numerical damping is part of what is measured. So is what the coupling of the jaws gives way in a step: 1 to 4 % of their
             # drive's stiffness with the steps used here, 0.3 % with a 16th of them.
-            relative = {"arm_damping": 0.10, "hand_damping": 0.10, "hand_stiffness": 0.05}.get(name, 0.03)
-            self.assertAlmostEqual(getattr(found, name), value, delta=max(relative * value, 1e-9), msg=name)
+            relative = {"arm_damping": 0.10, "hand_damping": 0.10, "hand_stiffness": 0.05}.get(
+                name, 0.03
+            )
+            self.assertAlmostEqual(
+                getattr(found, name), value, delta=max(relative * value, 1e-9), msg=name
+            )
 
     def test_what_the_scene_says_and_what_is_altered(self):
         self.assert_measured(measure(mujoco(), SCENE))
@@ -101,9 +117,13 @@ class ProbesTest(unittest.TestCase):
 class ChangeTest(unittest.TestCase):
     TASK = nominal_task(TASK)
 
-    def change(self, name: str, b: float, a: float | None = None, engine: str = "mujoco") -> TaskConfig | str:
+    def change(
+        self, name: str, b: float, a: float | None = None, engine: str = "mujoco"
+    ) -> TaskConfig | str:
         prop = COMPARED[name]
-        return change_towards(prop, getattr(STATED, prop.measured) if a is None else a, b, self.TASK, engine)
+        return change_towards(
+            prop, getattr(STATED, prop.measured) if a is None else a, b, self.TASK, engine
+        )
 
     def drawn(self, name: str, b: float, a: float | None = None) -> RandomizationConfig:
         found = self.change(name, b, a)
@@ -111,10 +131,14 @@ class ChangeTest(unittest.TestCase):
         return found.randomization
 
     def test_every_measured_number_is_a_property(self):
-        self.assertEqual({p.measured for p in COMPARED.values()}, {f.name for f in fields(Measured)})
+        self.assertEqual(
+            {p.measured for p in COMPARED.values()}, {f.name for f in fields(Measured)}
+        )
         for name, prop in COMPARED.items():
             same = getattr(STATED, prop.measured)
-            self.assertEqual(self.change(name, same), "the same in both, as far as is measured", name)
+            self.assertEqual(
+                self.change(name, same), "the same in both, as far as is measured", name
+            )
 
     def test_a_property_gets_the_other_value(self):
         for pair, name in enumerate(("tip friction", "link friction", "table friction")):
@@ -143,7 +167,14 @@ class AttributeTest(unittest.TestCase):
     """A grasp that just holds, and engines with one deliberate mistake each."""
 
     def attribute(self, b: Engine, **options) -> Attribution:
-        return attribute(toy_grasp.policy(), mujoco(), b, toy_grasp.trial(TASK, num_envs=3), episodes=1, **options)
+        return attribute(
+            toy_grasp.policy(),
+            mujoco(),
+            b,
+            toy_grasp.trial(TASK, num_envs=3),
+            episodes=1,
+            **options,
+        )
 
     def test_half_the_friction_is_what_costs_the_grasp(self):
         found = self.attribute(altered(mujoco(), friction=0.55))
@@ -165,11 +196,19 @@ class AttributeTest(unittest.TestCase):
 
     def test_the_same_engine_leaves_nothing_to_attribute(self):
         found = self.attribute(replace(mujoco(), name="same"), only=["tip friction"])
-        self.assertEqual([(row.kind, row.name) for row in found.rows], [("as it is", "mujoco"), ("other", "same")])
+        self.assertEqual(
+            [(row.kind, row.name) for row in found.rows],
+            [("as it is", "mujoco"), ("other", "same")],
+        )
         self.assertIsNone(found.costs())
         self.assertIn("nothing to attribute", verdict(found))
-        self.assertIn("not tried: timestep (4.17 ms in mujoco, 4.17 ms in same): not asked for", list(not_tried(found)))
-        with self.assertRaisesRegex(XResetError, "Unknown property colour. Choose from: tip friction, .*timestep"):
+        self.assertIn(
+            "not tried: timestep (4.17 ms in mujoco, 4.17 ms in same): not asked for",
+            list(not_tried(found)),
+        )
+        with self.assertRaisesRegex(
+            XResetError, "Unknown property colour. Choose from: tip friction, .*timestep"
+        ):
             self.attribute(mujoco(), only=["colour"])
 
 
@@ -205,14 +244,18 @@ class OutcomeTest(unittest.TestCase):
         self.assertAlmostEqual(found.share(found.rows[1]), 0.5)
         self.assertAlmostEqual(found.share(found.rows[3]), -1.0)
         self.assertEqual(found.costs(), found.rows[2])
-        found = self.found(A, row("other", "sapien", 0.33, 0.33, *[0.66] * 6))  # one demonstration among many
+        found = self.found(
+            A, row("other", "sapien", 0.33, 0.33, *[0.66] * 6)
+        )  # one demonstration among many
         self.assertIsNone(found.as_dict()["rows"][-1]["share_of_gap"])
         self.assertIsNone(found.costs())
 
     def test_json_and_table(self):
         found = self.found(A, row("towards", "arm stiffness", *[0.33] * 8), B)
         data = json.loads(json.dumps(found.as_dict(), allow_nan=False))
-        self.assertEqual((data["schema"], data["costs_most"]), ("xreset-attribution/2", "arm stiffness"))
+        self.assertEqual(
+            (data["schema"], data["costs_most"]), ("xreset-attribution/2", "arm stiffness")
+        )
         self.assertAlmostEqual(data["rows"][1]["difference"], -0.33)
         from rich.console import Console
 

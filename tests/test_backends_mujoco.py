@@ -65,7 +65,9 @@ class Model(unittest.TestCase):
         cls.scene = scene()
         cls.at = compile_scene(cls.scene, 0)
 
-    def test_a_drive_at_its_target_rests_and_off_it_pulls_with_its_stiffness_where_joints_are_coupled_too(self):
+    def test_a_drive_at_its_target_rests_and_off_it_pulls_with_its_stiffness_where_joints_are_coupled_too(
+        self,
+    ):
         at = self.at
         robot = self.scene.robot
         data = mujoco.MjData(at.model)
@@ -74,7 +76,9 @@ class Model(unittest.TestCase):
         data.qpos[at.qpos], _ = at.joints.spread(q, np.zeros_like(q))
         data.ctrl[:] = q + off
         mujoco.mj_forward(at.model, data)
-        np.testing.assert_allclose(data.actuator_force, off * [joint.drive.kp for joint in robot.joints], atol=1e-9)
+        np.testing.assert_allclose(
+            data.actuator_force, off * [joint.drive.kp for joint in robot.joints], atol=1e-9
+        )
 
     def collisions(self, **changes) -> set[frozenset[str]]:
         robot = replace(self.scene.robot, **changes)
@@ -88,7 +92,10 @@ class Model(unittest.TestCase):
         base, column, wrist, jaw_a, pad_b = (
             f"robot/{body}/0" for body in ("base", "column", "wrist", "jaw_a", "finger_b")
         )  # the pad is fixed to finger_b
-        expected = {frozenset((jaw_a, pad_b)), frozenset((column, pad_b))}  # jaw_a and column are excluded
+        expected = {
+            frozenset((jaw_a, pad_b)),
+            frozenset((column, pad_b)),
+        }  # jaw_a and column are excluded
         for link in (column, wrist, jaw_a, pad_b):
             expected |= {frozenset(("table", link))}  # the base is excluded
         for other in ("table", base, column, wrist, jaw_a, pad_b):
@@ -98,7 +105,11 @@ class Model(unittest.TestCase):
     def test_links_of_one_body_are_told_apart(self):
         # finger_b has no shape; its pad may collide with jaw_a, a second fixed link of the same body may not
         box = '<collision><geometry><box size="0.01 0.01 0.01"/></geometry></collision>'
-        text = gripper().urdf.read_text().replace('<link name="tip_b"/>', f'<link name="tip_b">{box}</link>')
+        text = (
+            gripper()
+            .urdf.read_text()
+            .replace('<link name="tip_b"/>', f'<link name="tip_b">{box}</link>')
+        )
         with tempfile.TemporaryDirectory() as folder:
             urdf = Path(folder) / "robot.urdf"
             urdf.write_text(text)
@@ -110,25 +121,50 @@ class Model(unittest.TestCase):
         self.assertEqual(own, {frozenset(("robot/jaw_a/0", "robot/finger_b/0"))})
 
     def test_neighbours_of_a_base_that_stands_still_never_collide(self):
-        own = self.collisions_of_the_robot(self_collision_links=("base", "column", "wrist"), collision_exclude=())
+        own = self.collisions_of_the_robot(
+            self_collision_links=("base", "column", "wrist"), collision_exclude=()
+        )
         wrist = "robot/wrist/0"
-        self.assertEqual(own, {frozenset(("robot/base/0", wrist)), frozenset(("robot/column/0", wrist))})
+        self.assertEqual(
+            own, {frozenset(("robot/base/0", wrist)), frozenset(("robot/column/0", wrist))}
+        )
 
     def test_slots_hold_any_of_the_objects(self):
         models = [compile_scene(self.scene, i, slots_for=range(3)) for i in range(3)]
-        self.assertEqual([int(m.parked.sum()) for m in models], [3, 3, 2])  # of one box, one cylinder and two hulls
-        same = ("geom_type", "mesh_vert", "mesh_graph", "geom_contype", "geom_bodyid", "geom_condim", "dof_parentid")
+        self.assertEqual(
+            [int(m.parked.sum()) for m in models], [3, 3, 2]
+        )  # of one box, one cylinder and two hulls
+        same = (
+            "geom_type",
+            "mesh_vert",
+            "mesh_graph",
+            "geom_contype",
+            "geom_bodyid",
+            "geom_condim",
+            "dof_parentid",
+        )
         for field in same:
             for other in models[1:]:
-                np.testing.assert_array_equal(getattr(models[0].model, field), getattr(other.model, field), field)
-        expected = {"geom_size", "geom_pos", "geom_aabb", "geom_rbound", "geom_dataid", "dof_invweight0"}
+                np.testing.assert_array_equal(
+                    getattr(models[0].model, field), getattr(other.model, field), field
+                )
+        expected = {
+            "geom_size",
+            "geom_pos",
+            "geom_aabb",
+            "geom_rbound",
+            "geom_dataid",
+            "dof_invweight0",
+        }
         expected |= {f"body_{name}" for name in ("mass", "ipos", "iquat", "inertia", "invweight0")}
         self.assertLessEqual(expected, set(differing_fields([m.model for m in models])))
 
     def test_bad_objects_and_robots(self):
         brick = objects()[0]
         robot = self.scene.robot
-        tip = FingertipSpec(name="thumb", link="nowhere", contact_links=("jaw_a",), keypoint="thumb4")
+        tip = FingertipSpec(
+            name="thumb", link="nowhere", contact_links=("jaw_a",), keypoint="thumb4"
+        )
         flat = np.diag((1e-4, 1e-4, 3e-4))
         for changes, error, message in (
             ({"objects": (replace(brick, pieces=()),)}, ObjectError, "no collision piece"),
@@ -213,7 +249,11 @@ class Steps(unittest.TestCase):
                 MujocoWarpBackend(scene(), 8) as backend,
             ):
                 state = snapshot(backend.state())
-                backend.set_state(replace(state, object_linvel=state.object_linvel + torch.tensor([0.3, 0.0, -0.5])))
+                backend.set_state(
+                    replace(
+                        state, object_linvel=state.object_linvel + torch.tensor([0.3, 0.0, -0.5])
+                    )
+                )
                 # A parameter that changes what positions lead to.
                 backend.set_object_com(torch.tensor([0.01, 0.0, 0.0]).expand(8, 3))
                 for target in torch.linspace(0.0, 0.3, 40):
@@ -244,7 +284,9 @@ class Limits(unittest.TestCase):
         backend.step(8)
         self.assertTrue(bool(backend.health().overflow.all()))  # the pool is everyone's
         state = snapshot(backend.state())
-        state = replace(state, object_pos=state.object_pos + torch.tensor([0.0, 0.0, 1.0]))  # no contacts
+        state = replace(
+            state, object_pos=state.object_pos + torch.tensor([0.0, 0.0, 1.0])
+        )  # no contacts
         backend.set_state(state[[2]], torch.tensor([2]))
         self.assertEqual(backend.health().overflow.tolist(), [True, True, False, True])
         backend.set_state(state)
@@ -257,7 +299,9 @@ class Limits(unittest.TestCase):
         feet = [shape("box", (0.002, 0.002, 0.005), (x, y, 0.0)) for x, y in places]
         standing = replace(scene(), objects=(solid("feet", 0.4, tuple(feet)),))
         for pieces, overflows in ((16, False), (1, True)):
-            room = mock.patch.object(mujoco_warp_backend, "contact_room", return_value=contact_room(pieces))
+            room = mock.patch.object(
+                mujoco_warp_backend, "contact_room", return_value=contact_room(pieces)
+            )
             with room, MujocoWarpBackend(standing, 2) as backend:
                 backend.step(8)
                 self.assertEqual(backend.health().overflow.tolist(), [overflows] * 2, pieces)
@@ -298,7 +342,9 @@ class Limits(unittest.TestCase):
             for device in ("cpu", "cuda", "cuda:1"):
                 self.assertEqual(device_for("mujoco-warp", device), device)
                 self.assertEqual(device_for("mujoco", device), "cpu")
-            with self.assertRaisesRegex(BackendUnavailableError, "Unknown device 'gpu'. Expected cpu, cuda"):
+            with self.assertRaisesRegex(
+                BackendUnavailableError, "Unknown device 'gpu'. Expected cpu, cuda"
+            ):
                 device_for("mujoco", "gpu")
 
 

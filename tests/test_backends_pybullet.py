@@ -70,8 +70,12 @@ class PybulletTest(EngineChecks, unittest.TestCase):
                 self.assertAlmostEqual(opening(*pieces), box, delta=5e-5)
 
     def test_the_import_prints_nothing(self):
-        code = "from xreset.backends.pybullet import PybulletBackend as B; print(B.engine_version())"
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+        code = (
+            "from xreset.backends.pybullet import PybulletBackend as B; print(B.engine_version())"
+        )
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, timeout=120
+        )
         self.assertEqual((done.returncode, done.stderr), (0, ""))
         self.assertRegex(done.stdout, r"^[\d.]+\n$")
 

@@ -57,7 +57,10 @@ class SapienTest(EngineChecks, unittest.TestCase):
         far = replace(
             robot,
             joints=tuple(j for j in robot.joints if j.name != "finger_b_bend"),
-            mimics=(*robot.mimics, MimicSpec(joint="finger_b_bend", source="swing", multiplier=0.5)),
+            mimics=(
+                *robot.mimics,
+                MimicSpec(joint="finger_b_bend", source="swing", multiplier=0.5),
+            ),
         )
         (result,) = run(SapienBackend, robot=far, only=["mimic_joints"])
         self.assertLess(
@@ -108,7 +111,9 @@ class FrictionTest(unittest.TestCase):
         force = tangential.sum(0)
         torque = np.cross(arms, tangential).sum(0)
         found = friction_forces(arms, normals, np.full(3, 0.8), force, torque)
-        np.testing.assert_allclose(found, tangential, atol=1e-6)  # three contacts: six unknowns, six equations
+        np.testing.assert_allclose(
+            found, tangential, atol=1e-6
+        )  # three contacts: six unknowns, six equations
 
 
 if __name__ == "__main__":

@@ -68,14 +68,20 @@ class TestCameras(unittest.TestCase):
         # as many pixels as a disk of the can's size has at that depth
         radius = np.ptp(self.objects[0].vertices[:, 0]) / 2
         pixels_per_metre = 24 / 2 / np.tan(ABOVE.fov / 2) / top
-        self.assertAlmostEqual(float((body == can).sum()), np.pi * (radius * pixels_per_metre) ** 2, delta=12)
+        self.assertAlmostEqual(
+            float((body == can).sum()), np.pi * (radius * pixels_per_metre) ** 2, delta=12
+        )
         torch.testing.assert_close(view[0, 0], ((2.0 - depth) / 1.9).where(depth > 0, 0.0))
 
     def test_same_state_same_pixels_in_every_engine(self):
         generator = torch.Generator().manual_seed(1)
-        joints = self.state.joint_pos + 0.2 * torch.rand(self.state.joint_pos.shape, generator=generator)
+        joints = self.state.joint_pos + 0.2 * torch.rand(
+            self.state.joint_pos.shape, generator=generator
+        )
         quat = torch.nn.functional.normalize(torch.randn(2, 4, generator=generator), dim=1)
-        state = State.at_rest(joints, self.state.object_pos + torch.tensor([0.02, -0.03, 0.1]), quat)
+        state = State.at_rest(
+            joints, self.state.object_pos + torch.tensor([0.02, -0.03, 0.1]), quat
+        )
         expected = self.look(self.cameras(), state).clone()
         for name in backend_names():
             with self.subTest(engine=name):
@@ -93,14 +99,19 @@ class TestCameras(unittest.TestCase):
     def test_errors_of_depth(self):
         def image(scale: float = 1.0, **noise: float) -> torch.Tensor:
             camera = replace(ABOVE, noise=replace(IDEAL, **noise))
-            cameras = self.cameras(replace(VISION, cameras=(camera, replace(camera, pos=(1.0, 0.2, 0.4)))))
+            cameras = self.cameras(
+                replace(VISION, cameras=(camera, replace(camera, pos=(1.0, 0.2, 0.4))))
+            )
             cameras.noise_scale.fill_(scale)
             self.look(cameras)
             return cameras.image
 
         exact = image()
         seen = exact > 0
-        for scale in (1.0, 2.0):  # the spread grows with the square of the depth, and with the scale
+        for scale in (
+            1.0,
+            2.0,
+        ):  # the spread grows with the square of the depth, and with the scale
             error = (image(spread=0.002, scale=scale) - exact) / exact.square().clamp_min(1e-3)
             self.assertAlmostEqual(float(error[seen].std()), 0.002 * scale, delta=2e-4 * scale)
         steps = 1 / image(step=0.01)[seen] / 0.01
@@ -112,18 +123,24 @@ class TestCameras(unittest.TestCase):
         self.assertFalse(bool(lost[0, 0, :, :6].any()))
 
     def test_points_are_on_the_object(self):
-        cameras = self.cameras(replace(VISION, view="points", points=20, goal_image=True), scale=2.0)
+        cameras = self.cameras(
+            replace(VISION, view="points", points=20, goal_image=True), scale=2.0
+        )
         cloud = self.look(cameras)
         self.assertEqual(cloud.shape, (2, 2, 20, 4))
         self.assertTrue(bool((cloud[..., 3] == 1).all()))
         points = cloud[..., :3] / 2 - self.state.object_pos[:, None, None]
         points[:, 1, :, 2] -= 0.2  # the goal is higher
-        low, high = (torch.tensor(getattr(self.objects[0].vertices, end)(axis=0)) for end in ("min", "max"))
+        low, high = (
+            torch.tensor(getattr(self.objects[0].vertices, end)(axis=0)) for end in ("min", "max")
+        )
         self.assertTrue(bool(((points > low - 1e-3) & (points < high + 1e-3)).all()))
 
     def test_a_camera_on_a_link_moves_with_it(self):
         cameras = self.cameras(
-            replace(VISION, cameras=(CameraConfig(link="palm", pos=(0, 0, 0.2), target=(1, 0, 0.2)),))
+            replace(
+                VISION, cameras=(CameraConfig(link="palm", pos=(0, 0, 0.2), target=(1, 0, 0.2)),)
+            )
         )
         self.look(cameras)
         before = cameras.rays.camera.clone()
@@ -143,7 +160,9 @@ class TestCameras(unittest.TestCase):
                 self.cameras(replace(VISION, cameras=(camera,)))
         with (
             mock.patch("xreset.cameras.rays.wp.launch", side_effect=RuntimeError("no driver")),
-            self.assertRaisesRegex(XResetError, "renderer of depth images cannot start on cpu: no driver"),
+            self.assertRaisesRegex(
+                XResetError, "renderer of depth images cannot start on cpu: no driver"
+            ),
         ):
             self.cameras()
         for changes in ({"near": 3.0}, {"fov": 4.0}, {"target": ABOVE.pos}):
@@ -161,7 +180,9 @@ class TestVisionInTheEnvironment(unittest.TestCase):
     def make(self, vision: VisionConfig, **changes):
         task = replace(evaluation_task(TASK), vision=vision, **changes)
         with mock.patch("xreset.env.make_backend", partial(make_backend, workers=0)):
-            return self.enterContext(make_env(self.robot, self.objects, self.bank, task, num_envs=2))
+            return self.enterContext(
+                make_env(self.robot, self.objects, self.bank, task, num_envs=2)
+            )
 
     def play(self, env, steps: int) -> list[torch.Tensor]:
         views = [env.get_observations()["view"]]
@@ -176,7 +197,9 @@ class TestVisionInTheEnvironment(unittest.TestCase):
         self.assertFalse(torch.equal(every[1], every[2]))
         third = self.play(self.make(replace(VISION, interval=3)), 6)
         late = self.play(self.make(replace(VISION, latency=2.0)), 6)
-        drawn = RandomizationConfig(camera_latency=(2.0, 2.0), friction=(0.75, 0.75), mass_scale=(1.0, 1.0))
+        drawn = RandomizationConfig(
+            camera_latency=(2.0, 2.0), friction=(0.75, 0.75), mass_scale=(1.0, 1.0)
+        )
         drawn_late = self.play(self.make(VISION, randomization=drawn), 6)
         for step in range(7):
             torch.testing.assert_close(third[step], every[step - step % 3])
@@ -196,7 +219,9 @@ class TestVisionInTheEnvironment(unittest.TestCase):
         self.assertTrue(torch.equal(env.get_observations()["view"], before))
 
     def test_cameras_are_moved_as_drawn(self):
-        moved = RandomizationConfig(camera_shift=(0.03, 0.03), camera_turn=(0.05, 0.05), camera_fov=(0.9, 1.1))
+        moved = RandomizationConfig(
+            camera_shift=(0.03, 0.03), camera_turn=(0.05, 0.05), camera_fov=(0.9, 1.1)
+        )
         cameras = self.make(VISION, randomization=moved).vision.cameras
         torch.testing.assert_close(cameras.shift.norm(dim=-1), torch.full((2, 2), 0.03))
         torch.testing.assert_close(cameras.turn.norm(dim=-1), torch.full((2, 2), 0.05))

@@ -11,13 +11,26 @@ from tests.command import xreset as run
 from xreset.cli import COMMANDS
 from xreset.cli.engines import COMMANDS as ENGINES
 
-HEAVY = {"torch", "warp", "mujoco", "mujoco_warp", "pybullet", "sapien", "matplotlib", "trimesh", "scipy", "rsl_rl"}
+HEAVY = {
+    "torch",
+    "warp",
+    "mujoco",
+    "mujoco_warp",
+    "pybullet",
+    "sapien",
+    "matplotlib",
+    "trimesh",
+    "scipy",
+    "rsl_rl",
+}
 
 
 def modules_after(code: str) -> set[str]:
     """Top-level modules that are loaded after running some code in a new interpreter."""
     code += "\nimport sys, json; print('\\n' + json.dumps(sorted({m.split('.')[0] for m in sys.modules})))"
-    out = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
+    out = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True
+    ).stdout
     return set(json.loads(out.strip().splitlines()[-1]))
 
 
@@ -26,7 +39,10 @@ class LightnessTest(unittest.TestCase):
         self.assertFalse(modules_after("import xreset") & (HEAVY | {"numpy"}))
 
     def test_help_loads_nothing_heavy(self):
-        self.assertFalse(modules_after("from xreset.cli import main; main(['--help'])") & (HEAVY | {"tyro", "numpy"}))
+        self.assertFalse(
+            modules_after("from xreset.cli import main; main(['--help'])")
+            & (HEAVY | {"tyro", "numpy"})
+        )
 
     def test_help_of_every_command_loads_nothing_heavy(self):
         commands = [[name] for name in COMMANDS] + [["engines", name] for name in ENGINES]
@@ -63,12 +79,24 @@ class UsageTest(unittest.TestCase):
                 r"--seed is -1, expected a whole number from 0 to 4294967295",
                 ("demos", "synth", "--out", "x.npz", "--seed", "-1"),
             ),
-            (r"--seed is 9{20}, expected", ("eval", "zero", "--demos", "none.npz", "--seed", "9" * 20)),
-            (r"--num-envs is 0, expected a whole number from 1", ("train", "--out", "x", "--num-envs", "0")),
+            (
+                r"--seed is 9{20}, expected",
+                ("eval", "zero", "--demos", "none.npz", "--seed", "9" * 20),
+            ),
+            (
+                r"--num-envs is 0, expected a whole number from 1",
+                ("train", "--out", "x", "--num-envs", "0"),
+            ),
             (r"--minutes is not a number", ("train", "--out", "x", "--minutes", "nan")),
-            (r"Unknown device 'quantum'; expected cpu, cuda or", ("train", "--out", "x", "--device", "quantum")),
+            (
+                r"Unknown device 'quantum'; expected cpu, cuda or",
+                ("train", "--out", "x", "--device", "quantum"),
+            ),
             (r"(File name too long|there is no)", ("demos", "info", "x" * 300)),
-            (r"Nothing was overwritten", ("retarget", "d.npz", "--robot", "openarm", "--out", "./d.npz")),
+            (
+                r"Nothing was overwritten",
+                ("retarget", "d.npz", "--robot", "openarm", "--out", "./d.npz"),
+            ),
         ):
             with self.subTest(" ".join(argv)[:80]):
                 code, out, err = run(*argv)
@@ -78,7 +106,16 @@ class UsageTest(unittest.TestCase):
 
     def test_a_gpu_that_is_not_there(self):
         with mock.patch("torch.cuda.device_count", return_value=0):
-            code, _, err = run("resets", "none.npz", "--out", "x.npz", "--backend", "mujoco-warp", "--device", "cuda")
+            code, _, err = run(
+                "resets",
+                "none.npz",
+                "--out",
+                "x.npz",
+                "--backend",
+                "mujoco-warp",
+                "--device",
+                "cuda",
+            )
         self.assertEqual(code, 1)
         self.assertIn("--device is cuda, but torch finds 0 GPUs", err)
 
@@ -96,15 +133,22 @@ class UsageTest(unittest.TestCase):
     def test_a_missing_engine_is_named_with_the_command_that_mends_it(self):
         code = "import sys; sys.modules['pybullet'] = None; from xreset.cli import main; main(['engines', 'list'])"
         wide = os.environ | {"COLUMNS": "300"}
-        out = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, env=wide).stdout
+        out = subprocess.run(
+            [sys.executable, "-c", code], check=True, capture_output=True, text=True, env=wide
+        ).stdout
         self.assertRegex(out, r"pybullet .* no: .*pip install 'xreset\[pybullet\]'")
 
     def test_naming_engines_replaces_the_default(self):
-        for given, expected in (((), ["mujoco"]), (("sapien", "pybullet", "sapien"), ["sapien", "pybullet"])):
+        for given, expected in (
+            ((), ["mujoco"]),
+            (("sapien", "pybullet", "sapien"), ["sapien", "pybullet"]),
+        ):
             argv = ["eval", "zero", "--robot", "openarm", "--demos", "x.npz"]
             for name in given:
                 argv += ["--backend", name]
-            with mock.patch("xreset.eval.evaluate.evaluate", side_effect=KeyboardInterrupt) as evaluate:
+            with mock.patch(
+                "xreset.eval.evaluate.evaluate", side_effect=KeyboardInterrupt
+            ) as evaluate:
                 self.assertEqual(run(*argv)[0], 130)
             self.assertEqual(list(evaluate.call_args.args[2]), expected)
 

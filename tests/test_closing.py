@@ -31,11 +31,17 @@ WIDE = toy_grasp.OPEN + 0.03
 """A jaw position 30.1 mm from the brick."""
 
 
-def retargeted(joint_pos: np.ndarray, object_pos: np.ndarray, offsets=None, **changes) -> Retargeted:
+def retargeted(
+    joint_pos: np.ndarray, object_pos: np.ndarray, offsets=None, **changes
+) -> Retargeted:
     """Trajectories of the gripper and the brick, given by joints [F, J] and the brick's positions [F, 3]."""
     frames = len(joint_pos)
     offsets = offsets or [0, frames]
-    tips = Kinematics(ROBOT).points(torch.as_tensor(joint_pos), [tip.link for tip in ROBOT.fingertips]).numpy()
+    tips = (
+        Kinematics(ROBOT)
+        .points(torch.as_tensor(joint_pos), [tip.link for tip in ROBOT.fingertips])
+        .numpy()
+    )
     values = {
         "joint_pos": joint_pos,
         "fingertip_pos": tips,
@@ -74,11 +80,18 @@ class ClosingTest(unittest.TestCase):
     def states(self, data: Retargeted | None = None, **config):
         none = torch.zeros(10, 2, 3)
         fingers = Fingers(
-            links=("a", "b"), finger=torch.tensor([0, 1]), gap=torch.as_tensor(self.gap), point=none, inward=none
+            links=("a", "b"),
+            finger=torch.tensor([0, 1]),
+            gap=torch.as_tensor(self.gap),
+            point=none,
+            inward=none,
         )
         with mock.patch("xreset.resets.closing.fingers_of", lambda *_: fingers):
             return closing_states(
-                data or self.data, ROBOT, (toy_grasp.brick(),), ClosingConfig(**({"spacing": 0.005} | config))
+                data or self.data,
+                ROBOT,
+                (toy_grasp.brick(),),
+                ClosingConfig(**({"spacing": 0.005} | config)),
             )
 
     def test_fingertips_move_by_no_more_than_the_spacing(self):
@@ -93,10 +106,14 @@ class ClosingTest(unittest.TestCase):
         old = self.data.joint_pos
         found = positions_between(old, frame, part)
         following = old[np.minimum(frame + 1, 9)]
-        np.testing.assert_allclose(found, old[frame] + part[:, None] * (following - old[frame]), atol=1e-12)
+        np.testing.assert_allclose(
+            found, old[frame] + part[:, None] * (following - old[frame]), atol=1e-12
+        )
         self.assertEqual(found[part == 0].tobytes(), old.tobytes())
         quat = rotations_between(self.data.object_quat_wxyz, frame, part)
-        np.testing.assert_allclose(2 * np.arctan2(quat[:, 3], quat[:, 0]), 0.2 * (frame + part), atol=1e-9)
+        np.testing.assert_allclose(
+            2 * np.arctan2(quat[:, 3], quat[:, 0]), 0.2 * (frame + part), atol=1e-9
+        )
         self.assertEqual(quat[part == 0].tobytes(), self.data.object_quat_wxyz.tobytes())
 
     def test_sequences_are_not_mixed_and_nothing_invalid_is_bridged(self):
@@ -120,7 +137,11 @@ class ClosingTest(unittest.TestCase):
         self.gap[1:, 1] = 0.001  # a finger alone
         self.gap[2, 0], self.gap[8, 0] = 0.001, 0.001
         frame, part = self.states()
-        self.assertEqual(sorted(set(frame[part > 0].tolist())), [0, 1, 5, 6, 7], "also where the thumb lets go again")
+        self.assertEqual(
+            sorted(set(frame[part > 0].tolist())),
+            [0, 1, 5, 6, 7],
+            "also where the thumb lets go again",
+        )
         pos = self.data.object_pos.copy()
         pos[6, 0] += 0.011
         frame, part = self.states(replace(self.data, object_pos=pos))
@@ -134,20 +155,28 @@ class FingersTest(unittest.TestCase):
         joints = np.tile(ROBOT.home, (len(jaw), 1))
         joints[:, JAW] = jaw
         pos, quat = (np.tile(value, (len(jaw), 1)) for value in toy_grasp.brick_pose())
-        return fingers_of(ROBOT, (toy_grasp.brick(),), np.full(len(jaw), "brick"), joints, pos, quat), joints
+        return fingers_of(
+            ROBOT, (toy_grasp.brick(),), np.full(len(jaw), "brick"), joints, pos, quat
+        ), joints
 
     def test_gaps_and_directions(self):
         jaws = np.array([0.0201, 0.0251, 0.0501])
         fingers, joints = self.fingers(*jaws)
-        self.assertEqual((fingers.links, fingers.finger.tolist()), (("jaw_a", "pad_b", "finger_b"), [0, 1, 1]))
+        self.assertEqual(
+            (fingers.links, fingers.finger.tolist()), (("jaw_a", "pad_b", "finger_b"), [0, 1, 1])
+        )
         np.testing.assert_allclose(fingers.gap[:, 0], jaws - 0.02, atol=3e-4)
         np.testing.assert_allclose(fingers.gap[:, 1], 1.1 * jaws - 0.002 - 0.02, atol=3e-4)
         np.testing.assert_allclose(fingers.nearest, jaws - 0.02, atol=3e-4)
-        self.assertEqual(fingers.leading.tolist(), [[True, True, False]] * 3, "finger_b has no shape of its own")
+        self.assertEqual(
+            fingers.leading.tolist(), [[True, True, False]] * 3, "finger_b has no shape of its own"
+        )
         wrist = Kinematics(ROBOT).link_poses(torch.as_tensor(joints), ["wrist"])[:, 0, :3, 0]
         torch.testing.assert_close(fingers.inward[:, 0], -wrist, atol=0.02, rtol=0)
         torch.testing.assert_close(fingers.inward[:, 1], wrist, atol=0.02, rtol=0)
-        np.testing.assert_allclose(fingers.point[:, 0, 0], -0.005, atol=1e-3)  # the jaw's inner side
+        np.testing.assert_allclose(
+            fingers.point[:, 0, 0], -0.005, atol=1e-3
+        )  # the jaw's inner side
 
     def test_a_squeeze_is_as_far_beyond_as_its_force_takes(self):
         fingers, joints = self.fingers(0.0201, 0.0501)
@@ -160,15 +189,21 @@ class FingersTest(unittest.TestCase):
             arm = ROBOT.arm_indices
             np.testing.assert_array_equal(target[:, arm], joints[:, arm])
         far = squeeze_targets(ROBOT, fingers, joints, SqueezeConfig(force=1e4))
-        self.assertAlmostEqual(far[0, JAW], 0.002 / 1.1, places=9, msg="where jaw_b, which mimics it, has its limit")
+        self.assertAlmostEqual(
+            far[0, JAW], 0.002 / 1.1, places=9, msg="where jaw_b, which mimics it, has its limit"
+        )
         bend = ROBOT.joint_names.index("finger_b_bend")
         self.assertLessEqual(abs(far[0, bend]), 0.8)
-        np.testing.assert_array_equal(squeeze_targets(ROBOT, fingers, joints, SqueezeConfig(force=0.0)), joints)
+        np.testing.assert_array_equal(
+            squeeze_targets(ROBOT, fingers, joints, SqueezeConfig(force=0.0)), joints
+        )
 
     def test_a_squeeze_is_within_the_drives_torque(self):
         fingers, joints = self.fingers(0.0201)
         joints_of_weak = list(ROBOT.joints)
-        joints_of_weak[JAW] = replace(ROBOT.joints[JAW], drive=replace(ROBOT.joints[JAW].drive, effort=0.8))
+        joints_of_weak[JAW] = replace(
+            ROBOT.joints[JAW], drive=replace(ROBOT.joints[JAW].drive, effort=0.8)
+        )
         weak = replace(ROBOT, joints=tuple(joints_of_weak))
         target = squeeze_targets(weak, fingers, joints, SqueezeConfig(force=50.0))
         self.assertAlmostEqual(target[0, JAW] - joints[0, JAW], -0.8 / 800, places=9)
@@ -182,13 +217,17 @@ class TargetsTest(unittest.TestCase):
 
     def pressing(self):
         bank = toy_bank(ROBOT)
-        return replace(bank, joint_target=bank.joint_pos + 0.25, frame_part=np.full(6, 0.5, np.float32))
+        return replace(
+            bank, joint_target=bank.joint_pos + 0.25, frame_part=np.full(6, 0.5, np.float32)
+        )
 
     def test_files(self):
         write_bank(self.folder / "b.npz", self.pressing(), config={}, inputs={})
         found = read_bank(self.folder / "b.npz")
         np.testing.assert_array_equal(found.targets, found.joint_pos + 0.25)
-        np.testing.assert_array_equal(found.with_states(~found.post_contact).targets, found.targets[[0, 2, 4]])
+        np.testing.assert_array_equal(
+            found.with_states(~found.post_contact).targets, found.targets[[0, 2, 4]]
+        )
         self.assertEqual((found.num_pressing, found.rejected_frame_part), (6, None))
         old = toy_bank(ROBOT)
         write_bank(self.folder / "old.npz", old, config={}, inputs={})
@@ -200,9 +239,13 @@ class TargetsTest(unittest.TestCase):
 
     def test_starts(self):
         bank = self.pressing()
-        resets = ResetDistribution(bank, ROBOT, tuple(bank.object_names), ResetConfig(demo_probability=0.5))
+        resets = ResetDistribution(
+            bank, ROBOT, tuple(bank.object_names), ResetConfig(demo_probability=0.5)
+        )
         drawn = resets.sample(torch.tensor([0, 1] * 50), torch.Generator().manual_seed(0))
-        torch.testing.assert_close(drawn.joint_target, drawn.joint_pos + 0.25 * drawn.from_bank[:, None])
+        torch.testing.assert_close(
+            drawn.joint_target, drawn.joint_pos + 0.25 * drawn.from_bank[:, None]
+        )
         chosen = bank_starts(bank, np.array([4, 1]))
         torch.testing.assert_close(chosen.joint_target, chosen.joint_pos + 0.25)
 
@@ -217,13 +260,21 @@ class CommandTest(unittest.TestCase):
         self.enterContext(mock.patch("xreset.description.load_robot", lambda _: ROBOT))
         in_this_process = partial(make_backend, workers=0)
         self.enterContext(mock.patch("xreset.resets.probe.make_backend", in_this_process))
-        self.enterContext(mock.patch("xreset.objects.catalogue.load_objects", lambda *_: (toy_grasp.brick(),)))
+        self.enterContext(
+            mock.patch("xreset.objects.catalogue.load_objects", lambda *_: (toy_grasp.brick(),))
+        )
         write_retargeted(self.folder / "r.npz", grasp_and_lift(), config={}, inputs={})
 
     def resets(self, *options: str):
-        code, out, err = run("resets", str(self.folder / "r.npz"), "--out", str(self.folder / "b.npz"), *options)
+        code, out, err = run(
+            "resets", str(self.folder / "r.npz"), "--out", str(self.folder / "b.npz"), *options
+        )
         self.assertEqual(code, 0, out + err)
-        return read_bank(self.folder / "b.npz"), json.loads(accounts_path(self.folder / "b.npz").read_text()), out
+        return (
+            read_bank(self.folder / "b.npz"),
+            json.loads(accounts_path(self.folder / "b.npz").read_text()),
+            out,
+        )
 
     def test_everything_at_once(self):
         """Jaws close by 30 mm (33 mm on one side): five states between; held by 2.5 N a side, and not without."""
@@ -231,8 +282,12 @@ class CommandTest(unittest.TestCase):
         assert bank.frame_part is not None
         np.testing.assert_allclose(bank.frame_part * 6, [0, 1, 2, 3, 4, 5, 0, 0], atol=1e-5)
         self.assertEqual(bank.frame_index.tolist(), [0] * 6 + [1, 2])
-        self.assertEqual((bank.targets != bank.joint_pos).any(axis=1).tolist(), [False] * 6 + [True] * 2)
-        self.assertEqual(sum(row["total"] for row in account["rows"] if row["phase"] == "both"), 3, "frames only")
+        self.assertEqual(
+            (bank.targets != bank.joint_pos).any(axis=1).tolist(), [False] * 6 + [True] * 2
+        )
+        self.assertEqual(
+            sum(row["total"] for row in account["rows"] if row["phase"] == "both"), 3, "frames only"
+        )
         self.assertEqual(account["pressing"], 2)
         for words in ("2 of 2 states after contact press with 2.5 N", "8 states of 8"):
             self.assertIn(words, out)
@@ -243,18 +298,28 @@ class CommandTest(unittest.TestCase):
 
     def test_without_options(self):
         bank, account, _ = self.resets()
-        self.assertEqual((bank.num_states, bank.joint_target, bank.frame_part, account["pressing"]), (3, None, None, 0))
+        self.assertEqual(
+            (bank.num_states, bank.joint_target, bank.frame_part, account["pressing"]),
+            (3, None, None, 0),
+        )
 
     def test_a_squeeze_that_an_engine_does_not_accept_is_left_out(self):
         still = lambda robot, fingers, joints, config: joints - (np.arange(2) == 1)[:, None]  # noqa: E731
-        with mock.patch("xreset.resets.filter.squeeze_targets", still):  # the last state's targets are 1 rad (m) away
+        with mock.patch(
+            "xreset.resets.filter.squeeze_targets", still
+        ):  # the last state's targets are 1 rad (m) away
             bank, account, _ = self.resets("--squeeze.force", "2.5")
         self.assertEqual((bank.num_states, account["pressing"]), (3, 0))
         np.testing.assert_array_equal(bank.targets, bank.joint_pos)
 
     def test_bad_options(self):
         code, out, err = run(
-            "resets", str(self.folder / "r.npz"), "--out", str(self.folder / "b.npz"), "--closing.spacing", "0"
+            "resets",
+            str(self.folder / "r.npz"),
+            "--out",
+            str(self.folder / "b.npz"),
+            "--closing.spacing",
+            "0",
         )
         self.assertNotEqual(code, 0)
         self.assertIn("spacing is 0.0, expected a number above 0", " ".join((out + err).split()))

@@ -28,7 +28,9 @@ STEPS = 1024
 """Environment steps of an iteration."""
 
 
-def curves_of(seconds: tuple[float, ...], success: tuple[float, ...], first: int = 1) -> pd.DataFrame:
+def curves_of(
+    seconds: tuple[float, ...], success: tuple[float, ...], first: int = 1
+) -> pd.DataFrame:
     """Curves of a training whose iterations took that long."""
     time = np.array(seconds)
     columns = {
@@ -51,7 +53,10 @@ class Compared(InFolder):
 
     def training(self, name: str, curves: pd.DataFrame | None = None):
         """What a folder holds, with curves that need not be written."""
-        return replace(read_training(name, self.folder / name), curves=pd.DataFrame() if curves is None else curves)
+        return replace(
+            read_training(name, self.folder / name),
+            curves=pd.DataFrame() if curves is None else curves,
+        )
 
     def run_and_results(self, name: str, results: dict | None = None, **changes) -> str:
         self.write_run(name, **changes)
@@ -68,7 +73,12 @@ class Compared(InFolder):
 class ReadTest(Compared):
     def test_labels(self):
         a, b, odd = (str(self.write_results(name)) for name in ("a", "b", "p=0.5"))
-        for given, label in ((a, "a"), (f"X-RESET, 2={b}", "X-RESET, 2"), (f"{a}/eval", "a"), (odd, "p=0.5")):
+        for given, label in (
+            (a, "a"),
+            (f"X-RESET, 2={b}", "X-RESET, 2"),
+            (f"{a}/eval", "a"),
+            (odd, "p=0.5"),
+        ):
             self.assertEqual(read_trainings([given])[0].label, label)
 
     def test_bad_arguments(self):
@@ -81,7 +91,10 @@ class ReadTest(Compared):
             ([f"={a}"], "a name is missing"),
             (["x="], "a folder is missing"),
             ([f"{self.folder}/nowhere"], "there is no folder .*nowhere"),
-            ([f"{self.folder}/bare"], "neither learning curves .* nor evaluation results.*xreset eval .*/bare"),
+            (
+                [f"{self.folder}/bare"],
+                "neither learning curves .* nor evaluation results.*xreset eval .*/bare",
+            ),
         ):
             with self.subTest(message), self.assertRaisesRegex(RunError, message):
                 read_trainings(runs)
@@ -107,11 +120,15 @@ class ReadTest(Compared):
 
     def test_event_files_that_are_not_whole(self):
         """Cut anywhere: the head is missed, what is left of a tail is read as it was."""
-        curves = pd.DataFrame({"task/grasped": 0.5, "task/success": np.arange(1, 5) / 8}, index=range(1, 5))
+        curves = pd.DataFrame(
+            {"task/grasped": 0.5, "task/success": np.arange(1, 5) / 8}, index=range(1, 5)
+        )
         a = self.write_curves("a", curves)
         (file,) = a.glob("events*")
         whole = file.read_bytes()
-        pd.testing.assert_frame_equal(read_curves(a), curves, check_names=False, check_index_type=False)
+        pd.testing.assert_frame_equal(
+            read_curves(a), curves, check_names=False, check_index_type=False
+        )
         for at in (1, 100, len(whole) - 40):
             with self.subTest(at):
                 file.write_bytes(whole[at:])
@@ -126,7 +143,9 @@ class ReadTest(Compared):
         whole = file.read_bytes()
         middle = len(whole) // 2
         file.write_bytes(whole[:middle] + bytes(300) + whole[middle + 300 :])
-        with self.assertRaisesRegex(FileFormatError, "is damaged.* up to step [0-9]+ and no farther"):
+        with self.assertRaisesRegex(
+            FileFormatError, "is damaged.* up to step [0-9]+ and no farther"
+        ):
             read_curves(b)
 
     def test_a_resumed_run_repeats_iterations(self):
@@ -155,7 +174,9 @@ class ProgressTest(Compared):
         np.testing.assert_allclose(amounts(training, "steps"), np.array([1, 2, 3]) * STEPS * 1e-6)
         np.testing.assert_allclose(amounts(training, "iterations"), [1, 2, 3])
         late = self.training("a", curves_of((60.0, 30.0), (0.0, 0.1), first=3))
-        np.testing.assert_allclose(amounts(late, "minutes"), [3.0, 3.5], err_msg="what was not logged is as the next")
+        np.testing.assert_allclose(
+            amounts(late, "minutes"), [3.0, 3.5], err_msg="what was not logged is as the next"
+        )
         without = self.training("a", training.curves.drop(columns="speed/learn_seconds"))
         with self.assertRaisesRegex(RunError, "a did not log speed/learn_seconds.*--x iterations"):
             line([without], "task/success", "minutes")
@@ -165,10 +186,14 @@ class ProgressTest(Compared):
         a = self.training("a", curves_of((60.0,) * 4, (0.0, 0.2, 0.4, 0.6)))
         b = self.training("a", curves_of((120.0,) * 3, (0.2, 0.6, 0.8)))
         found = line([a, b], "task/success", "minutes")
-        np.testing.assert_allclose(found.index, [2, 3, 4])  # the first has ended at 4 minutes, the second begins at 2
+        np.testing.assert_allclose(
+            found.index, [2, 3, 4]
+        )  # the first has ended at 4 minutes, the second begins at 2
         np.testing.assert_allclose(found["low"], [0.2, 0.4, 0.6])
         np.testing.assert_allclose(found["high"], [0.2, 0.4, 0.6])
-        np.testing.assert_allclose(line([a, b], "task/success", "iterations")["mean"], [0.1, 0.4, 0.6], atol=1e-12)
+        np.testing.assert_allclose(
+            line([a, b], "task/success", "iterations")["mean"], [0.1, 0.4, 0.6], atol=1e-12
+        )
         self.assertIsNone(line([a, b], "task/other", "minutes"))
         np.testing.assert_allclose(line([b], "task/success", "minutes").T, [[0.2, 0.6, 0.8]] * 3)
 
@@ -178,19 +203,34 @@ class LiftTest(Compared):
         """A run with ``lift.json``: minutes until its end and until each share that it passed."""
 
         def at(minutes: float) -> dict:
-            return {"iteration": round(10 * minutes), "env_steps": round(1e6 * minutes), "minutes": minutes}
+            return {
+                "iteration": round(10 * minutes),
+                "env_steps": round(1e6 * minutes),
+                "minutes": minutes,
+            }
 
         folder = self.write_run(name, **changes)
-        write_lift(folder, Lift(passed=tuple(Passing(share=s, **at(t)) for s, t in passed), **at(end)))
+        write_lift(
+            folder, Lift(passed=tuple(Passing(share=s, **at(t)) for s, t in passed), **at(end))
+        )
         return name
 
     def test_seeds_are_one_row(self):
-        names = [self.lifted("x-s0", 12.0, (0.01, 6.0), (0.1, 8.5)), self.lifted("x-s1", 10.0, (0.01, 7.0), seed=1)]
+        names = [
+            self.lifted("x-s0", 12.0, (0.01, 6.0), (0.1, 8.5)),
+            self.lifted("x-s1", 10.0, (0.01, 7.0), seed=1),
+        ]
         names.append(self.lifted("other", 8.0, num_envs=128))
         self.write_curves("old", curves_of((60.0, 60.0), (0.0, 0.04)))
         for x, first in (
-            ("minutes", "| x | 2 | 100% (34-100); 6.0, 7.0 | 50% (9-91); 8.5, >10.0 | 0% (0-66); >12.0, >10.0 |"),
-            ("iterations", "| x | 2 | 100% (34-100); 60, 70 | 50% (9-91); 85, >100 | 0% (0-66); >120, >100 |"),
+            (
+                "minutes",
+                "| x | 2 | 100% (34-100); 6.0, 7.0 | 50% (9-91); 8.5, >10.0 | 0% (0-66); >12.0, >10.0 |",
+            ),
+            (
+                "iterations",
+                "| x | 2 | 100% (34-100); 60, 70 | 50% (9-91); 85, >100 | 0% (0-66); >120, >100 |",
+            ),
         ):
             text = self.compare(*names, "old", x=x)
             self.assertIn(first, text)
@@ -220,7 +260,9 @@ class GroupTest(Compared):
             (("X s0", "X s1"), "X"), (("run10", "run11"), "run"), (("first", "second"), "first + second"), (("seed0", "seed1"), "seed"),
         ):  # fmt: skip
             with self.subTest(expected):
-                found, _ = self.groups(*(self.run_and_results(name, seed=i) for i, name in enumerate(names)))
+                found, _ = self.groups(
+                    *(self.run_and_results(name, seed=i) for i, name in enumerate(names))
+                )
                 self.assertEqual(found, [(expected, 2)])
         names = [self.run_and_results(f"s-{i}", seed=i, num_envs=64 + i // 2) for i in range(4)]
         self.assertEqual(self.groups(*names)[0], [("s-0 + s-1", 2), ("s-2 + s-3", 2)], "told apart")
@@ -236,14 +278,18 @@ class GroupTest(Compared):
             self.run_and_results(name, results, **changes)
             found, notes = self.groups("a", name)
             self.assertEqual(found, [("a", 1), (name, 1)])
-            self.assertRegex(notes, f"a, {name} have the same configuration and are not grouped. .*{reason}")
+            self.assertRegex(
+                notes, f"a, {name} have the same configuration and are not grouped. .*{reason}"
+            )
 
 
 class ScoreTest(Compared):
     def scored(self, *progress: tuple[float, ...], engines=("mujoco",)) -> pd.DataFrame:
         """The scores of trainings with other seeds, by engine."""
         for i, values in enumerate(progress):
-            self.run_and_results(f"s-{i}", {"rollouts": rollouts_with(*values), "engines": engines}, seed=i)
+            self.run_and_results(
+                f"s-{i}", {"rollouts": rollouts_with(*values), "engines": engines}, seed=i
+            )
         groups, _ = grouped([self.training(f"s-{i}") for i in range(len(progress))])
         return scores(groups).set_index(["engine", "metric"])
 
@@ -251,14 +297,20 @@ class ScoreTest(Compared):
         ours = self.scored((1.0, 0.33, 0.66, 0.0), engines=ENGINES).loc["pybullet"]
         summary = self.training("s-0").results["pybullet"]
         self.assertEqual(ours.loc["task_progress", "mean"], summary.task_progress.mean)
-        np.testing.assert_allclose(ours.loc["task_progress", ["low", "high"]], summary.task_progress.ci95, atol=1e-6)
+        np.testing.assert_allclose(
+            ours.loc["task_progress", ["low", "high"]], summary.task_progress.ci95, atol=1e-6
+        )
         for metric in ("approach", "grasp", "reorient", "reorient_once", "published_success"):
             self.assertEqual(ours.loc[metric, "mean"], getattr(summary, f"{metric}_rate"), metric)
 
     def test_seeds_widen_the_interval(self):
-        alike = self.scored((0.4, 0.6, 0.4, 0.6), (0.4, 0.6, 0.4, 0.6)).loc["mujoco", "task_progress"]
+        alike = self.scored((0.4, 0.6, 0.4, 0.6), (0.4, 0.6, 0.4, 0.6)).loc[
+            "mujoco", "task_progress"
+        ]
         self.assertEqual(list(alike[["mean", "low", "high"]]), [0.5, 0.5, 0.5])
-        apart = self.scored((0.0, 0.2, 0.0, 0.2), (0.8, 1.0, 0.8, 1.0)).loc["mujoco", "task_progress"]
+        apart = self.scored((0.0, 0.2, 0.0, 0.2), (0.8, 1.0, 0.8, 1.0)).loc[
+            "mujoco", "task_progress"
+        ]
         half = "one of the two seeds only is drawn in half of the resamples"
         np.testing.assert_allclose(apart[["low", "high"]].astype(float), (0.1, 0.9), err_msg=half)
 
@@ -270,7 +322,9 @@ class ScoreTest(Compared):
         low, high = crossed_bootstrap_ci95(values, runs, demos, draws=20000)
         expected = 2 * 1.96 * np.sqrt(of_run.var() / 8 + of_demo.var() / 30)
         self.assertAlmostEqual(high - low, expected, delta=0.05 * expected)
-        self.assertEqual(crossed_bootstrap_ci95(values, np.zeros(240), demos), bootstrap_ci95(values, demos))
+        self.assertEqual(
+            crossed_bootstrap_ci95(values, np.zeros(240), demos), bootstrap_ci95(values, demos)
+        )
         with self.assertRaisesRegex(ValueError, "every demonstration"):
             crossed_bootstrap_ci95(values[:4], np.array([0, 0, 0, 1]), np.array([0, 0, 1, 1]))
 
@@ -278,23 +332,43 @@ class ScoreTest(Compared):
 class FairnessTest(Compared):
     def test_alike(self):
         for name, share in (("a", 0.3), ("b", 0.6)):
-            self.write_run(name, TrainConfig(task=TaskConfig(reset=ResetConfig(demo_probability=share))))
+            self.write_run(
+                name, TrainConfig(task=TaskConfig(reset=ResetConfig(demo_probability=share)))
+            )
             self.write_results(name, inputs={"demos": "ab", "policy": name})
         text = self.compare("a", "b")
         self.assertNotIn("comparable", text)
-        self.assertIn("Note:** Of 4 episodes of a in mujoco, 1 stopped being finite and 1 dropped contacts", text)
+        self.assertIn(
+            "Note:** Of 4 episodes of a in mujoco, 1 stopped being finite and 1 dropped contacts",
+            text,
+        )
 
     def test_what_makes_results_incomparable_is_said(self):
         self.write_results("a", engines=("mujoco", "sapien"))
         base = toy_rollouts()
-        renamed = replace(base, episodes=tuple(replace(e, sequence_name=f"other_{e.sequence}") for e in base.episodes))
-        soups = replace(base, episodes=tuple(replace(e, object="005_tomato_soup_can") for e in base.episodes))
+        renamed = replace(
+            base,
+            episodes=tuple(replace(e, sequence_name=f"other_{e.sequence}") for e in base.episodes),
+        )
+        soups = replace(
+            base, episodes=tuple(replace(e, object="005_tomato_soup_can") for e in base.episodes)
+        )
         other = {"inputs": {"demos": "cd"}}
         for what, rollouts, changes, expected in (
             ("seed", None, {"seed": 4}, r"seed of the evaluation \(3: a; 4: seed\)"),
             ("robot", None, {"robot": "other"}, r"robot \(toy: a; other: robot\)"),
-            ("meshes", None, {"objects_folder": "/ycb"}, r"object meshes \(stand-ins: a; /ycb: meshes\)\."),
-            ("engine", None, {"backend_version": "5.1"}, r"version of mujoco \(4.0.0: a; 5.1: engine\)"),
+            (
+                "meshes",
+                None,
+                {"objects_folder": "/ycb"},
+                r"object meshes \(stand-ins: a; /ycb: meshes\)\.",
+            ),
+            (
+                "engine",
+                None,
+                {"backend_version": "5.1"},
+                r"version of mujoco \(4.0.0: a; 5.1: engine\)",
+            ),
             ("demos", renamed, other, r"demonstrations \(ab: a; cd: demos\)\.$"),
             (
                 "file",
@@ -302,17 +376,30 @@ class FairnessTest(Compared):
                 other,
                 r"demonstrations \(ab: a; cd: file\)\. .* same names: if one was made from the other",
             ),
-            ("objects", soups, {}, r"objects \(potted meat can, tomato soup can: a; tomato soup can: ob"),
-            ("fewer", replace(base, episodes=base.episodes[::2]), {}, r"number of episodes \(4: a; 2: fewer\)"),
+            (
+                "objects",
+                soups,
+                {},
+                r"objects \(potted meat can, tomato soup can: a; tomato soup can: ob",
+            ),
+            (
+                "fewer",
+                replace(base, episodes=base.episodes[::2]),
+                {},
+                r"number of episodes \(4: a; 2: fewer\)",
+            ),
         ):
             with self.subTest(what):
                 self.write_results(what, rollouts, ("mujoco", "sapien"), **changes)
                 text = self.compare("a", what)
                 self.assertRegex(
-                    text, rf"(?m)^> \*\*Note:\*\* These results are not comparable: not the same {expected}"
+                    text,
+                    rf"(?m)^> \*\*Note:\*\* These results are not comparable: not the same {expected}",
                 )
         self.write_results("a", engines=("sapien",), seed=9)
-        self.assertRegex(self.compare("a"), r"seed of the evaluation \(3: a in mujoco; 9: a in sapien\)")
+        self.assertRegex(
+            self.compare("a"), r"seed of the evaluation \(3: a in mujoco; 9: a in sapien\)"
+        )
 
     def test_policies_that_play_another_task(self):
         short = TrainConfig(task=TaskConfig(termination=TerminationConfig(episode_seconds=2.5)))
@@ -332,8 +419,16 @@ class FairnessTest(Compared):
 
 class WrittenTest(Compared):
     def write_three(self) -> list[str]:
-        for name, seed, gravity, success in (("x-s0", 0, True, 0.2), ("x-s1", 1, True, 0.4), ("fixed", 0, False, 0.1)):
-            self.write_run(name, TrainConfig(task=TaskConfig(reset=ResetConfig(random_gravity=gravity))), seed=seed)
+        for name, seed, gravity, success in (
+            ("x-s0", 0, True, 0.2),
+            ("x-s1", 1, True, 0.4),
+            ("fixed", 0, False, 0.1),
+        ):
+            self.write_run(
+                name,
+                TrainConfig(task=TaskConfig(reset=ResetConfig(random_gravity=gravity))),
+                seed=seed,
+            )
             self.write_results(name, rollouts_with(success, 0.33, 0.66, 0.0), ("mujoco", "sapien"))
             self.write_curves(name, curves_of((60.0, 60.0), (0.0, success)))
         self.write_results("ik")
@@ -363,8 +458,13 @@ class WrittenTest(Compared):
     def test_a_picture_of_the_right_size_with_everything_and_with_less(self):
         names = self.write_three()
         heights = []
-        for chosen, curves in ((names[3:], ()), (names, ("task/success", "task/success_from_home", *SPEED))):
-            page = compare([str(self.folder / name) for name in chosen], self.folder / "drawn", curves=curves)
+        for chosen, curves in (
+            (names[3:], ()),
+            (names, ("task/success", "task/success_from_home", *SPEED)),
+        ):
+            page = compare(
+                [str(self.folder / name) for name in chosen], self.folder / "drawn", curves=curves
+            )
             content = page.with_name("compare.png").read_bytes()
             width, height = (int.from_bytes(content[i : i + 4], "big") for i in (16, 20))
             self.assertEqual((content[:4], width), (b"\x89PNG", 1200))
@@ -375,8 +475,16 @@ class WrittenTest(Compared):
         self.write_curves("a", curves_of((60.0, 60.0), (0.0, 0.5)))
         self.assertNotIn("## Evaluation", self.compare("a"))
         for name, curves, words in (
-            ("a", ["task/sucess"], r"no curve task/sucess; there are speed/.*task/success, task/success_from_home\. "),
-            (str(self.write_results("ik")), ["task/success"], "no curve task/success; there are none"),
+            (
+                "a",
+                ["task/sucess"],
+                r"no curve task/sucess; there are speed/.*task/success, task/success_from_home\. ",
+            ),
+            (
+                str(self.write_results("ik")),
+                ["task/success"],
+                "no curve task/success; there are none",
+            ),
         ):
             with self.assertRaisesRegex(RunError, words):
                 self.compare(name, curves=curves)
@@ -403,18 +511,33 @@ class DrawTest(Compared):
     def test_lines_and_bands(self):
         mean = pd.DataFrame({"mean": [0.1, 0.3]}, index=[1.0, 3.0])
         alone = mean.assign(low=mean["mean"], high=mean["mean"])
-        lines = {"0": alone, "2": mean.assign(low=mean["mean"] - 0.1, high=mean["mean"] + 0.1), "8": alone}
+        lines = {
+            "0": alone,
+            "2": mean.assign(low=mean["mean"] - 0.1, high=mean["mean"] + 0.1),
+            "8": alone,
+        }
         ax = self.draw(draw_lines, "task/success", lines, "steps", [str(i) for i in range(9)])
         np.testing.assert_allclose(ax.lines[0].get_xydata(), [[1, 10], [3, 30]])
-        self.assertEqual([curve.get_color() for curve in ax.lines], [COLORS[0], COLORS[2], COLORS[0]])
-        self.assertNotEqual(ax.lines[0].get_linestyle(), ax.lines[2].get_linestyle(), "the ninth has another line")
-        np.testing.assert_allclose(ax.collections[0].get_datalim(ax.transData).intervaly, (0, 40), atol=1e-9)
-        self.assertEqual((ax.get_xlabel(), ax.get_title(loc="left")), ("million environment steps", "at the goal"))
+        self.assertEqual(
+            [curve.get_color() for curve in ax.lines], [COLORS[0], COLORS[2], COLORS[0]]
+        )
+        self.assertNotEqual(
+            ax.lines[0].get_linestyle(), ax.lines[2].get_linestyle(), "the ninth has another line"
+        )
+        np.testing.assert_allclose(
+            ax.collections[0].get_datalim(ax.transData).intervaly, (0, 40), atol=1e-9
+        )
+        self.assertEqual(
+            (ax.get_xlabel(), ax.get_title(loc="left")),
+            ("million environment steps", "at the goal"),
+        )
 
     def test_bars_are_as_long_as_the_results(self):
         self.write_results("a", rollouts_with(1.0, 0.5, 0.5, 0.0), ("mujoco", "sapien"))
         self.write_results("b", rollouts_with(0.2, 0.2, 0.2, 0.2), ("sapien",))
-        ax = self.draw(draw_scores, scores(grouped([self.training(n) for n in "ab"])[0]), ["a", "b"])
+        ax = self.draw(
+            draw_scores, scores(grouped([self.training(n) for n in "ab"])[0]), ["a", "b"]
+        )
         np.testing.assert_allclose([bar.get_height() for bar in ax.patches], [50, 50, np.nan, 20])
         self.assertEqual([label.get_text() for label in ax.get_xticklabels()], ["mujoco", "sapien"])
 
@@ -424,7 +547,9 @@ class CommandTest(Compared):
         for name, seed in (("a", 3), ("b", 4)):
             self.run_and_results(name, {"engines": ENGINES, "seed": seed}, num_envs=64 + seed)
         out = self.folder / "made"
-        code, printed, _ = run("compare", f"[one]={self.folder}/a", str(self.folder / "b"), "--out", str(out))
+        code, printed, _ = run(
+            "compare", f"[one]={self.folder}/a", str(self.folder / "b"), "--out", str(out)
+        )
         self.assertEqual(code, 0, printed)
         for expected in (*ENGINES, "[one]", "49.8", "num_envs", "These results are", "compare.md"):
             self.assertIn(expected, printed)

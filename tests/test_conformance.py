@@ -396,7 +396,9 @@ class TorsionalFrictionAtLeastAsBuilt(MujocoWorld):
 class TorsionalFrictionTimesSlidingFriction(MujocoWorld):
     def set_friction(self, friction):
         super().set_friction(friction)
-        self._model.geom_friction[:, 1] = self._at.model.geom_friction[:, 1] * self._model.geom_friction[:, 0]
+        self._model.geom_friction[:, 1] = (
+            self._at.model.geom_friction[:, 1] * self._model.geom_friction[:, 0]
+        )
 
 
 @remodelled("shaken_grasp")
@@ -410,7 +412,9 @@ class TheSuiteCanFail(unittest.TestCase):
             for name, result in outcome(defect, *checks).items():
                 with self.subTest(defect=defect.__name__, check=name):
                     self.assertEqual(result.verdict, "failed")
-                    self.assertEqual(result.problem, "", "it must fail by a measure, not by an exception")
+                    self.assertEqual(
+                        result.problem, "", "it must fail by a measure, not by an exception"
+                    )
                     self.assertTrue(result.check.cause)
 
     def test_every_check_has_a_defect_that_it_notices(self):
@@ -460,7 +464,9 @@ class Harness(unittest.TestCase):
             (0.1, None, "failed"),
             (10.0, "another", "failed"),
         ):
-            known = KnownDifference(check="free_fall", measure="velocity", bound=bound, reason="r", robot=robot)
+            known = KnownDifference(
+                check="free_fall", measure="velocity", bound=bound, reason="r", robot=robot
+            )
             with mock.patch.object(Different, "known_differences", (known,)):
                 [result] = run(partial(Different, workers=0), only=["free_fall"])
             self.assertEqual(result.verdict, verdict)
@@ -479,13 +485,24 @@ class Harness(unittest.TestCase):
     def test_command(self):
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "c.json"
-            command = ["engines", "check", "--backend", "mujoco", "--check", "free_fall", "--json", str(file)]
+            command = [
+                "engines",
+                "check",
+                "--backend",
+                "mujoco",
+                "--check",
+                "free_fall",
+                "--json",
+                str(file),
+            ]
             with contextlib.redirect_stdout(io.StringIO()) as out:
                 main(command)
             self.assertIn("no check failed", out.getvalue())
             data = json.loads(file.read_text())
             self.assertEqual(data["schema"], "xreset-conformance/2")
-            self.assertEqual(data["command"], "xreset engines check --backend mujoco --check free_fall")
+            self.assertEqual(
+                data["command"], "xreset engines check --backend mujoco --check free_fall"
+            )
             self.assertEqual([c["verdict"] for c in data["runs"][0]["checks"]], ["passed"])
             broken = Measure(what="x", measured=float("nan"), tolerance=1.0)
             red = ("failed", "", (broken,))
@@ -496,7 +513,10 @@ class Harness(unittest.TestCase):
             ):
                 main(command)
             self.assertEqual(raised.exception.code, 1)
-            self.assertEqual(json.loads(file.read_text())["runs"][0]["checks"][0]["measures"][0]["measured"], "nan")
+            self.assertEqual(
+                json.loads(file.read_text())["runs"][0]["checks"][0]["measures"][0]["measured"],
+                "nan",
+            )
 
 
 if __name__ == "__main__":

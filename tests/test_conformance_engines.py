@@ -42,7 +42,9 @@ def panda() -> RobotSpec:
     joints = []
     for i, q in enumerate((0.0, -0.6, 0.0, -2.2, 0.0, 1.6, 0.8), start=1):
         strong = i <= 4
-        drive = DriveSpec(kp=1500.0 if strong else 300.0, kd=0.0, effort=87.0 if strong else 12.0, armature=0.1)
+        drive = DriveSpec(
+            kp=1500.0 if strong else 300.0, kd=0.0, effort=87.0 if strong else 12.0, armature=0.1
+        )
         joints.append(JointSpec(name=f"panda_joint{i}", group="arm", home=q, drive=drive))
     drive = DriveSpec(kp=1000.0, kd=0.0, effort=20.0)
     joints.append(JointSpec(name="panda_finger_joint1", group="hand", home=0.02, drive=drive))
@@ -75,7 +77,9 @@ class EveryBackend(unittest.TestCase):
         if status.reason is not None:
             self.skipTest(f"{backend}: {status.reason}")
         results = run(make_local(backend), **options)
-        self.assertEqual([explain(r) for r in results if r.verdict not in ("passed", "known difference")], [])
+        self.assertEqual(
+            [explain(r) for r in results if r.verdict not in ("passed", "known difference")], []
+        )
 
     def test_every_backend_passes(self):
         for backend in BACKENDS:
@@ -84,7 +88,9 @@ class EveryBackend(unittest.TestCase):
 
     @PYBULLET  # whose data package has the robot
     def test_a_robot_from_outside(self):
-        robot_dependent = [c.name for c in CHECKS if c.group in ("state", "robot") and not c.own_robot_only]
+        robot_dependent = [
+            c.name for c in CHECKS if c.group in ("state", "robot") and not c.own_robot_only
+        ]
         for backend in BACKENDS:
             with self.subTest(backend=backend):
                 self.passes(backend, robot=panda(), only=robot_dependent)
@@ -93,7 +99,9 @@ class EveryBackend(unittest.TestCase):
     def test_checks_that_need_the_suites_robot_are_skipped_with_another(self):
         own = [c.name for c in CHECKS if c.own_robot_only]
         results = run(make_local("mujoco"), robot=panda(), only=own)
-        self.assertEqual([(r.name, r.verdict) for r in results], [(name, "skipped") for name in own])
+        self.assertEqual(
+            [(r.name, r.verdict) for r in results], [(name, "skipped") for name in own]
+        )
 
 
 if __name__ == "__main__":

@@ -53,17 +53,23 @@ class Archive(InFolder):
     def moved(self, by):
         """The demonstrations moved by [F, 3]."""
         return replace(
-            self.demos, object_pos=self.demos.object_pos + by, hand_keypoints=self.demos.hand_keypoints + by[:, None]
+            self.demos,
+            object_pos=self.demos.object_pos + by,
+            hand_keypoints=self.demos.hand_keypoints + by[:, None],
         )
 
     def assert_same(self, a, b):
         for field in fields(a):
-            np.testing.assert_array_equal(getattr(a, field.name), getattr(b, field.name), field.name)
+            np.testing.assert_array_equal(
+                getattr(a, field.name), getattr(b, field.name), field.name
+            )
 
     def test_round_trip_is_exact(self):
         first = self.folder / "a.npz"
         second = self.folder / "b.npz"
-        unseen = {name: getattr(self.demos, name).copy() for name in ("hand_keypoints", "wrist_quat_wxyz")}
+        unseen = {
+            name: getattr(self.demos, name).copy() for name in ("hand_keypoints", "wrist_quat_wxyz")
+        }
         for array in unseen.values():
             array[:2] = np.nan
         rich = replace(
@@ -83,18 +89,33 @@ class Archive(InFolder):
         begin = self.demos.frames(1).start
         where = "First in frame {} of sequence 1".format
         for demos, message in (
-            (self.changed("hand_keypoints", (begin + 3, 8, 1), np.nan), "hand_keypoints are not finite.*" + where(3)),
-            (self.changed("wrist_quat_wxyz", begin + 4, np.nan), "wrist_quat_wxyz is not a unit .*" + where(4)),
+            (
+                self.changed("hand_keypoints", (begin + 3, 8, 1), np.nan),
+                "hand_keypoints are not finite.*" + where(3),
+            ),
+            (
+                self.changed("wrist_quat_wxyz", begin + 4, np.nan),
+                "wrist_quat_wxyz is not a unit .*" + where(4),
+            ),
             (
                 replace(self.demos, hand_keypoints=self.demos.hand_keypoints + 200),
                 "hand_keypoints are far from the table",
             ),
             (self.changed("object_pos", (begin, 2), 200), "object_pos' holds 200, expected"),
-            (self.changed("object_quat_wxyz", begin + 1, (1, 1, 0, 0)), "quaternions that are not unit"),
-            (self.changed("hand_side", 2, "Right"), r"sequence 2 .* hand_side 'Right', expected 'right' or 'left'"),
+            (
+                self.changed("object_quat_wxyz", begin + 1, (1, 1, 0, 0)),
+                "quaternions that are not unit",
+            ),
+            (
+                self.changed("hand_side", 2, "Right"),
+                r"sequence 2 .* hand_side 'Right', expected 'right' or 'left'",
+            ),
             (self.changed("frame_offsets", 2, 0), "frame_offsets must increase"),
             (self.changed("sequence_name", 1, self.demos.sequence_name[0]), "must be unique"),
-            (replace(self.demos, hand_keypoints=1000 * self.demos.hand_keypoints), "Are these millimetres"),
+            (
+                replace(self.demos, hand_keypoints=1000 * self.demos.hand_keypoints),
+                "Are these millimetres",
+            ),
             (replace(self.demos, fps=0.0), "fps"),
             (replace(self.demos, subjects=np.array(["a"])), "belong together"),
         ):
@@ -107,7 +128,9 @@ class Archive(InFolder):
             arrays = dict(file)
         arrays["hand_keypoints"][7, 0, 0] = np.nan
         np.savez(path, **arrays)
-        with self.assertRaisesRegex(FileFormatError, r"a\.npz.*not finite.* frame 7 of sequence 0 \(synthetic/005"):
+        with self.assertRaisesRegex(
+            FileFormatError, r"a\.npz.*not finite.* frame 7 of sequence 0 \(synthetic/005"
+        ):
             read_demos(path)
 
     def test_select(self):
@@ -118,27 +141,40 @@ class Archive(InFolder):
             ({"indices": [3, 0]}, [3, 0]),
             ({"names": names[1:2], "sides": ["right"], "subjects": ["synthetic"]}, [1]),
         ):
-            self.assertEqual(self.demos.select(**options).sequence_name.tolist(), names[indices].tolist())
+            self.assertEqual(
+                self.demos.select(**options).sequence_name.tolist(), names[indices].tolist()
+            )
         picked = self.demos.select(indices=[3, 0])
-        np.testing.assert_array_equal(picked.goal_pose[0][1], self.demos.object_pos[self.demos.frames(0)][-1])
+        np.testing.assert_array_equal(
+            picked.goal_pose[0][1], self.demos.object_pos[self.demos.frames(0)][-1]
+        )
         for options, message in (
             ({"sides": ["left"]}, r"no hand_side left. Choose from: \['right"),
             ({"indices": [4]}, "there are 4 sequences"),
-            ({"objects": ["soup", "cup", "mug"]}, "Unknown objects 'cup', 'mug'. Choose from: 005_tomato_soup_can"),
+            (
+                {"objects": ["soup", "cup", "mug"]},
+                "Unknown objects 'cup', 'mug'. Choose from: 005_tomato_soup_can",
+            ),
             ({"share": 0.0}, "share is 0, expected"),
         ):
             with self.assertRaisesRegex(DemoError, message):
                 self.demos.select(**options)
 
     def test_split_by_share_spread_and_chance(self):
-        parts = [replace(self.demos, sequence_name=np.array([f"{i}{j}" for j in range(4)])) for i in range(6)]
+        parts = [
+            replace(self.demos, sequence_name=np.array([f"{i}{j}" for j in range(4)]))
+            for i in range(6)
+        ]
         demos = merge_demos(parts)  # 12 sequences of each object
         alone = demos.select(objects=["soup"])
         for options, soup in (
             ({"share": 0.25}, ["00", "01", "10"]),
             ({"max_per_object": 3, "spread": True}, ["01", "21", "41"]),
             # the choice for an object depends on the seed alone
-            ({"max_per_object": 3, "seed": 1}, alone.select(max_per_object=3, seed=1).sequence_name.tolist()),
+            (
+                {"max_per_object": 3, "seed": 1},
+                alone.select(max_per_object=3, seed=1).sequence_name.tolist(),
+            ),
         ):
             with self.subTest(**options):
                 kept, rest = demos.split(**options)
@@ -165,23 +201,33 @@ class Archive(InFolder):
 
     def test_unknown_object(self):
         file = self.folder / "a.npz"
-        write_demos(file, self.changed("object_name", 3, "055_baseball"))  # the archive may hold any object
-        with self.assertRaisesRegex(DemoError, r"Unknown object '055_baseball'. Choose from: 003_cracker_box"):
+        write_demos(
+            file, self.changed("object_name", 3, "055_baseball")
+        )  # the archive may hold any object
+        with self.assertRaisesRegex(
+            DemoError, r"Unknown object '055_baseball'. Choose from: 003_cracker_box"
+        ):
             demo_objects(read_demos(file))
         write_demos(file, self.changed("object_name", 3, "banana"))  # the paper's name
-        self.assertEqual(list(demo_objects(read_demos(file))), ["005_tomato_soup_can", "011_banana"])
+        self.assertEqual(
+            list(demo_objects(read_demos(file))), ["005_tomato_soup_can", "011_banana"]
+        )
 
     def test_levelled_applies_the_subjects_transform_once(self):
         T = np.eye(4)
         T[:3, :3] = Rotation.from_rotvec([0.02, 0, 0]).as_matrix()
         T[:3, 3] = (0, 0, 0.01)
         levels = np.stack([np.eye(4), T])
-        demos = replace(self.demos, subjects=np.array(["other", "synthetic"]), T_level_from_table=levels)
+        demos = replace(
+            self.demos, subjects=np.array(["other", "synthetic"]), T_level_from_table=levels
+        )
         level = levelled(demos)
         for name in ("object_pos", "hand_keypoints"):
             expected = getattr(demos, name) @ T[:3, :3].T + T[:3, 3]
             np.testing.assert_allclose(getattr(level, name), expected, atol=1e-6)
-        np.testing.assert_allclose(angles(demos.object_quat_wxyz, level.object_quat_wxyz), 0.02, atol=1e-5)
+        np.testing.assert_allclose(
+            angles(demos.object_quat_wxyz, level.object_quat_wxyz), 0.02, atol=1e-5
+        )
         self.assertIs(levelled(level), level)
         self.assertIs(levelled(self.demos), self.demos)
         with self.assertRaisesRegex(DemoError, "not for synthetic"):
@@ -195,12 +241,16 @@ class Archive(InFolder):
             up[:, 2] = elsewhere  # below the table: lifted, however far
             up[first, 2] = height
             raised = self.moved(up)
-            self.assertEqual(on_something(raised, objects).tolist(), [stays > 0] + [False] * (len(raised) - 1))
+            self.assertEqual(
+                on_something(raised, objects).tolist(), [stays > 0] + [False] * (len(raised) - 1)
+            )
             after = grounded(raised, objects)
             expected = np.zeros_like(up)
             expected[first, 2] = stays
             np.testing.assert_allclose(after.object_pos, self.moved(expected).object_pos, atol=1e-6)
-            np.testing.assert_allclose(after.hand_keypoints, self.moved(expected).hand_keypoints, atol=1e-6)
+            np.testing.assert_allclose(
+                after.hand_keypoints, self.moved(expected).hand_keypoints, atol=1e-6
+            )
 
 
 class DexYCB(InFolder):
@@ -220,12 +270,17 @@ class DexYCB(InFolder):
             poses[key] = (Rotation.random(random_state=rng), rng.normal(size=3))
         poses[self.SERIALS[0]] = (Rotation.identity(), np.zeros(3))
         self.sequence = self.folder / "20200709-subject-01" / "20200709_141754"
-        self.calibration = self.folder / "calibration" / "extrinsics_20200702_151821" / "extrinsics.yml"
+        self.calibration = (
+            self.folder / "calibration" / "extrinsics_20200702_151821" / "extrinsics.yml"
+        )
         self.calibration.parent.mkdir(parents=True)
         lines = ["extrinsics:"]
         for key, (rot, pos) in poses.items():
             lines.append(f"  '{key}': !!python/tuple")
-            lines += [f"  - {value!r}" for value in np.column_stack((rot.as_matrix(), pos)).ravel().tolist()]
+            lines += [
+                f"  - {value!r}"
+                for value in np.column_stack((rot.as_matrix(), pos)).ravel().tolist()
+            ]
         self.calibration.write_text("\n".join(lines))
         self.sequence.mkdir(parents=True)
         self.write_meta()
@@ -265,13 +320,22 @@ class DexYCB(InFolder):
     def check(self):
         read = read_dexycb(self.folder)
         self.assertEqual(read.sequence_name.tolist(), ["20200709-subject-01/20200709_141754"])
-        self.assertEqual((read.object_name[0], read.hand_side[0], read.fps), ("010_potted_meat_can", "right", 30.0))
+        self.assertEqual(
+            (read.object_name[0], read.hand_side[0], read.fps),
+            ("010_potted_meat_can", "right", 30.0),
+        )
         self.assertEqual(read.hand_valid.tolist(), [False] + [True] * (self.demos.num_frames - 1))
-        self.assertTrue(np.isnan(read.hand_keypoints[0]).all() and np.isnan(read.wrist_quat_wxyz[0]).all())
-        np.testing.assert_allclose(read.hand_keypoints[1:], self.demos.hand_keypoints[1:], atol=1e-5)
+        self.assertTrue(
+            np.isnan(read.hand_keypoints[0]).all() and np.isnan(read.wrist_quat_wxyz[0]).all()
+        )
+        np.testing.assert_allclose(
+            read.hand_keypoints[1:], self.demos.hand_keypoints[1:], atol=1e-5
+        )
         np.testing.assert_allclose(read.object_pos, self.demos.object_pos, atol=1e-5)
         self.assertLess(angles(read.object_quat_wxyz, self.demos.object_quat_wxyz).max(), 1e-5)
-        self.assertLess(angles(read.wrist_quat_wxyz[1:], self.demos.wrist_quat_wxyz[1:]).max(), 1e-5)
+        self.assertLess(
+            angles(read.wrist_quat_wxyz[1:], self.demos.wrist_quat_wxyz[1:]).max(), 1e-5
+        )
 
     def refused(self, message, root=None):
         with self.subTest(message), self.assertRaisesRegex(DemoError, message):
@@ -285,7 +349,10 @@ class DexYCB(InFolder):
 
     def test_incomplete(self):
         for changes, message in (
-            ({"num_frames": self.demos.num_frames + 1}, r"frames of meta\.yml: array .pose_y. has shape"),
+            (
+                {"num_frames": self.demos.num_frames + 1},
+                r"frames of meta\.yml: array .pose_y. has shape",
+            ),
             ({"ycb_grasp_ind": 2}, "not a meta.yml of DexYCB.*list index out of range"),
             ({"mano_sides": ["up"]}, "side is out of range"),
         ):
@@ -318,14 +385,19 @@ class RealData(unittest.TestCase):
         compared = 0
         for name, _ in ARCHIVES:
             archive = read_demos(data_dir() / name)
-            for sequence in set(layout.sequence_name.tolist()) & set(archive.sequence_name.tolist()):
+            for sequence in set(layout.sequence_name.tolist()) & set(
+                archive.sequence_name.tolist()
+            ):
                 compared += 1
                 a, b = (demos.select(names=[sequence]) for demos in (archive, layout))
                 for field in ("hand_side", "hand_valid"):
                     np.testing.assert_array_equal(getattr(a, field), getattr(b, field))
                 np.testing.assert_allclose(a.hand_keypoints, b.hand_keypoints, atol=1e-5)
                 np.testing.assert_allclose(a.object_pos, b.object_pos, atol=1e-5)
-                self.assertLess(angles(a.wrist_quat_wxyz[a.hand_valid], b.wrist_quat_wxyz[a.hand_valid]).max(), 1e-4)
+                self.assertLess(
+                    angles(a.wrist_quat_wxyz[a.hand_valid], b.wrist_quat_wxyz[a.hand_valid]).max(),
+                    1e-4,
+                )
         self.assertEqual(compared, 3)
 
     def test_synthetic_hands_have_the_conventions_of_real_hands(self):
@@ -333,10 +405,14 @@ class RealData(unittest.TestCase):
         for file, side in ARCHIVES:
             real = read_demos(data_dir() / file)
             points = real.hand_keypoints[real.hand_valid]
-            local = in_frame(points[:, 0], real.wrist_quat_wxyz[real.hand_valid], points).mean(axis=0)
+            local = in_frame(points[:, 0], real.wrist_quat_wxyz[real.hand_valid], points).mean(
+                axis=0
+            )
             model = hand.keypoints(hand.RELAXED, side)
             np.testing.assert_allclose(local[KNUCKLES], model[KNUCKLES], atol=0.01)
-            np.testing.assert_allclose(local, model, atol=0.04)  # real fingers are bent more or less
+            np.testing.assert_allclose(
+                local, model, atol=0.04
+            )  # real fingers are bent more or less
 
     def test_recorded_demonstrations_are_not_doubted(self):
         for name, _ in ARCHIVES:
@@ -352,7 +428,9 @@ class Synthetic(InFolder):
         cls.objects = demo_objects(cls.demos)
 
     def hand_in_object(self, demos):
-        return in_frame(demos.object_pos, demos.object_quat_wxyz, demos.hand_keypoints.astype(float))
+        return in_frame(
+            demos.object_pos, demos.object_quat_wxyz, demos.hand_keypoints.astype(float)
+        )
 
     def test_the_same_seed_gives_the_same_bits(self):
         self.assertEqual(self.demos.object_name[:9].tolist(), list(object_names()))
@@ -385,7 +463,9 @@ class Synthetic(InFolder):
 
     def check_object(self, one, obj, lifted):
         """It rests in the workspace, and is lifted."""
-        np.testing.assert_array_equal(one.object_pos[:lifted, :2], one.object_pos[:1, :2].repeat(lifted, axis=0))
+        np.testing.assert_array_equal(
+            one.object_pos[:lifted, :2], one.object_pos[:1, :2].repeat(lifted, axis=0)
+        )
         height = one.object_pos[:, 2] - rest_height(obj, one.object_quat_wxyz)
         self.assertAlmostEqual(height[0], 0, delta=1e-4)
         self.assertGreater(height.min(), -1e-4)
@@ -394,14 +474,18 @@ class Synthetic(InFolder):
 
     def check_grasp(self, one, obj, lifted):
         """Thumb and fingers oppose each other on the surface."""
-        distance = Solid.of(obj, np.zeros(3), Rotation.identity()).distance(self.hand_in_object(one))
+        distance = Solid.of(obj, np.zeros(3), Rotation.identity()).distance(
+            self.hand_in_object(one)
+        )
         self.assertTrue((np.abs(distance[lifted, TIPS[:3]]) < 0.008).all())  # thumb, index, middle
         self.assertGreater(distance[:, 1:].min(), -0.002)  # the hand goes through nothing
         self.assertGreater(one.hand_keypoints[..., 2].min(), 0.0)
         tips = one.hand_keypoints[lifted, TIPS].astype(float)
         to_fingers = tips[1:3].mean(axis=0) - tips[0]
         points = tips[0] + np.linspace(0, 1, 41)[1:-1, None] * to_fingers
-        solid = Solid.of(obj, one.object_pos[lifted].astype(float), turns(one.object_quat_wxyz[lifted]))
+        solid = Solid.of(
+            obj, one.object_pos[lifted].astype(float), turns(one.object_quat_wxyz[lifted])
+        )
         inside = (solid.distance(points) < 0).mean()  # the object is between them
         self.assertGreater(inside * np.linalg.norm(to_fingers), 0.008)
         self.assertGreater(inside, 0.5)
@@ -437,8 +521,14 @@ class Plausible(unittest.TestCase):
             for words, changes in (
                 ("MANO's order", {"hand_keypoints": mano}),
                 (r"\(w, x, y, z\)", {"wrist_quat_wxyz": demos.wrist_quat_wxyz[:, [1, 2, 3, 0]]}),
-                ("1 of 1 sequences begin .* coordinates of a camera", {"object_pos": demos.object_pos + 0.9}),
-                ("1 of 1 sequences begin .* at its goal already", {"object_pos": pos, "object_quat_wxyz": quat}),
+                (
+                    "1 of 1 sequences begin .* coordinates of a camera",
+                    {"object_pos": demos.object_pos + 0.9},
+                ),
+                (
+                    "1 of 1 sequences begin .* at its goal already",
+                    {"object_pos": pos, "object_quat_wxyz": quat},
+                ),
             ):
                 with self.subTest(words, side=side):
                     (doubt,) = doubts(replace(demos, **changes))
@@ -448,7 +538,20 @@ class Plausible(unittest.TestCase):
 class Commands(InFolder):
     def test_synth_then_info(self):
         file = self.folder / "demos.npz"
-        synth = ("demos", "synth", "--out", file, "--objects", "soup", "--per-object", 1, "--side", "both", "--fps", 10)
+        synth = (
+            "demos",
+            "synth",
+            "--out",
+            file,
+            "--objects",
+            "soup",
+            "--per-object",
+            1,
+            "--side",
+            "both",
+            "--fps",
+            10,
+        )
         code, out = run(*synth)
         self.assertEqual(code, 0, out)
         first = file.read_bytes()
@@ -468,7 +571,16 @@ class Commands(InFolder):
         for command in (
             ("split", file, "--out", left, "--rest", rest, "--share", 0.5),
             ("merge", left, rest, "--out", self.folder / "both.npz"),
-            ("select", self.folder / "both.npz", "--out", left, "--per-object", 1, "--pick", "spread"),
+            (
+                "select",
+                self.folder / "both.npz",
+                "--out",
+                left,
+                "--per-object",
+                1,
+                "--pick",
+                "spread",
+            ),
         ):
             code, out = run("demos", *command)
             self.assertEqual(code, 0, out)

@@ -70,10 +70,17 @@ class RuntimeTest(unittest.TestCase):
         trial = load_trial(spec, synthesize([SOUP], 1))
         zero = np.zeros(1, int)
         frames = []
-        with trial.worlds(engine("mujoco", workers=0), torch.zeros(1, dtype=torch.long)) as (env, _):
+        with trial.worlds(engine("mujoco", workers=0), torch.zeros(1, dtype=torch.long)) as (
+            env,
+            _,
+        ):
             env.reset(start=episode_starts(trial.starts(), zero, zero, seed=0))
             policy = spec.begin(env)
-            values = {"goal_pos": env.goal_pos, "goal_quat": env.goal_quat, "target": env.joint_target}
+            values = {
+                "goal_pos": env.goal_pos,
+                "goal_quat": env.goal_quat,
+                "target": env.joint_target,
+            }
             recording = {name: value[0].numpy().copy() for name, value in values.items()}
             for _ in range(STEPS):
                 reading = EngineDriver(env).read()
@@ -83,11 +90,22 @@ class RuntimeTest(unittest.TestCase):
         names = ("action", "joint_pos", "joint_vel", "object_pos", "object_quat", "tip_force")
         recording |= {name: np.stack([frame[name][0] for frame in frames]) for name in names}
         np.savez(folder / "recording.npz", object=SOUP, **recording)
-        command = [sys.executable, "-I", "-c", REPLAY, str(folder / "can"), str(folder / "recording.npz")]
-        found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+        command = [
+            sys.executable,
+            "-I",
+            "-c",
+            REPLAY,
+            str(folder / "can"),
+            str(folder / "recording.npz"),
+        ]
+        found = json.loads(
+            subprocess.run(command, check=True, capture_output=True, text=True).stdout
+        )
         self.assertEqual(found["modules"], [])
         self.assertLess(found["worst"], 1e-5)
-        measured = subprocess.run([sys.executable, "-m", "runtime"], capture_output=True, text=True, cwd=folder / "can")
+        measured = subprocess.run(
+            [sys.executable, "-m", "runtime"], capture_output=True, text=True, cwd=folder / "can"
+        )
         self.assertIn("a step takes", measured.stdout)
 
 
@@ -96,17 +114,28 @@ class ContractTest(unittest.TestCase):
         self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
         self.task = TaskConfig()
         robot = toy_grasp.robot()
-        file = write_policy(self.folder / "toy.onnx", policy_contract(robot, self.task, ("brick",)), value=0.01)
+        file = write_policy(
+            self.folder / "toy.onnx", policy_contract(robot, self.task, ("brick",)), value=0.01
+        )
         self.out = self.folder / "out"
         self.contract = write_deployed(file, robot, self.task, [toy_grasp.brick()], self.out)
         self.home = [joint["home"] for joint in self.contract["joints"]]
 
     def test_it_says_what_goes_in_and_out(self):
         self.assertEqual(read_contract(self.out), self.contract)
-        self.assertEqual([joint["name"] for joint in self.contract["joints"]], list(toy_grasp.robot().joint_names))
+        self.assertEqual(
+            [joint["name"] for joint in self.contract["joints"]],
+            list(toy_grasp.robot().joint_names),
+        )
         self.assertEqual(np.shape(self.contract["objects"]["brick"]["points"]), (64, 3))
         with self.assertRaisesRegex(PolicyError, "exists already"):
-            write_deployed(self.folder / "toy.onnx", toy_grasp.robot(), self.task, [toy_grasp.brick()], self.out)
+            write_deployed(
+                self.folder / "toy.onnx",
+                toy_grasp.robot(),
+                self.task,
+                [toy_grasp.brick()],
+                self.out,
+            )
         with self.assertRaisesRegex(LiveError, "has no object 'hat'. Choose from: brick"):
             load_controller(self.out).points("hat")
 
@@ -114,9 +143,15 @@ class ContractTest(unittest.TestCase):
         file = self.out / "contract.json"
         original = file.read_text()
         for change, words in (
-            ({"schema": "xreset-deploy/9"}, "has schema 'xreset-deploy/9', this runtime reads 'xreset-deploy/1'"),
+            (
+                {"schema": "xreset-deploy/9"},
+                "has schema 'xreset-deploy/9', this runtime reads 'xreset-deploy/1'",
+            ),
             ({"policy_sha256": "0" * 64}, "has SHA-256 .* the contract names 000000000000"),
-            ({"observation": {"smell": 1}}, "observation options that this runtime does not know: smell"),
+            (
+                {"observation": {"smell": 1}},
+                "observation options that this runtime does not know: smell",
+            ),
         ):
             file.write_text(json.dumps(self.contract | change))
             with self.subTest(words), self.assertRaisesRegex(LiveError, words):
@@ -160,15 +195,24 @@ class ContractTest(unittest.TestCase):
         driver = Robot(self.home, close_after_a_second)
         with self.assertLogs("xreset"):
             outcome = Runner(remote, driver).run(10)
-        self.assertEqual((outcome.reason, driver.stops), ("The policy could not act: the server has gone.", 1))
+        self.assertEqual(
+            (outcome.reason, driver.stops), ("The policy could not act: the server has gone.", 1)
+        )
 
     def test_the_example_of_a_driver(self):
         rows = 11
         brick = self.contract["objects"]["brick"]
-        arrays = {"time": np.arange(rows) * 0.05, "frame_offsets": [0, rows], "object_name": ["brick"]}
+        arrays = {
+            "time": np.arange(rows) * 0.05,
+            "frame_offsets": [0, rows],
+            "object_name": ["brick"],
+        }
         arrays |= {name: np.tile(self.home, (rows, 1)) for name in ("joint_pos", "joint_target")}
         arrays |= {"object_pos": np.tile(brick["center"], (rows, 1)), "goal_pos": [[0.5, 0.3, 0.2]]}
-        arrays |= {"object_quat_wxyz": np.tile([1, 0, 0, 0], (rows, 1)), "goal_quat_wxyz": [[1, 0, 0, 0]]}
+        arrays |= {
+            "object_quat_wxyz": np.tile([1, 0, 0, 0], (rows, 1)),
+            "goal_quat_wxyz": [[1, 0, 0, 0]],
+        }
         np.savez(self.folder / "episodes.npz", **arrays)
         said = run("11_own_driver", self.out, self.folder / "episodes.npz")
         self.assertIn("30 steps; stopped because: the recording is over", said)
@@ -179,7 +223,12 @@ class ContractTest(unittest.TestCase):
         from xreset.live.serve import _Episode
 
         episode = _Episode(load_controller(self.out))
-        begin = {"object": "brick", "goal_pos": [0, 0, 1], "goal_quat": [1, 0, 0, 0], "target": self.home}
+        begin = {
+            "object": "brick",
+            "goal_pos": [0, 0, 1],
+            "goal_quat": [1, 0, 0, 0],
+            "target": self.home,
+        }
         for message, words in (
             ('{"a":' * 5000, "is not JSON"),
             ("[]", "one of the keys begin, goal, step"),
@@ -187,8 +236,14 @@ class ContractTest(unittest.TestCase):
             ({"begin": 3}, "begin is not an object"),
             ({"begin": begin | {"object": ["hat"]}}, "no object"),
             ({"begin": begin | {"goal_pos": [0, 0, float("nan")]}}, "goal_pos has shape"),
-            ({"begin": begin | {"goal_pos": [0, 0, 10**400]}}, "goal_pos holds something that is not a number"),
-            ({"begin": begin | {"goal_quat": [1, 1, 0, 0]}}, "length 1.414, expected a unit quaternion"),
+            (
+                {"begin": begin | {"goal_pos": [0, 0, 10**400]}},
+                "goal_pos holds something that is not a number",
+            ),
+            (
+                {"begin": begin | {"goal_quat": [1, 1, 0, 0]}},
+                "length 1.414, expected a unit quaternion",
+            ),
         ):
             text = message if isinstance(message, str) else json.dumps(message)
             with self.subTest(text[:60]):
@@ -197,7 +252,9 @@ class ContractTest(unittest.TestCase):
         self.assertIn("joint_pos is missing", episode.answer('{"step": {}}')["error"])
 
     def test_a_baseline_and_cameras_are_refused(self):
-        code, _, err = xreset("export", "deploy", "zero", "--robot", "openarm", "--out", self.folder / "x")
+        code, _, err = xreset(
+            "export", "deploy", "zero", "--robot", "openarm", "--out", self.folder / "x"
+        )
         self.assertEqual(code, 1)
         self.assertIn("The baseline 'zero' is no exported policy", err)
         seeing = replace(self.task, vision=VisionConfig(cameras=(CameraConfig(),)))
@@ -213,7 +270,9 @@ class Robot(Scripted):
         self.home = np.array(home)
 
     def read(self):
-        return replace(super().read(), joint_pos=self.home, joint_vel=0 * self.home, tip_force=np.zeros((2, 3)))
+        return replace(
+            super().read(), joint_pos=self.home, joint_vel=0 * self.home, tip_force=np.zeros((2, 3))
+        )
 
 
 if __name__ == "__main__":

@@ -38,7 +38,9 @@ try:
 except (ImportError, XResetError) as error:
     raise unittest.SkipTest(str(error)) from error
 
-TASK = TaskConfig(observation=ObservationConfig(cloud_points=16, cloud="paired"), distance_points=64)
+TASK = TaskConfig(
+    observation=ObservationConfig(cloud_points=16, cloud="paired"), distance_points=64
+)
 SMALL = ModelConfig(pointnet=(8, 6), conv=(4, 4), lstm=12, mlp=(16,), initial_std=0.1)
 IMAGES = VisionConfig(cameras=(FRONT, WRIST), width=16, height=12)
 POINTS = replace(IMAGES, view="points", points=8, goal_image=True)
@@ -48,13 +50,19 @@ class DistillTest(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
         cls.folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
-        cls.enterClassContext(mock.patch("xreset.env.make_backend", partial(make_backend, workers=0)))
+        cls.enterClassContext(
+            mock.patch("xreset.env.make_backend", partial(make_backend, workers=0))
+        )
         cls.robot = robots.load("openarm")
-        cls.bank_of_robot = toy_bank(cls.robot, joint_pos=np.tile(cls.robot.home, (6, 1)).astype(np.float32))
+        cls.bank_of_robot = toy_bank(
+            cls.robot, joint_pos=np.tile(cls.robot.home, (6, 1)).astype(np.float32)
+        )
         cls.bank = cls.folder / "bank.npz"
         write_bank(cls.bank, cls.bank_of_robot, config={}, inputs={})
         cls.teacher = cls.folder / "teacher"
-        config = TrainConfig(task=TASK, model=SMALL, ppo=PpoConfig(horizon=8, mini_epochs=1), iterations=1)
+        config = TrainConfig(
+            task=TASK, model=SMALL, ppo=PpoConfig(horizon=8, mini_epochs=1), iterations=1
+        )
         with redirect_stdout(io.StringIO()):
             train(cls.bank, out=cls.teacher, config=config, **cls.options())
             cls.run_folder = cls.distill("images")
@@ -66,7 +74,9 @@ class DistillTest(unittest.TestCase):
     @classmethod
     def distill(cls, name: str, vision: VisionConfig = IMAGES, **changes) -> Path:
         config = student_config(TASK, vision)
-        ppo = replace(config.ppo, horizon=8, sequence_length=4, minibatch_size=16, learning_rate=3e-3)
+        ppo = replace(
+            config.ppo, horizon=8, sequence_length=4, minibatch_size=16, learning_rate=3e-3
+        )
         config = replace(config, **({"model": SMALL, "ppo": ppo, "iterations": 2} | changes))
         return distill(cls.teacher, cls.bank, out=cls.folder / name, config=config, **cls.options())
 
@@ -89,7 +99,9 @@ class DistillTest(unittest.TestCase):
     def test_the_run_is_a_policy_that_sees(self):
         info = read_run(self.run_folder)
         self.assertEqual(info.teacher, str(self.teacher))
-        self.assertEqual((self.run_folder / TEACHER).read_bytes(), (self.teacher / "policy.onnx").read_bytes())
+        self.assertEqual(
+            (self.run_folder / TEACHER).read_bytes(), (self.teacher / "policy.onnx").read_bytes()
+        )
         policy = OnnxPolicy(self.run_folder / "policy.onnx")
         self.assertEqual(list(policy.contract["observation_layout"]), ["goal", "proprio", "view"])
         env = self.env(IMAGES)
@@ -108,7 +120,12 @@ class DistillTest(unittest.TestCase):
         self.assertFalse(torch.allclose(actions[0], actions[1]))
         self.assertTrue(torch.equal(actions[0], actions[2]))
         with self.assertRaisesRegex(PolicyError, "another set of cameras"):
-            check_contract("it", policy.contract, self.robot, replace(env.task, vision=replace(IMAGES, interval=1)))
+            check_contract(
+                "it",
+                policy.contract,
+                self.robot,
+                replace(env.task, vision=replace(IMAGES, interval=1)),
+            )
 
     def test_the_student_learns_the_teachers_actions_and_resumes(self):
         errors = []
@@ -123,14 +140,21 @@ class DistillTest(unittest.TestCase):
             after = read_checkpoint(latest_checkpoint(out))
         self.assertLess(np.mean(errors[-3:]), 0.5 * np.mean(errors[:3]))
         self.assertEqual((before.iteration, after.iteration), (15, 20))
-        steps = [max(int(s["step"]) for s in c.optimizer_state_dict["state"].values()) for c in (before, after)]
+        steps = [
+            max(int(s["step"]) for s in c.optimizer_state_dict["state"].values())
+            for c in (before, after)
+        ]
         self.assertEqual(20 * steps[0], 15 * steps[1], "the optimizer went on")
 
     def test_refusals(self):
         away = replace(IMAGES, cameras=(replace(FRONT, target=(3.0, 0.2, 0.5)),))
         two = {"teacher": self.teacher, "bank": self.bank, "out": self.folder / "refused"}
         for error, words, options in (
-            (XResetError, "Unknown camera rear. Choose from: front, side, wrist", {"cameras": ("rear",)}),
+            (
+                XResetError,
+                "Unknown camera rear. Choose from: front, side, wrist",
+                {"cameras": ("rear",)},
+            ),
             (PolicyError, "Unknown policy 'nobody'", {"teacher": "nobody"}),
             (
                 PolicyError,

@@ -50,29 +50,43 @@ class TwoProcesses(unittest.TestCase):
         torchrun = "-m torch.distributed.run --standalone --nproc-per-node 2 tests/train_worker.py"
         command = [sys.executable, *torchrun.split(), str(cls.folder), *arguments.split()]
         environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-        done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=900)
+        done = subprocess.run(
+            command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=900
+        )
         if done.returncode:
-            raise AssertionError(f"torchrun ended with {done.returncode}:\n{done.stdout}\n{done.stderr}")
+            raise AssertionError(
+                f"torchrun ended with {done.returncode}:\n{done.stdout}\n{done.stderr}"
+            )
         cls.output = done.stdout
         return [torch.load(cls.folder / f"{rank}.pt", weights_only=True) for rank in (0, 1)]
 
     def test_both_learn_the_same_from_other_episodes(self):
         for one, two in (self.first, self.second):
-            for model in ("actor", "critic"):  # weights, and the normalisers' mean, variance and count
+            for model in (
+                "actor",
+                "critic",
+            ):  # weights, and the normalisers' mean, variance and count
                 torch.testing.assert_close(one[model], two[model], rtol=0, atol=0, msg=model)
             self.assertEqual(one["learning_rate"], two["learning_rate"])
             self.assertFalse(torch.equal(one["policy_obs"], two["policy_obs"]))
             self.assertFalse(torch.equal(one["random"], two["random"]))
         steps = 2 * 8 * 8  # processes x horizon x worlds
-        count = next(value for name, value in self.first[0]["actor"].items() if name.endswith("count"))
+        count = next(
+            value for name, value in self.first[0]["actor"].items() if name.endswith("count")
+        )
         self.assertEqual(int(count), 2 * steps)
-        self.assertEqual([end["env_steps"] for end in (*self.first, *self.second)], [2 * steps] * 2 + [3 * steps] * 2)
+        self.assertEqual(
+            [end["env_steps"] for end in (*self.first, *self.second)],
+            [2 * steps] * 2 + [3 * steps] * 2,
+        )
         for before, after in zip(self.first, self.second, strict=True):
             torch.testing.assert_close(before["actor"], after["start_actor"], rtol=0, atol=0)
 
     def test_the_main_process_alone_writes(self):
         self.assertEqual(self.made.count("run.json"), 1)
-        self.assertEqual([c.name for c in checkpoints(self.out)], ["000001.pt", "000002.pt", "000003.pt"])
+        self.assertEqual(
+            [c.name for c in checkpoints(self.out)], ["000001.pt", "000002.pt", "000003.pt"]
+        )
         self.assertEqual(len([name for name in self.made if name.startswith("events.out")]), 1)
         self.assertTrue((self.out / "policy.onnx").is_file())
         self.assertEqual(self.output.count("continuing after iteration 2"), 1)
@@ -81,10 +95,15 @@ class TwoProcesses(unittest.TestCase):
 class Environment(unittest.TestCase):
     def test_what_a_process_knows(self):
         alone = Processes.of_environment()
-        self.assertEqual((alone, alone.is_main, alone.device("cuda"), alone.seed(5)), (Processes(), True, "cuda", 5))
+        self.assertEqual(
+            (alone, alone.is_main, alone.device("cuda"), alone.seed(5)),
+            (Processes(), True, "cuda", 5),
+        )
         with mock.patch.dict(os.environ, {"RANK": "5", "LOCAL_RANK": "1", "WORLD_SIZE": "8"}):
             fifth = Processes.of_environment()
-        self.assertEqual((fifth.is_main, fifth.device("cuda:0"), fifth.device("cpu")), (False, "cuda:1", "cpu"))
+        self.assertEqual(
+            (fifth.is_main, fifth.device("cuda:0"), fifth.device("cpu")), (False, "cuda:1", "cpu")
+        )
         self.assertNotEqual(fifth.seed(0), alone.seed(0))
 
 

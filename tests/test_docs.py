@@ -51,16 +51,26 @@ class DocumentedCommandsTest(unittest.TestCase):
         seen = 0
         for page in PAGES:
             for words in commands(page):
-                if not words or not re.fullmatch(r"[a-z]+", words[0]) or (words[0] in GROUPS and len(words) < 2):
+                if (
+                    not words
+                    or not re.fullmatch(r"[a-z]+", words[0])
+                    or (words[0] in GROUPS and len(words) < 2)
+                ):
                     continue
                 with self.subTest(page=page.name, command=" ".join(words)):
                     self.assertIn(words[0], COMMANDS)
                     if words[0] == "engines" and len(words) > 1:
                         self.assertIn(words[1], ENGINES)
-                    options = {word.partition("=")[0] for word in words if re.match(r"--[a-z]", word)}
+                    options = {
+                        word.partition("=")[0] for word in words if re.match(r"--[a-z]", word)
+                    }
                     if options:
                         help_text = help_of(command_of(words))
-                        missing = {option for option in options if not re.search(rf"{option}(?![\w-])", help_text)}
+                        missing = {
+                            option
+                            for option in options
+                            if not re.search(rf"{option}(?![\w-])", help_text)
+                        }
                         self.assertFalse(missing)
                         seen += len(options)
         self.assertGreater(seen, 100)
@@ -76,7 +86,11 @@ class PageTest(unittest.TestCase):
     def test_every_public_name_is_in_the_reference(self):
         import xreset
 
-        headings = set(re.findall(r"^::: xreset\.(\w+)$", (ROOT / "docs/reference.md").read_text(), re.MULTILINE))
+        headings = set(
+            re.findall(
+                r"^::: xreset\.(\w+)$", (ROOT / "docs/reference.md").read_text(), re.MULTILINE
+            )
+        )
         self.assertEqual(headings, {*xreset.__all__})
 
 

@@ -52,11 +52,16 @@ class PageTest(unittest.TestCase):
         [fall] = [check for check in slower["runs"][0]["checks"] if check["check"] == "free_fall"]
         for measure in fall["measures"]:
             measure["measured"] = 0.5 * measure["tolerance"]
-        text = self.page_of(CONFORMANCE, self.changed(engine="mujoco-warp"), self.changed(engine="sapien"), slower)
+        text = self.page_of(
+            CONFORMANCE, self.changed(engine="mujoco-warp"), self.changed(engine="sapien"), slower
+        )
         version = CONFORMANCE["runs"][0]["engine_version"]
         columns = f"mujoco {version} | mujoco-warp {version} | mujoco-warp {version}, cuda | sapien {version} |"
         self.assertIn(f"| check | what must hold | {columns}", text)
-        self.assertEqual([cell == "0.50" for cell in self.row(text, "`free_fall`")[2:]], [False, False, True, False])
+        self.assertEqual(
+            [cell == "0.50" for cell in self.row(text, "`free_fall`")[2:]],
+            [False, False, True, False],
+        )
         self.assertEqual(self.row(text, "object mass"), ["object mass", "yes", "yes", "no", "yes"])
 
     def test_robots_have_tables_of_their_own(self):
@@ -79,7 +84,11 @@ class PageTest(unittest.TestCase):
         checks = {check["check"]: check for check in data["runs"][0]["checks"]}
         checks["free_fall"] |= {"verdict": "failed"}
         checks["free_fall"]["measures"][0] |= {"measured": "nan", "verdict": "failed"}
-        checks["mimic_joints"] |= {"verdict": "unsupported", "problem": "it has | none", "measures": []}
+        checks["mimic_joints"] |= {
+            "verdict": "unsupported",
+            "problem": "it has | none",
+            "measures": [],
+        }
         text = self.page_of(data)
         self.assertEqual(self.row(text, "`free_fall`")[-1], "**failed, inf**")
         self.assertEqual(self.row(text, "`mimic_joints`")[-1], "none")

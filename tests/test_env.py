@@ -53,7 +53,9 @@ TASK = TaskConfig(
     observation=ObservationConfig(cloud_points=16),
     distance_points=64,
 )
-QUIET = replace(TASK, observation=replace(TASK.observation, noise=evaluation_task(TASK).observation.noise))
+QUIET = replace(
+    TASK, observation=replace(TASK.observation, noise=evaluation_task(TASK).observation.noise)
+)
 
 
 class BreakableBackend(MujocoBackend):
@@ -80,7 +82,11 @@ class BreakableBackend(MujocoBackend):
 
     def health(self):
         health = super().health()
-        return replace(health, nonfinite=health.nonfinite | self.broken, overflow=health.overflow | self.overflow)
+        return replace(
+            health,
+            nonfinite=health.nonfinite | self.broken,
+            overflow=health.overflow | self.overflow,
+        )
 
 
 class Waiting(TorchDispatchMode):
@@ -95,7 +101,11 @@ class Waiting(TorchDispatchMode):
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         self.operations += 1
-        indices = args[1] if "index" in str(func) and len(args) > 1 and isinstance(args[1], (list, tuple)) else ()
+        indices = (
+            args[1]
+            if "index" in str(func) and len(args) > 1 and isinstance(args[1], (list, tuple))
+            else ()
+        )
         masks = [i for i in indices if isinstance(i, torch.Tensor) and i.dtype == torch.bool]
         if masks or any(name in str(func) for name in self.NAMES):
             self.found.append(str(func))
@@ -112,10 +122,18 @@ class WithEnv(unittest.TestCase):
     def make(
         self, task: TaskConfig = TASK, seed: int = 0, kind: type[MujocoBackend] = MujocoBackend
     ) -> ManipulationEnv:
-        backend = kind(make_scene(self.robot, self.objects, task), N, object_index=torch.tensor([0, 1, 0]), workers=0)
+        backend = kind(
+            make_scene(self.robot, self.objects, task),
+            N,
+            object_index=torch.tensor([0, 1, 0]),
+            workers=0,
+        )
         self.addCleanup(backend.close)
         return ManipulationEnv(
-            backend, task, ResetDistribution(self.bank, self.robot, (SOUP, SPAM), task.reset), seed=seed
+            backend,
+            task,
+            ResetDistribution(self.bank, self.robot, (SOUP, SPAM), task.reset),
+            seed=seed,
         )
 
     def actions(self, steps: int, seed: int = 0) -> torch.Tensor:
@@ -123,7 +141,9 @@ class WithEnv(unittest.TestCase):
 
     def assert_same(self, found, expected, worlds=slice(None)) -> None:
         """Every tensor of two states or observations is equal in these worlds."""
-        found, expected = (dict(vars(x) if isinstance(x, State) else x.items()) for x in (found, expected))
+        found, expected = (
+            dict(vars(x) if isinstance(x, State) else x.items()) for x in (found, expected)
+        )
         for name, value in found.items():
             self.assertTrue(torch.equal(value[worlds], expected[name][worlds]), name)
 
@@ -150,9 +170,17 @@ class StepTest(WithEnv):
         torch.testing.assert_close(policy[:, 15:], self.actions(5)[-1])
         middle = (env.actions.upper + env.actions.lower) / 2
         half = (env.actions.upper - env.actions.lower) / 2
-        torch.testing.assert_close(observations["proprio"][:, :7], (state.joint_pos - middle) / half)
-        sizes = torch.tensor([np.linalg.norm(o.vertices, axis=1).max() for o in self.objects], dtype=torch.float32)
-        distance = (observations["perception"][:, -1] - state.object_pos[:, None]).norm(dim=-1).amax(dim=-1)
+        torch.testing.assert_close(
+            observations["proprio"][:, :7], (state.joint_pos - middle) / half
+        )
+        sizes = torch.tensor(
+            [np.linalg.norm(o.vertices, axis=1).max() for o in self.objects], dtype=torch.float32
+        )
+        distance = (
+            (observations["perception"][:, -1] - state.object_pos[:, None])
+            .norm(dim=-1)
+            .amax(dim=-1)
+        )
         self.assertTrue(bool((distance <= sizes[env.backend.object_index] + 1e-5).all()))
 
     def test_actions_reach_the_drives(self):
@@ -177,8 +205,12 @@ class StepTest(WithEnv):
             reach.append(reward.terms["reach"])
             distance.append(reading.tip_distance.mean(dim=-1))
         best = torch.stack(distance).cummin(dim=0).values[1:]
-        torch.testing.assert_close(torch.stack(reach), 1 - torch.tanh(best / TASK.reward.reach_width))
-        self.assertTrue(bool((torch.stack(distance)[1:] > best + 1e-3).any()), "the hand moved away at times")
+        torch.testing.assert_close(
+            torch.stack(reach), 1 - torch.tanh(best / TASK.reward.reach_width)
+        )
+        self.assertTrue(
+            bool((torch.stack(distance)[1:] > best + 1e-3).any()), "the hand moved away at times"
+        )
 
     def test_a_reset_of_one_world_leaves_the_others_as_they_are(self):
         env = self.make()
@@ -282,14 +314,19 @@ class RobustnessTest(WithEnv):
         self.assertEqual(all_lost, 1.0)
         self.assertTrue(0.25 < half_lost < 0.75, half_lost)
 
-    def observed(self, tracker: TrackerConfig, steps: int = 12, **ranges) -> tuple[torch.Tensor, torch.Tensor]:
+    def observed(
+        self, tracker: TrackerConfig, steps: int = 12, **ranges
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Errors of the observed positions [steps, N, 3], and errors of the cloud's middle that follow from them."""
         env = self.make(self.task(tracker=tracker, **ranges))
         errors, cloud_errors = [], []
         for action in self.actions(steps):
             observations, *_ = env.step(action)
             state = env.backend.state()
-            cloud = quat_rotate(state.object_quat[:, None], env._cloud_points) + state.object_pos[:, None]
+            cloud = (
+                quat_rotate(state.object_quat[:, None], env._cloud_points)
+                + state.object_pos[:, None]
+            )
             errors.append(observations["policy"][:, :3] - state.object_pos)
             cloud_errors.append((observations["perception"][:, -1] - cloud).mean(dim=1))
         return torch.stack(errors), torch.stack(cloud_errors)
@@ -300,30 +337,46 @@ class RobustnessTest(WithEnv):
         torch.testing.assert_close(bias, bias[:1].expand_as(bias))
         torch.testing.assert_close(bias, cloud_bias)
         noise, _ = self.observed(TrackerConfig(position_noise=0.01))
-        self.assertTrue(bool((noise.abs() <= 0.01001).all()) and bool((noise[1:] != noise[:-1]).all()))
+        self.assertTrue(
+            bool((noise.abs() <= 0.01001).all()) and bool((noise[1:] != noise[:-1]).all())
+        )
         position, cloud = self.observed(TrackerConfig(rotation_noise=0.1, rotation_bias=0.1))
         self.assertLess(float(position.abs().max()), 1e-6)
         self.assertGreater(float(cloud.abs().max()), 1e-4)
 
     def test_poses_may_come_seldom_and_go_missing(self):
         """The error of each pose is another one, so the same error is the same pose."""
-        cases = ((TrackerConfig(interval=(3.0, 3.0)), 3), (TrackerConfig(loss=1.0, loss_steps=(4.0, 4.0)), 5))
+        cases = (
+            (TrackerConfig(interval=(3.0, 3.0)), 3),
+            (TrackerConfig(loss=1.0, loss_steps=(4.0, 4.0)), 5),
+        )
         for tracker, period in cases:
             env = self.make(self.task(tracker=replace(tracker, position_noise=0.01)))
             poses = [env.step(action)[0]["policy"][:, :3] for action in self.actions(12)]
-            same = [torch.equal(a, b) for a, b in pairwise(poses)]  # the first pose came with the reset
+            same = [
+                torch.equal(a, b) for a, b in pairwise(poses)
+            ]  # the first pose came with the reset
             self.assertEqual(same, [(step + 2) % period != 0 for step in range(11)])
 
     def test_a_schedule_scales_all_faults(self):
         live = RECIPES["live"].config.task
         tracker = replace(live.randomization.tracker, interval=(1.0, 1.0))
-        faulty = replace(QUIET, randomization=replace(live.randomization, tracker=tracker, hand_latency=(0.0, 4.0)))
+        faulty = replace(
+            QUIET,
+            randomization=replace(live.randomization, tracker=tracker, hand_latency=(0.0, 4.0)),
+        )
         for scale in (0.0, 0.5):
             env = self.make(faulty)
             env.variation.fault_scale.fill_(scale)
             env.reset()
             kept = env.variation.lasting
-            for name in ("commands.delay", "poses.delay", "proprio.delay", "lost_actions", "tracker.bias"):
+            for name in (
+                "commands.delay",
+                "poses.delay",
+                "proprio.delay",
+                "lost_actions",
+                "tracker.bias",
+            ):
                 self.assertEqual(bool(kept[name].any()), scale > 0, name)
             self.assertLessEqual(float(kept["poses.delay"].max()), scale * 6.0)
             self.assertLessEqual(float(kept["pushes.probability"].max()), scale * 0.02)
@@ -335,7 +388,9 @@ class RobustnessTest(WithEnv):
 
     def test_a_delay_jitters_within_its_range(self):
         drawn = Drawn(200, torch.device("cpu"))
-        config = RandomizationConfig(observation_latency=(2.0, 2.0), tracker=TrackerConfig(jitter=3.0))
+        config = RandomizationConfig(
+            observation_latency=(2.0, 2.0), tracker=TrackerConfig(jitter=3.0)
+        )
         tracker = Tracker(drawn, config, torch.ones(()))
         generator = torch.Generator().manual_seed(0)
         for value, kept in drawn.draw(generator):
@@ -352,7 +407,9 @@ class RobustnessTest(WithEnv):
         env, same = self.make(self.task(push=push)), self.make(self.task())
         for each in (env, same):
             state = each.backend.state()
-            each.backend.set_state(replace(state, object_pos=state.object_pos + torch.tensor([0.0, 0.0, 0.3])))
+            each.backend.set_state(
+                replace(state, object_pos=state.object_pos + torch.tensor([0.0, 0.0, 0.3]))
+            )
             each.step(torch.zeros(N, 7))
         pushes, pushed, free = env.variation.pushes, env.backend.state(), same.backend.state()
         mass = env.variation.parameters["object_mass"][:, None]
@@ -360,9 +417,15 @@ class RobustnessTest(WithEnv):
         self.assertTrue(bool(((expected.norm(dim=-1) > 0) & (expected.norm(dim=-1) <= 0.5)).all()))
         spin = pushed.object_angvel - free.object_angvel
         self.assertTrue(bool(((spin.norm(dim=-1) > 0) & (spin.norm(dim=-1) <= 4.2)).all()))
-        com = torch.as_tensor(np.stack([o.com for o in self.objects]), dtype=torch.float32)[env.backend.object_index]
+        com = torch.as_tensor(np.stack([o.com for o in self.objects]), dtype=torch.float32)[
+            env.backend.object_index
+        ]
         arm = quat_rotate(pushed.object_quat, com)
-        velocity = pushed.object_linvel + torch.linalg.cross(pushed.object_angvel, arm) - free.object_linvel
+        velocity = (
+            pushed.object_linvel
+            + torch.linalg.cross(pushed.object_angvel, arm)
+            - free.object_linvel
+        )
         torch.testing.assert_close(velocity, expected, atol=0.01, rtol=0.02)
 
     def test_pushes_wait_for_the_gate_and_move_the_arms_targets(self):
@@ -373,7 +436,11 @@ class RobustnessTest(WithEnv):
         self.assertEqual(float(env.variation.pushes.force.abs().max()), 0.0)
         offset = sent.call_args.args[0] - env.joint_target
         drives = [joint.drive for joint in self.robot.joints]
-        torque = offset * torch.tensor([drive.kp for drive in drives]) / torch.tensor([d.effort for d in drives])
+        torque = (
+            offset
+            * torch.tensor([drive.kp for drive in drives])
+            / torch.tensor([d.effort for d in drives])
+        )
         self.assertTrue(bool((torque[:, :3].abs() <= 0.5001).all() and (torque[:, :3] != 0).all()))
         self.assertEqual(float(torque[:, 3:].abs().max()), 0.0)
         env.variation.pushes.gate.fill_(True)
@@ -381,8 +448,14 @@ class RobustnessTest(WithEnv):
         self.assertGreater(float(env.variation.pushes.force.norm(dim=-1).min()), 0.0)
 
     def test_parameters_are_drawn_for_the_worlds_that_begin(self):
-        ranges = {"arm_stiffness": (0.5, 0.6), "hand_damping": (2.0, 3.0), "object_com": (0.01, 0.01)}
-        env = self.make(self.task(torsional_friction=(0.5, 2.0), object_inertia=(0.5, 2.0), **ranges))
+        ranges = {
+            "arm_stiffness": (0.5, 0.6),
+            "hand_damping": (2.0, 3.0),
+            "object_com": (0.01, 0.01),
+        }
+        env = self.make(
+            self.task(torsional_friction=(0.5, 2.0), object_inertia=(0.5, 2.0), **ranges)
+        )
         before = {name: value.clone() for name, value in env.variation.parameters.items()}
         with mock.patch.object(env.backend, "set_where") as set_where:
             env.reset(torch.tensor([2, 0]))
@@ -411,12 +484,18 @@ class RobustnessTest(WithEnv):
         with mock.patch.object(MujocoBackend, "capabilities", able):
             self.make()
             with self.assertRaisesRegex(
-                CapabilityError, "'mujoco' cannot set drives, object com in each world, which this task draws"
+                CapabilityError,
+                "'mujoco' cannot set drives, object com in each world, which this task draws",
             ):
                 self.make(task)
 
     def test_a_snapshot_holds_what_is_late_and_scaled(self):
-        task = replace(QUIET, randomization=replace(RECIPES["live"].config.task.randomization, hand_latency=(0.0, 2.0)))
+        task = replace(
+            QUIET,
+            randomization=replace(
+                RECIPES["live"].config.task.randomization, hand_latency=(0.0, 2.0)
+            ),
+        )
         env = self.make(task)
         other = self.make(task, seed=1)
         for action in self.actions(5):
@@ -443,7 +522,9 @@ class RobustnessTest(WithEnv):
                 self.assertGreater(waiting.operations, 500)
                 self.assertEqual(waiting.found, [])
                 with waiting:
-                    env.step(self.actions(1)[0])  # an engine on the CPU asks which worlds begin anew: that must show
+                    env.step(
+                        self.actions(1)[0]
+                    )  # an engine on the CPU asks which worlds begin anew: that must show
                 self.assertEqual(waiting.found, ["aten.nonzero.default"])
 
 
@@ -460,9 +541,14 @@ class ObjectFrameTest(WithEnv):
         corners = np.random.default_rng(2).normal(size=(14, 3)) * (0.02, 0.03, 0.05)
         mesh = trimesh.convex.convex_hull(corners + np.array([0.0, 0.01, 0.05]))
         cls.specs = []
-        for name, vertices in (("drawn", mesh.vertices), ("moved", cls.TURN.apply(mesh.vertices) + cls.SHIFT)):
+        for name, vertices in (
+            ("drawn", mesh.vertices),
+            ("moved", cls.TURN.apply(mesh.vertices) + cls.SHIFT),
+        ):
             (folder / name).mkdir()
-            trimesh.Trimesh(vertices, mesh.faces, process=False).export(folder / name / f"{SOUP}.obj", digits=12)
+            trimesh.Trimesh(vertices, mesh.faces, process=False).export(
+                folder / name / f"{SOUP}.obj", digits=12
+            )
             cls.specs.append(load_object(SOUP, folder / name))
 
     def moved_bank(self):
@@ -485,27 +571,43 @@ class ObjectFrameTest(WithEnv):
         self.addCleanup(backend.close)
         pivots = object_origins((spec,), task)
         env = ManipulationEnv(
-            backend, task, ResetDistribution(bank, self.robot, (spec.name,), task.reset, "cpu", pivots)
+            backend,
+            task,
+            ResetDistribution(bank, self.robot, (spec.name,), task.reset, "cpu", pivots),
         )
         found = []
         for _ in range(5):  # contact makes rounding grow from the seventh step on
-            flat = torch.cat([value.flatten(1) for _, value in sorted(env.get_observations().items())], dim=-1)
+            flat = torch.cat(
+                [value.flatten(1) for _, value in sorted(env.get_observations().items())], dim=-1
+            )
             weights = torch.randn(flat.shape[1], 7, generator=torch.Generator().manual_seed(0))
             action = torch.tanh(0.1 * flat @ weights)
             _, reward, *_ = env.step(action)
             found += [flat, action, reward]
         points = MetricPoints.of((spec,) * N, task.object_frame)
         metrics = EpisodeMetrics(env.reading(), env.task_goal_pos, env.goal_quat, points)
-        return [*found, metrics.final_distance, metrics.final_position_error, metrics.final_angle, metrics._best]
+        return [
+            *found,
+            metrics.final_distance,
+            metrics.final_position_error,
+            metrics.final_angle,
+            metrics._best,
+        ]
 
     def test_the_frame_of_a_mesh_does_not_matter(self):
-        task = replace(RECIPES["live"].config.task, distance_points=64, randomization=RandomizationConfig())
+        task = replace(
+            RECIPES["live"].config.task, distance_points=64, randomization=RandomizationConfig()
+        )
         task = replace(task, reset=replace(task.reset, training_xy=0.05))
         one = self.played(self.specs[0], toy_bank(self.robot), task)
         other = self.played(self.specs[1], self.moved_bank(), task)
         for step, (a, b) in enumerate(zip(one, other, strict=True)):
-            torch.testing.assert_close(a, b, atol=1e-4, rtol=1e-4, msg=lambda text, step=step: f"{step}: {text}")
-        away = self.played(self.specs[0], toy_bank(self.robot), replace(task, object_frame="mesh"))[0]
+            torch.testing.assert_close(
+                a, b, atol=1e-4, rtol=1e-4, msg=lambda text, step=step: f"{step}: {text}"
+            )
+        away = self.played(self.specs[0], toy_bank(self.robot), replace(task, object_frame="mesh"))[
+            0
+        ]
         self.assertGreater(float((one[0] - away).abs().max()), 0.01)
 
 
@@ -535,7 +637,9 @@ class FailureTest(WithEnv):
                 env.backend.broken[1] = True
             observations, reward, done, extras = env.step(bad)
             same.step(action)
-            self.assertEqual((done.tolist(), extras["faulty"].tolist()), ([0, 1, 0], [False, True, False]))
+            self.assertEqual(
+                (done.tolist(), extras["faulty"].tolist()), ([0, 1, 0], [False, True, False])
+            )
             self.assertEqual(extras["time_outs"].tolist(), [0.0, 1.0, 0.0])
             self.assertEqual(float(reward[1]), 0.0)
             self.assertTrue(bool(reward.isfinite().all()))
@@ -551,23 +655,33 @@ class FailureTest(WithEnv):
 class RolloutTest(WithEnv):
     TASK = evaluation_task(TASK)
 
-    def roll_out(self, policy, num_envs: int, backend: type[MujocoBackend] = MujocoBackend, **options):
+    def roll_out(
+        self, policy, num_envs: int, backend: type[MujocoBackend] = MujocoBackend, **options
+    ):
         def make(scene, num_worlds, object_index):
             return backend(scene, num_worlds, workers=0, object_index=object_index)
 
         trial = Trial(
-            robot=self.robot, objects=tuple(self.objects), bank=self.bank, task=self.TASK, num_envs=num_envs, **options
+            robot=self.robot,
+            objects=tuple(self.objects),
+            bank=self.bank,
+            task=self.TASK,
+            num_envs=num_envs,
+            **options,
         )
         return roll_out(policy, Engine(name="mujoco", make=make, version=""), trial, repetitions=2)
 
     def test_every_demonstration_is_played_and_the_number_of_worlds_changes_nothing(self):
         one, found = (self.roll_out(ZeroPolicy(7), n) for n in (1, 6))
         self.assertEqual(
-            [(e.sequence, e.repetition) for e in found.episodes], [(s, r) for s in range(3) for r in range(2)]
+            [(e.sequence, e.repetition) for e in found.episodes],
+            [(s, r) for s in range(3) for r in range(2)],
         )
         self.assertEqual([e.object for e in found.episodes], [SOUP, SOUP, SPAM, SPAM, SOUP, SOUP])
         self.assertEqual(found.episodes[2].sequence_name, "demo_b")
-        self.assertEqual([(t.sequence, t.object) for t in found.traces], [(0, SOUP), (1, SPAM), (2, SOUP)])
+        self.assertEqual(
+            [(t.sequence, t.object) for t in found.traces], [(0, SOUP), (1, SPAM), (2, SOUP)]
+        )
         trace = found.traces[0]
         self.assertEqual((trace.joint_pos.shape, trace.object_pos.shape), ((11, 7), (11, 3)))
         np.testing.assert_allclose(np.diff(trace.time), 0.05)
@@ -581,7 +695,9 @@ class RolloutTest(WithEnv):
     def test_each_repetition_has_a_start_of_its_own_and_the_seed_decides(self):
         class Watching(ZeroPolicy):
             def begin(self, env: ManipulationEnv) -> None:
-                self.seen = env.backend.state().object_pos.numpy().copy()  # worlds: soup, soup, soup, soup, spam, spam
+                self.seen = (
+                    env.backend.state().object_pos.numpy().copy()
+                )  # worlds: soup, soup, soup, soup, spam, spam
 
         def starts(**options) -> np.ndarray:
             policy = Watching(7)
@@ -592,7 +708,9 @@ class RolloutTest(WithEnv):
         np.testing.assert_array_equal(found, starts())
         self.assertGreater(np.abs(found - starts(seed=1)).max(axis=1).min(), 1e-4)
         self.assertGreater(
-            np.abs(found[0::2] - found[1::2]).max(axis=1).min(), 1e-4, "the repetitions of a demonstration differ"
+            np.abs(found[0::2] - found[1::2]).max(axis=1).min(),
+            1e-4,
+            "the repetitions of a demonstration differ",
         )
         away = np.abs(found - self.bank.start_pos[[0, 0, 2, 2, 1, 1]])
         self.assertTrue(0 < away[:, :2].max() <= 0.02 and away[:, 2].max() < 1e-6)
@@ -616,16 +734,23 @@ class KinematicRetargetingTest(WithEnv):
     def test_plays_the_trajectory_at_its_own_speed_after_moving_there(self):
         from xreset.eval.baselines import KinematicRetargeting
 
-        task = evaluation_task(replace(TASK, action=ActionConfig(arm_lead=10.0), reset=ResetConfig(home_noise=False)))
+        task = evaluation_task(
+            replace(TASK, action=ActionConfig(arm_lead=10.0), reset=ResetConfig(home_noise=False))
+        )
         env = self.make(task)
         lengths = [7, 5, 6]
         rng = np.random.default_rng(0)
         low = env.actions.lower.numpy()
         high = env.actions.upper.numpy()
-        paths = [low + (high - low) * (0.5 + 0.02 * np.cumsum(rng.random((n, 7)), axis=0)) for n in lengths]
+        paths = [
+            low + (high - low) * (0.5 + 0.02 * np.cumsum(rng.random((n, 7)), axis=0))
+            for n in lengths
+        ]
         for path in paths:
             path[:, :3] = 0.01 * path[:, :3] + 0.01  # the arm can follow
-        retargeted = SimpleNamespace(joint_pos=np.concatenate(paths), frame_offsets=np.cumsum([0, *lengths]), fps=30.0)
+        retargeted = SimpleNamespace(
+            joint_pos=np.concatenate(paths), frame_offsets=np.cumsum([0, *lengths]), fps=30.0
+        )
         policy = KinematicRetargeting(retargeted, lead_in=0.1)  # 6 control steps
         policy.begin(env)
         targets = []
@@ -637,8 +762,12 @@ class KinematicRetargetingTest(WithEnv):
             found = np.stack(targets)[:, world]
             played = found[6 : 6 + 2 * len(path) : 2]  # 30 Hz frames at 60 Hz control
             np.testing.assert_allclose(played, path, atol=1e-4)
-            np.testing.assert_allclose(found[-1], path[-1], atol=1e-4, err_msg="it holds the last frame")
-            np.testing.assert_allclose(found[2], 0.5 * (0.01 + path[0]), atol=1e-4, err_msg="half of the lead-in")
+            np.testing.assert_allclose(
+                found[-1], path[-1], atol=1e-4, err_msg="it holds the last frame"
+            )
+            np.testing.assert_allclose(
+                found[2], 0.5 * (0.01 + path[0]), atol=1e-4, err_msg="half of the lead-in"
+            )
 
 
 if __name__ == "__main__":

@@ -40,7 +40,12 @@ PRESS, LIGHT = (1.0, 0.0, 1.0), (0.0, 1.0, 1.0)
 
 
 def reading(
-    pos=START, quat=IDENTITY, tips=(0.2, 0.2, 0.2), press=(0.0, 0.0, 0.0), nonfinite=False, overflow=False
+    pos=START,
+    quat=IDENTITY,
+    tips=(0.2, 0.2, 0.2),
+    press=(0.0, 0.0, 0.0),
+    nonfinite=False,
+    overflow=False,
 ) -> Reading:
     """One world with three fingers (thumb first): the object's pose, fingertip distances [m], contact forces [N]."""
     zero3, quats = torch.zeros(1, 3), IDENTITY.expand(1, 4, 4)
@@ -65,7 +70,9 @@ def turned(degrees: float) -> torch.Tensor:
     return quat_from_axis_angle(torch.tensor([0.0, 0.0, math.radians(degrees)]))
 
 
-def episode(*steps: Reading, start: Reading | None = None, lost_at: int | None = None) -> EpisodeMetrics:
+def episode(
+    *steps: Reading, start: Reading | None = None, lost_at: int | None = None
+) -> EpisodeMetrics:
     """The metrics of an episode; at step ``lost_at`` the object leaves the scene."""
     metrics = EpisodeMetrics(start or reading(), GOAL[None], IDENTITY[None], POINTS)
     for i, step in enumerate(steps):
@@ -85,13 +92,21 @@ class MetricsTest(unittest.TestCase):
         near = {"tips": (0.0, 0.0, 0.0)}
         for name, expected, m in (
             ("nothing", "", episode(reading(tips=(0.06, 0.051, 0.2)))),
-            ("one finger within five centimetres", "a", episode(reading(tips=(0.2, 0.049, 0.2)), reading())),
+            (
+                "one finger within five centimetres",
+                "a",
+                episode(reading(tips=(0.2, 0.049, 0.2)), reading()),
+            ),
             ("at the start", "a", episode(reading(), start=reading(tips=(0.2, 0.2, 0.04)))),
             ("thumb, finger and lift at once", "ag", episode(reading(raised(0.011), **HELD))),
             ("too low", "a", episode(reading(raised(0.009), **HELD))),
             ("no thumb", "a", episode(reading(raised(0.011), press=LIGHT, **near))),
             ("thumb too light", "a", episode(reading(raised(0.011), press=(0.09, 1, 1), **near))),
-            ("not at once", "a", episode(reading(press=PRESS, **near), reading(raised(0.05), **near))),
+            (
+                "not at once",
+                "a",
+                episode(reading(press=PRESS, **near), reading(raised(0.05), **near)),
+            ),
             ("dropped later", "ag", episode(reading(raised(0.05), **HELD), reading())),
             ("at the goal", "r", episode(reading(GOAL))),
             ("left the goal", "", episode(reading(GOAL), reading(raised(0.1)))),
@@ -99,16 +114,31 @@ class MetricsTest(unittest.TestCase):
             ("the other sign of the quaternion", "r", episode(reading(OFF, -turned(14.8)))),
             ("turned too far", "", episode(reading(OFF, turned(15.2)))),
             ("too far away", "", episode(reading(GOAL + torch.tensor([0.0, 0.0205, 0.0])))),
-            ("left the scene first", "", episode(reading(), reading(raised(0.05), **HELD), reading(GOAL), lost_at=1)),
-            ("left later", "ag", episode(reading(raised(0.1), **HELD), reading(GOAL), reading(GOAL), lost_at=2)),
+            (
+                "left the scene first",
+                "",
+                episode(reading(), reading(raised(0.05), **HELD), reading(GOAL), lost_at=1),
+            ),
+            (
+                "left later",
+                "ag",
+                episode(reading(raised(0.1), **HELD), reading(GOAL), reading(GOAL), lost_at=2),
+            ),
             ("overflow ends nothing", "r", episode(reading(overflow=True), reading(GOAL))),
         ):
             with self.subTest(name):
-                found = "".join(stage[0] for stage in ("approach", "grasp", "reorient") if getattr(m, stage))
+                found = "".join(
+                    stage[0] for stage in ("approach", "grasp", "reorient") if getattr(m, stage)
+                )
                 self.assertEqual(found, expected)
                 self.assertAlmostEqual(float(m.task_progress), SCORES.get(expected, 1.0), places=6)
-                self.assertEqual(bool(m.reorient_once), expected == "r" or name in ("left the goal", "left later"))
-                self.assertEqual(bool(m.out_of_bounds), name.startswith("left the scene") or name == "left later")
+                self.assertEqual(
+                    bool(m.reorient_once),
+                    expected == "r" or name in ("left the goal", "left later"),
+                )
+                self.assertEqual(
+                    bool(m.out_of_bounds), name.startswith("left the scene") or name == "left later"
+                )
                 self.assertEqual(bool(m.overflow), name.startswith("overflow"))
 
     def test_reorientation_progress_is_the_best_of_the_episode(self):
@@ -119,10 +149,15 @@ class MetricsTest(unittest.TestCase):
             (0.0, episode(reading(raised(-0.1)))),
             (1.0, episode(reading(GOAL))),
             (0.0, episode(reading(), reading(raised(0.05)), reading(GOAL), lost_at=1)),
-            (1 - 0.1 / (0.2 * math.sqrt(2)), episode(reading(raised(0.1)), start=reading(AWAY, turned(180)))),
+            (
+                1 - 0.1 / (0.2 * math.sqrt(2)),
+                episode(reading(raised(0.1)), start=reading(AWAY, turned(180))),
+            ),
         ):
             self.assertAlmostEqual(float(m.reorientation_progress), expected, places=5)
-        there = episode(reading(GOAL), start=reading(GOAL))  # nothing is left to do: no division by zero
+        there = episode(
+            reading(GOAL), start=reading(GOAL)
+        )  # nothing is left to do: no division by zero
         self.assertTrue(0.0 <= float(there.reorientation_progress) <= 1.0)
 
     def test_published_success_is_a_mean_distance_of_two_centimetres_at_any_time(self):
@@ -132,22 +167,44 @@ class MetricsTest(unittest.TestCase):
         near = GOAL + torch.tensor([0.0, 0.0199, 0.0])
         far = GOAL + torch.tensor([0.0, 0.0201, 0.0])
         for name, m, success, least, last in (
-            ("near, then away", episode(reading(near), reading(raised(0.1))), True, 0.0199, (0.1, 0.1, 0.0)),
+            (
+                "near, then away",
+                episode(reading(near), reading(raised(0.1))),
+                True,
+                0.0199,
+                (0.1, 0.1, 0.0),
+            ),
             ("not near enough", episode(reading(far)), False, 0.0201, (0.0201, 0.0201, 0.0)),
             ("at the start", episode(reading(), start=reading(GOAL)), True, 0.0, (0.2, 0.2, 0.0)),
-            ("turned", episode(reading(GOAL, turned(20))), False, turn, (turn, 0.0, math.radians(20))),
-            ("left the scene", episode(reading(raised(0.1)), reading(GOAL), lost_at=1), False, 0.1, (0.1, 0.1, 0.0)),
+            (
+                "turned",
+                episode(reading(GOAL, turned(20))),
+                False,
+                turn,
+                (turn, 0.0, math.radians(20)),
+            ),
+            (
+                "left the scene",
+                episode(reading(raised(0.1)), reading(GOAL), lost_at=1),
+                False,
+                0.1,
+                (0.1, 0.1, 0.0),
+            ),
         ):
             with self.subTest(name):
                 self.assertEqual(bool(m.published_success), success)
                 self.assertAlmostEqual(float(m.least_distance), least, places=6)
-                found = [float(x) for x in (m.final_distance, m.final_position_error, m.final_angle)]
+                found = [
+                    float(x) for x in (m.final_distance, m.final_position_error, m.final_angle)
+                ]
                 np.testing.assert_allclose(found, last, atol=1e-3)
 
     def test_a_world_that_is_not_finite_is_counted_and_no_longer_looked_at(self):
         nan = torch.full((3,), math.nan)
         broken = reading(nan, tips=(math.nan,) * 3, press=(math.nan,) * 3, nonfinite=True)
-        m = episode(reading(raised(0.05)), broken, broken, reading(GOAL, tips=(0, 0, 0), nonfinite=True))
+        m = episode(
+            reading(raised(0.05)), broken, broken, reading(GOAL, tips=(0, 0, 0), nonfinite=True)
+        )
         self.assertFalse(m.approach or m.grasp or m.reorient or m.out_of_bounds)
         self.assertTrue(m.nonfinite)
         self.assertAlmostEqual(float(m.reorientation_progress), 0.25, places=5)
@@ -180,13 +237,24 @@ class RecordedTest(unittest.TestCase):
         for episode, trace in zip(found.episodes, found.traces, strict=True):
             points = metric_points(load_object(trace.object))
             turns = Rotation.from_quat(trace.object_quat, scalar_first=True).as_matrix()
-            goal = Rotation.from_quat(trace.goal_quat, scalar_first=True).apply(points) + trace.goal_pos
-            distance = np.linalg.norm(points @ turns.swapaxes(1, 2) + trace.object_pos[:, None] - goal, axis=-1).mean(1)
+            goal = (
+                Rotation.from_quat(trace.goal_quat, scalar_first=True).apply(points)
+                + trace.goal_pos
+            )
+            distance = np.linalg.norm(
+                points @ turns.swapaxes(1, 2) + trace.object_pos[:, None] - goal, axis=-1
+            ).mean(1)
             error = np.linalg.norm(trace.object_pos[-1] - trace.goal_pos)
-            measured = (episode.least_distance, episode.final_distance, episode.final_position_error)
+            measured = (
+                episode.least_distance,
+                episode.final_distance,
+                episode.final_position_error,
+            )
             np.testing.assert_allclose(measured, (distance.min(), distance[-1], error), atol=5e-6)
             self.assertEqual(episode.published_success, distance.min() <= 0.02)
-        self.assertGreater(len({e.least_distance for e in found.episodes}), 2, "each world is judged by itself")
+        self.assertGreater(
+            len({e.least_distance for e in found.episodes}), 2, "each world is judged by itself"
+        )
 
 
 class BootstrapTest(unittest.TestCase):
@@ -237,12 +305,21 @@ class ResultsTest(unittest.TestCase):
     def test_summary(self):
         s = toy_summary()
         self.assertEqual((s.objects, s.episodes, s.task_progress.mean), ((SOUP, SPAM), 4, 0.4975))
-        self.assertEqual(s.task_progress.ci95, (0.33, 0.665), "two demonstrations: the interval spans their means")
+        self.assertEqual(
+            s.task_progress.ci95,
+            (0.33, 0.665),
+            "two demonstrations: the interval spans their means",
+        )
         self.assertEqual((s.approach_rate, s.grasp_rate, s.reorient_rate), (0.75, 0.5, 0.25))
         self.assertEqual(s.reorientation_progress, 0.375)
         self.assertEqual(vars(s.health), {"nonfinite": 1, "overflow": 1, "out_of_bounds": 1})
-        self.assertEqual([(d.sequence, d.task_progress) for d in s.per_demo], [("demo_0", 0.665), ("demo_1", 0.33)])
-        self.assertEqual((s.per_demo[1].grasp_rate, s.per_demo[1].object, s.per_demo[1].episodes), (0.5, SPAM, 2))
+        self.assertEqual(
+            [(d.sequence, d.task_progress) for d in s.per_demo],
+            [("demo_0", 0.665), ("demo_1", 0.33)],
+        )
+        self.assertEqual(
+            (s.per_demo[1].grasp_rate, s.per_demo[1].object, s.per_demo[1].episodes), (0.5, SPAM, 2)
+        )
 
     def test_what_is_no_result_is_refused(self):
         write_results(self.folder, toy_summary(), toy_rollouts(), self.JOINTS)
@@ -253,14 +330,19 @@ class ResultsTest(unittest.TestCase):
             ("missing: grasp_rate", {"grasp_rate": None}),
             ("unknown: later", {"later": 1}),
             ("policy is 5, expected str", {"policy": 5}),
-            ("mean is 7, expected a number from 0 to 1", {"task_progress": {"mean": 7, "ci95": [0, 1]}}),
+            (
+                "mean is 7, expected a number from 0 to 1",
+                {"task_progress": {"mean": 7, "ci95": [0, 1]}},
+            ),
             ("ci95 has 1 entries", {"task_progress": {"mean": 0.5, "ci95": [0]}}),
             ("nonfinite is '<script>alert", {"health": health}),
             ("inputs.demos is 3", {"inputs": {"demos": 3}}),
             (r"per_demo is \[\], expected one demonstration", {"per_demo": []}),
         ):
             changed = {
-                name: value for name, value in (good | changes).items() if value is not None or name == "objects_folder"
+                name: value
+                for name, value in (good | changes).items()
+                if value is not None or name == "objects_folder"
             }
             path.write_text(json.dumps(changed))
             with self.subTest(words), self.assertRaisesRegex(FileFormatError, words):
@@ -293,7 +375,9 @@ class ResultsTest(unittest.TestCase):
             read_results(self.folder)
 
     def test_two_evaluations_are_not_written_into_one_folder(self):
-        policy = PolicySpec(name="zero", start=mock.Mock(), robot=mock.Mock(), task=TaskConfig(), folder=self.folder)
+        policy = PolicySpec(
+            name="zero", start=mock.Mock(), robot=mock.Mock(), task=TaskConfig(), folder=self.folder
+        )
         with mock.patch("xreset.eval.evaluate.load_trial"):
             with claim_folder(self.folder), self.assertRaisesRegex(XResetError, "writing"):
                 evaluate(policy, "demos.npz", [])

@@ -77,9 +77,17 @@ class PluginTest(unittest.TestCase):
         backend = "SomeonesBackend"
         install = "from xreset.errors import BackendUnavailableError as E\nraise E('pip install their-engine')\n"
         for source, name, pattern in (
-            ("import nothing\n", backend, r"(?s)'someones' \(someones_engine:SomeonesBackend\) does not load.*nothing"),
+            (
+                "import nothing\n",
+                backend,
+                r"(?s)'someones' \(someones_engine:SomeonesBackend\) does not load.*nothing",
+            ),
             ("", "Misspelt", "does not load.*Misspelt"),
-            (f"def {backend}(scene, num_worlds): ...\n", backend, "a class that inherits from xreset.physics.Backend"),
+            (
+                f"def {backend}(scene, num_worlds): ...\n",
+                backend,
+                "a class that inherits from xreset.physics.Backend",
+            ),
             (install, backend, "^pip install their-engine$"),
         ):
             with self.subTest(source):
@@ -105,23 +113,37 @@ class ExampleTest(unittest.TestCase):
     def test_without_its_engine_an_example_says_what_to_install(self):
         for engine, package in EXAMPLES.items():
             ours = f"xreset_{engine}"
-            absent = {name: None for name in list(sys.modules) if name.split(".")[0] == package} | {package: None}
-            kept = {name: module for name, module in sys.modules.items() if not name.startswith(ours)}
+            absent = {name: None for name in list(sys.modules) if name.split(".")[0] == package} | {
+                package: None
+            }
+            kept = {
+                name: module for name, module in sys.modules.items() if not name.startswith(ours)
+            }
             with (
                 self.subTest(engine),
                 mock.patch.object(sys, "path", [str(folder_of(engine)), *sys.path]),
                 mock.patch.dict(sys.modules, kept | absent, clear=True),
-                mock.patch.object(plugins, "entry_points", lambda group, engine=engine: [declared(engine)]),
+                mock.patch.object(
+                    plugins, "entry_points", lambda group, engine=engine: [declared(engine)]
+                ),
             ):
                 with self.assertRaisesRegex(BackendUnavailableError, f"pip install '?{engine}"):
                     make_backend(engine, scene(), 1)
                 self.assertRegex(backend_status(engine).reason or "", f"pip install '?{engine}")
 
     def test_they_use_the_public_interface_only(self):
-        public = {"xreset.physics", "xreset.backends.pool", "xreset.backends.rigid", "xreset.spec", "xreset.errors"}
+        public = {
+            "xreset.physics",
+            "xreset.backends.pool",
+            "xreset.backends.rigid",
+            "xreset.spec",
+            "xreset.errors",
+        }
         for engine in EXAMPLES:
             for file in folder_of(engine).rglob("*.py"):
-                for module in re.findall(r"^\s*(?:from|import) (xreset\.\S+)", file.read_text(), re.MULTILINE):
+                for module in re.findall(
+                    r"^\s*(?:from|import) (xreset\.\S+)", file.read_text(), re.MULTILINE
+                ):
                     self.assertIn(module, public, file.name)
                 self.assertNotRegex(file.read_text(), r"from xreset\..* import .*\b_\w", file.name)
 
@@ -140,7 +162,9 @@ class EngineTest:
             raise unittest.SkipTest(
                 f"{cls.engine} is not installed: pip install -e examples/xreset-{cls.engine}"
             ) from None
-        cls.enterClassContext(mock.patch.object(sys, "path", [str(folder_of(cls.engine)), *sys.path]))
+        cls.enterClassContext(
+            mock.patch.object(sys, "path", [str(folder_of(cls.engine)), *sys.path])
+        )
         cls.backend = declared(cls.engine).load()
 
     def make(self, scene, num_worlds, *, object_index=None):
@@ -163,9 +187,12 @@ class NewtonTest(EngineTest, unittest.TestCase):
 
     def test_what_it_lacks_is_refused(self):
         stiff = scene().robot
-        joints = tuple(replace(joint, drive=replace(joint.drive, friction_loss=0.1)) for joint in stiff.joints)
+        joints = tuple(
+            replace(joint, drive=replace(joint.drive, friction_loss=0.1)) for joint in stiff.joints
+        )
         with self.assertRaisesRegex(
-            CapabilityError, "no dry friction of joints on the CPU: give the robot's drives a friction_loss of 0"
+            CapabilityError,
+            "no dry friction of joints on the CPU: give the robot's drives a friction_loss of 0",
         ):
             self.make(replace(scene(), robot=replace(stiff, joints=joints)), 1)
 
@@ -192,7 +219,8 @@ class DrakeTest(EngineTest, unittest.TestCase):
             with (
                 mock.patch.object(world, "_simulator") as simulator,
                 self.assertWarnsRegex(
-                    UserWarning, "gives up on a world, which counts as not finite from now on: too much"
+                    UserWarning,
+                    "gives up on a world, which counts as not finite from now on: too much",
                 ),
             ):
                 simulator.AdvanceTo.side_effect = RuntimeError("too much")
@@ -202,7 +230,9 @@ class DrakeTest(EngineTest, unittest.TestCase):
             backend.set_state(good)
             backend.step()
             self.assertFalse(bool(backend.health().nonfinite[0]))
-            torch.testing.assert_close(backend.state().object_pos, good.object_pos, atol=1e-3, rtol=0)
+            torch.testing.assert_close(
+                backend.state().object_pos, good.object_pos, atol=1e-3, rtol=0
+            )
 
 
 if __name__ == "__main__":

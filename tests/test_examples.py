@@ -21,7 +21,10 @@ NUMBERED = sorted(EXAMPLES.glob("[0-9]*.py"))
 
 
 def run(name: str, *arguments) -> str:
-    with mock.patch.object(sys, "path", [str(EXAMPLES), *sys.path]), contextlib.redirect_stdout(io.StringIO()) as out:
+    with (
+        mock.patch.object(sys, "path", [str(EXAMPLES), *sys.path]),
+        contextlib.redirect_stdout(io.StringIO()) as out,
+    ):
         importlib.import_module(name).main(*arguments)
     return out.getvalue()
 
@@ -54,7 +57,9 @@ class FaceTest(unittest.TestCase):
         }
         for name in xreset.__all__:
             value = name != "VectorEnv" and getattr(xreset, name)
-            for annotation in getattr(value, "__annotations__", {}).values() if callable(value) else ():
+            for annotation in (
+                getattr(value, "__annotations__", {}).values() if callable(value) else ()
+            ):
                 types = set(re.findall(r"\b[A-Z]\w+", str(annotation))) - elsewhere
                 if not isinstance(value, type):
                     self.assertLessEqual(types, {*xreset.__all__}, name)
@@ -70,7 +75,9 @@ class FaceTest(unittest.TestCase):
 
 class ShelfTest(unittest.TestCase):
     def test_they_are_numbered_and_short(self):
-        self.assertEqual([file.name[:2] for file in NUMBERED], [f"{number:02}" for number in range(13)])
+        self.assertEqual(
+            [file.name[:2] for file in NUMBERED], [f"{number:02}" for number in range(13)]
+        )
         for file in NUMBERED:
             self.assertLess(len(file.read_text().splitlines()), 70, file.name)
 
@@ -78,7 +85,9 @@ class ShelfTest(unittest.TestCase):
         with mock.patch.dict(sys.modules, {"gymnasium": None}):
             sys.modules.pop("xreset.vector_env", None)
             vars(xreset).pop("VectorEnv", None)
-            with self.assertRaisesRegex(xreset.errors.XResetError, r"pip install 'xreset\[gymnasium\]'"):
+            with self.assertRaisesRegex(
+                xreset.errors.XResetError, r"pip install 'xreset\[gymnasium\]'"
+            ):
                 xreset.VectorEnv  # noqa: B018
 
     def test_an_engine_is_checked(self):
@@ -86,7 +95,8 @@ class ShelfTest(unittest.TestCase):
         self.assertEqual([line.split()[0] for line in lines], ["passed", "passed", "failed"], lines)
 
     @unittest.skipUnless(
-        has("coal", "pybullet", "onnxruntime", "imageio_ffmpeg"), "an engine or a codec is not installed"
+        has("coal", "pybullet", "onnxruntime", "imageio_ffmpeg"),
+        "an engine or a codec is not installed",
     )
     def test_a_shipped_policy_is_filmed_with_an_unseen_object(self):
         with tempfile.TemporaryDirectory() as folder:
@@ -118,7 +128,9 @@ class FromABankTest(unittest.TestCase):
     def test_an_environment_is_stepped(self):
         said = run("03_step_an_environment", self.bank)
         self.assertIn("return after 60 steps", said)
-        self.assertRegex(said, r"picture of the first world: \(480, 640, 3\), mean brightness [1-9]")
+        self.assertRegex(
+            said, r"picture of the first world: \(480, 640, 3\), mean brightness [1-9]"
+        )
 
     def test_pictures_show_the_world_that_was_asked_for(self):
         bank = xreset.read_bank(self.bank)
@@ -131,7 +143,9 @@ class FromABankTest(unittest.TestCase):
             self.assertTrue((first != env.render(1, (64, 48))).any())
 
     def test_a_reward_term_pays(self):
-        self.assertRegex(run("04_own_reward", self.bank), r"upright pays 0\.[0-4]\d*[1-9]\d* per step")
+        self.assertRegex(
+            run("04_own_reward", self.bank), r"upright pays 0\.[0-4]\d*[1-9]\d* per step"
+        )
 
     @unittest.skipUnless(has("rsl_rl", "onnx"), "rsl-rl-lib or onnx is not installed")
     def test_a_policy_is_trained(self):
@@ -139,23 +153,29 @@ class FromABankTest(unittest.TestCase):
         self.assertIn("trained run for 2 iterations, on 005_tomato_soup_can", said)
         self.assertTrue((self.folder / "run" / "policy.onnx").is_file())
 
-    @unittest.skipUnless(has("onnxruntime", "matplotlib"), "onnxruntime or matplotlib is not installed")
+    @unittest.skipUnless(
+        has("onnxruntime", "matplotlib"), "onnxruntime or matplotlib is not installed"
+    )
     def test_a_policy_is_evaluated(self):
-        self.assertRegex(run("08_evaluate_and_plot", self.folder, ("mujoco",)), r"task progress [1-9]\d*%")
+        self.assertRegex(
+            run("08_evaluate_and_plot", self.folder, ("mujoco",)), r"task progress [1-9]\d*%"
+        )
         self.assertTrue((self.folder / "progress.png").is_file())
 
     @unittest.skipUnless(has("onnxruntime"), "onnxruntime is not installed")
     def test_a_policy_plays_where_nothing_can_train(self):
-        hidden = (
-            "import sys; sys.modules.update(dict.fromkeys(('rsl_rl', 'warp', 'mujoco_warp', 'onnx', 'tensorboard')))"
-        )
+        hidden = "import sys; sys.modules.update(dict.fromkeys(('rsl_rl', 'warp', 'mujoco_warp', 'onnx', 'tensorboard')))"
         program = f"{hidden}; sys.path.insert(0, {str(EXAMPLES)!r}); __import__('09_play_a_policy').main(sys.argv[1])"
         done = subprocess.run(
             [sys.executable, "-c", program, self.folder / "demos.npz"],
             capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"},
         )  # fmt: skip
         self.assertEqual(done.returncode, 0, done.stderr)
-        self.assertLess(float(done.stdout.partition("the object ends ")[2].partition(" cm")[0]), 5.0, done.stdout)
+        self.assertLess(
+            float(done.stdout.partition("the object ends ")[2].partition(" cm")[0]),
+            5.0,
+            done.stdout,
+        )
 
     @unittest.skipUnless(has("onnxruntime"), "onnxruntime is not installed")
     def test_a_policy_says_where_it_cannot_play(self):
@@ -163,7 +183,10 @@ class FromABankTest(unittest.TestCase):
         objects = [xreset.load_object(name) for name in bank.object_names]
         with xreset.make_env(xreset.load_robot("openarm"), objects, bank, num_envs=1) as env:
             for arguments, message in (
-                (("soup-can", env, "film.mp4"), "trained with another robot .robot: 'ur7e-sharpa', here 'openarm'"),
+                (
+                    ("soup-can", env, "film.mp4"),
+                    "trained with another robot .robot: 'ur7e-sharpa', here 'openarm'",
+                ),
                 (("no-such-policy", env, "film.mp4"), "no-such-policy"),
             ):
                 with self.subTest(message), self.assertRaisesRegex(xreset.XResetError, message):

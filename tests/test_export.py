@@ -35,25 +35,35 @@ class Case(unittest.TestCase):
         rollouts = change(toy_rollouts(np.array([joint.home for joint in self.robot.joints])))
         for engine in engines:
             write_results(
-                self.folder / name, toy_summary(engine, rollouts, robot="ur7e-sharpa"), rollouts, self.robot.joint_names
+                self.folder / name,
+                toy_summary(engine, rollouts, robot="ur7e-sharpa"),
+                rollouts,
+                self.robot.joint_names,
             )
         return self.folder / name
 
     def change_first(self, **changes):
-        return lambda rollouts: replace(rollouts, traces=(replace(rollouts.traces[0], **changes), *rollouts.traces[1:]))
+        return lambda rollouts: replace(
+            rollouts, traces=(replace(rollouts.traces[0], **changes), *rollouts.traces[1:])
+        )
 
 
 class Episodes(Case):
     def test_states_with_the_action_that_is_in_force_before_the_next(self):
         recording = read_recorded([self.evaluate()])
         self.assertEqual(recording.fps, 20.0)
-        self.assertEqual(list(recording.episodes["engine"]), ["mujoco", "mujoco", "sapien", "sapien"])
+        self.assertEqual(
+            list(recording.episodes["engine"]), ["mujoco", "mujoco", "sapien", "sapien"]
+        )
         np.testing.assert_array_equal(recording.offsets, [0, 5, 10, 15, 20])
         steps = (recording.episodes["action"][0] - recording.robot.home)[
             :, 0
         ] / 0.01  # 12 control steps between 5 states
         np.testing.assert_allclose(steps, [2, 5, 8, 11, 11], atol=1e-4)
-        self.assertEqual(recording.episodes["task"][0], "Grasp the tomato soup can and bring it to the goal pose.")
+        self.assertEqual(
+            recording.episodes["task"][0],
+            "Grasp the tomato soup can and bring it to the goal pose.",
+        )
         self.assertEqual(list(recording.episodes["repetition"]), [0] * 4)
         self.assertEqual(list(recording.episodes["least_distance"]), [0.01, 0.1] * 2)
 
@@ -65,20 +75,27 @@ class Episodes(Case):
         broken = toy_rollouts(self.robot.home).traces[0].object_pos.copy()
         broken[3:] = np.nan
         with self.assertLogs("xreset.eval.export.recorded", "WARNING") as log:
-            recording = read_recorded([self.evaluate(change=self.change_first(object_pos=broken))], backends=["mujoco"])
+            recording = read_recorded(
+                [self.evaluate(change=self.change_first(object_pos=broken))], backends=["mujoco"]
+            )
         self.assertIn("demonstration 0 is left out", log.output[0])
         self.assertEqual(list(map(len, recording.episodes["action"])), [5])
 
     def test_refusals(self):
         def changed(name: str, **changes):
             return self.evaluate(
-                name, change=lambda r: replace(r, traces=tuple(replace(t, **changes) for t in r.traces))
+                name,
+                change=lambda r: replace(r, traces=tuple(replace(t, **changes) for t in r.traces)),
             )
 
         slow = 2 * toy_rollouts().traces[0].time
         for folders, error, words in (
             ([changed("without", joint_target=None)], FileFormatError, "without the actions"),
-            ([self.evaluate(), changed("slower", time=slow)], RunError, "different rates.*20 in.*10 in"),
+            (
+                [self.evaluate(), changed("slower", time=slow)],
+                RunError,
+                "different rates.*20 in.*10 in",
+            ),
             ([self.folder / "nowhere"], RunError, "no folder"),
         ):
             with self.subTest(words), self.assertRaisesRegex(error, words):
@@ -86,7 +103,9 @@ class Episodes(Case):
         with self.assertRaisesRegex(RunError, "no recorded episodes of pybullet"):
             read_recorded([self.evaluate()], backends=["pybullet"])
         stray = self.evaluate("stray", change=self.change_first(sequence=1_000_000))
-        with self.assertRaisesRegex(FileFormatError, "a trace of demonstration 1000000, of which no episode is known"):
+        with self.assertRaisesRegex(
+            FileFormatError, "a trace of demonstration 1000000, of which no episode is known"
+        ):
             read_recorded([stray])
 
 
@@ -98,12 +117,17 @@ class Arrays(Case):
             arrays = dict(file)
         page = (Path(__file__).parents[1] / "docs/rollouts.md").read_text().split("## npz")[1]
         documented = {
-            name for line in page.splitlines() if line.startswith("| `") for name in line.split("|")[1].split("`")[1::2]
+            name
+            for line in page.splitlines()
+            if line.startswith("| `")
+            for name in line.split("|")[1].split("`")[1::2]
         }
         self.assertEqual(documented, set(arrays) - {"meta"})
         self.assertEqual(str(arrays["schema"]), "xreset-rollouts/1")
         self.assertEqual(arrays["joint_pos"].shape, (20, len(self.robot.joints)))
-        np.testing.assert_allclose(arrays["object_pos"][5:10], recording.episodes["trace"][1].object_pos, atol=1e-7)
+        np.testing.assert_allclose(
+            arrays["object_pos"][5:10], recording.episodes["trace"][1].object_pos, atol=1e-7
+        )
         self.assertEqual(arrays["engine"].tolist(), ["mujoco", "mujoco", "sapien", "sapien"])
         self.assertEqual(arrays["success"].tolist(), [True, False, True, False])
 
@@ -117,8 +141,12 @@ class LeRobot(Case):
         root = self.folder / "set"
         write_lerobot(root, recording, video=False)
         info = json.loads((root / "meta/info.json").read_text())
-        self.assertEqual((info["codebase_version"], info["fps"], info["total_frames"]), ("v3.0", 20, 20))
-        data = parquet.read_table(root / info["data_path"].format(chunk_index=0, file_index=0)).to_pydict()
+        self.assertEqual(
+            (info["codebase_version"], info["fps"], info["total_frames"]), ("v3.0", 20, 20)
+        )
+        data = parquet.read_table(
+            root / info["data_path"].format(chunk_index=0, file_index=0)
+        ).to_pydict()
         self.assertEqual(set(data), set(info["features"]))
         self.assertEqual(data["index"], list(range(20)))
         np.testing.assert_allclose(data["action"][5], recording.episodes["action"][1][0], rtol=1e-6)
@@ -126,12 +154,18 @@ class LeRobot(Case):
             data["observation.environment_state"][19][7:], [0.5, 0.35, 0.15, 1, 0, 0, 0], rtol=1e-6
         )
         stats = json.loads((root / "meta/stats.json").read_text())
-        np.testing.assert_allclose(stats["action"]["mean"], np.mean(data["action"], axis=0), rtol=1e-6)
+        np.testing.assert_allclose(
+            stats["action"]["mean"], np.mean(data["action"], axis=0), rtol=1e-6
+        )
         episodes = parquet.read_table(root / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
         self.assertEqual(
-            [(e["dataset_from_index"], e["dataset_to_index"]) for e in episodes], [(0, 5), (5, 10), (10, 15), (15, 20)]
+            [(e["dataset_from_index"], e["dataset_to_index"]) for e in episodes],
+            [(0, 5), (5, 10), (10, 15), (15, 20)],
         )
-        self.assertEqual([(e["engine"], e["success"]) for e in episodes][1:3], [("mujoco", False), ("sapien", True)])
+        self.assertEqual(
+            [(e["engine"], e["success"]) for e in episodes][1:3],
+            [("mujoco", False), ("sapien", True)],
+        )
         self.assertEqual([p.name for p in self.folder.iterdir() if p.name.startswith(".")], [])
 
     def test_refuses_without_a_trace(self):
@@ -143,7 +177,9 @@ class LeRobot(Case):
         ):
             with self.subTest(words), self.assertRaisesRegex(XResetError, words):
                 write_lerobot(options.pop("folder", self.folder / "set"), recording, **options)
-        lost = replace(recording, episodes=recording.episodes.assign(meshes=self.folder / "nowhere"))
+        lost = replace(
+            recording, episodes=recording.episodes.assign(meshes=self.folder / "nowhere")
+        )
         with self.assertRaisesRegex(XResetError, "no folder"):
             write_lerobot(self.folder / "set", lost)
         self.assertEqual([p.name for p in self.folder.iterdir()], ["eval"])
@@ -154,7 +190,9 @@ class LeRobot(Case):
         root = self.folder / "set"
         write_lerobot(root, recording, size=(64, 48), cameras=("side",))
         films = sorted(path.parts[-3] for path in root.rglob("*.mp4"))
-        self.assertEqual(films, ["observation.images.depth_side"] * 2 + ["observation.images.front"] * 2)
+        self.assertEqual(
+            films, ["observation.images.depth_side"] * 2 + ["observation.images.front"] * 2
+        )
         stats = json.loads((root / "meta/stats.json").read_text())["observation.images.depth_side"]
         self.assertLess(stats["min"][0][0][0], 0.05)  # beyond the table
         self.assertGreater(stats["max"][0][0][0], 0.4)  # the table
@@ -166,14 +204,18 @@ class LeRobot(Case):
         recording = read_recorded([self.evaluate()], backends=["sapien"])
         root = self.folder / "set"
         write_lerobot(root, recording, size=(64, 48))
-        found = LeRobotDataset("xreset/test", root=root, delta_timestamps={"action": [0.0, 0.05]}, video_backend="pyav")
+        found = LeRobotDataset(
+            "xreset/test", root=root, delta_timestamps={"action": [0.0, 0.05]}, video_backend="pyav"
+        )
         self.assertEqual((found.num_episodes, found.num_frames, found.fps), (2, 10, 20))
         item = found[8]
         trace = recording.episodes["trace"][1]
         action = recording.episodes["action"][1]
         np.testing.assert_allclose(item["observation.state"], trace.joint_pos[3], atol=1e-6)
         np.testing.assert_allclose(item["action"], action[3:5], atol=1e-6)
-        np.testing.assert_allclose(item["observation.environment_state"][:3], trace.object_pos[3], atol=1e-6)
+        np.testing.assert_allclose(
+            item["observation.environment_state"][:3], trace.object_pos[3], atol=1e-6
+        )
         self.assertEqual((item["task"], item["engine"]), (recording.episodes["task"][1], "sapien"))
         self.assertEqual(tuple(item["observation.images.front"].shape), (3, 48, 64))
         self.assertEqual(set(found.meta.stats), set(found.meta.features) - {"engine"})

@@ -90,18 +90,25 @@ class Learning(unittest.TestCase):
                     done[1] = 1.0
                     faulty[1] = marked
                 alg.process_env_step(
-                    observations(N, seed=t + 1), reward, done, {"time_outs": done * 0, "faulty": faulty}
+                    observations(N, seed=t + 1),
+                    reward,
+                    done,
+                    {"time_outs": done * 0, "faulty": faulty},
                 )
             alg.compute_returns(observations(N, seed=8))
         torch.manual_seed(1)
         alg.update()
-        return alg.actor.state_dict() | {f"critic.{k}": v for k, v in alg.critic.state_dict().items()}
+        return alg.actor.state_dict() | {
+            f"critic.{k}": v for k, v in alg.critic.state_dict().items()
+        }
 
     def test_nothing_is_learned_from_a_faulty_step(self):
         """Without the mark it would be."""
         for marked in (True, False):
             one, two = (self.updated(reward, marked=marked) for reward in (0.0, 1000.0))
-            self.assertEqual(all(torch.equal(value, two[name]) for name, value in one.items()), marked)
+            self.assertEqual(
+                all(torch.equal(value, two[name]) for name, value in one.items()), marked
+            )
 
 
 class Run(WithEnv):
@@ -116,14 +123,18 @@ class Run(WithEnv):
 
     def test_few_faults_do_no_harm_and_too_many_end_the_run(self):
         folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
-        runner = self.train(folder / "few", {5: ("broken", 0), 6: ("overflow", 2), 20: ("broken", 1)})
+        runner = self.train(
+            folder / "few", {5: ("broken", 0), 6: ("overflow", 2), 20: ("broken", 1)}
+        )
         self.assertEqual(runner.iteration, 3)
         for name, value in runner.alg.actor.state_dict().items():
             self.assertTrue(bool(value.isfinite().all()), name)
         # all in the second iteration
         plan = {step: ("broken" if step % 2 else "overflow", step % N) for step in range(9, 17)}
         self.assertGreater(len(plan), MAX_SHARE * WINDOW * 8 * N)
-        with self.assertRaisesRegex(RunError, "4 worlds were not finite and 4 dropped contacts.*--resume"):
+        with self.assertRaisesRegex(
+            RunError, "4 worlds were not finite and 4 dropped contacts.*--resume"
+        ):
             self.train(folder / "many", plan)
         self.assertEqual([c.name for c in checkpoints(folder / "many")], ["000001.pt"])
 

@@ -100,7 +100,9 @@ class AtomicWriteTest(InFolder):
                 pass
             with self.subTest(oct(umask)):
                 self.assertEqual((self.folder / "a.json").stat().st_mode & 0o777, 0o666 & ~umask)
-                self.assertEqual((self.folder / f"made-{umask}").stat().st_mode & 0o777, 0o777 & ~umask)
+                self.assertEqual(
+                    (self.folder / f"made-{umask}").stat().st_mode & 0o777, 0o777 & ~umask
+                )
 
     def test_what_cannot_be_written(self):
         path = self.folder / "a.json"
@@ -141,10 +143,15 @@ class ClaimTest(InFolder):
         for path in (self.folder, self.file):
             with self.subTest(path):
                 command = [sys.executable, "-c", program, str(path)]
-                with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+                with subprocess.Popen(
+                    command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+                ) as other:
                     assert other.stdout is not None
                     self.assertEqual(other.stdout.readline(), "mine\n")
-                    with self.assertRaisesRegex(XResetError, "another command is writing"), claim(path):
+                    with (
+                        self.assertRaisesRegex(XResetError, "another command is writing"),
+                        claim(path),
+                    ):
                         self.fail("two writers")
                     other.kill()  # what a killed one held is free
                 with claim(path):
@@ -195,11 +202,15 @@ class JsonTest(InFolder):
     def test_the_version_is_recorded_and_does_not_matter(self):
         path = self.folder / "a.json"
         write_json(path, {"schema": "x/1", "a": 1})
-        self.assertEqual(json.loads(path.read_text()), {"schema": "x/1", "xreset": code_version(), "a": 1})
+        self.assertEqual(
+            json.loads(path.read_text()), {"schema": "x/1", "xreset": code_version(), "a": 1}
+        )
         self.assertEqual(read_json(path, "x/1"), {"a": 1})
         write_npz(self.folder / "a.npz", "x/1", {"a": np.zeros(2)})
         meta = json.loads(str(np.load(self.folder / "a.npz")["meta"]))
-        self.assertRegex(meta["xreset"], rf"^{re.escape(__version__)}(\+g[0-9a-f]{{12}}(\.dirty)?)?$")
+        self.assertRegex(
+            meta["xreset"], rf"^{re.escape(__version__)}(\+g[0-9a-f]{{12}}(\.dirty)?)?$"
+        )
         self.assertEqual(meta["xreset"], code_version())
 
     def test_refusals(self):
@@ -268,7 +279,10 @@ class NpzTest(InFolder):
             self.write(names=np.array([{}, {}], dtype=object))
         self.assert_only()
         np.savez(
-            self.file, schema="test/1", **(ARRAYS | {"names": np.array(["a", None], dtype=object)}), allow_pickle=True
+            self.file,
+            schema="test/1",
+            **(ARRAYS | {"names": np.array(["a", None], dtype=object)}),
+            allow_pickle=True,
         )
         with self.refused("cannot be read as a test file"):
             self.read()
@@ -323,9 +337,18 @@ class NpzTest(InFolder):
             ("no array 'names'; found good, meta, offsets", {"names": None}),
             (r"'points' has shape \(4, 2\), expected \(F, 3\)", {"points": np.zeros((4, 2))}),
             (r"'points' has shape \(12,\), expected \(F, 3\)", {"points": np.zeros(12)}),
-            ("'points' has type int64, expected floating-point", {"points": np.zeros((4, 3), dtype=np.int64)}),
-            (r"'good' has shape \(5,\), but F = 4 by array 'points'", {"good": np.ones(5, dtype=bool)}),
-            (r"'names' has shape \(3,\), but S = 2 by array 'offsets'", {"names": np.array(["a", "b", "c"])}),
+            (
+                "'points' has type int64, expected floating-point",
+                {"points": np.zeros((4, 3), dtype=np.int64)},
+            ),
+            (
+                r"'good' has shape \(5,\), but F = 4 by array 'points'",
+                {"good": np.ones(5, dtype=bool)},
+            ),
+            (
+                r"'names' has shape \(3,\), but S = 2 by array 'offsets'",
+                {"names": np.array(["a", "b", "c"])},
+            ),
             ("'note' has type", {"note": 3.0}),
         ):
             self.write(**change)
@@ -333,9 +356,13 @@ class NpzTest(InFolder):
                 self.read()
 
     def test_numbers_are_native(self):
-        self.write(offsets=np.array([0, 1, 4], dtype=">u4"), points=ARRAYS["points"].astype(np.longdouble))
+        self.write(
+            offsets=np.array([0, 1, 4], dtype=">u4"), points=ARRAYS["points"].astype(np.longdouble)
+        )
         found = self.read()
-        self.assertEqual((found["offsets"].dtype, found["points"].dtype), (np.dtype("=i8"), np.dtype("=f8")))
+        self.assertEqual(
+            (found["offsets"].dtype, found["points"].dtype), (np.dtype("=i8"), np.dtype("=f8"))
+        )
         np.testing.assert_array_equal(found["points"], ARRAYS["points"])
         self.write(offsets=np.array([0, 1, 2**63], dtype=np.uint64))
         with self.refused("more than 63 bits"):
@@ -352,7 +379,10 @@ class NpzTest(InFolder):
         with mock.patch.dict(os.environ, XRESET_MAX_FILE_MB="10"):
             self.read()
         self.write(offsets=np.zeros(1_500_000, dtype=np.int8))  # becomes int64
-        with mock.patch.dict(os.environ, XRESET_MAX_FILE_MB="9"), self.refused("take 11 MB unpacked"):
+        with (
+            mock.patch.dict(os.environ, XRESET_MAX_FILE_MB="9"),
+            self.refused("take 11 MB unpacked"),
+        ):
             self.read()
         with (
             mock.patch.dict(os.environ, XRESET_MAX_FILE_MB="many"),
@@ -361,11 +391,20 @@ class NpzTest(InFolder):
             self.read()
 
     def test_values_that_are_refused(self):
-        schema = SCHEMA | {"points": Field(("F", 3), "f", within=(-100, 100)), "turn": Field((4,), "f", unit=True)}
-        texts = [{"names": np.array(["a", text])} for text in ("\x1b[31m", "\x9b1m", "a\u202eb", "\ud800")]
+        schema = SCHEMA | {
+            "points": Field(("F", 3), "f", within=(-100, 100)),
+            "turn": Field((4,), "f", unit=True),
+        }
+        texts = [
+            {"names": np.array(["a", text])}
+            for text in ("\x1b[31m", "\x9b1m", "a\u202eb", "\ud800")
+        ]
         for words, changes in (
             ("'points' holds non-finite", {"points": np.full((4, 3), np.nan)}),
-            ("'points' holds 1e.30, expected numbers from -100 to 100", {"points": np.full((4, 3), 1e30)}),
+            (
+                "'points' holds 1e.30, expected numbers from -100 to 100",
+                {"points": np.full((4, 3), 1e30)},
+            ),
             ("'turn' holds quaternions that are not unit", {"turn": np.zeros(4)}),
             *(("array 'names' holds the text", change) for change in texts),
         ):
@@ -376,7 +415,13 @@ class NpzTest(InFolder):
     def test_a_further_check_may_refuse(self):
         self.write()
         with self.refused("the offsets are odd"):
-            read_npz(self.file, "test/1", SCHEMA, what="a test file", check=lambda arrays: "the offsets are odd")
+            read_npz(
+                self.file,
+                "test/1",
+                SCHEMA,
+                what="a test file",
+                check=lambda arrays: "the offsets are odd",
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -395,7 +440,9 @@ class Outer:
 
 
 class TypedTest(unittest.TestCase):
-    GOOD = Outer(inner=Inner(size=1.5, mode="b"), widths=(1, 2, 3), pair=(0.0, 1.0), name="x", on=True)
+    GOOD = Outer(
+        inner=Inner(size=1.5, mode="b"), widths=(1, 2, 3), pair=(0.0, 1.0), name="x", on=True
+    )
 
     def test_round_trip_through_json(self):
         for value in (self.GOOD, replace(self.GOOD, name=None)):
@@ -411,7 +458,12 @@ class TypedTest(unittest.TestCase):
 
     def test_a_removed_option_is_ignored_where_it_was_off(self):
         data = asdict(TaskConfig(timestep=0.01))
-        data["reset"] |= {"frontier": 0.0, "frontier_over": "bank", "frontier_power": 1.0, "frontier_rate": 0.1}
+        data["reset"] |= {
+            "frontier": 0.0,
+            "frontier_over": "bank",
+            "frontier_power": 1.0,
+            "frontier_rate": 0.1,
+        }
         self.assertEqual(from_dict(TaskConfig, data), TaskConfig(timestep=0.01))
         data["reset"]["frontier"] = 0.75
         with self.assertRaisesRegex(
@@ -424,15 +476,27 @@ class TypedTest(unittest.TestCase):
         for words, data in (
             ("unknown: extra", good | {"extra": 1}),
             ("missing: pair", {k: v for k, v in good.items() if k != "pair"}),
-            ("configuration.inner does not fit Inner.*missing: size", good | {"inner": {"mode": "b"}}),
-            ("inner.mode is 'c', expected one of 'a', 'b'", good | {"inner": {"size": 1.0, "mode": "c"}}),
+            (
+                "configuration.inner does not fit Inner.*missing: size",
+                good | {"inner": {"mode": "b"}},
+            ),
+            (
+                "inner.mode is 'c', expected one of 'a', 'b'",
+                good | {"inner": {"size": 1.0, "mode": "c"}},
+            ),
             ("pair has 3 entries, expected 2", good | {"pair": [1.0, 2.0, 3.0]}),
             ("on is 1, expected bool", good | {"on": 1}),
             (r"widths\[0\] is True, expected int", good | {"widths": [True]}),
             (r"widths\[1\] is 2.5, expected int", good | {"widths": [1, 2.5]}),
             ("configuration is 3, expected an object", 3),
-            (r"widths\[0\] is a number of thousands of digits, expected int", good | {"widths": [2**15000]}),
-            (r"pair is .{1,200}, expected a list", good | {"pair": {str(i): ["x" * 1000] * 1000 for i in range(1000)}}),
+            (
+                r"widths\[0\] is a number of thousands of digits, expected int",
+                good | {"widths": [2**15000]},
+            ),
+            (
+                r"pair is .{1,200}, expected a list",
+                good | {"pair": {str(i): ["x" * 1000] * 1000 for i in range(1000)}},
+            ),
         ):
             with self.subTest(words), self.assertRaisesRegex(FileFormatError, words):
                 from_dict(Outer, data)
@@ -454,7 +518,12 @@ class BankTest(InFolder):
         self.robot = toy_hand_arm(self.folder)
 
     def write(self, **changes):
-        write_bank(self.file, toy_bank(self.robot, **changes), config={"steps": 8}, inputs={"retargeted": "ab"})
+        write_bank(
+            self.file,
+            toy_bank(self.robot, **changes),
+            config={"steps": 8},
+            inputs={"retargeted": "ab"},
+        )
 
     def test_round_trip(self):
         for changes in ({}, {"rejected_reason": np.zeros(3, dtype=np.int32)}):
@@ -472,11 +541,15 @@ class BankTest(InFolder):
         np.testing.assert_array_equal(chosen.joint_pos, bank.joint_pos[[0, 4]])
         write_bank(self.file, bank.with_states(np.zeros(6, dtype=bool)), config={}, inputs={})
         found = read_bank(self.file, robot=self.robot)
-        self.assertEqual((found.num_states, len(found.goal_pos)), (0, 3), "starts and goals are left")
+        self.assertEqual(
+            (found.num_states, len(found.goal_pos)), (0, 3), "starts and goals are left"
+        )
 
     def test_a_bank_of_the_robot_before_it_was_changed(self):
         self.write()
-        self.robot.urdf.write_text(self.robot.urdf.read_text().replace('mass value="0.1"', 'mass value="0.2"'))
+        self.robot.urdf.write_text(
+            self.robot.urdf.read_text().replace('mass value="0.1"', 'mass value="0.2"')
+        )
         with self.refused("another version of 'toy'", "Make it again"):
             read_bank(self.file, robot=self.robot)
 
@@ -491,8 +564,14 @@ class BankTest(InFolder):
         for words, changes in (
             ("'sequence_index' points beyond the 3 sequences", with_value("sequence_index", 1, 3)),
             ("another object than its sequence", with_value("object_name", 0, SPAM)),
-            (f"does not list \\['{SPAM}'\\]", {"object_names": (SOUP,), "object_sources": ("stand-in",)}),
-            ("'rejected_sequence_index' points beyond the 3 sequences", with_value("rejected_sequence_index", 0, 7)),
+            (
+                f"does not list \\['{SPAM}'\\]",
+                {"object_names": (SOUP,), "object_sources": ("stand-in",)},
+            ),
+            (
+                "'rejected_sequence_index' points beyond the 3 sequences",
+                with_value("rejected_sequence_index", 0, 7),
+            ),
             ("'rejected_reason' points beyond the 2 reasons", with_value("rejected_reason", 0, 2)),
             ("but J = 7", {"joint_pos": np.zeros((6, 8), dtype=np.float32)}),
         ):

@@ -16,10 +16,12 @@ ON_GPU = torch.cuda.is_available()
 
 
 @unittest.skipUnless(
-    importlib.util.find_spec("triton"), "Triton is not installed (it comes with PyTorch's CUDA builds)"
+    importlib.util.find_spec("triton"),
+    "Triton is not installed (it comes with PyTorch's CUDA builds)",
 )
 @unittest.skipUnless(
-    ON_GPU or os.environ.get("TRITON_INTERPRET") == "1", "no GPU here, and TRITON_INTERPRET=1 is not set"
+    ON_GPU or os.environ.get("TRITON_INTERPRET") == "1",
+    "no GPU here, and TRITON_INTERPRET=1 is not set",
 )
 class FusedPointNetTest(unittest.TestCase):
     @classmethod
@@ -29,7 +31,9 @@ class FusedPointNetTest(unittest.TestCase):
         cls.fused = fused
         cls.device = "cuda" if ON_GPU else "cpu"
 
-    def compare(self, clouds: tuple[int, ...], dims: list[int], points: int, width: int) -> dict[str, float]:
+    def compare(
+        self, clouds: tuple[int, ...], dims: list[int], points: int, width: int
+    ) -> dict[str, float]:
         """Relative differences of the embeddings and of every gradient."""
         torch.manual_seed(clouds[0])
         net = PointNet(dims, point_width=width).to(self.device)
@@ -63,7 +67,12 @@ class FusedPointNetTest(unittest.TestCase):
 
     def test_what_the_kernels_cannot_take(self):
         self.assertTrue(self.fused.supports(64, (64, 128, 64)))
-        for points, widths in ((48, (64, 128, 64)), (64, (64, 100, 64)), (64, (64, 64)), (64, (64, 256, 64))):
+        for points, widths in (
+            (48, (64, 128, 64)),
+            (64, (64, 100, 64)),
+            (64, (64, 64)),
+            (64, (64, 256, 64)),
+        ):
             self.assertFalse(self.fused.supports(points, widths), (points, widths))
 
 

@@ -36,12 +36,24 @@ class EveryReader(unittest.TestCase):
             ("mesh .ply", lambda whole: whole[:-4] + b"\xff\xff\x01\x00"),
             ("camera, npy", lambda whole: whole[:100]),
             ("camera, npy", lambda whole: whole.replace(b"'descr'", b"('descr'")),
-            ("run.json, compared", lambda whole: whole.replace(b'"resets": "b.npz"', b'"resets": 5')),
-            ("run.json, compared", lambda whole: whole.replace(b'"contract": {', b'"contract": 0.5, "x": {')),
+            (
+                "run.json, compared",
+                lambda whole: whole.replace(b'"resets": "b.npz"', b'"resets": 5'),
+            ),
+            (
+                "run.json, compared",
+                lambda whole: whole.replace(b'"contract": {', b'"contract": 0.5, "x": {'),
+            ),
             ("study", lambda whole: whole + b"x = " + b"1" * 5000),
             ("URDF, imported", lambda whole: whole.replace(b'"0.08 0.08 0.02"', b'"0.08 0.08"')),
-            ("URDF, imported", lambda whole: whole.replace(b'multiplier="0.8"', b'multiplier="x"', 1)),
-            ("URDF, imported", lambda whole: whole.replace(b'multiplier="0.8"', b'multiplier="inf"', 1)),
+            (
+                "URDF, imported",
+                lambda whole: whole.replace(b'multiplier="0.8"', b'multiplier="x"', 1),
+            ),
+            (
+                "URDF, imported",
+                lambda whole: whole.replace(b'multiplier="0.8"', b'multiplier="inf"', 1),
+            ),
             ("URDF, imported", lambda whole: b'<?xml version="1.0" encoding="utf-7"?>' + whole),
             ("MJCF, imported", lambda whole: whole.replace(b'axis="0 1 0"', b'axis="0 nan 0"', 1)),
             ("MJCF, imported", lambda whole: whole.replace(b'mass="0.4"', b'mass="inf"')),

@@ -45,10 +45,14 @@ class SurfaceTest(unittest.TestCase):
     def test_nearest_point_is_exact(self):
         nearest, distance = self.surface.nearest(self.points)
         np.testing.assert_allclose(distance, np.abs(self.exact), atol=1e-9)
-        np.testing.assert_allclose(np.linalg.norm(nearest - self.points, axis=1), distance, atol=1e-12)
+        np.testing.assert_allclose(
+            np.linalg.norm(nearest - self.points, axis=1), distance, atol=1e-12
+        )
 
     def test_faces_inside_the_solid_do_not_count(self):
-        two = Surface(box_object(((-0.02, 0, 0), (0.08, 0.06, 0.06)), ((0.02, 0, 0), (0.08, 0.06, 0.06))))
+        two = Surface(
+            box_object(((-0.02, 0, 0), (0.08, 0.06, 0.06)), ((0.02, 0, 0), (0.08, 0.06, 0.06)))
+        )
         distance, _ = two.signed_distance(torch.zeros(1, 3, dtype=FLOAT))
         # To the outer faces, not to the ends of the boxes at x = +-0.02.
         self.assertAlmostEqual(distance.item(), -0.03, delta=2.1e-3)
@@ -56,7 +60,9 @@ class SurfaceTest(unittest.TestCase):
     def test_contacts_need_annotation_and_nearness(self):
         quat = np.array([[np.sqrt(0.5), 0, 0, np.sqrt(0.5)]])  # x of the object is y of the world
         keypoints = np.array([[[1.0, 2.045, 3.0], [1.0, 2.060, 3.0], [np.nan] * 3]])
-        points, contact = keypoint_contacts(self.surface, keypoints, np.array([[1.0, 2.0, 3.0]]), quat, 0.02)
+        points, contact = keypoint_contacts(
+            self.surface, keypoints, np.array([[1.0, 2.0, 3.0]]), quat, 0.02
+        )
         self.assertEqual(contact.tolist(), [[True, False, False]])
         np.testing.assert_allclose(points[0, 0], [1.0, 2.03, 3.0], atol=1e-9)
         np.testing.assert_array_equal(points[0, 1:], 0.0)
@@ -86,7 +92,10 @@ class ShapesTest(unittest.TestCase):
     def test_no_surface_of_a_thick_shape_lies_bare(self):
         """Without balls under its surface the OpenArm's gripper was 7 mm deep between its balls, and bananas sank
         in."""
-        for shape in (box((0, 0, 0), (0.05, 0.14, 0.04)), hull(trimesh.creation.cone(0.04, 0.08).vertices)):
+        for shape in (
+            box((0, 0, 0), (0.05, 0.14, 0.04)),
+            hull(trimesh.creation.cone(0.04, 0.08).vertices),
+        ):
             centers, radii = link_balls([shape])
             surface = trimesh.sample.sample_surface(shape_mesh(shape), 4000, seed=0)[0]
             bare = (np.linalg.norm(surface[:, None] - centers, axis=-1) - radii).min(axis=1)
@@ -108,7 +117,9 @@ class ShapesTest(unittest.TestCase):
         self.assertGreater(len(expected), 500)
         rows, near, slope = fields.nearer(points, which, limit)
         self.assertTrue(torch.equal(rows, expected))
-        self.assertTrue(torch.equal(near, value[expected]) and torch.equal(slope, direction[expected]))
+        self.assertTrue(
+            torch.equal(near, value[expected]) and torch.equal(slope, direction[expected])
+        )
 
     def test_a_link_of_thin_walls_is_solid_for_other_links_and_no_thicker(self):
         # A tube, open at both ends.
@@ -126,7 +137,10 @@ class ShapesTest(unittest.TestCase):
     def test_distances_to_every_kind_of_shape(self):
         points = np.random.default_rng(0).uniform(-0.07, 0.07, (300, 3))
         turn = trimesh.transformations.euler_matrix(0.3, -0.4, 0.5)
-        for geometry in (*self.PRIMITIVES, hull(trimesh.creation.icosphere(1, 0.03).vertices).geometry):
+        for geometry in (
+            *self.PRIMITIVES,
+            hull(trimesh.creation.icosphere(1, 0.03).vertices).geometry,
+        ):
             with self.subTest(kind=geometry.kind):
                 shape = Shape(geometry=geometry, T_body_shape=turn)
                 expected = -trimesh.proximity.signed_distance(shape_mesh(shape), points)
@@ -160,7 +174,9 @@ class SelfCollisionTest(unittest.TestCase):
         kinematics = Kinematics(self.robot)
         collision = SelfCollision(self.robot, kinematics)
         self.assertNotIn(("right_index_MP", "right_index_DP"), collision.link_pairs)
-        poses = kinematics.link_poses(torch.as_tensor(self.home_and(("right_index_MCP_AA", 0.35)))).numpy()
+        poses = kinematics.link_poses(
+            torch.as_tensor(self.home_and(("right_index_MCP_AA", 0.35)))
+        ).numpy()
         clearance = collision.clearance(poses, 0.01)
         self.assertGreaterEqual(clearance[0], 0.0)
         self.assertLess(clearance[1], -0.002)
@@ -171,14 +187,23 @@ class SelfCollisionTest(unittest.TestCase):
 
     def test_one_link_is_kept_out_of_another(self):
         model = HandModel(self.robot)
-        joints = torch.as_tensor(self.home_and(*self.CROSSED)[:, self.robot.hand_indices])[[0, 1, 1]]
+        joints = torch.as_tensor(self.home_and(*self.CROSSED)[:, self.robot.hand_indices])[
+            [0, 1, 1]
+        ]
         above = torch.tensor([0.0, 0.0, 1.0], dtype=FLOAT).expand(3, 3)
         quat = UPRIGHT.expand(3, 4)
         field = link_field([box((0, 0, 0), (0.1, 0.1, 0.1))])
         nothing = Objects.at(above + 10.0, quat, torch.zeros(3, dtype=torch.long), field)
 
         def found(q: torch.Tensor):
-            return too_near(model, model.bodies(q, above, quat), nothing, torch.ones(3, dtype=torch.bool), 0.0, 0.0)
+            return too_near(
+                model,
+                model.bodies(q, above, quat),
+                nothing,
+                torch.ones(3, dtype=torch.bool),
+                0.0,
+                0.0,
+            )
 
         here = found(joints)
         self.assertEqual(sorted(set(here.frame.tolist())), [1, 2])

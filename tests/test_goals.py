@@ -36,7 +36,9 @@ def rotations(quat: np.ndarray) -> Rotation:
 class MadeTest(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
-        in_this_process = mock.patch("xreset.resets.probe.make_backend", partial(make_backend, workers=0))
+        in_this_process = mock.patch(
+            "xreset.resets.probe.make_backend", partial(make_backend, workers=0)
+        )
         cls.enterClassContext(in_this_process)
         cls.robot = load_robot("ur7e-sharpa")
         cls.banana = load_object(BANANA)
@@ -50,9 +52,15 @@ class MadeTest(unittest.TestCase):
     def test_starts_are_at_rest_and_goals_are_what_their_family_says(self):
         goals = self.exact
         self.assertEqual(goals.family.tolist(), list(FAMILIES))
-        self.assertEqual((goals.num_states, goals.object_names, goals.robot), (0, (BANANA,), "ur7e-sharpa"))
-        np.testing.assert_allclose(goals.start_pos[:, 2], rest_height(self.banana, goals.start_quat_wxyz), atol=2e-3)
-        self.assertTrue((goals.goal_pos[:, 2] > rest_height(self.banana, goals.goal_quat_wxyz)).all())
+        self.assertEqual(
+            (goals.num_states, goals.object_names, goals.robot), (0, (BANANA,), "ur7e-sharpa")
+        )
+        np.testing.assert_allclose(
+            goals.start_pos[:, 2], rest_height(self.banana, goals.start_quat_wxyz), atol=2e-3
+        )
+        self.assertTrue(
+            (goals.goal_pos[:, 2] > rest_height(self.banana, goals.goal_quat_wxyz)).all()
+        )
         shift = self.centers(goals, "goal") - self.centers(goals, "start")
         np.testing.assert_allclose(shift[:4], np.tile([0.0, 0.0, 0.2], (4, 1)), atol=1e-5)
         turn = rotations(goals.goal_quat_wxyz) * rotations(goals.start_quat_wxyz).inv()
@@ -60,7 +68,9 @@ class MadeTest(unittest.TestCase):
         np.testing.assert_allclose(np.abs(turn.as_rotvec()[:4]), expected, atol=1e-5)
 
     def test_offsets_are_those_of_the_published_paper(self):
-        goals = make_goals(["banana"], robot=self.robot, families=["lift"], config=GoalConfig(per_family=8))
+        goals = make_goals(
+            ["banana"], robot=self.robot, families=["lift"], config=GoalConfig(per_family=8)
+        )
         shift = self.centers(goals, "goal") - self.centers(goals, "start") - [0.0, 0.0, 0.2]
         self.assertTrue((np.abs(shift) <= [0.05, 0.05, 0.05]).all(), shift)
         self.assertTrue((np.ptp(shift, axis=0) > 0.01).all(), shift)
@@ -70,8 +80,16 @@ class MadeTest(unittest.TestCase):
 
     def test_what_cannot_be_is_refused(self):
         for error, message, options in (
-            (GoalError, "banana: the goal is .* cm inside the table", {"poses": [(0.5, 0.3, 0.0, 1, 0, 0, 0)]}),
-            (GoalError, r"cannot reach 1 of 1 goals .* own_000", {"poses": [(1.9, 0.3, 0.3, 1, 0, 0, 0)]}),
+            (
+                GoalError,
+                "banana: the goal is .* cm inside the table",
+                {"poses": [(0.5, 0.3, 0.0, 1, 0, 0, 0)]},
+            ),
+            (
+                GoalError,
+                r"cannot reach 1 of 1 goals .* own_000",
+                {"poses": [(1.9, 0.3, 0.3, 1, 0, 0, 0)]},
+            ),
             (GoalError, "is not a pose", {"poses": [(0.5, 0.3, 0.2)]}),
             (GoalError, "Unknown family 'turn'. Choose from: lift, ", {"families": ["turn"]}),
         ):
@@ -81,8 +99,12 @@ class MadeTest(unittest.TestCase):
     def test_a_goal_of_ones_own(self):
         pose = (0.6, 0.25, 0.3, 1, 0, 0, 0)
         goals = make_goals(["banana"], robot=self.robot, poses=[pose])
-        self.assertEqual((goals.family.tolist(), goals.sequence_name.tolist()), (["own"], [f"{BANANA}/own_000"]))
-        np.testing.assert_allclose(np.concatenate((goals.goal_pos[0], goals.goal_quat_wxyz[0])), pose, atol=1e-6)
+        self.assertEqual(
+            (goals.family.tolist(), goals.sequence_name.tolist()), (["own"], [f"{BANANA}/own_000"])
+        )
+        np.testing.assert_allclose(
+            np.concatenate((goals.goal_pos[0], goals.goal_quat_wxyz[0])), pose, atol=1e-6
+        )
 
 
 class UsedTest(unittest.TestCase):
@@ -100,7 +122,10 @@ class UsedTest(unittest.TestCase):
         np.testing.assert_array_equal(read_goals(self.folder / "goals.npz").family, goals.family)
         policy = load_policy("zero", robot="ur7e-sharpa")
         policy = replace(
-            policy, task=replace(policy.task, termination=replace(policy.task.termination, episode_seconds=0.1))
+            policy,
+            task=replace(
+                policy.task, termination=replace(policy.task.termination, episode_seconds=0.1)
+            ),
         )
         trial = load_trial(policy, self.folder / "goals.npz")
         rollouts = roll_out(policy.start(None), engine("mujoco", workers=0), trial, repetitions=1)
@@ -108,7 +133,9 @@ class UsedTest(unittest.TestCase):
         for i, trace in enumerate(rollouts.traces):
             np.testing.assert_allclose(trace.object_pos[0], goals.start_pos[i], atol=1e-6)
             np.testing.assert_allclose(trace.goal_pos, goals.goal_pos[i], atol=1e-6)
-            np.testing.assert_allclose(trace.object_pos[-1], goals.start_pos[i], atol=2e-3, err_msg="it is not at rest")
+            np.testing.assert_allclose(
+                trace.object_pos[-1], goals.start_pos[i], atol=2e-3, err_msg="it is not at rest"
+            )
         with self.assertRaisesRegex(DemoError, "is a goal set, which holds no motion"):
             load_trial(load_policy("ik", robot="ur7e-sharpa"), goals)
 
@@ -118,7 +145,8 @@ class UsedTest(unittest.TestCase):
         far = toy_goals(load_robot("openarm"))
         far.goal_pos[2] = (1.9, 0.3, 0.3)
         with self.assertRaisesRegex(
-            GoalError, "1 of 2 goals of 010_potted_meat_can are out of the reach of ur7e-sharpa, such as .*lift_002"
+            GoalError,
+            "1 of 2 goals of 010_potted_meat_can are out of the reach of ur7e-sharpa, such as .*lift_002",
         ):
             load_inputs(far, robot=self.robot)
 
@@ -128,7 +156,11 @@ class UsedTest(unittest.TestCase):
         for error, message, changes in (
             (GoalError, f"{SOUP}/lift_000: the goal is 5.0 cm inside the table", {"goal_pos": low}),
             (GoalError, "starts 3.0 cm above the table", {"start_pos": high}),
-            (FileFormatError, "an imported mesh of 005_tomato_soup_can", {"object_sources": ("abc", "stand-in")}),
+            (
+                FileFormatError,
+                "an imported mesh of 005_tomato_soup_can",
+                {"object_sources": ("abc", "stand-in")},
+            ),
         ):
             with self.subTest(message), self.assertRaisesRegex(error, message):
                 load_inputs(toy_goals(self.robot, **changes))

@@ -54,7 +54,9 @@ class Ho3d(InFolder):
             path.write_bytes(pickle.dumps(data, protocol=2))
 
     def read(self, **options):
-        return read_ho3d(**{"root": self.folder / "ho3d", "fps": 10.0, "cameras": self.cameras, **options})
+        return read_ho3d(
+            **{"root": self.folder / "ho3d", "fps": 10.0, "cameras": self.cameras, **options}
+        )
 
     def refused(self, words, **options):
         with self.subTest(words), self.assertRaisesRegex(DemoError, words):
@@ -76,7 +78,9 @@ class Ho3d(InFolder):
         found = self.read()
         self.assertEqual(found.num_frames, last - 2)  # cut off at the ends
         middle = (self.demos.object_pos[6] + self.demos.object_pos[8]) / 2
-        np.testing.assert_allclose(found.object_pos[5], middle, atol=1e-5)  # interpolated between others
+        np.testing.assert_allclose(
+            found.object_pos[5], middle, atol=1e-5
+        )  # interpolated between others
 
     def test_refusals(self):
         for words, changes in (
@@ -130,7 +134,10 @@ class Pickles(InFolder):
 
     def test_a_pickle_of_python_2(self):
         kind = b"cnumpy\ndtype\n(S'f8'\nI0\nI1\ntR(I3\nS'<'\nNNNI-1\nI-1\nI0\ntb"
-        data = b"(dS'a'\ncnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(I0\ntS'b'\ntR(I1\n(I1\nt" + kind
+        data = (
+            b"(dS'a'\ncnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(I0\ntS'b'\ntR(I1\n(I1\nt"
+            + kind
+        )
         data += b"I00\nS'\\x00\\x00\\x00\\x00\\x00\\x00\\xf8?'\ntbs."
         np.testing.assert_array_equal(array_of(self.load(data)["a"]), [1.5])
 
@@ -146,7 +153,10 @@ class Pickles(InFolder):
 
     def test_an_array_that_is_none(self):
         good = pickle.dumps({"a": np.zeros(3)}, protocol=2)
-        for wrong in (good.replace(b"K\x03\x85", b"J\xff\xff\xff\x7f\x85"), good.replace(b"f8", b"O8")):
+        for wrong in (
+            good.replace(b"K\x03\x85", b"J\xff\xff\xff\x7f\x85"),
+            good.replace(b"f8", b"O8"),
+        ):
             with self.assertRaises(ValueError):
                 array_of(self.load(wrong)["a"])
 
@@ -154,7 +164,9 @@ class Pickles(InFolder):
         tracemalloc.start()
         self.addCleanup(tracemalloc.stop)
         self.load(b"\x80\x02}r\x00\x00\x00\x10.")  # a value that is stored under the number 2^28
-        self.refused("cannot be read", b"\x80\x05\x96" + (1 << 40).to_bytes(8, "little") + b".")  # a bytearray of 1 TiB
+        self.refused(
+            "cannot be read", b"\x80\x05\x96" + (1 << 40).to_bytes(8, "little") + b"."
+        )  # a bytearray of 1 TiB
         self.refused("more than a megabyte", pickle.dumps({"a": np.zeros(200_000)}))
         self.assertLess(tracemalloc.get_traced_memory()[1], 8 << 20)
 

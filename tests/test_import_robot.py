@@ -88,9 +88,14 @@ _MJCF_FINGER = """<body name="{0}_a" pos="{1}" euler="{2}"><inertial pos="0.02 0
 MJCF = (
     '<mujoco model="hand"><compiler angle="radian" eulerseq="XYZ"/><worldbody><body name="base">'
     '<inertial pos="0.04 0 0" mass="0.4" diaginertia="3e-4 3e-4 5e-4"/><geom type="box" pos="0.04 0 0" size="0.04 0.04 0.01"/>'
-    + "".join(_MJCF_FINGER.format(name, "{} {} {}".format(*xyz), rpy) for name, (xyz, rpy) in _PLACES.items())
+    + "".join(
+        _MJCF_FINGER.format(name, "{} {} {}".format(*xyz), rpy)
+        for name, (xyz, rpy) in _PLACES.items()
+    )
     + "</body></worldbody><equality>"
-    + "".join(f'<joint joint1="{name}_2" joint2="{name}_1" polycoef="0.1 0.8 0 0 0"/>' for name in _PLACES)
+    + "".join(
+        f'<joint joint1="{name}_2" joint2="{name}_1" polycoef="0.1 0.8 0 0 0"/>' for name in _PLACES
+    )
     + '</equality><actuator><position joint="f1_1" kp="3" kv="0.2" forcerange="-2 2"/></actuator></mujoco>'
 )
 
@@ -122,7 +127,11 @@ class Robots(InFolder):
 
 
 def errors(folder) -> list[str]:
-    return [f"{finding.topic}: {finding.message}" for finding in check(folder) if finding.level == "error"]
+    return [
+        f"{finding.topic}: {finding.message}"
+        for finding in check(folder)
+        if finding.level == "error"
+    ]
 
 
 def at_home(spec, *links) -> np.ndarray:
@@ -138,12 +147,16 @@ class Toy(Robots):
         cls.hand = cls.sources / "hand.urdf"
         cls.hand.write_text(HAND)
         out = cls.sources / "mine"
-        cls.code, cls.said = run("robots", "import", "--arm", cls.arm, "--hand", cls.hand, "--out", out)
+        cls.code, cls.said = run(
+            "robots", "import", "--arm", cls.arm, "--hand", cls.hand, "--out", out
+        )
         cls.spec = load_robot(cls.sources / "mine")
 
     def imported(self, hand, arm=None, **options):
         """The folder of the arm with a hand, given as a text."""
-        made = import_robot(arm or self.arm, self.file("hand.urdf", hand), self.folder / "mine", **options)
+        made = import_robot(
+            arm or self.arm, self.file("hand.urdf", hand), self.folder / "mine", **options
+        )
         return made.folder
 
     def read(self, file, text):
@@ -155,34 +168,48 @@ class Toy(Robots):
         spec = self.spec
         self.assertEqual(self.code, 0)
         links = {tip.name: tip.contact_links[0] for tip in spec.fingertips}
-        self.assertEqual(links, {"thumb": "thumb_b", "index": "f1_b", "middle": "f2_b", "ring": "f3_b"})
+        self.assertEqual(
+            links, {"thumb": "thumb_b", "index": "f1_b", "middle": "f2_b", "ring": "f3_b"}
+        )
         mimics = {(mimic.joint, mimic.multiplier, mimic.offset) for mimic in spec.mimics}
         self.assertEqual(mimics, {(f"{finger}_2", 0.8, 0.1) for finger in _PLACES})
         keypoints = {point.keypoint: point.link for point in spec.keypoints}
-        self.assertEqual([keypoints[f"index{i}"] for i in (1, 2, 4)], ["f1_a", "f1_b", "index_tip_frame"])
+        self.assertEqual(
+            [keypoints[f"index{i}"] for i in (1, 2, 4)], ["f1_a", "f1_b", "index_tip_frame"]
+        )
         said = " ".join(self.said.split())
-        self.assertIn("fingers are named from the thumb's side on: index is f1_b; middle is f2_b", said)
+        self.assertIn(
+            "fingers are named from the thumb's side on: index is f1_b; middle is f2_b", said
+        )
         self.assertIn("the hand is turned by --rpy 0 -1.5708 0: its fingers point along", said)
         self.assertRegex(
             said,
             r"its fingers point along \(0.05, 0.00, 1.00\).*The angle about the flange's z axis is yours.*0 errors",
         )
         self.assertTrue((self.sources / "mine" / "robot.png").read_bytes().startswith(b"\x89PNG"))
-        self.assertEqual([path.name for path in self.sources.iterdir() if path.name.startswith(".")], [])
+        self.assertEqual(
+            [path.name for path in self.sources.iterdir() if path.name.startswith(".")], []
+        )
 
     def test_the_palm_looks_where_the_fingers_bend(self):
         hand, palm = at_home(self.spec, "hand_base", "palm_frame")
         in_hand = np.linalg.inv(hand) @ palm
         np.testing.assert_allclose(in_hand[:3, :3], np.diag((1, -1, -1)), atol=0.06)
-        np.testing.assert_allclose(palm[:3, 2], (0, 0, -1), atol=0.05)  # at home it looks down at the table
+        np.testing.assert_allclose(
+            palm[:3, 2], (0, 0, -1), atol=0.05
+        )  # at home it looks down at the table
 
     def test_home_is_within_the_limits_after_rounding_and_strong_drives_are_stable(self):
         narrow = ARM.replace('lower="-2.9" upper="2.9"', 'lower="0.123446" upper="0.2"')
-        folder = self.imported(HAND, self.file("narrow.urdf", narrow.replace('effort="60"', 'effort="300"')))
+        folder = self.imported(
+            HAND, self.file("narrow.urdf", narrow.replace('effort="60"', 'effort="300"'))
+        )
         spec = load_robot(folder)
         self.assertEqual(spec.home[spec.arm_indices].tolist(), [0.1235] * 6)
         self.assertEqual(spec.joints[0].drive.kp, 2000)
-        self.assertIn("ok", [finding.level for finding in check(folder) if finding.topic == "drives"])
+        self.assertIn(
+            "ok", [finding.level for finding in check(folder) if finding.topic == "drives"]
+        )
 
     def test_home_keeps_off_the_table_where_it_can(self):
         robot = load_robot("ur7e-sharpa")
@@ -195,14 +222,20 @@ class Toy(Robots):
     def test_names_of_the_shadow_hand(self):
         shadow = HAND
         for old, new in (("f1", "rh_LF"), ("f2", "rh_MF"), ("f3", "rh_TH"), ("thumb", "rh_FF")):
-            shadow = shadow.replace(f"{old}_a", f"{new}proximal").replace(f"{old}_b", f"{new}middle")
+            shadow = shadow.replace(f"{old}_a", f"{new}proximal").replace(
+                f"{old}_b", f"{new}middle"
+            )
             shadow = shadow.replace(f"{old}_", f"{new}J")
-        links = {tip.name: tip.contact_links[0] for tip in load_robot(self.imported(shadow)).fingertips}
+        links = {
+            tip.name: tip.contact_links[0] for tip in load_robot(self.imported(shadow)).fingertips
+        }
         codes = {"thumb": "TH", "index": "FF", "middle": "MF", "little": "LF"}
         self.assertEqual(links, {finger: f"rh_{code}middle" for finger, code in codes.items()})
 
     def test_a_coupled_joint_has_the_limits_that_its_source_gives_it(self):
-        folder = self.imported(HAND.replace('upper="1.5" effort="1" velocity="5"/>\n  <mimic', 'upper="1"/><mimic'))
+        folder = self.imported(
+            HAND.replace('upper="1.5" effort="1" velocity="5"/>\n  <mimic', 'upper="1"/><mimic')
+        )
         joint = load_urdf(folder / "robot.urdf").joint("f1_2")
         np.testing.assert_allclose((joint.lower, joint.upper), (0.1, 1.3))
         text = (folder / "robot.urdf").read_text()
@@ -212,7 +245,9 @@ class Toy(Robots):
         self.assertIn("'f1_2' goes from 0.1 to 1.3 with 'f1_1', beyond its own limits", found[0])
 
     def test_origins_beside_a_finger_do_not_turn_its_palm(self):
-        spec = load_robot(self.imported(_hand(*(_finger(f"f{i}", 0.015) for i in (1, 2, 3)), _finger("thumb"))))
+        spec = load_robot(
+            self.imported(_hand(*(_finger(f"f{i}", 0.015) for i in (1, 2, 3)), _finger("thumb")))
+        )
         knuckle = {point.keypoint: point.link for point in spec.keypoints}["index1"]
         hand, *others = at_home(spec, "hand_base", "palm_frame", knuckle)
         palm, knuckle = np.linalg.inv(hand) @ others
@@ -223,7 +258,10 @@ class Toy(Robots):
         folder = self.imported(HAND)
         text = (folder / "robot.urdf").read_text()
         for pattern, new in (
-            (r'(name="palm_frame_fixed"[^>]*>\s*<origin xyz="[^"]*" rpy=")[^"]*', r"\g<1>0 1.5708 0"),
+            (
+                r'(name="palm_frame_fixed"[^>]*>\s*<origin xyz="[^"]*" rpy=")[^"]*',
+                r"\g<1>0 1.5708 0",
+            ),
             (
                 r'(<link name="f1_a">[\s\S]*?<inertia )[^/]*',
                 r'\1ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0" ',
@@ -232,7 +270,9 @@ class Toy(Robots):
             text, count = re.subn(pattern, new, text, count=1)
             self.assertEqual(count, 1)
         (folder / "robot.urdf").write_text(text)
-        warnings = " ".join(finding.message for finding in check(folder) if finding.level == "warning")
+        warnings = " ".join(
+            finding.message for finding in check(folder) if finding.level == "warning"
+        )
         self.assertRegex(
             warnings,
             r"'f1_a' has the principal moments 0.1, 0.1, 0.1 .*placeholder.*do not lie along x of the palm 'palm_frame'",
@@ -247,17 +287,28 @@ class Toy(Robots):
                 self.assertEqual(getattr(a, name, None), getattr(b, name, None))
             for name in ("T_parent_joint", "mass", "com", "inertia"):
                 np.testing.assert_allclose(getattr(a, name, 0), getattr(b, name, 0), atol=1e-6)
-        sizes = [[shape.geometry.size for shape in tree.link("f1_b").collisions] for tree in (mjcf, urdf)]  # noqa: XR002
+        sizes = [
+            [shape.geometry.size for shape in tree.link("f1_b").collisions] for tree in (mjcf, urdf)
+        ]  # noqa: XR002
         self.assertEqual(*sizes)
-        self.assertEqual([(joint.stiffness, joint.effort) for joint in mjcf.joints[:2]], [(3.0, 2.0), (0.0, 0.0)])
+        self.assertEqual(
+            [(joint.stiffness, joint.effort) for joint in mjcf.joints[:2]], [(3.0, 2.0), (0.0, 0.0)]
+        )
 
     def test_what_mjcf_has_and_robots_do_not_is_named_one_by_one(self):
-        ball = MJCF.replace('<joint name="f1_2" axis="0 1 0" range="0 1.5"/>', '<joint name="f1_2" type="ball"/>')
+        ball = MJCF.replace(
+            '<joint name="f1_2" axis="0 1 0" range="0 1.5"/>', '<joint name="f1_2" type="ball"/>'
+        )
         ball = ball.replace('<joint joint1="f1_2" joint2="f1_1" polycoef="0.1 0.8 0 0 0"/>', "")
-        ball = ball.replace('type="box" pos="0.04 0 0"', 'name="egg" type="ellipsoid" pos="0.04 0 0"')
+        ball = ball.replace(
+            'type="box" pos="0.04 0 0"', 'name="egg" type="ellipsoid" pos="0.04 0 0"'
+        )
         curve = MJCF.replace("0.1 0.8 0 0 0", "0.1 0.8 1 0 0", 1)
         for text, words in (
-            (ball, "(?s)ball joint 'f1_2'. Replace it by.*ellipsoid 'egg' of body 'base'. Replace it by"),
+            (
+                ball,
+                "(?s)ball joint 'f1_2'. Replace it by.*ellipsoid 'egg' of body 'base'. Replace it by",
+            ),
             (curve, "'f1_1', 'f1_2', which do not move in proportion.* 0.36 rad .m. off"),
         ):
             with self.assertRaisesRegex(RobotError, words):
@@ -271,18 +322,25 @@ class Toy(Robots):
             <actuator><position tendon="t" kp="2" forcerange="-3 3"/>
             <motor joint="f2_1" ctrlrange="-3 3" gear="2"/></actuator></mujoco>""",
         )
-        self.assertEqual([(m.joint, m.source, m.multiplier) for m in tree.mimics], [("f1_2", "f1_1", 0.5)])
+        self.assertEqual(
+            [(m.joint, m.source, m.multiplier) for m in tree.mimics], [("f1_2", "f1_1", 0.5)]
+        )
         # The tendon shortens by 1 + 0.5 * 0.5 for each rad.
-        self.assertEqual((tree.joint("f1_1").effort, tree.joint("f1_1").stiffness), (3 * 1.25, 2 * 1.25**2))
+        self.assertEqual(
+            (tree.joint("f1_1").effort, tree.joint("f1_1").stiffness), (3 * 1.25, 2 * 1.25**2)
+        )
         self.assertIn("coupled joints: 'f1_2' with 'f1_1'", notes)
         self.assertEqual((tree.joint("f2_1").effort, tree.joint("f2_1").stiffness), (6.0, 0.0))
 
     def test_a_joint_that_follows_a_follower_follows_its_source(self):
         tree, _ = self.read(
-            "chain.urdf", HAND.replace('joint="f2_1" multiplier="0.8"', 'joint="f1_2" multiplier="0.5"')
+            "chain.urdf",
+            HAND.replace('joint="f2_1" multiplier="0.8"', 'joint="f1_2" multiplier="0.5"'),
         )
         mimic = tree.joint("f2_2").mimic
-        self.assertEqual((mimic.source, mimic.multiplier, round(mimic.offset, 9)), ("f1_1", 0.4, 0.15))
+        self.assertEqual(
+            (mimic.source, mimic.multiplier, round(mimic.offset, 9)), ("f1_1", 0.4, 0.15)
+        )
         with self.assertRaisesRegex(RobotError, "follow one another in a circle: f1_2. Let"):
             self.read("circle.urdf", HAND.replace('<mimic joint="f1_1"', '<mimic joint="f1_2"'))
 
@@ -292,10 +350,14 @@ class Toy(Robots):
         self.assertEqual(errors(made.folder), [])
         self.assertEqual(len(spec.hand_indices), 1)
         coupled = {mimic.joint: round(mimic.multiplier, 3) for mimic in spec.mimics}
-        self.assertEqual(coupled, {"l_rocker": 1, "l_finger": -1, "r_crank": 1, "r_rocker": 1, "r_finger": -1})
+        self.assertEqual(
+            coupled, {"l_rocker": 1, "l_finger": -1, "r_crank": 1, "r_rocker": 1, "r_finger": -1}
+        )
         self.assertEqual([tip.contact_links for tip in spec.fingertips], [("l_pad",), ("r_pad",)])
         notes = " ".join(made.guessed)
-        self.assertRegex(notes, r"coupled joints: 'l_finger', 'l_rocker', .* with 'l_crank'; .* 0.00 mm")
+        self.assertRegex(
+            notes, r"coupled joints: 'l_finger', 'l_rocker', .* with 'l_crank'; .* 0.00 mm"
+        )
         self.assertRegex(notes, "bars of a linkage: l_rod, r_rod")
 
     def test_damaged_or_huge_mjcf_is_refused(self):
@@ -316,8 +378,14 @@ class Toy(Robots):
                 "a texture has 9e.08 entries",
                 asset('<texture name="h" type="2d" builtin="flat" width="30000" height="30000"/>'),
             ),
-            ("a size has 2e.09 entries", MJCF.replace("<worldbody>", '<size nkey="2000000000"/><worldbody>')),
-            ("a size has 1e.08 entries", MJCF.replace("<worldbody>", '<size nuser_body="1e8"/><worldbody>')),
+            (
+                "a size has 2e.09 entries",
+                MJCF.replace("<worldbody>", '<size nkey="2000000000"/><worldbody>'),
+            ),
+            (
+                "a size has 1e.08 entries",
+                MJCF.replace("<worldbody>", '<size nuser_body="1e8"/><worldbody>'),
+            ),
             ("Give the file that includes it", "<mujocoinclude/>"),
         ):
             with self.subTest(words), self.assertRaisesRegex(RobotError, words):
@@ -325,7 +393,9 @@ class Toy(Robots):
 
     def test_what_hangs_on_the_flange_gives_way(self):
         gripper = '<link name="{0}"/><joint name="{0}" type="fixed"><parent link="l5"/><child link="{0}"/></joint>'
-        arm, _ = self.read("armed.urdf", ARM.replace("</robot>", gripper.format("claw") + "</robot>"))
+        arm, _ = self.read(
+            "armed.urdf", ARM.replace("</robot>", gripper.format("claw") + "</robot>")
+        )
         notes = []
         self.assertNotIn("claw", bare(arm, "l5", notes).link_names)
         self.assertIn("claw", notes[0])
@@ -357,16 +427,20 @@ class Toy(Robots):
             made = import_robot(arm, self.hand, self.folder / f"mine{axis}")
             spec = load_robot(made.folder)
             palm, last = Kinematics(spec).link_poses(torch.tensor(spec.home), ["palm_frame", "l5"])
-            fingers = (last[:3, :3].T @ palm[:3, 0]).numpy()  # of the last link, whose joint turns about z
+            fingers = (
+                last[:3, :3].T @ palm[:3, 0]
+            ).numpy()  # of the last link, whose joint turns about z
             with self.subTest(axis):
-                self.assertIn(f"The angle about the flange's {axis} axis is yours to know", made.to_say[0])
+                self.assertIn(
+                    f"The angle about the flange's {axis} axis is yours to know", made.to_say[0]
+                )
                 if axis != "z":  # no axis of the flange points out of the arm
                     np.testing.assert_allclose(fingers, (0, 0, 1), atol=0.06)
 
     def test_impossible_figures_are_replaced_and_told(self):
-        heavy = HAND.replace('ixx="1e-5" iyy="1e-5" izz="1e-5"', 'ixx="0.1" iyy="0.1" izz="0.1"', 1).replace(
-            '<mass value="0.4"/>', '<mass value="0"/>'
-        )
+        heavy = HAND.replace(
+            'ixx="1e-5" iyy="1e-5" izz="1e-5"', 'ixx="0.1" iyy="0.1" izz="0.1"', 1
+        ).replace('<mass value="0.4"/>', '<mass value="0"/>')
         tree, notes = self.read("heavy.urdf", heavy)
         self.assertRegex(
             notes, r"have no mass.*base \(0.128 kg\).*their mass and size do not allow.*f1_a"
@@ -380,7 +454,11 @@ class Toy(Robots):
         for hand, options, words in (
             (_hand(_finger("f1")), {}, "expected a thumb and at least one finger"),
             ("nothing", {}, "cannot be read as XML"),
-            (f"<!DOCTYPE robot [{entities}]><robot>&e7;</robot>", {}, "limit on input amplification"),
+            (
+                f"<!DOCTYPE robot [{entities}]><robot>&e7;</robot>",
+                {},
+                "limit on input amplification",
+            ),
             (HAND, {"thumb": "f9"}, "--thumb 'f9' is in 0 fingers"),
         ):
             with self.assertRaisesRegex(RobotError, words):
@@ -414,15 +492,30 @@ class Published(Robots):
         made = import_robot(arm, hand, self.folder / "mine")
         spec = load_robot(made.folder)
         tree = load_urdf(spec.urdf)
-        self.assertEqual((len(spec.arm_indices), len(spec.hand_indices), spec.hand_root), (9, 22, "palm"))
-        self.assertEqual([tip.contact_links[0][:5] for tip in spec.fingertips], [f"part{i}" for i in range(5)])
-        self.assertRegex("\n".join(made.guessed), "WRJ2, WRJ1 move the whole hand: they are the last joints of the arm")
+        self.assertEqual(
+            (len(spec.arm_indices), len(spec.hand_indices), spec.hand_root), (9, 22, "palm")
+        )
+        self.assertEqual(
+            [tip.contact_links[0][:5] for tip in spec.fingertips], [f"part{i}" for i in range(5)]
+        )
+        self.assertRegex(
+            "\n".join(made.guessed),
+            "WRJ2, WRJ1 move the whole hand: they are the last joints of the arm",
+        )
         thumb, *others, little = spec.fingertips
         swapped = (replace(thumb, link=little.link), *others, replace(little, link=thumb.link))
         for changes, problems, expected in (
             ({"fingertips": swapped}, checks._fingers, "little 'thumb_tip_frame' can meet"),
-            ({"hand_root": "forearm"}, checks._fingers, "WRJ2, WRJ1 move every fingertip: joints of a wrist"),
-            ({"palm": "forearm"}, checks._frames, "the palm 'forearm' is 2.. mm from the nearest finger"),
+            (
+                {"hand_root": "forearm"},
+                checks._fingers,
+                "WRJ2, WRJ1 move every fingertip: joints of a wrist",
+            ),
+            (
+                {"palm": "forearm"},
+                checks._frames,
+                "the palm 'forearm' is 2.. mm from the nearest finger",
+            ),
         ):
             with self.subTest(expected):
                 self.assertRegex(dict(problems(replace(spec, **changes), tree))["error"], expected)
@@ -436,15 +529,23 @@ class Published(Robots):
         ):
             with self.subTest(file):
                 name, model = file.split("/")
-                folder = import_robot(arm, self.unpacked(name) / model, self.folder / f"xarm7-{name}").folder
+                folder = import_robot(
+                    arm, self.unpacked(name) / model, self.folder / f"xarm7-{name}"
+                ).folder
                 spec = load_robot(folder)
                 self.assertEqual((len(spec.hand_indices), len(spec.mimics)), (joints, mimics))
                 self.assertEqual(spec.fingertips[0].contact_links[0], thumb)
                 self.assertEqual(errors(folder), [])
-        for name in ("mujoco", "pybullet", "sapien"):  # a joint of Inspire's thumb follows one that is no neighbour
+        for name in (
+            "mujoco",
+            "pybullet",
+            "sapien",
+        ):  # a joint of Inspire's thumb follows one that is no neighbour
             with self.subTest(name):
                 try:
-                    engine = make_backend(name, SceneSpec(robot=spec, objects=(load_object("soup"),)), 1)
+                    engine = make_backend(
+                        name, SceneSpec(robot=spec, objects=(load_object("soup"),)), 1
+                    )
                 except BackendUnavailableError as error:
                     self.skipTest(str(error))
                 with engine:
@@ -453,7 +554,9 @@ class Published(Robots):
                     joints = engine.state().joint_pos[0].double().cpu()
                     poses = Kinematics(spec).link_poses(joints, spec.tracked_links)
                     np.testing.assert_allclose(joints, spec.home, atol=0.02)
-                    np.testing.assert_allclose(engine.links().pos[0].cpu(), poses[:, :3, 3], atol=2e-3)
+                    np.testing.assert_allclose(
+                        engine.links().pos[0].cpu(), poses[:, :3, 3], atol=2e-3
+                    )
 
 
 if __name__ == "__main__":

@@ -33,34 +33,46 @@ class InputsTest(unittest.TestCase):
         self.assertEqual([o.name for o in inputs.objects], [SOUP, SPAM])
         self.assertEqual((inputs.path, inputs.hash), (self.demos_file, file_hash(self.demos_file)))
         self.assertIsNone(inputs.robot_name)
-        with self.assertRaisesRegex(DemoError, "demos.npz holds human demonstrations.* Give --robot"):
+        with self.assertRaisesRegex(
+            DemoError, "demos.npz holds human demonstrations.* Give --robot"
+        ):
             inputs.bank  # noqa: B018
 
     def test_starts_and_goals_of_demonstrations_and_of_their_motion_are_the_same(self):
         demos = load_inputs(self.demos, robot=self.robot, only=["soup"])
-        self.assertEqual(([o.name for o in demos.objects], len(demos.bank.sequence_name)), ([SOUP], 1))
+        self.assertEqual(
+            ([o.name for o in demos.objects], len(demos.bank.sequence_name)), ([SOUP], 1)
+        )
         motion = load_inputs(demos.motion())
         self.assertIsInstance(motion.data, Retargeted)
         self.assertEqual((motion.robot_name, motion.hash), ("ur7e-sharpa", None))
         self.assertEqual(motion.bank.num_states, 0)
         for name in ("start_pos", "start_quat_wxyz", "goal_pos", "goal_quat_wxyz"):
-            np.testing.assert_array_equal(getattr(motion.bank, name), getattr(demos.bank, name), name)
+            np.testing.assert_array_equal(
+                getattr(motion.bank, name), getattr(demos.bank, name), name
+            )
 
     def test_a_bank_names_its_robot(self):
         inputs = load_inputs(self.bank_file)
         self.assertEqual((inputs.robot.name, inputs.robot_name), ("ur7e-sharpa", "ur7e-sharpa"))
         self.assertEqual(inputs.bank.num_states, 6)
-        self.assertEqual([o.name for o in load_inputs(self.bank_file, only=["spam"]).objects], [SPAM])
+        self.assertEqual(
+            [o.name for o in load_inputs(self.bank_file, only=["spam"]).objects], [SPAM]
+        )
         with self.assertRaisesRegex(DemoError, "resets.npz is a reset bank, which holds no motion"):
             inputs.motion()
 
     def test_what_does_not_fit_is_refused(self):
         with self.assertRaisesRegex(FileFormatError, "for the robot 'ur7e-sharpa'"):
             load_inputs(self.bank_file, robot="openarm")
-        with self.assertRaisesRegex(FileFormatError, "expected 'xreset-demos/1' .xreset demos. or 'xreset-retargeted"):
+        with self.assertRaisesRegex(
+            FileFormatError, "expected 'xreset-demos/1' .xreset demos. or 'xreset-retargeted"
+        ):
             load_inputs(self.bank_file, accept=("demos", "motion"))
         other = toy_bank(self.robot, object_sources=("abc", "stand-in"))
-        with self.assertRaisesRegex(FileFormatError, "was made with an imported mesh of 005_tomato_soup_can"):
+        with self.assertRaisesRegex(
+            FileFormatError, "was made with an imported mesh of 005_tomato_soup_can"
+        ):
             load_inputs(other)
 
 

@@ -44,8 +44,12 @@ class Judge(unittest.TestCase):
                 squeeze = SqueezeConfig(force=force, reach=0.01)
                 found = judging.judge(bank(), robot(), (brick(),), squeeze=squeeze)
                 rows = {row.object_name: row for row in found.rows}
-                self.assertEqual((rows["brick"].tried, rows["brick"].hold, rows["brick"].lift), (3, held, held))
-                self.assertEqual((rows["all"].arm_fails, rows["all"].turn), (3, 0))  # its arm cannot turn that way
+                self.assertEqual(
+                    (rows["brick"].tried, rows["brick"].hold, rows["brick"].lift), (3, held, held)
+                )
+                self.assertEqual(
+                    (rows["all"].arm_fails, rows["all"].turn), (3, 0)
+                )  # its arm cannot turn that way
                 self.assertEqual(found.kept, [])
                 rise = np.diff(found.shots["brick"][:, -5])  # of the object's z
                 self.assertEqual(bool(rise[1] > 0.08), held > 0, rise)
@@ -56,15 +60,23 @@ class Judge(unittest.TestCase):
         palm = kinematics.link_poses(home, ["palm"])[:, 0]
         for turn in (0.0, judging.TURN):
             with self.subTest(turn=turn):
-                path, error = judging.arm_path(kinematics, home, palm, rise=judging.HEIGHT, turn=turn)
+                path, error = judging.arm_path(
+                    kinematics, home, palm, rise=judging.HEIGHT, turn=turn
+                )
                 self.assertLess(float(error), 1.0)
                 end = kinematics.link_poses(path[-1], ["palm"])[:, 0]
                 relative = torch.linalg.inv(palm[0]) @ end[0]
-                self.assertAlmostEqual(float(end[0, 2, 3] - palm[0, 2, 3]), judging.HEIGHT, delta=0.005)
-                self.assertAlmostEqual(float(torch.atan2(relative[2, 1], relative[2, 2])), turn, delta=0.03)
+                self.assertAlmostEqual(
+                    float(end[0, 2, 3] - palm[0, 2, 3]), judging.HEIGHT, delta=0.005
+                )
+                self.assertAlmostEqual(
+                    float(torch.atan2(relative[2, 1], relative[2, 2])), turn, delta=0.03
+                )
 
     def test_a_bank_without_grasps_in_the_air_is_refused(self):
-        low = replace(bank(), object_pos=bank().object_pos - np.array([0, 0, 0.05], dtype=np.float32))
+        low = replace(
+            bank(), object_pos=bank().object_pos - np.array([0, 0, 0.05], dtype=np.float32)
+        )
         with self.assertRaisesRegex(RobotError, "no state in which an object is in the air"):
             judging.judge(low, robot(), (brick(),))
         wide = bank().joint_pos.copy()

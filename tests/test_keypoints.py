@@ -50,7 +50,9 @@ def write_csv(path, points, pos, turn, scale=1.0, columns=MappingProxyType({}), 
         for i in range(len(points)):
             numbers = np.concatenate((scale * points[i].ravel(), scale * pos[i], quats[i]))
             cells = ["" if np.isnan(x) else f"{x:.9f}" for x in numbers]
-            table.writerow([*(np.broadcast_to(value, len(points))[i] for value in columns.values()), *cells])
+            table.writerow(
+                [*(np.broadcast_to(value, len(points))[i] for value in columns.values()), *cells]
+            )
 
 
 class Synthetic(InFolder):
@@ -79,8 +81,14 @@ class Synthetic(InFolder):
     def same(self, found, tolerance=2e-6):
         np.testing.assert_allclose(found.hand_keypoints, self.demos.hand_keypoints, atol=tolerance)
         np.testing.assert_allclose(found.object_pos, self.demos.object_pos, atol=tolerance)
-        for field in ("object_quat_wxyz", "wrist_quat_wxyz"):  # synthetic hands are the average hand
-            turn, own = (Rotation.from_quat(getattr(d, field), scalar_first=True) for d in (found, self.demos))
+        for field in (
+            "object_quat_wxyz",
+            "wrist_quat_wxyz",
+        ):  # synthetic hands are the average hand
+            turn, own = (
+                Rotation.from_quat(getattr(d, field), scalar_first=True)
+                for d in (found, self.demos)
+            )
             self.assertLess((turn.inv() * own).magnitude().max(), 1e-3)
         self.assertEqual(found.object_name.tolist(), self.demos.object_name.tolist())
 
@@ -96,7 +104,9 @@ class Synthetic(InFolder):
             pose[:, :3, 3] = scale * pos
             changes = {"object_pos": None, "object_quat_wxyz": None, "object_pose": pose}
             path = self.npz(keypoints=scale * written(points, order), **changes)
-            convention = replace(PLAIN, order=order, units=units, frame="camera", table_from_camera=CAMERA)
+            convention = replace(
+                PLAIN, order=order, units=units, frame="camera", table_from_camera=CAMERA
+            )
             with self.subTest(order=order, units=units):
                 self.same(read_keypoints(path, convention))
 
@@ -105,7 +115,9 @@ class Synthetic(InFolder):
         xyzw = np.roll(wxyz, -1, axis=1)
         self.same(read_keypoints(self.npz(object_quat_wxyz=None, object_quat_xyzw=xyzw), PLAIN))
         self.refused("must be given once", object_quat_xyzw=xyzw)
-        self.refused("object_quat_wxyz of frame 0 is not a unit quaternion", object_quat_wxyz=2 * wxyz)
+        self.refused(
+            "object_quat_wxyz of frame 0 is not a unit quaternion", object_quat_wxyz=2 * wxyz
+        )
 
     def test_what_is_not_known_is_asked_for(self):
         self.refused("--table-from-camera FILE", replace(PLAIN, frame="camera"))
@@ -119,15 +131,25 @@ class Synthetic(InFolder):
         self.refused("Is --units mm right", replace(PLAIN, units="mm"))
         self.refused("Use --order mano", keypoints=written(self.points, "mano"))
         self.refused("Use --order (mediapipe|openpose)", replace(PLAIN, order="mano"))
-        self.refused("It is the other hand .*or the coordinates are left-handed", side=np.array("left"))
+        self.refused(
+            "It is the other hand .*or the coordinates are left-handed", side=np.array("left")
+        )
         self.refused("file says side 'right', but --side says 'left'", replace(PLAIN, side="left"))
         self.refused("file says 20 frames per second, but --fps says 10", fps=np.array(20.0))
-        self.refused("centred on the hand", keypoints=self.points - self.points.mean(axis=1, keepdims=True))
+        self.refused(
+            "centred on the hand", keypoints=self.points - self.points.mean(axis=1, keepdims=True)
+        )
         wrist = self.points[:, :1]
         swelling = np.linspace(0.4, 2.5, len(self.points))[:, None, None]
-        self.refused("so the keypoints are not metric", keypoints=wrist + swelling * (self.points - wrist))
+        self.refused(
+            "so the keypoints are not metric", keypoints=wrist + swelling * (self.points - wrist)
+        )
         points, pos, turn = seen_from(CAMERA, self.demos)
-        seen = {"keypoints": points, "object_pos": pos, "object_quat_wxyz": turn.as_quat(scalar_first=True)}
+        seen = {
+            "keypoints": points,
+            "object_pos": pos,
+            "object_quat_wxyz": turn.as_quat(scalar_first=True),
+        }
         self.refused("Are these the camera's coordinates", **seen)
         inverse = replace(PLAIN, frame="camera", table_from_camera=np.linalg.inv(CAMERA))
         self.refused("or is that matrix the inverse", inverse, **seen)
@@ -169,7 +191,12 @@ class Synthetic(InFolder):
 
     def test_a_csv_of_several_sequences(self):
         path = self.folder / "two.csv"
-        columns = {"sequence": "a", "object": str(self.demos.object_name[0]), "side": "right", "confidence": 0.9}
+        columns = {
+            "sequence": "a",
+            "object": str(self.demos.object_name[0]),
+            "side": "right",
+            "confidence": 0.9,
+        }
         write_csv(path, self.points, self.demos.object_pos, self.turn, columns=columns, quat="xyzw")
         first = path.read_text()
         path.write_text(first + re.sub("(?m)^a,", "b,", first.split("\n", 1)[1]))
@@ -179,7 +206,10 @@ class Synthetic(InFolder):
         self.assertEqual(found.sequence_name.tolist(), ["a", "b"])
         self.same(found.select(names=["a"]))
         for words, text in (
-            ("could not convert string to float: 'oops'", re.sub(r"(?m)(^a,[^,]*,right,0.9,)[^,]*", r"\1oops", first)),
+            (
+                "could not convert string to float: 'oops'",
+                re.sub(r"(?m)(^a,[^,]*,right,0.9,)[^,]*", r"\1oops", first),
+            ),
             ("lacks the columns .*z20", first.replace("z20", "depth")),
             ("shorter than", first.split("\n")[0] + "\n3\n"),
             ("same name", first.replace("z20", "z19")),
@@ -195,7 +225,9 @@ class Synthetic(InFolder):
         source = self.folder / "in"
         source.mkdir()
         for name in ("one", "two"):
-            write_csv(source / f"{name}.csv", self.points, self.demos.object_pos, self.turn, scale=1e3)
+            write_csv(
+                source / f"{name}.csv", self.points, self.demos.object_pos, self.turn, scale=1e3
+            )
         np.savetxt(self.folder / "T.txt", np.eye(4))
         out = self.folder / "out.npz"
         command = ["demos", "import", "keypoints", source, "--out", out]
@@ -219,12 +251,18 @@ class Real(unittest.TestCase):
             time = np.arange(demos.num_frames) / 30
             columns = {"object": str(demos.object_name[0]), "side": "right", "time": time}
             points, pos, turn = seen_from(CAMERA, demos)
-            write_csv(Path(folder, "a.csv"), points, pos, turn, scale=1e3, columns=columns, quat="xyzw")
-            convention = replace(PLAIN, units="mm", frame="camera", table_from_camera=CAMERA, fps=None)
+            write_csv(
+                Path(folder, "a.csv"), points, pos, turn, scale=1e3, columns=columns, quat="xyzw"
+            )
+            convention = replace(
+                PLAIN, units="mm", frame="camera", table_from_camera=CAMERA, fps=None
+            )
             found = read_keypoints(folder, convention)
         np.testing.assert_array_equal(found.hand_valid, seen)
         self.assertLess(np.abs(found.hand_keypoints - demos.hand_keypoints)[seen].max(), 1e-4)
-        wrists = [Rotation.from_quat(d.wrist_quat_wxyz[seen], scalar_first=True) for d in (found, demos)]
+        wrists = [
+            Rotation.from_quat(d.wrist_quat_wxyz[seen], scalar_first=True) for d in (found, demos)
+        ]
         self.assertLess((wrists[0].inv() * wrists[1]).magnitude().max(), np.radians(3.7))
 
 

@@ -21,7 +21,9 @@ from xreset.geometry.urdf_writer import fixed, frame, pose, urdf_text, write_mes
 
 assert_close = torch.testing.assert_close
 
-FIXED = '<joint name="{name}" type="fixed"><parent link="base"/><child link="{child}"/><!----></joint>'
+FIXED = (
+    '<joint name="{name}" type="fixed"><parent link="base"/><child link="{child}"/><!----></joint>'
+)
 
 
 class DriveSharesTest(unittest.TestCase):
@@ -30,7 +32,9 @@ class DriveSharesTest(unittest.TestCase):
         (mimic,) = robot.mimics
         source = robot.joint_names.index(mimic.source)
         shares = drive_shares(robot)
-        rates = np.vstack((np.eye(len(robot.joints)), mimic.multiplier * np.eye(len(robot.joints))[source]))
+        rates = np.vstack(
+            (np.eye(len(robot.joints)), mimic.multiplier * np.eye(len(robot.joints))[source])
+        )
         np.testing.assert_allclose(shares @ rates, np.eye(len(robot.joints)), atol=1e-9)
         follower = dataclasses.replace(robot.joints[source], name=mimic.joint)
         free = dataclasses.replace(robot, joints=(*robot.joints, follower), mimics=())
@@ -77,7 +81,9 @@ class UrdfTest(unittest.TestCase):
             collisions += f"<collision>{origin}<geometry><{shape}/></geometry></collision>"
         joint = FIXED.format(name="j", child="end").replace("fixed", "continuous")
         tree = load_urdf(self.urdf(f'<link name="end">{collisions}</link>', joint))
-        found = [(shape.geometry.kind, shape.geometry.size) for shape in tree.link("end").collisions]
+        found = [
+            (shape.geometry.kind, shape.geometry.size) for shape in tree.link("end").collisions
+        ]
         kinds = [("box", (1, 2, 3)), ("sphere", (1,)), ("cylinder", (1, 2)), ("capsule", (1, 2))]
         self.assertEqual(found, kinds)
         turned = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
@@ -93,14 +99,18 @@ class UrdfTest(unittest.TestCase):
         for name, size in (("f/1", 0.1), ("f_1", 0.2)):
             shape = hull(size * np.vstack((np.zeros(3), np.eye(3))))
             links.append(dataclasses.replace(frame(name), collisions=(shape,)))
-        joints = [fixed("base", link.name, pose((1, 2, 3), rpy=(0.1, 0.2, 0.3))) for link in links[1:]]
+        joints = [
+            fixed("base", link.name, pose((1, 2, 3), rpy=(0.1, 0.2, 0.3))) for link in links[1:]
+        ]
         tree = RobotTree(name="toy", root="base", links=tuple(links), joints=tuple(joints))
         path = self.folder / "robot.urdf"
         path.write_text(urdf_text(tree, "made by --hand"))
         write_meshes(tree, self.folder)
         read = load_urdf(path)
         self.assertEqual(read.link_names, tree.link_names)
-        np.testing.assert_allclose(read.joints[0].T_parent_joint, joints[0].T_parent_joint, atol=1e-8)
+        np.testing.assert_allclose(
+            read.joints[0].T_parent_joint, joints[0].T_parent_joint, atol=1e-8
+        )
         sizes = [float(np.max(link.collisions[0].geometry.vertices)) for link in read.links[1:]]
         np.testing.assert_allclose(sizes, (0.1, 0.2))
 
@@ -126,9 +136,15 @@ class UrdfTest(unittest.TestCase):
             ((link, '<joint name="j" type="fixed"/>'), "no parent link"),
             ((link, joint.replace('name="j"', "")), "KeyError"),
             ((link.replace("end", "e&#155;d"),), "control characters"),
-            ((link, joint.replace("fixed", "revolute").replace("<!---->", '<axis xyz="1 0"/>')), "expected 3 numbers"),
             (
-                (link, joint.replace("fixed", "revolute").replace("<!---->", '<axis xyz="0 0 0"/>')),
+                (link, joint.replace("fixed", "revolute").replace("<!---->", '<axis xyz="1 0"/>')),
+                "expected 3 numbers",
+            ),
+            (
+                (
+                    link,
+                    joint.replace("fixed", "revolute").replace("<!---->", '<axis xyz="0 0 0"/>'),
+                ),
                 "expected a direction",
             ),
         ):
@@ -149,12 +165,18 @@ class KinematicsTest(unittest.TestCase):
         """[*shape, J] joint positions within the limits."""
         low = kinematics.lower
         generator = torch.Generator().manual_seed(0)
-        return low + (kinematics.upper - low) * torch.rand(*shape, len(low), dtype=FLOAT, generator=generator)
+        return low + (kinematics.upper - low) * torch.rand(
+            *shape, len(low), dtype=FLOAT, generator=generator
+        )
 
     def test_link_poses_agree_with_mujoco(self):
         import mujoco
 
-        for robot, atol in ((self.robot, 1e-9), (robots.load("ur7e-sharpa"), 1e-6), (robots.load("openarm"), 1e-6)):
+        for robot, atol in (
+            (self.robot, 1e-9),
+            (robots.load("ur7e-sharpa"), 1e-6),
+            (robots.load("openarm"), 1e-6),
+        ):
             kinematics = Kinematics(robot)
             description = mujoco.MjSpec.from_file(str(robot.urdf))
             description.compiler.fusestatic = False
@@ -164,23 +186,33 @@ class KinematicsTest(unittest.TestCase):
                 for name, position in zip(robot.joint_names, q.tolist(), strict=True):
                     data.joint(name).qpos = position
                 for mimic in robot.mimics:
-                    data.joint(mimic.joint).qpos = mimic.multiplier * data.joint(mimic.source).qpos + mimic.offset
+                    data.joint(mimic.joint).qpos = (
+                        mimic.multiplier * data.joint(mimic.source).qpos + mimic.offset
+                    )
                 mujoco.mj_kinematics(model, data)
                 poses = kinematics.link_poses(q, base=torch.eye(4, dtype=FLOAT)).numpy()
                 for name, T in zip(kinematics.link_names[1:], poses[1:], strict=True):
-                    np.testing.assert_allclose(T[:3, 3], data.body(name).xpos, atol=atol, err_msg=name)
-                    np.testing.assert_allclose(T[:3, :3].ravel(), data.body(name).xmat, atol=atol, err_msg=name)
+                    np.testing.assert_allclose(
+                        T[:3, 3], data.body(name).xpos, atol=atol, err_msg=name
+                    )
+                    np.testing.assert_allclose(
+                        T[:3, :3].ravel(), data.body(name).xmat, atol=atol, err_msg=name
+                    )
 
     def test_jacobian_is_the_derivative(self):
         links = ["tip_a", "finger_a2", "palm", "tip_b"]
-        offsets = torch.tensor([[0.01, 0.02, -0.03], [0, 0, 0], [0.1, 0, 0], [0, 0.01, 0]], dtype=FLOAT)
+        offsets = torch.tensor(
+            [[0.01, 0.02, -0.03], [0, 0, 0], [0.1, 0, 0], [0, 0.01, 0]], dtype=FLOAT
+        )
         jacobian = self.kinematics.jacobian(self.q, links, offsets)
         assert_close(jacobian.pos, self.kinematics.points(self.q, links, offsets))
         for j in range(self.q.shape[-1]):
             T = slope(lambda q: self.kinematics.link_poses(q, links), self.q, (..., j))
             points = T[..., :3, 3] + (T[..., :3, :3] @ offsets[..., None])[..., 0]
             assert_close(jacobian.linear[..., j], points, atol=1e-8, rtol=0)
-            spin = T[..., :3, :3] @ jacobian.rot.mT  # the cross-product matrix of the angular velocity
+            spin = (
+                T[..., :3, :3] @ jacobian.rot.mT
+            )  # the cross-product matrix of the angular velocity
             omega = torch.stack((spin[..., 2, 1], spin[..., 0, 2], spin[..., 1, 0]), dim=-1)
             assert_close(jacobian.angular[..., j], omega, atol=1e-8, rtol=0)
 
@@ -195,14 +227,20 @@ class KinematicsTest(unittest.TestCase):
 
     def test_a_subtree_moves_as_in_the_whole(self):
         hand = Kinematics(self.robot, root="palm")
-        self.assertEqual(hand.joint_names, tuple(self.robot.joint_names[i] for i in self.robot.hand_indices))
+        self.assertEqual(
+            hand.joint_names, tuple(self.robot.joint_names[i] for i in self.robot.hand_indices)
+        )
         whole = self.kinematics.link_poses(self.q, hand.link_names)
         palm = self.kinematics.link_poses(self.q, ["palm"])[..., 0, :, :]
-        assert_close(hand.link_poses(self.q[..., hand.joint_indices], base=palm), whole, atol=1e-12, rtol=0)
+        assert_close(
+            hand.link_poses(self.q[..., hand.joint_indices], base=palm), whole, atol=1e-12, rtol=0
+        )
 
     def test_limits_take_the_mimic_joint_into_account(self):
         # Joints are in the order of the description. The mimic, at half its travel, is the first to end.
-        self.assertAlmostEqual(self.kinematics.upper[self.robot.joint_names.index("jaw_a")].item(), 0.025)
+        self.assertAlmostEqual(
+            self.kinematics.upper[self.robot.joint_names.index("jaw_a")].item(), 0.025
+        )
 
     def test_errors_name_the_cause(self):
         with self.assertRaisesRegex(RobotError, "no link 'nose' below"):

@@ -37,7 +37,9 @@ SMALL = ModelConfig(pointnet=(8, 6), lstm=12, mlp=(16,))
 def observations(*batch: int, seed: int = 0) -> TensorDict:
     g = torch.Generator().manual_seed(seed)
     widths = {"policy": (7,), "proprio": (9,), "perception": (5, 10, 3), "privileged": (4,)}
-    return TensorDict({k: torch.randn(*batch, *w, generator=g) for k, w in widths.items()}, batch_size=list(batch))
+    return TensorDict(
+        {k: torch.randn(*batch, *w, generator=g) for k, w in widths.items()}, batch_size=list(batch)
+    )
 
 
 def make_model() -> PointNetLstmModel:
@@ -129,7 +131,9 @@ class ModelTest(unittest.TestCase):
             with (
                 mock.patch.object(torch.Tensor, "is_cuda", on_gpu),
                 mock.patch.object(torch.ops.aten, "_thnn_fused_lstm_cell", cell),
-                mock.patch.object(pointnet, "forward", lambda cloud, mlp=pointnet.mlp: mlp(cloud).amax(dim=-2)),
+                mock.patch.object(
+                    pointnet, "forward", lambda cloud, mlp=pointnet.mlp: mlp(cloud).amax(dim=-2)
+                ),
             ):
                 output = model(obs, masks=first, hidden_state=states)
                 output.square().sum().backward()
@@ -146,7 +150,10 @@ def places(alg: SequencePpo) -> dict[str, int]:
     tensors = {f"actor {name}": value for name, value in alg.actor.state_dict().items()}
     tensors |= {f"critic {name}": value for name, value in alg.critic.state_dict().items()}
     tensors |= dict(alg.storage.observations.items())
-    for name in set(read) - {"observations", "rewards"}:  # an update reads the returns of the rewards
+    for name in set(read) - {
+        "observations",
+        "rewards",
+    }:  # an update reads the returns of the rewards
         values = read[name] if isinstance(read[name], list | tuple) else [read[name]]
         for i, value in enumerate(values):
             if isinstance(value, torch.Tensor):
@@ -182,7 +189,11 @@ class StorageTest(unittest.TestCase):
         """
 
         model = ModelConfig(
-            pointnet=(8, 6), lstm=12, mlp=(16,), initial_std=0.5, normalize_returns=ppo.pop("normalize_returns", False)
+            pointnet=(8, 6),
+            lstm=12,
+            mlp=(16,),
+            initial_std=0.5,
+            normalize_returns=ppo.pop("normalize_returns", False),
         )
         config = TrainConfig(model=model, ppo=PpoConfig(horizon=8, minibatch_size=128, **ppo))
         torch.manual_seed(0)
@@ -190,7 +201,9 @@ class StorageTest(unittest.TestCase):
         alg = SequencePpo(obs, A, config, device, Processes())
         alg._graphs.active &= capture
         alg.actor.mlp[-1].bias.data += bias
-        obs["perception"] = obs["perception"][:, -1:].expand(-1, 5, -1, -1)  # a scene in which nothing moves
+        obs["perception"] = obs["perception"][:, -1:].expand(
+            -1, 5, -1, -1
+        )  # a scene in which nothing moves
         before = alg.actor(obs).detach()
         alg.actor.reset()
         self.places = []
@@ -199,7 +212,9 @@ class StorageTest(unittest.TestCase):
             with torch.no_grad():
                 for _ in range(8):
                     actions = alg.act(obs)
-                    alg.process_env_step(obs, -(actions - target).abs().mean(-1), torch.zeros(64, device=device), {})
+                    alg.process_env_step(
+                        obs, -(actions - target).abs().mean(-1), torch.zeros(64, device=device), {}
+                    )
                 alg.compute_returns(obs)
             self.losses = alg.update()
             self.places.append(places(alg))
@@ -213,14 +228,21 @@ class StorageTest(unittest.TestCase):
             self.assertEqual(self.places[1], self.places[0])
             self.assertEqual(self.places[2], self.places[0])
 
-    @unittest.skipUnless(torch.cuda.is_available(), "there is no CUDA device: updates are captured on GPUs only")
+    @unittest.skipUnless(
+        torch.cuda.is_available(), "there is no CUDA device: updates are captured on GPUs only"
+    )
     def test_a_captured_update_learns_what_a_plain_one_does(self):
         # Adam moves a weight by about the rate whatever its gradient's size, so that one whose sign hangs on the last bits of a kernel may
         # end 60 steps x 3e-4 away: 0.018. An adaptive rate multiplies that: a step more or less of it is a factor of 1.5.
         fixed = {"schedule": "fixed", "learning_rate": 3e-4}
-        for tolerance, options in ((1e-2, fixed), (1e-2, fixed | {"normalize_returns": True}), (5e-2, {})):
+        for tolerance, options in (
+            (1e-2, fixed),
+            (1e-2, fixed | {"normalize_returns": True}),
+            (5e-2, {}),
+        ):
             (one, before, plain), (two, _, captured) = (
-                self.bandit(iterations=3, device="cuda", capture=on, **options) for on in (False, True)
+                self.bandit(iterations=3, device="cuda", capture=on, **options)
+                for on in (False, True)
             )
             self.assertFalse(one._graphs._graphs)
             self.assertTrue(two._graphs._graphs)
@@ -242,7 +264,9 @@ class ReturnCriticTest(unittest.TestCase):
         before = critic(obs)
         seen = []
         for shift in (0.0, 10.0, 10.0, 10.0):
-            seen.append(3.0 * torch.randn(4000, generator=torch.Generator().manual_seed(0)) + 7.0 + shift)
+            seen.append(
+                3.0 * torch.randn(4000, generator=torch.Generator().manual_seed(0)) + 7.0 + shift
+            )
             critic.take_returns(seen[-1])
             critic.reset()
             torch.testing.assert_close(critic(obs), before, atol=1e-4, rtol=1e-4)
@@ -262,16 +286,26 @@ class ExportTest(unittest.TestCase):
         model = PointNetLstmModel(seen(0), GROUPS, A, SMALL, stochastic=True)
         model.update_normalization(seen(9))
         task = TaskConfig(observation=ObservationConfig(cloud_points=10, cloud="paired"))
-        layout = {"policy": {"all": 7}, "proprio": {"all": 9}, "perception": {"paired_cloud": 10 * 9}}
+        layout = {
+            "policy": {"all": 7},
+            "proprio": {"all": 9},
+            "perception": {"paired_cloud": 10 * 9},
+        }
         contract = policy_contract(robots.load("openarm"), task, ())
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "policy.onnx"
-            export_onnx(model, file, contract | {"observation_layout": layout, "joint_names": list("abcde")})
-            self.assertNotIn(b".py", file.read_bytes(), "nothing of the exporting machine is in the file")
+            export_onnx(
+                model, file, contract | {"observation_layout": layout, "joint_names": list("abcde")}
+            )
+            self.assertNotIn(
+                b".py", file.read_bytes(), "nothing of the exporting machine is in the file"
+            )
             policy = OnnxPolicy(file)
         with torch.no_grad():
             for t in range(50):
-                torch.testing.assert_close(policy.act(seen(t)), model(seen(t)).clamp(-1, 1), atol=1e-5, rtol=0)
+                torch.testing.assert_close(
+                    policy.act(seen(t)), model(seen(t)).clamp(-1, 1), atol=1e-5, rtol=0
+                )
 
 
 class ConfigTest(unittest.TestCase):
@@ -281,15 +315,31 @@ class ConfigTest(unittest.TestCase):
 
     def test_numbers_that_make_no_sense_are_refused(self):
         for make, options, problem in (
-            (PpoConfig, {"sequence_length": 5}, "sequence_length is 5, expected a divisor of the horizon, which is 16"),
+            (
+                PpoConfig,
+                {"sequence_length": 5},
+                "sequence_length is 5, expected a divisor of the horizon, which is 16",
+            ),
             (PpoConfig, {"discount": 1.01}, "discount is 1.01, expected a number from 0 to 1"),
             (PpoConfig, {"entropy": float("nan")}, "entropy is nan"),
             (ModelConfig, {"initial_std": 0.0}, "initial_std is 0.0, expected a number above 0"),
             (ModelConfig, {"mlp": (64, 0)}, "mlp is .*expected one width or more"),
-            (RandomizationConfig, {"friction": (1.0, 0.5)}, "friction is .1.0, 0.5., expected two finite numbers"),
-            (RandomizationConfig, {"tracker": TrackerConfig(jitter=1.0)}, "changes observation_latency, which is 0"),
+            (
+                RandomizationConfig,
+                {"friction": (1.0, 0.5)},
+                "friction is .1.0, 0.5., expected two finite numbers",
+            ),
+            (
+                RandomizationConfig,
+                {"tracker": TrackerConfig(jitter=1.0)},
+                "changes observation_latency, which is 0",
+            ),
             (PushConfig, {"probability": (0.0, 0.1)}, "expected two numbers above 0"),
-            (TerminationConfig, {"object_low": 2.0}, "object_low is 2.0, expected less than object_high, which is 1.0"),
+            (
+                TerminationConfig,
+                {"object_low": 2.0},
+                "object_low is 2.0, expected less than object_high, which is 1.0",
+            ),
         ):
             with self.subTest(problem), self.assertRaisesRegex(ValueError, problem):
                 make(**options)
@@ -303,7 +353,9 @@ class ConfigTest(unittest.TestCase):
         data["random_episode_start"] = True
         self.assertEqual(from_dict(TrainConfig, data), TrainConfig())
         data["model"]["synergy_std"] = 0.4
-        with self.assertRaisesRegex(FileFormatError, r"model\.synergy_std is 0\.4\. This option was removed"):
+        with self.assertRaisesRegex(
+            FileFormatError, r"model\.synergy_std is 0\.4\. This option was removed"
+        ):
             from_dict(TrainConfig, data)
 
 

@@ -19,7 +19,9 @@ class Learns(unittest.TestCase):
             by_chance, (learned, steps) = random_policy(0, backend), trained(0, backend)
         self.assertEqual(steps, CONFIG.iterations * CONFIG.ppo.horizon * WORLDS, "it was stopped")
         self.assertGreater(
-            learned["grasped"], by_chance["grasped"] + MARGIN, f"a random policy: {by_chance}; trained: {learned}"
+            learned["grasped"],
+            by_chance["grasped"] + MARGIN,
+            f"a random policy: {by_chance}; trained: {learned}",
         )
 
 

@@ -29,7 +29,10 @@ class LiftTest(unittest.TestCase):
         lift = read_lift(self.folder)
         self.assertEqual([(p.share, p.iteration, p.env_steps, p.minutes) for p in lift.passed],
                          [(0.01, 3, 3000, 1.5), (0.1, 3, 3000, 1.5), (0.5, 6, 6000, 3.0)])  # fmt: skip
-        self.assertEqual((lift.iteration, lift.env_steps, lift.minutes, lift.success_from_home), (7, 7000, 3.5, 0.3))
+        self.assertEqual(
+            (lift.iteration, lift.env_steps, lift.minutes, lift.success_from_home),
+            (7, 7000, 3.5, 0.3),
+        )
 
     def test_a_resumed_run_forgets_what_came_after_its_checkpoint(self):
         again = self.after(Lift(), [0.0, 0.02, 0.0, 0.3]).up_to(3)
@@ -52,7 +55,10 @@ class CurvesTest(unittest.TestCase):
             "task/grasped": torch.ones(()),
             "task/success": torch.ones(()),
         }
-        with tempfile.TemporaryDirectory() as name, mock.patch.dict("sys.modules", {"wandb": online}):
+        with (
+            tempfile.TemporaryDirectory() as name,
+            mock.patch.dict("sys.modules", {"wandb": online}),
+        ):
             folder = Path(name)
             write_json(folder / "run.json", {"a": 1})
             for project in (None, "project"):
@@ -65,7 +71,9 @@ class CurvesTest(unittest.TestCase):
             self.assertEqual(online.init.call_args.kwargs["project"], "project")
             self.assertEqual(online.init.call_args.kwargs["config"], {"a": 1})
             sent = online.init.return_value.log.call_args
-            self.assertEqual((sent.args[0]["task/success_from_home"], sent.kwargs), (0.5, {"step": 3}))
+            self.assertEqual(
+                (sent.args[0]["task/success_from_home"], sent.kwargs), (0.5, {"step": 3})
+            )
             online.init.return_value.finish.assert_called_once_with()
             with (
                 mock.patch.dict("sys.modules", {"wandb": None}),

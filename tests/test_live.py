@@ -79,7 +79,9 @@ def after(moment, **changes):
     def fault(time, reading):
         if time < moment:
             return reading
-        return replace(reading, **{k: v(time, reading) if callable(v) else v for k, v in changes.items()})
+        return replace(
+            reading, **{k: v(time, reading) if callable(v) else v for k, v in changes.items()}
+        )
 
     return fault
 
@@ -156,7 +158,10 @@ class FaultTest(unittest.TestCase):
         driver = Scripted()
         driver.send = refuse  # type: ignore[method-assign]
         with self.assertLogs("xreset"):
-            self.assertRegex(Runner(Steady(), driver).run(30).reason or "", "could not send targets: the cable is out")
+            self.assertRegex(
+                Runner(Steady(), driver).run(30).reason or "",
+                "could not send targets: the cable is out",
+            )
         self.assertEqual(driver.stops, 1)
 
         def interrupted(target):
@@ -197,7 +202,10 @@ class EngineTest(unittest.TestCase):
         actions = np.random.default_rng(0).uniform(-1.2, 1.2, (STEPS, 2, len(played.robot.joints)))
         actor = Recorded(actions.astype(np.float32))
         recorded = []
-        with played.worlds(engine("mujoco", workers=0), torch.zeros(2, dtype=torch.long)) as (env, _):
+        with played.worlds(engine("mujoco", workers=0), torch.zeros(2, dtype=torch.long)) as (
+            env,
+            _,
+        ):
             env.reset(start=start)
             for action in actor.actions:
                 seen = env.get_observations()
@@ -207,7 +215,9 @@ class EngineTest(unittest.TestCase):
             moving = EngineDriver(env).read()
             found = make_controller(env, actor).kinematics.links(moving.joint_pos, moving.joint_vel)
             for name in ("palm_pos", "palm_linvel", "palm_angvel"):
-                np.testing.assert_allclose(getattr(found, name), getattr(moving.links, name), atol=2e-4, err_msg=name)
+                np.testing.assert_allclose(
+                    getattr(found, name), getattr(moving.links, name), atol=2e-4, err_msg=name
+                )
             env.reset(start=start)
             controller = make_controller(env, actor)
             driver = EngineDriver(env)
@@ -215,7 +225,9 @@ class EngineTest(unittest.TestCase):
             np.testing.assert_allclose(links, recorded[0][0], atol=1e-6)  # forward kinematics
             controller = make_controller(env, actor)
             outcome = Runner(controller, driver).run(STEPS * controller.dt)
-        self.assertEqual((outcome.reasons, outcome.steps, len(actor.seen)), ([None, None], STEPS, STEPS))
+        self.assertEqual(
+            (outcome.reasons, outcome.steps, len(actor.seen)), ([None, None], STEPS, STEPS)
+        )
         for expected, found in zip(recorded, actor.seen, strict=True):
             np.testing.assert_array_equal(found[0], expected[0])
             np.testing.assert_array_equal(found[1], expected[1])

@@ -46,7 +46,9 @@ class MirrorTest(unittest.TestCase):
                 placed.append(turn.apply(self.object.vertices) + demos.object_pos[frame])
             distance, _ = cKDTree(placed[1]).query(reflect(placed[0]))
             self.assertLess(np.percentile(distance, 95), 0.004)
-        np.testing.assert_allclose(self.found.hand_keypoints, reflect(self.demos.hand_keypoints), atol=1e-6)
+        np.testing.assert_allclose(
+            self.found.hand_keypoints, reflect(self.demos.hand_keypoints), atol=1e-6
+        )
 
     def test_a_left_hand_becomes_a_right_hand(self):
         """In its own frame, a left hand is the mirror image in x of a right one."""
@@ -54,7 +56,9 @@ class MirrorTest(unittest.TestCase):
         local = []
         for demos in (self.demos, self.found):
             turn = Rotation.from_quat(demos.wrist_quat_wxyz, scalar_first=True).as_matrix()
-            local.append(np.einsum("fji,fkj->fki", turn, demos.hand_keypoints - demos.hand_keypoints[:, :1]))
+            local.append(
+                np.einsum("fji,fkj->fki", turn, demos.hand_keypoints - demos.hand_keypoints[:, :1])
+            )
         np.testing.assert_allclose(local[1], local[0] * [-1.0, 1.0, 1.0], atol=1e-5)
 
     def test_an_object_that_is_not_symmetric_is_refused(self):

@@ -74,10 +74,14 @@ class Depth(unittest.TestCase):
             data.qpos[:] = qpos[i]
             mujoco.mj_forward(model, data)
             expected = np.sort(data.contact.dist)
-            np.testing.assert_allclose(np.sort(dist[world == i]), expected, atol=2e-6, err_msg=f"pose {qpos[i]}")
+            np.testing.assert_allclose(
+                np.sort(dist[world == i]), expected, atol=2e-6, err_msg=f"pose {qpos[i]}"
+            )
             deepest = mujoco.mj_geomDistance(model, data, 0, 1, 1.0, None)
             elsewhere += len(expected) == 1 and expected[0] > deepest + 2e-5
-        self.assertGreater(elsewhere, 10, "the deepest point must often be elsewhere, or this shows nothing")
+        self.assertGreater(
+            elsewhere, 10, "the deepest point must often be elsewhere, or this shows nothing"
+        )
 
 
 class OtherVersions(unittest.TestCase):
@@ -85,7 +89,9 @@ class OtherVersions(unittest.TestCase):
         with (
             mock.patch.object(mujoco_warp_depth, "KNOWN_FAULT", "another"),
             mock.patch.object(mujoco_warp_depth, "correct_depths") as correct,
-            self.assertWarnsRegex(UserWarning, r"finds contacts in another way.*Install mujoco-warp==4\.0\.0"),
+            self.assertWarnsRegex(
+                UserWarning, r"finds contacts in another way.*Install mujoco-warp==4\.0\.0"
+            ),
         ):
             correct_engine()
         correct.assert_not_called()
@@ -96,7 +102,9 @@ class OtherVersions(unittest.TestCase):
         with mock.patch.object(mjw, "__version__", "4.0.1"), warnings.catch_warnings():
             warnings.simplefilter("error")
             correct_engine()
-            self.assertIs(engine_step(wp.get_device("cpu"), model).func, mujoco_warp_step.forked_step)
+            self.assertIs(
+                engine_step(wp.get_device("cpu"), model).func, mujoco_warp_step.forked_step
+            )
         self.assertIs(collision_convex.multicontact, mujoco_warp_depth.multicontact_with_depth)
 
     def test_another_step_or_integrator_is_left_to_the_engine(self):

@@ -18,7 +18,13 @@ from xreset.errors import ObjectError, XResetError
 from xreset.geometry.shapes import half_spaces, hull, shape_mesh, shell_properties
 from xreset.objects.catalogue import canonical_name, load_object, load_objects, object_names
 from xreset.objects.decompose import Settings, as_solid, decompose, limited_hull
-from xreset.objects.meshes import DEFAULT_DENSITY, add_mesh, import_with_notes, mesh_files, read_mesh
+from xreset.objects.meshes import (
+    DEFAULT_DENSITY,
+    add_mesh,
+    import_with_notes,
+    mesh_files,
+    read_mesh,
+)
 from xreset.objects.procedural import make_shapes
 from xreset.objects.properties import Properties
 from xreset.objects.rest import rest_height, resting_orientation
@@ -40,11 +46,23 @@ def distance_to_pieces(points, obj):
 
 class Names(unittest.TestCase):
     def test_other_spellings(self):
-        papers = ("cheez-its", "soup", "mustard", "tuna", "spam", "banana", "pitcher", "powerdrill", "scissors")
+        papers = (
+            "cheez-its",
+            "soup",
+            "mustard",
+            "tuna",
+            "spam",
+            "banana",
+            "pitcher",
+            "powerdrill",
+            "scissors",
+        )
         self.assertEqual(tuple(canonical_name(name) for name in papers), object_names())
         for name in ("035_power_drill", "power_drill", "Power Drill"):
             self.assertEqual(canonical_name(name), "035_power_drill")
-        with self.assertRaisesRegex(ObjectError, r"'teapot'.*003_cracker_box \(cheez-its\).*037_scissors"):
+        with self.assertRaisesRegex(
+            ObjectError, r"'teapot'.*003_cracker_box \(cheez-its\).*037_scissors"
+        ):
             load_object("teapot")
 
 
@@ -75,7 +93,9 @@ class Geometry(unittest.TestCase):
         b = a.copy().apply_translation((1, 0, 0))
         both = trimesh.util.concatenate([a, b])
         points = np.array([[-0.5, 0.1, 0.2], [0.5, 0.1, 0.2], [2.5, 0.1, 0.2]])
-        np.testing.assert_allclose(winding_number(points, both.vertices, both.faces), [1, 2, 0], atol=1e-9)
+        np.testing.assert_allclose(
+            winding_number(points, both.vertices, both.faces), [1, 2, 0], atol=1e-9
+        )
 
     def test_limited_hull_keeps_the_shape(self):
         sphere = trimesh.creation.icosphere(4, 0.05)
@@ -98,7 +118,9 @@ class Sampling(unittest.TestCase):
     def test_keypoints_are_corners_that_span_the_box(self):
         obj = load_object("scissors")
         points = keypoints(obj)
-        self.assertGreater(abs(np.linalg.det(points[1:] - points[0])), 1e-6)  # not coplanar: they see every rotation
+        self.assertGreater(
+            abs(np.linalg.det(points[1:] - points[0])), 1e-6
+        )  # not coplanar: they see every rotation
         low, high = bounding_box(obj)
         self.assertTrue((np.isclose(points, low) | np.isclose(points, high)).all())
 
@@ -150,7 +172,9 @@ class MeshImport(InFolder):
         self.assertEqual(self.load(BOX, facts="mass = 0.2").obj.mass, 0.2)
         mug = self.load(BOX, "025_mug")
         self.assertEqual((mug.obj.mass, mug.mass_source, mug.notes), (0.118, "published (YCB)", ()))
-        inside_out = self.load(trimesh.Trimesh(BOX.vertices, BOX.faces[:, ::-1]), facts="mass = 1.0")
+        inside_out = self.load(
+            trimesh.Trimesh(BOX.vertices, BOX.faces[:, ::-1]), facts="mass = 1.0"
+        )
         self.assertEqual(inside_out.notes, ())
         mesh = trimesh.Trimesh(inside_out.obj.vertices, inside_out.obj.faces, process=False)
         self.assertGreater(mesh.volume, 0)
@@ -161,16 +185,23 @@ class MeshImport(InFolder):
         volume = sum(shape_mesh(piece).volume for piece in first.pieces)
         self.assertAlmostEqual(volume / RING.volume, 1.0, delta=0.1)
         np.testing.assert_allclose(first.com, 0, atol=1e-9)
-        self.assertGreater(distance_to_pieces(np.zeros((1, 3)), first)[0], 0.03)  # the hole stays open
+        self.assertGreater(
+            distance_to_pieces(np.zeros((1, 3)), first)[0], 0.03
+        )  # the hole stays open
         (file,) = (self.folder / "cache" / "objects").glob("*.npz")
-        for content, cuts in ((file.read_bytes(), 0), (file.read_bytes()[:100], 1)):  # a damaged cache is made again
+        for content, cuts in (
+            (file.read_bytes(), 0),
+            (file.read_bytes()[:100], 1),
+        ):  # a damaged cache is made again
             file.write_bytes(content)
             with mock.patch("xreset.objects.cache.decompose", wraps=decompose) as cut:
                 again = self.load(RING).obj
             self.assertEqual(cut.call_count, cuts)
             for a, b in zip(first.pieces, again.pieces, strict=True):
                 np.testing.assert_allclose(shape_mesh(a).bounds, shape_mesh(b).bounds, atol=1e-12)
-        with mock.patch("xreset.objects.cache.distributions", return_value=[mock.Mock(version="99")]):
+        with mock.patch(
+            "xreset.objects.cache.distributions", return_value=[mock.Mock(version="99")]
+        ):
             self.load(BOX)
         self.load(BOX)  # the cache knows the version of the cutter
         self.assertEqual(len(list(file.parent.glob("*.npz"))), 3)
@@ -199,15 +230,22 @@ class MeshImport(InFolder):
     def test_a_hollow_objects_mass_is_on_its_surface(self):
         mesh = trimesh.creation.icosphere(4, 0.1)
         moved = trimesh.Trimesh(mesh.vertices + np.array([1, 2, 3]), mesh.faces)
-        self.assertTrue(np.allclose(shell_properties(moved.vertices, moved.faces, 0.3)[0], (1, 2, 3), atol=1e-9))
-        for mass, moment in ((0.3, 0.002), (3.0, 0.012)):  # 2/3 m r^2 of a shell: 0.3 kg in 4.2 l; 2/5 m r^2 of a solid
+        self.assertTrue(
+            np.allclose(shell_properties(moved.vertices, moved.faces, 0.3)[0], (1, 2, 3), atol=1e-9)
+        )
+        for mass, moment in (
+            (0.3, 0.002),
+            (3.0, 0.012),
+        ):  # 2/3 m r^2 of a shell: 0.3 kg in 4.2 l; 2/5 m r^2 of a solid
             found = self.load(mesh, facts=f"mass = {mass}").obj
             np.testing.assert_allclose(np.diag(found.inertia), moment, rtol=0.01)
 
     def test_a_mesh_in_millimetres_with_what_it_is_made_of(self):
         path = self.write(trimesh.creation.box((100, 60, 40)))
         out = self.folder / "objects"
-        result = add_mesh(path, out, "brick", scale=0.001, properties=Properties(density=700, friction=0.4))
+        result = add_mesh(
+            path, out, "brick", scale=0.001, properties=Properties(density=700, friction=0.4)
+        )
         self.assertAlmostEqual(result.obj.mass, 700 * 0.1 * 0.06 * 0.04, places=6)
         self.assertEqual(result.notes, ())
         found = load_object("brick", out)
@@ -229,13 +267,24 @@ class MeshImport(InFolder):
             self.assertRaises(KeyboardInterrupt, add_mesh, path, out, "brick")
         self.assertFalse(out.exists())  # nothing is written before the mesh is cut
         out.mkdir()
-        (out / "brick.toml").write_text("mass = 0.2\ntolerance = 0.002\n")  # killed between the two files
+        (out / "brick.toml").write_text(
+            "mass = 0.2\ntolerance = 0.002\n"
+        )  # killed between the two files
         add_mesh(path, out, "brick", properties=Properties(mass=0.2))
         self.assertEqual(load_object("brick", out).mass, 0.2)
 
     @CUTS
     def test_the_neck_of_a_bottle_stays_free(self):
-        half = [[0, 0], [0.03, 0], [0.03, 0.14], [0.014, 0.16], [0.014, 0.17], [0.018, 0.171], [0.018, 0.18], [0, 0.18]]
+        half = [
+            [0, 0],
+            [0.03, 0],
+            [0.03, 0.14],
+            [0.014, 0.16],
+            [0.014, 0.17],
+            [0.018, 0.171],
+            [0.018, 0.18],
+            [0, 0.18],
+        ]
         path = self.write(trimesh.creation.revolve(np.array(half), sections=24))
         plain = import_with_notes(path, "bottle")
         self.assertEqual(len(plain.obj.pieces), 1)
@@ -252,11 +301,16 @@ class MeshImport(InFolder):
         content = self.write(BOX).read_bytes() + b"#" * (2 << 20)
         with zipfile.ZipFile(self.folder / "mesh.3mf", "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr("mesh.obj", content)
-        header = {"asset": {"version": "2.0"}, "accessors": [{"componentType": 5126, "type": "VEC3", "count": 10**9}]}
+        header = {
+            "asset": {"version": "2.0"},
+            "accessors": [{"componentType": 5126, "type": "VEC3", "count": 10**9}],
+        }
         (self.folder / "huge.gltf").write_text(json.dumps(header))
         scene = trimesh.Scene(BOX)
         for i in range(50):
-            scene.add_geometry(scene.geometry["geometry_0"], node_name=f"copy {i}", geom_name="geometry_0")
+            scene.add_geometry(
+                scene.geometry["geometry_0"], node_name=f"copy {i}", geom_name="geometry_0"
+            )
         (self.folder / "copies.glb").write_bytes(scene.export(file_type="glb"))
         for name, limit, words in (
             ("mesh.3mf", 16 << 20, "is an archive. Unpack it"),
@@ -298,7 +352,9 @@ class MeshImport(InFolder):
 
     def test_own_friction_takes_the_place_of_the_middle(self):
         c = RandomizationConfig(friction=(0.5, 1.0))
-        torch.testing.assert_close(own_friction([None, 0.95, 0.35], c), torch.tensor([[0.0], [0.1], [-0.2]]))
+        torch.testing.assert_close(
+            own_friction([None, 0.95, 0.35], c), torch.tensor([[0.0], [0.1], [-0.2]])
+        )
 
     def test_bad_meshes(self):
         box = trimesh.creation.box((0.1, 0.1, 0.1))
@@ -306,7 +362,10 @@ class MeshImport(InFolder):
         cases = {
             "empty": ("", "no triangles|cannot be read"),
             "nan": (nan, "finite|cannot be read"),
-            "tilted square": ("v 0 0 0\nv 0.1 0 0.1\nv 0 0.1 0.1\nv 0.1 0.1 0.2\nf 1 2 3\nf 2 4 3\n", "flat"),
+            "tilted square": (
+                "v 0 0 0\nv 0.1 0 0.1\nv 0 0.1 0.1\nv 0.1 0.1 0.2\nf 1 2 3\nf 2 4 3\n",
+                "flat",
+            ),
             "millimetres": (box.copy().apply_scale(1000).export(file_type="obj"), "millimetres"),
         }
         for name, (text, message) in cases.items():
@@ -319,12 +378,21 @@ class MeshImport(InFolder):
     def test_layouts(self):
         mesh = trimesh.creation.box((0.1, 0.1, 0.1))
         self.write(mesh, "011_banana")
-        for path in ("025_mug/textured.obj", "025_mug/textured_simple.obj", "024_bowl/textured.obj"):
+        for path in (
+            "025_mug/textured.obj",
+            "025_mug/textured_simple.obj",
+            "024_bowl/textured.obj",
+        ):
             (self.folder / path).parent.mkdir(exist_ok=True)
             mesh.export(self.folder / path)
         found = {name: path.name for name, path in mesh_files(self.folder).items()}
         self.assertEqual(
-            found, {"011_banana": "011_banana.obj", "024_bowl": "textured.obj", "025_mug": "textured_simple.obj"}
+            found,
+            {
+                "011_banana": "011_banana.obj",
+                "024_bowl": "textured.obj",
+                "025_mug": "textured_simple.obj",
+            },
         )
         with self.assertLogs("xreset.objects.meshes", "WARNING") as log:
             self.assertEqual(load_object("banana", self.folder).mass, 0.066)
@@ -337,7 +405,9 @@ class MeshImport(InFolder):
     def test_a_real_can_stays_whole(self):
         obj = load_object("soup", data_dir() / "ycb")
         self.assertEqual(len(obj.pieces), 1)
-        self.assertLess(distance_to_pieces(obj.vertices, obj).max(), 0.002)  # 64 vertices are enough
+        self.assertLess(
+            distance_to_pieces(obj.vertices, obj).max(), 0.002
+        )  # 64 vertices are enough
 
 
 @CUTS
@@ -346,24 +416,35 @@ class ThinWalls(unittest.TestCase):
 
     def room(self, point, pieces):
         """[m] From a point to the nearest piece, at least."""
-        return min(float((half_spaces(p)[:, :3] @ point + half_spaces(p)[:, 3]).max()) for p in pieces.shapes)
+        return min(
+            float((half_spaces(p)[:, :3] @ point + half_spaces(p)[:, 3]).max())
+            for p in pieces.shapes
+        )
 
     def test_a_finger_fits_into_a_mug_and_its_handle(self):
         outline = [[0, 0], [0.04, 0], [0.04, 0.09], [0.0365, 0.09], [0.0365, 0.004], [0, 0.004]]
         cup = trimesh.creation.revolve(np.array(outline), sections=28)
         turn = trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])
         turn[:3, 3] = 0.042, 0, 0.045
-        ring = trimesh.creation.torus(0.024, 0.004, major_sections=24, minor_sections=8, transform=turn)
+        ring = trimesh.creation.torus(
+            0.024, 0.004, major_sections=24, minor_sections=8, transform=turn
+        )
         bore = trimesh.creation.cylinder(0.038, 0.3, sections=28)
         mug = trimesh.boolean.union([cup, trimesh.boolean.difference([ring, bore])])
         pieces = decompose(mug)
-        points = np.concatenate([trimesh.sample.sample_surface(shape_mesh(p), 400, seed=1)[0] for p in pieces.shapes])
+        points = np.concatenate(
+            [trimesh.sample.sample_surface(shape_mesh(p), 400, seed=1)[0] for p in pieces.shapes]
+        )
         outside = points[winding_number(points, mug.vertices, mug.faces) < 0.5]
         surface = cKDTree(trimesh.sample.sample_surface(mug, 60000, seed=1)[0])
-        self.assertLess(surface.query(outside)[0].max(), 0.0021)  # measured apart from the importer's own account
+        self.assertLess(
+            surface.query(outside)[0].max(), 0.0021
+        )  # measured apart from the importer's own account
         self.assertLess(pieces.deviation, 0.002)
         self.assertLess(len(pieces.shapes), 40)
-        self.assertGreater(self.room(np.array([0, 0, 0.05]), pieces), 0.030)  # the cup's inner radius is 36.5 mm
+        self.assertGreater(
+            self.room(np.array([0, 0, 0.05]), pieces), 0.030
+        )  # the cup's inner radius is 36.5 mm
         self.assertGreater(
             self.room(np.array([0.051, 0, 0.045]), pieces), 0.008
         )  # a finger of 16 mm through the handle
@@ -372,7 +453,8 @@ class ThinWalls(unittest.TestCase):
     def test_a_small_bridge_on_a_large_piece_is_seen(self):
         """The middle of what covers a hollow is 4 mm from its walls; a few hundred points of the plate miss it."""
         hollow = trimesh.creation.box(
-            (0.008, 0.008, 0.012), transform=trimesh.transformations.translation_matrix((0.05, 0.03, 0.01))
+            (0.008, 0.008, 0.012),
+            transform=trimesh.transformations.translation_matrix((0.05, 0.03, 0.01)),
         )
         plate = trimesh.boolean.difference([trimesh.creation.box((0.3, 0.3, 0.02)), hollow])
         pieces = decompose(plate)
@@ -388,7 +470,9 @@ class ThinWalls(unittest.TestCase):
         solid = as_solid(sheet)
         self.assertAlmostEqual(solid.volume(), sheet.area * 0.001, delta=0.1 * sheet.area * 0.001)
         pieces = decompose(sheet)
-        self.assertGreater(self.room(np.array([0, 0, 0.02]), pieces), 0.012)  # 20 mm above the bottom
+        self.assertGreater(
+            self.room(np.array([0, 0, 0.02]), pieces), 0.012
+        )  # 20 mm above the bottom
         self.assertLess(pieces.deviation, 0.002)
 
     def test_limits_of_pieces_and_effort(self):
@@ -422,7 +506,10 @@ class RandomShapes(InFolder):
         self.assertNotEqual(nine[0].read_bytes(), nine[8].read_bytes())
 
     def test_a_folder_is_never_overwritten(self):
-        for words, folder, count in (("exists. Name a new", self.folder, 1), ("count is 0", self.folder / "none", 0)):
+        for words, folder, count in (
+            ("exists. Name a new", self.folder, 1),
+            ("count is 0", self.folder / "none", 0),
+        ):
             with self.assertRaisesRegex(ObjectError, words):
                 make_shapes(folder, count)
 

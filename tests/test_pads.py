@@ -33,23 +33,31 @@ class PadsTest(unittest.TestCase):
         cls.model = HandModel(robots.load("openarm"))
         cls.box = Surface(box_object(((0, 0, 0), (0.05, 0.05, 0.1))))
 
-    def aslant(self, angle: float, *, held: bool = True, frames: int = 6) -> tuple[HandState, HandTargets]:
+    def aslant(
+        self, angle: float, *, held: bool = True, frames: int = 6
+    ) -> tuple[HandState, HandTargets]:
         """A jaw turned by an angle [rad] about its axis of approach, its pads 2 mm from the box's edges, and its
         keypoints."""
         turn = quat_from_axis_angle(angle * UP).expand(1, frames, 4)
         half = 0.025 * (math.cos(angle) + math.sin(angle)) + 0.002
         # Each pad of the closed jaw is 0.5 mm from its middle.
         joints = torch.full((1, frames, 1), half - 0.0005, dtype=FLOAT)
-        middle = self.model.keypoints(joints, torch.zeros(1, frames, 3, dtype=FLOAT), turn)[:, :, 1:].mean(dim=2)
+        middle = self.model.keypoints(joints, torch.zeros(1, frames, 3, dtype=FLOAT), turn)[
+            :, :, 1:
+        ].mean(dim=2)
         state = HandState(joints=joints, root_pos=UP - middle, root_quat=turn)
         keypoints = self.model.keypoints(joints, state.root_pos, turn)
         flags = torch.full((1, frames), held)
-        return state, hand_targets(keypoints, self.box.field, held=flags, object_pos=UP.expand(1, frames, 3))
+        return state, hand_targets(
+            keypoints, self.box.field, held=flags, object_pos=UP.expand(1, frames, 3)
+        )
 
     def degrees_off(self, targets: HandTargets, config: HandConfig) -> float:
         """Largest angle between the jaw's axis and the box's face."""
         motion = retarget_hand(self.model, targets, config)
-        axis = quat_rotate(motion.root_quat, torch.tensor([0.0, 1.0, 0.0], dtype=FLOAT).expand_as(motion.root_pos))
+        axis = quat_rotate(
+            motion.root_quat, torch.tensor([0.0, 1.0, 0.0], dtype=FLOAT).expand_as(motion.root_pos)
+        )
         return math.degrees(axis[..., 1].abs().clamp_max(1.0).acos().max().item())
 
     def test_pads_are_the_faces_that_meet(self):
@@ -58,7 +66,9 @@ class PadsTest(unittest.TestCase):
             mine = balls.link[self.model.pad_balls] == balls.links.index(link)
             own = self.model.pad_balls[mine]
             centers = balls.centers[own]
-            self.assertLess((side * centers[:, 1] + balls.radii[own] - 0.0055).abs().max().item(), 1.1e-3)
+            self.assertLess(
+                (side * centers[:, 1] + balls.radii[own] - 0.0055).abs().max().item(), 1.1e-3
+            )
             self.assertGreater(np.ptp(centers[:, 2].numpy()), 0.05)
             self.assertAlmostEqual(self.model.pad_shares[mine].sum().item(), 1.0)
         for name in ("ur7e-sharpa", "xarm7-leap"):
@@ -75,7 +85,9 @@ class PadsTest(unittest.TestCase):
         state, targets = self.aslant(math.radians(17), frames=2)
         config = HandConfig(clearance_weight=0.0)
         without = dataclasses.replace(config, pad_weight=0.0)
-        cost, free = (system(self.model, targets, each, state).cost.item() for each in (config, without))
+        cost, free = (
+            system(self.model, targets, each, state).cost.item() for each in (config, without)
+        )
         self.assertGreater(cost - free, 1e-3)
         check_gradient(self.model, targets, config, state, frames=(1,))
 
@@ -95,7 +107,9 @@ class AnalyticMapTest(unittest.TestCase):
         for name in ("openarm", "ur7e-robotiq"):
             model = HandModel(robots.load(name))
             share = torch.rand(1, 5, 1, generator=generator, dtype=FLOAT)
-            joints = model.kinematics.lower + share * (model.kinematics.upper - model.kinematics.lower)
+            joints = model.kinematics.lower + share * (
+                model.kinematics.upper - model.kinematics.lower
+            )
             pos = torch.randn(1, 5, 3, generator=generator, dtype=FLOAT)
             quat = quat_from_axis_angle(torch.randn(1, 5, 3, generator=generator, dtype=FLOAT))
             followed = model.keypoints(joints, pos, quat)
@@ -103,7 +117,9 @@ class AnalyticMapTest(unittest.TestCase):
             again = model.keypoints(state.joints, state.root_pos, state.root_quat)
             torch.testing.assert_close(again, followed, atol=5e-4, rtol=0, msg=name)
 
-    def test_a_span_wider_than_the_jaw_keeps_its_middle_and_the_second_jaw_follows_two_fingers(self):
+    def test_a_span_wider_than_the_jaw_keeps_its_middle_and_the_second_jaw_follows_two_fingers(
+        self,
+    ):
         model = HandModel(robots.load("ur7e-robotiq"))
         hand = np.zeros((1, 21, 3))
         at = {name: hand[0, i] for i, name in enumerate(KEYPOINTS)}
@@ -116,7 +132,9 @@ class AnalyticMapTest(unittest.TestCase):
         motion = retarget_hand(model, targets, HandConfig(jaw="analytic"))
         tips = model.keypoints(**vars(motion))[0, 0, model.is_tip]
         self.assertAlmostEqual(motion.joints.item(), 0.0)
-        torch.testing.assert_close(tips[:, 0].abs(), torch.full((2,), 0.0425, dtype=FLOAT), atol=1e-3, rtol=0)
+        torch.testing.assert_close(
+            tips[:, 0].abs(), torch.full((2,), 0.0425, dtype=FLOAT), atol=1e-3, rtol=0
+        )
         torch.testing.assert_close(tips[:, 1:], torch.zeros(2, 2, dtype=FLOAT), atol=1e-3, rtol=0)
 
 

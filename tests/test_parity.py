@@ -17,7 +17,14 @@ from tests.toy_bank import toy_retargeted
 from xreset import robots
 from xreset.errors import DemoError
 from xreset.eval.engines.actions import grasp_and_lift
-from xreset.eval.engines.agreement import Metric, carried, compare, outcome_metric, palm_distance, press_metrics
+from xreset.eval.engines.agreement import (
+    Metric,
+    carried,
+    compare,
+    outcome_metric,
+    palm_distance,
+    press_metrics,
+)
 from xreset.eval.engines.grasps import (
     GraspMotion,
     Grasps,
@@ -57,14 +64,21 @@ def between(kinematics: Kinematics, q: torch.Tensor) -> torch.Tensor:
 
 
 def grasps_of(
-    robot: RobotSpec, thing: ObjectSpec, offsets=OFFSETS, *, gap: float = 0.066, height: float = 0.06
+    robot: RobotSpec,
+    thing: ObjectSpec,
+    offsets=OFFSETS,
+    *,
+    gap: float = 0.066,
+    height: float = 0.06,
 ) -> Retargeted:
     """The home pose's hand lowered over an upright object at several places between its fingers: sequences of two
     frames, the second of which is lifted by 0.1 m."""
     kinematics = Kinematics(robot)
     home = torch.as_tensor(robot.home)[None]
     points = tips(kinematics, home)
-    q = moved_fingertips(kinematics, home, 0.5 * (float((points[:, 1:].mean(1) - points[:, 0]).norm()) - gap))
+    q = moved_fingertips(
+        kinematics, home, 0.5 * (float((points[:, 1:].mean(1) - points[:, 0]).norm()) - gap)
+    )
 
     def shifted(q: torch.Tensor, z: float) -> torch.Tensor:
         way = torch.zeros(40, 3)
@@ -74,7 +88,9 @@ def grasps_of(
     low = shifted(q, height - float(between(kinematics, q)[0, 2]))
     both = torch.cat((low, shifted(low, 0.1)))
     upright = np.array([1.0, 0.0, 0.0, 0.0])
-    pos = between(kinematics, low) + torch.nn.functional.pad(torch.tensor(offsets, dtype=torch.float64), (0, 1))
+    pos = between(kinematics, low) + torch.nn.functional.pad(
+        torch.tensor(offsets, dtype=torch.float64), (0, 1)
+    )
     pos[:, 2] = float(rest_height(thing, upright))
     n = len(offsets)
     joints = both.repeat(n, 1)
@@ -98,13 +114,18 @@ def grasps_of(
 
 def weak(scene: SceneSpec, factor: float = 0.5) -> SceneSpec:
     """The scene with weaker drives."""
-    joints = [replace(joint, drive=replace(joint.drive, kp=factor * joint.drive.kp)) for joint in scene.robot.joints]
+    joints = [
+        replace(joint, drive=replace(joint.drive, kp=factor * joint.drive.kp))
+        for joint in scene.robot.joints
+    ]
     return replace(scene, robot=replace(scene.robot, joints=tuple(joints)))
 
 
 def heavy(scene: SceneSpec) -> SceneSpec:
     """The scene with an object that hardly any grasp carries."""
-    return replace(scene, objects=tuple(replace(thing, mass=8 * thing.mass) for thing in scene.objects))
+    return replace(
+        scene, objects=tuple(replace(thing, mass=8 * thing.mass) for thing in scene.objects)
+    )
 
 
 class Episodes(unittest.TestCase):
@@ -137,10 +158,16 @@ class Episodes(unittest.TestCase):
         torque = (kp * (target - held))[0]
         before = tips(self.kinematics, self.home)
         line = torch.nn.functional.normalize(before[0, 1:].mean(0) - before[0, 0], dim=0)
-        force = torch.stack([4.0 * line, *[-1.0 * line] * 4])  # four fingers share what the thumb bears
-        jacobian = self.kinematics.jacobian(held, [tip.link for tip in self.robot.fingertips]).linear[0]
+        force = torch.stack(
+            [4.0 * line, *[-1.0 * line] * 4]
+        )  # four fingers share what the thumb bears
+        jacobian = self.kinematics.jacobian(
+            held, [tip.link for tip in self.robot.fingertips]
+        ).linear[0]
         hand = torch.as_tensor(self.robot.hand_indices)
-        torch.testing.assert_close(torque[hand], torch.einsum("ecj,ec->j", jacobian, force)[hand], atol=1e-9, rtol=0)
+        torch.testing.assert_close(
+            torque[hand], torch.einsum("ecj,ec->j", jacobian, force)[hand], atol=1e-9, rtol=0
+        )
         self.assertLess(float(torque[torch.as_tensor(self.robot.arm_indices)].abs().max()), 1e-9)
 
     def test_a_closing_opens_closes_lifts_and_shakes(self):
@@ -179,7 +206,9 @@ class Finding(unittest.TestCase):
         self.can = load_object("soup")
 
     def find(self, motion: Retargeted, *objects: ObjectSpec, count: int = 10, **where) -> Grasps:
-        return find_grasps(motion, self.robot, objects or (self.can,), count, **({"where": "table"} | where))
+        return find_grasps(
+            motion, self.robot, objects or (self.can,), count, **({"where": "table"} | where)
+        )
 
     def test_table_and_air_are_told_apart(self):
         motion = grasps_of(self.robot, self.can)
@@ -189,14 +218,19 @@ class Finding(unittest.TestCase):
         self.assertEqual({label.split(":")[1] for label in air.label}, {"1"})
         self.assertEqual(len(table), 5)
         torch.testing.assert_close(
-            air.object_pos[:, 2] - table.object_pos[:, 2], torch.full((5,), 0.1, dtype=torch.float64), atol=6e-4, rtol=0
+            air.object_pos[:, 2] - table.object_pos[:, 2],
+            torch.full((5,), 0.1, dtype=torch.float64),
+            atol=6e-4,
+            rtol=0,
         )
         actions = grasp_and_lift(self.robot, self.can, table[1:2])
         self.assertEqual(actions.label, f"grasp and lift of {self.can.name}, {table.label[1]}")
         before = replace(motion, first_contact=np.full(5, -1))
         away = grasps_of(self.robot, self.can, [(0.2, 0.0)])
         for ungrasped, frames in ((before, 0), (away, 2)):
-            with self.assertRaisesRegex(DemoError, f"no grasp was found in {frames} frames after first contact"):
+            with self.assertRaisesRegex(
+                DemoError, f"no grasp was found in {frames} frames after first contact"
+            ):
                 self.find(ungrasped)
 
     def test_a_turned_or_moved_object_is_not_at_rest(self):
@@ -246,14 +280,18 @@ class Numbers(unittest.TestCase):
         total, tip = press_metrics(recording(tip_force=force), recording(), steps=2)
         self.assertAlmostEqual(total.measured or 0.0, 0.1, places=5)  # median of 0.2 and 0
         self.assertEqual(total.n, 2)
-        self.assertAlmostEqual(tip.measured or 0.0, 0.2, places=5)  # median of 0.2, 0.2, 0 and sqrt 2
+        self.assertAlmostEqual(
+            tip.measured or 0.0, 0.2, places=5
+        )  # median of 0.2, 0.2, 0 and sqrt 2
         self.assertEqual(tip.n, 4)
 
         force = recording().tip_force.clone()
         force[0] *= 100
         force[:, 0, 1] = 0.0
         total, tip = press_metrics(recording(tip_force=force), recording(), steps=2)
-        self.assertEqual((tip.n, tip.measured), (4, 0.0), "a finger that presses in one engine only counts")
+        self.assertEqual(
+            (tip.n, tip.measured), (4, 0.0), "a finger that presses in one engine only counts"
+        )
 
     def test_outcomes_and_nothing_to_compare(self):
         high = torch.zeros(3, 2, 3)
@@ -278,10 +316,14 @@ class Numbers(unittest.TestCase):
             object_quat=quarter.expand(3, 2, 4),
             palm_quat=quarter.expand(3, 2, 4),
         )
-        torch.testing.assert_close(palm_distance(moved, recording(), corners), torch.zeros(2), atol=1e-7, rtol=0)
+        torch.testing.assert_close(
+            palm_distance(moved, recording(), corners), torch.zeros(2), atol=1e-7, rtol=0
+        )
         # ... and an object that turns in the palm is seen.
         turned = recording(object_quat=quarter.expand(3, 2, 4))
-        torch.testing.assert_close(palm_distance(turned, recording(), corners), torch.full((2,), 0.1 * math.sqrt(2)))
+        torch.testing.assert_close(
+            palm_distance(turned, recording(), corners), torch.full((2,), 0.1 * math.sqrt(2))
+        )
 
 
 class Comparing(unittest.TestCase):
@@ -295,7 +337,10 @@ class Comparing(unittest.TestCase):
             robot,
             [can],
             grasps_of(robot, can),
-            [toy_grasp.with_scene(reference, "heavy", heavy), toy_grasp.with_scene(reference, "weak", weak)],
+            [
+                toy_grasp.with_scene(reference, "heavy", heavy),
+                toy_grasp.with_scene(reference, "weak", weak),
+            ],
             grasps=6,
             tries=BRISK,
             reference=reference,
@@ -333,9 +378,13 @@ class Comparing(unittest.TestCase):
     def test_the_exit_code_of_the_command_says_the_verdict(self):
         folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
         path = folder / "retargeted.npz"
-        write_retargeted(path, grasps_of(self.result.robot, self.result.objects[0]), config={}, inputs={})
+        write_retargeted(
+            path, grasps_of(self.result.robot, self.result.objects[0]), config={}, inputs={}
+        )
         for result, code in ((self.result, 1), (replace(self.result, engines=()), 0)):
-            with mock.patch("xreset.eval.engines.agreement.compare", lambda *_, result=result, **__: result):
+            with mock.patch(
+                "xreset.eval.engines.agreement.compare", lambda *_, result=result, **__: result
+            ):
                 options = ("--backend", "mujoco", "--json", folder / "parity.json")
                 found, text, _ = xreset("engines", "compare", path, *options)
             self.assertEqual(found, code)
@@ -362,13 +411,21 @@ class Engines(unittest.TestCase):
 
     def test_they_agree_with_mujoco(self):
         robot, can = robots.load("ur7e-sharpa"), load_object("soup")
-        tested = [engine(name, workers=0) for name in ("pybullet", "sapien") if backend_status(name).reason is None]
+        tested = [
+            engine(name, workers=0)
+            for name in ("pybullet", "sapien")
+            if backend_status(name).reason is None
+        ]
         motion = grasps_of(robot, can, FREE_OFFSETS, gap=FREE_GAP)
         reference = engine("mujoco", workers=0)
         result = compare(robot, [can], motion, tested, grasps=3, tries=BRISK, reference=reference)
         for found in result.engines:
             metrics = {metric.metric: metric for metric in found.metrics}
-            for name in ("press, total", "press, fingertip", "closing, outcome"):  # few holds near the edge say little
+            for name in (
+                "press, total",
+                "press, fingertip",
+                "closing, outcome",
+            ):  # few holds near the edge say little
                 with self.subTest(name, engine=found.engine.name):
                     self.assertTrue(metrics[name].ok, metrics[name])
 

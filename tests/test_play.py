@@ -39,7 +39,9 @@ class Played(unittest.TestCase):
         session.move_goal(moment.goal_pos + np.array((0.08, 0.0, 0.0)), moment.goal_quat)
         self.assertGreater(session.step().distance, 0.05)
         moment = self.steps(3.0)
-        self.assertGreater(moment.time - session.history[0].time, session.env.cfg.termination.episode_seconds)
+        self.assertGreater(
+            moment.time - session.history[0].time, session.env.cfg.termination.episode_seconds
+        )
         self.assertLess(moment.distance, 0.05)
         self.assertFalse(session.dropped)
 
@@ -161,7 +163,9 @@ class Played(unittest.TestCase):
             write_trace(path, session)
             steps = round(0.5 / session.control_dt)
             (trace,) = read_traces(Path(folder), "play", session.policy.robot.joint_names)
-            self.assertEqual((len(trace.time), len(np.asarray(trace.joint_target))), (steps, steps - 1))
+            self.assertEqual(
+                (len(trace.time), len(np.asarray(trace.joint_target))), (steps, steps - 1)
+            )
             np.testing.assert_array_equal(trace.joint_pos[-1], session.history[-1].joint_pos)
             np.testing.assert_array_equal(trace.goal_pos, session.history[-1].goal_pos)
             with np.load(path) as arrays:

@@ -50,15 +50,21 @@ class InTheBrowser(unittest.TestCase):
 
     def shows_the_object(self) -> bool:
         """Whether the page has pixels of the object's color."""
-        rgb = np.asarray(Image.open(io.BytesIO(self.browser.screenshot())).convert("RGB")).astype(int)
+        rgb = np.asarray(Image.open(io.BytesIO(self.browser.screenshot())).convert("RGB")).astype(
+            int
+        )
         return int(((rgb[150:, 40:640, 0] - rgb[150:, 40:640, 2]) > 60).sum()) > 50
 
     def pixel_of(self, point: np.ndarray) -> tuple[float, float]:
         """Where the page shows a point of the world."""
         camera = max(self.page._server.get_clients().items())[1].camera
-        x, y, z = Rotation.from_quat(camera.wxyz, scalar_first=True).inv().apply(point - camera.position)
+        x, y, z = (
+            Rotation.from_quat(camera.wxyz, scalar_first=True).inv().apply(point - camera.position)
+        )
         focal = camera.image_height / 2 / np.tan(camera.fov / 2)
-        return float(camera.image_width / 2 + focal * x / z), float(camera.image_height / 2 + focal * y / z)
+        return float(camera.image_width / 2 + focal * x / z), float(
+            camera.image_height / 2 + focal * y / z
+        )
 
     def pass_time(self, seconds: float):
         """Let the session play, faster than the page would show it."""
@@ -72,7 +78,9 @@ class InTheBrowser(unittest.TestCase):
         goal = self.pass_time(0.1).goal_pos
         x, y = self.pixel_of(self.page._handle.position)
         self.browser.drag((x, y), (x - 60, y - 30))
-        self.until(lambda: np.linalg.norm(session.history[-1].goal_pos - goal) > 0.05, "the goal to move")
+        self.until(
+            lambda: np.linalg.norm(session.history[-1].goal_pos - goal) > 0.05, "the goal to move"
+        )
         self.assertFalse(self.page._hint.visible)
         self.assertGreater(session.history[-1].distance, 0.1)
         self.assertLess(self.pass_time(4.0).distance, 0.05)
@@ -90,7 +98,9 @@ class InTheBrowser(unittest.TestCase):
         self.until(lambda: "The object is away" in self.browser.text(), "the object to be away")
         self.browser.press("Put the object back")
         self.until(lambda: not session.away, "the object to be back")
-        problems = [text for text in self.browser.problems if "passive event listener" not in text]  # viser's own
+        problems = [
+            text for text in self.browser.problems if "passive event listener" not in text
+        ]  # viser's own
         self.assertEqual(problems, [])
         self.browser.resize(390, 844, phone=True)
         self.assertLessEqual(self.browser.evaluate("document.documentElement.scrollWidth"), 390)

@@ -57,12 +57,22 @@ class OnnxPolicyTest(WithPolicy):
             ("a JSON list, expected an object", {"metadata": "[]"}),
             ("missing: .*schema.* Export the policy again", {"metadata": "{}"}),
             ("missing: robot", {"metadata": json.dumps(partial)}),
-            (r"task is \[\], expected an object", {"metadata": json.dumps(self.contract | {"task": []})}),
+            (
+                r"task is \[\], expected an object",
+                {"metadata": json.dumps(self.contract | {"task": []})},
+            ),
             (
                 "observation_layout.policy.x is -1",
-                {"metadata": json.dumps(self.contract | {"observation_layout": layout | {"policy": {"x": -1}}})},
+                {
+                    "metadata": json.dumps(
+                        self.contract | {"observation_layout": layout | {"policy": {"x": -1}}}
+                    )
+                },
             ),
-            (r"joint_names\[0\] is 1", {"metadata": json.dumps(self.contract | {"joint_names": [1, 2]})}),
+            (
+                r"joint_names\[0\] is 1",
+                {"metadata": json.dumps(self.contract | {"joint_names": [1, 2]})},
+            ),
         ):
             with (
                 self.subTest(words, **{k: str(v)[:40] for k, v in changes.items()}),
@@ -70,7 +80,9 @@ class OnnxPolicyTest(WithPolicy):
             ):
                 OnnxPolicy(write_policy(path, self.contract, **changes))
         write_policy(path, self.contract)
-        path.write_bytes(path.read_bytes().replace(b'"schema"', b"\xff\xfe\xff\xfe\xff\xfe\xff\xfe"))
+        path.write_bytes(
+            path.read_bytes().replace(b'"schema"', b"\xff\xfe\xff\xfe\xff\xfe\xff\xfe")
+        )
         with self.assertRaises(PolicyError):
             OnnxPolicy(path)
         with self.assertRaisesRegex(PolicyError, "here is no policy file"):
@@ -96,7 +108,8 @@ class ShippedTest(WithPolicy):
         self.assertEqual(list(policies.shipped()), ["skilled"])
         subject = load_policy("skilled")
         self.assertEqual(
-            (subject.name, subject.robot.name, subject.folder), ("skilled", "openarm", Path("runs/skilled/eval"))
+            (subject.name, subject.robot.name, subject.folder),
+            ("skilled", "openarm", Path("runs/skilled/eval")),
         )
         self.assertEqual(subject.task, TASK)
         self.assertEqual(subject.hash, load_policy(self.file).hash)
@@ -113,7 +126,16 @@ class ShippedTest(WithPolicy):
         card.write_text(text)
         code, out, err = run("policies", "list")
         self.assertEqual((code, err), (0, ""))
-        for part in ("skilled: Lifts.", "four demonstrations", "one minute", "MIT", "openarm", SOUP, "90 %", "70 %"):
+        for part in (
+            "skilled: Lifts.",
+            "four demonstrations",
+            "one minute",
+            "MIT",
+            "openarm",
+            SOUP,
+            "90 %",
+            "70 %",
+        ):
             self.assertIn(part, out)
         card.write_text(text.replace("card/1", "card/9"))
         self.assertIn("states schema", run("policies", "list")[2])
@@ -123,8 +145,13 @@ class ShippedTest(WithPolicy):
         self.assertEqual(load_policy("zero", robot="openarm").unseen((SOUP, "mug")), ())
 
     def test_an_unknown_name_lists_those_that_ship(self):
-        expected = "Unknown policy 'skiled'. Give a run folder, a .onnx file, or one of: zero, random, ik"
-        for command, options in ((("eval",), ()), (("engines", "attribute"), ("--towards", "pybullet"))):
+        expected = (
+            "Unknown policy 'skiled'. Give a run folder, a .onnx file, or one of: zero, random, ik"
+        )
+        for command, options in (
+            (("eval",), ()),
+            (("engines", "attribute"), ("--towards", "pybullet")),
+        ):
             code, _, err = run(*command, "skiled", "--demos", "x.npz", *options)
             self.assertEqual(code, 1)
             self.assertIn(f"{expected}, skilled.", err)
@@ -136,7 +163,9 @@ class ShippedTest(WithPolicy):
     def test_it_is_evaluated_traced_and_reported_by_name(self):
         write_demos("demos.npz", synthesize([SOUP], 1))
         self.assertEqual(run("eval", "skilled", "--demos", "demos.npz", "--episodes", "1")[0], 0)
-        self.assertEqual(json.loads(Path("runs/skilled/eval/mujoco.json").read_text())["policy"], "skilled")
+        self.assertEqual(
+            json.loads(Path("runs/skilled/eval/mujoco.json").read_text())["policy"], "skilled"
+        )
         code, out, err = run("report", "skilled")
         self.assertEqual((code, err), (0, ""))
         self.assertTrue(Path("runs/skilled/report/index.html").is_file(), out)

@@ -105,11 +105,16 @@ def toy_scene() -> SceneSpec:
     robot = RobotSpec(
         name="toy",
         urdf=Path("toy.urdf"),
-        joints=tuple(JointSpec(name=f"j{i}", group="arm", drive=drive, home=0.1 * i) for i in (1, 2)),
+        joints=tuple(
+            JointSpec(name=f"j{i}", group="arm", drive=drive, home=0.1 * i) for i in (1, 2)
+        ),
         base_pos=(0, 0, 0),
         base_quat=(1, 0, 0, 0),
         palm="palm",
-        fingertips=tuple(FingertipSpec(name=n, link=n, contact_links=(n,), keypoint=n) for n in ("thumb", "index")),
+        fingertips=tuple(
+            FingertipSpec(name=n, link=n, contact_links=(n,), keypoint=n)
+            for n in ("thumb", "index")
+        ),
         keypoints=(),
         hand_root="palm",
     )
@@ -131,7 +136,9 @@ def toy_scene() -> SceneSpec:
 def random_state(n: int, seed: int) -> State:
     rng = torch.Generator().manual_seed(seed)
     width = {"object_pos": 3, "object_quat": 4, "object_linvel": 3, "object_angvel": 3}
-    return State(**{f.name: torch.rand(n, width.get(f.name, 2), generator=rng) for f in fields(State)})
+    return State(
+        **{f.name: torch.rand(n, width.get(f.name, 2), generator=rng) for f in fields(State)}
+    )
 
 
 class PoolTest(unittest.TestCase):
@@ -159,7 +166,9 @@ class PoolTest(unittest.TestCase):
             expected[torch.tensor([4, 1])] = new
             pool.set_state(new, torch.tensor([4, 1]))
             for name in STATE_FIELDS:
-                torch.testing.assert_close(getattr(pool.state(), name), getattr(expected, name), rtol=0, atol=0)
+                torch.testing.assert_close(
+                    getattr(pool.state(), name), getattr(expected, name), rtol=0, atol=0
+                )
 
     def test_step_moves_each_world_by_its_own_inputs(self):
         for pool in self.each():
@@ -175,14 +184,18 @@ class PoolTest(unittest.TestCase):
             state = pool.state()
             torch.testing.assert_close(state.joint_pos, targets)
             torch.testing.assert_close(pool.links().pos[:, 1, 2], targets[:, 0])
-            torch.testing.assert_close(pool.links().angvel[:, 0, 0], torch.tensor([0.0, 1.0, 0.0, 1.0, 0.0]))
+            torch.testing.assert_close(
+                pool.links().angvel[:, 0, 0], torch.tensor([0.0, 1.0, 0.0, 1.0, 0.0])
+            )
             velocity[2, 1] += 3 * 0.5 / 1.0
             torch.testing.assert_close(state.object_linvel, velocity)
             torch.testing.assert_close(state.object_pos, before.object_pos + 3 * velocity)
             torch.testing.assert_close(pool.contacts().tip_force[:, :, 2], torch.full((5, 2), 3.0))
             self.assertEqual(pool.contacts().tip_touch.tolist(), [[True, False]] * 5)
             pool.set_state(random_state(1, 2), torch.tensor([3]))
-            self.assertEqual(pool.contacts().table_force[:, 2].tolist(), [-3.0, -3.0, -3.0, 0.0, -3.0])
+            self.assertEqual(
+                pool.contacts().table_force[:, 2].tolist(), [-3.0, -3.0, -3.0, 0.0, -3.0]
+            )
 
     def test_mass_of_some_worlds(self):
         for pool in self.each():
@@ -191,7 +204,8 @@ class PoolTest(unittest.TestCase):
             before = pool.state().object_linvel.clone()
             pool.step(1)
             torch.testing.assert_close(
-                (pool.state().object_linvel - before)[:, 0], torch.tensor([0.125, 0.5, 1.0, 0.5, 0.25])
+                (pool.state().object_linvel - before)[:, 0],
+                torch.tensor([0.125, 0.5, 1.0, 0.5, 0.25]),
             )
             pool.set_object_mass(torch.tensor([1.0, 1.0]), torch.tensor([4, 0]))
 
@@ -225,7 +239,8 @@ class PoolTest(unittest.TestCase):
             targets[3, 0] = 13.0
             pool.set_joint_targets(targets)
             with self.assertRaisesRegex(
-                RuntimeError, r"(?s)'toy', world 3, step: ZeroDivisionError: unlucky.*in set_joint_targets"
+                RuntimeError,
+                r"(?s)'toy', world 3, step: ZeroDivisionError: unlucky.*in set_joint_targets",
             ):
                 pool.step(1)
             targets[3, 0] = 14.0
@@ -238,7 +253,9 @@ class PoolTest(unittest.TestCase):
 
     def test_wrong_input(self):
         for pool in self.each():
-            with self.assertRaisesRegex(ValueError, r"joint_target has shape \(5, 3\), expected \(5, 2\)"):
+            with self.assertRaisesRegex(
+                ValueError, r"joint_target has shape \(5, 3\), expected \(5, 2\)"
+            ):
                 pool.set_joint_targets(torch.zeros(5, 3))
             with self.assertRaisesRegex(ValueError, "joint_pos has shape"):
                 pool.set_state(random_state(4, 0))
@@ -255,7 +272,10 @@ class PoolTest(unittest.TestCase):
             pool.step(1)
             torch.testing.assert_close(pool.state().joint_pos, torch.full((2, 2), 3.0))
         for workers in (0, 1):
-            with self.subTest(workers=workers), self.assertRaisesRegex(RuntimeError, "world 0, build: TypeError"):
+            with (
+                self.subTest(workers=workers),
+                self.assertRaisesRegex(RuntimeError, "world 0, build: TypeError"),
+            ):
                 ToyBackend(toy_scene(), 2, workers=workers, nonsense=1)
 
 

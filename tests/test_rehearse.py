@@ -97,10 +97,18 @@ class FaultyDriverTest(unittest.TestCase):
         self.assertTrue((targets[:, is_arm] != expected[:, is_arm]).any())
 
     def test_a_seed_decides_everything(self):
-        faults = Faults(position_noise=0.01, pose_delay=0.2, missed_deadlines=0.3, drawn_delays=True)
+        faults = Faults(
+            position_noise=0.01, pose_delay=0.2, missed_deadlines=0.3, drawn_delays=True
+        )
         first = self.play(faults)[0]
-        for other, same in ((self.play(faults, worlds=2)[0], True), (self.play(faults, seed=1)[0], False)):
-            equal = [np.array_equal(a.object_pos[0], b.object_pos[0]) for a, b in zip(first, other, strict=True)]
+        for other, same in (
+            (self.play(faults, worlds=2)[0], True),
+            (self.play(faults, seed=1)[0], False),
+        ):
+            equal = [
+                np.array_equal(a.object_pos[0], b.object_pos[0])
+                for a, b in zip(first, other, strict=True)
+            ]
             self.assertEqual(all(equal), same)
 
 
@@ -129,7 +137,9 @@ class VerdictTest(unittest.TestCase):
         self.assertEqual(judge([self.card()]), ("Ready for a first, careful trial on a robot.", []))
         sentence, reasons = judge([self.card(), self.card("sapien", action_delay_67=0.2)])
         self.assertEqual(sentence, "Not ready for a robot.")
-        self.assertRegex(reasons[0], "sapien: action delay 67 ms costs 20.0 points .95 %: 20 to 20.. At most 4")
+        self.assertRegex(
+            reasons[0], "sapien: action delay 67 ms costs 20.0 points .95 %: 20 to 20.. At most 4"
+        )
         _, reasons = judge([replace(self.card(), task_progress=0.3)])
         self.assertIn("only 30 % without any fault", reasons[0])
         self.assertIn("No verdict", judge([replace(self.card(), curves=self.card().curves[:3])])[0])
@@ -157,15 +167,25 @@ class CommandTest(unittest.TestCase):
         xreset("demos", "synth", "--objects", SOUP, "--per-object", 1, "--out", demos)
         options = ("--demos", demos, "--backend", "mujoco", "--out", folder)
         _, out, _ = xreset(
-            "rehearse", shipped()["soup-can"], *options, "--fault", "published-faults=0.5", "--fault", "lost-frames=1.2"
+            "rehearse",
+            shipped()["soup-can"],
+            *options,
+            "--fault",
+            "published-faults=0.5",
+            "--fault",
+            "lost-frames=1.2",
         )
         self.assertIn("No verdict: not every fault that decides was tried.", out)
         found = read_json(folder / "mujoco.json", "xreset-rehearsal/1")
-        self.assertEqual([c["property"] for c in found["curves"]], ["published-faults", "lost-frames"])
+        self.assertEqual(
+            [c["property"] for c in found["curves"]], ["published-faults", "lost-frames"]
+        )
         self.assertEqual(list(found["stopped"].values()), [1])
         self.assertIn("pose of the object is ... s old", next(iter(found["stopped"])))
         self.assertTrue((folder / "index.html").is_file())
-        code, _, err = xreset("rehearse", shipped()["soup-can"], *options, "--fault", "missed-deadlines=150")
+        code, _, err = xreset(
+            "rehearse", shipped()["soup-can"], *options, "--fault", "missed-deadlines=150"
+        )
         self.assertEqual(code, 1)
         self.assertIn("missed-deadlines 150 % of the steps cannot be tried", err)
 

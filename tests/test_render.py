@@ -51,7 +51,9 @@ class Pictures(unittest.TestCase):
     def setUpClass(cls):
         cls.robot = load("openarm")
         cls.size = (240, 180)
-        cls.renderer = Renderer(SceneSpec(robot=cls.robot, objects=(cube(0.04), cube(0.08))), size=cls.size)
+        cls.renderer = Renderer(
+            SceneSpec(robot=cls.robot, objects=(cube(0.04), cube(0.08))), size=cls.size
+        )
         cls.camera = Camera()
         cls.home = cls.robot.home
 
@@ -60,19 +62,27 @@ class Pictures(unittest.TestCase):
 
     def test_object_appears_where_it_is(self):
         empty = self.renderer.draw(self.home)
-        for position in ((0.4, 0.1, 0.3), (0.6, 0.2, 0.5)):  # in the air: its shadow falls elsewhere
+        for position in (
+            (0.4, 0.1, 0.3),
+            (0.6, 0.2, 0.5),
+        ):  # in the air: its shadow falls elsewhere
             picture = self.renderer.draw(self.home, at(*position))
             orange = (picture[..., 0] > picture[..., 2] + 60) & self.changed(picture, empty)
             y, x = np.nonzero(orange)
             expected = pixel(self.camera, self.size, position)
             np.testing.assert_allclose(
-                (x.min() / 2 + x.max() / 2 + 0.5, y.min() / 2 + y.max() / 2 + 0.5), expected, atol=2.0
+                (x.min() / 2 + x.max() / 2 + 0.5, y.min() / 2 + y.max() / 2 + 0.5),
+                expected,
+                atol=2.0,
             )
 
     def test_the_object_is_the_one_of_the_index_and_the_robot_moves(self):
         empty = self.renderer.draw(self.home)
         small, large = (
-            self.changed(self.renderer.draw(self.home, at(0.4, 0.1, 0.4), object_index=i), empty).sum() for i in (0, 1)
+            self.changed(
+                self.renderer.draw(self.home, at(0.4, 0.1, 0.4), object_index=i), empty
+            ).sum()
+            for i in (0, 1)
         )
         self.assertGreater(large, 2.5 * small)
         moved = self.home.copy()
@@ -99,11 +109,18 @@ class Pictures(unittest.TestCase):
     def test_points_are_drawn_over_everything_and_missing_ones_or_far_ones_left_out(self):
         color = (1.0, 0.0, 1.0)
         inside = np.array([0.4, 0.1, 0.3])
-        outside = [[50.0, 0, 0], [1.3, -1.5, 0.9], [1.28, -0.5, 0.9], [np.nan] * 3]  # the second is behind the camera
+        outside = [
+            [50.0, 0, 0],
+            [1.3, -1.5, 0.9],
+            [1.28, -0.5, 0.9],
+            [np.nan] * 3,
+        ]  # the second is behind the camera
         points = Points(pos=np.array([inside, *outside]), color=color, radius=0.012)
         picture = self.renderer.draw(self.home, at(*inside), points=[points])
         y, x = np.nonzero((picture == (255, 0, 255)).all(axis=-1))
-        np.testing.assert_allclose((x.mean() + 0.5, y.mean() + 0.5), pixel(self.camera, self.size, inside), atol=1.0)
+        np.testing.assert_allclose(
+            (x.mean() + 0.5, y.mean() + 0.5), pixel(self.camera, self.size, inside), atol=1.0
+        )
 
     def test_frames_show_the_links_axes(self):
         lines = self.renderer.link_frames(self.home, ["palm"], length=0.1)
@@ -119,10 +136,14 @@ class Pictures(unittest.TestCase):
     def test_a_picture_may_have_its_own_camera(self):
         near = Camera(eye=(0.8, -0.1, 0.5), target=(0.4, 0.1, 0.1))
         T = at(0.4, 0.1, 0.04)
-        own = Renderer(self.renderer.scene, size=self.size, camera=near).draw(self.home, T)  # the same, each time
+        own = Renderer(self.renderer.scene, size=self.size, camera=near).draw(
+            self.home, T
+        )  # the same, each time
         np.testing.assert_array_equal(self.renderer.draw(self.home, T, camera=near), own)
         self.assertGreater(self.changed(self.renderer.draw(self.home, T), own).mean(), 0.1)
-        smooth = Renderer(self.renderer.scene, size=self.size, camera=near, smooth=True).draw(self.home, T)
+        smooth = Renderer(self.renderer.scene, size=self.size, camera=near, smooth=True).draw(
+            self.home, T
+        )
         self.assertEqual(smooth.shape, own.shape)
         self.assertLess(np.abs(smooth.astype(float) - own).mean(), 3.0)
 

@@ -120,11 +120,15 @@ class CollectTest(Reported):
 
     def test_nothing_to_report(self):
         self.folder.mkdir()
-        with self.assertRaisesRegex(RunError, f"nor evaluation results.*xreset eval POLICY.*--out {self.folder}"):
+        with self.assertRaisesRegex(
+            RunError, f"nor evaluation results.*xreset eval POLICY.*--out {self.folder}"
+        ):
             collect(self.folder)
         self.write_soup()
         (self.folder / "lift.json").write_text('{"schema": "xreset-lift/1"}')
-        with self.assertRaisesRegex(RunError, f"no evaluation results.*xreset eval {self.folder} --demos"):
+        with self.assertRaisesRegex(
+            RunError, f"no evaluation results.*xreset eval {self.folder} --demos"
+        ):
             collect(self.folder)
 
     def test_results_outlive_the_description_of_their_training(self):
@@ -141,15 +145,22 @@ class CollectTest(Reported):
         for change in ({"seed": 4}, {"policy": "ik"}, {"inputs": {"demos": "cd"}}):
             self.write(("sapien",), **change)
             (note,) = collect(self.folder).notes
-            what = {"seed": "seed of the evaluation", "inputs": "demonstrations"}.get(*change, *change)
-            self.assertRegex(note, f"not comparable: not the same {what} .*: soup in mujoco; .*: soup in sapien")
+            what = {"seed": "seed of the evaluation", "inputs": "demonstrations"}.get(
+                *change, *change
+            )
+            self.assertRegex(
+                note, f"not comparable: not the same {what} .*: soup in mujoco; .*: soup in sapien"
+            )
 
     def test_what_it_bears_and_how_it_was_chosen(self):
         policy = {"policy": "ab12"}
         self.write(inputs=policy)
         (self.folder / "stress").mkdir()
         result = {"task_progress": 0.8, "ci95": (0.7, 0.9)}
-        points = [result | {"difference_ci95": (-0.3, 0.1), "value": v, "difference": v - 1} for v in (0.6, 1.0)]
+        points = [
+            result | {"difference_ci95": (-0.3, 0.1), "value": v, "difference": v - 1}
+            for v in (0.6, 1.0)
+        ]
         curve = {
             "property": "arm-stiffness",
             "unit": "x",
@@ -158,10 +169,25 @@ class CollectTest(Reported):
             "lower": 0.8,
             "upper": None,
         }
-        card = result | {"backend": "mujoco", "backend_version": "4", "episodes": 4, "curves": [curve], "left_out": []}
-        card |= {"schema": "xreset-stress/1", "policy": "soup", "robot": "toy", "seed": 0, "inputs": policy}
+        card = result | {
+            "backend": "mujoco",
+            "backend_version": "4",
+            "episodes": 4,
+            "curves": [curve],
+            "left_out": [],
+        }
+        card |= {
+            "schema": "xreset-stress/1",
+            "policy": "soup",
+            "robot": "toy",
+            "seed": 0,
+            "inputs": policy,
+        }
         write_json(self.folder / "stress" / "mujoco.json", card)
-        tried = tuple(Candidate(name=f"{i}.pt", task_progress={"mujoco": 0.5 + 0.2 * (i == 1)}) for i in (2, 1))
+        tried = tuple(
+            Candidate(name=f"{i}.pt", task_progress={"mujoco": 0.5 + 0.2 * (i == 1)})
+            for i in (2, 1)
+        )
         choice = Choice(
             chosen="1.pt", policy_hash="ab12", candidates=tried, engines={"mujoco": "4"}, seed=9, episodes_per_demo=2, demos="cd",
         )  # fmt: skip
@@ -183,7 +209,12 @@ class ClipTest(Reported):
         whole = self.ROLLOUTS.episodes[::-1]
         worse = [replace(e, task_progress=0.0) if e.sequence == 0 else e for e in whole]
         alike = pd.concat([table_of(*whole, engine=engine) for engine in ENGINES])
-        mixed = pd.concat([table_of(*(worse if engine in ENGINES[2:] else whole), engine=engine) for engine in ENGINES])
+        mixed = pd.concat(
+            [
+                table_of(*(worse if engine in ENGINES[2:] else whole), engine=engine)
+                for engine in ENGINES
+            ]
+        )
         traces = dict.fromkeys(ENGINES, (first, second))
         for episodes, shown, expected in (
             (alike, traces, [0] * 4),
@@ -191,24 +222,36 @@ class ClipTest(Reported):
             (alike, {"mujoco": (first,), "sapien": (second,)}, []),
         ):
             best = best_everywhere(recorded(episodes, shown))
-            self.assertEqual((best["sequence"].tolist(), set(best["repetition"]) - {0}), (expected, set()))
-        with self.assertRaisesRegex(FileFormatError, "mujoco.trace.npz has a trace of demonstration 1000000"):
+            self.assertEqual(
+                (best["sequence"].tolist(), set(best["repetition"]) - {0}), (expected, set())
+            )
+        with self.assertRaisesRegex(
+            FileFormatError, "mujoco.trace.npz has a trace of demonstration 1000000"
+        ):
             recorded(alike, {"mujoco": [replace(first, sequence=1_000_000)]})
 
     def draw(self, strip: bool = False, **changes) -> Clip:
         self.folder.mkdir(exist_ok=True)
         robot = toy_hand_arm(self.folder)
         trace = toy_rollouts(robot.home).traces[0]
-        trace = replace(trace, **{k: np.array(change(getattr(trace, k).copy())) for k, change in changes.items()})
-        return draw_clip(row_of(0), trace, robot, load_object(SOUP), camera_for([trace]), strip=strip)
+        trace = replace(
+            trace,
+            **{k: np.array(change(getattr(trace, k).copy())) for k, change in changes.items()},
+        )
+        return draw_clip(
+            row_of(0), trace, robot, load_object(SOUP), camera_for([trace]), strip=strip
+        )
 
     def test_a_clip_shows_the_object_on_its_way_at_the_right_speed(self):
         clip = self.draw()
-        self.assertEqual(clip.frames.shape, (3, 300, 400, 3))  # 5 states of 0.05 s, every second one
+        self.assertEqual(
+            clip.frames.shape, (3, 300, 400, 3)
+        )  # 5 states of 0.05 s, every second one
         self.assertAlmostEqual(clip.fps, 10.0)
         self.assertTrue(clip.finite)
         orange = [
-            np.argwhere((f[..., 0] > 180) & (f[..., 2] < 100)).mean(axis=0)[0] for f in clip.frames[:2].astype(int)
+            np.argwhere((f[..., 0] > 180) & (f[..., 2] < 100)).mean(axis=0)[0]
+            for f in clip.frames[:2].astype(int)
         ]
         self.assertLess(orange[1], orange[0] - 3, "the object rises in the picture")
 
@@ -222,18 +265,34 @@ class ClipTest(Reported):
         strip = self.draw(strip=True, object_pos=broken)
         self.assertEqual(strip.frames.shape, (6, 180, 240, 3))
         np.testing.assert_allclose(strip.times, [0, 0.05, 0.1, 0.1, 0.15, 0.2], atol=0.051)
-        self.assertTrue((strip.frames[2] == strip.frames[5]).all() and (strip.frames[0] != strip.frames[2]).any())
+        self.assertTrue(
+            (strip.frames[2] == strip.frames[5]).all()
+            and (strip.frames[0] != strip.frames[2]).any()
+        )
 
     def test_the_film_holds_every_frame(self):
         import imageio_ffmpeg
 
-        colors = np.array([[200, 40, 40], [40, 200, 40], [40, 40, 200], [220, 220, 40]], dtype=np.uint8)
+        colors = np.array(
+            [[200, 40, 40], [40, 200, 40], [40, 40, 200], [220, 220, 40]], dtype=np.uint8
+        )
         frames = np.broadcast_to(colors[:, None, None], (4, 48, 64, 3))
         file = self.folder.with_suffix(".mp4")
         file.write_bytes(encode_mp4(frames, 10.0))
-        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(file), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+        command = [
+            imageio_ffmpeg.get_ffmpeg_exe(),
+            "-i",
+            str(file),
+            "-f",
+            "rawvideo",
+            "-pix_fmt",
+            "rgb24",
+            "-",
+        ]
         decoded = subprocess.run(command, capture_output=True, check=True)
-        self.assertRegex(decoded.stderr.decode(), r"Video: h264.*yuv420p.*64x48.*10 fps")  # what browsers play
+        self.assertRegex(
+            decoded.stderr.decode(), r"Video: h264.*yuv420p.*64x48.*10 fps"
+        )  # what browsers play
         found = np.frombuffer(decoded.stdout, np.uint8).reshape(-1, 48, 64, 3).mean(axis=(1, 2))
         np.testing.assert_allclose(found, colors, atol=12)
 
@@ -246,7 +305,8 @@ class ClipTest(Reported):
         with (
             mock.patch("xreset.eval.report.film.load_robot", lambda _: robot),
             mock.patch(
-                "xreset.eval.report.film.encode_mp4", lambda frames, fps: repr((frames.shape, round(fps))).encode()
+                "xreset.eval.report.film.encode_mp4",
+                lambda frames, fps: repr((frames.shape, round(fps))).encode(),
             ),
         ):
             engines, objects = make_film(self.folder, out)
@@ -267,7 +327,11 @@ class FailureTest(Reported):
             episodes = []
             traces = []
             for i, (value, name) in enumerate(zip(progress, objects, strict=True)):
-                outcome = {"task_progress": value, "reorient": value == 1.0, "reorientation_progress": 0.1 * i}
+                outcome = {
+                    "task_progress": value,
+                    "reorient": value == 1.0,
+                    "reorientation_progress": 0.1 * i,
+                }
                 episodes.append(replace(rollouts.episodes[0], sequence=i, object=name, **outcome))
                 traces.append(replace(rollouts.traces[0], sequence=i, object=name))
             found = worst_episodes(recorded(table_of(*episodes), {"mujoco": traces}), count)
@@ -276,7 +340,9 @@ class FailureTest(Reported):
 
     def test_every_episode_that_missed_its_goal_is_counted_once(self):
         at_goal, near, lifted, broken = toy_rollouts().episodes
-        counts = count_failures(table_of(at_goal, near, near, lifted, replace(at_goal, reorient=False), broken))
+        counts = count_failures(
+            table_of(at_goal, near, near, lifted, replace(at_goal, reorient=False), broken)
+        )
         self.assertEqual(list(counts.values()), [1, 2, 1, 1])
 
 
@@ -302,7 +368,13 @@ class PageTest(Reported):
         for name, row in zip((*ENGINES, ""), (0, 0, 0, 0, 2), strict=True):
             episode = row_of(row)._replace(engine=name)
             frames = np.zeros((2, 48, 64, 3), dtype=np.uint8)
-            clip = Clip(episode=episode, frames=frames, times=np.arange(2.0), fps=10.0, finite=name != "sapien")
+            clip = Clip(
+                episode=episode,
+                frames=frames,
+                times=np.arange(2.0),
+                fps=10.0,
+                finite=name != "sapien",
+            )
             cls.clips.append(clip)
         cls.strips = [cls.clips.pop()]
 
@@ -314,7 +386,9 @@ class PageTest(Reported):
 
     def test_the_page(self):
         text = page(self.data(), self.clips, self.strips)
-        self.assertEqual(text, page(self.data(), self.clips, self.strips), "the same results give the same page")
+        self.assertEqual(
+            text, page(self.data(), self.clips, self.strips), "the same results give the same page"
+        )
         outline = Outline(text)
         with self.subTest("well formed, with unique identifiers"):
             self.assertEqual(outline.open, [])
@@ -330,10 +404,16 @@ class PageTest(Reported):
             self.assertNotIn("@import", text)
             for target in re.findall(r"url\(([^)]*)\)", text):
                 self.assertTrue(target.startswith("#"), target)
-            policy = next(a["content"] for a in outline.of("meta") if a.get("http-equiv") == "Content-Security-Policy")
+            policy = next(
+                a["content"]
+                for a in outline.of("meta")
+                if a.get("http-equiv") == "Content-Security-Policy"
+            )
             self.assertIn("default-src 'none'", policy)
         with self.subTest("says in words what it shows"):
-            charts = [a.get("aria-label") or "" for a in outline.of("figure") if a.get("role") == "img"]
+            charts = [
+                a.get("aria-label") or "" for a in outline.of("figure") if a.get("role") == "img"
+            ]
             films = [a.get("aria-label") or "" for a in outline.of("video")]
             self.assertEqual((len(charts), len(films)), (1, 4))
             for words in (*charts, *films):
@@ -341,7 +421,9 @@ class PageTest(Reported):
             self.assertIn("object at its goal", films[0])
             self.assertIn("stopped being finite", films[3])
             (strip,) = outline.of("img")
-            self.assertRegex(strip["alt"], "at 0.0, 1.0 s: .*demo_1: grasped and lifted, 50% of the way")
+            self.assertRegex(
+                strip["alt"], "at 0.0, 1.0 s: .*demo_1: grasped and lifted, 50% of the way"
+            )
             self.assertEqual(outline.of("html")[0]["lang"], "en")
             self.assertEqual(len(outline.of("caption")), 3)
         for expected in (
@@ -372,8 +454,12 @@ class PageTest(Reported):
     def test_the_headline_begins_with_the_best(self):
         data = self.data()
         results = {}
-        for (engine, result), mean in zip(data.training.results.items(), (0.4, 0.9, 0.1, 0.5), strict=True):
-            results[engine] = replace(result, task_progress=TaskProgress(mean=mean, ci95=(mean, mean)))
+        for (engine, result), mean in zip(
+            data.training.results.items(), (0.4, 0.9, 0.1, 0.5), strict=True
+        ):
+            results[engine] = replace(
+                result, task_progress=TaskProgress(mean=mean, ci95=(mean, mean))
+            )
         self.assertEqual(
             headline(replace(data, training=replace(data.training, results=results))),
             "Task progress is 90% in mujoco-warp, 50% in sapien, 40% in mujoco, 10% in pybullet. "
@@ -388,7 +474,12 @@ class CommandTest(Reported):
 
     def test_from_results_to_page_and_picture(self):
         robot = robots.load("openarm")
-        self.write(("mujoco", "sapien"), rollouts=toy_rollouts(robot.home), joints=robot.joint_names, robot="openarm")
+        self.write(
+            ("mujoco", "sapien"),
+            rollouts=toy_rollouts(robot.home),
+            joints=robot.joint_names,
+            robot="openarm",
+        )
         code, printed = self.run_command(str(self.folder))
         self.assertEqual(code, 0, printed)
         for word in ("mujoco", "sapien", "49.8%", "index.html"):
@@ -400,7 +491,9 @@ class CommandTest(Reported):
     def test_numbers_are_reported_even_where_no_clip_can_be_drawn(self):
         self.write(("mujoco",), robot="a-robot-that-is-not-installed")
         html, data = make_report(self.folder, self.folder / "elsewhere")
-        self.assertRegex(" ".join(data.notes), "no clips: Unknown robot 'a-robot-that-is-not-installed'")
+        self.assertRegex(
+            " ".join(data.notes), "no clips: Unknown robot 'a-robot-that-is-not-installed'"
+        )
         self.assertEqual(html, self.folder / "elsewhere" / "index.html")
         self.assertIn("There are no clips", html.read_text())
 
@@ -409,7 +502,9 @@ class CommandTest(Reported):
         with claim_folder(self.folder / "report"):
             code, printed = self.run_command(str(self.folder))
         self.assertEqual((code, list((self.folder / "report").iterdir())), (1, []))
-        self.assertRegex(printed, "^xreset report: another command is writing .*report. Wait for its end, or")
+        self.assertRegex(
+            printed, "^xreset report: another command is writing .*report. Wait for its end, or"
+        )
 
 
 if __name__ == "__main__":

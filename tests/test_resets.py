@@ -32,7 +32,9 @@ UPRIGHT = np.array([1.0, 0, 0, 0])
 class FilterTest(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
-        in_this_process = mock.patch("xreset.resets.probe.make_backend", partial(make_backend, workers=0))
+        in_this_process = mock.patch(
+            "xreset.resets.probe.make_backend", partial(make_backend, workers=0)
+        )
         cls.enterClassContext(in_this_process)
         cls.robot = robots.load("openarm")
         cls.objects = load_objects([SOUP, SPAM])
@@ -41,7 +43,10 @@ class FilterTest(unittest.TestCase):
     def try_one(self, pos, backend_class=MujocoBackend):
         """The reason (None: accepted) of one state with the soup can at ``pos``."""
         scene = SceneSpec(robot=self.robot, objects=self.objects[:1])
-        rows = [torch.as_tensor(np.asarray(v)[None], dtype=torch.float32) for v in (self.robot.home, pos, UPRIGHT)]
+        rows = [
+            torch.as_tensor(np.asarray(v)[None], dtype=torch.float32)
+            for v in (self.robot.home, pos, UPRIGHT)
+        ]
         with backend_class(scene, 1, workers=0) as backend:
             start = State.at_rest(*rows)
             settle(backend, start, gravity=0.0, steps=FilterConfig().steps)
@@ -63,17 +68,31 @@ class FilterTest(unittest.TestCase):
 
             class Broken(MujocoBackend):
                 def health(self, field=field) -> Health:
-                    return replace(super().health(), **{field: torch.ones(self.num_worlds, dtype=torch.bool)})
+                    return replace(
+                        super().health(), **{field: torch.ones(self.num_worlds, dtype=torch.bool)}
+                    )
 
             self.assertEqual(self.try_one([0.5, 0.3, self.height], backend_class=Broken), reason)
 
     def retargeted(self, **changes) -> Retargeted:
         """Two demonstrations of three frames: soup (at rest, inside the table, at rest) and spam (not valid, at rest, at rest)."""
         spam_height = float(rest_height(self.objects[1], UPRIGHT))
-        heights = [self.height, self.height - 0.02, self.height, spam_height, spam_height, spam_height]
+        heights = [
+            self.height,
+            self.height - 0.02,
+            self.height,
+            spam_height,
+            spam_height,
+            spam_height,
+        ]
         pos = np.array([[0.45 + 0.02 * i, 0.3, z] for i, z in enumerate(heights)])
         reason = np.array([0, 0, 0, 1, 0, 0])
-        values = {"object_pos": pos, "valid": reason == 0, "reason": reason, "first_contact": np.array([2, -1])}
+        values = {
+            "object_pos": pos,
+            "valid": reason == 0,
+            "reason": reason,
+            "first_contact": np.array([2, -1]),
+        }
         return toy_retargeted(self.robot, [SOUP, SPAM], [0, 3, 6], **(values | changes))
 
     def bank(self, engine="mujoco", **options):
@@ -88,7 +107,9 @@ class FilterTest(unittest.TestCase):
         self.assertEqual(bank.post_contact.tolist(), [False, True, False, False])
         self.assertEqual(bank.object_name.tolist(), [SOUP, SOUP, SPAM, SPAM])
         self.assertEqual([REASONS[r] for r in bank.rejected_reason], ["object linear velocity"])
-        self.assertEqual((bank.rejected_sequence_index.tolist(), bank.rejected_frame_index.tolist()), ([0], [1]))
+        self.assertEqual(
+            (bank.rejected_sequence_index.tolist(), bank.rejected_frame_index.tolist()), ([0], [1])
+        )
         np.testing.assert_allclose(
             bank.start_pos[1], self.retargeted().object_pos[3], atol=1e-6
         )  # frame 0 counts although it is not valid
@@ -120,7 +141,9 @@ class FilterTest(unittest.TestCase):
             def state(self):
                 state = super().state()
                 return replace(
-                    state, joint_vel=state.joint_vel + 9.0 * ((state.object_pos[:, :1] - 0.53).abs() < 0.005)
+                    state,
+                    joint_vel=state.joint_vel
+                    + 9.0 * ((state.object_pos[:, :1] - 0.53).abs() < 0.005),
                 )
 
         def made(name, *args, **options):
@@ -132,8 +155,13 @@ class FilterTest(unittest.TestCase):
         ):
             bank = self.bank(["mujoco", "moves"], num_envs=2)
         self.assertEqual(bank.backends, ("mujoco", "moves"))
-        self.assertEqual(list(zip(bank.sequence_index.tolist(), bank.frame_index.tolist())), [(0, 0), (0, 2), (1, 2)])
-        rejected = list(zip(bank.rejected_frame_index.tolist(), (REASONS[r] for r in bank.rejected_reason)))
+        self.assertEqual(
+            list(zip(bank.sequence_index.tolist(), bank.frame_index.tolist())),
+            [(0, 0), (0, 2), (1, 2)],
+        )
+        rejected = list(
+            zip(bank.rejected_frame_index.tolist(), (REASONS[r] for r in bank.rejected_reason))
+        )
         self.assertEqual(rejected, [(1, "object linear velocity"), (1, "joint velocity")])
 
     def test_loose_limits_accept_all_and_nothing_valid_is_an_error(self):

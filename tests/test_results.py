@@ -31,7 +31,8 @@ class ResultsTest(unittest.TestCase):
         )
         first = table.iloc[0].to_dict()
         self.assertEqual(
-            (first["policy"], first["robot"], first["seed"], first["sequence_name"]), ("zero", "toy", 3, "demo_0")
+            (first["policy"], first["robot"], first["seed"], first["sequence_name"]),
+            ("zero", "toy", 3, "demo_0"),
         )
         for expected in ("mujoco", "sapien", "49.8%", "4 episodes of 2 demonstrations, seed 3"):
             self.assertIn(expected, str(evaluation))
@@ -43,7 +44,10 @@ class ResultsTest(unittest.TestCase):
         self.assertRegex(str(today), r"published success *│ *25.0% │ *25.0%")
         for file, fields in (
             ("mujoco.json", ("published_success_rate", "published_success_ci95", "least_distance")),
-            ("mujoco.episodes.json", ("published_success", "least_distance", "final_distance", "final_angle")),
+            (
+                "mujoco.episodes.json",
+                ("published_success", "least_distance", "final_distance", "final_angle"),
+            ),
         ):
             content = json.loads((self.folder / file).read_text())
             rows = content["episodes"] if "episodes" in file else content["per_demo"]
@@ -55,7 +59,9 @@ class ResultsTest(unittest.TestCase):
         self.assertRegex(str(evaluation), r"published success *│ *missing │ *25.0%")
         self.assertRegex(str(evaluation), r"task progress *│ *49.8% │ *49.8%")
         table = evaluation.to_frame()
-        self.assertEqual(table.groupby("engine")["least_distance"].count().to_dict(), {"mujoco": 0, "sapien": 4})
+        self.assertEqual(
+            table.groupby("engine")["least_distance"].count().to_dict(), {"mujoco": 0, "sapien": 4}
+        )
         for engine, expected in (("mujoco", np.nan), ("sapien", 0.0775)):
             found, (low, _) = estimate(table[table["engine"] == engine], "least_distance")
             np.testing.assert_allclose(found, expected)
@@ -64,11 +70,21 @@ class ResultsTest(unittest.TestCase):
     def test_impossible_values_are_refused(self):
         episode = json.loads((self.folder / "mujoco.episodes.json").read_text())["episodes"][0]
         passing = {"share": 0.1, "iteration": 3, "env_steps": 30, "minutes": 0.5}
-        lift = {"schema": "xreset-lift/1", "passed": [passing], "iteration": 9, "env_steps": 90, "minutes": 1.5}
+        lift = {
+            "schema": "xreset-lift/1",
+            "passed": [passing],
+            "iteration": 9,
+            "env_steps": 90,
+            "minutes": 1.5,
+        }
         for change in ({"task_progress": 1e308}, {"reorientation_progress": -7}, {"sequence": -1}):
             content = {"schema": "xreset-episodes/1", "episodes": [episode | change] * 4}
             self.refuse("mujoco.episodes.json", content, read_evaluation)
-        for change in ({"minutes": 1e300}, {"iteration": -5}, {"passed": [passing | {"share": 1e308}]}):
+        for change in (
+            {"minutes": 1e300},
+            {"iteration": -5},
+            {"passed": [passing | {"share": 1e308}]},
+        ):
             self.refuse("lift.json", lift | change, read_lift)
 
     def refuse(self, name: str, content: dict, read):

@@ -51,7 +51,9 @@ class ChainTest(unittest.TestCase):
         diagonal = A @ A.mT + 6.0 * torch.eye(n, dtype=FLOAT)
         coupling = torch.randn(S, T - 1, n, dtype=FLOAT, generator=generator)
         rhs = torch.randn(S, T, n, dtype=FLOAT, generator=generator)
-        dense = torch.diag_embed(coupling.flatten(1), offset=n) + torch.diag_embed(coupling.flatten(1), offset=-n)
+        dense = torch.diag_embed(coupling.flatten(1), offset=n) + torch.diag_embed(
+            coupling.flatten(1), offset=-n
+        )
         for t in range(T):
             block = slice(t * n, (t + 1) * n)
             dense[:, block, block] = diagonal[:, t]
@@ -62,7 +64,9 @@ class ChainTest(unittest.TestCase):
 class TermTest(unittest.TestCase):
     def test_contact_costs_nothing_within_the_margin_and_is_linear_beyond_the_knee(self):
         x = torch.tensor([[[0.05, 0.0, 0.0], [0.11, 0.0, 0.0], [0.5, 0.0, 0.0]]], dtype=FLOAT)
-        found = terms.contact(x, torch.zeros_like(x), torch.tensor([[1.0, 3.0, 5.0]], dtype=FLOAT), 0.1, 0.02)
+        found = terms.contact(
+            x, torch.zeros_like(x), torch.tensor([[1.0, 3.0, 5.0]], dtype=FLOAT), 0.1, 0.02
+        )
         self.assertAlmostEqual(found.cost.item(), 3 * 0.01**2 / 0.04 + 5 * (0.4 - 0.01))
 
     def test_jumps_cost_beyond_their_limit(self):
@@ -100,33 +104,52 @@ class HandTest(unittest.TestCase):
         objects = Objects.at(pos, quat, targets.object_index.repeat_interleave(12), targets.fields)
         annotated = targets.annotated.flatten()
         bodies = self.model.bodies(*flat)
-        return too_near(self.model, bodies, objects, annotated, config.object_clearance, config.self_depth)
+        return too_near(
+            self.model, bodies, objects, annotated, config.object_clearance, config.self_depth
+        )
 
     def test_gradient_is_the_derivative_of_the_cost(self):
         """All terms at once: bones, alignment, contact (beyond and below the knee), object, smoothness, jumps."""
         turn = quat_from_axis_angle(torch.tensor([0.3, -0.2, 0.5], dtype=FLOAT))
         targets = self.targets(
-            contact_points=self.keypoints + torch.tensor([0.011, 0.0, 0.0], dtype=FLOAT) * torch.arange(6)[:, None],
+            contact_points=self.keypoints
+            + torch.tensor([0.011, 0.0, 0.0], dtype=FLOAT) * torch.arange(6)[:, None],
             in_contact=self.touching,
             object_pos=self.keypoints[:, :, 3] + 0.01,
             object_quat=turn.expand(*self.keypoints.shape[:2], 4),
         )
         config = HandConfig(jump_limit=0.02)
         joints = self.model.kinematics.clamp(self.motion.joints + 0.05)
-        state = dataclasses.replace(self.motion, joints=joints, root_pos=self.motion.root_pos + 0.004)
+        state = dataclasses.replace(
+            self.motion, joints=joints, root_pos=self.motion.root_pos + 0.004
+        )
         cost = system(self.model, targets, config, state).cost
         self.assertGreater(len(self.too_near(targets, state, config).value), 10)
         self.assertGreater(joints.diff(dim=1).abs().max().item(), config.jump_limit)
-        for weight in ("jump_weight", "clearance_weight", "contact_weight", "global_weight", "local_weight"):
-            without = system(self.model, targets, dataclasses.replace(config, **{weight: 0.0}), state).cost
+        for weight in (
+            "jump_weight",
+            "clearance_weight",
+            "contact_weight",
+            "global_weight",
+            "local_weight",
+        ):
+            without = system(
+                self.model, targets, dataclasses.replace(config, **{weight: 0.0}), state
+            ).cost
             self.assertGreater((cost - without).max().item(), 1e-6, weight)
         check_gradient(self.model, targets, config, state, frames=(0, 5, 11))
 
     def test_recovers_a_motion_from_its_own_keypoints(self):
-        config = HandConfig(smoothness_weight=1e-6, clearance_weight=0.0, iterations=60, tolerance=1e-9)
+        config = HandConfig(
+            smoothness_weight=1e-6, clearance_weight=0.0, iterations=60, tolerance=1e-9
+        )
         found = self.solve(config)
-        self.assertLess((self.model.keypoints(**vars(found)) - self.keypoints).norm(dim=-1).max().item(), 1e-4)
-        seen = [name != "jaw_a" for name in self.model.kinematics.joint_names]  # no keypoint follows the jaws
+        self.assertLess(
+            (self.model.keypoints(**vars(found)) - self.keypoints).norm(dim=-1).max().item(), 1e-4
+        )
+        seen = [
+            name != "jaw_a" for name in self.model.kinematics.joint_names
+        ]  # no keypoint follows the jaws
         self.assertLess((found.joints - self.motion.joints)[..., seen].abs().max().item(), 5e-3)
         self.assertLess(quat_angle(found.root_quat, self.motion.root_quat).max().item(), 5e-3)
 
@@ -134,12 +157,18 @@ class HandTest(unittest.TestCase):
         targets = self.targets(object_pos=self.keypoints[:, :, self.tip] + 0.01)
         together = retarget_hand(self.model, targets).joints
         for order in ([2, 0, 1], [1]):
-            assert_close(retarget_hand(self.model, targets[order]).joints, together[order], atol=1e-9, rtol=0)
+            assert_close(
+                retarget_hand(self.model, targets[order]).joints, together[order], atol=1e-9, rtol=0
+            )
 
     def test_joints_do_not_jump(self):
         """Keypoints that jump to another posture in one frame: the wall spreads the change over several."""
-        swapped = torch.cat((self.keypoints[:, :6], self.keypoints[:, -1:].expand(-1, 6, -1, -1)), dim=1)
-        free, walled = (self.solve(HandConfig(jump_weight=w), keypoints=swapped).joints for w in (0.0, 1000.0))
+        swapped = torch.cat(
+            (self.keypoints[:, :6], self.keypoints[:, -1:].expand(-1, 6, -1, -1)), dim=1
+        )
+        free, walled = (
+            self.solve(HandConfig(jump_weight=w), keypoints=swapped).joints for w in (0.0, 1000.0)
+        )
         self.assertGreater(free.diff(dim=1).abs().max().item(), 0.25)
         self.assertLess(walled.diff(dim=1).abs().max().item(), 0.2)
 
@@ -150,7 +179,9 @@ class HandTest(unittest.TestCase):
         garbage = self.keypoints.clone()
         garbage[~annotated] = 1e3
         joints = self.solve(annotated=annotated).joints
-        assert_close(self.solve(annotated=annotated, keypoints=garbage).joints, joints, atol=0, rtol=0)
+        assert_close(
+            self.solve(annotated=annotated, keypoints=garbage).joints, joints, atol=0, rtol=0
+        )
         assert_close(joints[:, 5], (joints[:, 3] + joints[:, 7]) / 2, atol=1e-3, rtol=0)
         assert_close(joints[:, 11], joints[:, 9], atol=1e-3, rtol=0)
 
@@ -160,7 +191,10 @@ class HandTest(unittest.TestCase):
         mask = torch.zeros_like(self.touching)
         mask[:, :, self.tip] = True
         pulled = self.solve(HandConfig(contact_weight=50.0), contact_points=aim, in_contact=mask)
-        self.assertLess((self.model.keypoints(**vars(pulled)) - aim)[:, :, self.tip].norm(dim=-1).mean().item(), 0.025)
+        self.assertLess(
+            (self.model.keypoints(**vars(pulled)) - aim)[:, :, self.tip].norm(dim=-1).mean().item(),
+            0.025,
+        )
 
     def test_the_hand_stays_out_of_the_object(self):
         inside = self.targets(object_pos=self.keypoints[:, :, self.tip])
@@ -173,7 +207,9 @@ class HandTest(unittest.TestCase):
         self.assertLess(depth[1], 0.005)
 
     def test_pairs_for_any_subset_of_keypoints(self):
-        jaws = keypoint_pairs(("wrist", "thumb4", "index4", "middle4"), ("hand", "left", "right", "right"))
+        jaws = keypoint_pairs(
+            ("wrist", "thumb4", "index4", "middle4"), ("hand", "left", "right", "right")
+        )
         self.assertEqual(set(jaws), {(0, 1), (0, 2), (0, 3), (1, 2), (1, 3)})
 
     def test_a_description_that_does_not_allow_retargeting_is_refused(self):
@@ -197,10 +233,14 @@ class ArmTest(unittest.TestCase):
         """[1, T, J] all joints along a path from home."""
         joints = torch.as_tensor(self.robot.home).repeat(1, frames, 1)
         direction = torch.tensor([1.0, 0.3, -0.5, 0.4, 0.3, 1.0], dtype=FLOAT)
-        joints[..., self.model.arm] += torch.linspace(0, 0.4, frames, dtype=FLOAT)[:, None] * direction
+        joints[..., self.model.arm] += (
+            torch.linspace(0, 0.4, frames, dtype=FLOAT)[:, None] * direction
+        )
         return joints
 
-    def targets(self, frames: int, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> ArmTargets:
+    def targets(
+        self, frames: int, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ) -> ArmTargets:
         """Targets from the hand's pose along the path, moved by a shift [m]."""
         targets = arm_targets(self.model, self.path(frames))
         clearance = self.model.hand_clearance(targets.hand_joints)
@@ -209,7 +249,9 @@ class ArmTest(unittest.TestCase):
 
     def track(self, targets: ArmTargets, **changes) -> tuple[torch.Tensor, Measures, list[str]]:
         """Joints, measures, and the reason of every frame of the first sequence."""
-        joints, measures = track(self.model, targets, Thresholds(), dataclasses.replace(self.CONFIG, **changes))
+        joints, measures = track(
+            self.model, targets, Thresholds(), dataclasses.replace(self.CONFIG, **changes)
+        )
         return joints, measures, [REASONS[i] for i in classify(measures, Thresholds())[0]]
 
     def test_follows_a_path_that_the_arm_can_follow(self):
@@ -221,7 +263,9 @@ class ArmTest(unittest.TestCase):
 
     def test_stays_above_the_table(self):
         support = table_points(self.robot, self.model.kinematics)
-        points = self.model.kinematics.points(self.path(4), support.links, torch.as_tensor(support.points))
+        points = self.model.kinematics.points(
+            self.path(4), support.links, torch.as_tensor(support.points)
+        )
         heights = height_above_table(points, torch.as_tensor(support.radii), self.model.table)
         sunk = self.targets(4, shift=(0.0, 0.0, -heights.min().item() - 0.05))
         _, free, free_reasons = self.track(sunk, collision_weight=0.0)
@@ -234,11 +278,19 @@ class ArmTest(unittest.TestCase):
 
 class ValidityTest(unittest.TestCase):
     def test_every_reason_can_be_reached_and_the_first_counts(self):
-        good = {"annotated": True, "at_limit": False, "arm_jump": 0.1, "table_clearance": 0.01, "self_clearance": 0.01}
+        good = {
+            "annotated": True,
+            "at_limit": False,
+            "arm_jump": 0.1,
+            "table_clearance": 0.01,
+            "self_clearance": 0.01,
+        }
         good |= dict.fromkeys(("hand_error", "wrist_position", "wrist_orientation"), 0.001)
 
         def reason(**changes) -> str:
-            measures = Measures(**{name: torch.tensor([value]) for name, value in (good | changes).items()})
+            measures = Measures(
+                **{name: torch.tensor([value]) for name, value in (good | changes).items()}
+            )
             return REASONS[int(classify(measures, Thresholds()))]
 
         self.assertEqual(reason(), "valid")
@@ -320,7 +372,9 @@ class PipelineTest(unittest.TestCase):
         self.assertEqual(self.write("b.npz", again).read_bytes(), file.read_bytes())
         back = read_retargeted(file)
         for field in dataclasses.fields(Retargeted):
-            np.testing.assert_array_equal(getattr(back, field.name), getattr(self.result, field.name), field.name)
+            np.testing.assert_array_equal(
+                getattr(back, field.name), getattr(self.result, field.name), field.name
+            )
 
     def test_a_file_that_contradicts_itself_is_refused(self):
         for changes, message in (
@@ -353,8 +407,12 @@ class PipelineTest(unittest.TestCase):
 
 class RealDataTest(unittest.TestCase):
     def test_fingertips_follow_a_real_hand(self):
-        demos = read_demos(data_dir() / "dexycb_right_9x20.npz").select(objects=["soup"], max_per_object=1)
-        result = retarget_demos(demos, robots.load("ur7e-sharpa"), list(demo_objects(demos).values()))
+        demos = read_demos(data_dir() / "dexycb_right_9x20.npz").select(
+            objects=["soup"], max_per_object=1
+        )
+        result = retarget_demos(
+            demos, robots.load("ur7e-sharpa"), list(demo_objects(demos).values())
+        )
         self.assertLess(result.hand_error[result.annotated].mean(), 0.010)
         self.assertGreater(result.valid.sum() / result.annotated.sum(), 0.9)
 

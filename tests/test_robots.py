@@ -22,7 +22,14 @@ from xreset.robot_tools.check import check
 from xreset.robots import build
 from xreset.task.config import TaskConfig
 
-BUILT_IN = ("ur7e-sharpa", "openarm", "panda-allegro", "xarm7-leap", "iiwa14-sharpa", "ur7e-robotiq")
+BUILT_IN = (
+    "ur7e-sharpa",
+    "openarm",
+    "panda-allegro",
+    "xarm7-leap",
+    "iiwa14-sharpa",
+    "ur7e-robotiq",
+)
 
 
 class Copied(InFolder):
@@ -43,21 +50,31 @@ class BuiltIn(unittest.TestCase):
     def test_committed_urdf_is_what_build_writes(self):
         for name in BUILT_IN:
             with self.subTest(name):
-                self.assertEqual(load(name).urdf.read_text(), build.robot_urdf(name.replace("-", "_")))
+                self.assertEqual(
+                    load(name).urdf.read_text(), build.robot_urdf(name.replace("-", "_"))
+                )
 
     def test_efforts_in_the_description_are_those_of_the_urdf(self):
         for name in BUILT_IN:
-            efforts = {joint.name: joint.effort for joint in robot_tree(load(name)).joints if joint.effort}
-            self.assertEqual({joint.name: joint.drive.effort for joint in load(name).joints}, efforts)
+            efforts = {
+                joint.name: joint.effort for joint in robot_tree(load(name)).joints if joint.effort
+            }
+            self.assertEqual(
+                {joint.name: joint.drive.effort for joint in load(name).joints}, efforts
+            )
 
     def test_check_finds_nothing(self):
         for name in BUILT_IN:
             findings = check(name)
-            self.assertEqual([finding for finding in findings if finding.level in ("warning", "error")], [], name)
+            self.assertEqual(
+                [finding for finding in findings if finding.level in ("warning", "error")], [], name
+            )
 
     def test_sharpa_is_a_right_hand_held_palm_down(self):
         robot = load("ur7e-sharpa")
-        palm, *tips = Kinematics(robot).link_poses(torch.tensor(robot.home), robot.tracked_links).numpy()
+        palm, *tips = (
+            Kinematics(robot).link_poses(torch.tensor(robot.home), robot.tracked_links).numpy()
+        )
         thumb = tips[0][:3, 3]
         fingers = np.array([tip[:3, 3] for tip in tips[1:]])
         self.assertLess(palm[2, 2], -0.8)  # the palm looks down
@@ -80,7 +97,9 @@ class BuiltIn(unittest.TestCase):
             q[-1] = position
             thumb, index = Kinematics(robot).link_poses(q, ["thumb_tip", "index_tip"]).numpy()
             apart = index[:3, 3] - thumb[:3, 3]
-            np.testing.assert_allclose(apart @ thumb[:3, 2], gap, atol=1e-4)  # z looks out of the pad, at the other jaw
+            np.testing.assert_allclose(
+                apart @ thumb[:3, 2], gap, atol=1e-4
+            )  # z looks out of the pad, at the other jaw
             np.testing.assert_allclose(np.linalg.norm(apart), gap, atol=1e-4)
             np.testing.assert_allclose(thumb[:3, 2], -index[:3, 2], atol=1e-6)
 
@@ -88,7 +107,9 @@ class BuiltIn(unittest.TestCase):
         for name in BUILT_IN:
             robot = load(name)
             ratio = damping_ratio(robot, robot.home)
-            np.testing.assert_allclose(ratio[robot.hand_indices], 0.9, atol=0.01, err_msg=name)  # 1.8 sqrt(kp I)
+            np.testing.assert_allclose(
+                ratio[robot.hand_indices], 0.9, atol=0.01, err_msg=name
+            )  # 1.8 sqrt(kp I)
             self.assertGreater(ratio[robot.arm_indices].min(), 0.95, name)
 
     def test_home_is_well_inside_the_limits(self):
@@ -96,7 +117,9 @@ class BuiltIn(unittest.TestCase):
             robot = load(name)
             kinematics = Kinematics(robot)
             spread = np.array([robot.home_std[joint.group == "hand"] for joint in robot.joints])
-            margin = np.minimum(robot.home - kinematics.lower.numpy(), kinematics.upper.numpy() - robot.home)
+            margin = np.minimum(
+                robot.home - kinematics.lower.numpy(), kinematics.upper.numpy() - robot.home
+            )
             self.assertGreater((margin / spread).min(), 1.2, name)
 
 
@@ -207,7 +230,12 @@ class Registry(Copied):
         self.edit("robot.toml", "quat = [0.38268343,", "quat = [0.5,")
         with self.assertRaises(RobotError) as caught:
             load(self.folder)
-        for part in ("index occur more than once", "finger_joint9", "must be 'thumb'", "expected 1"):
+        for part in (
+            "index occur more than once",
+            "finger_joint9",
+            "must be 'thumb'",
+            "expected 1",
+        ):
             self.assertIn(part, str(caught.exception))
 
     def test_not_toml_wrong_schema_no_file(self):
@@ -239,16 +267,31 @@ class Registry(Copied):
             self.assertIn(part, found)
 
     def test_check_finds_a_missing_mesh(self):
-        self.edit("robot.urdf", '<box size="0.05 0.14 0.04" />', '<mesh filename="package://a/body.stl" />')
-        self.assertRegex(self.errors(), r"URDF: .*'package://a/body\.stl', which is not in its folders")
+        self.edit(
+            "robot.urdf",
+            '<box size="0.05 0.14 0.04" />',
+            '<mesh filename="package://a/body.stl" />',
+        )
+        self.assertRegex(
+            self.errors(), r"URDF: .*'package://a/body\.stl', which is not in its folders"
+        )
 
     def test_a_mesh_name_does_not_lead_out_of_the_robots_folders(self):
         deep = self.folder / "a" / "b" / "c" / "d"
         (deep / "meshes").mkdir(parents=True)
         places = (
-            (deep / "x.stl", ("x.stl", "meshes/../x.stl", str(deep / "x.stl"), "package://d/x.stl")),
-            (self.folder / "a" / "y.stl", ("../../../y.stl", "package://any/y.stl", f"file://{self.folder}/a/y.stl")),
-            (self.folder / "z.stl", ("../../../../z.stl", str(self.folder / "z.stl"), "package://../../../../z.stl")),
+            (
+                deep / "x.stl",
+                ("x.stl", "meshes/../x.stl", str(deep / "x.stl"), "package://d/x.stl"),
+            ),
+            (
+                self.folder / "a" / "y.stl",
+                ("../../../y.stl", "package://any/y.stl", f"file://{self.folder}/a/y.stl"),
+            ),
+            (
+                self.folder / "z.stl",
+                ("../../../../z.stl", str(self.folder / "z.stl"), "package://../../../../z.stl"),
+            ),
         )
         for i, (file, names) in enumerate(places):
             file.write_bytes(b"")
@@ -264,7 +307,8 @@ class Registry(Copied):
         self.assertRegex(self.errors(), r"lowest at -[\s\S]*link5 and link7 overlap at home")
         warnings = self.errors("warning")
         self.assertRegex(
-            warnings, r"'joint1' has the damping ratio 0\.\d+ at home. It swings[\s\S]*finger_joint1': kd = 500"
+            warnings,
+            r"'joint1' has the damping ratio 0\.\d+ at home. It swings[\s\S]*finger_joint1': kd = 500",
         )
 
     def test_command_fails_on_errors_only(self):

@@ -24,13 +24,17 @@ class AgainstScipy(unittest.TestCase):
         for dtype, atol in ((torch.float64, 1e-15), (torch.float32, 2.4e-7)):
             with self.subTest(function.__name__, dtype=dtype):
                 found = function(*(torch.as_tensor(x, dtype=dtype) for x in arguments))
-                torch.testing.assert_close(found.double(), torch.as_tensor(expected), rtol=4 * atol, atol=4 * atol)
+                torch.testing.assert_close(
+                    found.double(), torch.as_tensor(expected), rtol=4 * atol, atol=4 * atol
+                )
 
     def test_single_functions(self):
         a, b = (r.as_quat(scalar_first=True) for r in (self.a, self.b))
         product = (self.a * self.b).as_quat(scalar_first=True)
         product *= np.sign(
-            (product * quat_multiply(*map(torch.as_tensor, (a, b))).numpy()).sum(axis=1, keepdims=True)
+            (product * quat_multiply(*map(torch.as_tensor, (a, b))).numpy()).sum(
+                axis=1, keepdims=True
+            )
         )  # q is -q
         self.assert_near(quat_multiply, product, a, b)
         self.assert_near(quat_to_matrix, self.a.as_matrix(), a)

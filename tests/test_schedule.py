@@ -33,7 +33,9 @@ class ScheduleTest(unittest.TestCase):
                 fewer = len(plan.rounds) - 1
                 if fewer:
                     needed = sum(-(-count // fewer) for count in np.bincount(items))
-                    self.assertGreater(needed, len(plan.object_index), "one round fewer would have been possible")
+                    self.assertGreater(
+                        needed, len(plan.object_index), "one round fewer would have been possible"
+                    )
 
     def test_a_world_without_work_repeats_an_item_of_its_object(self):
         plan = schedule(np.array([0, 0, 0]), 2)

@@ -69,7 +69,9 @@ class SelectTest(unittest.TestCase):
             choice.sentence(),
             "200.pt, 75.0 % in its worst engine (b), of 4 checkpoints in 3 engines; the newest, 300.pt, has 60.0 %.",
         )
-        order = {name: "".join(e for other, e, _ in self.played if other == name) for name in SCORES}
+        order = {
+            name: "".join(e for other, e, _ in self.played if other == name) for name in SCORES
+        }
         # where the best is worst comes first; one that cannot win is given up
         self.assertEqual(order, {"300.pt": "abc", "200.pt": "bca", "100.pt": "bc", "050.pt": "b"})
         with mock.patch.dict(SCORES, {"100.pt": SCORES["200.pt"]}):
@@ -125,7 +127,10 @@ class SelectTest(unittest.TestCase):
             file.write_text(json.dumps(content | changes))
             with self.assertRaisesRegex(FileFormatError, problem):
                 read_choice(self.folder)
-        self.assertIn("--most is 0, expected", xreset("select", self.folder, "--demos", self.demos, "--most", "0")[2])
+        self.assertIn(
+            "--most is 0, expected",
+            xreset("select", self.folder, "--demos", self.demos, "--most", "0")[2],
+        )
 
 
 if __name__ == "__main__":

@@ -27,7 +27,9 @@ def tilted(degrees: float) -> np.ndarray:
 class SettleTest(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
-        in_this_process = mock.patch("xreset.resets.probe.make_backend", partial(make_backend, workers=0))
+        in_this_process = mock.patch(
+            "xreset.resets.probe.make_backend", partial(make_backend, workers=0)
+        )
         cls.enterClassContext(in_this_process)
         cls.robot = load_robot("ur7e-sharpa")
         cls.objects = [load_object(name) for name in (SOUP, SPAM)]
@@ -60,7 +62,9 @@ class SettleTest(unittest.TestCase):
         self.assertEqual(settled.inputs["starts"], "settled")
         lean = []
         for trial in (recorded, settled):
-            axis = Rotation.from_quat(trial.bank.start_quat_wxyz[0], scalar_first=True).apply([0, 0, 1])
+            axis = Rotation.from_quat(trial.bank.start_quat_wxyz[0], scalar_first=True).apply(
+                [0, 0, 1]
+            )
             lean.append(np.degrees(np.arccos(axis[2])))
         self.assertAlmostEqual(lean[0], 6, delta=0.1)
         self.assertLess(lean[1], 1)

@@ -15,7 +15,11 @@ from xreset.backends.mujoco_warp import MujocoWarpBackend
 def published(backend: MujocoWarpBackend) -> dict[str, Tensor]:
     """Every tensor of the getters that a control step writes, by name."""
     tensors = {"nonfinite": backend.health().nonfinite}
-    for prefix, bundle in (("", backend.state()), ("link_", backend.links()), ("", backend.contacts())):
+    for prefix, bundle in (
+        ("", backend.state()),
+        ("link_", backend.links()),
+        ("", backend.contacts()),
+    ):
         tensors |= {prefix + field.name: getattr(bundle, field.name) for field in fields(bundle)}
     return tensors
 
@@ -23,7 +27,10 @@ def published(backend: MujocoWarpBackend) -> dict[str, Tensor]:
 class SharedMemory(unittest.TestCase):
     def each(self):
         for device in MujocoWarpBackend.devices():
-            with self.subTest(device=device), MujocoWarpBackend(scene(), 3, device=device) as backend:
+            with (
+                self.subTest(device=device),
+                MujocoWarpBackend(scene(), 3, device=device) as backend,
+            ):
                 yield backend
 
     def test_a_step_shows_in_tensors_that_were_read_before(self):
@@ -36,7 +43,9 @@ class SharedMemory(unittest.TestCase):
                 self.assertEqual(tensor.data_ptr(), before[name].data_ptr(), name)
                 self.assertEqual(tensor.device, backend.device, name)
             written = {name for name in before if not torch.equal(before[name], start[name])}
-            self.assertLessEqual({"joint_pos", "joint_vel", "joint_target", "object_pos", "table_force"}, written)
+            self.assertLessEqual(
+                {"joint_pos", "joint_vel", "joint_target", "object_pos", "table_force"}, written
+            )
             self.assertLessEqual({"link_pos", "link_linvel"}, written)
 
     @unittest.skipUnless(torch.cuda.is_available(), "no CUDA device")

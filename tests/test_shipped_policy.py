@@ -42,7 +42,9 @@ class ShippedPolicyTest(unittest.TestCase):
         command = [sys.executable, "-c", ACT, ABSENT, *map(str, files)]
         out = subprocess.run(command, check=True, capture_output=True, text=True).stdout
         for line, file in zip(out.splitlines(), files, strict=True):
-            self.assertEqual(json.loads(line), [[3, len(OnnxPolicy(file).contract["joint_names"])], True])
+            self.assertEqual(
+                json.loads(line), [[3, len(OnnxPolicy(file).contract["joint_names"])], True]
+            )
 
     def test_it_fits_this_version_and_has_a_card(self):
         for name, file in shipped().items():

@@ -37,7 +37,10 @@ class StableBaselinesTest(WithEnv):
                 if ends:
                     self.assertEqual((info["TimeLimit.truncated"], info["faulty"]), (True, False))
                     last = info["terminal_observation"]["policy"]
-                    self.assertFalse(np.array_equal(last, observations["policy"][world]), "it is the old episode's")
+                    self.assertFalse(
+                        np.array_equal(last, observations["policy"][world]),
+                        "it is the old episode's",
+                    )
         self.assertEqual(env.env.episode_length_buf.tolist(), [0] * N)
         for seed, is_same in ((3, True), (4, False)):
             env.seed(seed)
@@ -60,7 +63,9 @@ class StableBaselinesTest(WithEnv):
 
     def test_a_learner_takes_steps(self):
         env = self.wrapped(0.2)
-        learner = PPO("MultiInputPolicy", env, n_steps=8, batch_size=8, n_epochs=1, device="cpu", seed=0)
+        learner = PPO(
+            "MultiInputPolicy", env, n_steps=8, batch_size=8, n_epochs=1, device="cpu", seed=0
+        )
         learner.learn(16 * N)
         actions, _ = learner.predict(env.reset())
         self.assertEqual(actions.shape, (N, env.env.num_actions))

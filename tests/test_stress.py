@@ -23,7 +23,11 @@ from xreset.task.config import RandomizationConfig, TaskConfig, evaluation_task
 class StressedTest(unittest.TestCase):
     def test_nothing_is_random_and_one_thing_differs(self):
         task = evaluation_task(
-            TaskConfig(randomization=RandomizationConfig(arm_stiffness=(0.5, 2.0), friction=(0.4, 0.8), metal=0.2))
+            TaskConfig(
+                randomization=RandomizationConfig(
+                    arm_stiffness=(0.5, 2.0), friction=(0.4, 0.8), metal=0.2
+                )
+            )
         )
         plain = nominal_task(task).randomization
         self.assertEqual(
@@ -35,9 +39,14 @@ class StressedTest(unittest.TestCase):
             value = prop.values[0]
             found = prop.set_in(nominal_task(task), value)
             set_to = 3.0 if prop.unit == "ms" else value  # 50 ms are three control steps
-            np.testing.assert_allclose(getattr(found.randomization, prop.changed_field), (set_to, set_to))
+            np.testing.assert_allclose(
+                getattr(found.randomization, prop.changed_field), (set_to, set_to)
+            )
             self.assertEqual(
-                replace(found.randomization, **{prop.changed_field: getattr(plain, prop.changed_field)}), plain
+                replace(
+                    found.randomization, **{prop.changed_field: getattr(plain, prop.changed_field)}
+                ),
+                plain,
             )
             self.assertEqual(found.reset, task.reset)
 
@@ -57,11 +66,14 @@ class StressedTest(unittest.TestCase):
                 chosen([text])
         (late,) = chosen(["action-latency=300"])
         with self.assertRaisesRegex(
-            XResetError, "action-latency 300 control steps cannot be tried: .* fewer than the 300 of an episode"
+            XResetError,
+            "action-latency 300 control steps cannot be tried: .* fewer than the 300 of an episode",
         ):
             late.set_in(TaskConfig(), 300.0)
         (light,) = chosen(["object-mass=0"])
-        with self.assertRaisesRegex(XResetError, "object-mass x 0 cannot be tried: mass_scale .*0.0.*above 0"):
+        with self.assertRaisesRegex(
+            XResetError, "object-mass x 0 cannot be tried: mass_scale .*0.0.*above 0"
+        ):
             light.set_in(TaskConfig(), 0.0)
 
 
@@ -79,7 +91,9 @@ class CurveTest(unittest.TestCase):
                 )
             return curve(prop, episodes(base), found)
 
-        stiffness = swept("arm-stiffness", **{"v0.5": -0.3, "v0.8": -0.05, "v1.5": -0.02, "v2.0": -0.08})
+        stiffness = swept(
+            "arm-stiffness", **{"v0.5": -0.3, "v0.8": -0.05, "v1.5": -0.02, "v2.0": -0.08}
+        )
         self.assertEqual([p.value for p in stiffness.points], [0.5, 0.8, 1.0, 1.5, 2.0])
         assert stiffness.lower is not None
         self.assertAlmostEqual(stiffness.lower, 0.8 - 0.3 * 0.05 / 0.25)
@@ -90,9 +104,14 @@ class CurveTest(unittest.TestCase):
         harmless = swept("object-mass", **{"v0.5": 0.0, "v2.0": 0.0})
         scattered = swept("force-gain", **{"v2.0": [-0.6, -0.6, 0.2, 0.2]})
         assert scattered.upper is not None
-        self.assertEqual((scattered.is_certain(scattered.upper), stiffness.is_certain(stiffness.lower)), (False, True))
+        self.assertEqual(
+            (scattered.is_certain(scattered.upper), stiffness.is_certain(stiffness.lower)),
+            (False, True),
+        )
         self.assertEqual(scattered.costs(), "x 1.5, or chance")
-        self.assertEqual((late.costs(), harmless.costs()), ("0.67 control steps", "none that was tried"))
+        self.assertEqual(
+            (late.costs(), harmless.costs()), ("0.67 control steps", "none that was tried")
+        )
 
     def test_cards_of_another_policy_are_left_out(self):
         card = Stress(
@@ -105,9 +124,18 @@ class CurveTest(unittest.TestCase):
             left_out=(),
         )
         with tempfile.TemporaryDirectory() as name:
-            for backend, inputs in (("mujoco", {"policy": "old"}), ("sapien", {"policy": "new"}), ("pybullet", {})):
-                write_json(Path(name) / f"{backend}.json", asdict(replace(card, backend=backend, inputs=inputs)))
-            self.assertEqual([c.backend for c in read_stress(Path(name), "new")], ["pybullet", "sapien"])
+            for backend, inputs in (
+                ("mujoco", {"policy": "old"}),
+                ("sapien", {"policy": "new"}),
+                ("pybullet", {}),
+            ):
+                write_json(
+                    Path(name) / f"{backend}.json",
+                    asdict(replace(card, backend=backend, inputs=inputs)),
+                )
+            self.assertEqual(
+                [c.backend for c in read_stress(Path(name), "new")], ["pybullet", "sapien"]
+            )
             self.assertEqual(len(read_stress(Path(name))), 3)
 
 
@@ -121,16 +149,23 @@ class CommandTest(unittest.TestCase):
         xreset("demos", "synth", "--objects", SOUP, "--per-object", 1, "--out", demos)
         options = ("--robot", "openarm", "--demos", demos, "--episodes", 1, "--out", folder)
         sweeps = ("--property", "arm-stiffness=0.5", "--property", "action-latency=1")
-        with mock.patch.object(MujocoBackend, "capabilities", MujocoBackend.capabilities - {"drives"}):
+        with mock.patch.object(
+            MujocoBackend, "capabilities", MujocoBackend.capabilities - {"drives"}
+        ):
             _, out, _ = xreset("stress", "zero", *options, *sweeps)
         (card,) = read_stress(folder)
         self.assertEqual((card.schema, card.policy, card.episodes), ("xreset-stress/1", "zero", 1))
         self.assertEqual(card.left_out, ("arm-stiffness",))
         (curve,) = card.curves
-        self.assertEqual((curve.property, [p.value for p in curve.points]), ("action-latency", [0.0, 1.0]))
+        self.assertEqual(
+            (curve.property, [p.value for p in curve.points]), ("action-latency", [0.0, 1.0])
+        )
         self.assertEqual(curve.points[0].task_progress, card.task_progress)
         self.assertTrue((folder / "stress.png").read_bytes().startswith(b"\x89PNG"))
-        for expected in ("left out in mujoco, which cannot set them: arm-stiffness", "cannot be set"):
+        for expected in (
+            "left out in mujoco, which cannot set them: arm-stiffness",
+            "cannot be set",
+        ):
             self.assertIn(expected, out)
 
 

@@ -52,7 +52,9 @@ class InFolder(unittest.TestCase):
         return path
 
     def plan(self, text: str, **options) -> Plan:
-        return make_plan(read_study(self.file(text)), "study", given=self.folder, out=self.out, **options)
+        return make_plan(
+            read_study(self.file(text)), "study", given=self.folder, out=self.out, **options
+        )
 
 
 class FileTest(InFolder):
@@ -61,19 +63,40 @@ class FileTest(InFolder):
         for text, message in (
             ("schema = ", "is not valid TOML"),
             ("about = 'x'", "states schema None, expected 'xreset-study/1'"),
-            (head + "[runs.a]\nminuets = 3\n", r"runs\.a does not fit Runs \(unknown: minuets \(minutes\?\)\)"),
-            (head + "[runs.a]\nseeds = [0, 0]\n", r"runs\.a\.seeds is \[0, 0\], expected one or more"),
-            (head + "[runs.a]\nseeds = [99999999999999]\n", r"runs\.a\.seeds\[0\] is 99999999999999, expected a whole"),
+            (
+                head + "[runs.a]\nminuets = 3\n",
+                r"runs\.a does not fit Runs \(unknown: minuets \(minutes\?\)\)",
+            ),
+            (
+                head + "[runs.a]\nseeds = [0, 0]\n",
+                r"runs\.a\.seeds is \[0, 0\], expected one or more",
+            ),
+            (
+                head + "[runs.a]\nseeds = [99999999999999]\n",
+                r"runs\.a\.seeds\[0\] is 99999999999999, expected a whole",
+            ),
             (head + "[runs.a]\nminutes = inf\n", r"runs\.a\.minutes is inf"),
             (head + "[runs.a]\ngpus = 4\n", r"runs\.a\.gpus is 4\. This option was removed"),
             (head + "[runs.a]\ndata = 'real'\n", r"runs\.a\.data is 'real', expected one of 'toy'"),
-            (head + "[runs.a]\nweights = 'b'\n[runs.b]\n", r"runs\.a\.weights is 'b', expected one of none"),
+            (
+                head + "[runs.a]\nweights = 'b'\n[runs.b]\n",
+                r"runs\.a\.weights is 'b', expected one of none",
+            ),
             (head + "[runs.a]\nrobot = '..'\n", r"runs\.a: robot is '\.\.', expected the name"),
             (head + "[runs.'../a']\n", "'../a' cannot be the name of a folder"),
             (head + "[runs.a]\n[evaluations.checkpoints]\n", "is a folder in every run: call it"),
-            (head + "[evaluations.eval]\nunseen = true\n[runs.a]\n", "unseen is true without objects"),
-            (head + "[[tables]]\nruns = { b = 'B' }\n", r"tables\[0\]\.runs is 'b', expected one of none"),
-            (head + "[[tables]]\npaper = 'X'\nruns = {}\n", r"tables\[0\]\.paper is 'X', expected one of 'I'"),
+            (
+                head + "[evaluations.eval]\nunseen = true\n[runs.a]\n",
+                "unseen is true without objects",
+            ),
+            (
+                head + "[[tables]]\nruns = { b = 'B' }\n",
+                r"tables\[0\]\.runs is 'b', expected one of none",
+            ),
+            (
+                head + "[[tables]]\npaper = 'X'\nruns = {}\n",
+                r"tables\[0\]\.paper is 'X', expected one of 'I'",
+            ),
             (
                 head + "[runs.a]\n[[tables]]\npaper = 'I'\nruns = { a = 'A' }\n",
                 r"runs is 'A', expected one of 'IK Oracle'",
@@ -99,15 +122,35 @@ class FileTest(InFolder):
 
     def test_options_of_the_configuration_are_passed_on(self):
         for command, options in (
-            ("retarget", ["--hand.object-clearance", "-0.001", "--arm.restarts=8", "--hand.jump_limit", "0.2"]),
+            (
+                "retarget",
+                [
+                    "--hand.object-clearance",
+                    "-0.001",
+                    "--arm.restarts=8",
+                    "--hand.jump_limit",
+                    "0.2",
+                ],
+            ),
             (
                 "resets",
-                ["--closing.spacing", "0.005", "--squeeze.force", "5", "--num-envs", "8", "--backend", "mujoco"],
+                [
+                    "--closing.spacing",
+                    "0.005",
+                    "--squeeze.force",
+                    "5",
+                    "--num-envs",
+                    "8",
+                    "--backend",
+                    "mujoco",
+                ],
             ),
         ):
             text = HEAD + DATA + f"{command} = {json.dumps(options)}\n" + RUN + "[runs.a]\n"
             with self.subTest(command):
-                self.assertEqual(list(getattr(read_study(self.file(text)).data["toy"], command)), options)
+                self.assertEqual(
+                    list(getattr(read_study(self.file(text)).data["toy"], command)), options
+                )
 
     def test_every_study_that_ships_can_be_read(self):
         files = sorted(SHIPPED.glob("*.toml"))
@@ -145,30 +188,41 @@ class PlanTest(InFolder):
         self.assertEqual(step.needs, ("data toy-tomato_soup_can openarm", "train a-seed3"))
         (command,) = step.commands()
         self.assertEqual(command[command.index("--weights") + 1], str(self.out / "a-seed3"))
-        self.assertEqual(plan.steps["eval ik"].needs, ("data toy-tomato_soup_can+potted_meat_can openarm",))
+        self.assertEqual(
+            plan.steps["eval ik"].needs, ("data toy-tomato_soup_can+potted_meat_can openarm",)
+        )
         self.assertFalse(self.out.exists())
-        self.assertEqual(len(self.plan((self.folder / "study.toml").read_text(), only=("ik",)).runs), 1)
+        self.assertEqual(
+            len(self.plan((self.folder / "study.toml").read_text(), only=("ik",)).runs), 1
+        )
 
     def test_objects_that_were_left_out_are_played_if_the_evaluation_says_so(self):
         for unseen, played in (("false", []), ("true", [("010_potted_meat_can",)])):
             evaluation = f"[evaluations.eval]\n[evaluations.eval-new]\nobjects = ['spam']\nunseen = {unseen}\n"
             plan = self.plan(HEAD + DATA + evaluation + RUN + "[runs.a]\nobjects = ['soup']\n")
-            self.assertEqual([s.objects for name, s in plan.steps.items() if name.startswith("eval-new")], played)
+            self.assertEqual(
+                [s.objects for name, s in plan.steps.items() if name.startswith("eval-new")], played
+            )
 
     def test_changes_of_the_recipe_are_flags(self):
         changes = "task.reset = { random_gravity = false, demo_probability = 0.25 }\nmodel.pointnet = [8, 6]\ntask.action.hand_zero = 'middle'\n"
-        plan = self.plan(HEAD + DATA + RUN + "[runs.a]\nsteps = 1e6\nnum_envs = 64\n[runs.a.config]\n" + changes)
+        plan = self.plan(
+            HEAD + DATA + RUN + "[runs.a]\nsteps = 1e6\nnum_envs = 64\n[runs.a.config]\n" + changes
+        )
         (train,) = (s for s in plan.steps.values() if s.kind == "train")
         base = RECIPES["minutes"].config
         self.assertEqual(train.run.config.iterations, 977)
         self.assertEqual(
-            train.run.config.task.reset, replace(base.task.reset, random_gravity=False, demo_probability=0.25)
+            train.run.config.task.reset,
+            replace(base.task.reset, random_gravity=False, demo_probability=0.25),
         )
         (command,) = train.commands()
         module = "xreset.learning.train"
         with mock.patch(f"{module}.train") as start:
             main(command[3:])
-        config = replace(start.call_args.kwargs["config"], iterations=start.call_args.kwargs["iterations"])
+        config = replace(
+            start.call_args.kwargs["config"], iterations=start.call_args.kwargs["iterations"]
+        )
         self.assertEqual(config, train.run.config)
         self.assertEqual(list(config_flags({"a": {"b_c": True}})), ["--config.a.b-c"])
 
@@ -189,15 +243,27 @@ class PlanTest(InFolder):
                 FileFormatError,
                 r"runs\.a\.config\.task\.reset.*unknown: gravity",
             ),
-            (HEAD + DATA + RUN + "[runs.a]\nobjects = ['cup']\n", ObjectError, "Unknown object 'cup'"),
+            (
+                HEAD + DATA + RUN + "[runs.a]\nobjects = ['cup']\n",
+                ObjectError,
+                "Unknown object 'cup'",
+            ),
         ):
             with self.subTest(message), self.assertRaisesRegex(error, message):
                 self.plan(text)
         demos = synthesize(["soup"], 1, 0)
-        write_demos(self.folder / "climbs.npz", replace(demos, object_name=np.array(["../../elsewhere"])), config={})
-        plan = self.plan(HEAD + "[data.toy]\ndemos = 'climbs.npz'\n[runs.a]\ndata = 'toy'\nalone = true\n")
+        write_demos(
+            self.folder / "climbs.npz",
+            replace(demos, object_name=np.array(["../../elsewhere"])),
+            config={},
+        )
+        plan = self.plan(
+            HEAD + "[data.toy]\ndemos = 'climbs.npz'\n[runs.a]\ndata = 'toy'\nalone = true\n"
+        )
         self.assertEqual([run.folder.resolve().parent for run in plan.runs], [self.out.resolve()])
-        self.assertEqual({s.folder.resolve().parent for s in plan.subsets}, {self.out.resolve() / "data"})
+        self.assertEqual(
+            {s.folder.resolve().parent for s in plan.subsets}, {self.out.resolve() / "data"}
+        )
         for message, text in (
             ("runs.a and runs.a-seed0 would both", "[runs.a]\n[runs.a-seed0]\npolicy = 'ik'\n"),
             ("the study and runs.logs would both", "[runs.logs]\npolicy = 'ik'\n"),
@@ -238,7 +304,9 @@ class LaunchTest(InFolder):
             "^d cannot start: c is not done",
             "^f: it ended before it was done",
         ):
-            self.assertEqual(sum(bool(re.search(expected, problem)) for problem in problems), 1, expected)
+            self.assertEqual(
+                sum(bool(re.search(expected, problem)) for problem in problems), 1, expected
+            )
         self.assertEqual(len(problems), 4)
 
     def test_each_step_sees_its_own_gpu_and_a_waiting_one_is_not_asked_again_and_again(self):
@@ -251,7 +319,11 @@ class LaunchTest(InFolder):
         a, b, c, d = ((self.folder / name / "gpus").read_text().strip() for name in "abcd")
         self.assertEqual((sorted((a, b)), c), (["2", "5"], ""))
         self.assertIn(f"d: begun on GPU {d}", said)
-        self.assertEqual(left.call_count, 2, "before its turn and at its end: a training reads its checkpoint for it")
+        self.assertEqual(
+            left.call_count,
+            2,
+            "before its turn and at its end: a training reads its checkpoint for it",
+        )
 
     def test_a_step_that_another_process_runs_is_waited_for(self):
         """The other process begins between the question and the start, and ends later."""
@@ -266,13 +338,18 @@ class LaunchTest(InFolder):
         with mock.patch.object(Step, "busy", busy):
             problems, said = self.launch(step)
         self.assertEqual(problems, [])
-        self.assertEqual(said, ["a: begun", "a: in progress in another process; waiting for its end"])
+        self.assertEqual(
+            said, ["a: begun", "a: in progress in another process; waiting for its end"]
+        )
         with claim(step.writes):
             self.assertTrue(step.busy())
         self.assertFalse(step.busy())
 
     def test_ctrl_c_asks_the_command_to_end(self):
-        step = self.step("a", "trap 'touch stopped; exit 0' TERM INT; touch begun; while true; do sleep 0.1; done")
+        step = self.step(
+            "a",
+            "trap 'touch stopped; exit 0' TERM INT; touch begun; while true; do sleep 0.1; done",
+        )
 
         def interrupt():
             while not (step.writes / "begun").exists():
@@ -309,10 +386,16 @@ class TablesTest(InFolder):
         table, grasps = (fill(plan, t) for t in plan.study.tables)
         rows = table.as_rows("mujoco")
         self.assertEqual(rows[0], ("%", "IK Oracle", "X-Sim", "Ours"))
-        self.assertEqual([r[0] for r in rows[1:]], ["tomato soup can", "potted meat can", "all of them"])
+        self.assertEqual(
+            [r[0] for r in rows[1:]], ["tomato soup can", "potted meat can", "all of them"]
+        )
         soup, _, everything = (dict(zip(rows[0], r, strict=True)) for r in rows[1:])
         self.assertEqual(soup["X-Sim"], "-, paper 35.0 \N{PLUS-MINUS SIGN} 0.8")
-        self.assertRegex(soup["Ours"], r"^83\.0 \(66-100\), paper 90\.8 . 1\.5$", "the interval is over the seeds, too")
+        self.assertRegex(
+            soup["Ours"],
+            r"^83\.0 \(66-100\), paper 90\.8 . 1\.5$",
+            "the interval is over the seeds, too",
+        )
         self.assertRegex(everything["Ours"], r"^58\.0 \(33-100\), paper 78\.2$")
         self.assertEqual(grasps.as_rows("mujoco")[1][0], "X-RESET")
         page, notes = write_page(plan, self.folder / "page")
@@ -335,19 +418,28 @@ class TablesTest(InFolder):
         rows = fill(plan, plan.study.tables[0]).as_rows("mujoco")
         self.assertRegex(rows[1][3], r"^66\.5 ")
         self.assertEqual([r[3][0] for r in rows[2:]], ["-", "-"])
-        self.write("ours-tomato_soup_can-seed1", 1.0, 0.33)  # now seed 0 lacks an object, seed 1 does not
+        self.write(
+            "ours-tomato_soup_can-seed1", 1.0, 0.33
+        )  # now seed 0 lacks an object, seed 1 does not
         self.write("ours-potted_meat_can-seed1", 0.66, 0.0, first=2)
         rows = fill(plan, plan.study.tables[0]).as_rows("mujoco")
         self.assertRegex(rows[1][3], r"^66\.5 \(66-66\)", "the same demonstration in both seeds")
         self.assertRegex(rows[3][3], r"^49\.8 ", "seed 1 alone")
         _, notes = write_page(plan, self.folder / "page")
-        self.assertFalse([note for note in notes if "comparable" in note], "objects alone are not compared")
+        self.assertFalse(
+            [note for note in notes if "comparable" in note], "objects alone are not compared"
+        )
 
     def test_results_of_other_episodes_do_not_count(self):
         self.write("ik", 0.33, 0.33, 0.33, 0.33)
-        for changes, left in (("", ""), ("seed = 7\n", "in mujoco"), ("episodes = 3\n", "in mujoco")):
+        for changes, left in (
+            ("", ""),
+            ("seed = 7\n", "in mujoco"),
+            ("episodes = 3\n", "in mujoco"),
+        ):
             text = self.TEXT.replace(
-                "episodes = 2\n", f"{changes}" if "episodes" in changes else f"episodes = 2\n{changes}"
+                "episodes = 2\n",
+                f"{changes}" if "episodes" in changes else f"episodes = 2\n{changes}",
             )
             self.assertEqual(self.plan(text).steps["eval ik"].left(), left)
 
@@ -375,11 +467,15 @@ class WholeTest(unittest.TestCase):
         return make_plan(read_study(file), "changed", given=self.folder, out=self.out)
 
     def test_it_trains_evaluates_and_writes_the_table(self):
-        self.assertRegex(self.said, r"(?s)data .*: done.*train x-reset-seed0: done.*eval x-reset-seed0: done")
+        self.assertRegex(
+            self.said, r"(?s)data .*: done.*train x-reset-seed0: done.*eval x-reset-seed0: done"
+        )
         text = (self.out / "reports" / "seconds" / "study.md").read_text()
         self.assertRegex(text, r"\| tomato soup can \| \d.* paper 33\.0 .* \| \d.* paper 90\.8 ")
         self.assertIn("one seed only of x-reset", text)
-        self.assertTrue((self.out / "reports" / "seconds" / "compare-tomato_soup_can" / "compare.png").is_file())
+        self.assertTrue(
+            (self.out / "reports" / "seconds" / "compare-tomato_soup_can" / "compare.png").is_file()
+        )
 
     def test_what_is_done_is_not_done_again(self):
         before = {f: f.stat().st_mtime_ns for f in self.out.glob("*-seed0/**/*") if f.is_file()}
@@ -396,7 +492,8 @@ class WholeTest(unittest.TestCase):
         self.assertFalse(step.done())
         (command,) = step.commands()
         self.assertEqual(
-            command[3:], ["train", "--out", str(self.out / "x-reset-seed0"), "--iterations", "4", "--resume"]
+            command[3:],
+            ["train", "--out", str(self.out / "x-reset-seed0"), "--iterations", "4", "--resume"],
         )
 
     def test_another_configuration_under_the_same_name_is_refused(self):
@@ -427,7 +524,11 @@ class WholeTest(unittest.TestCase):
         content = policy.read_bytes()
         self.addCleanup(policy.write_bytes, content)
         policy.write_bytes(content + b" ")
-        self.assertEqual(plan.steps["eval x-reset-seed0"].left(), "in mujoco", "another policy is evaluated again")
+        self.assertEqual(
+            plan.steps["eval x-reset-seed0"].left(),
+            "in mujoco",
+            "another policy is evaluated again",
+        )
         self.assertTrue(plan.steps["train x-reset-seed0"].done())
 
     def test_a_dry_run_prints_the_plan(self):

@@ -105,8 +105,14 @@ class RewardTest(unittest.TestCase):
         opposing = RewardConfig(contact="opposing")
         squeeze = torch.tensor([[3.0, 0, 1], [0, 0, 0], [-3.0, 0, 1]])
         held = {"grasp": 1, "position": 4, "rotation": 4, "success": 10}
-        away = {"object_pos": torch.tensor([0.5, 0.36, 0.02]), "object_quat": turned(60, (0.0, 0.6, 0.8))}
-        errors = {"position": 4 * (1 - math.tanh(0.1 / 0.2)), "rotation": 4 * (1 - math.tanh(math.pi / 3 / 1.5))}
+        away = {
+            "object_pos": torch.tensor([0.5, 0.36, 0.02]),
+            "object_quat": turned(60, (0.0, 0.6, 0.8)),
+        }
+        errors = {
+            "position": 4 * (1 - math.tanh(0.1 / 0.2)),
+            "rotation": 4 * (1 - math.tanh(math.pi / 3 / 1.5)),
+        }
         action = torch.tensor([1.0, -0.5, 0, 0])
         moving = {"action": action, "previous_action": torch.tensor([1.0, 0.5, 0.2, 0])}
         for config, changes, expected in (
@@ -144,10 +150,18 @@ class RewardTest(unittest.TestCase):
                 points=points,
                 action=torch.tensor([0.5, 0, 0.5, 0]),
             )
-            expected = -2.5 * min(3 * tips, 3) - 2.5 * min(palm, 0.5) - 0.005 * 0.5 - 0.05 * 0.25 - 0.005 * 0.25
+            expected = (
+                -2.5 * min(3 * tips, 3)
+                - 2.5 * min(palm, 0.5)
+                - 0.005 * 0.5
+                - 0.05 * 0.25
+                - 0.005 * 0.25
+            )
             expected += gate * 3 * (1.4 - 3 * d) + (gate and d <= 0.02) * 15 / (1 + 10 * d)
             with self.subTest(tips=tips, palm=palm, d=d):
-                self.assertEqual((bool(reward.gate), bool(reward.success)), (gate, gate and d <= 0.02))
+                self.assertEqual(
+                    (bool(reward.gate), bool(reward.success)), (gate, gate and d <= 0.02)
+                )
                 self.assertAlmostEqual(float(reward.total), 0.01 / 30 * expected, places=6)
 
     def test_a_term_of_the_users_own_is_added(self):
@@ -167,7 +181,10 @@ class RewardTest(unittest.TestCase):
             with self.subTest(name), self.assertRaisesRegex(RunError, problem):
                 self.reward(RewardConfig(own={name: 1.0}))
         for own in ({"height": 1.0}, {"module:": 1.0}, {"a:b": math.nan}):
-            with self.subTest(own), self.assertRaisesRegex(ValueError, "expected module:function and a finite number"):
+            with (
+                self.subTest(own),
+                self.assertRaisesRegex(ValueError, "expected module:function and a finite number"),
+            ):
                 RewardConfig(own=own)
 
     def test_success_needs_two_centimetres_and_fifteen_degrees_and_contact(self):
@@ -180,31 +197,54 @@ class RewardTest(unittest.TestCase):
             (0.015, 0.0, {"success_position": torch.tensor(0.01)}, False),
         ):
             where = torch.tensor([0.5, 0.3, 0.1 + distance])
-            inputs = {"object_pos": where, "object_quat": turned(degrees, (1.0, 0, 0)), "tip_force": self.PRESS}
+            inputs = {
+                "object_pos": where,
+                "object_quat": turned(degrees, (1.0, 0, 0)),
+                "tip_force": self.PRESS,
+            }
             reward = self.reward(**(inputs | changes))
             self.assertEqual(bool(reward.success), expected, (distance, degrees, changes))
             self.assertEqual(float(reward.terms["success"]), 10.0 * expected)
 
     def test_the_contact_gate_needs_the_thumb_and_another_finger(self):
-        forces = torch.tensor([[1.0, 0, 0], [0, 1, 1], [1, 0, 1], [1, 1, 0], [0.09, 1, 1], [1, 0.1, 0.1], [0, 0, 0]])
+        forces = torch.tensor(
+            [[1.0, 0, 0], [0, 1, 1], [1, 0, 1], [1, 1, 0], [0.09, 1, 1], [1, 0.1, 0.1], [0, 0, 0]]
+        )
         forces = forces[..., None] * torch.tensor([0.6, 0.0, -0.8])
-        self.assertEqual(contact_gate(forces, 0.1).tolist(), [False, False, True, True, False, False, False])
+        self.assertEqual(
+            contact_gate(forces, 0.1).tolist(), [False, False, True, True, False, False, False]
+        )
         down = [0.0, 0, -5]
         left = [-5.0, 0, -1]
         right = [5.0, 0, -1]
         none = [0.0, 0, 0]
         hands = torch.tensor(
-            [[down, down, down], [left, right, none], [left, none, right], [left, left, down], [none, left, right]]
+            [
+                [down, down, down],
+                [left, right, none],
+                [left, none, right],
+                [left, left, down],
+                [none, left, right],
+            ]
         )
         self.assertEqual(contact_gate(hands, 0.1).tolist(), [True, True, True, True, False])
-        self.assertEqual(contact_gate(hands, 0.1, opposing=True).tolist(), [False, True, True, False, False])
+        self.assertEqual(
+            contact_gate(hands, 0.1, opposing=True).tolist(), [False, True, True, False, False]
+        )
 
 
 class TerminationTest(unittest.TestCase):
     def test_bounds(self):
         table, c = TableSpec(center=(0.5, 0.3), half_size=(0.7, 0.5, 0.02)), TerminationConfig()
         limits = torch.tensor(
-            [[1.3, 0.3, 0.1], [-0.3, 0.3, 0.1], [0.5, 0.9, 0.1], [0.5, -0.3, 0.1], [0.5, 0.3, 1.0], [0.5, 0.3, -0.05]]
+            [
+                [1.3, 0.3, 0.1],
+                [-0.3, 0.3, 0.1],
+                [0.5, 0.9, 0.1],
+                [0.5, -0.3, 0.1],
+                [0.5, 0.3, 1.0],
+                [0.5, 0.3, -0.05],
+            ]
         )
         away = (limits - torch.tensor([0.5, 0.3, 0.1])).sign() * 0.01
         self.assertFalse(bool(out_of_bounds(limits - away, table, c).any()))
@@ -222,7 +262,9 @@ class ActionTest(WithRobot):
         # a loaded arm that sags would otherwise sink a little further at every step of zero action
         torch.testing.assert_close(still[:, :3], target[:, :3])
         torch.testing.assert_close(still[:, 3:], torch.tensor([[-0.55, 0.55, 0.8, 0.02]]))
-        full = space.targets(torch.full((1, 7), 5.0), target, target)  # actions are limited to [-1, 1]
+        full = space.targets(
+            torch.full((1, 7), 5.0), target, target
+        )  # actions are limited to [-1, 1]
         torch.testing.assert_close(full, torch.tensor([[0.15, 0.55, -0.45, 0.5, 1.6, 1.6, 0.04]]))
 
     def test_arm_targets_stay_near_the_joint_and_within_its_limits(self):
@@ -240,22 +282,33 @@ class ActionTest(WithRobot):
         space = self.space(hand_zero="home")
         home = torch.as_tensor(self.robot.home, dtype=torch.float32)
         target = torch.zeros(1, 7)
-        for action, expected in ((0.0, home), (1.0, space.upper), (-1.0, space.lower), (0.5, (home + space.upper) / 2)):
+        for action, expected in (
+            (0.0, home),
+            (1.0, space.upper),
+            (-1.0, space.lower),
+            (0.5, (home + space.upper) / 2),
+        ):
             found = space.targets(torch.full((1, 7), action), target, target)
             torch.testing.assert_close(found[0, 3:], expected[3:], msg=f"action {action}")
 
     def test_a_relative_hand_that_does_nothing_holds_its_targets(self):
         space = self.space(hand="relative", hand_step=0.05, hand_lead=0.4)
-        target = torch.tensor([[0.1, 0.5, -0.5, -0.2, 0.4, 0.3, 0.01]])  # the last one slides, by 4 cm in all
+        target = torch.tensor(
+            [[0.1, 0.5, -0.5, -0.2, 0.4, 0.3, 0.01]]
+        )  # the last one slides, by 4 cm in all
         # joints that an object keeps from following
         pressed = target - torch.tensor([0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.004])
-        torch.testing.assert_close(space.targets(torch.zeros(1, 7), target, pressed)[:, 3:], target[:, 3:])
+        torch.testing.assert_close(
+            space.targets(torch.zeros(1, 7), target, pressed)[:, 3:], target[:, 3:]
+        )
         moved = space.targets(torch.tensor([[0.0, 0, 0, 1, -1, 0.5, 1]]), target, pressed)
         torch.testing.assert_close(moved[:, 3:], torch.tensor([[-0.15, 0.35, 0.325, 0.012]]))
         for _ in range(20):
             moved = space.targets(torch.ones(1, 7), moved, pressed)
         held = pressed[:, 3:] + torch.tensor([0.4, 0.4, 0.4, 0.016])
-        torch.testing.assert_close(moved[:, 3:], held, msg="it presses no harder than its lead allows")
+        torch.testing.assert_close(
+            moved[:, 3:], held, msg="it presses no harder than its lead allows"
+        )
         action = space.action_for(target + torch.tensor([0.02] * 6 + [0.0008]), target)
         torch.testing.assert_close(action[:, 3:], torch.full((1, 4), 0.4))
 
@@ -274,7 +327,9 @@ class LatencyTest(unittest.TestCase):
         line = DelayLine(torch.zeros(4, 1), 2.0)
         line.delay.copy_(torch.tensor([[0.0], [1.0], [1.5], [2.0]]))
         line.fill(torch.ones(4, dtype=torch.bool), torch.zeros(4, 1))
-        heard = [line.push(torch.full((4, 1), float(value)))[:, 0].tolist() for value in (10, 20, 30)]
+        heard = [
+            line.push(torch.full((4, 1), float(value)))[:, 0].tolist() for value in (10, 20, 30)
+        ]
         self.assertEqual(heard, [[10, 0, 0, 0], [20, 10, 5, 0], [30, 20, 15, 10]])
         line.fill(torch.tensor([False, True, False, False]), torch.full((4, 1), 7.0))
         self.assertEqual(line.push(torch.full((4, 1), 40.0))[:, 0].tolist(), [40, 7, 25, 20])
@@ -284,7 +339,8 @@ class RandomizationTest(unittest.TestCase):
     def test_a_pairs_friction_is_the_mean_of_its_materials(self):
         c = RandomizationConfig(elastomer=0.8, metal=0.1, table=0.5)
         torch.testing.assert_close(
-            pair_friction(torch.tensor([0.5, 1.0]), c), torch.tensor([[0.65, 0.3, 0.5], [0.9, 0.55, 0.75]])
+            pair_friction(torch.tensor([0.5, 1.0]), c),
+            torch.tensor([[0.65, 0.3, 0.5], [0.9, 0.55, 0.75]]),
         )
         nominal = sample_friction(3, RandomizationConfig(enabled=False), generator())
         torch.testing.assert_close(nominal, pair_friction(torch.full((3,), 0.75), c))
@@ -295,7 +351,9 @@ class RandomizationTest(unittest.TestCase):
         material = 2 * table - c.table
         drawn = 2 * link - (2 * tip - c.elastomer)
         for values in (material, drawn):
-            torch.testing.assert_close(torch.stack(values.aminmax()), torch.tensor([0.5, 1.0]), atol=2e-3, rtol=0)
+            torch.testing.assert_close(
+                torch.stack(values.aminmax()), torch.tensor([0.5, 1.0]), atol=2e-3, rtol=0
+            )
             self.assertAlmostEqual(float(values.mean()), 0.75, delta=0.005)
         self.assertEqual(len(material.mul(1e5).round().unique()), 250)
 
@@ -317,12 +375,16 @@ class ResetTest(WithRobot):
     def test_bank_resets_are_states_of_the_bank(self):
         bank = toy_bank(self.robot)
         reset = self.sample(torch.tensor([0, 1] * 500), demo_probability=1.0)
-        state = ((reset.object_pos[:, 0] - 0.6) * 100).round().long()  # the toy bank numbers its states
+        state = (
+            ((reset.object_pos[:, 0] - 0.6) * 100).round().long()
+        )  # the toy bank numbers its states
         torch.testing.assert_close(reset.joint_pos, torch.as_tensor(bank.joint_pos)[state])
         torch.testing.assert_close(reset.object_quat, torch.as_tensor(bank.object_quat_wxyz)[state])
         self.assertEqual(reset.sequence.tolist(), bank.sequence_index[state].tolist())
         torch.testing.assert_close(reset.goal_pos, torch.as_tensor(bank.goal_pos)[reset.sequence])
-        torch.testing.assert_close(reset.goal_quat, torch.as_tensor(bank.goal_quat_wxyz)[reset.sequence])
+        torch.testing.assert_close(
+            reset.goal_quat, torch.as_tensor(bank.goal_quat_wxyz)[reset.sequence]
+        )
 
     def test_which_states_are_drawn(self):
         """Every state of the object, and of no other; home where there is none."""
@@ -338,26 +400,34 @@ class ResetTest(WithRobot):
             ((SOUP, SPAM), 0, {"bank": empty}, set(), {0, 2}),
         ):
             with self.subTest(objects=objects, index=index, options=list(options)):
-                reset = self.sample(torch.full((200,), index), objects, demo_probability=1.0, **options)
+                reset = self.sample(
+                    torch.full((200,), index), objects, demo_probability=1.0, **options
+                )
                 drawn = ((reset.object_pos[reset.from_bank, 0] - 0.6) * 100).round().int()
                 self.assertEqual(set(drawn.tolist()), states)
                 self.assertEqual(set(reset.sequence.tolist()), sequences)
         with self.assertRaisesRegex(
-            DemoError, "no demonstration of 011_banana; it has 005_tomato_soup_can, 010_potted_meat_can"
+            DemoError,
+            "no demonstration of 011_banana; it has 005_tomato_soup_can, 010_potted_meat_can",
         ):
             self.sample(objects=(SOUP, "011_banana"))
 
     def test_gravity(self):
         """Of bank resets uniform, of home resets alpha = 1 + eta / 9.81 with eta ~ N(0, 1), clipped."""
         gravity = self.sample(demo_probability=1.0).gravity_fraction
-        torch.testing.assert_close(torch.stack(gravity.aminmax()), torch.tensor([0.0, 1.0]), atol=0.01, rtol=0)
+        torch.testing.assert_close(
+            torch.stack(gravity.aminmax()), torch.tensor([0.0, 1.0]), atol=0.01, rtol=0
+        )
         self.assertAlmostEqual(float(gravity.mean()), 0.5, delta=0.02)
         gravity = self.sample().gravity_fraction
         self.assertAlmostEqual(float(gravity.mean()), 1.0, delta=0.01)
         self.assertAlmostEqual(float(gravity.std()), 1 / 9.81, delta=0.005)
         clipped = self.sample(home_gravity_clip=0.1).gravity_fraction
         torch.testing.assert_close(torch.stack(clipped.aminmax()), torch.tensor([0.9, 1.1]))
-        for options in ({"demo_probability": 1.0, "random_gravity": False}, {"home_gravity_std": 0.0}):
+        for options in (
+            {"demo_probability": 1.0, "random_gravity": False},
+            {"home_gravity_std": 0.0},
+        ):
             self.assertTrue(bool((self.sample(**options).gravity_fraction == 1).all()))
 
     def test_home_spawns_are_uniform_around_the_demonstrations_start(self):
@@ -365,17 +435,29 @@ class ResetTest(WithRobot):
         reset = self.sample()
         offset = reset.object_pos - start[reset.sequence]
         extremes = torch.stack(torch.aminmax(offset, dim=0))
-        torch.testing.assert_close(extremes, torch.tensor([[-0.02, -0.02, 0], [0.02, 0.02, 0]]), atol=2e-4, rtol=0)
-        yaw = quat_angle(reset.object_quat, torch.as_tensor(toy_bank(self.robot).start_quat_wxyz)[reset.sequence])
+        torch.testing.assert_close(
+            extremes, torch.tensor([[-0.02, -0.02, 0], [0.02, 0.02, 0]]), atol=2e-4, rtol=0
+        )
+        yaw = quat_angle(
+            reset.object_quat, torch.as_tensor(toy_bank(self.robot).start_quat_wxyz)[reset.sequence]
+        )
         self.assertAlmostEqual(float(yaw.rad2deg().max()), 25.0, delta=0.1)
         self.assertAlmostEqual(float(yaw.rad2deg().mean()), 12.5, delta=0.5)
         unmoved = self.sample(spawn_xy=0.0, spawn_yaw=0.0)
         torch.testing.assert_close(unmoved.object_pos, start[unmoved.sequence])
         wide = self.sample(training_xy=0.1)
-        self.assertAlmostEqual(float((wide.object_pos - start[wide.sequence]).max()), 0.1, delta=1e-3)
-        lying = toy_bank(self.robot, start_quat_wxyz=np.tile(turned(90, (1.0, 0, 0)).numpy(), (3, 1)))
-        axis = quat_rotate(self.sample(bank=lying).object_quat, torch.tensor([0.0, 1, 0]))  # y of the object stands up
-        torch.testing.assert_close(axis, torch.tensor([0.0, 0, 1]).expand_as(axis), atol=1e-6, rtol=0)
+        self.assertAlmostEqual(
+            float((wide.object_pos - start[wide.sequence]).max()), 0.1, delta=1e-3
+        )
+        lying = toy_bank(
+            self.robot, start_quat_wxyz=np.tile(turned(90, (1.0, 0, 0)).numpy(), (3, 1))
+        )
+        axis = quat_rotate(
+            self.sample(bank=lying).object_quat, torch.tensor([0.0, 1, 0])
+        )  # y of the object stands up
+        torch.testing.assert_close(
+            axis, torch.tensor([0.0, 0, 1]).expand_as(axis), atol=1e-6, rtol=0
+        )
 
     def test_goals_move_around_the_demonstrated_ones_and_never_below_the_start(self):
         bank = toy_bank(self.robot)
@@ -383,10 +465,15 @@ class ResetTest(WithRobot):
         reset = self.sample(demo_probability=0.5, **options)
         goal = torch.as_tensor(bank.goal_pos, dtype=torch.float32)[reset.sequence]
         offset = (reset.goal_pos - goal).masked_fill(reset.from_bank[:, None], 0)
-        angle = quat_angle(reset.goal_quat, torch.as_tensor(bank.goal_quat_wxyz, dtype=torch.float32)[reset.sequence])
+        angle = quat_angle(
+            reset.goal_quat,
+            torch.as_tensor(bank.goal_quat_wxyz, dtype=torch.float32)[reset.sequence],
+        )
         torch.testing.assert_close(reset.goal_pos[reset.from_bank], goal[reset.from_bank])
         largest = torch.cat((offset.abs().amax(dim=0), angle[~reset.from_bank].max()[None]))
-        torch.testing.assert_close(largest, torch.tensor([0.03, 0.03, 0.05, 0.5]), atol=2e-3, rtol=0)
+        torch.testing.assert_close(
+            largest, torch.tensor([0.03, 0.03, 0.05, 0.5]), atol=2e-3, rtol=0
+        )
         reset = self.sample(bank=toy_bank(self.robot, goal_pos=bank.start_pos), **options)
         start = torch.as_tensor(bank.start_pos, dtype=torch.float32)[reset.sequence]
         self.assertGreaterEqual(float((reset.goal_pos - start)[:, 2].min()), 0.0)
@@ -398,7 +485,9 @@ class ResetTest(WithRobot):
         space = ActionSpace.of(self.robot, ActionConfig())
         self.assertTrue(bool(((joints >= space.lower) & (joints <= space.upper)).all()))
         spread = (joints - torch.as_tensor(self.robot.home, dtype=torch.float32)).std(dim=0)
-        self.assertAlmostEqual(float(spread[1]), 0.075, delta=0.004)  # an arm joint far from its limits
+        self.assertAlmostEqual(
+            float(spread[1]), 0.075, delta=0.004
+        )  # an arm joint far from its limits
         self.assertAlmostEqual(float(spread[4]), 0.10, delta=0.005)  # a finger joint
         quiet = self.sample(self.SOUPS[:5], home_noise=False)
         torch.testing.assert_close(quiet.joint_pos, torch.full((5, 7), 0.01))
@@ -422,7 +511,9 @@ class ObservationTest(unittest.TestCase):
         still = State.at_rest(rand(self.J), rand(3), quat())
         links = {name: rand(1 + self.E, 3) for name in ("pos", "linvel", "angvel")}
         self.x = obs.ObservationInput(
-            state=replace(still, joint_vel=rand(self.J), object_linvel=rand(3), object_angvel=rand(3)),
+            state=replace(
+                still, joint_vel=rand(self.J), object_linvel=rand(3), object_angvel=rand(3)
+            ),
             links=Links(quat=quat(1 + self.E), **links),
             joint_target=rand(self.J),
             joint_lower=torch.full((self.J,), -2.0),
@@ -439,8 +530,12 @@ class ObservationTest(unittest.TestCase):
         )
         self.config = ObservationConfig(noise=QUIET, contact_force_scale=0.1, joint_vel_scale=0.2)
         widths = obs.layout(self.J, self.E, self.config)
-        self.policy = self.split(obs.policy_group(self.x, self.config, generator()), widths["policy"])
-        self.proprio = self.split(obs.proprio_group(self.x, self.config, generator()), widths["proprio"])
+        self.policy = self.split(
+            obs.policy_group(self.x, self.config, generator()), widths["policy"]
+        )
+        self.proprio = self.split(
+            obs.proprio_group(self.x, self.config, generator()), widths["proprio"]
+        )
 
     def split(self, group: torch.Tensor, widths: dict[str, int]) -> dict[str, torch.Tensor]:
         self.assertEqual(tuple(group.shape), (self.N, sum(widths.values())))
@@ -448,8 +543,12 @@ class ObservationTest(unittest.TestCase):
 
     def test_without_noise_the_proprio_group_is_exact(self):
         for name in ("pos", "linvel", "angvel"):
-            torch.testing.assert_close(self.proprio[f"palm_{name}"], getattr(self.x.links, name)[:, 0])
-        torch.testing.assert_close(self.proprio["tip_pos"], self.x.links.pos[:, 1:].reshape(self.N, -1))
+            torch.testing.assert_close(
+                self.proprio[f"palm_{name}"], getattr(self.x.links, name)[:, 0]
+            )
+        torch.testing.assert_close(
+            self.proprio["tip_pos"], self.x.links.pos[:, 1:].reshape(self.N, -1)
+        )
         torch.testing.assert_close(self.proprio["joint_vel"], 0.2 * self.x.state.joint_vel)
         torch.testing.assert_close(
             self.proprio["joint_pos"], (self.x.state.joint_pos - 0.5) / 2.5
@@ -457,7 +556,9 @@ class ObservationTest(unittest.TestCase):
         force = self.proprio["tip_force"]
         self.assertEqual(float(force.abs().max()), 1.0)
         small = self.x.tip_force.abs() < 10
-        torch.testing.assert_close(force.view(self.N, self.E, 3)[small], 0.1 * self.x.tip_force[small])
+        torch.testing.assert_close(
+            force.view(self.N, self.E, 3)[small], 0.1 * self.x.tip_force[small]
+        )
 
     def test_one_rotation_is_one_observation(self):
         negated = replace(
@@ -470,19 +571,25 @@ class ObservationTest(unittest.TestCase):
         for rotation in ("quaternion", "matrix", "to_goal"):
             c = replace(self.config, rotation=rotation)
             for group in (obs.policy_group, obs.proprio_group):
-                torch.testing.assert_close(group(negated, c, generator()), group(self.x, c, generator()))
+                torch.testing.assert_close(
+                    group(negated, c, generator()), group(self.x, c, generator())
+                )
         for name, quat, own in (
             ("object_quat", self.policy, self.x.observed_quat),
             ("palm_quat", self.proprio, self.x.links.quat[:, 0]),
         ):
             self.assertTrue(bool((quat[name][:, 0] >= 0).all()), name)
-            torch.testing.assert_close(quat_angle(quat[name], own), torch.zeros(self.N), atol=1e-3, rtol=0)
+            torch.testing.assert_close(
+                quat_angle(quat[name], own), torch.zeros(self.N), atol=1e-3, rtol=0
+            )
 
     def test_the_published_observation(self):
         c = RECIPES["published"].config.task.observation
         widths = obs.layout(28, 5, c)
         flat = sum(widths["policy"].values()) + sum(widths["proprio"].values())
-        self.assertEqual((flat, flat + widths["perception"]["paired_cloud"]), (72, 648))  # the paper's 648 inputs
+        self.assertEqual(
+            (flat, flat + widths["perception"]["paired_cloud"]), (72, 648)
+        )  # the paper's 648 inputs
         points = torch.randn(len(self.x.observed_pos), 64, 3, generator=generator())
         found = obs.policy_group(self.x, c, generator(), points)
         cloud = quat_rotate(self.x.observed_quat[:, None], points) + self.x.observed_pos[:, None]
@@ -498,14 +605,24 @@ class ObservationTest(unittest.TestCase):
         found = obs.privileged_group(self.x, ObservationConfig())
         self.assertEqual(tuple(found.shape), (self.N, 15))
         expected = torch.cat(
-            (self.x.state.object_linvel, self.x.state.object_angvel, self.x.goal_pos - self.x.state.object_pos), 1
+            (
+                self.x.state.object_linvel,
+                self.x.state.object_angvel,
+                self.x.goal_pos - self.x.state.object_pos,
+            ),
+            1,
         )
         torch.testing.assert_close(found[:, :9], expected)
         axis = torch.tensor([1.0, 0, 0]).expand(self.N, 3)
-        corrected = quat_rotate(quat_from_axis_angle(found[:, 9:12]), quat_rotate(self.x.state.object_quat, axis))
-        torch.testing.assert_close(corrected, quat_rotate(self.x.goal_quat, axis), atol=1e-5, rtol=0)
+        corrected = quat_rotate(
+            quat_from_axis_angle(found[:, 9:12]), quat_rotate(self.x.state.object_quat, axis)
+        )
         torch.testing.assert_close(
-            found[:, 12:], torch.stack((self.x.tip_distance.amin(1), self.x.gravity_fraction, self.x.reward), 1)
+            corrected, quat_rotate(self.x.goal_quat, axis), atol=1e-5, rtol=0
+        )
+        torch.testing.assert_close(
+            found[:, 12:],
+            torch.stack((self.x.tip_distance.amin(1), self.x.gravity_fraction, self.x.reward), 1),
         )
 
     def test_clouds(self):
@@ -528,18 +645,28 @@ class ObservationTest(unittest.TestCase):
         x = replace(self.x, observed_quat=turned(90)[None].expand(self.N, 4))
         shown = self.split(obs.policy_group(x, c, generator()), widths["policy"])
         shown |= self.split(obs.proprio_group(x, c, generator()), widths["proprio"])
-        torch.testing.assert_close(shown["object_rotation"], torch.tensor([0.0, 1, 0, -1, 0, 0]).expand(self.N, 6))
+        torch.testing.assert_close(
+            shown["object_rotation"], torch.tensor([0.0, 1, 0, -1, 0, 0]).expand(self.N, 6)
+        )
         first, second = shown["palm_rotation"].split(3, dim=-1)
-        torch.testing.assert_close(first, quat_rotate(x.links.quat[:, 0], torch.tensor([1.0, 0, 0]).expand(self.N, 3)))
-        torch.testing.assert_close(second, quat_rotate(x.links.quat[:, 0], torch.tensor([0.0, 1, 0]).expand(self.N, 3)))
+        torch.testing.assert_close(
+            first, quat_rotate(x.links.quat[:, 0], torch.tensor([1.0, 0, 0]).expand(self.N, 3))
+        )
+        torch.testing.assert_close(
+            second, quat_rotate(x.links.quat[:, 0], torch.tensor([0.0, 1, 0]).expand(self.N, 3))
+        )
         torch.testing.assert_close(shown["joint_target"], x.joint_target - x.state.joint_pos)
         torch.testing.assert_close(shown["tip_force"], self.proprio["tip_force"])
 
     def test_noise_has_the_configured_spread_and_touches_only_what_is_measured(self):
         many = torch.zeros(4000, dtype=torch.long)
-        per_world = {k: v[many] for k, v in vars(self.x).items() if k not in ("joint_lower", "joint_upper")}
+        per_world = {
+            k: v[many] for k, v in vars(self.x).items() if k not in ("joint_lower", "joint_upper")
+        }
         x = replace(self.x, **per_world)
-        noise = NoiseConfig(joint_pos=0.01, joint_vel=0.1, object_pos=0.02, object_rot=0.05, cloud=0.03)
+        noise = NoiseConfig(
+            joint_pos=0.01, joint_vel=0.1, object_pos=0.02, object_rot=0.05, cloud=0.03
+        )
         c = replace(self.config, noise=noise)
         policy = obs.policy_group(x, c, generator())
         spread = torch.cat((policy, obs.proprio_group(x, c, generator())), dim=-1).std(dim=0)
@@ -554,12 +681,17 @@ class ObservationTest(unittest.TestCase):
         angle = quat_angle(rotation, x.observed_quat).square().mean().sqrt()
         self.assertAlmostEqual(float(angle), 0.05 * math.sqrt(3), delta=0.005)
         cloud = obs.cloud_frame(torch.zeros(self.N, 1000, 3), self.x, c, generator())
-        self.assertAlmostEqual(float((cloud - self.x.observed_pos[:, None]).std()), 0.03, delta=0.001)
+        self.assertAlmostEqual(
+            float((cloud - self.x.observed_pos[:, None]).std()), 0.03, delta=0.001
+        )
 
 
 class EvaluationTaskTest(unittest.TestCase):
     def test_only_what_evaluation_fixes_is_changed(self):
-        task = TaskConfig(action=ActionConfig(arm_step=0.03), reset=ResetConfig(spawn_xy=0.05, demo_probability=0.5))
+        task = TaskConfig(
+            action=ActionConfig(arm_step=0.03),
+            reset=ResetConfig(spawn_xy=0.05, demo_probability=0.5),
+        )
         for timestep, substeps, expected in (
             (1 / 240, 4, (1 / 240, 4)),
             (1 / 120, 2, (1 / 240, 4)),
@@ -571,7 +703,9 @@ class EvaluationTaskTest(unittest.TestCase):
         reset = replace(task.reset, demo_probability=0.0, home_gravity_std=0.0)
         randomization = replace(task.randomization, enabled=False)
         observation = replace(task.observation, noise=QUIET)
-        self.assertEqual(found, replace(task, reset=reset, randomization=randomization, observation=observation))
+        self.assertEqual(
+            found, replace(task, reset=reset, randomization=randomization, observation=observation)
+        )
 
 
 class PolicyTest(WithRobot):
@@ -590,8 +724,13 @@ class PolicyTest(WithRobot):
             check_contract("p.onnx", contract, self.robot, task)
 
     def test_refusals_name_what_differs(self):
-        self.refused("another robot .robot: 'openarm', here 'toy'.*--robot openarm", robot="openarm")
-        self.refused("schema is 'xreset-policy/9', expected one of 'xreset-policy/1'", schema="xreset-policy/9")
+        self.refused(
+            "another robot .robot: 'openarm', here 'toy'.*--robot openarm", robot="openarm"
+        )
+        self.refused(
+            "schema is 'xreset-policy/9', expected one of 'xreset-policy/1'",
+            schema="xreset-policy/9",
+        )
         self.refused("another joint order", joint_names=list(reversed(self.robot.joint_names)))
         self.refused("another fingertips", fingertip_names=["index", "thumb"])
         self.refused("another version of the robot", robot_fingerprint="00")
@@ -608,7 +747,8 @@ class PolicyTest(WithRobot):
         scaled = replace(self.TASK, observation=replace(self.TASK.observation, cloud_scale=5.0))
         self.refused("another scale of observations .cloud_scale: 1.0, here 5.0", task=scaled)
         self.refused(
-            "another time between actions .control_dt: 0.01666.*, here 0.02083", task=replace(self.TASK, substeps=5)
+            "another time between actions .control_dt: 0.01666.*, here 0.02083",
+            task=replace(self.TASK, substeps=5),
         )
 
     def test_policies_without_training(self):
@@ -619,7 +759,9 @@ class PolicyTest(WithRobot):
         self.assertTrue(torch.equal(actions[0], actions[1]))
         self.assertFalse(torch.equal(actions[0], actions[2]))
         self.assertEqual(tuple(actions[0].shape), (50, 3, 7))
-        self.assertTrue(-1 <= float(actions[0].min()) < -0.97 and 0.97 < float(actions[0].max()) <= 1)
+        self.assertTrue(
+            -1 <= float(actions[0].min()) < -0.97 and 0.97 < float(actions[0].max()) <= 1
+        )
 
 
 if __name__ == "__main__":

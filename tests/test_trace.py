@@ -17,7 +17,13 @@ from tests.command import xreset
 from tests.toy_bank import SOUP, SPAM
 from tests.toy_grasp import recording
 from xreset.errors import DemoError, FileFormatError, XResetError
-from xreset.eval.engines.actions import Actions, from_file, read_actions, recorded_actions, write_actions
+from xreset.eval.engines.actions import (
+    Actions,
+    from_file,
+    read_actions,
+    recorded_actions,
+    write_actions,
+)
 from xreset.eval.engines.recording import Recording
 from xreset.eval.engines.replay import THRESHOLDS, Divergence, TraceResult, differences, trace
 from xreset.eval.engines.trace_view import rich_table, sentences, write_plot
@@ -36,10 +42,14 @@ DT = 1 / 60
 def grasp_actions(steps: int = 60) -> Actions:
     """The toy grasp: close and lift."""
     return Actions(
-        scene=SceneSpec(robot=toy_grasp.robot(), objects=(toy_grasp.brick(),), friction=toy_grasp.FRICTION),
+        scene=SceneSpec(
+            robot=toy_grasp.robot(), objects=(toy_grasp.brick(),), friction=toy_grasp.FRICTION
+        ),
         label="toy grasp",
         start=toy_grasp.start(),
-        joint_target=torch.as_tensor(np.stack([toy_grasp.targets(i) for i in range(steps)]), dtype=torch.float32),
+        joint_target=torch.as_tensor(
+            np.stack([toy_grasp.targets(i) for i in range(steps)]), dtype=torch.float32
+        ),
     )
 
 
@@ -49,7 +59,9 @@ def wave_actions() -> Actions:
     home = torch.as_tensor(actions.robot.home, dtype=torch.float32)
     step = torch.tensor([0.2 if "jaw" not in name else 0.0 for name in actions.robot.joint_names])
     start = replace(
-        actions.start, object_pos=torch.tensor([[0.9, 0.5, 0.02]]), object_quat=torch.tensor([[1.0, 0, 0, 0]])
+        actions.start,
+        object_pos=torch.tensor([[0.9, 0.5, 0.02]]),
+        object_quat=torch.tensor([[1.0, 0, 0, 0]]),
     )
     return replace(actions, start=start, joint_target=(home + step).expand(30, -1).clone())
 
@@ -74,7 +86,9 @@ class DivergenceTest(unittest.TestCase):
         pos = torch.zeros(20, 1, 3)
         pos[10:, 0, 1] = 0.006
         quat = torch.tensor([1.0, 0, 0, 0]).repeat(20, 1, 1)
-        quat[15:] = -quat_from_axis_angle(torch.tensor([0.0, 0.0, math.radians(6)]))  # its sign means nothing
+        quat[15:] = -quat_from_axis_angle(
+            torch.tensor([0.0, 0.0, math.radians(6)])
+        )  # its sign means nothing
         found = compare(recording(joint_pos=joint, object_pos=pos, object_quat=quat), recording())
         d = found["joints"]
         self.assertEqual(d.where, "turn")
@@ -124,7 +138,9 @@ class TraceTest(unittest.TestCase):
     def setUpClass(cls):
         cls.mujoco = engine("mujoco", workers=0)
         same = toy_grasp.with_scene(cls.mujoco, "same", lambda scene: scene)
-        slippery = toy_grasp.with_scene(cls.mujoco, "slippery", lambda scene: toy_grasp.with_tip_friction(scene, 0.5))
+        slippery = toy_grasp.with_scene(
+            cls.mujoco, "slippery", lambda scene: toy_grasp.with_tip_friction(scene, 0.5)
+        )
         broken = replace(cls.mujoco, name="broken", make=cls.broken)
         cls.result = trace(grasp_actions(), cls.mujoco, [same, slippery, broken])
 
@@ -139,7 +155,9 @@ class TraceTest(unittest.TestCase):
             inner(substeps)
             if count[0] == 20:
                 values = {name: value.clone() for name, value in vars(backend.state()).items()}
-                backend.set_state(State(**values | {"object_pos": torch.full((num_worlds, 3), math.nan)}))
+                backend.set_state(
+                    State(**values | {"object_pos": torch.full((num_worlds, 3), math.nan)})
+                )
 
         backend.step = step
         return backend
@@ -153,7 +171,9 @@ class TraceTest(unittest.TestCase):
         self.assertAlmostEqual(self.result.reference.lifted or 0.0, toy_grasp.RAISED, delta=0.01)
 
     def test_half_a_drives_gain_is_found_in_its_joint_at_once(self):
-        weak = toy_grasp.with_scene(self.mujoco, "weak", lambda scene: toy_grasp.with_drive(scene, "turn", kp=0.5))
+        weak = toy_grasp.with_scene(
+            self.mujoco, "weak", lambda scene: toy_grasp.with_drive(scene, "turn", kp=0.5)
+        )
         result = trace(wave_actions(), self.mujoco, [weak])
         found = {d.quantity: d for d in result.engines[0].divergences}
         self.assertEqual(found["joints"].where, "turn")
@@ -172,8 +192,15 @@ class TraceTest(unittest.TestCase):
         self.assertIn("slippery diverges first in object position", list(sentences(self.result))[1])
 
     def test_noise_excuses_only_what_it_does_itself_by_then(self):
-        position = next(d for d in self.result.engines[1].divergences if d.quantity == "object position")
-        for time, size, excused in ((-0.01, 1.0, True), (0.01, 1.0, False), (-0.01, 0.5, False), (None, 1.0, False)):
+        position = next(
+            d for d in self.result.engines[1].divergences if d.quantity == "object position"
+        )
+        for time, size, excused in (
+            (-0.01, 1.0, True),
+            (0.01, 1.0, False),
+            (-0.01, 0.5, False),
+            (None, 1.0, False),
+        ):
             at = None if time is None else (position.time or 0.0) + time
             noise = replace(position, time=at, largest=position.largest * size)
             with mock.patch.object(TraceResult, "worst_noise", (noise,)):
@@ -183,12 +210,16 @@ class TraceTest(unittest.TestCase):
         broken = self.result.engines[2]
         self.assertEqual((len(broken.differences.time), broken.lifted), (19, None))
         self.assertIn("broken is no longer finite after 0.317 s", list(sentences(self.result))[2])
-        with self.assertRaisesRegex(XResetError, "the reference 'broken' is not finite after 0.317 s"):
+        with self.assertRaisesRegex(
+            XResetError, "the reference 'broken' is not finite after 0.317 s"
+        ):
             trace(grasp_actions(), broken.engine, [])
 
     def test_files_table_and_pictures(self):
         data = json.loads(json.dumps(self.result.as_dict(), allow_nan=False))
-        self.assertEqual([e["name"] for e in data["engines"]], ["mujoco", "same", "slippery", "broken"])
+        self.assertEqual(
+            [e["name"] for e in data["engines"]], ["mujoco", "same", "slippery", "broken"]
+        )
         self.assertEqual(len(data["noise"]), len(THRESHOLDS))
         two = replace(self.result, engines=self.result.engines[1:2])
         with tempfile.TemporaryDirectory() as folder:
@@ -198,7 +229,12 @@ class TraceTest(unittest.TestCase):
             from rich.console import Console
 
             Console(width=120, file=sink).print(rich_table(two))
-            for expected in ("slippery", "object position", "(from 5 mm)", "4 starts moved by 1e-06"):
+            for expected in (
+                "slippery",
+                "object position",
+                "(from 5 mm)",
+                "4 starts moved by 1e-06",
+            ):
                 self.assertIn(expected, sink.getvalue())
 
 
@@ -207,13 +243,16 @@ class ActionsTest(unittest.TestCase):
         self.path = Path(self.enterContext(tempfile.TemporaryDirectory())) / "actions.npz"
         actions = grasp_actions()
         self.actions = replace(
-            actions, scene=replace(actions.scene, friction=PairFriction(tip=0.7, link=0.4, table=0.3))
+            actions,
+            scene=replace(actions.scene, friction=PairFriction(tip=0.7, link=0.4, table=0.3)),
         )
         write_actions(self.path, self.actions, {"mujoco": recording()})
 
     def test_round_trip(self):
         with np.load(self.path) as file:
-            self.assertEqual((file["engine"].tolist(), file["tip_force"].shape), (["mujoco"], (1, 20, 2, 3)))
+            self.assertEqual(
+                (file["engine"].tolist(), file["tip_force"].shape), (["mujoco"], (1, 20, 2, 3))
+            )
         found = read_actions(self.path, self.actions.robot, lambda _: self.actions.object)
         for name in ("timestep", "substeps", "friction"):
             self.assertEqual(getattr(found.scene, name), getattr(self.actions.scene, name), name)
@@ -224,11 +263,15 @@ class ActionsTest(unittest.TestCase):
 
     def test_refusals(self):
         robot, thing = self.actions.robot, self.actions.object
-        with self.assertRaisesRegex(FileFormatError, "for another version of 'conformance-gripper'"):
+        with self.assertRaisesRegex(
+            FileFormatError, "for another version of 'conformance-gripper'"
+        ):
             read_actions(self.path, replace(robot, base_pos=(0.0, 0.0, 0.2)), lambda _: thing)
         with self.assertRaisesRegex(FileFormatError, "another geometry of brick"):
             read_actions(self.path, robot, lambda _: replace(thing, source="0" * 64))
-        write_actions(self.path, replace(self.actions, joint_target=self.actions.joint_target * math.nan))
+        write_actions(
+            self.path, replace(self.actions, joint_target=self.actions.joint_target * math.nan)
+        )
         with self.assertRaisesRegex(FileFormatError, "'joint_target' holds non-finite numbers"):
             read_actions(self.path, robot, lambda _: thing)
 
@@ -240,7 +283,11 @@ class EvaluationTest(unittest.TestCase):
     def setUpClass(cls):
         task = TaskConfig(
             reset=ResetConfig(
-                demo_probability=0.0, home_gravity_std=0.0, spawn_xy=0.0, spawn_yaw=0.0, home_noise=False
+                demo_probability=0.0,
+                home_gravity_std=0.0,
+                spawn_xy=0.0,
+                spawn_yaw=0.0,
+                home_noise=False,
             ),
             randomization=RandomizationConfig(enabled=False),
             termination=TerminationConfig(episode_seconds=0.7),
@@ -255,15 +302,22 @@ class EvaluationTest(unittest.TestCase):
         self.assertEqual(len(actions.joint_target), 42)
         replayed = trace(actions, engine("mujoco", workers=0), []).reference.recording
         slower = replace(episode, time=2 * episode.time)
-        self.assertEqual(recorded_actions(toy_grasp.robot(), toy_grasp.brick(), slower, label="").scene.substeps, 8)
+        self.assertEqual(
+            recorded_actions(toy_grasp.robot(), toy_grasp.brick(), slower, label="").scene.substeps,
+            8,
+        )
         odd = replace(episode, time=0.9 * episode.time)
-        with self.assertRaisesRegex(FileFormatError, "control steps of 0.015 s, expected a multiple"):
+        with self.assertRaisesRegex(
+            FileFormatError, "control steps of 0.015 s, expected a multiple"
+        ):
             recorded_actions(toy_grasp.robot(), toy_grasp.brick(), odd, label="")
         every = 3  # control steps of 1/60 s between recorded states
         np.testing.assert_allclose(
             replayed.object_pos[every - 1 :: every, 0].numpy(), episode.object_pos[1:], atol=1e-6
         )
-        np.testing.assert_allclose(replayed.joint_pos[every - 1 :: every, 0].numpy(), episode.joint_pos[1:], atol=1e-6)
+        np.testing.assert_allclose(
+            replayed.joint_pos[every - 1 :: every, 0].numpy(), episode.joint_pos[1:], atol=1e-6
+        )
 
     def test_from_files(self):
         from tests.toy_results import toy_rollouts, toy_summary
@@ -281,11 +335,19 @@ class EvaluationTest(unittest.TestCase):
             return from_file(folder / "sapien.trace.npz", Place(), thing, episode)
 
         actions = load(0, SPAM)
-        self.assertEqual((actions.object.name, actions.label), (SPAM, "zero in sapien, demonstration 1"))
-        np.testing.assert_allclose(actions.joint_target.numpy(), np.asarray(made.traces[1].joint_target), atol=1e-6)
+        self.assertEqual(
+            (actions.object.name, actions.label), (SPAM, "zero in sapien, demonstration 1")
+        )
+        np.testing.assert_allclose(
+            actions.joint_target.numpy(), np.asarray(made.traces[1].joint_target), atol=1e-6
+        )
         for episode in (0, 1):
-            self.assertEqual(load(episode, object=SOUP).label, f"zero in sapien, demonstration {episode}")
-        with self.assertRaisesRegex(DemoError, f"records 1 episodes of {SPAM}, so --episode is at most 0"):
+            self.assertEqual(
+                load(episode, object=SOUP).label, f"zero in sapien, demonstration {episode}"
+            )
+        with self.assertRaisesRegex(
+            DemoError, f"records 1 episodes of {SPAM}, so --episode is at most 0"
+        ):
             load(1, SPAM)
         with self.assertRaisesRegex(DemoError, f"has no mug; it has {SOUP}, {SPAM}"):
             load(0, "mug")

@@ -71,19 +71,31 @@ class TrainingTest(unittest.TestCase):
 
     @classmethod
     def options(cls, **changes):
-        return {"engine": "mujoco", "device": "cpu", "num_envs": 4, "seed": 3, "config": CONFIG} | changes
+        return {
+            "engine": "mujoco",
+            "device": "cpu",
+            "num_envs": 4,
+            "seed": 3,
+            "config": CONFIG,
+        } | changes
 
     @contextmanager
     def quickly(self):
         """Leave out what takes longer than all the rest: processes for the engine, and the export at the end."""
         in_this_process = mock.patch("xreset.env.make_backend", partial(make_backend, workers=0))
-        with in_this_process, mock.patch("xreset.learning.train.export_onnx"), redirect_stdout(io.StringIO()) as said:
+        with (
+            in_this_process,
+            mock.patch("xreset.learning.train.export_onnx"),
+            redirect_stdout(io.StringIO()) as said,
+        ):
             yield said
 
     def train(self, name: str, **changes) -> Path:
         """Train a run of that name in the folder, without an export."""
         with self.quickly():
-            return train(changes.pop("bank", self.bank), out=self.folder / name, **self.options(**changes))
+            return train(
+                changes.pop("bank", self.bank), out=self.folder / name, **self.options(**changes)
+            )
 
     def resume(self, out: Path, **options) -> str:
         """Continue a run without an export; returns what it printed."""
@@ -95,7 +107,10 @@ class TrainingTest(unittest.TestCase):
         info = read_run(self.out)
         self.assertEqual(info.config, CONFIG)
         self.assertEqual((info.backend, info.num_envs, info.seed), ("mujoco", 4, 3))
-        self.assertEqual((info.robot, info.resets, info.resets_hash), ("openarm", str(self.bank), file_hash(self.bank)))
+        self.assertEqual(
+            (info.robot, info.resets, info.resets_hash),
+            ("openarm", str(self.bank), file_hash(self.bank)),
+        )
         self.assertEqual(info.contract["objects"], [SOUP, SPAM])
         self.assertEqual(info.contract["joint_names"], list(self.robot.joint_names))
         self.assertEqual([c.name for c in checkpoints(self.out)], ["000001.pt", "000002.pt"])
@@ -111,15 +126,24 @@ class TrainingTest(unittest.TestCase):
         write_goals(self.folder / "goals.npz", goals)
         options = {"bank": None, "num_envs": 8}
         info = read_run(self.train("goals", goals=goals, **options))
-        self.assertEqual((info.resets, info.robot), (str(self.folder / "goals" / "goals.npz"), "openarm"))
-        self.assertEqual((CONFIG.task.reset.demo_probability, info.config.task.reset.demo_probability), (0.5, 0.0))
+        self.assertEqual(
+            (info.resets, info.robot), (str(self.folder / "goals" / "goals.npz"), "openarm")
+        )
+        self.assertEqual(
+            (CONFIG.task.reset.demo_probability, info.config.task.reset.demo_probability),
+            (0.5, 0.0),
+        )
         file = self.folder / "goals.npz"
         tuned = self.train("tuned", goals=file, weights=self.out, config=None, **options)
         info = read_run(tuned)
-        self.assertEqual((info.config.model, info.config.iterations), (CONFIG.model, CONFIG.iterations))
+        self.assertEqual(
+            (info.config.model, info.config.iterations), (CONFIG.model, CONFIG.iterations)
+        )
         self.assertEqual(info.weights, str(latest_checkpoint(self.out)))
         both = read_bank(read_run(self.train("both", goals=file)).resets)
-        self.assertEqual((both.num_states, len(both.sequence_name), both.object_names), (6, 7, (SOUP, SPAM)))
+        self.assertEqual(
+            (both.num_states, len(both.sequence_name), both.object_names), (6, 7, (SOUP, SPAM))
+        )
         np.testing.assert_array_equal(both.goal_pos[3:], goals.goal_pos)
 
     def test_the_same_seed_gives_the_same_policy_and_resume_continues(self):
@@ -128,14 +152,18 @@ class TrainingTest(unittest.TestCase):
         two = newest(out)
         torch.testing.assert_close(one.actor_state_dict, two.actor_state_dict)
         changed = newest(self.train("other", seed=4)).actor_state_dict
-        self.assertTrue(any(not torch.equal(x, changed[name]) for name, x in one.actor_state_dict.items()))
+        self.assertTrue(
+            any(not torch.equal(x, changed[name]) for name, x in one.actor_state_dict.items())
+        )
         self.resume(out, iterations=3)
         after = newest(out)
         self.assertEqual((after.iteration, after.env_steps), (3, 3 * 8 * 4))
         self.assertGreater(after.elapsed, two.elapsed)
         self.assertEqual(read_run(out).config.iterations, 3)
         steps = {int(s["step"]) for s in after.optimizer_state_dict["state"].values()}
-        self.assertEqual(steps, {3 * 2 * 2}, "iterations x epochs x minibatches: the optimiser went on")
+        self.assertEqual(
+            steps, {3 * 2 * 2}, "iterations x epochs x minibatches: the optimiser went on"
+        )
 
     def test_recipes_train(self):
         """The published one takes the longest steps through the network, so the network is small here."""
@@ -143,9 +171,13 @@ class TrainingTest(unittest.TestCase):
             with self.subTest(name):
                 base = RECIPES[name].config
                 small = replace(base.model, lstm=16)
-                config = replace(base, model=small, ppo=replace(base.ppo, mini_epochs=1), iterations=1)
+                config = replace(
+                    base, model=small, ppo=replace(base.ppo, mini_epochs=1), iterations=1
+                )
                 content = newest(self.train(f"recipe-{name}", config=config))
-                self.assertEqual((content.iteration, content.env_steps), (1, 4 * config.ppo.horizon))
+                self.assertEqual(
+                    (content.iteration, content.env_steps), (1, 4 * config.ppo.horizon)
+                )
                 for value in content.actor_state_dict.values():
                     self.assertTrue(bool(value.isfinite().all()))
 
@@ -185,24 +217,49 @@ class TrainingTest(unittest.TestCase):
     def test_a_configuration_starts_from_a_recipe_or_from_another_run(self):
         def parsed(*arguments: str) -> TrainConfig:
             with mock.patch("xreset.learning.train.train") as started:
-                main(["train", "--robot", "openarm", "--resets", "bank.npz", "--out", "run", *arguments])
+                main(
+                    [
+                        "train",
+                        "--robot",
+                        "openarm",
+                        "--resets",
+                        "bank.npz",
+                        "--out",
+                        "run",
+                        *arguments,
+                    ]
+                )
             return started.call_args.kwargs["config"]
 
         self.assertEqual(parsed(), TrainConfig())
         minutes = parsed("--like", "minutes", "--config.ppo.entropy", "0.001")
-        self.assertEqual((minutes.ppo.desired_kl, minutes.ppo.entropy, minutes.model.initial_std), (0.02, 0.001, 0.3))
+        self.assertEqual(
+            (minutes.ppo.desired_kl, minutes.ppo.entropy, minutes.model.initial_std),
+            (0.02, 0.001, 0.3),
+        )
         robust = parsed("--like", "robust")
         self.assertEqual(
-            replace(robust, task=replace(robust.task, randomization=RandomizationConfig())), RECIPES["minutes"].config
+            replace(robust, task=replace(robust.task, randomization=RandomizationConfig())),
+            RECIPES["minutes"].config,
         )
-        self.assertEqual(parsed(f"--like={self.out}", "--config.save-interval", "7"), replace(CONFIG, save_interval=7))
+        self.assertEqual(
+            parsed(f"--like={self.out}", "--config.save-interval", "7"),
+            replace(CONFIG, save_interval=7),
+        )
         for arguments, problem in (
-            (("--like", "nothing"), "no recipe and no run folder 'nothing'. Recipes: paper, .*; minutes, what taught"),
+            (
+                ("--like", "nothing"),
+                "no recipe and no run folder 'nothing'. Recipes: paper, .*; minutes, what taught",
+            ),
             (("--like", str(self.folder)), "is not a run folder"),
             (("--like", "minutes", "--resume"), "Omit --like"),
             (("--weights", str(self.out), "--resume"), "Omit --weights"),
         ):
-            with self.subTest(arguments), redirect_stderr(io.StringIO()) as said, self.assertRaises(SystemExit):
+            with (
+                self.subTest(arguments),
+                redirect_stderr(io.StringIO()) as said,
+                self.assertRaises(SystemExit),
+            ):
                 parsed(*arguments)
             self.assertRegex(said.getvalue(), problem)
 
@@ -210,7 +267,9 @@ class TrainingTest(unittest.TestCase):
         """Reward terms of one's own are taken from the command line only."""
         code = self.folder / "code"
         code.mkdir()
-        (code / "strangers_term.py").write_text("def zero(x):\n    return x.tip_distance[:, 0] * 0\n")
+        (code / "strangers_term.py").write_text(
+            "def zero(x):\n    return x.tip_distance[:, 0] * 0\n"
+        )
         sys.path.insert(0, str(code))
         self.addCleanup(sys.path.remove, str(code))
         stranger = self.folder / "stranger"
@@ -218,7 +277,16 @@ class TrainingTest(unittest.TestCase):
         data = json.loads((stranger / "run.json").read_text())
         data["config"]["task"]["reward"]["own"] = {"strangers_term:zero": 1.0}
         (stranger / "run.json").write_text(json.dumps(data))
-        like = ["--like", str(stranger), "--robot", "openarm", "--resets", str(self.bank), "--backend", "mujoco"]
+        like = [
+            "--like",
+            str(stranger),
+            "--robot",
+            "openarm",
+            "--resets",
+            str(self.bank),
+            "--backend",
+            "mujoco",
+        ]
         like += ["--device", "cpu", "--num-envs", "4", "--iterations", "1", "--out"]
         resume = ["--resume", "--out", str(stranger), "--iterations", "3"]
         naming = ["--config.task.reward.own", "strangers_term:zero", "1"]
@@ -237,17 +305,23 @@ class TrainingTest(unittest.TestCase):
         for arguments in ([*like, str(self.folder / "with")], resume):
             said(*arguments, *naming)
         self.assertIn("strangers_term", sys.modules)
-        self.assertEqual(read_run(self.folder / "with").config.task.reward.own, {"strangers_term:zero": 1.0})
+        self.assertEqual(
+            read_run(self.folder / "with").config.task.reward.own, {"strangers_term:zero": 1.0}
+        )
         self.assertEqual(len(checkpoints(stranger)), 3)
 
     def test_a_run_begins_with_the_networks_of_another(self):
-        still = replace(CONFIG, ppo=replace(CONFIG.ppo, learning_rate=1e-12, schedule="fixed"), iterations=1)
+        still = replace(
+            CONFIG, ppo=replace(CONFIG.ppo, learning_rate=1e-12, schedule="fixed"), iterations=1
+        )
         given = latest_checkpoint(self.out)
         out = self.train("onwards", config=still, weights=self.out)
         info = read_run(out)
         self.assertEqual((info.weights, info.weights_hash), (str(given), file_hash(given)))
         content, before = newest(out), read_checkpoint(given)
-        self.assertEqual((content.iteration, content.env_steps), (1, 8 * 4))  # counters start at zero
+        self.assertEqual(
+            (content.iteration, content.env_steps), (1, 8 * 4)
+        )  # counters start at zero
         runner = mock.Mock(config=CONFIG, _load=read_checkpoint)
         TrainingRunner.load_networks(runner, given)
         self.assertEqual(runner.alg.learning_rate, before.learning_rate)  # an adaptive rate goes on
@@ -256,7 +330,9 @@ class TrainingTest(unittest.TestCase):
                 if "normalizer" not in name:  # which goes on to learn
                     torch.testing.assert_close(getattr(content, networks)[name], value, msg=name)
         count = next(name for name in before.actor_state_dict if name.endswith("normalizer.count"))
-        self.assertEqual(int(content.actor_state_dict[count]), int(before.actor_state_dict[count]) + 8 * 4)
+        self.assertEqual(
+            int(content.actor_state_dict[count]), int(before.actor_state_dict[count]) + 8 * 4
+        )
 
     def test_the_policy_is_that_of_the_chosen_or_newest_checkpoint(self):
         out = self.folder / "exported"
@@ -278,7 +354,8 @@ class TrainingTest(unittest.TestCase):
             demos="",
         )
         self.assertRegex(
-            choice.sentence(), "000001.pt, .* of 2 checkpoints in 1 engines; the newest, 000002.pt, has 50"
+            choice.sentence(),
+            "000001.pt, .* of 2 checkpoints in 1 engines; the newest, 000002.pt, has 50",
         )
         write_choice(out, choice)
         first = ensure_policy(out).read_bytes()
@@ -288,11 +365,16 @@ class TrainingTest(unittest.TestCase):
         ensure_policy(out)
         self.assertEqual(policy.stat().st_mtime_ns, written)
         shutil.copy(out / "checkpoints" / "000002.pt", out / "checkpoints" / "000003.pt")
-        self.assertNotEqual(ensure_policy(out).read_bytes(), first, "the choice did not know the newest one")
+        self.assertNotEqual(
+            ensure_policy(out).read_bytes(), first, "the choice did not know the newest one"
+        )
 
     def test_what_cannot_be_trained_is_refused_and_leaves_no_run(self):
         short = replace(
-            CONFIG, task=replace(CONFIG.task, observation=replace(CONFIG.task.observation, cloud_history=3))
+            CONFIG,
+            task=replace(
+                CONFIG.task, observation=replace(CONFIG.task.observation, cloud_history=3)
+            ),
         )
         wide = replace(CONFIG, model=replace(CONFIG.model, lstm=16))
         empty = toy_bank(self.robot).with_states(np.zeros(6, dtype=bool))
@@ -306,13 +388,19 @@ class TrainingTest(unittest.TestCase):
             ("'mujoco' does not run on 'cuda'", {"device": "cuda"}),
             ("needs a reset bank .--resets., a goal set .--goals., or both", {"bank": None}),
             ("the goal set for 'ur7e-sharpa'", {"goals": toy_goals(robots.load("ur7e-sharpa"))}),
-            ("different meshes of 005", {"goals": toy_goals(self.robot, object_sources=("abc", "stand-in"))}),
+            (
+                "different meshes of 005",
+                {"goals": toy_goals(self.robot, object_sources=("abc", "stand-in"))},
+            ),
             ("no state to reset to.*demo-probability 0", {"bank": empty}),
             ("reset bank for the robot 'openarm'", {"robot": "ur7e-sharpa"}),
         ):
             with self.subTest(words), self.assertRaisesRegex(XResetError, words):
                 self.train("refused", **options)
-        with claim(self.folder / "refused"), self.assertRaisesRegex(XResetError, "nother (command|process) is writing"):
+        with (
+            claim(self.folder / "refused"),
+            self.assertRaisesRegex(XResetError, "nother (command|process) is writing"),
+        ):
             self.train("refused")
         self.assertFalse((self.folder / "refused" / "run.json").exists())
         with self.assertRaisesRegex(RunError, "holds a run already.*--resume"):
@@ -327,7 +415,9 @@ class TrainingTest(unittest.TestCase):
     def test_a_training_leaves_global_settings_as_they_were(self):
         self.addCleanup(torch.set_float32_matmul_precision, torch.get_float32_matmul_precision())
         torch.set_float32_matmul_precision("medium")
-        torch.distributed.init_process_group("gloo", store=torch.distributed.HashStore(), rank=0, world_size=1)
+        torch.distributed.init_process_group(
+            "gloo", store=torch.distributed.HashStore(), rank=0, world_size=1
+        )
         self.addCleanup(torch.distributed.destroy_process_group)
         self.train("polite", config=replace(CONFIG, iterations=1))
         self.assertEqual(torch.get_float32_matmul_precision(), "medium")
@@ -353,7 +443,9 @@ class TrainingTest(unittest.TestCase):
                     self.train(name, seed=5)
                 self.assertEqual(read_run(out).seed, 3 if is_resumed else 5)
                 self.assertEqual(len(checkpoints(out)), 2)
-                self.assertFalse([f.name for f in out.rglob("*") if f.name.endswith((".part", ".old", ".lock"))])
+                self.assertFalse(
+                    [f.name for f in out.rglob("*") if f.name.endswith((".part", ".old", ".lock"))]
+                )
 
     def test_too_little_memory_is_said(self):
         few = "4 worlds on cpu need more memory.*--num-envs"
@@ -380,7 +472,10 @@ class TrainingTest(unittest.TestCase):
             ("actor_state_dict", []),
         ):
             torch.save(good | {key: wrong}, file)
-            with self.subTest(key), self.assertRaisesRegex(FileFormatError, rf"{file.name}\.{key} is"):
+            with (
+                self.subTest(key),
+                self.assertRaisesRegex(FileFormatError, rf"{file.name}\.{key} is"),
+            ):
                 read_checkpoint(file)
         for name, key, wrong in (
             ("actor", "mlp.0.bias", "x"),
@@ -390,10 +485,17 @@ class TrainingTest(unittest.TestCase):
         ):
             table = f"{name}_state_dict"
             torch.save(good | {table: good[table] | {key: wrong}}, file)
-            with self.subTest(key), self.assertRaisesRegex(FileFormatError, f"(?s){table} is .*, expected "):
+            with (
+                self.subTest(key),
+                self.assertRaisesRegex(FileFormatError, f"(?s){table} is .*, expected "),
+            ):
                 read_checkpoint(file)
         optimizer = torch.optim.Adam([torch.zeros(2, requires_grad=True)])
-        moments = {"step": torch.tensor(1.0), "exp_avg": torch.zeros(3), "exp_avg_sq": torch.zeros(3)}
+        moments = {
+            "step": torch.tensor(1.0),
+            "exp_avg": torch.zeros(3),
+            "exp_avg_sq": torch.zeros(3),
+        }
         with self.assertRaisesRegex(ValueError, r"exp_avg has shape \(3,\), expected \(2,\)"):
             load_moments(optimizer, {0: moments})
 
@@ -407,7 +509,10 @@ class TrainingTest(unittest.TestCase):
             (r"config\.task\.action.*unknown: gripper", {"config": config}),
             (r"\(of xreset '9.9'\).*unknown: later", {"later": 1, "xreset": "9.9"}),
             ("num_envs is -5", {"num_envs": -5}),
-            ("contract of it.joint_names is 3", {"contract": good["contract"] | {"joint_names": 3}}),
+            (
+                "contract of it.joint_names is 3",
+                {"contract": good["contract"] | {"joint_names": 3}},
+            ),
         ):
             (out / "run.json").write_text(json.dumps(good | changes))
             with self.subTest(words), self.assertRaisesRegex(FileFormatError, words):

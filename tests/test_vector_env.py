@@ -20,7 +20,9 @@ from xreset.vector_env import VectorEnv
 
 class VectorEnvTest(WithEnv):
     def vector_env(self, seconds: float) -> VectorEnv:
-        envs = VectorEnv(self.make(replace(TASK, termination=TerminationConfig(episode_seconds=seconds))))
+        envs = VectorEnv(
+            self.make(replace(TASK, termination=TerminationConfig(episode_seconds=seconds)))
+        )
         self.addCleanup(envs.close)
         return envs
 
@@ -53,7 +55,9 @@ class VectorEnvTest(WithEnv):
         before, *_ = env.step(still)
         inner.backend.broken[0] = True
         seen, reward, terminated, truncated, infos = env.step(still)
-        self.assertEqual((terminated.tolist(), infos["faulty"].tolist()), ([True, False, False],) * 2)
+        self.assertEqual(
+            (terminated.tolist(), infos["faulty"].tolist()), ([True, False, False],) * 2
+        )
         self.assertFalse(truncated.any(), "a fault is no truncation: nobody may bootstrap from it")
         self.assertEqual(reward[0], 0.0)
         for name, value in seen.items():
@@ -71,7 +75,14 @@ class VectorEnvTest(WithEnv):
         env = self.vector_env(0.5)
         joints = env.env.num_actions
         right = np.zeros((N, joints))
-        for wrong in (0.0, right[:1], right[:, :1], right + 1j, right.astype(bool), [["left"] * joints] * N):
+        for wrong in (
+            0.0,
+            right[:1],
+            right[:, :1],
+            right + 1j,
+            right.astype(bool),
+            [["left"] * joints] * N,
+        ):
             with (
                 self.subTest(shape=np.shape(wrong)),
                 self.assertRaisesRegex(XResetError, rf"of shape \({N}, {joints}\)"),

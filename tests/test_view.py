@@ -135,14 +135,20 @@ class Data(WithFiles):
         self.assertEqual(view.text(3)[0], "not annotated")
         can = view.objects[0]
         lowest = view.object_pos[0, 2] + can.vertices[:, 2].min()
-        self.assertAlmostEqual(lowest, 0.0, delta=2e-3)  # the object rests on the table, and the hand has moved with it
-        np.testing.assert_allclose(view.human_keypoints[2, 0], view.object_pos[2] + [0.03, 0, 0], atol=1e-6)
+        self.assertAlmostEqual(
+            lowest, 0.0, delta=2e-3
+        )  # the object rests on the table, and the hand has moved with it
+        np.testing.assert_allclose(
+            view.human_keypoints[2, 0], view.object_pos[2] + [0.03, 0, 0], atol=1e-6
+        )
 
     def test_robot_trajectories(self):
         view = load_view(self.retargeted)
         self.assertIsNone(view.human_keypoints)
         named = replace(toy_retargeted(self.robot), object_name=np.array(["soup", "spam"]))
-        self.assertEqual(load_view(self.write(named, "alias")).objects, view.objects, "the paper's names")
+        self.assertEqual(
+            load_view(self.write(named, "alias")).objects, view.objects, "the paper's names"
+        )
         self.assertEqual(view.reason, ("", "joint limit", "", "") * 2)
         self.assertEqual(view.text(1)[:2], ("not valid: joint limit", SOUP))
         text = (
@@ -171,13 +177,20 @@ class Data(WithFiles):
         view = load_view(self.bank)
         np.testing.assert_array_equal(view.choose(), range(6))
         np.testing.assert_array_equal(view.choose(sequence=1), [2, 3])
-        self.assertEqual(view.text(3), ("stable in physics", SPAM, "sequence 1: demo_b", "frame 8", "after contact"))
+        self.assertEqual(
+            view.text(3),
+            ("stable in physics", SPAM, "sequence 1: demo_b", "frame 8", "after contact"),
+        )
 
     def test_wrong_use_is_explained(self):
         text = self.folder / "text.npz"
         text.write_text("hello")
         for words, kind, use in (
-            ("there is no|There is no", FileFormatError, lambda: load_view(self.folder / "none.npz")),
+            (
+                "there is no|There is no",
+                FileFormatError,
+                lambda: load_view(self.folder / "none.npz"),
+            ),
             ("npz", FileFormatError, lambda: load_view(text)),
             ("demonstrations only", XResetError, lambda: load_view(self.demos, demos=self.demos)),
             ("robot", FileFormatError, lambda: load_view(self.bank, robot="ur7e-sharpa")),
@@ -204,7 +217,9 @@ class Pictures(WithFiles):
     def test_demonstrations_have_no_robot_but_a_hand(self):
         yellow = []
         for picture in self.draw(self.demos, 0, 2, 3):  # the hand is away, touches, is unknown
-            yellow.append(((picture > [240, 190, -1]) & (picture < [256, 256, 60])).all(axis=-1).any())
+            yellow.append(
+                ((picture > [240, 190, -1]) & (picture < [256, 256, 60])).all(axis=-1).any()
+            )
         self.assertEqual(yellow, [False, True, False])
 
     def test_png_and_film_from_the_command_line(self):
@@ -213,7 +228,9 @@ class Pictures(WithFiles):
         self.assertEqual(code, 0, text)
         self.assertIn("not valid: joint limit", text)
         expected = self.folder / "expected.png"
-        write_png(expected, Drawer(load_view(self.retargeted), size=(960, 720), smooth=True).draw(5))
+        write_png(
+            expected, Drawer(load_view(self.retargeted), size=(960, 720), smooth=True).draw(5)
+        )
         self.assertEqual(out.read_bytes(), expected.read_bytes())
         if find_spec("imageio_ffmpeg"):
             film = self.folder / "view.mp4"
@@ -251,7 +268,9 @@ class Served(WithFiles):
             self.assertEqual([handle.visible for handle in scene._objects], [False, True])
             kinematics = Kinematics(self.robot)
             for name, link in scene._robot.links.items():
-                np.testing.assert_allclose(link.position, poses[kinematics.link_index(name), :3, 3], atol=1e-6)
+                np.testing.assert_allclose(
+                    link.position, poses[kinematics.link_index(name), :3, 3], atol=1e-6
+                )
                 own = scene._robot._colors[name]
                 np.testing.assert_array_equal(link.color, rgb(tint(own, color) if color else own))
 
@@ -273,7 +292,9 @@ class Served(WithFiles):
 
     def test_the_command_serves_until_interrupted(self):
         command = [sys.executable, "-u", "-m", "xreset", "view", str(self.bank), "--port", "8960"]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+        with subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        ) as process:
             self.addCleanup(process.kill)
             line = next((line for line in process.stdout if "reset states at" in line), "")
             self.assertIn("6 reset states", line)
@@ -335,7 +356,9 @@ class OwnPageOnly(WithFiles):
         from xreset.pictures.view.page import Page
 
         with (
-            mock.patch("viser.ViserServer") as server,  # it starts without the function that is replaced
+            mock.patch(
+                "viser.ViserServer"
+            ) as server,  # it starts without the function that is replaced
             self.assertRaisesRegex(XResetError, "cannot be restricted"),
         ):
             Page(load_view(self.bank))

@@ -41,10 +41,13 @@ class InTheBrowser(unittest.TestCase):
             page = Page(load_view(path, **options), port=8940)
         self.addCleanup(page.close)
         self.browser.problems.clear()
-        self.addCleanup(self.browser.open, "about:blank")  # first: a page without its server is a problem
+        self.addCleanup(
+            self.browser.open, "about:blank"
+        )  # first: a page without its server is a problem
         self.browser.open(page.url)
         self.until(
-            lambda: self.exists(INPUT.format(label="sequence")) and "1 of" in self.browser.text(), "the controls"
+            lambda: self.exists(INPUT.format(label="sequence")) and "1 of" in self.browser.text(),
+            "the controls",
         )
         return page
 
@@ -56,13 +59,17 @@ class InTheBrowser(unittest.TestCase):
             raise AssertionError(f"{error}; the page says: {self.browser.text()!r}") from None
 
     def exists(self, element: str) -> bool:
-        return self.browser.evaluate(f"(() => {{ try {{ return !!{element} }} catch {{ return false }} }})()")
+        return self.browser.evaluate(
+            f"(() => {{ try {{ return !!{element} }} catch {{ return false }} }})()"
+        )
 
     def orange_pixels(self) -> int:
         """How much of the page has the object's colour."""
         from PIL import Image
 
-        rgb = np.asarray(Image.open(io.BytesIO(self.browser.screenshot())).convert("RGB")).astype(int)
+        rgb = np.asarray(Image.open(io.BytesIO(self.browser.screenshot())).convert("RGB")).astype(
+            int
+        )
         return int(((rgb[..., 0] - rgb[..., 2] > 60) & (rgb[..., 1] > 100)).sum())
 
     def assert_no_problem(self):
@@ -77,16 +84,21 @@ class InTheBrowser(unittest.TestCase):
         self.browser.evaluate(f"{SLIDER.format(label='frame')}.focus()")
         self.browser.key("ArrowRight")
         self.until(
-            lambda: np.allclose(can.position, page.view.object_pos[1], rtol=0, atol=1e-6), "the can to move to frame 1"
+            lambda: np.allclose(can.position, page.view.object_pos[1], rtol=0, atol=1e-6),
+            "the can to move to frame 1",
         )
-        self.until(lambda: "not valid: joint limit" in self.browser.text(), "the reason in the browser")
+        self.until(
+            lambda: "not valid: joint limit" in self.browser.text(), "the reason in the browser"
+        )
         self.browser.key("End")
         self.until(
-            lambda: page.row == 3 and not page._scene._keypoints.visible, "the last frame, where no hand is annotated"
+            lambda: page.row == 3 and not page._scene._keypoints.visible,
+            "the last frame, where no hand is annotated",
         )
         self.browser.choose("sequence", "1: demo_b")
         self.until(
-            lambda: [body.visible for body in page._scene._objects] == [False, True], "the other sequence's object"
+            lambda: [body.visible for body in page._scene._objects] == [False, True],
+            "the other sequence's object",
         )
         self.assertEqual(page.row, 4)
         self.until(lambda: "sequence 1: demo_b" in self.browser.text(), "its name in the browser")

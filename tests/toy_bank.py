@@ -53,7 +53,9 @@ def toy_bank(robot: RobotSpec, **changes: Any) -> ResetBank:
     return ResetBank(**(fields | changes))
 
 
-def toy_retargeted(robot: RobotSpec, objects: list[str], offsets: list[int], **changes: Any) -> Retargeted:
+def toy_retargeted(
+    robot: RobotSpec, objects: list[str], offsets: list[int], **changes: Any
+) -> Retargeted:
     """Trajectories of demonstrations with these objects; ``changes`` replace fields.
 
     Every frame is valid. The robot is at home, and an object stays at the origin, upright.

@@ -19,7 +19,9 @@ def toy_goals(robot: RobotSpec, **changes: Any) -> GoalSet:
     """Return the goal set; ``changes`` replace fields."""
     owners = [SOUP, SOUP, SPAM, SPAM]
     heights = [rest_height(load_object(name), UPRIGHT) for name in owners]
-    start = np.array([[0.5 + 0.03 * i, 0.3, height] for i, height in enumerate(heights)], np.float32)
+    start = np.array(
+        [[0.5 + 0.03 * i, 0.3, height] for i, height in enumerate(heights)], np.float32
+    )
     fields: dict[str, Any] = {
         "robot": robot.name,
         "robot_fingerprint": robot.fingerprint,

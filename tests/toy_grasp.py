@@ -31,7 +31,10 @@ RAISED = 0.04
 def robot() -> RobotSpec:
     """The gripper, at home with its jaws around the brick."""
     spec = gripper()
-    return replace(spec, joints=tuple(replace(j, home=OPEN) if j.name == "jaw_a_slide" else j for j in spec.joints))
+    return replace(
+        spec,
+        joints=tuple(replace(j, home=OPEN) if j.name == "jaw_a_slide" else j for j in spec.joints),
+    )
 
 
 def brick() -> ObjectSpec:
@@ -51,7 +54,9 @@ def brick_pose() -> tuple[np.ndarray, np.ndarray]:
 def start() -> State:
     """[1] the robot at home, the brick between its jaws, everything at rest."""
     pos, quat = brick_pose()
-    return State.at_rest(torch.as_tensor(robot().home)[None], torch.as_tensor(pos)[None], torch.as_tensor(quat)[None])
+    return State.at_rest(
+        torch.as_tensor(robot().home)[None], torch.as_tensor(pos)[None], torch.as_tensor(quat)[None]
+    )
 
 
 def targets(step: int) -> np.ndarray:
@@ -63,10 +68,14 @@ def targets(step: int) -> np.ndarray:
     return wanted
 
 
-def recording(*, steps: int = 20, worlds: int = 1, joints: int = 5, **changes: torch.Tensor) -> Recording:
+def recording(
+    *, steps: int = 20, worlds: int = 1, joints: int = 5, **changes: torch.Tensor
+) -> Recording:
     """A recording with two fingertips in which everything stands still and touches nothing; ``changes`` replace fields."""
     upright = torch.tensor([1.0, 0, 0, 0])
-    still = State.at_rest(torch.zeros(worlds, joints), torch.zeros(worlds, 3), upright.expand(worlds, 4))
+    still = State.at_rest(
+        torch.zeros(worlds, joints), torch.zeros(worlds, 3), upright.expand(worlds, 4)
+    )
     fields = {
         "joint_pos": torch.zeros(steps, worlds, joints),
         "joint_target": torch.zeros(steps, worlds, joints),
@@ -105,7 +114,11 @@ def trial(task: TaskConfig, **setting) -> Trial:
 def policy() -> PolicySpec:
     """The policy :class:`OpenLoop` by name."""
     return PolicySpec(
-        name="open-loop", start=lambda motion: OpenLoop(), robot=robot(), task=TaskConfig(), folder=Path("eval")
+        name="open-loop",
+        start=lambda motion: OpenLoop(),
+        robot=robot(),
+        task=TaskConfig(),
+        folder=Path("eval"),
     )
 
 
@@ -118,7 +131,9 @@ class OpenLoop:
         self._env, self._step = env, 0
 
     def act(self, observations) -> torch.Tensor:
-        wanted = torch.as_tensor(targets(self._step), dtype=torch.float32).expand(self._env.num_envs, -1)
+        wanted = torch.as_tensor(targets(self._step), dtype=torch.float32).expand(
+            self._env.num_envs, -1
+        )
         self._step += 1
         return self._env.actions.action_for(wanted, self._env.joint_target)
 
@@ -135,7 +150,12 @@ def with_scene(base: Engine, name: str, change) -> Engine:
 def with_drive(scene: SceneSpec, joint: str, **factors: float) -> SceneSpec:
     """The scene with a joint's drive changed by factors."""
     joints = tuple(
-        replace(j, drive=replace(j.drive, **{name: getattr(j.drive, name) * x for name, x in factors.items()}))
+        replace(
+            j,
+            drive=replace(
+                j.drive, **{name: getattr(j.drive, name) * x for name, x in factors.items()}
+            ),
+        )
         if j.name == joint
         else j
         for j in scene.robot.joints

@@ -25,7 +25,14 @@ from xreset.policy import RandomPolicy
 from xreset.resets.bank import ResetBank
 from xreset.resets.distribution import ResetDistribution
 from xreset.spec import SceneSpec
-from xreset.task.config import ActionConfig, ObservationConfig, ResetConfig, RewardConfig, TaskConfig, TerminationConfig
+from xreset.task.config import (
+    ActionConfig,
+    ObservationConfig,
+    ResetConfig,
+    RewardConfig,
+    TaskConfig,
+    TerminationConfig,
+)
 
 WORLDS = 64
 LAST = 10
@@ -107,5 +114,7 @@ def scene() -> SceneSpec:
 
 def environment(seed: int, backend: Backend) -> ManipulationEnv:
     """The task in the backend's worlds."""
-    resets = ResetDistribution(bank(), toy_grasp.robot(), (toy_grasp.brick().name,), CONFIG.task.reset, backend.device)
+    resets = ResetDistribution(
+        bank(), toy_grasp.robot(), (toy_grasp.brick().name,), CONFIG.task.reset, backend.device
+    )
     return ManipulationEnv(backend, CONFIG.task, resets, seed=seed)

@@ -45,9 +45,13 @@ def write_policy(
         "h_in": [1, "n", lstm],
         "c_in": [1, "n", lstm],
     }
-    inputs = [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in shapes.items()]
+    inputs = [
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)
+        for name, shape in shapes.items()
+    ]
     given = [
-        helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in ("actions", "h_out", "c_out")[:outputs]
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, None)
+        for name in ("actions", "h_out", "c_out")[:outputs]
     ]
     width = len(contract["joint_names"]) if actions is None else actions
     weights = numpy_helper.from_array(np.full((flat, width), value, dtype=np.float32), "w")
@@ -58,6 +62,8 @@ def write_policy(
     ]
     graph = helper.make_graph(nodes, "policy", inputs, given, [weights])
     model = helper.make_model(graph, ir_version=9, opset_imports=[helper.make_opsetid("", 18)])
-    helper.set_model_props(model, {"xreset": json.dumps(contract) if metadata is None else metadata})
+    helper.set_model_props(
+        model, {"xreset": json.dumps(contract) if metadata is None else metadata}
+    )
     path.write_bytes(model.SerializeToString())
     return path

@@ -20,12 +20,28 @@ OBJECTS = (SOUP, SPAM)
 ENGINES = ("mujoco", "mujoco-warp", "pybullet", "sapien")
 
 
-def toy_episode(sequence: int, repetition: int, *reached: str, thing: str = "", **changes: Any) -> Episode:
+def toy_episode(
+    sequence: int, repetition: int, *reached: str, thing: str = "", **changes: Any
+) -> Episode:
     """An episode of a demonstration that reached some stages; nothing else is special but for ``changes``."""
-    flags = ("approach", "grasp", "reorient", "reorient_once", "out_of_bounds", "nonfinite", "overflow")
+    flags = (
+        "approach",
+        "grasp",
+        "reorient",
+        "reorient_once",
+        "out_of_bounds",
+        "nonfinite",
+        "overflow",
+    )
     distance = 0.01 if "reorient_once" in reached else 0.1
-    values = {"reorientation_progress": 0.0, "task_progress": 0.0, "published_success": distance < 0.02}
-    values |= dict.fromkeys(("least_distance", "final_distance", "final_position_error", "final_angle"), distance)
+    values = {
+        "reorientation_progress": 0.0,
+        "task_progress": 0.0,
+        "published_success": distance < 0.02,
+    }
+    values |= dict.fromkeys(
+        ("least_distance", "final_distance", "final_position_error", "final_angle"), distance
+    )
     return Episode(
         sequence=sequence,
         sequence_name=f"demo_{sequence}",
@@ -62,7 +78,8 @@ def toy_rollouts(joint_pos: np.ndarray | None = None) -> Rollouts:
             goal_quat=np.array([1.0, 0, 0, 0]),
             time=time,
             joint_pos=joints + 0.01 * sequence * time[:, None],
-            object_pos=np.array([0.5, 0.3, 0.05]) + np.outer(np.linspace(0, 1, 5), [0.0, 0.05, 0.1]),
+            object_pos=np.array([0.5, 0.3, 0.05])
+            + np.outer(np.linspace(0, 1, 5), [0.0, 0.05, 0.1]),
             object_quat=np.tile([1.0, 0, 0, 0], (5, 1)),
             joint_target=joints + 0.01 * np.arange(12)[:, None],
         )
@@ -81,11 +98,15 @@ def toy_rollouts(joint_pos: np.ndarray | None = None) -> Rollouts:
 def rollouts_with(*progress: float) -> Rollouts:
     """Return the toy's four episodes with other task progress."""
     rollouts = toy_rollouts()
-    episodes = [replace(e, task_progress=p) for e, p in zip(rollouts.episodes, progress, strict=True)]
+    episodes = [
+        replace(e, task_progress=p) for e, p in zip(rollouts.episodes, progress, strict=True)
+    ]
     return replace(rollouts, episodes=tuple(episodes))
 
 
-def toy_summary(backend: str = "mujoco", rollouts: Rollouts | None = None, **changes: Any) -> EvalResult:
+def toy_summary(
+    backend: str = "mujoco", rollouts: Rollouts | None = None, **changes: Any
+) -> EvalResult:
     """Return ``BACKEND.json`` of the rollouts; ``changes`` replace arguments of :func:`xreset.eval.results.summarize`."""
     arguments: dict[str, Any] = {
         "backend_version": "4.0.0",
@@ -105,11 +126,21 @@ class InFolder(unittest.TestCase):
         self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
 
     def write_results(
-        self, name: str, rollouts: Rollouts | None = None, engines=("mujoco",), joints=("a", "b", "c"), **changes: Any
+        self,
+        name: str,
+        rollouts: Rollouts | None = None,
+        engines=("mujoco",),
+        joints=("a", "b", "c"),
+        **changes: Any,
     ) -> Path:
         rollouts = rollouts or toy_rollouts()
         for engine in engines:
-            write_results(self.folder / name / "eval", toy_summary(engine, rollouts, **changes), rollouts, joints)
+            write_results(
+                self.folder / name / "eval",
+                toy_summary(engine, rollouts, **changes),
+                rollouts,
+                joints,
+            )
         return self.folder / name
 
     def write_run(self, name: str, config: TrainConfig | None = None, **changes: Any) -> Path:

@@ -28,7 +28,13 @@ def box_object(*boxes: tuple[tuple[float, float, float], tuple[float, float, flo
     pieces = tuple(box(center, size) for center, size in boxes)
     vertices, faces = surface_of(pieces)
     return ObjectSpec(
-        name="block", pieces=pieces, mass=1.0, com=np.zeros(3), inertia=np.eye(3), vertices=vertices, faces=faces
+        name="block",
+        pieces=pieces,
+        mass=1.0,
+        com=np.zeros(3),
+        inertia=np.eye(3),
+        vertices=vertices,
+        faces=faces,
     )
 
 
@@ -63,7 +69,9 @@ def arm_targets(model: ArmModel, joints: Tensor) -> ArmTargets:
     )
 
 
-def slope(function: Callable[[Tensor], Tensor], x: Tensor, index: Any, step: float = 1e-6) -> Tensor:
+def slope(
+    function: Callable[[Tensor], Tensor], x: Tensor, index: Any, step: float = 1e-6
+) -> Tensor:
     """Derivative of a function by the elements of x at an index, which is moved by a step both ways."""
     shift = torch.zeros_like(x)
     shift[index] = step
@@ -71,7 +79,11 @@ def slope(function: Callable[[Tensor], Tensor], x: Tensor, index: Any, step: flo
 
 
 def check_gradient(
-    model: HandModel, targets: HandTargets, config: HandConfig, state: HandState, frames: tuple[int, ...]
+    model: HandModel,
+    targets: HandTargets,
+    config: HandConfig,
+    state: HandState,
+    frames: tuple[int, ...],
 ) -> None:
     """Assert that the gradient of the hand's cost is its derivative by every variable of some frames."""
 

@@ -16,7 +16,17 @@ if TYPE_CHECKING:
 _JOINTS = (
     # name, type, parent, child, xyz, rpy, axis, lower, upper
     ("arm_1", "revolute", "base", "shoulder", "0 0 0.2", "0 0 0", "0 0 1", -3.0, 3.0),
-    ("arm_2", "revolute", "shoulder", "upper", "0.02 0.05 0", "1.2 -0.3 0.5", "0.6 0 0.8", -2.0, 2.0),
+    (
+        "arm_2",
+        "revolute",
+        "shoulder",
+        "upper",
+        "0.02 0.05 0",
+        "1.2 -0.3 0.5",
+        "0.6 0 0.8",
+        -2.0,
+        2.0,
+    ),
     ("arm_3", "prismatic", "upper", "fore", "0.3 0 0.1", "0 0.4 0", "0 1 0", -0.1, 0.3),
     ("mount", "fixed", "fore", "palm", "0 0.1 0.05", "0.2 0.1 -0.4", None, 0, 0),
     ("finger_a1", "revolute", "palm", "finger_a1", "0.05 0.02 0", "0 0 0.3", "0 1 0", -0.5, 1.6),
@@ -41,7 +51,11 @@ def write_urdf(path: Path, rename: dict[str, str] | None = None) -> Path:
         )
     for name, kind, parent, child, xyz, rpy, axis, lower, upper in _JOINTS:
         name = (rename or {}).get(name, name)
-        moves = f'<axis xyz="{axis}"/><limit lower="{lower}" upper="{upper}" effort="1" velocity="1"/>' if axis else ""
+        moves = (
+            f'<axis xyz="{axis}"/><limit lower="{lower}" upper="{upper}" effort="1" velocity="1"/>'
+            if axis
+            else ""
+        )
         lines.append(
             f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
             f'<origin xyz="{xyz}" rpy="{rpy}"/>{moves}</joint>'
@@ -58,15 +72,22 @@ def toy_hand_arm(folder: Path) -> RobotSpec:
         name="toy",
         urdf=write_urdf(folder / "toy.urdf"),
         joints=tuple(
-            JointSpec(name=n, group="arm" if n.startswith("arm") else "hand", drive=drive, home=0.01) for n in order
+            JointSpec(
+                name=n, group="arm" if n.startswith("arm") else "hand", drive=drive, home=0.01
+            )
+            for n in order
         ),
         mimics=(MimicSpec(joint="jaw_b", source="jaw_a", multiplier=2.0, offset=0.005),),
         base_pos=(0.1, -0.2, 0.3),
         base_quat=(0.5, 0.5, 0.5, 0.5),
         palm="palm",
         fingertips=(
-            FingertipSpec(name="thumb", link="tip_b", contact_links=("finger_b1",), keypoint="thumb4"),
-            FingertipSpec(name="index", link="tip_a", contact_links=("finger_a2",), keypoint="index4"),
+            FingertipSpec(
+                name="thumb", link="tip_b", contact_links=("finger_b1",), keypoint="thumb4"
+            ),
+            FingertipSpec(
+                name="index", link="tip_a", contact_links=("finger_a2",), keypoint="index4"
+            ),
         ),
         keypoints=(
             KeypointSpec(keypoint="wrist", link="palm"),
@@ -80,7 +101,9 @@ def toy_hand_arm(folder: Path) -> RobotSpec:
     )
 
 
-def toy_motion(model: HandModel, generator: torch.Generator, *, margin: float, turn: float) -> HandState:
+def toy_motion(
+    model: HandModel, generator: torch.Generator, *, margin: float, turn: float
+) -> HandState:
     """Three motions of 12 frames: the joints move between two postures, the root along a line while it turns.
 
     The postures keep a share ``margin`` of the joints' range from the limits. The root turns by ``turn`` [rad] about
@@ -92,8 +115,15 @@ def toy_motion(model: HandModel, generator: torch.Generator, *, margin: float, t
     high = model.kinematics.upper
     share = torch.linspace(0, 1, 12, dtype=low.dtype)[:, None]
     ends = low + (high - low) * (
-        margin + (1.0 - 2.0 * margin) * torch.rand(2, 3, 1, len(low), dtype=low.dtype, generator=generator)
+        margin
+        + (1.0 - 2.0 * margin) * torch.rand(2, 3, 1, len(low), dtype=low.dtype, generator=generator)
     )
     line = low.new_tensor([0.2, 0.3, 1.0]) + share * low.new_tensor([0.1, -0.2, 0.1])
-    root_quat = quat_from_axis_angle(torch.randn(3, 1, 3, dtype=low.dtype, generator=generator) + turn * share)
-    return HandState(joints=ends[0] + (ends[1] - ends[0]) * share, root_pos=line.expand(3, 12, 3), root_quat=root_quat)
+    root_quat = quat_from_axis_angle(
+        torch.randn(3, 1, 3, dtype=low.dtype, generator=generator) + turn * share
+    )
+    return HandState(
+        joints=ends[0] + (ends[1] - ends[0]) * share,
+        root_pos=line.expand(3, 12, 3),
+        root_quat=root_quat,
+    )

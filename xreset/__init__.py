@@ -23,7 +23,10 @@ from typing import Any
 __version__ = "0.3.0"
 
 _STUB = Path(__file__).with_suffix(".pyi").read_text()
-_HOMES = {name: module for module, name in re.findall(r"^from (\S+) import (\w+) as \w+$", _STUB, re.MULTILINE)}
+_HOMES = {
+    name: module
+    for module, name in re.findall(r"^from (\S+) import (\w+) as \w+$", _STUB, re.MULTILINE)
+}
 """Public name -> its module. The stub, which editors read, is the one list of them."""
 __all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
 

@@ -48,7 +48,9 @@ class Account:
         return replace(self, lost={name: n for name, n in self.lost.items() if name != reason})
 
 
-def accounts(object_name: np.ndarray, post_contact: np.ndarray, reason: np.ndarray) -> list[Account]:
+def accounts(
+    object_name: np.ndarray, post_contact: np.ndarray, reason: np.ndarray
+) -> list[Account]:
     """Return an account of every object and phase, objects in alphabetical order; then the sums over all objects: of
     each phase, and of both.
 
@@ -70,7 +72,9 @@ def accounts(object_name: np.ndarray, post_contact: np.ndarray, reason: np.ndarr
             chosen = chosen & (object_name == name)
         counts = Counter(reason[chosen].tolist())
         kept = counts.pop("", 0)
-        rows.append(Account(object_name=name, phase=phase, kept=kept, lost=dict(counts.most_common())))
+        rows.append(
+            Account(object_name=name, phase=phase, kept=kept, lost=dict(counts.most_common()))
+        )
     return rows
 
 

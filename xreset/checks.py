@@ -37,7 +37,8 @@ NotNegative = Annotated[T, Rule("a number from 0 to 1e15", lambda x: 0 <= x <= 1
 Finite = Annotated[T, Rule("a finite number", isfinite)]
 Share = Annotated[T, Rule("a number from 0 to 1", lambda x: 0 <= x <= 1)]
 Range = Annotated[
-    tuple[float, float], Rule("two finite numbers, 0 or more, the lower one first", lambda x: 0 <= x[0] <= x[1] < inf)
+    tuple[float, float],
+    Rule("two finite numbers, 0 or more, the lower one first", lambda x: 0 <= x[0] <= x[1] < inf),
 ]
 Text = Annotated[str, Rule("a text", lambda text: bool(text.strip()) and text.isprintable())]
 Number = Annotated[float, Rule("a finite number of at most 1e9", lambda x: abs(x) <= 1e9)]
@@ -52,7 +53,10 @@ class Checked:
         wrong = []
         for name, marks in marks_of(type(self)).items():
             value = getattr(self, name)
-            wrong += [f"{name} is {shown(value)}, expected {rule.expected}" for rule in _broken(marks, value)]
+            wrong += [
+                f"{name} is {shown(value)}, expected {rule.expected}"
+                for rule in _broken(marks, value)
+            ]
         if wrong:
             raise ValueError("; ".join(wrong))
 
@@ -132,7 +136,9 @@ def parsed(cls: type[T], data: Any, where: str) -> tuple[T | None, list[str]]:
 
 def _record(cls: type, data: Any, where: str, problems: list[str]) -> Any:
     if not isinstance(data, dict):
-        problems.append(f"{where} is {shown(data)}, expected an object with the entries of {cls.__name__}.")
+        problems.append(
+            f"{where} is {shown(data)}, expected an object with the entries of {cls.__name__}."
+        )
         return None
     count = len(problems)
     removed = getattr(cls, "REMOVED", {})
@@ -144,7 +150,9 @@ def _record(cls: type, data: Any, where: str, problems: list[str]) -> Any:
             )
     data = {name: value for name, value in data.items() if name not in removed}
     names = [f.name for f in fields(cls)]
-    required = {f.name for f in fields(cls) if f.default is MISSING and f.default_factory is MISSING}
+    required = {
+        f.name for f in fields(cls) if f.default is MISSING and f.default_factory is MISSING
+    }
     missing = sorted(required - set(data))
     unknown = sorted(set(data) - set(names))
     found = []
@@ -157,7 +165,11 @@ def _record(cls: type, data: Any, where: str, problems: list[str]) -> Any:
             f"{where} does not fit {cls.__name__} ({'; '.join(found)}). Was it written by another version of xreset?"
         )
     hints = get_type_hints(cls, include_extras=True)
-    values = {name: _value(hints[name], data[name], f"{where}.{name}", problems) for name in data if name in names}
+    values = {
+        name: _value(hints[name], data[name], f"{where}.{name}", problems)
+        for name in data
+        if name in names
+    }
     if len(problems) > count:
         return None
     try:
@@ -213,11 +225,16 @@ def _value(hint: Any, value: Any, where: str, problems: list[str]) -> Any:
             kinds = arguments[:1] * len(value)
         if len(kinds) != len(value):
             return problems.append(f"{where} has {len(value)} entries, expected {len(kinds)}.")
-        return tuple(_value(kind, value[i], f"{where}[{i}]", problems) for i, kind in enumerate(kinds))
+        return tuple(
+            _value(kind, value[i], f"{where}[{i}]", problems) for i, kind in enumerate(kinds)
+        )
     if origin is dict:
         if not isinstance(value, dict):
             return wrong("an object")
-        return {name: _value(arguments[1], item, f"{where}.{name}", problems) for name, item in value.items()}
+        return {
+            name: _value(arguments[1], item, f"{where}.{name}", problems)
+            for name, item in value.items()
+        }
     if origin is typing.Literal:
         if value not in arguments:
             return wrong(f"one of {', '.join(map(repr, arguments))}")

@@ -43,7 +43,9 @@ def load_robot(name_or_folder: str | Path) -> RobotSpec:
 
 def read_description(path: Path) -> RobotSpec:
     """Read a ``robot.toml``; see :func:`load_robot`."""
-    data = read_toml(path, SCHEMA, error=RobotError, hint=" A robot's folder holds one beside its URDF.")
+    data = read_toml(
+        path, SCHEMA, error=RobotError, hint=" A robot's folder holds one beside its URDF."
+    )
     spec, problems = parsed(RobotSpec, _fields(data, path.parent), "the file")
     if spec is not None:
         problems = _contradictions(spec)
@@ -76,12 +78,16 @@ def _fields(data: dict[str, Any], folder: Path) -> dict[str, Any]:
                 name = f"{table}.{entry}"
                 values[_FIELDS.get(name, name)] = value
     arm, hand = RobotSpec.home_std
-    values.setdefault("home_std", [values.pop("home_std.arm", arm), values.pop("home_std.hand", hand)])
+    values.setdefault(
+        "home_std", [values.pop("home_std.arm", arm), values.pop("home_std.hand", hand)]
+    )
     values.pop("base.placement", None)  # how it was found, in files of 0.2.0
     if isinstance(data.get("urdf"), str):
         values["urdf"] = (folder / data["urdf"]).resolve()
     if isinstance(data.get("keypoints"), dict):
-        values["keypoints"] = [{"keypoint": keypoint, "link": link} for keypoint, link in data["keypoints"].items()]
+        values["keypoints"] = [
+            {"keypoint": keypoint, "link": link} for keypoint, link in data["keypoints"].items()
+        ]
     if isinstance(data.get("joints"), list):
         values["joints"] = [_joint(joint) for joint in data["joints"]]
     return values
@@ -124,11 +130,17 @@ def _contradictions(spec: RobotSpec) -> list[str]:
             problems.append(f"{what}: {', '.join(repeated)} occur more than once.")
     for mimic in spec.mimics:
         if mimic.source not in spec.joint_names:
-            problems.append(f"mimics: {mimic.joint!r} follows {mimic.source!r}, which is not among the joints.")
+            problems.append(
+                f"mimics: {mimic.joint!r} follows {mimic.source!r}, which is not among the joints."
+            )
     if not spec.fingertips or spec.fingertips[0].name != "thumb":
-        problems.append(f"fingertips: the first must be 'thumb', found {list(spec.fingertip_names)}.")
+        problems.append(
+            f"fingertips: the first must be 'thumb', found {list(spec.fingertip_names)}."
+        )
     if not len(spec.arm_indices) or not len(spec.hand_indices):
-        problems.append("joints: at least one joint must be of group 'arm' and one of group 'hand'.")
+        problems.append(
+            "joints: at least one joint must be of group 'arm' and one of group 'hand'."
+        )
     length = math.hypot(*spec.base_quat)
     if abs(length - 1) > 1e-3:
         problems.append(f"base: quat {list(spec.base_quat)} has length {length:.4g}, expected 1.")

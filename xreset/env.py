@@ -124,7 +124,9 @@ class ManipulationEnv:
         vision: the cameras; None: the task has none.
     """
 
-    def __init__(self, backend: Backend, task: TaskConfig, resets: ResetDistribution, *, seed: int = 0) -> None:
+    def __init__(
+        self, backend: Backend, task: TaskConfig, resets: ResetDistribution, *, seed: int = 0
+    ) -> None:
         """Wrap a backend and reset every world.
 
         Args:
@@ -180,7 +182,9 @@ class ManipulationEnv:
         def mask() -> Tensor:
             return zeros(dtype=torch.bool)
 
-        self._new_start = self.resets.sample(self.backend.object_index, torch.Generator(device=self.device)).clone()
+        self._new_start = self.resets.sample(
+            self.backend.object_index, torch.Generator(device=self.device)
+        ).clone()
         episode = self._new_start.clone()
         self.goal_pos = episode.goal_pos
         self.goal_quat = episode.goal_quat
@@ -205,9 +209,13 @@ class ManipulationEnv:
         self._reset_mask = mask()
         self._over = mask()
         robot = self.backend.scene.robot
-        proprio = obs.layout(len(robot.joints), len(robot.fingertips), self.task.observation)["proprio"]
+        proprio = obs.layout(len(robot.joints), len(robot.fingertips), self.task.observation)[
+            "proprio"
+        ]
         randomization = self.task.randomization
-        self.variation = Variation(self.backend, randomization, self.actions.is_arm, sum(proprio.values()))
+        self.variation = Variation(
+            self.backend, randomization, self.actions.is_arm, sum(proprio.values())
+        )
         self.vision: Vision | None = None
         if self.task.vision.cameras:
             from xreset.task.vision import Vision  # Warp, which other tasks do not need
@@ -247,7 +255,9 @@ class ManipulationEnv:
         """Observations of the present state, by group."""
         return self._observations.clone()
 
-    def step(self, action: Tensor, begin: Tensor | None = None) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
+    def step(
+        self, action: Tensor, begin: Tensor | None = None
+    ) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
         """Take one control step, then reset every world whose episode has ended.
 
         Args:
@@ -345,12 +355,21 @@ class ManipulationEnv:
             world: index of the world.
             size: width and height in pixels.
         """
-        from xreset.pictures.render import Renderer, pose_matrix  # trimesh, which training does not need
+        from xreset.pictures.render import (
+            Renderer,
+            pose_matrix,
+        )  # trimesh, which training does not need
 
         if self._renderer is None or self._renderer.size != size:
             self._renderer = Renderer(self.backend.scene, size=size)
         state = self.backend.state()
-        values = (state.joint_pos, state.object_pos, state.object_quat, self.goal_pos, self.goal_quat)
+        values = (
+            state.joint_pos,
+            state.object_pos,
+            state.object_quat,
+            self.goal_pos,
+            self.goal_quat,
+        )
         joints, pos, quat, goal_pos, goal_quat = (value[world].cpu().numpy() for value in values)
         return self._renderer.draw(
             joints,
@@ -389,7 +408,9 @@ class ManipulationEnv:
     def _apply_action(self, action: Tensor, push: Tensor | None = None) -> None:
         self._action.copy_(action)
         self._graphs.run(self._process_action)
-        self.backend.set_joint_targets(self._sent_target if push is None else self._sent_target + push)
+        self.backend.set_joint_targets(
+            self._sent_target if push is None else self._sent_target + push
+        )
         pushes = self.variation.pushes
         if pushes is not None and pushes.config.moves_object:
             self.backend.set_object_wrench(pushes.force, pushes.torque)
@@ -416,9 +437,14 @@ class ManipulationEnv:
         self.nonfinite_count += (self._faulty & broken).sum()
         self.overflow_count += (self._faulty & ~broken).sum()
         state = reading.task_state
-        lost = out_of_bounds(state.object_pos, self.backend.scene.table, self.task.termination) & ~broken
+        lost = (
+            out_of_bounds(state.object_pos, self.backend.scene.table, self.task.termination)
+            & ~broken
+        )
         reach = reading.tip_distance.mean(dim=-1)
-        self._best_reach.copy_(torch.where(broken, self._best_reach, torch.minimum(self._best_reach, reach)))
+        self._best_reach.copy_(
+            torch.where(broken, self._best_reach, torch.minimum(self._best_reach, reach))
+        )
         start_pos, start_quat = self.resets.start_pose(self.sequence)
         reward = compute_reward(
             RewardInput(
@@ -448,8 +474,13 @@ class ManipulationEnv:
         time_out = (self._episode_length >= self.max_episode_length) | self._faulty
         self._time_out.copy_(time_out & ~lost)
         self._reset_mask.copy_((lost | time_out) & live)
-        totals = {"health/nonfinite_total": self.nonfinite_count, "health/overflow_total": self.overflow_count}
-        names, values = step_log(reward, self._reset_mask, sound=~broken, from_home=~self.from_bank, totals=totals)
+        totals = {
+            "health/nonfinite_total": self.nonfinite_count,
+            "health/overflow_total": self.overflow_count,
+        }
+        names, values = step_log(
+            reward, self._reset_mask, sound=~broken, from_home=~self.from_bank, totals=totals
+        )
         if not self._log_names:
             self._log_names = names
             self._log_values = torch.zeros_like(values)
@@ -476,12 +507,16 @@ class ManipulationEnv:
         """Put the worlds to reset into their new states."""
         start = self._new_start
         self._bad_action &= ~self._reset_mask
-        self._set_worlds(State.at_rest(start.joint_pos, start.object_pos, start.object_quat, start.joint_target))
+        self._set_worlds(
+            State.at_rest(start.joint_pos, start.object_pos, start.object_quat, start.joint_target)
+        )
 
     def _set_worlds(self, state: State) -> None:
         """Set states [N, ...] and physical parameters of the worlds to reset."""
         self.backend.set_where(
-            self._reset_mask, state, Parameters(**self.variation.parameters, object_gravity=self.gravity_fraction)
+            self._reset_mask,
+            state,
+            Parameters(**self.variation.parameters, object_gravity=self.gravity_fraction),
         )
 
     def _look(self) -> None:
@@ -492,15 +527,21 @@ class ManipulationEnv:
 
     def _aim_cameras(self) -> None:
         if self.vision is not None:
-            self.vision.aim(self.backend.state(), self.goal_pos, self.goal_quat, self._episode_length)
+            self.vision.aim(
+                self.backend.state(), self.goal_pos, self.goal_quat, self._episode_length
+            )
 
     def _compute_observations(self) -> None:
         """Refresh the observations. A fresh world's cloud history is copies, and its best reach is the present one."""
         reading = self.reading()
         state = reading.task_state
         c = self.task.observation
-        self._best_reach.copy_(torch.where(self._reset_mask, reading.tip_distance.mean(dim=-1), self._best_reach))
-        observed_pos, observed_quat = self.variation.observed_pose(state, self._reset_mask, self.generator)
+        self._best_reach.copy_(
+            torch.where(self._reset_mask, reading.tip_distance.mean(dim=-1), self._best_reach)
+        )
+        observed_pos, observed_quat = self.variation.observed_pose(
+            state, self._reset_mask, self.generator
+        )
         x = obs.ObservationInput(
             state=state,
             links=reading.links,
@@ -522,7 +563,9 @@ class ManipulationEnv:
         self._cloud.copy_(torch.where(self._reset_mask.view(-1, 1, 1, 1), frame, history))
         groups = {
             "policy": obs.policy_group(x, c, self.generator, self._cloud_points),
-            "proprio": self.variation.observed_proprio(obs.proprio_group(x, c, self.generator), self._reset_mask),
+            "proprio": self.variation.observed_proprio(
+                obs.proprio_group(x, c, self.generator), self._reset_mask
+            ),
             "perception": self._cloud,
             "privileged": obs.privileged_group(x, c),
         }

@@ -47,7 +47,9 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
     """
     path = Path(path)
     try:
-        if path.exists() and not path.is_file() and not path.is_dir():  # root could replace /dev/null by a file
+        if (
+            path.exists() and not path.is_file() and not path.is_dir()
+        ):  # root could replace /dev/null by a file
             raise XResetError(f"cannot write {path}: it is a device. Choose another place.")
         with _temporary(path.parent, Path.touch) as temporary, open(temporary, mode) as file:
             yield file
@@ -90,7 +92,9 @@ def _temporary(folder: Path, make: Callable[[Path], None]) -> Iterator[Path]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     descriptor = None
-    while descriptor is None:  # again if another process took it for a leftover before it was locked
+    while (
+        descriptor is None
+    ):  # again if another process took it for a leftover before it was locked
         temporary = folder / f".xreset-{secrets.token_hex(4)}.part"
         make(temporary)
         with suppress(FileNotFoundError):
@@ -138,9 +142,13 @@ def claim(path: str | Path) -> Iterator[None]:
     try:
         descriptor = _patient_lock(lock)
     except OSError as error:
-        raise XResetError(f"cannot write {path}: {error.strerror or error}. Choose another place.") from error
+        raise XResetError(
+            f"cannot write {path}: {error.strerror or error}. Choose another place."
+        ) from error
     if descriptor is None:
-        raise XResetError(f"another command is writing {path}. Wait for its end, or choose another --out.")
+        raise XResetError(
+            f"another command is writing {path}. Wait for its end, or choose another --out."
+        )
     try:
         remove_leftovers(folder)
         yield
@@ -161,7 +169,9 @@ def claim_folder(path: str | Path) -> Iterator[None]:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise XResetError(f"cannot make the folder {path}: {error.strerror or error}. Choose another place.") from error
+        raise XResetError(
+            f"cannot make the folder {path}: {error.strerror or error}. Choose another place."
+        ) from error
     with claim(path):
         yield
 
@@ -185,7 +195,9 @@ def _patient_lock(path: Path) -> int | None:
         path.parent.mkdir(parents=True, exist_ok=True)
         if not path.is_dir():
             path.touch()
-        with suppress(FileNotFoundError):  # the process that held the lock has just removed the file
+        with suppress(
+            FileNotFoundError
+        ):  # the process that held the lock has just removed the file
             descriptor = _lock(path)
             if descriptor is not None:
                 return descriptor
@@ -228,15 +240,31 @@ def code_version() -> str:
     root = Path(__file__).parent.parent
     commit = ""
     if (root / ".git").exists():
-        command = ["git", "--no-optional-locks", "-C", str(root), "describe", "--always", "--dirty=.dirty"]
-        environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+        command = [
+            "git",
+            "--no-optional-locks",
+            "-C",
+            str(root),
+            "describe",
+            "--always",
+            "--dirty=.dirty",
+        ]
+        environment = {
+            name: value for name, value in os.environ.items() if not name.startswith("GIT_")
+        }
         with suppress(OSError, subprocess.TimeoutExpired):
             found = subprocess.run(
-                [*command, "--abbrev=12", "--exclude=*"], capture_output=True, text=True, timeout=20, env=environment
+                [*command, "--abbrev=12", "--exclude=*"],
+                capture_output=True,
+                text=True,
+                timeout=20,
+                env=environment,
             )
             commit = found.stdout.strip()
     else:
-        with suppress(PackageNotFoundError, ValueError, AttributeError):  # no package, or one of another origin
+        with suppress(
+            PackageNotFoundError, ValueError, AttributeError
+        ):  # no package, or one of another origin
             origin = json.loads(distribution("xreset").read_text("direct_url.json") or "{}")
             commit = str(origin.get("vcs_info", {}).get("commit_id", ""))[:12]
     return f"{__version__}+g{commit}" if commit else __version__
@@ -250,17 +278,25 @@ def write_json(path: str | Path, data: Any) -> None:
     write_whole(path, json.dumps(data, indent=2, allow_nan=False) + "\n")
 
 
-def read_json(path: str | Path, schema: str | None = None, *, keep_version: bool = False) -> dict[str, Any]:
+def read_json(
+    path: str | Path, schema: str | None = None, *, keep_version: bool = False
+) -> dict[str, Any]:
     """Read a JSON object; with ``schema``, its ``schema`` entry must be that, and is removed, and so is the version of
     xreset that wrote it unless ``keep_version``."""
     path = Path(path)
     must_exist(path, "JSON file")
-    if path.stat().st_size > max_bytes() // 16:  # objects in memory are about that many times larger
-        raise FileFormatError(f"{path} has {path.stat().st_size >> 20} MB, too many for JSON. {RAISE_LIMIT}")
+    if (
+        path.stat().st_size > max_bytes() // 16
+    ):  # objects in memory are about that many times larger
+        raise FileFormatError(
+            f"{path} has {path.stat().st_size >> 20} MB, too many for JSON. {RAISE_LIMIT}"
+        )
     try:
         data = parse_json(path.read_bytes())
     except ValueError as error:
-        raise FileFormatError(f"{path} is not valid JSON ({error}). It may be truncated; make it again.") from error
+        raise FileFormatError(
+            f"{path} is not valid JSON ({error}). It may be truncated; make it again."
+        ) from error
     if schema is not None:
         check_schema(path, data.pop("schema", None), schema)
         if not keep_version:
@@ -269,7 +305,11 @@ def read_json(path: str | Path, schema: str | None = None, *, keep_version: bool
 
 
 def read_toml(
-    path: Path, schema: str | None = None, *, error: type[XResetError] = FileFormatError, hint: str = ""
+    path: Path,
+    schema: str | None = None,
+    *,
+    error: type[XResetError] = FileFormatError,
+    hint: str = "",
 ) -> dict[str, Any]:
     """Read a TOML file; with ``schema``, its ``schema`` entry must be that. ``hint`` ends the message if it cannot
     be read.
@@ -281,7 +321,10 @@ def read_toml(
         data = tomllib.loads(path.read_bytes().decode())
     except OSError as problem:
         raise error(f"{path} cannot be read ({problem.strerror}).{hint}") from problem
-    except (ValueError, RecursionError) as problem:  # of TOML, of decoding, of numbers of thousands of digits
+    except (
+        ValueError,
+        RecursionError,
+    ) as problem:  # of TOML, of decoding, of numbers of thousands of digits
         raise error(f"{path} is not valid TOML: {problem}.") from problem
     if schema is not None and data.get("schema") != schema:
         raise error(f"{path} states schema {shown(data.get('schema'))}, expected {schema!r}.")
@@ -314,7 +357,9 @@ def _no_constant(name: str) -> None:
 def _check_texts(data: Any) -> None:
     if isinstance(data, str):
         if not is_plain(data):
-            raise ValueError(f"the text {shown(data)} holds characters that control a terminal, or are none")
+            raise ValueError(
+                f"the text {shown(data)} holds characters that control a terminal, or are none"
+            )
     elif isinstance(data, dict):
         for key, value in data.items():
             _check_texts(key)
@@ -335,8 +380,13 @@ def must_exist(path: Path, what: str) -> None:
     try:
         mode = path.stat().st_mode
     except FileNotFoundError:
-        raise FileFormatError(f"there is no {path} ({what}). Check the path, or make the file first.") from None
-    except (OSError, ValueError) as error:  # a name too long, a folder that may not be entered, a zero in the name
+        raise FileFormatError(
+            f"there is no {path} ({what}). Check the path, or make the file first."
+        ) from None
+    except (
+        OSError,
+        ValueError,
+    ) as error:  # a name too long, a folder that may not be entered, a zero in the name
         raise FileFormatError(f"there is no {shown(str(path))} ({what}): {error}.") from error
     if not stat.S_ISREG(mode):
         raise FileFormatError(f"{path} is a folder or a device, expected a file ({what}).")

@@ -19,7 +19,14 @@ from xreset.files import file_hash
 from xreset.objects.catalogue import canonical_names, load_objects
 from xreset.records import npz_schema
 from xreset.resets.bank import SCHEMA as BANK
-from xreset.resets.bank import ResetBank, check_objects, check_retargeted, check_robot, read_bank, starts_and_goals
+from xreset.resets.bank import (
+    ResetBank,
+    check_objects,
+    check_retargeted,
+    check_robot,
+    read_bank,
+    starts_and_goals,
+)
 from xreset.resets.goals import SCHEMA as GOALS
 from xreset.resets.goals import GoalSet, checked_goals, read_goals
 from xreset.retarget.file import SCHEMA as MOTION
@@ -66,7 +73,9 @@ class Inputs:
             DemoError: the data are demonstrations, and no robot was given.
         """
         if self.loaded_robot is None:
-            raise DemoError(f"{self.name} holds human demonstrations, which are for no robot yet. Give --robot.")
+            raise DemoError(
+                f"{self.name} holds human demonstrations, which are for no robot yet. Give --robot."
+            )
         return self.loaded_robot
 
     @property
@@ -83,7 +92,9 @@ class Inputs:
             return starts_and_goals(rest_on_table(self.data, self.objects), self.robot)
         return starts_and_goals(self.data, self.robot)
 
-    def motion(self, progress: Callable[[float, int], None] = lambda done, total: None) -> Retargeted:
+    def motion(
+        self, progress: Callable[[float, int], None] = lambda done, total: None
+    ) -> Retargeted:
         """Return the robot's motion; demonstrations are retargeted here, which takes about a second for each.
 
         Args:
@@ -96,7 +107,9 @@ class Inputs:
             return self.data
         if isinstance(self.data, ResetBank):
             what = "goal set" if isinstance(self.data, GoalSet) else "reset bank"
-            raise DemoError(f"{self.name} is a {what}, which holds no motion. Give the file of xreset retarget.")
+            raise DemoError(
+                f"{self.name} is a {what}, which holds no motion. Give the file of xreset retarget."
+            )
         return retarget_demos(self.data, self.robot, self.objects, progress=progress)
 
 
@@ -163,7 +176,9 @@ def _read(path: Path, accept: tuple[Kind, ...]) -> Data:
         if stated == schema:
             return read(path)
         expected.append(f"{schema!r} ({command})")
-    raise FileFormatError(f"{path} states schema {shown(stated)}, expected {' or '.join(expected)}.")
+    raise FileFormatError(
+        f"{path} states schema {shown(stated)}, expected {' or '.join(expected)}."
+    )
 
 
 def _object_names(data: Data) -> tuple[str, ...]:

@@ -19,7 +19,13 @@ from xreset.spec import SceneSpec, lowest_point
 from xreset.tensors import Tensors
 
 Parameter = Literal[
-    "friction", "torsional_friction", "object_mass", "object_inertia", "object_com", "object_gravity", "drives"
+    "friction",
+    "torsional_friction",
+    "object_mass",
+    "object_inertia",
+    "object_com",
+    "object_gravity",
+    "drives",
 ]
 """A physical parameter with a value per world, set by ``Backend.set_...``."""
 Capability = Literal[Parameter, "object_wrench", "overflow", "mass_properties"]
@@ -48,7 +54,11 @@ class State(Tensors):
 
     @classmethod
     def at_rest(
-        cls, joint_pos: Tensor, object_pos: Tensor, object_quat: Tensor, joint_target: Tensor | None = None
+        cls,
+        joint_pos: Tensor,
+        object_pos: Tensor,
+        object_quat: Tensor,
+        joint_target: Tensor | None = None,
     ) -> Self:
         """Return a state in which nothing moves. ``joint_target`` [N, J] defaults to the joint positions [N, J]."""
         q = joint_pos.float()
@@ -69,7 +79,9 @@ class State(Tensors):
     def initial(cls, scene: SceneSpec, object_index: Tensor) -> Self:
         """Return the first state of worlds with these objects [N]: nothing moves, the robot at home, the object upright
         in the table's middle."""
-        places = torch.tensor([(*scene.table.center, -lowest_point(spec.pieces)) for spec in scene.objects])
+        places = torch.tensor(
+            [(*scene.table.center, -lowest_point(spec.pieces)) for spec in scene.objects]
+        )
         home = torch.as_tensor(scene.robot.home).repeat(len(object_index), 1)
         upright = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(object_index), 1)
         return cls.at_rest(home, places[object_index.cpu()], upright)
@@ -112,7 +124,11 @@ class Parameters(Tensors):
 
     def given(self) -> dict[Parameter, Tensor]:
         """Return the parameters that are not None, by name."""
-        return {name: getattr(self, name) for name in get_args(Parameter) if getattr(self, name) is not None}
+        return {
+            name: getattr(self, name)
+            for name in get_args(Parameter)
+            if getattr(self, name) is not None
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,7 +224,12 @@ class Backend(ABC):
     """What cannot agree with the reference, each with its size and reason."""
 
     def __init__(
-        self, scene: SceneSpec, num_worlds: int, *, object_index: Tensor | None = None, device: str = "cpu"
+        self,
+        scene: SceneSpec,
+        num_worlds: int,
+        *,
+        object_index: Tensor | None = None,
+        device: str = "cpu",
     ) -> None:
         """Build the worlds; every world starts with the robot at home and its object at rest height at the table's
         centre.
@@ -388,14 +409,20 @@ class Backend(ABC):
         """Raise the error that the contract asks for if a capability is missing."""
         if capability not in self.capabilities:
             what = capability.replace("_", " ")
-            raise CapabilityError(f"The backend {self.name!r} does not support {what}. Use another backend.")
+            raise CapabilityError(
+                f"The backend {self.name!r} does not support {what}. Use another backend."
+            )
 
     def _set(self, name: Parameter, value: Tensor, worlds: Tensor | None) -> None:
         """Set a physical parameter [M, ...]. Every setter calls this, so a backend overrides either."""
         self._require(name)
-        raise NotImplementedError(f"the backend {self.name!r} declares {name!r} and does not set it")
+        raise NotImplementedError(
+            f"the backend {self.name!r} declares {name!r} and does not set it"
+        )
 
 
 def unavailable(package: str, install: str, error: Exception) -> BackendUnavailableError:
     """The error for an engine that cannot be imported; ``install`` is what follows ``pip install``."""
-    return BackendUnavailableError(f"{package} cannot be imported ({error}). Install it with: pip install {install}")
+    return BackendUnavailableError(
+        f"{package} cannot be imported ({error}). Install it with: pip install {install}"
+    )

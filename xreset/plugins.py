@@ -54,7 +54,9 @@ def load_plugin(group: str, name: str) -> Any:
         raise
     except Exception as error:  # a plugin may fail in any way; the others must still work
         trace = traceback.format_exc(limit=-2)
-        raise error_class(f"the {noun} {name!r} ({entries[name].value}) does not load: {error}\n{trace}") from error
+        raise error_class(
+            f"the {noun} {name!r} ({entries[name].value}) does not load: {error}\n{trace}"
+        ) from error
 
 
 def known_plugins(group: str) -> str:
@@ -82,7 +84,9 @@ def robot_folder(name_or_folder: str | Path) -> Path:
         if os.path.isdir(folder):
             return folder.resolve()
         known = known_plugins(ROBOTS)
-        raise RobotError(f"Unknown robot {shown(name)}, and no folder has that name. Choose from: {known}.")
+        raise RobotError(
+            f"Unknown robot {shown(name)}, and no folder has that name. Choose from: {known}."
+        )
     module = load_plugin(ROBOTS, name)
     if not isinstance(module, ModuleType) or not module.__file__:
         raise RobotError(
@@ -158,5 +162,7 @@ def backend_status(name: str) -> BackendStatus:
     except BackendUnavailableError as error:
         return BackendStatus(name, None, "-", str(error))
     except Exception as error:  # a plugin's defect must not hide the other engines
-        return BackendStatus(name, None, "-", f"its engine_version() fails: {type(error).__name__}: {error}")
+        return BackendStatus(
+            name, None, "-", f"its engine_version() fails: {type(error).__name__}: {error}"
+        )
     return BackendStatus(name, version, ", ".join(cls.devices()), None)

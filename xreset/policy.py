@@ -61,13 +61,17 @@ def policy_contract(robot: RobotSpec, task: TaskConfig, objects: tuple[str, ...]
         "joint_names": list(robot.joint_names),
         "fingertip_names": list(robot.fingertip_names),
         "objects": list(objects),
-        "observation_layout": layout(len(robot.joints), len(robot.fingertips), task.observation, task.vision),
+        "observation_layout": layout(
+            len(robot.joints), len(robot.fingertips), task.observation, task.vision
+        ),
         "control_dt": task.timestep * task.substeps,
         "task": json.loads(json.dumps(asdict(task))),  # as it will be read back: lists for tuples
     }
 
 
-def check_contract(source: str, contract: dict[str, Any], robot: RobotSpec, task: TaskConfig) -> None:
+def check_contract(
+    source: str, contract: dict[str, Any], robot: RobotSpec, task: TaskConfig
+) -> None:
     """Refuse to run a policy where its observations or actions would mean something else.
 
     Raises:
@@ -86,11 +90,17 @@ def check_contract(source: str, contract: dict[str, Any], robot: RobotSpec, task
     }
     of_task = _meaning(here)
     for part, of_policy in _meaning(trained).items():
-        names = [name for name in of_policy | of_task[part] if of_policy.get(name) != of_task[part].get(name)]
+        names = [
+            name
+            for name in of_policy | of_task[part]
+            if of_policy.get(name) != of_task[part].get(name)
+        ]
         if names:
             differing = [f"{n}: {of_policy.get(n)!r}, here {of_task[part].get(n)!r}" for n in names]
             fix = fixes.get(part, "Use the run's own configuration.")
-            raise PolicyError(f"{source} was trained with another {part} ({'; '.join(differing)}). {fix}")
+            raise PolicyError(
+                f"{source} was trained with another {part} ({'; '.join(differing)}). {fix}"
+            )
 
 
 def _meaning(contract: Contract) -> dict[str, dict[str, Any]]:
@@ -146,7 +156,9 @@ def observation_shapes(contract: dict[str, Any], source: str) -> dict[str, tuple
     typed = read_contract(source, contract)
     *flat, picture = typed.task.policy_groups
     if missing := [name for name in flat if name not in typed.observation_layout]:
-        raise PolicyError(f"{source} does not state what it observes of {', '.join(missing)}. Export it again.")
+        raise PolicyError(
+            f"{source} does not state what it observes of {', '.join(missing)}. Export it again."
+        )
     widths = {name: (sum(typed.observation_layout[name].values()),) for name in flat}
     return widths | {picture: typed.task.picture_shape}
 
@@ -164,7 +176,9 @@ class OnnxPolicy:
         if not path.is_file():
             raise PolicyError(f"There is no policy file {path}.")
         if path.stat().st_size > max_bytes():
-            raise PolicyError(f"{path} has {path.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows.")
+            raise PolicyError(
+                f"{path} has {path.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows."
+            )
         with needs("onnxruntime", "eval", PolicyError):
             import onnxruntime
         options = onnxruntime.SessionOptions()
@@ -184,11 +198,15 @@ class OnnxPolicy:
                 f"{path} cannot be read as an ONNX policy: {shown(str(error))}. Is it damaged?"
             ) from error
         if METADATA_KEY not in metadata:
-            raise PolicyError(f"{path} is an ONNX file without xreset's contract: it was not exported by xreset.")
+            raise PolicyError(
+                f"{path} is an ONNX file without xreset's contract: it was not exported by xreset."
+            )
         try:
             self.contract = parse_json(metadata[METADATA_KEY])
         except ValueError as error:
-            raise PolicyError(f"{path} holds a contract that is not valid JSON ({error}). Export it again.") from error
+            raise PolicyError(
+                f"{path} holds a contract that is not valid JSON ({error}). Export it again."
+            ) from error
         self._try_step(path)
         self.name = path.stem if path.stem != "policy" else path.resolve().parent.name
         self._state: list[np.ndarray] | None = None
@@ -203,14 +221,24 @@ class OnnxPolicy:
             self._lstm_dim: int = self._session.get_inputs()[2].shape[2]
             state = (1, worlds, self._lstm_dim)
             shapes = ((worlds, sum(width for (width,) in flat)), (worlds, *picture), state, state)
-            feed = {name: np.zeros(shape, np.float32) for name, shape in zip(INPUTS, shapes, strict=True)}
+            feed = {
+                name: np.zeros(shape, np.float32)
+                for name, shape in zip(INPUTS, shapes, strict=True)
+            }
             outputs: Any = self._session.run(OUTPUTS, feed)
             found = [f"{x.dtype} {x.shape}" for x in outputs]
         except Exception as error:
-            raise PolicyError(f"{path} cannot act: {shown(str(error))}. Export it again.") from error
-        expected = [f"float32 {shape}" for shape in ((worlds, len(self.contract["joint_names"])), state, state)]
+            raise PolicyError(
+                f"{path} cannot act: {shown(str(error))}. Export it again."
+            ) from error
+        expected = [
+            f"float32 {shape}"
+            for shape in ((worlds, len(self.contract["joint_names"])), state, state)
+        ]
         if found != expected:
-            raise PolicyError(f"{path} gives {found} for {worlds} worlds, expected {expected}. Export it again.")
+            raise PolicyError(
+                f"{path} gives {found} for {worlds} worlds, expected {expected}. Export it again."
+            )
         if not all(np.isfinite(value).all() for value in outputs):
             raise PolicyError(
                 f"{path} gives numbers that are not finite: its training broke down, or the file is damaged."
@@ -265,4 +293,6 @@ class RandomPolicy:
     def act(self, observations: TensorDict) -> Tensor:
         """[N, J] uniform."""
         flat = observations["policy"]
-        return (2.0 * torch.rand(flat.shape[0], self._num_actions, generator=self._generator) - 1.0).to(flat.device)
+        return (
+            2.0 * torch.rand(flat.shape[0], self._num_actions, generator=self._generator) - 1.0
+        ).to(flat.device)

@@ -21,7 +21,14 @@ import numpy as np
 
 from xreset.checks import marks_of
 from xreset.errors import FileFormatError, XResetError
-from xreset.files import RAISE_LIMIT, atomic_write, check_schema, code_version, max_bytes, must_exist
+from xreset.files import (
+    RAISE_LIMIT,
+    atomic_write,
+    check_schema,
+    code_version,
+    max_bytes,
+    must_exist,
+)
 from xreset.text import is_plain, shown
 
 T = TypeVar("T")
@@ -75,11 +82,16 @@ def write_npz(
         inputs: name -> SHA-256 of each input.
     """
     meta = {"xreset": code_version(), "config": dict(config or {}), "inputs": dict(inputs or {})}
-    out = {"schema": np.array(schema_name), "meta": np.array(json.dumps(meta, sort_keys=True, allow_nan=False))}
+    out = {
+        "schema": np.array(schema_name),
+        "meta": np.array(json.dumps(meta, sort_keys=True, allow_nan=False)),
+    }
     for name, value in arrays.items():
         array = np.asarray(value)
         if array.dtype.kind not in "fiubU":
-            raise TypeError(f"array {name!r} has dtype {array.dtype}; only numbers, bool and text can be stored")
+            raise TypeError(
+                f"array {name!r} has dtype {array.dtype}; only numbers, bool and text can be stored"
+            )
         out[name] = array
     with atomic_write(path) as file:
         np.savez_compressed(file, **out)  # pyright: ignore[reportArgumentType]
@@ -128,7 +140,9 @@ def read_npz(
         for name in names:
             array = np.asanyarray(archive[name])
             # the size of an item as _native gives it
-            sizes[name] = array.size * max(array.dtype.itemsize, {"i": 8, "u": 8, "f": 4}.get(array.dtype.kind, 1))
+            sizes[name] = array.size * max(
+                array.dtype.itemsize, {"i": 8, "u": 8, "f": 4}.get(array.dtype.kind, 1)
+            )
             _check_size(path, sizes)
             arrays[name] = _native(path, name, array)
     problem = _wrong_shape(arrays, own) or wrong_value(arrays, schema)
@@ -150,7 +164,9 @@ def npz_schema(path: str | Path) -> str:
     with _opened(path, "is not one of xreset's npz files") as (archive, packed):
         stated = _stated_schema(archive, packed)
     if stated is None:
-        raise FileFormatError(f"{path} is not one of xreset's npz files: it states no schema. Is it the right file?")
+        raise FileFormatError(
+            f"{path} is not one of xreset's npz files: it states no schema. Is it the right file?"
+        )
     return stated
 
 
@@ -160,16 +176,26 @@ def _opened(path: Path, failure: str) -> Iterator[tuple[Mapping[str, Any], dict[
     at damage becomes one error."""
     try:
         with zipfile.ZipFile(path) as file:
-            sizes = {member.filename.removesuffix(".npy"): member.file_size for member in file.infolist()}
+            sizes = {
+                member.filename.removesuffix(".npy"): member.file_size for member in file.infolist()
+            }
         with np.load(path, allow_pickle=False) as arrays:
             yield arrays, sizes
     except XResetError:
         raise
     except Exception as error:
         if str(error).startswith("Object arrays"):  # numpy's refusal
-            raise FileFormatError(f"{path} {failure}: it holds Python objects, and objects are never read.") from error
-        reason = str(error) if isinstance(error, zipfile.BadZipFile | OSError) else "its content is broken"
-        raise FileFormatError(f"{path} {failure}: {reason}. It is damaged or truncated, or not an npz file.") from error
+            raise FileFormatError(
+                f"{path} {failure}: it holds Python objects, and objects are never read."
+            ) from error
+        reason = (
+            str(error)
+            if isinstance(error, zipfile.BadZipFile | OSError)
+            else "its content is broken"
+        )
+        raise FileFormatError(
+            f"{path} {failure}: {reason}. It is damaged or truncated, or not an npz file."
+        ) from error
 
 
 def _stated_schema(arrays: Mapping[str, Any], sizes: Mapping[str, int]) -> str | None:
@@ -194,7 +220,9 @@ def _native(path: Path, name: str, array: np.ndarray) -> np.ndarray:
     is_large = array.dtype == np.uint64 and (array > np.iinfo(np.int64).max).any()
     if kind not in "fiubU" or is_large:
         what = "integers of more than 63 bits" if is_large else array.dtype
-        raise FileFormatError(f"{path}: the array {name!r} holds {what}, expected numbers, bool or text.")
+        raise FileFormatError(
+            f"{path}: the array {name!r} holds {what}, expected numbers, bool or text."
+        )
     if kind in "iu":
         return array.astype(np.int64)
     if kind == "f":
@@ -247,7 +275,9 @@ def wrong_value(arrays: Mapping[str, np.ndarray], schema: Schema) -> str | None:
         low, high = field.within
         outside = array[(array < low) | (array > high)]
         if outside.size:
-            return f"array {name!r} holds {outside[0]:.6g}, expected numbers from {low:g} to {high:g}."
+            return (
+                f"array {name!r} holds {outside[0]:.6g}, expected numbers from {low:g} to {high:g}."
+            )
         if field.unit:
             lengths = np.linalg.norm(array.astype(np.float64), axis=-1)
             if (np.abs(lengths - 1) > UNIT_TOLERANCE).any():
@@ -267,7 +297,9 @@ def offsets_problem(arrays: Mapping[str, np.ndarray], frames: int) -> str | None
     lengths = np.diff(offsets)
     if (lengths <= 0).any():
         i = int(np.argmax(lengths <= 0))
-        return f"frame_offsets must increase, but sequence {i} ({names[i]!s}) has {lengths[i]} frames."
+        return (
+            f"frame_offsets must increase, but sequence {i} ({names[i]!s}) has {lengths[i]} frames."
+        )
     return unique_problem(names)
 
 

@@ -10,7 +10,14 @@ import torch
 
 from xreset.env import ManipulationEnv
 from xreset.errors import needs
-from xreset.vector_env import action_space, array, arrays, checked_action, observation_space, with_sound_rows
+from xreset.vector_env import (
+    action_space,
+    array,
+    arrays,
+    checked_action,
+    observation_space,
+    with_sound_rows,
+)
 
 with needs("stable_baselines3", "stable-baselines3"):
     from stable_baselines3.common.vec_env import VecEnv
@@ -46,7 +53,9 @@ class StableBaselinesEnv(VecEnv):
         """
         self._action = checked_action(self.env, actions)
 
-    def step_wait(self) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, list[dict[str, Any]]]:
+    def step_wait(
+        self,
+    ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Step every world: observations [N, ...] by group, reward [N], done [N] and a dictionary for each world."""
         before = self.env.get_observations()
         nothing = torch.zeros(self.num_envs, dtype=torch.bool, device=self.env.device)
@@ -81,7 +90,9 @@ class StableBaselinesEnv(VecEnv):
         """Set an attribute of the environment that all worlds share."""
         setattr(self.env, attr_name, value)
 
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **options: Any) -> list[Any]:
+    def env_method(
+        self, method_name: str, *args: Any, indices: Any = None, **options: Any
+    ) -> list[Any]:
         """Call a method of the environment once and return its result for each world."""
         value = getattr(self.env, method_name)(*args, **options)
         return [value for _ in self._get_indices(indices)]

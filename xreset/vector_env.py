@@ -66,7 +66,9 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self._observations = self.env.get_observations()
         return arrays(self._observations), {}
 
-    def step(self, actions: Any) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(
+        self, actions: Any
+    ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Take one control step in every world.
 
         Args:
@@ -80,7 +82,9 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             XResetError: the actions have another shape, or are not real numbers.
         """
         action = checked_action(self.env, actions)
-        action = torch.where(self._ended[:, None], 0.0, action)  # ignored: the world begins a new episode
+        action = torch.where(
+            self._ended[:, None], 0.0, action
+        )  # ignored: the world begins a new episode
         observations, reward, done, extras = self.env.step(action, begin=self._ended)
         reward = torch.where(self._ended, 0.0, reward)
         faulty = extras["faulty"]
@@ -129,7 +133,9 @@ def with_sound_rows(observations: TensorDict, before: TensorDict) -> TensorDict:
     """Replace the observations of every world that shows a number that is not finite with its observations before."""
     finite = [value.flatten(1).isfinite().all(dim=1) for value in observations.values()]
     sound = torch.stack(finite).all(dim=0)
-    return observations.apply(lambda new, old: torch.where(sound.view(-1, *[1] * (new.ndim - 1)), new, old), before)
+    return observations.apply(
+        lambda new, old: torch.where(sound.view(-1, *[1] * (new.ndim - 1)), new, old), before
+    )
 
 
 def arrays(observations: TensorDict) -> dict[str, np.ndarray]:

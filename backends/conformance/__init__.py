@@ -24,13 +24,32 @@ from xreset.backends.conformance import (
     world_checks,
 )
 from xreset.backends.conformance.harness import Bench, MakeBackend
-from xreset.backends.conformance.results import SCHEMA, Check, CheckResult, Measure, Skipped, Verdict, judge, largest
+from xreset.backends.conformance.results import (
+    SCHEMA,
+    Check,
+    CheckResult,
+    Measure,
+    Skipped,
+    Verdict,
+    judge,
+    largest,
+)
 from xreset.backends.conformance.scene import scene
 from xreset.errors import BackendUnavailableError, CapabilityError
 from xreset.physics import Backend
 from xreset.spec import RobotSpec
 
-__all__ = ["CHECKS", "SCHEMA", "Bench", "Check", "CheckResult", "MakeBackend", "Measure", "run", "scene"]
+__all__ = [
+    "CHECKS",
+    "SCHEMA",
+    "Bench",
+    "Check",
+    "CheckResult",
+    "MakeBackend",
+    "Measure",
+    "run",
+    "scene",
+]
 
 _MODULES = (state_checks, world_checks, robot_checks, motion_checks, contact_checks, grasp_checks)
 _TABLE = tomllib.loads(Path(__file__).with_name("checks.toml").read_text())
@@ -40,7 +59,9 @@ def _read_checks() -> tuple[Check, ...]:
     functions = {}
     for module in _MODULES:
         functions |= vars(module)
-    return tuple(Check(name=name, run=functions[name], **row) for name, row in _TABLE["checks"].items())
+    return tuple(
+        Check(name=name, run=functions[name], **row) for name, row in _TABLE["checks"].items()
+    )
 
 
 CHECKS = _read_checks()
@@ -78,7 +99,13 @@ def run(
                 start = time.perf_counter()
                 verdict, problem, measures = _run_one(check, bench)
                 seconds = time.perf_counter() - start
-                result = CheckResult(check=check, verdict=verdict, measures=measures, problem=problem, seconds=seconds)
+                result = CheckResult(
+                    check=check,
+                    verdict=verdict,
+                    measures=measures,
+                    problem=problem,
+                    seconds=seconds,
+                )
                 results.append(result)
                 report(result)
     finally:

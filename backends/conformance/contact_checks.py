@@ -33,7 +33,9 @@ def resting_weight(bench: Bench) -> Measured:
     moved = worlds.state().object_pos - start.object_pos
     weight = GRAVITY * bench.masses
     return {
-        "force right after setting": torch.cat((fresh.table_force[:, None], fresh.tip_force), dim=1),
+        "force right after setting": torch.cat(
+            (fresh.table_force[:, None], fresh.tip_force), dim=1
+        ),
         "vertical force": contacts.table_force[:, 2] / weight - 1.0,
         "horizontal force": contacts.table_force[:, :2] / weight[:, None],
         "force of the fingers": contacts.tip_force,
@@ -72,7 +74,9 @@ def rest_and_bounce(bench: Bench) -> Measured:
 
     def heights(worlds: Worlds, above: float) -> Tensor:
         """[T, N] heights over 1 s, one each physics step."""
-        worlds.set(replace_fields(start, object_pos=start.object_pos + torch.tensor([0.0, 0.0, above])))
+        worlds.set(
+            replace_fields(start, object_pos=start.object_pos + torch.tensor([0.0, 0.0, above]))
+        )
         rows = []
         for _ in range(round(1.0 / scene.timestep)):
             worlds.step(1)
@@ -103,11 +107,17 @@ def set_as_built(bench: Bench) -> Measured:
     mass = factors * bench.masses
     scenes = []
     for i, thing in enumerate(bench.objects):
-        built = replace(thing, mass=float(mass[i]), inertia=float(factors[i]) * np.asarray(thing.inertia))
+        built = replace(
+            thing, mass=float(mass[i]), inertia=float(factors[i]) * np.asarray(thing.inertia)
+        )
         tip, link, table = friction[i].tolist()
-        pairs = PairFriction(tip=tip, link=link, table=table, torsional=bench.scene.friction.torsional)
+        pairs = PairFriction(
+            tip=tip, link=link, table=table, torsional=bench.scene.friction.torsional
+        )
         scenes.append(replace(bench.scene, objects=(built,), friction=pairs))
-    return _against_built(bench, {"object_mass": mass, "friction": friction}, scenes, {"sliding": _slide})
+    return _against_built(
+        bench, {"object_mass": mass, "friction": friction}, scenes, {"sliding": _slide}
+    )
 
 
 def object_inertia_set(bench: Bench) -> Measured:
@@ -117,23 +127,35 @@ def object_inertia_set(bench: Bench) -> Measured:
     for thing, factor in zip(bench.objects, factors.tolist(), strict=True):
         built = replace(thing, inertia=factor * np.asarray(thing.inertia))
         scenes.append(replace(bench.scene, objects=(built,)))
-    return _against_built(bench, {"object_inertia": factors}, scenes, {"tumbling": _tumble, "sliding": _slide})
+    return _against_built(
+        bench, {"object_inertia": factors}, scenes, {"tumbling": _tumble, "sliding": _slide}
+    )
 
 
 def object_com_set(bench: Bench) -> Measured:
     """Move the centre of mass of some worlds' objects and build others so: both must tumble and slide alike."""
     offsets = torch.tensor(
-        [[0.0078125, 0.0, 0.0], [0.0, -0.0078125, 0.00390625], [0.00390625, 0.00390625, -0.00390625], [0.0, 0.0, 0.0]]
+        [
+            [0.0078125, 0.0, 0.0],
+            [0.0, -0.0078125, 0.00390625],
+            [0.00390625, 0.00390625, -0.00390625],
+            [0.0, 0.0, 0.0],
+        ]
     )
     scenes = []
     for thing, offset in zip(bench.objects, offsets.numpy(), strict=True):
         built = replace(thing, com=np.asarray(thing.com) + offset)
         scenes.append(replace(bench.scene, objects=(built,)))
-    return _against_built(bench, {"object_com": offsets}, scenes, {"tumbling": _tumble, "sliding": _slide})
+    return _against_built(
+        bench, {"object_com": offsets}, scenes, {"tumbling": _tumble, "sliding": _slide}
+    )
 
 
 def _against_built(
-    bench: Bench, parameters: dict[Parameter, Tensor], scenes: Sequence[SceneSpec], motions: dict[str, Motion]
+    bench: Bench,
+    parameters: dict[Parameter, Tensor],
+    scenes: Sequence[SceneSpec],
+    motions: dict[str, Motion],
 ) -> Measured:
     """Compare world i, whose parameters are set, with a world built from scene i: place, angle and force per weight."""
     worlds = bench.worlds()
@@ -163,7 +185,9 @@ def _slide(bench: Bench, worlds: Worlds, which: Sequence[int]) -> tuple[State, T
     """Let objects slide and turn on the table for a moment; later, contacts have made much of a last bit."""
     start = bench.start()[list(which)]
     start = replace_fields(
-        start, object_linvel=torch.tensor([0.25, 0.1, 0.0]), object_angvel=torch.tensor([0.0, 0.0, 3.0])
+        start,
+        object_linvel=torch.tensor([0.25, 0.1, 0.0]),
+        object_angvel=torch.tensor([0.0, 0.0, 3.0]),
     )
     end = worlds.advance(start, 4)
     return end, worlds.contacts().table_force
@@ -203,7 +227,9 @@ def sliding_distance(bench: Bench) -> Measured:
     off = (way / _DISTANCE - 1.0).abs().view(len(_CASES), len(shapes))
     errors = {}
     for (coefficient, degrees), row in zip(_CASES, off, strict=True):
-        errors[f"mu {coefficient}, {degrees} degrees"] = named([shape.name for shape in shapes], row)
+        errors[f"mu {coefficient}, {degrees} degrees"] = named(
+            [shape.name for shape in shapes], row
+        )
     return errors
 
 
@@ -257,17 +283,23 @@ def torsional_friction_set(bench: Bench) -> Measured:
 
     def prepare(worlds: Worlds) -> None:
         for rows in ([3, 1], [0]):
-            worlds.set_parameter("torsional_friction", factors * bench.scene.friction.torsional, rows)
+            worlds.set_parameter(
+                "torsional_friction", factors * bench.scene.friction.torsional, rows
+            )
 
     return {"spin lost": _spin_lost(bench, len(factors), 0.4, prepare) - factors}
 
 
-def _spin_lost(bench: Bench, count: int, seconds: float, prepare: Callable[[Worlds], None]) -> Tensor:
+def _spin_lost(
+    bench: Bench, count: int, seconds: float, prepare: Callable[[Worlds], None]
+) -> Tensor:
     """[count] what balls on the table lose of their spin, as a share of what the scene's torsional friction takes."""
     thing = ball()
     scene = replace(bench.scene, objects=(thing,))
     which = [0] * count
-    start = replace_fields(bench.initial(scene, which), object_angvel=torch.tensor([0.0, 0.0, 10.0]))
+    start = replace_fields(
+        bench.initial(scene, which), object_angvel=torch.tensor([0.0, 0.0, 10.0])
+    )
     steps = round(seconds / scene.timestep)
     with bench.other(scene, which) as worlds:
         prepare(worlds)
@@ -280,7 +312,10 @@ def _cases(bench: Bench, each: int) -> tuple[Tensor, Tensor]:
     """Coefficient [N] and direction [N, 3], towards the table's middle, of the worlds, ``each`` of them a case."""
     mu = torch.tensor([mu for mu, _ in _CASES]).repeat_interleave(each)
     angle = torch.tensor([math.radians(degrees) for _, degrees in _CASES]).repeat_interleave(each)
-    towards = [math.copysign(1.0, c - p) for c, p in zip(bench.scene.table.center, bench.place, strict=True)]
+    towards = [
+        math.copysign(1.0, c - p)
+        for c, p in zip(bench.scene.table.center, bench.place, strict=True)
+    ]
     direction = torch.stack((angle.cos(), angle.sin(), torch.zeros_like(angle)), dim=1)
     return mu, direction * torch.tensor([*towards, 0.0])
 
@@ -288,4 +323,6 @@ def _cases(bench: Bench, each: int) -> tuple[Tensor, Tensor]:
 def _pairs(bench: Bench, table: Tensor) -> Tensor:
     """[N, 3] friction of the pairs, given the friction with the table."""
     friction = bench.scene.friction
-    return torch.stack((torch.full_like(table, friction.tip), torch.full_like(table, friction.link), table), dim=1)
+    return torch.stack(
+        (torch.full_like(table, friction.tip), torch.full_like(table, friction.link), table), dim=1
+    )

@@ -26,7 +26,9 @@ def held_object(bench: Bench) -> Measured:
     force = contacts.tip_force
     weight = GRAVITY * bench.objects[0].mass
     total = force.sum(1)
-    squeeze = torch.stack((force[:, 0] @ closing, -force[:, 1] @ closing), dim=1)  # of each finger towards the other
+    squeeze = torch.stack(
+        (force[:, 0] @ closing, -force[:, 1] @ closing), dim=1
+    )  # of each finger towards the other
     return {
         "vertical force": total[:, 2] / weight - 1.0,
         "horizontal force": total[:, :2] / weight,
@@ -63,7 +65,9 @@ def _in_palm(bench: Bench, worlds: Worlds) -> tuple[Tensor, Tensor]:
     links = worlds.links()[bench.twins]
     now = worlds.state()[bench.twins]
     inverse = quat_conjugate(links.quat[:, 0])
-    return quat_rotate(inverse, now.object_pos - links.pos[:, 0]), quat_multiply(inverse, now.object_quat)
+    return quat_rotate(inverse, now.object_pos - links.pos[:, 0]), quat_multiply(
+        inverse, now.object_quat
+    )
 
 
 def tip_friction(bench: Bench) -> Measured:

@@ -60,14 +60,20 @@ class Worlds:
         """Set force and torque on the object, [3] or [N, 3]."""
         self.backend.set_object_wrench(self._for_all(force), self._for_all(torque))
 
-    def set_parameter(self, name: Parameter, value: Tensor, worlds: Sequence[int] | None = None) -> None:
+    def set_parameter(
+        self, name: Parameter, value: Tensor, worlds: Sequence[int] | None = None
+    ) -> None:
         """Set a physical parameter [N, ...] of all worlds, or of the given ones from their rows."""
         self.altered = True
         if worlds is not None:
             value = value[list(worlds)]
-        getattr(self.backend, f"set_{name}")(value.float().to(self.backend.device), self._index(worlds))
+        getattr(self.backend, f"set_{name}")(
+            value.float().to(self.backend.device), self._index(worlds)
+        )
 
-    def set_where(self, worlds: Sequence[int], state: State, parameters: dict[Parameter, Tensor]) -> None:
+    def set_where(
+        self, worlds: Sequence[int], state: State, parameters: dict[Parameter, Tensor]
+    ) -> None:
         """Set state and parameters through a mask."""
         self.altered = True
         device = self.backend.device
@@ -150,10 +156,14 @@ class Bench:
     def worlds(self) -> Worlds:
         """Return the shared worlds in their initial state, with nominal parameters."""
         if self._shared is None:
-            self._shared = Worlds(self._make(self.scene, self.NUM_WORLDS, object_index=torch.tensor(self.which)))
+            self._shared = Worlds(
+                self._make(self.scene, self.NUM_WORLDS, object_index=torch.tensor(self.which))
+            )
         worlds = self._shared
         if worlds.altered:
-            for name, value in Parameters.nominal(self.scene, torch.tensor(self.which)).given().items():
+            for name, value in (
+                Parameters.nominal(self.scene, torch.tensor(self.which)).given().items()
+            ):
                 if name in worlds.backend.capabilities:
                     worlds.set_parameter(name, value)
             worlds.altered = False
@@ -177,7 +187,9 @@ class Bench:
             raise Skipped(f"it compares with the reference engine: {status.reason}")
         finer = REFINEMENT if self.backend.name == REFERENCE else 1
         scene = replace(scene, timestep=scene.timestep / finer)
-        with make_backend(REFERENCE, scene, len(which), object_index=torch.tensor(which), workers=0) as backend:
+        with make_backend(
+            REFERENCE, scene, len(which), object_index=torch.tensor(which), workers=0
+        ) as backend:
             yield Worlds(backend, finer)
 
     def start(self) -> State:
@@ -218,7 +230,10 @@ def free_place(scene: SceneSpec) -> tuple[float, float]:
     avoid = np.stack((palm, np.array(robot.base_pos[:2])))
     xs = (x - (half_x - 0.25), x + (half_x - 0.25))
     ys = (y - (half_y - 0.2), y + (half_y - 0.2))
-    return max(product(xs, ys), key=lambda corner: float(np.linalg.norm(avoid - np.array(corner), axis=1).min()))
+    return max(
+        product(xs, ys),
+        key=lambda corner: float(np.linalg.norm(avoid - np.array(corner), axis=1).min()),
+    )
 
 
 def replace_fields(state: State, **changes: Tensor) -> State:
@@ -226,7 +241,9 @@ def replace_fields(state: State, **changes: Tensor) -> State:
     new = {}
     for name, value in changes.items():
         present = getattr(state, name)
-        new[name] = torch.as_tensor(value, dtype=torch.float32, device=present.device).expand_as(present)
+        new[name] = torch.as_tensor(value, dtype=torch.float32, device=present.device).expand_as(
+            present
+        )
     return replace(state, **new).clone()
 
 
@@ -262,7 +279,9 @@ def random_state(bench: Bench, scene: SceneSpec, num_worlds: int, seed: int) -> 
     lower, upper = finite_limits(joints)
     reach = 0.3 * (upper - lower)
     count = len(home)
-    pos = (home + reach * uniform(num_worlds, count)).clamp(lower + 0.1 * reach, upper - 0.1 * reach)
+    pos = (home + reach * uniform(num_worlds, count)).clamp(
+        lower + 0.1 * reach, upper - 0.1 * reach
+    )
     support = table_points(scene.robot, joints)
     points = torch.tensor(support.points)
     radii = torch.tensor(support.radii)
@@ -308,4 +327,6 @@ def state_errors(found: State, expected: State, words: str = "") -> dict[str, Te
 
 def named(names: Sequence[str], errors: Tensor | Sequence[float]) -> list[tuple[str, float]]:
     """Return pairs of a name and an absolute error."""
-    return list(zip(names, torch.as_tensor(errors, dtype=torch.float64).abs().tolist(), strict=True))
+    return list(
+        zip(names, torch.as_tensor(errors, dtype=torch.float64).abs().tolist(), strict=True)
+    )

@@ -56,7 +56,13 @@ def free_spin(bench: Bench) -> Measured:
     )
     end = bench.worlds().advance(start, _STEPS)
     t = _STEPS * bench.scene.timestep
-    errors = {"pos, horizontal": [], "pos, vertical": [], "linvel": [], "orientation": [], "angvel": []}
+    errors = {
+        "pos, horizontal": [],
+        "pos, vertical": [],
+        "linvel": [],
+        "orientation": [],
+        "angvel": [],
+    }
     for i, thing in enumerate(bench.objects):
         turn, omega = _spin(thing, quat, angvel, t)
         arm_at_start = Rotation.from_quat(quat, scalar_first=True).apply(thing.com)
@@ -103,7 +109,10 @@ def object_wrench(bench: Bench) -> Measured:
     state = worlds.state()
     t = steps * bench.scene.timestep
     com = torch.tensor(np.stack([thing.com for thing in bench.objects])).float()
-    inertia = factor[:, None, None] * torch.tensor(np.stack([thing.inertia for thing in bench.objects])).float()
+    inertia = (
+        factor[:, None, None]
+        * torch.tensor(np.stack([thing.inertia for thing in bench.objects])).float()
+    )
     gained = force / (factor * bench.masses)[:, None] * t - torch.tensor([0.0, 0.0, GRAVITY * t])
     omega = torch.linalg.solve(inertia, twist.expand_as(com)) * t  # the object has hardly turned
     arm = quat_rotate(state.object_quat, com)
@@ -111,7 +120,9 @@ def object_wrench(bench: Bench) -> Measured:
     return {
         "velocity of the centre of mass": _share(com_velocity, gained),
         "angular velocity": _share(state.object_angvel, omega),
-        "push after the state was set": worlds.advance(bench.in_the_air(), steps).object_linvel[:, :2],
+        "push after the state was set": worlds.advance(bench.in_the_air(), steps).object_linvel[
+            :, :2
+        ],
     }
 
 
@@ -120,7 +131,9 @@ def _share(found: Tensor, expected: Tensor) -> Tensor:
     return (found - expected).abs().amax(dim=1) / expected.abs().amax(dim=1)
 
 
-def _spin(thing: ObjectSpec, quat: np.ndarray, angvel: np.ndarray, t: float) -> tuple[Rotation, np.ndarray]:
+def _spin(
+    thing: ObjectSpec, quat: np.ndarray, angvel: np.ndarray, t: float
+) -> tuple[Rotation, np.ndarray]:
     """Orientation and angular velocity (world) after a time t without torque: Euler's equations in the body's frame."""
     inertia = np.asarray(thing.inertia)
     body = Rotation.from_quat(quat, scalar_first=True)

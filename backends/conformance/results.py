@@ -99,7 +99,9 @@ class Check:
     tolerance: Mapping[str, tuple[float, str]] = field(default_factory=dict)
     states: Mapping[str, str] = field(default_factory=dict)
 
-    def limit(self, what: str, device: str, state_limits: Mapping[str, Mapping[str, Any]]) -> tuple[float, str]:
+    def limit(
+        self, what: str, device: str, state_limits: Mapping[str, Mapping[str, Any]]
+    ) -> tuple[float, str]:
         """Return tolerance and unit of a measure on a device, ``cpu`` or ``cuda``."""
         for pattern, limit in self.tolerance.items():
             if fnmatchcase(what, pattern):

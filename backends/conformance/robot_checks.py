@@ -26,7 +26,11 @@ _WAY = 0.2  # rad, of a joint's step and of the amplitude of its sine
 _SLIDE_WAY = 0.02  # m, the same of a prismatic joint
 _DURATION = 1.5  # s
 _FREQUENCY = 1.0  # Hz
-_DRIVE_SCALES = ((1.0, 1.0, 1.0), (0.7, 1.4, 1.0), (1.3, 0.8, 0.5))  # of stiffness, damping and effort limit
+_DRIVE_SCALES = (
+    (1.0, 1.0, 1.0),
+    (0.7, 1.4, 1.0),
+    (1.3, 0.8, 0.5),
+)  # of stiffness, damping and effort limit
 
 
 def mass_properties(bench: Bench) -> Measured:
@@ -71,14 +75,18 @@ def effort_limit(bench: Bench) -> Measured:
         effort = min(joint.drive.effort, 0.3 * joint.drive.kp * abs(distance))
         weak.append(replace(joint, drive=replace(joint.drive, effort=effort)))
     scene = _with_joints(scene, weak)
-    return _against_reference(bench, scene, {"weak step": torch.ones(round(_DURATION / scene.control_dt))})
+    return _against_reference(
+        bench, scene, {"weak step": torch.ones(round(_DURATION / scene.control_dt))}
+    )
 
 
 def _alone(bench: Bench, scene: SceneSpec) -> tuple[State, Tensor]:
     """[J] worlds: in world i joint i has room for its way on both sides, the others are at home; and each way [J]."""
     kinematics = Kinematics(scene.robot)
     tree = robot_tree(scene.robot)
-    slides = torch.tensor([tree.joint(joint.name).type == "prismatic" for joint in scene.robot.joints])
+    slides = torch.tensor(
+        [tree.joint(joint.name).type == "prismatic" for joint in scene.robot.joints]
+    )
     lower = kinematics.lower
     upper = kinematics.upper
     way = torch.where(slides, _SLIDE_WAY, _WAY).double().minimum(0.3 * (upper - lower))
@@ -111,7 +119,9 @@ def _against_reference(bench: Bench, scene: SceneSpec, signals: dict[str, Tensor
             mine = [i for i, joint in enumerate(scene.robot.joints) if joint.group == group]
             if mine:
                 names = [scene.robot.joints[i].name for i in mine]
-                errors[f"{group}, {signal}, rms"] = named(names, off.square().mean(dim=0).sqrt()[mine])
+                errors[f"{group}, {signal}, rms"] = named(
+                    names, off.square().mean(dim=0).sqrt()[mine]
+                )
                 errors[f"{group}, {signal}, peak"] = named(names, off.abs().amax(dim=0)[mine])
     return errors
 
@@ -136,7 +146,9 @@ def drive_equation(bench: Bench) -> Measured:
     index = robot.joint_names.index("lift")
     drive = robot.joints[index].drive
     tree = robot_tree(robot)
-    carried = sum(tree.link(name).mass for name in ("carriage", "wrist", "palm", "jaw_a", "jaw_b", "finger_b"))
+    carried = sum(
+        tree.link(name).mass for name in ("carriage", "wrist", "palm", "jaw_a", "jaw_b", "finger_b")
+    )
     steps = torch.tensor([0.01, -0.01, 0.08, -0.08])  # the last two run into the effort limit
     worlds = bench.worlds()
     target = bench.start().joint_pos
@@ -152,10 +164,14 @@ def drive_equation(bench: Bench) -> Measured:
     for i, step in enumerate(steps.tolist()):
 
         def motion(_, y: np.ndarray, goal: float = step) -> list[float]:
-            effort = np.clip(drive.kp * (goal - y[0]) - drive.kd * y[1], -drive.effort, drive.effort)
+            effort = np.clip(
+                drive.kp * (goal - y[0]) - drive.kd * y[1], -drive.effort, drive.effort
+            )
             return [y[1], effort / (carried + drive.armature)]
 
-        exact = solve_ivp(motion, (0.0, times[-1]), [0.0, 0.0], t_eval=times, rtol=1e-6, atol=1e-9, max_step=1e-3).y[0]
+        exact = solve_ivp(
+            motion, (0.0, times[-1]), [0.0, 0.0], t_eval=times, rtol=1e-6, atol=1e-9, max_step=1e-3
+        ).y[0]
         errors[f"step of {step:+.2f} m"] = float(np.abs(path[:, i] - exact).max()) / abs(step)
     return errors
 
@@ -187,7 +203,9 @@ def drive_scale(bench: Bench) -> Measured:
         joints = []
         for joint in scene.robot.joints:
             drive = joint.drive
-            scaled = replace(drive, kp=stiffness * drive.kp, kd=damping * drive.kd, effort=effort * drive.effort)
+            scaled = replace(
+                drive, kp=stiffness * drive.kp, kd=damping * drive.kd, effort=effort * drive.effort
+            )
             joints.append(replace(joint, drive=scaled))
         with bench.other(_with_joints(scene, joints)) as worlds:
             expected.append(path(worlds, slice(i, i + 1)))
@@ -213,7 +231,10 @@ def joint_limits(bench: Bench) -> Measured:
     start, way = _alone(bench, scene)
     errors = {}
     with bench.other(scene, [0] * len(way)) as worlds:
-        for name, limit, side in (("upper", kinematics.upper.float(), 1.0), ("lower", kinematics.lower.float(), -1.0)):
+        for name, limit, side in (
+            ("upper", kinematics.upper.float(), 1.0),
+            ("lower", kinematics.lower.float(), -1.0),
+        ):
             limited = limit.isfinite()
             if not limited.any():
                 continue
@@ -237,7 +258,9 @@ def gravity_compensation(bench: Bench) -> Measured:
     scene = without_collisions(bench.scene)
     random = torch.Generator().manual_seed(8)
     lower, upper = finite_limits(bench.kinematics, 2.0)
-    share = 0.2 + 0.6 * torch.rand(bench.NUM_WORLDS, len(lower), generator=random, dtype=torch.float64)
+    share = 0.2 + 0.6 * torch.rand(
+        bench.NUM_WORLDS, len(lower), generator=random, dtype=torch.float64
+    )
     q = lower + (upper - lower) * share
     q[0] = torch.as_tensor(scene.robot.home)
     start = replace_fields(bench.start(), joint_pos=q, joint_target=q)
@@ -252,7 +275,9 @@ def own_weight(bench: Bench) -> Measured:
 
     At rest kp (target - q) = sum over links of m g dz/dq, in every world.
     """
-    scene = without_collisions(replace(bench.scene, robot=replace(bench.scene.robot, gravity_compensated=False)))
+    scene = without_collisions(
+        replace(bench.scene, robot=replace(bench.scene.robot, gravity_compensated=False))
+    )
     kinematics = bench.kinematics
     start = bench.start()
     with bench.other(scene, bench.which) as worlds:

@@ -68,7 +68,10 @@ def scene(robot: RobotSpec | None = None) -> SceneSpec:
 def without_collisions(scene: SceneSpec) -> SceneSpec:
     """Return the scene with a robot whose links touch neither one another nor the table."""
     robot = scene.robot
-    return replace(scene, robot=replace(robot, self_collision_links=(), table_exclude=robot_tree(robot).link_names))
+    return replace(
+        scene,
+        robot=replace(robot, self_collision_links=(), table_exclude=robot_tree(robot).link_names),
+    )
 
 
 def reorder_joints(scene: SceneSpec) -> SceneSpec:
@@ -76,7 +79,9 @@ def reorder_joints(scene: SceneSpec) -> SceneSpec:
     return replace(scene, robot=replace(scene.robot, joints=scene.robot.joints[::-1]))
 
 
-def shape(kind: str, size: Sequence[float], pos: Sequence[float] = (0, 0, 0), yaw: float = 0.0) -> Shape:
+def shape(
+    kind: str, size: Sequence[float], pos: Sequence[float] = (0, 0, 0), yaw: float = 0.0
+) -> Shape:
     """Return a shape at a place in the mesh frame [m].
 
     Sizes [m]: half edges of a box, or of a box that is given as a hull; radius and half height of a cylinder; radius
@@ -87,14 +92,21 @@ def shape(kind: str, size: Sequence[float], pos: Sequence[float] = (0, 0, 0), ya
     T[:3, 3] = pos
     if kind == "hull":
         mesh = trimesh.creation.box(extents=2.0 * np.array(size))
-        geometry = Geometry(kind="hull", vertices=np.asarray(mesh.vertices), faces=np.asarray(mesh.faces))
+        geometry = Geometry(
+            kind="hull", vertices=np.asarray(mesh.vertices), faces=np.asarray(mesh.faces)
+        )
     else:
         geometry = Geometry(kind=kind, size=tuple(size))  # pyright: ignore[reportArgumentType]
     return Shape(geometry=geometry, T_body_shape=T)
 
 
 def solid(
-    name: str, mass: float, pieces: tuple[Shape, ...], *, shift: Sequence[float] = (0, 0, 0), twist: float = 0.0
+    name: str,
+    mass: float,
+    pieces: tuple[Shape, ...],
+    *,
+    shift: Sequence[float] = (0, 0, 0),
+    twist: float = 0.0,
 ) -> ObjectSpec:
     """Return an object of even density whose centre of mass is then shifted and whose principal axes are turned.
 

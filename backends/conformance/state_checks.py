@@ -7,7 +7,13 @@ from collections import defaultdict
 import torch
 from torch import Tensor
 
-from xreset.backends.conformance.harness import Bench, random_state, rotation_angle, small_motion, state_errors
+from xreset.backends.conformance.harness import (
+    Bench,
+    random_state,
+    rotation_angle,
+    small_motion,
+    state_errors,
+)
 from xreset.backends.conformance.results import Measured, Skipped
 from xreset.backends.conformance.scene import reorder_joints
 from xreset.geometry.kinematics import Kinematics
@@ -66,7 +72,9 @@ def joint_order(bench: Bench) -> Measured:
         motion = small_motion(kinematics)
         worlds.set(start)
         worlds.set_targets(start.joint_pos + torch.diag(motion))  # world i moves joint i
-        worlds.step(240)  # until they rest, a second for soft drives: an arm in motion shakes its fingers
+        worlds.step(
+            240
+        )  # until they rest, a second for soft drives: an arm in motion shakes its fingers
         moved = (worlds.state().joint_pos - start.joint_pos) / motion
     wrong = moved - torch.eye(count)
     return {

@@ -114,7 +114,10 @@ def repeatable(bench: Bench) -> Measured:
         again = _busy(bench, worlds)
     with bench.other(bench.scene, bench.which) as new:
         in_new_worlds = _busy(bench, new)
-    return {**state_errors(again, first, "again,"), **state_errors(in_new_worlds, first, "newly built,")}
+    return {
+        **state_errors(again, first, "again,"),
+        **state_errors(in_new_worlds, first, "newly built,"),
+    }
 
 
 def masked_set(bench: Bench) -> Measured:
@@ -127,12 +130,16 @@ def masked_set(bench: Bench) -> Measured:
         "object_mass": bench.masses * scale,
         "object_inertia": scale.flip(0),
         "object_com": 0.01 * scale[:, None] * torch.tensor([1.0, -1.0, 0.5]),
-        "friction": torch.tensor([[0.8, 0.4, 0.3], [0.7, 0.5, 0.9], [0.6, 0.3, 0.45], [0.9, 0.6, 0.2]]),
+        "friction": torch.tensor(
+            [[0.8, 0.4, 0.3], [0.7, 0.5, 0.9], [0.6, 0.3, 0.45], [0.9, 0.6, 0.2]]
+        ),
         "torsional_friction": 2e-3 * scale,
         "object_gravity": torch.tensor([0.9, 0.5, 0.1, 0.0]),
         "drives": scale[:, None, None].expand(-1, 3, len(bench.scene.robot.joints)),
     }
-    parameters = {name: value for name, value in parameters.items() if name in bench.backend.capabilities}
+    parameters = {
+        name: value for name, value in parameters.items() if name in bench.backend.capabilities
+    }
 
     def run(masked: bool) -> State:
         worlds = bench.worlds()
@@ -159,7 +166,11 @@ def broken_world(bench: Bench) -> Measured:
     expected = worlds.advance(good, 4)
     others = [0, 2, 3]
     errors = defaultdict(list)
-    for field, value in (("object_linvel", torch.nan), ("object_pos", torch.inf), ("joint_vel", torch.nan)):
+    for field, value in (
+        ("object_linvel", torch.nan),
+        ("object_pos", torch.inf),
+        ("joint_vel", torch.nan),
+    ):
         bad = good.clone()
         getattr(bad, field)[1] = value
         after = worlds.advance(bad, 4)

@@ -35,7 +35,10 @@ from xreset.task.config import EVALUATION_TIMESTEP, TaskConfig
 
 SCHEMA = "xreset-actions/1"
 
-_STATE_KEYS = {f.name: f"start_{f.name}_wxyz" if f.name == "object_quat" else f"start_{f.name}" for f in fields(State)}
+_STATE_KEYS = {
+    f.name: f"start_{f.name}_wxyz" if f.name == "object_quat" else f"start_{f.name}"
+    for f in fields(State)
+}
 
 _FIELDS: Schema = {
     "robot": Field((), "U"),
@@ -101,12 +104,16 @@ def from_file(source: Path, place: Place, thing: str | None = None, episode: int
     if schema == TRACE_SCHEMA:
         return _from_evaluation(source, place, thing, episode)
     only = () if thing is None else (thing,)
-    inputs = load_inputs(source, robot=place.robot, objects=place.objects, only=only, accept=("demos", "motion"))
+    inputs = load_inputs(
+        source, robot=place.robot, objects=place.objects, only=only, accept=("demos", "motion")
+    )
     motion = inputs.motion()
     first = inputs.objects[0].name if only else motion.object_name[0]
     grasped = next(o for o in inputs.objects if o.name == first)
     grasps = find_grasps(motion, inputs.robot, (grasped,), len(motion.valid), where="table")
-    _check_episode(episode, len(grasps), f"{source} shows {len(grasps)} grasps of {grasped.name} on the table")
+    _check_episode(
+        episode, len(grasps), f"{source} shows {len(grasps)} grasps of {grasped.name} on the table"
+    )
     return grasp_and_lift(inputs.robot, grasped, grasps[episode : episode + 1])
 
 
@@ -124,7 +131,9 @@ def _from_evaluation(source: Path, place: Place, wanted: str | None, episode: in
     _check_episode(episode, len(mine), f"{source} records {len(mine)} episodes of {chosen}")
     found = mine[episode]
     thing = load_object(chosen, mesh_folder(place.objects, summary.objects_folder))
-    return recorded_actions(spec, thing, found, label=f"{summary.policy} in {name}, demonstration {found.sequence}")
+    return recorded_actions(
+        spec, thing, found, label=f"{summary.policy} in {name}, demonstration {found.sequence}"
+    )
 
 
 def _check_episode(episode: int, count: int, found: str) -> None:
@@ -148,7 +157,9 @@ def recorded_actions(robot: RobotSpec, thing: ObjectSpec, trace: Trace, *, label
         FileFormatError: the trace has no actions, or its control step is no whole number of physics steps.
     """
     if trace.joint_target is None:
-        raise FileFormatError("The trace holds states without the actions that led to them. Evaluate again.")
+        raise FileFormatError(
+            "The trace holds states without the actions that led to them. Evaluate again."
+        )
     steps_per_frame = len(trace.joint_target) // (len(trace.time) - 1)
     dt = float(trace.time[1] - trace.time[0]) / max(1, steps_per_frame)
     substeps = round(dt / EVALUATION_TIMESTEP)
@@ -157,14 +168,17 @@ def recorded_actions(robot: RobotSpec, thing: ObjectSpec, trace: Trace, *, label
             f"The episode was played with control steps of {dt:.4g} s, expected a multiple of 1/240 s. Replay another."
         )
     first = [
-        torch.as_tensor(x[:1], dtype=torch.float32) for x in (trace.joint_pos, trace.object_pos, trace.object_quat)
+        torch.as_tensor(x[:1], dtype=torch.float32)
+        for x in (trace.joint_pos, trace.object_pos, trace.object_quat)
     ]
     target = torch.as_tensor(trace.joint_target, dtype=torch.float32)
     scene = nominal_scene(robot, (thing,), TaskConfig(substeps=substeps))
     return Actions(scene=scene, label=label, start=State.at_rest(*first), joint_target=target)
 
 
-def write_actions(path: str | Path, actions: Actions, replays: Mapping[str, Recording] | None = None) -> None:
+def write_actions(
+    path: str | Path, actions: Actions, replays: Mapping[str, Recording] | None = None
+) -> None:
     """Write an action sequence, and what engines did with it, by name: the first world of each recording."""
     scene = actions.scene
     friction = scene.friction
@@ -186,11 +200,15 @@ def write_actions(path: str | Path, actions: Actions, replays: Mapping[str, Reco
         arrays["engine"] = np.array(list(replays))
         for name in ("joint_pos", "object_pos", "object_quat", "tip_force"):
             key = "object_quat_wxyz" if name == "object_quat" else name
-            arrays[key] = np.stack([getattr(recording, name)[:, 0].numpy() for recording in replays.values()])
+            arrays[key] = np.stack(
+                [getattr(recording, name)[:, 0].numpy() for recording in replays.values()]
+            )
     write_npz(path, SCHEMA, arrays)
 
 
-def read_actions(path: str | Path, robot: RobotSpec | str | None, objects: Callable[[str], ObjectSpec]) -> Actions:
+def read_actions(
+    path: str | Path, robot: RobotSpec | str | None, objects: Callable[[str], ObjectSpec]
+) -> Actions:
     """Read an action sequence.
 
     Args:
@@ -220,7 +238,10 @@ def read_actions(path: str | Path, robot: RobotSpec | str | None, objects: Calla
         timestep=float(a["timestep"]),
         substeps=int(a["substeps"]),
     )
-    start = {name: torch.as_tensor(a[key], dtype=torch.float32)[None] for name, key in _STATE_KEYS.items()}
+    start = {
+        name: torch.as_tensor(a[key], dtype=torch.float32)[None]
+        for name, key in _STATE_KEYS.items()
+    }
     return Actions(
         scene=scene,
         label=str(a["label"]),

@@ -102,7 +102,9 @@ class CommonStates:
     """[G, ...]"""
 
 
-def try_closings(tested: Engine, scene: SceneSpec, grasps: Grasps, tries: GraspMotion) -> tuple[Recording, Recording]:
+def try_closings(
+    tested: Engine, scene: SceneSpec, grasps: Grasps, tries: GraspMotion
+) -> tuple[Recording, Recording]:
     """Close each hand at the scene's frictions.
 
     Returns:
@@ -113,13 +115,17 @@ def try_closings(tested: Engine, scene: SceneSpec, grasps: Grasps, tries: GraspM
     start, targets = closing_episode(scene.robot, grasps, dt, tries)
     with tested.make(scene, len(grasps), grasps.object_index) as backend:
         whole = play(backend, start, targets)
-        mass = torch.tensor([scene.objects[i].mass for i in grasps.object_index.tolist()], device=backend.device)
+        mass = torch.tensor(
+            [scene.objects[i].mass for i in grasps.object_index.tolist()], device=backend.device
+        )
         backend.set_object_mass(PRESS_MASS * mass)
         backend.set_object_gravity(torch.zeros_like(mass))
         return play(backend, start, targets[: tries.closing_steps(dt)]), whole
 
 
-def try_holds(tested: Engine, scene: SceneSpec, common: CommonStates, tries: GraspMotion) -> tuple[Recording, ...]:
+def try_holds(
+    tested: Engine, scene: SceneSpec, common: CommonStates, tries: GraspMotion
+) -> tuple[Recording, ...]:
     """Lift and shake, once with each of the frictions."""
     targets = lifting_targets(scene.robot, common.start, scene.control_dt, tries)
     recordings = []
@@ -279,7 +285,9 @@ def compare(
         presses.append(press)
         closings.append(closing)
     air = find_grasps(motion, robot, objects, grasps, where="air")
-    closed = {e.name: closing for e, closing in zip(everyone, closings, strict=True) if e is not floor}
+    closed = {
+        e.name: closing for e, closing in zip(everyone, closings, strict=True) if e is not floor
+    }
     common = common_states(robot, table, air, closed, grasps, scene.control_dt, tries)
     holds: list[tuple[Recording, ...]] = []
     for done, e in enumerate(everyone, len(everyone)):
@@ -287,7 +295,9 @@ def compare(
         holds.append(try_holds(e, scene, common, tries))
     progress("", total, total)
 
-    surfaces = [torch.as_tensor(surface_points(o, SURFACE_POINTS), dtype=torch.float32) for o in objects]
+    surfaces = [
+        torch.as_tensor(surface_points(o, SURFACE_POINTS), dtype=torch.float32) for o in objects
+    ]
     points = torch.stack(surfaces)[common.object_index]
     window = round(PRESS_TIME / scene.control_dt)
     judged = []
@@ -304,7 +314,9 @@ def compare(
             EngineParity(
                 engine=e,
                 metrics=metrics if i else (),
-                carried={name: tuple(carried(r, tries.height).tolist()) for name, r in outcomes.items()},
+                carried={
+                    name: tuple(carried(r, tries.height).tolist()) for name, r in outcomes.items()
+                },
                 broken=sum(int(r.broken.sum()) for r in (*outcomes.values(), presses[i])),
             )
         )
@@ -362,7 +374,9 @@ def carried(recording: Recording, lift: float) -> Tensor:
     return (recording.lifted > lift / 2) & ~recording.broken
 
 
-def outcome_metric(name: str, found: Sequence[Recording], reference: Sequence[Recording], lift: float) -> Metric:
+def outcome_metric(
+    name: str, found: Sequence[Recording], reference: Sequence[Recording], lift: float
+) -> Metric:
     """Return the share of the tries that end alike, carried or not."""
     same = [carried(a, lift) == carried(b, lift) for a, b in zip(found, reference, strict=True)]
     return Metric.of(name, torch.cat(same), q=None)

@@ -93,7 +93,15 @@ class Attribution:
         }
 
     def _row(self, row: Row) -> dict[str, Any]:
-        metrics = ("approach", "grasp", "reorient", "reorientation_progress", "nonfinite", "overflow", "out_of_bounds")
+        metrics = (
+            "approach",
+            "grasp",
+            "reorient",
+            "reorientation_progress",
+            "nonfinite",
+            "overflow",
+            "out_of_bounds",
+        )
         means = {metric: round(row.mean(metric), 6) for metric in metrics}
         return {
             "kind": row.kind,
@@ -134,7 +142,9 @@ def attribute(
     """
     policy.check_seed(trial.seed)
     if unknown := sorted(set(only) - set(COMPARED)):
-        raise XResetError(f"Unknown property {', '.join(unknown)}. Choose from: {', '.join(COMPARED)}.")
+        raise XResetError(
+            f"Unknown property {', '.join(unknown)}. Choose from: {', '.join(COMPARED)}."
+        )
     progress(f"measuring {a.name}", 0, 0)
     measured_a = measure(a, trial.nominal_scene)
     progress(f"measuring {b.name}", 0, 0)
@@ -177,11 +187,18 @@ def attribute(
         run("all", f"all {changed} at once", a, everything)
     run("other", b.name, b, nominal)
     return Attribution(
-        a=a.name, b=b.name, measured_a=measured_a, measured_b=measured_b, rows=tuple(rows), skipped=skipped
+        a=a.name,
+        b=b.name,
+        measured_a=measured_a,
+        measured_b=measured_b,
+        rows=tuple(rows),
+        skipped=skipped,
     )
 
 
-def change_towards(prop: Property, a: float, b: float, task: TaskConfig, engine: str) -> TaskConfig | str:
+def change_towards(
+    prop: Property, a: float, b: float, task: TaskConfig, engine: str
+) -> TaskConfig | str:
     """Return the task in which a property of engine A has the value of engine B, or why there is none.
 
     A pair's friction is the mean of two materials, of which the one that is not the object's is changed. Other

@@ -15,7 +15,15 @@ from xreset.eval.table import success_text
 def rich_table(found: Attribution, title: str) -> Table:
     """One row for each run: change, score, and difference to A as it is. Bold: the interval leaves out zero."""
     table = Table("", title=title, title_justify="left")
-    names = ("value", "task progress", "grasp", "reorient", "published success", f"against {found.a}", "of gap")
+    names = (
+        "value",
+        "task progress",
+        "grasp",
+        "reorient",
+        "published success",
+        f"against {found.a}",
+        "of gap",
+    )
     for name in names:
         table.add_column(name, justify="right")
     for row in found.rows:
@@ -31,7 +39,9 @@ def rich_table(found: Attribution, title: str) -> Table:
             f"{row.mean('grasp'):.0%}",
             f"{row.mean('reorient'):.0%}",
             success_text(effect.published_success),
-            "" if first else f"{100 * effect.difference:+.1f}\n{100 * least:+.1f} to {100 * most:+.1f}",
+            ""
+            if first
+            else f"{100 * effect.difference:+.1f}\n{100 * least:+.1f} to {100 * most:+.1f}",
             "" if first or math.isnan(share) else f"{share:.0%}",
             style="bold" if effect.is_certain else None,
         )
@@ -57,7 +67,8 @@ def verdict(found: Attribution) -> str:
     row = found.costs()
     if row is None:
         return (
-            f"{found.b} differs from {found.a} by {size}, and none of the properties that could be changed explains it."
+            f"{found.b} differs from {found.a} by {size}, and none of the properties that could be changed explains "
+            "it."
         )
     best = f"{row.name!r} alone brings about {found.share(row):.0%} of it"
     for together in found.rows:

@@ -65,7 +65,12 @@ class Grasps(Tensors):
 
 
 def find_grasps(
-    motion: Retargeted, robot: RobotSpec, objects: Sequence[ObjectSpec], count: int, *, where: Literal["table", "air"]
+    motion: Retargeted,
+    robot: RobotSpec,
+    objects: Sequence[ObjectSpec],
+    count: int,
+    *,
+    where: Literal["table", "air"],
 ) -> Grasps:
     """Choose grasps, equally many of each object and spread over the sequences; the same arguments give the same
     grasps.
@@ -90,7 +95,9 @@ def find_grasps(
     moved = motion.object_pos[rows] - start_pos
     if where == "table":
         start = Rotation.from_quat(start_quat, scalar_first=True)
-        turned = (Rotation.from_quat(motion.object_quat_wxyz[rows], scalar_first=True) * start.inv()).magnitude()
+        turned = (
+            Rotation.from_quat(motion.object_quat_wxyz[rows], scalar_first=True) * start.inv()
+        ).magnitude()
         fits = (np.linalg.norm(moved, axis=1) < REST_DISTANCE) & (turned < REST_ANGLE)
     else:
         fits = moved[:, 2] > LIFTED
@@ -122,16 +129,22 @@ def _lowest(thing: ObjectSpec, quat: np.ndarray) -> float:
     """Return the smallest z of the object turned by ``quat``, relative to the origin of its mesh frame [m]."""
     T = np.eye(4)
     T[:3, :3] = Rotation.from_quat(quat, scalar_first=True).as_matrix()
-    return lowest_point([replace(piece, T_body_shape=T @ piece.T_body_shape) for piece in thing.pieces])
+    return lowest_point(
+        [replace(piece, T_body_shape=T @ piece.T_body_shape) for piece in thing.pieces]
+    )
 
 
-def _at_hand(motion: Retargeted, rows: np.ndarray, robot: RobotSpec, thing: ObjectSpec) -> np.ndarray:
+def _at_hand(
+    motion: Retargeted, rows: np.ndarray, robot: RobotSpec, thing: ObjectSpec
+) -> np.ndarray:
     """Return the rows [R] of an object in which the thumb's tip and another tip are near it."""
     rows = rows[motion.object_name[motion.sequence_of_frame[rows]] == thing.name]
     if not len(rows):
         return rows
     links = [tip.link for tip in robot.fingertips]
-    tips = Kinematics(robot).points(torch.as_tensor(motion.joint_pos[rows], dtype=torch.float64), links)
+    tips = Kinematics(robot).points(
+        torch.as_tensor(motion.joint_pos[rows], dtype=torch.float64), links
+    )
     pos = torch.as_tensor(motion.object_pos[rows], dtype=torch.float64)[:, None]
     quat = torch.as_tensor(motion.object_quat_wxyz[rows], dtype=torch.float64)[:, None]
     local = quat_rotate_inverse(quat.expand(-1, len(links), -1), tips - pos)
@@ -143,7 +156,9 @@ def _at_hand(motion: Retargeted, rows: np.ndarray, robot: RobotSpec, thing: Obje
 def _in_turns(motion: Retargeted, rows: np.ndarray, *, last_first: bool) -> np.ndarray:
     """Order rows [R]: objects take turns, then an object's sequences; a sequence's best frame comes first."""
     sequence = motion.sequence_of_frame[rows]
-    table = pd.DataFrame({"row": rows, "sequence": sequence, "object": motion.object_name[sequence]})
+    table = pd.DataFrame(
+        {"row": rows, "sequence": sequence, "object": motion.object_name[sequence]}
+    )
     size = table.groupby("sequence")["row"].transform("size").to_numpy()
     best = size - 1 if last_first else size // 2
     table["away"] = np.abs(table.groupby("sequence").cumcount().to_numpy() - best)
@@ -199,7 +214,9 @@ class GraspMotion:
 STANDARD = GraspMotion()
 
 
-def closing_episode(robot: RobotSpec, grasps: Grasps, dt: float, motion: GraspMotion) -> tuple[State, Tensor]:
+def closing_episode(
+    robot: RobotSpec, grasps: Grasps, dt: float, motion: GraspMotion
+) -> tuple[State, Tensor]:
     """Return start [G, ...] and targets [T, G, J] of a whole try: the open hand around an object at rest closes, lifts
     and shakes; dt: control step [s]."""
     kinematics = Kinematics(robot)
@@ -256,7 +273,9 @@ def squeezed(kinematics: Kinematics, joint_pos: Tensor, motion: GraspMotion) -> 
     """
     robot = kinematics.robot
     hand = torch.as_tensor(robot.hand_indices)
-    stiffness = torch.tensor([robot.joints[i].drive.kp for i in robot.hand_indices], dtype=joint_pos.dtype)
+    stiffness = torch.tensor(
+        [robot.joints[i].drive.kp for i in robot.hand_indices], dtype=joint_pos.dtype
+    )
     q = moved_fingertips(kinematics, joint_pos, motion.reach)
     share = torch.full((len(robot.fingertips), 1), 1.0 / (len(robot.fingertips) - 1), dtype=q.dtype)
     share[0] = 1.0
@@ -301,9 +320,15 @@ def carried_palm(kinematics: Kinematics, joint_pos: Tensor, offset: Tensor) -> T
             palm = kinematics.jacobian(q, [robot.palm])
             # For small angles, the rotation vector back to the start.
             turn = 0.5 * torch.linalg.cross(palm.rot[:, 0], start[:, :3, :3], dim=-2).sum(-1)
-            error = torch.cat((start[:, :3, 3] + here - palm.pos[:, 0], _TURN_LENGTH * turn), dim=-1)
-            jacobian = torch.cat((palm.linear[:, 0], _TURN_LENGTH * palm.angular[:, 0]), dim=-2)[..., arm]
-            q = kinematics.clamp(q.index_add(-1, arm, _least_squares(jacobian, error, _ARM_DAMPING)))
+            error = torch.cat(
+                (start[:, :3, 3] + here - palm.pos[:, 0], _TURN_LENGTH * turn), dim=-1
+            )
+            jacobian = torch.cat((palm.linear[:, 0], _TURN_LENGTH * palm.angular[:, 0]), dim=-2)[
+                ..., arm
+            ]
+            q = kinematics.clamp(
+                q.index_add(-1, arm, _least_squares(jacobian, error, _ARM_DAMPING))
+            )
         path.append(q)
     return torch.stack(path)
 
@@ -322,7 +347,11 @@ def _carried(kinematics: Kinematics, closed: Tensor, motion: GraspMotion, dt: fl
     up[: len(t), 2] *= t**3 * (10 - 15 * t + 6 * t**2)
     steps = round(motion.shake / dt)
     t = torch.arange(1, steps + 1) / steps
-    wave = motion.amplitude * torch.sin(math.pi * t) * torch.sin(2 * math.pi * motion.frequency * motion.shake * t)
+    wave = (
+        motion.amplitude
+        * torch.sin(math.pi * t)
+        * torch.sin(2 * math.pi * motion.frequency * motion.shake * t)
+    )
     shake = torch.zeros(2, steps, 3)
     shake[0, :, 0] = wave
     shake[1, :, 1] = wave

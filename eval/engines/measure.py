@@ -140,7 +140,9 @@ class _Bench:
             "link": _PULL * _PRESS * max(friction.link, 0.1),
         }
         # Four times the spin [rad/s] that the stated torsional friction takes; not so much that a contact patters.
-        self._spin = 4.0 * max(friction.torsional, 1e-3) * _SLAB_MASS * GRAVITY / _TOP_INERTIA[2] * _TIME
+        self._spin = (
+            4.0 * max(friction.torsional, 1e-3) * _SLAB_MASS * GRAVITY / _TOP_INERTIA[2] * _TIME
+        )
 
     def run(self, backend: Backend) -> dict[str, Tensor]:
         """Play all experiments; returns the worlds' states [T, N, ...] after each physics step, the start first."""
@@ -161,7 +163,9 @@ class _Bench:
             for name, values in rows.items():
                 values.append(getattr(state, name).cpu().clone())
         log = {name: torch.stack(values).double() for name, values in rows.items()}
-        sound = torch.stack([values.isfinite().flatten(2).all(-1).all(0) for values in log.values()]).all(0)
+        sound = torch.stack(
+            [values.isfinite().flatten(2).all(-1).all(0) for values in log.values()]
+        ).all(0)
         broken = [name for name, i in _AT.items() if not sound[i]]
         if broken:
             raise XResetError(
@@ -221,7 +225,9 @@ class _Bench:
         steps = int((spin > spin[0] / 2).long().cumprod(0).sum()) - 1
         if steps < 1:
             return float("nan")
-        load = GRAVITY * steps * self._dt + float(log["object_linvel"][steps, world, 2])  # its impulse, for the mass
+        load = GRAVITY * steps * self._dt + float(
+            log["object_linvel"][steps, world, 2]
+        )  # its impulse, for the mass
         return _TOP_INERTIA[2] / _SLAB_MASS * float(spin[0] - spin[steps]) / load
 
     def _start(self) -> State:
@@ -259,7 +265,11 @@ class _Bench:
         out = []
         for joint in self._robot.joints:
             limits = tree.joint(joint.name)
-            size = min(_STEP, 0.4 * joint.drive.effort / joint.drive.kp, 0.2 * (limits.upper - limits.lower))
+            size = min(
+                _STEP,
+                0.4 * joint.drive.effort / joint.drive.kp,
+                0.2 * (limits.upper - limits.lower),
+            )
             out.append(size if limits.upper - joint.home >= joint.home - limits.lower else -size)
         return out
 
@@ -269,7 +279,9 @@ class _Bench:
         velocity = log["joint_vel"][:, _AT["drives"]].numpy()
         drives = [joint.drive for joint in self._robot.joints]
         change = np.array(self._drive_steps(), dtype=np.float32).astype(float)
-        M = mass_matrix(self._robot, self._robot.home) + np.diag([drive.armature for drive in drives])
+        M = mass_matrix(self._robot, self._robot.home) + np.diag(
+            [drive.armature for drive in drives]
+        )
         loss = np.array([drive.friction_loss for drive in drives])
         momentum = velocity @ M + np.cumsum(loss * np.sign(velocity), axis=0) * self._dt
         lag = position[0] + change - position
@@ -291,7 +303,9 @@ def _block(name: str, *, inertia: np.ndarray) -> ObjectSpec:
 def _top() -> ObjectSpec:
     """Return a cone upside down. Its origin and its centre of mass are its point."""
     angle = np.arange(8) * np.pi / 4
-    rim = np.stack((_TOP_RADIUS * np.cos(angle), _TOP_RADIUS * np.sin(angle), np.full(8, _TOP_HEIGHT)), axis=1)
+    rim = np.stack(
+        (_TOP_RADIUS * np.cos(angle), _TOP_RADIUS * np.sin(angle), np.full(8, _TOP_HEIGHT)), axis=1
+    )
     cone = solid("top", _SLAB_MASS, (hull(np.concatenate((np.zeros((1, 3)), rim))),))
     return replace(cone, com=np.zeros(3), inertia=np.diag(_TOP_INERTIA))
 
@@ -353,7 +367,9 @@ def _z_to(direction: np.ndarray) -> np.ndarray:
     """[4] rotation that turns z into a unit vector [3]."""
     x = np.cross(np.eye(3)[np.abs(direction).argmin()], direction)
     x /= np.linalg.norm(x)
-    return Rotation.from_matrix(np.stack((x, np.cross(direction, x), direction), axis=1)).as_quat(scalar_first=True)
+    return Rotation.from_matrix(np.stack((x, np.cross(direction, x), direction), axis=1)).as_quat(
+        scalar_first=True
+    )
 
 
 def _median(values: Sequence[float] | np.ndarray) -> float:

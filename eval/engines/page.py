@@ -40,12 +40,24 @@ def read(paths: Iterable[Path]) -> list[Json]:
         data = read_json(path, CONFORMANCE)
         try:
             page([data])  # asks the file for everything that the page needs
-        except (KeyError, TypeError, AttributeError, ValueError, IndexError, OverflowError, UndefinedError) as error:
+        except (
+            KeyError,
+            TypeError,
+            AttributeError,
+            ValueError,
+            IndexError,
+            OverflowError,
+            UndefinedError,
+        ) as error:
             what = f"{type(error).__name__} {shown(str(error))}"
-            raise FileFormatError(f"{path} is no complete {CONFORMANCE}: {what}. Make it again.") from error
+            raise FileFormatError(
+                f"{path} is no complete {CONFORMANCE}: {what}. Make it again."
+            ) from error
         files.append(data)
     if not files:
-        raise XResetError("there is nothing to make a page of. Give files of xreset engines check --json.")
+        raise XResetError(
+            "there is nothing to make a page of. Give files of xreset engines check --json."
+        )
     return files
 
 
@@ -79,7 +91,14 @@ def page(files: Iterable[Json]) -> str:
                         amounts = [_amount(m[key], m) for key in ("measured", "tolerance", "bound")]
                         known.append((*where, f"`{name}`: {m['what']}", *amounts, m["reason"]))
                 if check["verdict"] in ("failed", "unsupported", "skipped"):
-                    not_done.append((*where, f"`{name}`", check["verdict"], check["problem"] or _failures(check)))
+                    not_done.append(
+                        (
+                            *where,
+                            f"`{name}`",
+                            check["verdict"],
+                            check["problem"] or _failures(check),
+                        )
+                    )
     measured = ("engine", "robot", "measure", "measured", "tolerance", "accepted up to", "why")
     return render(
         "engines.md.j2",
@@ -103,7 +122,12 @@ def _capabilities(found: Mapping[str, set[str]]) -> str:
     others = sorted(set().union(*found.values()))
     rows = []
     for name in dict.fromkeys((*get_args(Capability), *others)) if found else ():
-        rows.append((name.replace("_", " "), *("yes" if name in found[column] else "no" for column in columns)))
+        rows.append(
+            (
+                name.replace("_", " "),
+                *("yes" if name in found[column] else "no" for column in columns),
+            )
+        )
     return _table(("", *columns), rows)
 
 
@@ -118,7 +142,13 @@ def _summary(checks: Checks) -> str:
         if check["group"] != group:
             group = check["group"]
             rows.append((f"**{group}**", *[""] * (1 + len(columns))))
-        rows.append((f"`{name}`", check["statement"], *(_verdict(checks[column].get(name)) for column in columns)))
+        rows.append(
+            (
+                f"`{name}`",
+                check["statement"],
+                *(_verdict(checks[column].get(name)) for column in columns),
+            )
+        )
     return _table(("check", "what must hold", *columns), rows)
 
 
@@ -129,14 +159,18 @@ def _verdict(check: Json | None) -> str:
         return "none"
     worst = max((_share(m) for m in check["measures"]), default=0.0)
     share = "< 0.01" if 0 < worst < 0.01 else f"{worst:.2f}" if worst < 10 else f"{worst:.3g}"
-    return {"passed": share, "known difference": f"known, {share}"}.get(check["verdict"], f"**failed, {share}**")
+    return {"passed": share, "known difference": f"known, {share}"}.get(
+        check["verdict"], f"**failed, {share}**"
+    )
 
 
 def _failures(check: Json) -> str:
     parts = []
     for m in check["measures"]:
         if m["verdict"] == "failed":
-            parts.append(f"{m['what']}: {_amount(m['measured'], m)}, tolerance {_amount(m['tolerance'], m)}")
+            parts.append(
+                f"{m['what']}: {_amount(m['measured'], m)}, tolerance {_amount(m['tolerance'], m)}"
+            )
     return "; ".join(parts)
 
 

@@ -48,13 +48,20 @@ class Recording:
     def state_after(self, step: int) -> State:
         """Return the states [G] after a control step, brought to rest: positions and targets, without velocities."""
         return State.at_rest(
-            self.joint_pos[step], self.object_pos[step], self.object_quat[step], self.joint_target[step]
+            self.joint_pos[step],
+            self.object_pos[step],
+            self.object_quat[step],
+            self.joint_target[step],
         )
 
     def in_palm(self, step: int, points: Tensor) -> Tensor:
         """Return points [G, P, 3] of the objects' mesh frames in the palm's frame after a control step [m]."""
-        world = self.object_pos[step][:, None] + quat_rotate(self.object_quat[step][:, None], points)
-        return quat_rotate_inverse(self.palm_quat[step][:, None], world - self.palm_pos[step][:, None])
+        world = self.object_pos[step][:, None] + quat_rotate(
+            self.object_quat[step][:, None], points
+        )
+        return quat_rotate_inverse(
+            self.palm_quat[step][:, None], world - self.palm_pos[step][:, None]
+        )
 
 
 def play(backend: Backend, start: State, targets: Tensor) -> Recording:

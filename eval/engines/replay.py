@@ -95,7 +95,9 @@ class Differences:
         return tuple(found)
 
 
-def differences(found: Recording, reference: Recording, robot: RobotSpec, dt: float, *, world: int = 0) -> Differences:
+def differences(
+    found: Recording, reference: Recording, robot: RobotSpec, dt: float, *, world: int = 0
+) -> Differences:
     """Compare a world of a recording with the first world of the reference's recording, which is as long.
 
     Args:
@@ -111,8 +113,12 @@ def differences(found: Recording, reference: Recording, robot: RobotSpec, dt: fl
     force = found.tip_force[:, world].norm(dim=-1).double().numpy()
     other = reference.tip_force[:, 0].norm(dim=-1).double().numpy()
     joint = (found.joint_pos[:, world] - reference.joint_pos[:, 0]).abs().double().numpy() * scale
-    position = (found.object_pos[:, world] - reference.object_pos[:, 0]).double().norm(dim=-1).numpy()
-    angle = quat_angle(found.object_quat[:, world].double(), reference.object_quat[:, 0].double()).numpy()
+    position = (
+        (found.object_pos[:, world] - reference.object_pos[:, 0]).double().norm(dim=-1).numpy()
+    )
+    angle = quat_angle(
+        found.object_quat[:, world].double(), reference.object_quat[:, 0].double()
+    ).numpy()
     broken = ~np.isfinite(np.column_stack((joint, position, angle, force, other))).all(axis=1)
     steps = slice(int(broken.argmax()) if broken.any() else len(joint))
     force = _averaged(force[steps], dt)
@@ -122,7 +128,10 @@ def differences(found: Recording, reference: Recording, robot: RobotSpec, dt: fl
     differs = touch != (other >= TOUCH)
     contacts = []
     for row, touches in zip(differs, touch, strict=True):
-        names = [f"{fingers[i]} {'touches' if touches[i] else 'does not touch'}" for i in np.flatnonzero(row)]
+        names = [
+            f"{fingers[i]} {'touches' if touches[i] else 'does not touch'}"
+            for i in np.flatnonzero(row)
+        ]
         contacts.append(", ".join(names))
     value = {
         "joints": joint[steps].max(axis=1),
@@ -151,7 +160,9 @@ def worst(several: Sequence[tuple[Divergence, ...]]) -> tuple[Divergence, ...]:
     out = []
     for same in zip(*several, strict=True):
         first = min(same, key=lambda d: math.inf if d.time is None else d.time)
-        out.append(replace(first, end=max(d.end for d in same), largest=max(d.largest for d in same)))
+        out.append(
+            replace(first, end=max(d.end for d in same), largest=max(d.largest for d in same))
+        )
     return tuple(out)
 
 
@@ -225,7 +236,9 @@ class TraceResult:
                     "device": e.engine.device,
                     "lifted_m": e.lifted,
                     "finite_steps": len(e.differences.time),
-                    "divergences": [asdict(d) | {"within_noise": self.within_noise(d)} for d in e.divergences],
+                    "divergences": [
+                        asdict(d) | {"within_noise": self.within_noise(d)} for d in e.divergences
+                    ],
                 }
             )
         return {
@@ -282,7 +295,9 @@ def trace(
             f"the reference {reference.name!r} is not finite after {steps * dt:.3f} s of this sequence, so nothing can "
             "be compared with it. Choose another --reference, or another sequence."
         )
-    noise = [differences(expected, expected, actions.robot, dt, world=1 + i) for i in range(PERTURBED)]
+    noise = [
+        differences(expected, expected, actions.robot, dt, world=1 + i) for i in range(PERTURBED)
+    ]
     return TraceResult(
         actions=actions,
         reference=base,

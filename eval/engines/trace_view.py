@@ -10,7 +10,13 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from xreset.eval.engines.replay import PERTURBATION, THRESHOLDS, Divergence, EngineTrace, TraceResult
+from xreset.eval.engines.replay import (
+    PERTURBATION,
+    THRESHOLDS,
+    Divergence,
+    EngineTrace,
+    TraceResult,
+)
 from xreset.eval.plots import COLORS, picture
 
 _SHOWN = {
@@ -42,7 +48,9 @@ def rich_table(result: TraceResult) -> Table:
         cells = []
         for e in result.engines:
             cells.append(
-                _cell(result, e.divergences[i], result.within_noise(e.divergences[i])) if e.divergences else "-"
+                _cell(result, e.divergences[i], result.within_noise(e.divergences[i]))
+                if e.divergences
+                else "-"
             )
         quantity = f"{noise.quantity}\n(from {shown(noise.quantity, THRESHOLDS[noise.quantity])})"
         table.add_row(quantity, *cells, _cell(result, noise, False))
@@ -57,7 +65,10 @@ def _cell(result: TraceResult, found: Divergence, noise: bool) -> Text:
             lines.append("within noise")
     if found.where:
         lines.append(found.where)
-    lines += [f"end {shown(found.quantity, found.end)}", f"most {shown(found.quantity, found.largest)}"]
+    lines += [
+        f"end {shown(found.quantity, found.end)}",
+        f"most {shown(found.quantity, found.largest)}",
+    ]
     return Text("\n".join(lines), "dim" if noise and found.time is not None else "")
 
 
@@ -93,7 +104,9 @@ def write_plot(path: Path, result: TraceResult) -> None:
     """
     quantities = [quantity for quantity in THRESHOLDS if quantity != "contacts"]
     with picture(path, (10, 1.7 * len(quantities) + 0.9), dpi=110, font_size=9) as figure:
-        figure.suptitle(f"{result.actions.label}: distance to {result.reference.name}", fontweight="bold")
+        figure.suptitle(
+            f"{result.actions.label}: distance to {result.reference.name}", fontweight="bold"
+        )
         axes = figure.subplots(len(quantities), 1, sharex=True)
         for ax, quantity in zip(axes, quantities, strict=True):
             _draw_differences(ax, result, quantity)
@@ -108,11 +121,23 @@ def _draw_differences(ax, result: TraceResult, quantity: str) -> None:
     floor = 1e-4 * threshold
     label = f"{result.reference.name}, start moved by {PERTURBATION:.0e}"
     for d in result.noise:
-        ax.plot(d.time, np.maximum(scale * d.value[quantity], floor), color="#999999", linewidth=0.7, label=label)
+        ax.plot(
+            d.time,
+            np.maximum(scale * d.value[quantity], floor),
+            color="#999999",
+            linewidth=0.7,
+            label=label,
+        )
         label = None
     for engine, color in zip(result.engines, COLORS[1:], strict=False):
         d = engine.differences
-        ax.plot(d.time, np.maximum(scale * d.value[quantity], floor), color=color, linewidth=1.3, label=engine.name)
+        ax.plot(
+            d.time,
+            np.maximum(scale * d.value[quantity], floor),
+            color=color,
+            linewidth=1.3,
+            label=engine.name,
+        )
     ax.axhline(threshold, color="black", linestyle="--", linewidth=0.8, label="threshold")
     ax.set_yscale("log")
     ax.set_ylim(bottom=floor)

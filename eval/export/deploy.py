@@ -50,7 +50,10 @@ def served(
 
 
 def _with_objects(
-    policy: str | Path | PolicySpec, robot: str | Path | None, objects: str | Path | None, only: Sequence[str]
+    policy: str | Path | PolicySpec,
+    robot: str | Path | None,
+    objects: str | Path | None,
+    only: Sequence[str],
 ) -> tuple[PolicySpec, tuple[ObjectSpec, ...]]:
     spec = policy if isinstance(policy, PolicySpec) else load_policy(policy, robot=robot)
     spec.exported()

@@ -68,7 +68,9 @@ def write_lerobot(
     with needs("pyarrow, which writes LeRobot data sets,", "lerobot"):
         import pyarrow.parquet  # noqa: F401
     if unknown := set(cameras) - set(CAMERAS):
-        raise XResetError(f"Unknown camera {', '.join(sorted(unknown))}. Choose from: {', '.join(CAMERAS)}.")
+        raise XResetError(
+            f"Unknown camera {', '.join(sorted(unknown))}. Choose from: {', '.join(CAMERAS)}."
+        )
     videos = (VIDEO, *(_DEPTH + name for name in cameras)) if video else ()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise XResetError(f"{folder} is there already. Nothing was changed; choose another --out.")
@@ -85,7 +87,9 @@ def write_lerobot(
         ) from error
 
 
-def _write(root: Path, recording: Recording, videos: tuple[str, ...], size: tuple[int, int]) -> None:
+def _write(
+    root: Path, recording: Recording, videos: tuple[str, ...], size: tuple[int, int]
+) -> None:
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -140,7 +144,11 @@ def _write(root: Path, recording: Recording, videos: tuple[str, ...], size: tupl
     for key, values in whole.items():
         if key not in videos:
             flat = pa.array(values.reshape(-1).astype(features[key]["dtype"]))
-            columns[key] = flat if values.shape[1] == 1 else pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
+            columns[key] = (
+                flat
+                if values.shape[1] == 1
+                else pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
+            )
     columns["engine"] = pa.array(np.repeat(recording.episodes["engine"].tolist(), np.diff(offsets)))
     for name, table in (("data", pa.table(columns)), ("meta/episodes", pa.Table.from_pylist(rows))):
         path = root / name / _FIRST
@@ -149,7 +157,9 @@ def _write(root: Path, recording: Recording, videos: tuple[str, ...], size: tupl
     pd.DataFrame({"task_index": range(len(tasks))}, index=pd.Index(tasks, name="task")).to_parquet(
         root / "meta/tasks.parquet"
     )
-    write_json(root / "meta/stats.json", {key: _stats(key, values) for key, values in whole.items()})
+    write_json(
+        root / "meta/stats.json", {key: _stats(key, values) for key, values in whole.items()}
+    )
     write_json(root / "meta/xreset.json", {"schema": SCHEMA})  # with the version of xreset
     write_json(root / "meta/info.json", _info(recording, len(tasks), features))
 
@@ -174,9 +184,15 @@ def _info(recording: Recording, tasks: int, features: dict[str, Any]) -> dict[st
     }
 
 
-def _features(recording: Recording, videos: tuple[str, ...], size: tuple[int, int]) -> dict[str, dict[str, Any]]:
+def _features(
+    recording: Recording, videos: tuple[str, ...], size: tuple[int, int]
+) -> dict[str, dict[str, Any]]:
     joints = list(recording.robot.joint_names)
-    vectors = {"observation.state": joints, "observation.environment_state": _ENVIRONMENT, "action": joints}
+    vectors = {
+        "observation.state": joints,
+        "observation.environment_state": _ENVIRONMENT,
+        "action": joints,
+    }
     features: dict[str, dict[str, Any]] = {}
     for key, names in vectors.items():
         features[key] = {"dtype": "float32", "shape": [len(names)], "names": names}
@@ -203,7 +219,9 @@ def _features(recording: Recording, videos: tuple[str, ...], size: tuple[int, in
     return features
 
 
-def _arrays(episode: dict[str, Any], index: int, offset: int, task: int, fps: float) -> dict[str, np.ndarray]:
+def _arrays(
+    episode: dict[str, Any], index: int, offset: int, task: int, fps: float
+) -> dict[str, np.ndarray]:
     """Return the numbers of an episode's frames, each [T, n]."""
     trace = episode["trace"]
     count = len(trace.time)
@@ -211,7 +229,9 @@ def _arrays(episode: dict[str, Any], index: int, offset: int, task: int, fps: fl
     frame = np.arange(count)[:, None]
     return {
         "observation.state": trace.joint_pos.astype(np.float32),
-        "observation.environment_state": np.hstack((trace.object_pos, trace.object_quat, goal)).astype(np.float32),
+        "observation.environment_state": np.hstack(
+            (trace.object_pos, trace.object_quat, goal)
+        ).astype(np.float32),
         "action": episode["action"].astype(np.float32),
         "timestamp": (frame / fps).astype(np.float32),
         "frame_index": frame,
@@ -224,8 +244,15 @@ def _arrays(episode: dict[str, Any], index: int, offset: int, task: int, fps: fl
 def _stats(key: str, rows: np.ndarray) -> dict[str, list[Any]]:
     """Return statistics of numbers [n, k]; of pixels [n, 3] as shares of white, each [3, 1, 1]."""
     rows = rows.astype(np.float64)
-    stats = {"min": rows.min(axis=0), "max": rows.max(axis=0), "mean": rows.mean(axis=0), "std": rows.std(axis=0)}
-    for name, value in zip(_QUANTILES, np.quantile(rows, list(_QUANTILES.values()), axis=0), strict=True):
+    stats = {
+        "min": rows.min(axis=0),
+        "max": rows.max(axis=0),
+        "mean": rows.mean(axis=0),
+        "std": rows.std(axis=0),
+    }
+    for name, value in zip(
+        _QUANTILES, np.quantile(rows, list(_QUANTILES.values()), axis=0), strict=True
+    ):
         stats[name] = value
     shape = (3, 1, 1) if key.startswith(_IMAGES) else (-1,)
     lists = {name: value.reshape(shape).tolist() for name, value in stats.items()}
@@ -233,7 +260,11 @@ def _stats(key: str, rows: np.ndarray) -> dict[str, list[Any]]:
 
 
 def _draw(
-    robot: RobotSpec, episode: dict[str, Any], video: str, painters: dict[Any, Painter], size: tuple[int, int]
+    robot: RobotSpec,
+    episode: dict[str, Any],
+    video: str,
+    painters: dict[Any, Painter],
+    size: tuple[int, int],
 ) -> np.ndarray:
     """Return the film [T, H, W, 3] of an episode, always from the same camera, so that episodes can be compared."""
     trace = episode["trace"]
@@ -246,7 +277,9 @@ def _draw(
             painters[key] = partial(draw_state, renderer)
         else:
             camera = CAMERAS[video.removeprefix(_DEPTH)]
-            eyes = policy_cameras(robot, obj, VisionConfig(cameras=(camera,), width=size[0], height=size[1]))
+            eyes = policy_cameras(
+                robot, obj, VisionConfig(cameras=(camera,), width=size[0], height=size[1])
+            )
             assert eyes is not None, "there is a camera"
             painters[key] = partial(draw_view, eyes, width=size[0])
     return np.stack([painters[key](trace, row) for row in range(len(trace.time))])

@@ -103,7 +103,10 @@ def read_recorded(
                 intervals.setdefault(round(float(np.median(np.diff(trace.time))), 6), results)
                 if not (finite_states(trace).all() and np.isfinite(action).all()):
                     logging.getLogger(__name__).warning(
-                        "%s, %s, demonstration %d is left out: its engine broke down.", results, engine, trace.sequence
+                        "%s, %s, demonstration %d is left out: its engine broke down.",
+                        results,
+                        engine,
+                        trace.sequence,
                     )
                     continue
                 episode |= {
@@ -124,7 +127,9 @@ def read_recorded(
         )
     if len(intervals) > 1:
         listing = ", ".join(f"{1 / dt:.4g} in {path}" for dt, path in intervals.items())
-        raise RunError(f"the episodes have different rates, frames per second: {listing}. Export them one by one.")
+        raise RunError(
+            f"the episodes have different rates, frames per second: {listing}. Export them one by one."
+        )
     return Recording(
         robot=next(iter(robots.values())),
         fps=_rate(next(iter(intervals))),
@@ -135,12 +140,16 @@ def read_recorded(
 def _actions(trace: Trace, file: Path) -> np.ndarray:
     """Return the action [T, J] at each state."""
     if trace.joint_target is None:
-        raise FileFormatError(f"{file} holds states without the actions that led to them. Evaluate again.")
+        raise FileFormatError(
+            f"{file} holds states without the actions that led to them. Evaluate again."
+        )
     frames = len(trace.time)
     steps = len(trace.joint_target)
     every = steps // (frames - 1)
     if every < 1:
-        raise FileFormatError(f"{file} has {steps} actions for {frames} states, expected as many or more.")
+        raise FileFormatError(
+            f"{file} has {steps} actions for {frames} states, expected as many or more."
+        )
     return trace.joint_target[np.minimum(np.arange(1, frames + 1) * every - 1, steps - 1)]
 
 
@@ -164,7 +173,9 @@ def write_arrays(path: str | Path, recording: Recording) -> None:
         "object_quat_wxyz": [t.object_quat for t in traces],
     }
     arrays = {name: np.concatenate(parts).astype(np.float32) for name, parts in per_frame.items()}
-    arrays |= {name: np.array(recording.episodes[column].tolist()) for name, column in _COLUMNS.items()}
+    arrays |= {
+        name: np.array(recording.episodes[column].tolist()) for name, column in _COLUMNS.items()
+    }
     arrays |= {
         "frame_offsets": recording.offsets,
         "fps": np.array(recording.fps),

@@ -152,7 +152,9 @@ class Page(WebPage):
         """Show that something is being loaded, and restore the controls from the session, whatever happened."""
         notes = []
         for client in self._server.get_clients().values():
-            notes.append(client.add_notification("Loading", "", loading=True, with_close_button=False))
+            notes.append(
+                client.add_notification("Loading", "", loading=True, with_close_button=False)
+            )
         try:
             yield
         finally:
@@ -187,7 +189,12 @@ class Page(WebPage):
         body = scene.add_mesh_simple("/object", obj.vertices, obj.faces, color=rgb(OBJECT_COLOR))
         # Rings turn the goal. The shape or, where a hand hides it, the ball next to it is dragged.
         rings = scene.add_transform_controls(
-            "/rings", scale=2.4 * radius, disable_axes=True, disable_sliders=True, depth_test=False, line_width=3.5
+            "/rings",
+            scale=2.4 * radius,
+            disable_axes=True,
+            disable_sliders=True,
+            depth_test=False,
+            line_width=3.5,
         )
         goal = scene.add_mesh_simple(
             "/goal",
@@ -198,10 +205,16 @@ class Page(WebPage):
             cast_shadow=False,
         )
         handle = scene.add_icosphere("/handle", 0.018, rgb(GOAL_COLOR))
-        hint = scene.add_label("/handle/hint", "drag me", position=(0.0, 0.0, 0.02), anchor="bottom-center")
+        hint = scene.add_label(
+            "/handle/hint", "drag me", position=(0.0, 0.0, 0.02), anchor="bottom-center"
+        )
         self._beside = 1.8 * radius * RIGHT
         points = scene.add_point_cloud(
-            "/points", np.zeros((1, 3), np.float32), rgb(TOUCH_COLOR), point_size=0.006, visible=False
+            "/points",
+            np.zeros((1, 3), np.float32),
+            rgb(TOUCH_COLOR),
+            point_size=0.006,
+            visible=False,
         )
         robot = RobotMeshes(scene, session.policy.robot)
         self._robot = robot
@@ -233,7 +246,9 @@ class Page(WebPage):
     async def _drag(self, event: Any) -> None:
         if event.phase == "start":
             self._grasped = self._goal.position - np.array(event.start_position)
-        self._wish(self._move_goal, np.array(event.end_position) + self._grasped, self._goal.wxyz.copy())
+        self._wish(
+            self._move_goal, np.array(event.end_position) + self._grasped, self._goal.wxyz.copy()
+        )
 
     async def _turn(self, event: Any) -> None:
         self._holder = event.client_id
@@ -281,7 +296,9 @@ class Page(WebPage):
         self._speed = gui.add_slider("speed", 0.1, 1.0, 0.1, 1.0)
         self._take = gui.add_button("Take the object away")
         self._take.on_click(lambda _: self._wish(self._take_or_put))
-        self._retry = gui.add_checkbox("try again", True, hint="Begin again from home once the object was dropped.")
+        self._retry = gui.add_checkbox(
+            "try again", True, hint="Begin again from home once the object was dropped."
+        )
         self._object = gui.add_dropdown("object", ("",))
         self._engine = gui.add_dropdown("engine", backend_names())
         self._policies = {
@@ -349,7 +366,11 @@ class Page(WebPage):
         if robot != session.policy.robot.name:
             choice = partial(session.choose_policy, NOBODY, robot=robot)
         elif policy != session.policy.name:
-            choice = partial(session.choose_policy, self._policies[policy], robot=robot if policy == NOBODY else None)
+            choice = partial(
+                session.choose_policy,
+                self._policies[policy],
+                robot=robot if policy == NOBODY else None,
+            )
         elif thing != session.object_name:
             choice = partial(session.choose_object, thing)
         elif self._engine.value != session.engine:
@@ -368,7 +389,9 @@ class Page(WebPage):
         if wall > 1.0:
             self._factor = (session.time - self._clock[1]) / wall
             self._clock = (now, session.time)
-        self._take.label = "Put the object back" if session.away or session.lost else "Take the object away"
+        self._take.label = (
+            "Put the object back" if session.away or session.lost else "Take the object away"
+        )
         self._written = now
         if not session.history:
             return
@@ -400,7 +423,9 @@ class Page(WebPage):
         elif last.success:
             where = f"**At the goal**: {100 * last.distance:.1f} cm, {degrees(last.angle):.0f} degrees off."
         else:
-            where = f"{100 * last.distance:.1f} cm and {degrees(last.angle):.0f} degrees from the goal."
+            where = (
+                f"{100 * last.distance:.1f} cm and {degrees(last.angle):.0f} degrees from the goal."
+            )
         if self._paused:
             return f"{where}\n\n{session.engine}, paused"
         reason = ", slowed by this machine" if self._factor < 0.9 * self._speed.value else ""
@@ -410,7 +435,9 @@ class Page(WebPage):
 
     def _save_film(self, client: Any) -> None:
         moments = last_moments(self.session, self._seconds.value)
-        note = client.add_notification("Drawing the film", "It takes a while. Go on playing.", loading=True)
+        note = client.add_notification(
+            "Drawing the film", "It takes a while. Go on playing.", loading=True
+        )
         film = self._films.submit(draw_film, self.session.env.backend.scene, moments)
 
         def send(done: Any) -> None:
@@ -432,10 +459,17 @@ class Page(WebPage):
 class _Curves:
     """One plot of the folder "curves". It is made again where its curves change."""
 
-    def __init__(self, gui: Any, folder: Any, title: str, order: int, *, legend: bool = True) -> None:
+    def __init__(
+        self, gui: Any, folder: Any, title: str, order: int, *, legend: bool = True
+    ) -> None:
         self._gui = gui
         self._folder = folder
-        self._options = {"title": title, "order": order, "height": 180, "legend": {"show": legend, "live": False}}
+        self._options = {
+            "title": title,
+            "order": order,
+            "height": 180,
+            "legend": {"show": legend, "live": False},
+        }
         self._names: tuple[str, ...] = ()
         self._plot: Any = None
 
@@ -452,4 +486,6 @@ class _Curves:
         for i, name in enumerate(names):
             series.append({"label": name, "stroke": COLORS[i % len(COLORS)], "width": 1.5})
         with self._folder:
-            self._plot = self._gui.add_uplot(data, tuple(series), scales={"x": {"time": False}}, **self._options)
+            self._plot = self._gui.add_uplot(
+                data, tuple(series), scales={"x": {"time": False}}, **self._options
+            )

@@ -146,7 +146,9 @@ class Session:
 
     # Choosing ---------------------------------------------------------------------------------------------------------
 
-    def choose_policy(self, policy: str | Path | PolicySpec, *, robot: str | Path | None = None) -> None:
+    def choose_policy(
+        self, policy: str | Path | PolicySpec, *, robot: str | Path | None = None
+    ) -> None:
         """Let another policy act, and begin anew. Arguments and errors as for the constructor's."""
         self._open(policy, robot, self.object_name, self.engine)
 
@@ -172,7 +174,13 @@ class Session:
         """Name of the object."""
         return self.env.backend.scene.objects[0].name
 
-    def _open(self, policy: str | Path | PolicySpec, robot: str | Path | None, thing: str | None, engine: str) -> None:
+    def _open(
+        self,
+        policy: str | Path | PolicySpec,
+        robot: str | Path | None,
+        thing: str | None,
+        engine: str,
+    ) -> None:
         """Open worlds; where this fails, the session stays as it was."""
         if not isinstance(policy, PolicySpec):
             policy = load_policy(policy, robot=robot, seed=self._seed)
@@ -201,8 +209,12 @@ class Session:
         self._player: Policy = player
         spec = policy.robot
         self._kinematics = Kinematics(spec)
-        self._stiffness = torch.tensor([joint.drive.kp for joint in spec.joints], dtype=torch.float32)
-        self.inputs = _slices(layout(len(spec.joints), len(spec.fingertips), policy.task.observation))
+        self._stiffness = torch.tensor(
+            [joint.drive.kp for joint in spec.joints], dtype=torch.float32
+        )
+        self.inputs = _slices(
+            layout(len(spec.joints), len(spec.fingertips), policy.task.observation)
+        )
         self.terms: tuple[str, ...] = ()
         self.history: deque[Moment] = deque(maxlen=round(KEPT_SECONDS / self.control_dt))
         self._begin()
@@ -246,7 +258,9 @@ class Session:
         self.time += self.control_dt
         if bool(reading.health.nonfinite):
             self.begin()
-            raise XResetError(f"The simulation in {self.engine} broke down. A new episode has begun.")
+            raise XResetError(
+                f"The simulation in {self.engine} broke down. A new episode has begun."
+            )
         if self.away or reading.state.object_pos[0, 2] < -1.0:
             self._remove_object()  # an object that has fallen off the table does not fall for ever
         state = reading.state
@@ -289,7 +303,11 @@ class Session:
     def lost(self) -> bool:
         """Whether the object has left the table."""
         env = self.env
-        return bool(out_of_bounds(env.backend.state().object_pos, env.backend.scene.table, env.task.termination))
+        return bool(
+            out_of_bounds(
+                env.backend.state().object_pos, env.backend.scene.table, env.task.termination
+            )
+        )
 
     def cloud(self) -> np.ndarray:
         """[P, 3] the newest points of the object's surface that the policy observes, world frame [m]."""
@@ -298,7 +316,9 @@ class Session:
 
     # The user's hand --------------------------------------------------------------------------------------------------
 
-    def move_goal(self, pos: Sequence[float] | np.ndarray, quat: Sequence[float] | np.ndarray) -> None:
+    def move_goal(
+        self, pos: Sequence[float] | np.ndarray, quat: Sequence[float] | np.ndarray
+    ) -> None:
         """Set the goal, at the nearest position above the table that the object can have.
 
         Args:
@@ -324,7 +344,9 @@ class Session:
         point = torch.tensor(at, dtype=torch.float32)
         state = self.env.backend.state()
         if link is None:
-            local = quat_rotate_inverse(state.object_quat[0].cpu(), point - state.object_pos[0].cpu())
+            local = quat_rotate_inverse(
+                state.object_quat[0].cpu(), point - state.object_pos[0].cpu()
+            )
         else:
             pose = self._kinematics.link_poses(state.joint_pos[0].cpu().double(), [link])[0].float()
             local = pose[:3, :3].T @ (point - pose[:3, 3])
@@ -356,7 +378,9 @@ class Session:
         self._set_gravity()
 
     def _set_gravity(self) -> None:
-        fraction = torch.zeros_like(self.env.gravity_fraction) if self.away else self.env.gravity_fraction
+        fraction = (
+            torch.zeros_like(self.env.gravity_fraction) if self.away else self.env.gravity_fraction
+        )
         self.env.backend.set_object_gravity(fraction)
 
     def _apply_pull(self) -> Tensor | None:
@@ -372,7 +396,9 @@ class Session:
         elif pull is not None and pull.link is not None:
             offset = self._pull_robot(pull, pull.link, state)
         if "object_wrench" in backend.capabilities:
-            backend.set_object_wrench(force[None].to(self.env.device), torque[None].to(self.env.device))
+            backend.set_object_wrench(
+                force[None].to(self.env.device), torque[None].to(self.env.device)
+            )
         return offset
 
     def _pull_object(self, pull: _Pull, state: State) -> tuple[Tensor, Tensor]:
@@ -388,7 +414,9 @@ class Session:
         weight = torch.tensor((0.0, 0.0, body.mass * GRAVITY))
         force = spring - body.mass * damping * state.object_linvel[0].cpu() + weight
         inertia = float(np.linalg.eigvalsh(body.inertia)[-1])
-        return force, torch.linalg.cross(arm, spring) - inertia * damping * state.object_angvel[0].cpu()
+        return force, torch.linalg.cross(arm, spring) - inertia * damping * state.object_angvel[
+            0
+        ].cpu()
 
     def _pull_robot(self, pull: _Pull, link: str, state: State) -> Tensor:
         """[1, J] what to add to the targets, so that the drives give the torques of a force at the point as well.

@@ -88,7 +88,11 @@ def best_everywhere(shown: Table) -> Table:
     engines = shown["engine"].nunique()
     everywhere = shown.groupby("sequence").filter(lambda own: len(own) == engines)
     metrics = ["task_progress", "reorientation_progress"]
-    quality = everywhere.groupby("sequence")[metrics].mean().sort_values(metrics, ascending=False, kind="stable")
+    quality = (
+        everywhere.groupby("sequence")[metrics]
+        .mean()
+        .sort_values(metrics, ascending=False, kind="stable")
+    )
     return everywhere[everywhere["sequence"].isin(quality.index[:1])]
 
 
@@ -148,8 +152,14 @@ def camera_for(traces: Sequence[Trace], *, distance: float = 1.0) -> Camera:
     center = (start + goal) / 2 + (0.0, 0.0, 0.06)
     default = Camera()
     away = np.subtract(default.eye, default.target)
-    away *= distance * np.clip(0.75 + 1.2 * np.linalg.norm(goal - start), 0.85, 1.3) / np.linalg.norm(away)
-    return Camera(eye=tuple((center + away).tolist()), target=tuple(center.tolist()), fov=default.fov)
+    away *= (
+        distance
+        * np.clip(0.75 + 1.2 * np.linalg.norm(goal - start), 0.85, 1.3)
+        / np.linalg.norm(away)
+    )
+    return Camera(
+        eye=tuple((center + away).tolist()), target=tuple(center.tolist()), fov=default.fov
+    )
 
 
 def finite_states(trace: Trace) -> np.ndarray:
@@ -158,10 +168,14 @@ def finite_states(trace: Trace) -> np.ndarray:
     return np.asarray(np.isfinite(state).all(axis=1))
 
 
-def draw_state(renderer: Renderer, trace: Trace, row: int, eyes: Cameras | None = None) -> np.ndarray:
+def draw_state(
+    renderer: Renderer, trace: Trace, row: int, eyes: Cameras | None = None
+) -> np.ndarray:
     """Draw one state of a trace, with the goal as a translucent object, above what the policy's cameras show."""
     pose = pose_matrix(trace.object_pos[row], trace.object_quat[row])
-    picture = renderer.draw(trace.joint_pos[row], pose, goal_pose=pose_matrix(trace.goal_pos, trace.goal_quat))
+    picture = renderer.draw(
+        trace.joint_pos[row], pose, goal_pose=pose_matrix(trace.goal_pos, trace.goal_quat)
+    )
     if eyes is None:
         return picture
     return np.vstack((picture, draw_view(eyes, trace, row, picture.shape[1])))
@@ -169,15 +183,25 @@ def draw_state(renderer: Renderer, trace: Trace, row: int, eyes: Cameras | None 
 
 def draw_view(eyes: Cameras, trace: Trace, row: int, width: int) -> np.ndarray:
     """Draw what cameras of one world show of one state of a trace; see :meth:`Cameras.picture`."""
-    now = (trace.joint_pos[row], trace.object_pos[row], trace.object_quat[row], trace.goal_pos, trace.goal_quat)
-    joints, pos, quat, goal_pos, goal_quat = (torch.as_tensor(value, dtype=torch.float32)[None] for value in now)
+    now = (
+        trace.joint_pos[row],
+        trace.object_pos[row],
+        trace.object_quat[row],
+        trace.goal_pos,
+        trace.goal_quat,
+    )
+    joints, pos, quat, goal_pos, goal_quat = (
+        torch.as_tensor(value, dtype=torch.float32)[None] for value in now
+    )
     eyes.aim(State.at_rest(joints, pos, quat), goal_pos, goal_quat, torch.ones(1, dtype=torch.bool))
     eyes.cast()
     eyes.observe(torch.Generator().manual_seed(row))
     return eyes.picture(0, width)
 
 
-def policy_cameras(robot: RobotSpec, obj: ObjectSpec, vision: VisionConfig | None) -> Cameras | None:
+def policy_cameras(
+    robot: RobotSpec, obj: ObjectSpec, vision: VisionConfig | None
+) -> Cameras | None:
     """Return the cameras of a policy that sees, to draw what they show."""
     if vision is None or not vision.cameras:
         return None
@@ -234,7 +258,17 @@ def encode_mp4(frames: np.ndarray, fps: float, *, keyframes: int | None = None) 
     """
     with needs("imageio-ffmpeg", "eval"):
         import imageio_ffmpeg
-    settings = ["-crf", "24", "-preset", "veryfast", "-movflags", "+faststart", "-threads", "1", "-bitexact"]
+    settings = [
+        "-crf",
+        "24",
+        "-preset",
+        "veryfast",
+        "-movflags",
+        "+faststart",
+        "-threads",
+        "1",
+        "-bitexact",
+    ]
     if keyframes is not None:
         settings += ["-g", str(keyframes)]
     with tempfile.TemporaryDirectory() as folder:

@@ -72,4 +72,7 @@ def line(members: Sequence[Training], tag: str, x: X) -> Table | None:
         end = min(own[-1] for own, _ in curves)
         at = at[(at >= start) & (at <= end)]
     values = np.stack([np.interp(at, own, value) for own, value in curves])
-    return pd.DataFrame({"mean": values.mean(axis=0), "low": values.min(axis=0), "high": values.max(axis=0)}, index=at)
+    return pd.DataFrame(
+        {"mean": values.mean(axis=0), "low": values.min(axis=0), "high": values.max(axis=0)},
+        index=at,
+    )

@@ -33,7 +33,9 @@ def uneven(trainings: Sequence[Training]) -> list[str]:
         found += _difference(table, name, name)
     if table["objects"].nunique() == 1:
         same_names = table["sequences"].nunique() == 1
-        found += _difference(table, "demonstrations", "demonstrations", _SAME_NAMES if same_names else "")
+        found += _difference(
+            table, "demonstrations", "demonstrations", _SAME_NAMES if same_names else ""
+        )
     for engine, own in table.groupby("engine"):
         found += _difference(own, "version", f"version of {engine}")
     return found
@@ -55,11 +57,20 @@ def _condition_table(trainings: Sequence[Training]) -> Table:
                 "objects": ", ".join(sorted(map(short_name, episodes["object"].unique()))),
                 "object meshes": result.objects_folder or "stand-ins",
                 "demonstrations": result.inputs.get("demos", "")[:12],
-                "sequences": tuple(sorted(set(episodes["object"] + "/" + episodes["sequence_name"]))),
+                "sequences": tuple(
+                    sorted(set(episodes["object"] + "/" + episodes["sequence_name"]))
+                ),
                 "number of episodes": result.episodes,
                 "seed of the evaluation": result.seed,
             }
-            rows.append(row | {name: text for name, text in training.facts.items() if name.startswith(_PLAYED_TASK)})
+            rows.append(
+                row
+                | {
+                    name: text
+                    for name, text in training.facts.items()
+                    if name.startswith(_PLAYED_TASK)
+                }
+            )
     return pd.DataFrame(rows)
 
 

@@ -95,10 +95,14 @@ def draw_lines(ax: Axes, tag: str, lines: Mapping[str, Table], x: X, order: Sequ
         values = curve * (100 if percent else 1)
         at = curve.index
         if (curve["high"] > curve["low"]).any():
-            ax.fill_between(at, values["low"], values["high"], color=color(index), linewidth=0, alpha=0.2)
+            ax.fill_between(
+                at, values["low"], values["high"], color=color(index), linewidth=0, alpha=0.2
+            )
         # Above the axis, because many curves stay at zero.
         look: dict[str, Any] = {"marker": "o" if len(at) < 10 else "", "markersize": 4, "zorder": 3}
-        ax.plot(at, values["mean"], color=color(index), linestyle=_style(index), linewidth=1.5, **look)
+        ax.plot(
+            at, values["mean"], color=color(index), linestyle=_style(index), linewidth=1.5, **look
+        )
     ax.set_title(TITLES.get(tag, tag), fontsize="medium", loc="left")
     ax.set_xlabel(AXES[x][0])
     ax.set_xlim(left=0)
@@ -149,8 +153,14 @@ def write_picture(path: Path, groups: Groups, tags: Sequence[str], found: Table,
         if not found.empty:
             draw_scores(parts[-1].subplots(), found, order)
         handles = []
-        for i, label in enumerate(order):  # matplotlib leaves out labels that begin with an underscore
-            handles.append(Line2D([], [], color=color(i), linestyle=_style(i), linewidth=2.5, label=f" {label}"))
+        for i, label in enumerate(
+            order
+        ):  # matplotlib leaves out labels that begin with an underscore
+            handles.append(
+                Line2D(
+                    [], [], color=color(i), linestyle=_style(i), linewidth=2.5, label=f" {label}"
+                )
+            )
         figure.legend(handles=handles, loc="outside upper center", ncols=3, frameon=False)
 
 

@@ -28,7 +28,9 @@ from xreset.spec import RobotSpec
 from xreset.text import short_name
 
 
-def draw_best(shown: Table, robot: RobotSpec, meshes: Path | None, vision: VisionConfig | None = None) -> list[Clip]:
+def draw_best(
+    shown: Table, robot: RobotSpec, meshes: Path | None, vision: VisionConfig | None = None
+) -> list[Clip]:
     """Draw the episode that went best over all engines, in each of them; empty if no demonstration was recorded in
     every engine.
 

@@ -96,4 +96,6 @@ def estimate(episodes: Table, metric: str) -> tuple[float, tuple[float, float]]:
     """
     values = episodes[metric].to_numpy(float)
     runs = pd.factorize(episodes["run"])[0]
-    return mean(episodes, metric), crossed_bootstrap_ci95(values, runs, episodes["sequence"].to_numpy())
+    return mean(episodes, metric), crossed_bootstrap_ci95(
+        values, runs, episodes["sequence"].to_numpy()
+    )

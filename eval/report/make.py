@@ -57,7 +57,9 @@ def make_report(
     return out / "index.html", data
 
 
-def _draw(data: ReportData, robot: str | None, objects: Path | None) -> tuple[list[Clip], list[Clip]]:
+def _draw(
+    data: ReportData, robot: str | None, objects: Path | None
+) -> tuple[list[Clip], list[Clip]]:
     """Draw one episode in every engine, and the failures in the first engine."""
     spec = load_robot(robot or data.robot)
     shown = read_recorded(data, spec)
@@ -65,9 +67,13 @@ def _draw(data: ReportData, robot: str | None, objects: Path | None) -> tuple[li
     vision = data.run.config.task.vision if data.run else None
     clips = draw_best(shown, spec, meshes, vision)
     if not clips:
-        raise XResetError("no demonstration was recorded in every engine. Evaluate all engines in one command.")
+        raise XResetError(
+            "no demonstration was recorded in every engine. Evaluate all engines in one command."
+        )
     strips = []
-    for episode in worst_episodes(shown[shown["engine"] == data.first.backend], _FAILURES).itertuples():
+    for episode in worst_episodes(
+        shown[shown["engine"] == data.first.backend], _FAILURES
+    ).itertuples():
         obj = load_object(episode.object, meshes)
         camera = camera_for([episode.trace], distance=0.7)
         eyes = policy_cameras(spec, obj, vision)
@@ -76,7 +82,12 @@ def _draw(data: ReportData, robot: str | None, objects: Path | None) -> tuple[li
 
 
 def compare(
-    runs: Sequence[str], out: Path, *, x: X = "minutes", curves: Sequence[str] = (), apart: bool = False
+    runs: Sequence[str],
+    out: Path,
+    *,
+    x: X = "minutes",
+    curves: Sequence[str] = (),
+    apart: bool = False,
 ) -> Path:
     """Write ``compare.png`` and ``compare.md``, and return the path of the latter.
 

@@ -197,7 +197,9 @@ def read_trainings(runs: Sequence[str]) -> tuple[Training, ...]:
         FileFormatError: a file is damaged or of another version.
     """
     if not runs:
-        raise RunError("there is nothing to compare. Give run folders, or folders that xreset eval wrote results into.")
+        raise RunError(
+            "there is nothing to compare. Give run folders, or folders that xreset eval wrote results into."
+        )
     folders: dict[str, Path] = {}
     for text in runs:
         label, folder = _split(text)
@@ -234,7 +236,9 @@ def read_training(label: str, folder: Path, results: Path | None = None) -> Trai
     return Training(
         label=label,
         folder=folder,
-        facts=run_facts(read_json(file, RUN_SCHEMA, keep_version=True), file) if file.is_file() else {},
+        facts=run_facts(read_json(file, RUN_SCHEMA, keep_version=True), file)
+        if file.is_file()
+        else {},
         curves=curves,
         results={s.backend: s for s in evaluation},
         episodes=evaluation.to_frame(),
@@ -256,14 +260,23 @@ def _split(text: str) -> tuple[str, Path]:
     if "=" in text and not Path(text).is_dir():
         label, _, name = text.partition("=")
         if not label or not name:
-            raise RunError(f"{text!r} is not NAME=FOLDER: a {'folder' if label else 'name'} is missing.")
+            raise RunError(
+                f"{text!r} is not NAME=FOLDER: a {'folder' if label else 'name'} is missing."
+            )
     folder = Path(name)
     if not folder.exists() and name in shipped():
         folder = results_folder(name)
     return label or name_of(folder), folder
 
 
-_RUN_TYPES = {"robot": str, "resets": str, "resets_hash": str, "device": str, "seed": int, "config": dict}
+_RUN_TYPES = {
+    "robot": str,
+    "resets": str,
+    "resets_hash": str,
+    "device": str,
+    "seed": int,
+    "config": dict,
+}
 
 
 def run_facts(run: dict[str, Any], file: Path) -> dict[str, str]:

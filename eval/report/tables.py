@@ -29,7 +29,9 @@ def results(trainings: Sequence[Training], found: Table) -> Rows:
         versions = {m.results[engine].backend_version for m in trainings if engine in m.results}
         head.append(f"{engine} {', '.join(sorted(versions))}")
     texts = [estimate_text(*values) for values in found[["mean", "low", "high"]].to_numpy()]
-    cells = found.assign(text=texts).pivot_table("text", ["group", "metric"], "engine", "first", "-", sort=False)
+    cells = found.assign(text=texts).pivot_table(
+        "text", ["group", "metric"], "engine", "first", "-", sort=False
+    )
     rows = [head]
     for (label, metric), row in cells[sorted(cells)].iterrows():
         rows.append([label if metric == next(iter(METRICS)) else "", METRICS[metric], *row])
@@ -81,7 +83,9 @@ def different(groups: Groups) -> Rows:
         for columns in facts.values():
             texts = [known.get(name, "-") for known in columns]
             cells.append("; ".join(dict.fromkeys(texts)))
-            described.update(text for text, known in zip(texts, columns, strict=True) if "seed" in known)
+            described.update(
+                text for text, known in zip(texts, columns, strict=True) if "seed" in known
+            )
         if len(described) > 1 or name in lengths:
             rows.append([name, *cells])
     return rows

@@ -50,7 +50,9 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 _LARGEST_SEED = 2**32 - 1
 """numpy, torch and the engines take seeds up to this one."""
-Seed = Annotated[int, Rule(f"a whole number from 0 to {_LARGEST_SEED}", lambda x: 0 <= x <= _LARGEST_SEED)]
+Seed = Annotated[
+    int, Rule(f"a whole number from 0 to {_LARGEST_SEED}", lambda x: 0 <= x <= _LARGEST_SEED)
+]
 
 
 Axis = Literal["run", "object", "metric"]
@@ -135,7 +137,9 @@ class Runs(Checked):
     recipe: str = "minutes"
     config: dict[str, Any] = field(default_factory=dict)
     """Changes of the recipe, nested as the configuration is."""
-    seeds: Annotated[tuple[Seed, ...], Rule("one or more, each once", lambda x: 0 < len(x) == len(set(x)))] = (0,)
+    seeds: Annotated[
+        tuple[Seed, ...], Rule("one or more, each once", lambda x: 0 < len(x) == len(set(x)))
+    ] = (0,)
     minutes: Positive[Finite[float]] | None = None
     """Minutes of training, without compiling."""
     steps: Positive[Finite[float]] | None = None
@@ -153,7 +157,9 @@ class Runs(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not _NAME.fullmatch(Path(self.robot).name):
-            raise ValueError(f"robot is {shown(self.robot)}, expected the name of a robot or the folder of one")
+            raise ValueError(
+                f"robot is {shown(self.robot)}, expected the name of a robot or the folder of one"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,7 +199,9 @@ def study_path(name: str) -> Path:
     if os.path.isfile(path):
         return path
     if name not in shipped:
-        raise RunError(f"Unknown study {name!r}. Give a file, or a study that ships with xreset: {', '.join(shipped)}.")
+        raise RunError(
+            f"Unknown study {name!r}. Give a file, or a study that ships with xreset: {', '.join(shipped)}."
+        )
     return shipped[name]
 
 

@@ -33,7 +33,9 @@ def visible_gpus() -> tuple[int, ...]:
     return tuple(numbers[:count] or range(count))
 
 
-def launch(plan: Plan, steps: Sequence[Step], *, per_gpu: int = 1, say: Callable[[str], None] = print) -> list[str]:
+def launch(
+    plan: Plan, steps: Sequence[Step], *, per_gpu: int = 1, say: Callable[[str], None] = print
+) -> list[str]:
     """Run steps, each as soon as the steps that it needs are done.
 
     Args:
@@ -43,7 +45,10 @@ def launch(plan: Plan, steps: Sequence[Step], *, per_gpu: int = 1, say: Callable
         What failed, or cannot start: sentences.
     """
     gpus = visible_gpus()
-    free: list[int | None] = [*gpus * per_gpu, None]  # None: the CPU, on which steps come one at a time
+    free: list[int | None] = [
+        *gpus * per_gpu,
+        None,
+    ]  # None: the CPU, on which steps come one at a time
     problems = []
     waiting = {}
     for step in steps:
@@ -101,7 +106,9 @@ def launch(plan: Plan, steps: Sequence[Step], *, per_gpu: int = 1, say: Callable
                             begin(step)
                     time.sleep(_POLL)
             except KeyboardInterrupt:
-                say("Stopping: trainings write a checkpoint. The same command continues from there.")
+                say(
+                    "Stopping: trainings write a checkpoint. The same command continues from there."
+                )
                 for process in processes:
                     process.terminate()
                 raise

@@ -46,7 +46,12 @@ class PaperTable:
         for row, values in self.values.items():
             errors = self.standard_error.get(row, (None,) * len(values))
             for column, value, error in zip(self.names, values, errors, strict=True):
-                key = {"object": self.object, "metric": self.metric, self.rows: row, self.columns: column}
+                key = {
+                    "object": self.object,
+                    "metric": self.metric,
+                    self.rows: row,
+                    self.columns: column,
+                }
                 found[key["method"], key["object"], key["metric"]] = (value, error)
         return found
 
@@ -55,7 +60,10 @@ class PaperTable:
 def paper_tables() -> dict[str, PaperTable]:
     """Return the paper's tables by number."""
     tables = tomllib.loads(FILE.read_text())["tables"]
-    return {number: from_dict(PaperTable, content, f"{FILE}: {number}") for number, content in tables.items()}
+    return {
+        number: from_dict(PaperTable, content, f"{FILE}: {number}")
+        for number, content in tables.items()
+    }
 
 
 def paper_training() -> str:

@@ -71,7 +71,9 @@ class Run:
         assert self.config is not None
         now = self.trained()
         minutes = self.runs.minutes
-        if now.iteration >= self.config.iterations or (minutes is not None and now.minutes >= _ENOUGH * minutes):
+        if now.iteration >= self.config.iterations or (
+            minutes is not None and now.minutes >= _ENOUGH * minutes
+        ):
             return ""
         if not now.iteration:
             return "not begun"
@@ -83,7 +85,9 @@ class Run:
         if self.config is None or not (self.folder / "run.json").is_file():
             return
         info = read_run(self.folder)
-        wanted = {name: getattr(self.runs, name) for name in ("robot", "backend", "num_envs")} | {"seed": self.seed}
+        wanted = {name: getattr(self.runs, name) for name in ("robot", "backend", "num_envs")} | {
+            "seed": self.seed
+        }
         found: dict[str, Any] = {name: getattr(info, name) for name in wanted}
         found["stand-ins"] = info.objects is None
         found["other networks to begin with"] = info.weights is not None
@@ -212,7 +216,12 @@ def config_flags(changes: dict[str, Any], prefix: str = "--config.") -> Iterator
 
 
 def eval_step(
-    run: Run, key: str, evaluation: Evaluation, subset: Subset, engines: tuple[str, ...], needs: tuple[str, ...]
+    run: Run,
+    key: str,
+    evaluation: Evaluation,
+    subset: Subset,
+    engines: tuple[str, ...],
+    needs: tuple[str, ...],
 ) -> Step:
     """Return the step of one evaluation of one run.
 
@@ -229,7 +238,11 @@ def eval_step(
         """Return the engines without a result of this policy and evaluation."""
         policy = run.folder / "policy.onnx"
         inputs = {"policy": policy} if run.config is not None and policy.is_file() else {}
-        hashes = {name: file_hash(file) for name, file in (inputs | {"demos": demos}).items() if file.is_file()}
+        hashes = {
+            name: file_hash(file)
+            for name, file in (inputs | {"demos": demos}).items()
+            if file.is_file()
+        }
         engines_left = []
         for engine in engines:
             file = folder / f"{engine}.json"
@@ -303,7 +316,14 @@ class Plan:
         chosen = tuple(sorted(objects))
         if data.demos is not None and chosen == self.objects[name]:
             chosen = ()
-        made = Subset(name=name, data=data, given=self.given, out=self.out, objects=chosen, per_object=per_object)
+        made = Subset(
+            name=name,
+            data=data,
+            given=self.given,
+            out=self.out,
+            objects=chosen,
+            per_object=per_object,
+        )
         if made not in self.subsets:
             self.subsets.append(made)
         return made
@@ -327,7 +347,9 @@ def make_plan(study: Study, name: str, *, given: Path, out: Path, only: Iterable
     """
     unknown = sorted(set(only) - set(study.runs))
     if unknown:
-        raise RunError(f"the study has no runs {', '.join(unknown)}; it has {', '.join(study.runs)}.")
+        raise RunError(
+            f"the study has no runs {', '.join(unknown)}; it has {', '.join(study.runs)}."
+        )
     engines: dict[str, None] = {}
     for evaluation in study.evaluations.values():
         engines |= dict.fromkeys(evaluation.engines)
@@ -365,12 +387,17 @@ def _check_folders(plan: Plan) -> None:
     owned = [(plan.out / name, "the study") for name in ("data", "logs", "reports")]
     owned += [(subset.folder, f"data.{subset.name}") for subset in plan.subsets]
     for run in plan.runs:
-        owned += [(run.folder, f"runs.{run.group}"), (run.bank.parent, f"the robot {run.runs.robot}")]
+        owned += [
+            (run.folder, f"runs.{run.group}"),
+            (run.bank.parent, f"the robot {run.runs.robot}"),
+        ]
     owners: dict[Path, str] = {}
     for folder, owner in owned:
         first = owners.setdefault(folder, owner)
         if first != owner:
-            raise RunError(f"{first} and {owner} would both write {folder}. Give one of them another name.")
+            raise RunError(
+                f"{first} and {owner} would both write {folder}. Give one of them another name."
+            )
 
 
 def _add_evaluation(plan: Plan, run: Run, key: str, training: str | None) -> None:
@@ -409,12 +436,16 @@ def _runs(plan: Plan, group: str) -> Iterator[Run]:
     objects = canonical_names(spec.objects, known) or known
     if spec.policy is not None:
         subset = plan.subset(spec.data, objects, spec.per_object)
-        yield Run(group=group, runs=spec, seed=0, objects=objects, folder=plan.out / group, subset=subset)
+        yield Run(
+            group=group, runs=spec, seed=0, objects=objects, folder=plan.out / group, subset=subset
+        )
         return
     changed = merged(asdict(starting_config(spec.recipe)), spec.config)
     config = from_dict(TrainConfig, changed, f"runs.{group}.config")
     if config.task.reward.own:
-        raise RunError(f"runs.{group}.config.task.reward.own names code, which a study may not. Use xreset train.")
+        raise RunError(
+            f"runs.{group}.config.task.reward.own names code, which a study may not. Use xreset train."
+        )
     if spec.steps is not None:
         iterations = round(spec.steps / (spec.num_envs * config.ppo.horizon))
         config = replace(config, iterations=max(1, iterations))

@@ -77,7 +77,9 @@ def _unfair(plan: Plan, table: FilledTable, trained: dict[str, Lift]) -> Iterato
         return
     by_objects: dict[tuple[str, ...], list[Training]] = {}
     for training in chain(*table.trainings.values()):
-        by_objects.setdefault(tuple(sorted(training.episodes["object"].unique())), []).append(training)
+        by_objects.setdefault(tuple(sorted(training.episodes["object"].unique())), []).append(
+            training
+        )
     for trainings in by_objects.values():
         yield from fairness.uneven(trainings)
         yield from fairness.begun(trainings)
@@ -109,7 +111,9 @@ def _compare(plan: Plan, out: Path) -> list[str]:
     for run in plan.runs:
         has_curves = any(run.folder.glob("events.out.tfevents.*"))
         if run.config is not None and (has_curves or any(run.folder.glob("eval/*.episodes.json"))):
-            by_objects.setdefault(run.objects, []).append(f"{run.group}-seed{run.seed}={run.folder}")
+            by_objects.setdefault(run.objects, []).append(
+                f"{run.group}-seed{run.seed}={run.folder}"
+            )
     names = []
     for objects, runs in by_objects.items():
         what = short_name(objects[0], "_") if len(objects) == 1 else f"{len(objects)}-objects"

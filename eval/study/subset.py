@@ -36,7 +36,11 @@ class Subset:
     def folder(self) -> Path:
         """Folder of the subset, named after its content."""
         objects = "+".join(short_name(name, "_") for name in self.objects).replace("/", "_")
-        return self.out / "data" / "-".join(filter(None, [self.name, objects, str(self.per_object or "")]))
+        return (
+            self.out
+            / "data"
+            / "-".join(filter(None, [self.name, objects, str(self.per_object or "")]))
+        )
 
     @property
     def demos(self) -> Path:
@@ -55,7 +59,10 @@ class Subset:
         if data.demos:
             source: dict[str, Any] = {"demos": file_hash(self.given / data.demos)}
         else:
-            source = {"synthetic_per_object": data.synthetic_per_object, "synthetic_seed": data.synthetic_seed}
+            source = {
+                "synthetic_per_object": data.synthetic_per_object,
+                "synthetic_seed": data.synthetic_seed,
+            }
         return source | {
             "retarget": list(data.retarget),
             "resets": list(data.resets),
@@ -79,7 +86,9 @@ class Subset:
         if self.data.demos:
             demos = read_demos(self.given / self.data.demos)
         else:
-            demos = synthesize(self.objects or None, self.data.synthetic_per_object, self.data.synthetic_seed)
+            demos = synthesize(
+                self.objects or None, self.data.synthetic_per_object, self.data.synthetic_seed
+            )
         chosen = demos.select(objects=self.objects or None, max_per_object=self.per_object)
         write_demos(self.demos, chosen, config=self.definition)
         write_json(file, {"schema": SUBSET_SCHEMA} | self.definition)

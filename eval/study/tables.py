@@ -61,7 +61,9 @@ class FilledTable:
 
     def versions(self, engine: str) -> str:
         """Return the engine's versions in which the runs were evaluated."""
-        evaluated = [t.results[engine] for t in chain(*self.trainings.values()) if engine in t.results]
+        evaluated = [
+            t.results[engine] for t in chain(*self.trainings.values()) if engine in t.results
+        ]
         return ", ".join(sorted({result.backend_version for result in evaluated}))
 
 
@@ -72,7 +74,9 @@ def fill(plan: Plan, table: TableSpec) -> FilledTable:
         FileFormatError: a result is damaged.
     """
     trainings = {name: trainings_of(plan, name, table.evaluation) for name in table.runs}
-    episodes = {name: _episodes(found, plan.study.runs[name].alone) for name, found in trainings.items()}
+    episodes = {
+        name: _episodes(found, plan.study.runs[name].alone) for name, found in trainings.items()
+    }
     paper = paper_tables()[table.paper] if table.paper else None
     stated = paper.figures() if paper else {}
     (row_axis, rows), (column_axis, columns), fixed = _axes(plan, table, paper)
@@ -84,7 +88,11 @@ def fill(plan: Plan, table: TableSpec) -> FilledTable:
         run = run_of[key["method"]]
         objects = {key["object"]} if key["object"] != ALL else set(objects_of(plan, run, table))
         own = _episodes_with(episodes[run], engine, objects)
-        cell: dict[str, Any] = {"engine": engine, "row": _shown(row_axis, row), "column": _shown(column_axis, column)}
+        cell: dict[str, Any] = {
+            "engine": engine,
+            "row": _shown(row_axis, row),
+            "column": _shown(column_axis, column),
+        }
         mean, (low, high) = estimate(own, key["metric"]) if len(own) else (nan, (nan, nan))
         figure = stated.get((key["method"], key["object"], key["metric"]))
         text = estimate_text(mean, low, high)
@@ -92,7 +100,13 @@ def fill(plan: Plan, table: TableSpec) -> FilledTable:
             text += f", paper {figure[0]:.1f}"
             if figure[1] is not None:
                 text += f" \N{PLUS-MINUS SIGN} {figure[1]:.1f}"
-        cell |= {"mean": mean, "low": low, "high": high, "paper": figure[0] if figure else nan, "text": text}
+        cell |= {
+            "mean": mean,
+            "low": low,
+            "high": high,
+            "paper": figure[0] if figure else nan,
+            "text": text,
+        }
         cells.append(cell)
     names = ["engine", "row", "column", "mean", "low", "high", "paper", "text"]
     return FilledTable(
@@ -141,12 +155,18 @@ def objects_of(plan: Plan, group: str, table: TableSpec) -> tuple[str, ...]:
     """Return the objects with which a run of the study is evaluated."""
     objects = set()
     for step in plan.steps.values():
-        if step.run is not None and step.run.group == group and step.name.startswith(f"{table.evaluation} "):
+        if (
+            step.run is not None
+            and step.run.group == group
+            and step.name.startswith(f"{table.evaluation} ")
+        ):
             objects.update(step.objects)
     return tuple(sorted(objects))
 
 
-def _axes(plan: Plan, table: TableSpec, paper: PaperTable | None) -> tuple[Axis, Axis, dict[str, str]]:
+def _axes(
+    plan: Plan, table: TableSpec, paper: PaperTable | None
+) -> tuple[Axis, Axis, dict[str, str]]:
     """Return rows, columns, and what is the same in all cells."""
     known = sorted(set().union(*(objects_of(plan, run, table) for run in table.runs)))
     methods = list(table.runs.values())
@@ -184,10 +204,14 @@ def draw(path: Path, table: FilledTable) -> None:
             wide = table.wide(engine)
             draw_bars(ax, wide["mean"], wide["low"], wide["high"])
             for bar, value in zip(ax.patches, wide["paper"].to_numpy().T.ravel(), strict=True):
-                ax.hlines(value, bar.get_x(), bar.get_x() + bar.get_width(), color="black", linewidth=2)
+                ax.hlines(
+                    value, bar.get_x(), bar.get_x() + bar.get_width(), color="black", linewidth=2
+                )
             ax.set_ylabel(table.unit)
             ax.set_title(engine, fontsize="medium", loc="left")
         if table.paper:
             panels[-1].plot([], [], color="black", linewidth=2, label=" the paper")
         handles, labels = panels[-1].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=min(len(labels), 5), frameon=False)
+        figure.legend(
+            handles, labels, loc="outside upper center", ncols=min(len(labels), 5), frameon=False
+        )

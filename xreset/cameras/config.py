@@ -43,7 +43,9 @@ class CameraConfig(Checked):
     """Position of the camera in the frame of the link or of the world [m]."""
     target: Point = (0.53, 0.22, 0.21)
     """Point in the middle of the picture, in the same frame [m]. The frame's z axis is up in the picture."""
-    fov: Annotated[float, Rule("an angle between 0.05 and 3 rad", lambda x: 0.05 <= x <= 3.0)] = math.radians(52.0)
+    fov: Annotated[float, Rule("an angle between 0.05 and 3 rad", lambda x: 0.05 <= x <= 3.0)] = (
+        math.radians(52.0)
+    )
     """Vertical field of view [rad]."""
     near: NotNegative[float] = 0.1
     """Least depth that the camera measures [m]."""
@@ -95,7 +97,9 @@ class VisionConfig(Checked):
 FRONT = CameraConfig()
 """A camera in front of the table, opposite the robot."""
 SIDE = CameraConfig(pos=(0.55, -0.45, 0.55), target=(0.55, 0.22, 0.18))
-WRIST = CameraConfig(link="palm", pos=(-0.10, 0.0, 0.06), target=(0.10, 0.0, 0.10), near=0.03, far=1.0, fov=1.4)
+WRIST = CameraConfig(
+    link="palm", pos=(-0.10, 0.0, 0.06), target=(0.10, 0.0, 0.10), near=0.03, far=1.0, fov=1.4
+)
 """A camera behind the palm that looks along the fingers."""
 CAMERAS = {"front": FRONT, "side": SIDE, "wrist": WRIST}
 """Name -> camera."""

@@ -120,7 +120,9 @@ class RayCaster:
                 self._on_stream = TorchStream(device)
                 with self._on_stream():
                     self._meshes = [_warp_mesh(mesh) for mesh in meshes]
-                    self._ids = torch.tensor([mesh.id for mesh in self._meshes])[bodies.cpu()].to(device)
+                    self._ids = torch.tensor([mesh.id for mesh in self._meshes])[bodies.cpu()].to(
+                        device
+                    )
                     arrays = [
                         wp.from_torch(self.due, dtype=wp.bool),
                         wp.from_torch(self.camera, dtype=wp.mat44),
@@ -132,7 +134,9 @@ class RayCaster:
                         wp.from_torch(self.depth.flatten(2)),
                         wp.from_torch(self.body.flatten(2)),
                     ]
-                    self._launch = wp.launch(_cast, (*shape, size[0] * size[1]), arrays, record_cmd=True)
+                    self._launch = wp.launch(
+                        _cast, (*shape, size[0] * size[1]), arrays, record_cmd=True
+                    )
         except Exception as error:  # a missing compiler or driver may fail in any way
             raise XResetError(
                 f"The renderer of depth images cannot start on {device}: {error}. Use --device cpu, or a policy "
@@ -153,5 +157,6 @@ def _ball(mesh: trimesh.Trimesh) -> list[float]:
 
 def _warp_mesh(mesh: trimesh.Trimesh) -> Any:
     return wp.Mesh(
-        wp.array(np.float32(mesh.vertices), dtype=wp.vec3), wp.array(np.int32(mesh.faces).ravel(), dtype=int)
+        wp.array(np.float32(mesh.vertices), dtype=wp.vec3),
+        wp.array(np.int32(mesh.faces).ravel(), dtype=int),
     )

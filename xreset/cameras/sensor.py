@@ -38,7 +38,9 @@ class Cameras:
         view: [N, ...] what the policy gets of the newest images: :attr:`VisionConfig.view_shape`.
     """
 
-    def __init__(self, scene: SceneSpec, object_index: Tensor, config: VisionConfig, *, scale: float = 1.0) -> None:
+    def __init__(
+        self, scene: SceneSpec, object_index: Tensor, config: VisionConfig, *, scale: float = 1.0
+    ) -> None:
         """Allocate, and start the renderer.
 
         Args:
@@ -64,7 +66,9 @@ class Cameras:
         mounts = [robot.palm if c.link == "palm" else c.link for c in config.cameras]
         self._mounts = [None if name is None else len(bodies) + i for i, name in enumerate(mounts)]
         self._links = [*bodies, *(name or self._kinematics.root for name in mounts)]
-        home = self._kinematics.link_poses(torch.as_tensor(robot.home, dtype=torch.float32, device=device), self._links)
+        home = self._kinematics.link_poses(
+            torch.as_tensor(robot.home, dtype=torch.float32, device=device), self._links
+        )
         self._check_outside(home.cpu().numpy(), bodies)
         worlds = len(object_index)
         fixed = torch.arange(first_object, device=device).expand(worlds, -1)
@@ -73,7 +77,11 @@ class Cameras:
         count = len(config.cameras)
         surfaces = [*bodies.values(), _table(scene.table), *objects]
         self.rays = RayCaster(surfaces, torch.cat((fixed, held), dim=1), count, size, device)
-        self._goal_rays = RayCaster(objects, object_index[:, None], count, size, device) if config.goal_image else None
+        self._goal_rays = (
+            RayCaster(objects, object_index[:, None], count, size, device)
+            if config.goal_image
+            else None
+        )
 
         def tensor(values: Any) -> Tensor:
             return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=device)
@@ -81,12 +89,26 @@ class Cameras:
         rows = []
         for camera in config.cameras:
             noise = camera.noise
-            rows.append((camera.near, camera.far, noise.spread, noise.step, noise.holes, noise.edges, noise.edge))
+            rows.append(
+                (
+                    camera.near,
+                    camera.far,
+                    noise.spread,
+                    noise.step,
+                    noise.holes,
+                    noise.edges,
+                    noise.edge,
+                )
+            )
         columns = tensor(rows).T[..., None, None]
-        self._near, self._far, self._spread, self._step, self._holes, self._edges, self._edge = columns
+        self._near, self._far, self._spread, self._step, self._holes, self._edges, self._edge = (
+            columns
+        )
         self._half_fov = tensor([c.fov / 2 for c in config.cameras])
         self._mounted = tensor(np.stack([mounted_pose(c) for c in config.cameras]))
-        y, x = torch.meshgrid(*(torch.arange(n, device=device) + 0.5 - n / 2 for n in size), indexing="ij")
+        y, x = torch.meshgrid(
+            *(torch.arange(n, device=device) + 0.5 - n / 2 for n in size), indexing="ij"
+        )
         self._pixels = (
             torch.stack((x, y), dim=-1).flatten(0, 1) * 2 / config.height
         )  # at half a field of view of 45 deg
@@ -112,7 +134,9 @@ class Cameras:
         rays.pose[:, : self._num_links] = links[:, : self._num_links]
         _set_pose(rays.pose[:, -1], state.object_pos, state.object_quat)
         for i, mount in enumerate(self._mounts):
-            self._believed[:, i] = self._mounted[i] if mount is None else links[:, mount] @ self._mounted[i]
+            self._believed[:, i] = (
+                self._mounted[i] if mount is None else links[:, mount] @ self._mounted[i]
+            )
         moved = torch.zeros_like(self._believed)
         moved[..., :3, 3] = self.shift
         moved[..., :3, :3] = quat_to_matrix(quat_from_axis_angle(self.turn))
@@ -138,14 +162,18 @@ class Cameras:
         Depths are 1 at the camera's least depth, 0 at its largest one, and 0 where a pixel sees nothing.
         """
         due = self.rays.due.view(-1, 1, 1, 1)
-        self.image.copy_(torch.where(due, self._with_errors(self.rays.depth, generator), self.image))
+        self.image.copy_(
+            torch.where(due, self._with_errors(self.rays.depth, generator), self.image)
+        )
         images = [self.image]
         if self._goal_rays is not None:
             images.append(self._in_range(self._goal_rays.depth))
         if self.config.view == "depth":
             shown = []
             for image in images:
-                shown.append(torch.where(image > 0, (self._far - image) / (self._far - self._near), 0.0))
+                shown.append(
+                    torch.where(image > 0, (self._far - image) / (self._far - self._near), 0.0)
+                )
             view = torch.cat(shown, dim=1)
         else:
             is_object = [self.rays.body == self.rays.pose.shape[1] - 1, images[-1] > 0]
@@ -164,7 +192,9 @@ class Cameras:
             width: width of the picture in pixels; its height is even.
         """
         images = self.image[world]
-        near = torch.where(images > 0, 0.2 + 0.8 * (self._far - images) / (self._far - self._near), 0.0)
+        near = torch.where(
+            images > 0, 0.2 + 0.8 * (self._far - images) / (self._far - self._near), 0.0
+        )
         pixels = Image.fromarray((255 * torch.cat(tuple(near), dim=1)).byte().cpu().numpy())
         height = 2 * round(width * pixels.height / pixels.width / 2)
         return np.asarray(pixels.resize((width, height), Image.Resampling.NEAREST).convert("RGB"))
@@ -198,7 +228,11 @@ class Cameras:
         scale = self.noise_scale.view(-1, 1, 1, 1)
         seen = self._in_range(depth)
         inverse = torch.where(seen > 0, 1.0 / seen.clamp_min(1e-6), 0.0)
-        lost = torch.where(_bend(inverse) * seen.square() > self._edge, self._edges.maximum(self._holes), self._holes)
+        lost = torch.where(
+            _bend(inverse) * seen.square() > self._edge,
+            self._edges.maximum(self._holes),
+            self._holes,
+        )
         chance = torch.rand(depth.shape, generator=generator, device=depth.device)
         error = torch.randn(depth.shape, generator=generator, device=depth.device)
         measured = inverse + scale * self._spread * error

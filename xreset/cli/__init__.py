@@ -52,7 +52,9 @@ def main(argv: list[str] | None = None) -> None:
 
     argv = sys.argv[1:] if argv is None else argv
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):  # write an escape for a character that the terminal lacks
+        if isinstance(
+            stream, TextIOWrapper
+        ):  # write an escape for a character that the terminal lacks
             stream.reconfigure(errors="backslashreplace")
     if argv[:1] == ["--version"]:
         from xreset.files import code_version
@@ -94,7 +96,10 @@ def _run(group: str, commands: dict[str, str], argv: list[str]) -> None:
     name = argv[0]
     arguments = argv[1:]
     if name not in commands:
-        print(f"xreset{group}: Unknown command {name!r}.\n\n{_usage(group, commands)}", file=sys.stderr)
+        print(
+            f"xreset{group}: Unknown command {name!r}.\n\n{_usage(group, commands)}",
+            file=sys.stderr,
+        )
         raise SystemExit(2)
     module = import_module(f"xreset.cli{group.replace(' ', '.')}.{name}")
     if hasattr(module, "COMMANDS"):

@@ -38,13 +38,23 @@ Policy = Annotated[str, tyro.conf.Positional, tyro.conf.arg(help=f"{_POLICY}.")]
 PolicyOrBaseline = Annotated[
     str,
     tyro.conf.Positional,
-    tyro.conf.arg(help=f"{_POLICY}; or a baseline: zero, random, ik (open-loop kinematic retargeting)."),
+    tyro.conf.arg(
+        help=f"{_POLICY}; or a baseline: zero, random, ik (open-loop kinematic retargeting)."
+    ),
 ]
-RobotName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(help="Name of a robot, or a folder with a robot.toml.")]
-Robot = Annotated[str | None, tyro.conf.arg(help="Name or folder of the robot; default: the policy's, or the file's.")]
-Objects = Annotated[Path | None, tyro.conf.arg(help="Folder of real meshes; default: the built-in stand-ins.")]
+RobotName = Annotated[
+    str, tyro.conf.Positional, tyro.conf.arg(help="Name of a robot, or a folder with a robot.toml.")
+]
+Robot = Annotated[
+    str | None,
+    tyro.conf.arg(help="Name or folder of the robot; default: the policy's, or the file's."),
+]
+Objects = Annotated[
+    Path | None, tyro.conf.arg(help="Folder of real meshes; default: the built-in stand-ins.")
+]
 TrainedObjects = Annotated[
-    Path | None, tyro.conf.arg(help="Folder of real meshes; default: that of the training, else the stand-ins.")
+    Path | None,
+    tyro.conf.arg(help="Folder of real meshes; default: that of the training, else the stand-ins."),
 ]
 Engines = Annotated[
     tuple[str, ...],
@@ -54,10 +64,15 @@ Engines = Annotated[
 AllEngines = Annotated[
     tuple[str, ...],
     tyro.conf.UseAppendAction,
-    tyro.conf.arg(help="Physics engine; give it again for more. Default: all that can be used here."),
+    tyro.conf.arg(
+        help="Physics engine; give it again for more. Default: all that can be used here."
+    ),
 ]
 Device = Annotated[
-    str, tyro.conf.arg(help="Where engines run that can use a GPU: cpu or cuda; the others run on the CPU.")
+    str,
+    tyro.conf.arg(
+        help="Where engines run that can use a GPU: cpu or cuda; the others run on the CPU."
+    ),
 ]
 Host = Annotated[str, tyro.conf.arg(help="Address to serve at; 0.0.0.0 allows other machines.")]
 Port = Annotated[int, tyro.conf.arg(help="Port to serve at; if it is taken, the next free one.")]
@@ -92,7 +107,9 @@ def this_command() -> str:
     words = list(INVOCATION)
     if "--json" in words:
         del words[(i := words.index("--json")) : i + 2]
-    return shlex.join(["xreset", *(Path(word).name if Path(word).exists() else word for word in words)])
+    return shlex.join(
+        ["xreset", *(Path(word).name if Path(word).exists() else word for word in words)]
+    )
 
 
 def show_accounts(rows: Sequence[Account], title: str) -> None:

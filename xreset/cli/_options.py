@@ -62,10 +62,14 @@ def _check(options: dict[str, Any]) -> None:
             continue
         low = 1 if name in _COUNTS else 0 if name in _INDICES else None
         if low is not None and not low <= value <= _LARGEST:
-            raise XResetError(f"{flag} is {value}, expected a whole number from {low} to {_LARGEST}.")
+            raise XResetError(
+                f"{flag} is {value}, expected a whole number from {low} to {_LARGEST}."
+            )
         for text in value if isinstance(value, tuple) else (value,):
             if isinstance(text, str | Path) and len(str(text)) > _LONGEST:
-                raise XResetError(f"{flag} has {len(str(text))} characters, expected at most {_LONGEST}.")
+                raise XResetError(
+                    f"{flag} has {len(str(text))} characters, expected at most {_LONGEST}."
+                )
         if isinstance(value, float) and math.isnan(value):
             raise XResetError(f"{flag} is not a number.")
         if name == "device" and isinstance(value, str):
@@ -76,7 +80,9 @@ def _check(options: dict[str, Any]) -> None:
 def check_device(device: str) -> None:
     """Refuse an unknown device, and a GPU that this machine does not have."""
     if not re.fullmatch("cpu|cuda(:[0-9]{1,3})?", device):
-        raise XResetError(f"Unknown device {device!r}; expected cpu, cuda or one of several GPUs, such as cuda:1.")
+        raise XResetError(
+            f"Unknown device {device!r}; expected cpu, cuda or one of several GPUs, such as cuda:1."
+        )
     if device != "cpu":
         import torch
 

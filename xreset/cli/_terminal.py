@@ -45,7 +45,9 @@ class Progress(rich.progress.Progress):
 
     def __init__(self, where: Console = console) -> None:
         super().__init__(
-            rich.progress.TextColumn("{task.description}", style="progress.description", markup=False),
+            rich.progress.TextColumn(
+                "{task.description}", style="progress.description", markup=False
+            ),
             rich.progress.BarColumn(),
             rich.progress.TaskProgressColumn(),
             rich.progress.TimeRemainingColumn(),

@@ -94,7 +94,11 @@ def import_keypoints(
         subject=subject,
     )
     demos = read_keypoints(path, convention)
-    config = {"dataset": "keypoints", **vars(convention), "table_from_camera": None if T is None else T.tolist()}
+    config = {
+        "dataset": "keypoints",
+        **vars(convention),
+        "table_from_camera": None if T is None else T.tolist(),
+    }
     _save(demos, out, config, **({"keypoints": path} if path.is_file() else {}))
 
 
@@ -128,11 +132,23 @@ def synth(
             if side in (hand, "both"):
                 progress = bar.count(f"{hand} hands")
                 part = synthesize(
-                    objects or None, per_object, seed, fps=fps, side=hand, meshes=meshes, progress=progress
+                    objects or None,
+                    per_object,
+                    seed,
+                    fps=fps,
+                    side=hand,
+                    meshes=meshes,
+                    progress=progress,
                 )
                 parts.append(part)
     demos = merge_demos(parts)
-    config = {"objects": list(objects), "per_object": per_object, "seed": seed, "fps": fps, "side": side}
+    config = {
+        "objects": list(objects),
+        "per_object": per_object,
+        "seed": seed,
+        "fps": fps,
+        "side": side,
+    }
     _save(demos, out, config)
 
 
@@ -160,7 +176,9 @@ class Selection(Options):
     def conditions(self) -> dict[str, Any]:
         """Return the arguments of ``Demos.select``."""
         if self.pick != "first" and self.per_object is None and self.share is None:
-            raise DemoError(f"--pick {self.pick} needs a number of sequences. Add --per-object or --share.")
+            raise DemoError(
+                f"--pick {self.pick} needs a number of sequences. Add --per-object or --share."
+            )
         return {
             "objects": self.objects or None,
             "names": self.sequences or None,
@@ -181,7 +199,9 @@ def select(file: Source, *, out: Path, selection: Flat[Selection] = Selection())
         out: Archive to write.
         selection: Conditions.
     """
-    _save(_read(file).select(**selection.conditions()), out, {"select": asdict(selection)}, demos=file)
+    _save(
+        _read(file).select(**selection.conditions()), out, {"select": asdict(selection)}, demos=file
+    )
 
 
 def split(file: Source, *, out: Path, rest: Path, selection: Flat[Selection] = Selection()) -> None:
@@ -241,7 +261,9 @@ def reflect(
     _save(result, out, {"mirrored": True, "tolerance": tolerance}, demos=file)
 
 
-def add_noise(file: Source, *, out: Path, tier: Literal["low", "medium", "high"] = "medium", seed: int = 0) -> None:
+def add_noise(
+    file: Source, *, out: Path, tier: Literal["low", "medium", "high"] = "medium", seed: int = 0
+) -> None:
     """Add the errors of a worse hand tracker to demonstrations: the published paper's tiers.
 
     Args:
@@ -253,7 +275,9 @@ def add_noise(file: Source, *, out: Path, tier: Literal["low", "medium", "high"]
     """
     from xreset.demos.noise import TIERS, with_noise
 
-    _save(with_noise(_read(file), TIERS[tier], seed), out, {"noise": tier, "seed": seed}, demos=file)
+    _save(
+        with_noise(_read(file), TIERS[tier], seed), out, {"noise": tier, "seed": seed}, demos=file
+    )
 
 
 def describe(file: Source) -> None:
@@ -275,7 +299,9 @@ def _save(made: Demos, out: Path, config: dict[str, Any], **inputs: Path) -> Non
     """Write and describe demonstrations that were made from some files."""
     from xreset.demos.archive import write_demos
 
-    write_demos(out, made, config=config, inputs={name: file_hash(path) for name, path in inputs.items()})
+    write_demos(
+        out, made, config=config, inputs={name: file_hash(path) for name, path in inputs.items()}
+    )
     _print_summary(made, out)
 
 
@@ -290,10 +316,28 @@ def _print_summary(demos: Demos, path: Path) -> None:
         height = own.object_pos[:, 2]
         lift = np.median(np.maximum.reduceat(height, first) - height[first])
         distance, angle = map(np.median, start_to_goal(own))
-        counts = (f"{right}", f"{len(own) - right}", f"{own.num_frames}", f"{own.hand_valid.mean():.0%}")
-        table.append((name, *counts, f"{100 * lift:.1f}", f"{100 * distance:.1f}", f"{np.degrees(angle):.0f}"))
-    show_table(table, caption="right, left: sequences. hand: frames with a hand. lift, goal: medians, from the start")
-    console.print(f"{path}: {demos.num_sequences} sequences, {demos.num_frames} frames at {demos.fps:g} per second")
+        counts = (
+            f"{right}",
+            f"{len(own) - right}",
+            f"{own.num_frames}",
+            f"{own.hand_valid.mean():.0%}",
+        )
+        table.append(
+            (
+                name,
+                *counts,
+                f"{100 * lift:.1f}",
+                f"{100 * distance:.1f}",
+                f"{np.degrees(angle):.0f}",
+            )
+        )
+    show_table(
+        table,
+        caption="right, left: sequences. hand: frames with a hand. lift, goal: medians, from the start",
+    )
+    console.print(
+        f"{path}: {demos.num_sequences} sequences, {demos.num_frames} frames at {demos.fps:g} per second"
+    )
     for doubt in doubts(demos):
         console.print(f"note: {doubt}", style="yellow")
 

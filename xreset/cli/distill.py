@@ -48,7 +48,9 @@ def distill(
         training.resume(out, iterations=iterations, minutes=minutes)
         return
     if not teacher or resets is None:
-        raise RunError("A new run needs a teacher and --resets. To continue the run in --out, add --resume.")
+        raise RunError(
+            "A new run needs a teacher and --resets. To continue the run in --out, add --resume."
+        )
     training.distill(
         teacher,
         resets,

@@ -41,7 +41,14 @@ def evaluate(
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
     with engine_bars(engines) as progress:
         summaries = evaluation.evaluate(
-            spec, demos, engines, episodes=episodes, settle=settle, out=out, progress=progress, **vars(setting)
+            spec,
+            demos,
+            engines,
+            episodes=episodes,
+            settle=settle,
+            out=out,
+            progress=progress,
+            **vars(setting),
         )
     console.print(table.results_table(summaries))
     if unseen := summaries[0].unseen:

@@ -47,7 +47,14 @@ def lerobot(
     _say(recording, out)
 
 
-def npz(folders: Sources, *, out: Path, backend: Several = (), robot: Robot = None, task: str | None = None) -> None:
+def npz(
+    folders: Sources,
+    *,
+    out: Path,
+    backend: Several = (),
+    robot: Robot = None,
+    task: str | None = None,
+) -> None:
     """Write recorded evaluation episodes as plain arrays in one npz file (docs/rollouts.md has the schema).
 
     Args:
@@ -64,7 +71,12 @@ def npz(folders: Sources, *, out: Path, backend: Several = (), robot: Robot = No
 
 
 def deploy(
-    policy: Policy, *, out: Path, robot: Robot = None, objects: TrainedObjects = None, object: Several = ()
+    policy: Policy,
+    *,
+    out: Path,
+    robot: Robot = None,
+    objects: TrainedObjects = None,
+    object: Several = (),
 ) -> None:
     """Write a policy for a robot: the network, a contract that says what goes in and out, and a runtime.
 
@@ -89,13 +101,21 @@ def deploy(
 
 
 def _recording(
-    folders: tuple[Path, ...], backends: tuple[str, ...], robot: str | None, objects: Path | None, task: str | None
+    folders: tuple[Path, ...],
+    backends: tuple[str, ...],
+    robot: str | None,
+    objects: Path | None,
+    task: str | None,
 ) -> recorded.Recording:
     from xreset.eval.export import recorded
 
     if not folders:
-        raise RunError("Nothing to export. Give a run folder, or a folder that xreset eval wrote into.")
-    return recorded.read_recorded(folders, backends=backends, robot=robot, objects=objects, task=task or recorded.TASK)
+        raise RunError(
+            "Nothing to export. Give a run folder, or a folder that xreset eval wrote into."
+        )
+    return recorded.read_recorded(
+        folders, backends=backends, robot=robot, objects=objects, task=task or recorded.TASK
+    )
 
 
 def _say(recording: recorded.Recording, out: Path) -> None:

@@ -48,7 +48,9 @@ def goals(
     goal_sets.write_goals(out, made, draw)
     counts = Counter(made.family.tolist())
     listing = ", ".join(f"{count} {kind}" for kind, count in counts.items())
-    console.print(f"{len(made.family)} goals of {len(made.object_names)} objects ({listing}) in {out}")
+    console.print(
+        f"{len(made.family)} goals of {len(made.object_names)} objects ({listing}) in {out}"
+    )
 
 
 COMMAND = goals

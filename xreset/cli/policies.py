@@ -23,7 +23,9 @@ def list_() -> None:
         }
         for what, text in facts.items():
             console.print(f"  {what + ':':9} {text}")
-        engines = list({engine: None for by_engine in about.results.values() for engine in by_engine})  # noqa: XR002
+        engines: list[str] = []
+        for by_engine in about.results.values():
+            engines += [engine for engine in by_engine if engine not in engines]
         table = [("task progress", *engines)]
         for episodes, by_engine in about.results.items():
             table.append((episodes, *(by_engine.get(engine, "") for engine in engines)))

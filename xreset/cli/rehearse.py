@@ -55,9 +55,13 @@ def rehearse(
             out=folder,
             progress=progress,
         )
-    table = [("fault", *(f"{card.backend}, {100 * card.task_progress:.0f} % without" for card in found))]
+    table = [
+        ("fault", *(f"{card.backend}, {100 * card.task_progress:.0f} % without" for card in found))
+    ]
     table += [(name, *limits) for name, limits in rehearsal.limits(found)]
-    show_table(table, title=f"{spec.name}: the smallest fault that costs ten points of task progress")
+    show_table(
+        table, title=f"{spec.name}: the smallest fault that costs ten points of task progress"
+    )
     sentence, reasons = rehearsal.judge(found)
     console.print(sentence, style="bold")
     for reason in reasons:

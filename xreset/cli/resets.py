@@ -60,7 +60,9 @@ def resets(
     options = {"limits": limits, "closing": closing, "squeeze": squeeze}
     title = f"states stable in {', '.join(backends)}"
     with Progress() as bar:
-        bank = make_bank(data, spec, loaded, backends, progress=bar.count(title), **where, **options)
+        bank = make_bank(
+            data, spec, loaded, backends, progress=bar.count(title), **where, **options
+        )
         if settle:
             count = bar.count("start poses come to rest")
             bank, at_rest = settle_starts(bank, spec, loaded, backends[0], progress=count, **where)
@@ -76,15 +78,21 @@ def resets(
     }
     write_bank(out, bank, config=config, inputs={"retargeted": file_hash(retargeted)})
     accounts = bank.accounts()
-    write_accounts(accounts_path(out), of="states tried in physics", rows=accounts, pressing=bank.num_pressing)
+    write_accounts(
+        accounts_path(out), of="states tried in physics", rows=accounts, pressing=bank.num_pressing
+    )
     show_accounts(accounts, f"{spec.name}: {title}")
     if squeeze.force > 0:
         console.print(
             f"{bank.num_pressing} of {int(bank.post_contact.sum())} states after contact press with {squeeze.force:g} N"
         )
     tried = bank.num_states + len(bank.rejected_reason)
-    console.print(f"{accounts[-1].kept / max(data.annotated.sum(), 1):.0%} of the annotated frames are kept")
-    console.print(f"{bank.num_states} states of {tried} kept in {out}; counts in {accounts_path(out)}")
+    console.print(
+        f"{accounts[-1].kept / max(data.annotated.sum(), 1):.0%} of the annotated frames are kept"
+    )
+    console.print(
+        f"{bank.num_states} states of {tried} kept in {out}; counts in {accounts_path(out)}"
+    )
 
 
 COMMAND = resets

@@ -54,7 +54,9 @@ def retarget(
     config = RetargetConfig(hand=hand, arm=arm)
     with Progress() as bar:
         count = bar.count("sequences")
-        result = retarget_demos(chosen, spec, list(specs.values()), config, progress=count, device=device)
+        result = retarget_demos(
+            chosen, spec, list(specs.values()), config, progress=count, device=device
+        )
     write_retargeted(
         out,
         result,

@@ -9,7 +9,16 @@ import numpy as np
 from rich.text import Text
 
 from xreset import __version__
-from xreset.cli._common import AllEngines, Device, Objects, Robot, RobotName, Source, this_command, usable_engines
+from xreset.cli._common import (
+    AllEngines,
+    Device,
+    Objects,
+    Robot,
+    RobotName,
+    Source,
+    this_command,
+    usable_engines,
+)
 from xreset.cli._terminal import Progress, console, show_table
 from xreset.errors import RobotError
 from xreset.files import write_json
@@ -31,7 +40,9 @@ def list_robots() -> None:
             table.append((name, "-", "-", f"broken: {error}"))
             continue
         joints = f"{len(spec.arm_indices)} + {len(spec.hand_indices)}"
-        table.append((name, joints, ", ".join(spec.fingertip_names), str(description.robot_folder(name))))
+        table.append(
+            (name, joints, ", ".join(spec.fingertip_names), str(description.robot_folder(name)))
+        )
     show_table(table)
 
 
@@ -95,7 +106,9 @@ def import_(
     from xreset.robot_tools import importer
     from xreset.robot_tools import picture as pictures
 
-    made = importer.import_robot(arm, hand, out, name=name, flange=flange, offset=offset, rpy=rpy, thumb=thumb)
+    made = importer.import_robot(
+        arm, hand, out, name=name, flange=flange, offset=offset, rpy=rpy, thumb=thumb
+    )
     render.write_png(out / "robot.png", pictures.robot_picture(description.load_robot(out)))
     for title, lines in (("guessed", made.guessed), ("for you to decide", made.to_say)):
         console.print(f"{title}:")
@@ -138,7 +151,9 @@ def place(
         task = bar.add_task("placements", total=1.0)
 
         def report(done: float, reached: float) -> None:
-            bar.update(task, completed=done, description=f"placements (best yet reaches {reached:.0%})")
+            bar.update(
+                task, completed=done, description=f"placements (best yet reaches {reached:.0%})"
+            )
 
         found = places.place(spec, paths, avoid, search, report)
     table = [("follows", "reaches", "dexterity", "base.pos", "base.quat", "home")]
@@ -204,18 +219,26 @@ def judge(
     table = [("object", "states", *names)]
     for label in dict.fromkeys(row.object_name for row in found.rows):
         mine = [row for row in found.rows if row.object_name == label]
-        table.append((label, str(mine[0].tried), *(f"{row.hold}, {row.lift}, {row.turn}" for row in mine)))
+        table.append(
+            (label, str(mine[0].tried), *(f"{row.hold}, {row.lift}, {row.turn}" for row in mine))
+        )
     show_table(table, title=f"{found.robot}: states that hold, also lift, also turn the object")
     if fails := found.rows[-1].arm_fails:
-        console.print(f"the arm cannot raise or turn the hand that far in {fails} of {found.rows[-1].tried} states")
+        console.print(
+            f"the arm cannot raise or turn the hand that far in {fails} of {found.rows[-1].tried} states"
+        )
     if found.without:
         absent = ", ".join(found.without)
-        console.print(f"no accepted state has these objects in the air between thumb and finger: {absent}")
+        console.print(
+            f"no accepted state has these objects in the air between thumb and finger: {absent}"
+        )
     console.print(
         f"at least half of the states hold, lift and turn these objects in every engine: {', '.join(found.kept) or '-'}"
     )
     if json is not None:
-        write_json(json, {**found.as_dict(), "xreset_version": __version__, "command": this_command()})
+        write_json(
+            json, {**found.as_dict(), "xreset_version": __version__, "command": this_command()}
+        )
         console.print(f"wrote {json}")
     if picture is not None:
         render.write_png(picture, judging.judge_picture(found, loaded.robot, loaded.objects))

@@ -42,7 +42,9 @@ def select(
         console.print(f"{name} in {engine}: {100 * score:.1f} %")
 
     setting = replace(setting, seed=selection.SEED if starts is None else starts)
-    choice = selection.select(folder, engines, demos, setting, most=most, episodes=episodes, progress=say)
+    choice = selection.select(
+        folder, engines, demos, setting, most=most, episodes=episodes, progress=say
+    )
     names = [engine.name for engine in engines]
     table = [("checkpoint", *names, "worst")]
     for candidate in choice.candidates:

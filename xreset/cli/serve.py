@@ -30,7 +30,9 @@ def serve(
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     spec, contract = deploy.served(policy, robot=robot, objects=objects, only=object)
     listening = server.PolicyServer(contract, spec.exported().read_bytes(), host=host, port=port)
-    print(f"{spec.name} for {spec.robot.name} at {listening.url}, {contract['rate']:g} steps per second. Ctrl-C ends.")
+    print(
+        f"{spec.name} for {spec.robot.name} at {listening.url}, {contract['rate']:g} steps per second. Ctrl-C ends."
+    )
     if host not in ("127.0.0.1", "localhost", "::1"):
         print("Every computer that reaches this address can use the policy. There is no password.")
     pages.serve_until_interrupted(listening)

@@ -40,9 +40,19 @@ def stress(
     engines = chosen_engines(backend, setting.device)
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
     folder = out or spec.folder.parent / "stress"
-    played = trial.load_trial(spec, demos, objects=setting.objects, seed=setting.seed, num_envs=setting.num_envs)
+    played = trial.load_trial(
+        spec, demos, objects=setting.objects, seed=setting.seed, num_envs=setting.num_envs
+    )
     with engine_bars([e.name for e in engines]) as progress:
-        found = sweeps.stress(spec, played, engines, folder, sweeps=properties, repetitions=episodes, progress=progress)
+        found = sweeps.stress(
+            spec,
+            played,
+            engines,
+            folder,
+            sweeps=properties,
+            repetitions=episodes,
+            progress=progress,
+        )
     sweeps.write_plot(folder / "stress.png", found, f"{spec.name}: robustness")
     table = [("property", "value", *(result.backend for result in found))]
     by_option = [{curve.property: curve for curve in result.curves} for result in found]  # noqa: XR002
@@ -56,10 +66,14 @@ def stress(
                 else:
                     cells.append("cannot be set")
             table.append((prop.option, f"{value:g} {prop.unit}", *cells))
-    show_table(table, title=f"{spec.name}: task progress, and its difference to the same episodes (95 %)")
+    show_table(
+        table, title=f"{spec.name}: task progress, and its difference to the same episodes (95 %)"
+    )
     for result in found:
         if result.left_out:
-            console.print(f"left out in {result.backend}, which cannot set them: {', '.join(result.left_out)}")
+            console.print(
+                f"left out in {result.backend}, which cannot set them: {', '.join(result.left_out)}"
+            )
     console.print(f"results and picture in {folder}")
 
 

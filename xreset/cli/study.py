@@ -51,7 +51,9 @@ def study(
         for step in wanted:
             after = [need for need in step.needs if not todo.steps[need].done()]
             waits = f", after {', '.join(after)}" if after else ""
-            console.print(f"{step.name}: {step.left() or 'done'} ({'a' if step.gpu else 'no'} GPU{waits})")
+            console.print(
+                f"{step.name}: {step.left() or 'done'} ({'a' if step.gpu else 'no'} GPU{waits})"
+            )
             for command in [] if step.done() else step.commands():
                 console.print(f"    {launch.shown_command(command)}")
         return
@@ -59,14 +61,18 @@ def study(
     if only != "tables":
         for subset in todo.subsets:
             subset.make()
-        problems = launch.launch(todo, [step for step in wanted if not step.done()], per_gpu=per_gpu, say=console.print)
+        problems = launch.launch(
+            todo, [step for step in wanted if not step.done()], per_gpu=per_gpu, say=console.print
+        )
     if only in ("all", "tables"):
         page, notes = report.write_page(planned(), out / "reports" / todo.name)
         for note in notes:
             console.print(f"note: {note}", style="yellow")
         console.print(f"page: {page}")
     if problems:
-        raise RunError("\n".join([f"{len(problems)} steps failed. Finished steps are kept.", *problems]))
+        raise RunError(
+            "\n".join([f"{len(problems)} steps failed. Finished steps are kept.", *problems])
+        )
 
 
 COMMAND = study

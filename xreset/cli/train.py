@@ -63,12 +63,18 @@ def train(
     if resume and like != "paper":
         raise RunError("--resume continues with the run's own configuration. Omit --like.")
     if resume and weights is not None:
-        raise RunError("--resume continues with the run's own networks. Omit --weights, or start another run with it.")
+        raise RunError(
+            "--resume continues with the run's own networks. Omit --weights, or start another run with it."
+        )
     if resume:
-        training.resume(out, iterations=iterations, minutes=minutes, own=config.task.reward.own, wandb=wandb)
+        training.resume(
+            out, iterations=iterations, minutes=minutes, own=config.task.reward.own, wandb=wandb
+        )
         return
     if goals is None and (robot is None or resets is None):
-        raise RunError("A new run needs --robot and --resets, or --goals. To continue the run in --out, add --resume.")
+        raise RunError(
+            "A new run needs --robot and --resets, or --goals. To continue the run in --out, add --resume."
+        )
     training.train(
         resets,
         out=out,

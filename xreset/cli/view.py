@@ -46,7 +46,9 @@ def view(
     if png is None and mp4 is None:
         _serve(shown, host, port, sequence, frame or 0)
         return
-    rows = shown.choose(sequence=sequence if sequence is not None or shown.kind == "reset states" else 0)
+    rows = shown.choose(
+        sequence=sequence if sequence is not None or shown.kind == "reset states" else 0
+    )
     if png is not None:
         _write_png(png, shown, rows, frame)
     if mp4 is not None:
@@ -58,7 +60,10 @@ def _serve(shown: data.View, host: str, port: int, sequence: int | None, frame: 
 
     opened = page.Page(shown, host=host, port=port, sequence=sequence, frame=frame)
     number = opened.url.rpartition(":")[2]
-    print(f"{len(shown.sequence_name)} sequences, {len(shown.frame)} {shown.kind} at {opened.url}", flush=True)
+    print(
+        f"{len(shown.sequence_name)} sequences, {len(shown.frame)} {shown.kind} at {opened.url}",
+        flush=True,
+    )
     tunnel = f"ssh -L {number}:localhost:{number} THIS_MACHINE"
     print(f"From another machine: {tunnel}, then open the same address. Ctrl-C ends.", flush=True)
     server.serve_until_interrupted(opened)
@@ -71,7 +76,9 @@ def _write_png(path: Path, shown: data.View, rows: np.ndarray, frame: int | None
     chosen = len(rows) // 2 if frame is None else frame
     if not 0 <= chosen < len(rows):
         raise XResetError(f"Frame {chosen} does not exist. Choose one from 0 to {len(rows) - 1}.")
-    render.write_png(path, picture.Drawer(shown, size=(960, 720), smooth=True).draw(int(rows[chosen])))
+    render.write_png(
+        path, picture.Drawer(shown, size=(960, 720), smooth=True).draw(int(rows[chosen]))
+    )
     print("\n".join((*shown.text(int(rows[chosen])), f"picture in {path}")))
 
 

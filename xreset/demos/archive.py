@@ -103,7 +103,9 @@ class Demos(ObjectMotions):
     """Frames per second."""
     subjects: Annotated[np.ndarray, Field(("B",), "U")] | None = None
     """[B] the subjects that ``T_level_from_table`` is given for."""
-    T_level_from_table: Annotated[np.ndarray, Field(("B", 4, 4), "f", within=POSITION)] | None = None
+    T_level_from_table: Annotated[np.ndarray, Field(("B", 4, 4), "f", within=POSITION)] | None = (
+        None
+    )
     """[B, 4, 4] per subject: takes poses to a frame whose z axis is the true table's normal
     (:func:`levelled`)."""
 
@@ -155,13 +157,20 @@ class Demos(ObjectMotions):
         if indices is not None:
             chosen = np.asarray(list(indices), dtype=np.int64)
         if ((chosen < 0) | (chosen >= len(self))).any():
-            raise DemoError(f"Unknown sequence index in {chosen.tolist()}: there are {len(self)} sequences.")
+            raise DemoError(
+                f"Unknown sequence index in {chosen.tolist()}: there are {len(self)} sequences."
+            )
         if objects is not None:
             try:
                 objects = canonical_names(objects, sorted(set(self.object_name.tolist())))
             except ObjectError as error:
                 raise DemoError(f"The demonstrations lack an object: {error}") from None
-        wanted = {"sequence_name": names, "object_name": objects, "hand_side": sides, "subject": subjects}
+        wanted = {
+            "sequence_name": names,
+            "object_name": objects,
+            "hand_side": sides,
+            "subject": subjects,
+        }
         for field, values in wanted.items():
             if values is not None:
                 chosen = chosen[np.isin(getattr(self, field)[chosen], self._known(field, values))]
@@ -169,7 +178,9 @@ class Demos(ObjectMotions):
             raise DemoError(f"The share is {share:g}, expected a number above 0 and at most 1.")
         if max_per_object is not None or share is not None:
             most = len(self) if max_per_object is None else max_per_object
-            chosen = self._few_per_object(chosen, most, 1.0 if share is None else share, spread, seed)
+            chosen = self._few_per_object(
+                chosen, most, 1.0 if share is None else share, spread, seed
+            )
         if not len(chosen):
             raise DemoError("No sequence meets all conditions of the selection. Relax one of them.")
         frames = [np.arange(self.frame_offsets[i], self.frame_offsets[i + 1]) for i in chosen]
@@ -187,7 +198,9 @@ class Demos(ObjectMotions):
         kept = self.select(**conditions)
         others = np.flatnonzero(~np.isin(self.sequence_name, kept.sequence_name))
         if not len(others):
-            raise DemoError("Every sequence meets the conditions, so that none is left for the other part. Add one.")
+            raise DemoError(
+                "Every sequence meets the conditions, so that none is left for the other part. Add one."
+            )
         return kept, self.select(indices=others)
 
     def _known(self, field: str, wanted: Iterable[str]) -> list[str]:
@@ -196,7 +209,9 @@ class Demos(ObjectMotions):
         known = sorted(set(getattr(self, field).tolist()))
         missing = [name for name in wanted if name not in known]
         if missing:
-            raise DemoError(f"The demonstrations have no {field} {', '.join(missing)}. Choose from: {shown(known)}.")
+            raise DemoError(
+                f"The demonstrations have no {field} {', '.join(missing)}. Choose from: {shown(known)}."
+            )
         return wanted
 
     def _few_per_object(
@@ -210,8 +225,12 @@ class Demos(ObjectMotions):
             count = min(most, max(1, round(share * len(rows))))
             picks = np.arange(count)
             if seed is not None:
-                picks = np.random.default_rng([seed, zlib.crc32(name.encode())]).permutation(len(rows))[:count]
-            elif spread:  # one from each of n even parts, at another place in the parts for every object
+                picks = np.random.default_rng([seed, zlib.crc32(name.encode())]).permutation(
+                    len(rows)
+                )[:count]
+            elif (
+                spread
+            ):  # one from each of n even parts, at another place in the parts for every object
                 place = (number + 0.5) / len(objects)
                 picks = ((picks + place) * len(rows) / max(len(picks), 1)).astype(int)
             kept.extend(rows[picks])
@@ -267,7 +286,9 @@ def merge_demos(parts: Sequence[Demos]) -> Demos:
         raise DemoError("There are no demonstrations to join.")
     rates = sorted({round(float(part.fps), 3) for part in parts})
     if len(rates) > 1:
-        raise DemoError(f"Demonstrations in one file must have one frame rate, but these have the frame rates {rates}.")
+        raise DemoError(
+            f"Demonstrations in one file must have one frame rate, but these have the frame rates {rates}."
+        )
     parts = [levelled(part) for part in parts]
     joined = {}
     for name in _PER_SEQUENCE + _PER_FRAME:
@@ -296,18 +317,28 @@ def levelled(demos: Demos) -> Demos:
     known = demos.subjects.tolist()
     missing = sorted(set(demos.subject.tolist()) - set(known))
     if missing:
-        raise DemoError(f"T_level_from_table is given for {', '.join(known)}, but not for {', '.join(missing)}.")
+        raise DemoError(
+            f"T_level_from_table is given for {', '.join(known)}, but not for {', '.join(missing)}."
+        )
     subject = np.array([known.index(name) for name in demos.subject.tolist()])
     T = demos.T_level_from_table[subject[demos.sequence_of_frame]]
     R = T[:, :3, :3]
     turn = Rotation.from_matrix(R)
 
     def rotate(quats: np.ndarray) -> np.ndarray:
-        return (turn * Rotation.from_quat(quats, scalar_first=True)).as_quat(scalar_first=True).astype(quats.dtype)
+        return (
+            (turn * Rotation.from_quat(quats, scalar_first=True))
+            .as_quat(scalar_first=True)
+            .astype(quats.dtype)
+        )
 
     kind = demos.object_pos.dtype
     valid = demos.hand_valid[:, None]
-    wrist = np.where(valid, demos.wrist_quat_wxyz, np.array([1.0, 0.0, 0.0, 0.0], dtype=demos.wrist_quat_wxyz.dtype))
+    wrist = np.where(
+        valid,
+        demos.wrist_quat_wxyz,
+        np.array([1.0, 0.0, 0.0, 0.0], dtype=demos.wrist_quat_wxyz.dtype),
+    )
     keypoints = np.einsum("fij,f...j->f...i", R, demos.hand_keypoints) + T[:, None, :3, 3]
     return replace(
         demos,
@@ -327,7 +358,9 @@ def read_demos(path: str | Path) -> Demos:
         FileFormatError: the file is missing, damaged or not an archive, or a value in it is wrong: the message names
             sequence and frame.
     """
-    demos = read_record(Demos, path, SCHEMA_NAME, what="an archive of demonstrations", check=_problem)
+    demos = read_record(
+        Demos, path, SCHEMA_NAME, what="an archive of demonstrations", check=_problem
+    )
     names = [official_name(name) for name in demos.object_name.tolist()]
     if names != demos.object_name.tolist():
         demos = replace(demos, object_name=np.array(names))
@@ -335,7 +368,11 @@ def read_demos(path: str | Path) -> Demos:
 
 
 def write_demos(
-    path: str | Path, demos: Demos, *, config: Mapping[str, Any] | None = None, inputs: Mapping[str, str] | None = None
+    path: str | Path,
+    demos: Demos,
+    *,
+    config: Mapping[str, Any] | None = None,
+    inputs: Mapping[str, str] | None = None,
 ) -> None:
     """Write an archive (see :func:`xreset.records.write_npz` for ``config`` and ``inputs``).
 
@@ -358,7 +395,9 @@ def demo_objects(demos: Demos, folder: Path | None = None) -> dict[str, ObjectSp
         canonical_names(names, object_names(folder))
     except ObjectError as error:
         hint = "" if folder else " Or give a folder of meshes with --objects."
-        raise DemoError(f"The demonstrations need objects that are not there. {error}{hint}") from None
+        raise DemoError(
+            f"The demonstrations need objects that are not there. {error}{hint}"
+        ) from None
     return {name: load_object(name, folder) for name in names}
 
 
@@ -396,9 +435,15 @@ def _problem(arrays: Mapping[str, Any]) -> str | None:
         size = np.linalg.norm(hand[:, 1:] - hand[:, :1], axis=2).max(axis=1)
         length = np.linalg.norm(arrays["wrist_quat_wxyz"], axis=1)
     for problem, fits in (
-        (f"hand_keypoints are not finite or more than {_HAND} m from the wrist. Are these millimetres?", size <= _HAND),
+        (
+            f"hand_keypoints are not finite or more than {_HAND} m from the wrist. Are these millimetres?",
+            size <= _HAND,
+        ),
         ("hand_keypoints are far from the table.", np.abs(hand[:, 0]).max(axis=1) <= POSITION[1]),
-        ("wrist_quat_wxyz is not a unit quaternion.", ~valid | (np.abs(length - 1) <= UNIT_TOLERANCE)),
+        (
+            "wrist_quat_wxyz is not a unit quaternion.",
+            ~valid | (np.abs(length - 1) <= UNIT_TOLERANCE),
+        ),
     ):
         if not fits.all():
             frame = int(np.argmin(fits))

@@ -34,7 +34,9 @@ _Poses = Mapping[str, np.ndarray]
 """Camera serial, or ``apriltag`` -> pose [4, 4] in the world frame."""
 
 
-def read_dexycb(root: str | Path, *, progress: Callable[[int, int], None] = lambda done, total: None) -> Demos:
+def read_dexycb(
+    root: str | Path, *, progress: Callable[[int, int], None] = lambda done, total: None
+) -> Demos:
     """Read all sequences below a DexYCB folder, in the table frame.
 
     Args:
@@ -70,11 +72,15 @@ def _read(folder: Path, meta: Mapping[str, Any], extrinsics: _Poses) -> Demos:
     frames = meta["num_frames"]
     objects = meta["ycb_ids"]
     grasped = meta["ycb_grasp_ind"]
-    pose_object, pose_hand = _read_npz(path, {"pose_y": (frames, len(objects), 7), "pose_m": (frames, 1, 51)})
+    pose_object, pose_hand = _read_npz(
+        path, {"pose_y": (frames, len(objects), 7), "pose_m": (frames, 1, 51)}
+    )
     pose_object = pose_object[:, grasped]
     pose_hand = pose_hand[:, 0]
     if not (np.abs(pose_object) < 1e3).all() or not (np.abs(pose_hand) < 1e3).all():
-        raise DemoError(f"{path} holds numbers that are not finite, or far too large. Unpack it again.")
+        raise DemoError(
+            f"{path} holds numbers that are not finite, or far too large. Unpack it again."
+        )
     unknown = np.linalg.norm(pose_object[:, :4], axis=1) < 0.5
     if unknown.any():
         raise DemoError(f"{path}: frame {np.argmax(unknown)} has no object pose.")
@@ -125,9 +131,17 @@ def _read_meta(path: Path) -> dict[str, Any]:
         meta["ycb_ids"] = [int(number) for number in meta["ycb_ids"]]
         meta |= {name: int(meta[name]) for name in ("ycb_grasp_ind", "num_frames")}
         known = NAME_OF_ID[meta["ycb_ids"][meta["ycb_grasp_ind"]]]
-        if meta["ycb_grasp_ind"] < 0 or meta["num_frames"] < 1 or meta["mano_sides"] not in [[side] for side in SIDES]:
+        if (
+            meta["ycb_grasp_ind"] < 0
+            or meta["num_frames"] < 1
+            or meta["mano_sides"] not in [[side] for side in SIDES]
+        ):
             raise ValueError("a number or a side is out of range")
-        if not (known and meta["extrinsics"] and all(isinstance(serial, str) for serial in meta["serials"])):
+        if not (
+            known
+            and meta["extrinsics"]
+            and all(isinstance(serial, str) for serial in meta["serials"])
+        ):
             raise ValueError("a text is missing")
         return meta
     except (LookupError, TypeError, ValueError) as error:
@@ -141,7 +155,9 @@ def _read_extrinsics(root: Path, name: str) -> _Poses:
     path = root / "calibration" / f"extrinsics_{name}" / "extrinsics.yml"
     entries = _read_yaml(path).get("extrinsics")
     if not isinstance(entries, dict) or "apriltag" not in entries:
-        raise DemoError(f"{path} has no pose 'apriltag' under 'extrinsics': without it the table frame is unknown.")
+        raise DemoError(
+            f"{path} has no pose 'apriltag' under 'extrinsics': without it the table frame is unknown."
+        )
     poses = {}
     for key, values in entries.items():
         T = np.eye(4)
@@ -169,8 +185,17 @@ def _read_yaml(path: Path) -> dict[str, Any]:
         if path.stat().st_size > _MAX_YAML_BYTES:
             raise ValueError("it has more than a megabyte")
         data = yaml.load(path.read_text(), Loader=yaml.BaseLoader)
-    except (yaml.YAMLError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        raise DemoError(f"{path} is not valid YAML: {shown(str(error) or 'it is nested too deeply')}") from error
+    except (
+        yaml.YAMLError,
+        ValueError,
+        TypeError,
+        KeyError,
+        AttributeError,
+        RecursionError,
+    ) as error:
+        raise DemoError(
+            f"{path} is not valid YAML: {shown(str(error) or 'it is nested too deeply')}"
+        ) from error
     if not isinstance(data, dict):
         raise DemoError(f"{path} holds a {type(data).__name__}, expected names and values.")
     return data

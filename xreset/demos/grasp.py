@@ -33,12 +33,18 @@ MAX_OPENING = 0.095
 MIN_WIDTH = 0.002
 """Thinnest part: the wall of a cup, with the thumb or the fingers inside [m]."""
 
-_STACK = np.array([0.0, -0.004, -0.026, -0.043, -0.059])  # thumb, then index to little, along the knuckles [m]
+_STACK = np.array(
+    [0.0, -0.004, -0.026, -0.043, -0.059]
+)  # thumb, then index to little, along the knuckles [m]
 _FINGER_ROOM = 0.022  # free space that a finger needs next to the object [m]
 _LEANS = (0.6, 1.0)  # first guesses: lean of the back of the hand to the fingers' side [rad]
 _POSTURE = hand.RELAXED + np.array([0.0, 0.25, 0.25] * 4 + [0.0] * 5)  # of a grasping hand
 _GRID = 0.012  # spacing of the centers that are tried [m]
-_SIDE_TILTS = (0.6, 0.4, 0.15)  # steepness of a hand that comes from the side [rad]: the first is the most natural
+_SIDE_TILTS = (
+    0.6,
+    0.4,
+    0.15,
+)  # steepness of a hand that comes from the side [rad]: the first is the most natural
 _TILT_COST = 2.0  # of being less steep [1/rad]
 _LOW_OBJECT = 0.07  # objects up to this height are grasped from above [m]
 _TOUCH = 1e-4  # pieces of an object that are this close are one part [m]
@@ -73,7 +79,9 @@ class Solid:
     def distance(self, points: np.ndarray) -> np.ndarray:
         """[...] signed distance of points [..., 3] to the surface, negative inside; outside it is a lower bound near
         edges."""
-        return np.min([(points @ plane[:, :3].T + plane[:, 3]).max(axis=-1) for plane in self.planes], axis=0)
+        return np.min(
+            [(points @ plane[:, :3].T + plane[:, 3]).max(axis=-1) for plane in self.planes], axis=0
+        )
 
     def crossings(
         self, origins: np.ndarray, direction: np.ndarray
@@ -152,7 +160,9 @@ def plan_contacts(solid: Solid, azimuths: np.ndarray, side: str = "right") -> li
     found: list[Contacts] = []
     for azimuth in azimuths:
         closing = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-        away = np.array([closing[1], -closing[0], 0.0]) * handedness(side)  # horizontal, away from the hand
+        away = np.array([closing[1], -closing[0], 0.0]) * handedness(
+            side
+        )  # horizontal, away from the hand
         centers = _centers(low, high, closing, away, from_above)
         for tilt in (np.pi / 2,) if from_above else _SIDE_TILTS:
             approach = away * np.cos(tilt) - np.array([0.0, 0.0, np.sin(tilt)])
@@ -161,7 +171,9 @@ def plan_contacts(solid: Solid, azimuths: np.ndarray, side: str = "right") -> li
     return sorted(found, key=lambda contacts: contacts.cost)
 
 
-def best_of(count: int, make: Callable[[], T], *, is_good: Callable[[T], bool], cost: Callable[[T], float]) -> T:
+def best_of(
+    count: int, make: Callable[[], T], *, is_good: Callable[[T], bool], cost: Callable[[T], float]
+) -> T:
     """Return the first good one of at most ``count`` random attempts, or else the one with the lowest cost."""
     tries = []
     for _ in range(count):
@@ -176,7 +188,9 @@ def handedness(side: str) -> float:
     return 1.0 if side == "right" else -1.0
 
 
-def _centers(low: np.ndarray, high: np.ndarray, closing: np.ndarray, away: np.ndarray, from_above: bool) -> np.ndarray:
+def _centers(
+    low: np.ndarray, high: np.ndarray, closing: np.ndarray, away: np.ndarray, from_above: bool
+) -> np.ndarray:
     """[n, 3] a grid of points that the thumb and the fingers may close upon."""
     half = (high - low) / 2
     grids = []
@@ -194,11 +208,20 @@ def _centers(low: np.ndarray, high: np.ndarray, closing: np.ndarray, away: np.nd
 
 
 def _contacts_at(
-    solid: Solid, centers: np.ndarray, approach: np.ndarray, closing: np.ndarray, side: str, effort: float
+    solid: Solid,
+    centers: np.ndarray,
+    approach: np.ndarray,
+    closing: np.ndarray,
+    side: str,
+    effort: float,
 ) -> list[Contacts]:
     """Return the contacts of a hand that closes upon centers [n, 3]; ``effort`` is added to their cost."""
-    up_hand = np.cross(approach, closing) * handedness(side)  # from the little finger to the thumb's side of the hand
-    origins = centers[:, None] + _STACK[:, None] * up_hand  # [n, 5, 3]: the lines of the thumb and the fingers
+    up_hand = np.cross(approach, closing) * handedness(
+        side
+    )  # from the little finger to the thumb's side of the hand
+    origins = (
+        centers[:, None] + _STACK[:, None] * up_hand
+    )  # [n, 5, 3]: the lines of the thumb and the fingers
     lines = origins.reshape(-1, 3)
     enter, leave, normal_in, normal_out = solid.crossings(lines, closing)
     # The part of the object around each origin: merge the pieces whose intervals overlap the one that holds it.
@@ -219,13 +242,20 @@ def _contacts_at(
     start = start.reshape(-1, 5)
     facing_fingers = facing_fingers.reshape(-1, 5)
     above_table = origins[..., 2] > 0.007
-    fits = np.isfinite(start) & (room_before.reshape(-1, 5) > _FINGER_ROOM) & (facing_fingers > 0.6) & above_table
+    fits = (
+        np.isfinite(start)
+        & (room_before.reshape(-1, 5) > _FINGER_ROOM)
+        & (facing_fingers > 0.6)
+        & above_table
+    )
     middle_start = np.median(np.where(fits, start, 0.0)[:, 1:3], axis=1, keepdims=True)
     finger = fits & (np.abs(start - middle_start) < 0.025)
     end = end.reshape(-1, 5)[:, 0]
     facing_thumb = facing_thumb.reshape(-1, 5)[:, 0]
     room_after = room_after.reshape(-1, 5)[:, 0]
-    thumb = np.isfinite(end) & (room_after > _FINGER_ROOM) & (facing_thumb > 0.75) & above_table[:, 0]
+    thumb = (
+        np.isfinite(end) & (room_after > _FINGER_ROOM) & (facing_thumb > 0.75) & above_table[:, 0]
+    )
     width = end - start[:, 0]
     depth = _depth(solid, centers, approach)
     with np.errstate(invalid="ignore"):
@@ -239,7 +269,9 @@ def _contacts_at(
         points[0] = origins[i, 0] + (end[i] + SKIN) * closing
         points[fingers] = origins[i, fingers] + (start[i, fingers] - SKIN)[:, None] * closing
         middle = (points[0] + points[fingers].mean(axis=0)) / 2
-        lever = np.linalg.norm(np.cross(middle - solid.com, approach))  # of the weight about the grasp
+        lever = np.linalg.norm(
+            np.cross(middle - solid.com, approach)
+        )  # of the weight about the grasp
         cost = (
             effort
             + lever / 0.03

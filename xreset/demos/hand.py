@@ -55,8 +55,13 @@ def _thumb(angles: np.ndarray) -> np.ndarray:
     """[..., 4, 3] points of the thumb for its joint angles [..., 5]."""
     radial, palmar, twist, mcp, ip = np.moveaxis(angles, -1, 0)
     zero = np.zeros_like(twist)
-    first = np.stack((-np.cos(radial) * np.cos(palmar), -np.sin(palmar), np.sin(radial) * np.cos(palmar)), axis=-1)
-    bend = np.stack((zero, -np.sin(twist), -np.cos(twist)), axis=-1)  # where the tip goes when the thumb flexes
+    first = np.stack(
+        (-np.cos(radial) * np.cos(palmar), -np.sin(palmar), np.sin(radial) * np.cos(palmar)),
+        axis=-1,
+    )
+    bend = np.stack(
+        (zero, -np.sin(twist), -np.cos(twist)), axis=-1
+    )  # where the tip goes when the thumb flexes
     bend = bend - (bend * first).sum(axis=-1, keepdims=True) * first
     bend /= np.linalg.norm(bend, axis=-1, keepdims=True)
     flexion = np.stack((zero, mcp, mcp + ip), axis=-1)[..., None]

@@ -47,7 +47,9 @@ def read_ho3d(
     cameras = Path(cameras)
     folders = [path for path in sorted(Path(root, "train").glob("*/meta")) if path.is_dir()]
     if not folders:
-        raise DemoError(f"There is no HO-3D sequence in {root}: expected train/SEQUENCE/meta/0000.pkl below it.")
+        raise DemoError(
+            f"There is no HO-3D sequence in {root}: expected train/SEQUENCE/meta/0000.pkl below it."
+        )
     poses = {}
     for folder in folders:
         name = folder.parent.name
@@ -91,7 +93,9 @@ def _read_sequence(folder: Path, fps: float) -> dict[str, np.ndarray]:
     numbers = [number for number in frames if known[0] <= number <= known[-1]]
     joints, poses, names = zip(*(frames[number] for number in numbers), strict=True)
     if len(set(names)) > 1:
-        raise DemoError(f"{folder}: the object changes within the sequence: {shown(sorted(set(names)))}.")
+        raise DemoError(
+            f"{folder}: the object changes within the sequence: {shown(sorted(set(names)))}."
+        )
     return {
         "object": np.array(names[0]),
         "keypoints": np.stack(joints),
@@ -105,7 +109,9 @@ def _read_frame(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
     data = read_pickle(path)
     lacking = sorted({*_SHAPES, "objName"} - set(data))
     if lacking:
-        raise DemoError(f"{path} lacks {', '.join(lacking)}; it has {shown(list(data))}. Is it an annotation of HO-3D?")
+        raise DemoError(
+            f"{path} lacks {', '.join(lacking)}; it has {shown(list(data))}. Is it an annotation of HO-3D?"
+        )
     name = data["objName"]
     if not isinstance(name, str):
         raise DemoError(f"{path}: objName is {shown(name)}, expected a text.")

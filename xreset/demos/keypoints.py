@@ -132,7 +132,11 @@ def read_keypoints(path: str | Path, convention: Convention) -> Demos:
     files = [path]
     if path.is_dir():
         folder = path
-        files = [file for file in sorted(path.rglob("*")) if file.suffix in (".npz", ".csv") and file.is_file()]
+        files = [
+            file
+            for file in sorted(path.rglob("*"))
+            if file.suffix in (".npz", ".csv") and file.is_file()
+        ]
         if not files:
             raise DemoError(
                 f"There is no .npz and no .csv file below {path}. Give a folder with a file for each sequence."
@@ -156,7 +160,11 @@ def read_transform(path: str | Path) -> np.ndarray:
     try:
         if path.stat().st_size > _MATRIX_BYTES:
             raise ValueError(f"it has {path.stat().st_size} bytes")
-        T = np.load(path, mmap_mode="r", allow_pickle=False) if path.suffix == ".npy" else np.loadtxt(path, ndmin=2)
+        T = (
+            np.load(path, mmap_mode="r", allow_pickle=False)
+            if path.suffix == ".npy"
+            else np.loadtxt(path, ndmin=2)
+        )
     except Exception as error:  # numpy's parsers raise any kind of error
         raise DemoError(
             f"{path} cannot be read as a matrix: {shown(str(error))}. Write its four rows as four lines of four"
@@ -184,7 +192,9 @@ def _read_csv(path: Path, name: str) -> Iterator[dict[str, np.ndarray]]:
     arrays: dict[str, np.ndarray] = {}
     try:
         if path.stat().st_size > max_bytes():
-            raise ValueError(f"it has {path.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows")
+            raise ValueError(
+                f"it has {path.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows"
+            )
         with open(path, newline="", encoding="utf-8-sig") as file:
             rows = [row for row in csv.reader(file, strict=True) if row]
         columns = list(zip(*rows, strict=True))
@@ -199,22 +209,30 @@ def _read_csv(path: Path, name: str) -> Iterator[dict[str, np.ndarray]]:
                 numbers = np.column_stack([_numbers(table.pop(column)) for column in names])
                 arrays[field] = numbers.reshape(-1, *_FILE[field].shape[1:])
             elif field == "keypoints" or len(missing) < len(names):
-                raise ValueError(f"it lacks the columns {shown(missing)} of {field} (docs/demonstrations.md)")
+                raise ValueError(
+                    f"it lacks the columns {shown(missing)} of {field} (docs/demonstrations.md)"
+                )
     except (OSError, ValueError, csv.Error) as error:
         raise DemoError(f"{path} cannot be read as a CSV table: {error}.") from error
     texts = {text: table.pop(text) for text in _TEXTS if text in table}
     unknown = sorted(set(table) - {"frame"})
     if unknown:
-        logging.getLogger(__name__).warning("%s also has the columns %s, which are ignored.", path, shown(unknown))
+        logging.getLogger(__name__).warning(
+            "%s also has the columns %s, which are ignored.", path, shown(unknown)
+        )
     frames = range(len(rows) - 1)
     sequences = texts.pop("sequence", [name] * len(frames))
     for sequence, part in groupby(frames, key=sequences.__getitem__):
         own = list(part)
-        found = {"sequence": np.array(sequence)} | {field: values[own] for field, values in arrays.items()}
+        found = {"sequence": np.array(sequence)} | {
+            field: values[own] for field, values in arrays.items()
+        }
         for text, cells in texts.items():
             values = {cells[frame].strip() for frame in own}
             if len(values) > 1:
-                raise DemoError(f"{path}, sequence {sequence}: the column {text} changes: {shown(sorted(values))}.")
+                raise DemoError(
+                    f"{path}, sequence {sequence}: the column {text} changes: {shown(sorted(values))}."
+                )
             found[text] = np.array(values.pop())
         yield found
 
@@ -281,7 +299,9 @@ def _text(arrays: Mapping[str, np.ndarray], field: str, option: str | None) -> s
         raise DemoError(f"the {field} is neither in the file nor given. Add --{field}.")
     text = str(arrays[field]) if field in arrays else str(option)
     if option not in (None, text):
-        raise DemoError(f"the file says {field} {shown(text)}, but --{field} says {shown(option)}. Omit the option.")
+        raise DemoError(
+            f"the file says {field} {shown(text)}, but --{field} says {shown(option)}. Omit the option."
+        )
     if not text or not is_plain(text):
         raise DemoError(f"the {field} is {shown(text)}, expected a name of printable characters.")
     return text
@@ -297,7 +317,9 @@ def _hand_problems(points: np.ndarray, convention: Convention, side: str) -> Ite
             f"from the wrist to the middle finger's knuckle it is {palm:.3g} mm, expected 60 to 140 mm. Is --units"
             f" {convention.units} right? Keypoints must be metric and in space, not those of an image."
         )
-    lengths = {name: np.median(hand.bone_lengths(points[:, ORDERS[name]]).sum(axis=1)) for name in ORDERS}
+    lengths = {
+        name: np.median(hand.bone_lengths(points[:, ORDERS[name]]).sum(axis=1)) for name in ORDERS
+    }
     best = min(lengths, key=lambda name: lengths[name])
     if lengths[convention.order] > _ORDER_RATIO * lengths[best]:
         yield (
@@ -337,14 +359,20 @@ def _hand_problems(points: np.ndarray, convention: Convention, side: str) -> Ite
 def _object_pose(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray, Rotation]:
     """Return position [F, 3] and orientation of the object, in the file's unit and frame."""
     given = [name for name in _FILE if name.startswith("object_") and name in arrays]
-    if given not in (["object_pose"], ["object_pos", "object_quat_wxyz"], ["object_pos", "object_quat_xyzw"]):
+    if given not in (
+        ["object_pose"],
+        ["object_pos", "object_quat_wxyz"],
+        ["object_pos", "object_quat_xyzw"],
+    ):
         raise DemoError(
             "the object's pose must be given once, as object_pose (matrices) or as object_pos and"
             f" object_quat_wxyz or _xyzw; found {', '.join(given) or 'none'}."
         )
     name = given[-1]
     values = np.asarray(arrays[name], dtype=float)
-    pos = values[:, :3, 3] if name == "object_pose" else np.asarray(arrays["object_pos"], dtype=float)
+    pos = (
+        values[:, :3, 3] if name == "object_pose" else np.asarray(arrays["object_pos"], dtype=float)
+    )
     if not np.isfinite(values).all() or not np.isfinite(pos).all():
         raise DemoError(
             "the object's pose is unknown in some frames. Remove such frames at the ends, interpolate the others."
@@ -362,14 +390,18 @@ def _object_pose(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray, Rotation
     return pos, Rotation.from_quat(values, scalar_first=name == "object_quat_wxyz")
 
 
-def _evenly(arrays: Mapping[str, np.ndarray], convention: Convention, motion: Motion) -> tuple[float, Motion]:
+def _evenly(
+    arrays: Mapping[str, np.ndarray], convention: Convention, motion: Motion
+) -> tuple[float, Motion]:
     """Return the rate, and the motion at that rate: as it is, or interpolated between its own times."""
     if "time" not in arrays:
         rate = float(arrays["fps"]) if "fps" in arrays else convention.fps
         if rate is None:
             raise DemoError("it has neither times nor a rate. Add --fps, the frames per second.")
         if convention.fps not in (None, rate):
-            raise DemoError(f"the file says {rate:g} frames per second, but --fps says {convention.fps:g}.")
+            raise DemoError(
+                f"the file says {rate:g} frames per second, but --fps says {convention.fps:g}."
+            )
         return rate, motion
     time = np.asarray(arrays["time"], dtype=float)
     steps = np.diff(time)
@@ -377,7 +409,9 @@ def _evenly(arrays: Mapping[str, np.ndarray], convention: Convention, motion: Mo
         raise DemoError("time must increase from frame to frame.")
     own = 1 / float(np.median(steps))
     if not 2 <= own <= RATE[1] or (own > 500 and convention.fps is None):
-        raise DemoError(f"by its times it has {own:.4g} frames per second. Times must be in seconds.")
+        raise DemoError(
+            f"by its times it has {own:.4g} frames per second. Times must be in seconds."
+        )
     even = np.abs(steps * own - 1).max() <= _UNEVEN
     if convention.fps is None and not even:
         raise DemoError(
@@ -407,7 +441,9 @@ def _wrist(points: np.ndarray, side: str) -> Rotation:
     if side == "left":
         template[:, 0] *= -1
     found = points[:, _KNUCKLES]
-    covariance = np.einsum("ki,fkj->fij", template - template.mean(axis=0), found - found.mean(axis=1, keepdims=True))
+    covariance = np.einsum(
+        "ki,fkj->fij", template - template.mean(axis=0), found - found.mean(axis=1, keepdims=True)
+    )
     U, _, Vt = np.linalg.svd(covariance)
     Vt[:, 2] *= np.linalg.det(U @ Vt)[:, None]
     return Rotation.from_matrix((U @ Vt).transpose(0, 2, 1))

@@ -56,7 +56,10 @@ def symmetry(obj: ObjectSpec) -> Symmetry:
 
     axes = np.linalg.svd(points - center)[2]
     options = {"maxfev": 80, "initial_simplex": 0.1 * np.eye(4, 3)}
-    fits = [minimize(mean_square, np.zeros(3), (axis,), method="Nelder-Mead", options=options) for axis in axes]
+    fits = [
+        minimize(mean_square, np.zeros(3), (axis,), method="Nelder-Mead", options=options)
+        for axis in axes
+    ]
     best = int(np.argmin([fit.fun for fit in fits]))
     normal, offset = _plane(fits[best].x, axes[best], center)
     deviation = np.percentile(deviations(fits[best].x, axes[best]), 95)
@@ -74,17 +77,23 @@ def mirrored(demos: Demos, symmetries: Mapping[str, Symmetry], *, tolerance: flo
     Raises:
         DemoError: no object is symmetric enough; the message lists the deviations.
     """
-    measured = {name: symmetries[name].deviation for name in sorted(set(demos.object_name.tolist()))}
+    measured = {
+        name: symmetries[name].deviation for name in sorted(set(demos.object_name.tolist()))
+    }
     kept = [name for name, deviation in measured.items() if deviation <= tolerance]
     if not kept:
-        listed = ", ".join(f"{name} {1e3 * deviation:.1f} mm" for name, deviation in measured.items())
+        listed = ", ".join(
+            f"{name} {1e3 * deviation:.1f} mm" for name, deviation in measured.items()
+        )
         raise DemoError(
             f"No object is its own mirror image within {1e3 * tolerance:g} mm: {listed}. Raise --tolerance or"
             " omit xreset demos mirror."
         )
     demos = levelled(demos).select(objects=kept)
     shift = np.array([2.0 * TableSpec().center[0], 0.0, 0.0])
-    symmetry_of_frame = [symmetries[name] for name in demos.object_name[demos.sequence_of_frame].tolist()]
+    symmetry_of_frame = [
+        symmetries[name] for name in demos.object_name[demos.sequence_of_frame].tolist()
+    ]
     normals = np.array([found.normal for found in symmetry_of_frame])
     offsets = np.array([found.offset for found in symmetry_of_frame])
     turn = Rotation.from_quat(demos.object_quat_wxyz, scalar_first=True).as_matrix()
@@ -105,7 +114,9 @@ def mirrored(demos: Demos, symmetries: Mapping[str, Symmetry], *, tolerance: flo
     )
 
 
-def _plane(parameters: np.ndarray, axis: np.ndarray, center: np.ndarray) -> tuple[np.ndarray, float]:
+def _plane(
+    parameters: np.ndarray, axis: np.ndarray, center: np.ndarray
+) -> tuple[np.ndarray, float]:
     """Return normal and offset of the plane through the center across an axis, tilted by two angles [rad] and moved by
     a length [0.1 m]."""
     u = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])

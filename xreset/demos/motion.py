@@ -54,8 +54,13 @@ class HandPath:
 
 def random_timing(fps: float, rng: np.random.Generator) -> Timing:
     """Draw the timing of a demonstration of about 2.4 s whose object leaves the table after about 1.15 s."""
-    durations = [rng.uniform(*span) for span in ((0.75, 0.95), (0.15, 0.25), (0.05, 0.1), (0.8, 1.0), (0.25, 0.45))]
-    reach, close, lift, end, last = (round(float(seconds) * fps) for seconds in np.cumsum(durations))
+    durations = [
+        rng.uniform(*span)
+        for span in ((0.75, 0.95), (0.15, 0.25), (0.05, 0.1), (0.8, 1.0), (0.25, 0.45))
+    ]
+    reach, close, lift, end, last = (
+        round(float(seconds) * fps) for seconds in np.cumsum(durations)
+    )
     return Timing(frames=last + 1, reach=reach, close=close, lift=lift, end=end)
 
 
@@ -74,7 +79,9 @@ def object_path(
     goal = pos + np.array([rng.uniform(-0.06, 0.06), rng.uniform(-0.14, 0.0), rng.uniform(*LIFT)])
     heading = rng.uniform(0, 2 * np.pi)
     tilt = np.radians(rng.uniform(10.0, 40.0)) * np.array([np.cos(heading), np.sin(heading), 0.0])
-    turn = Rotation.from_rotvec(tilt) * Rotation.from_euler("z", np.radians(rng.uniform(-45.0, 45.0)))
+    turn = Rotation.from_rotvec(tilt) * Rotation.from_euler(
+        "z", np.radians(rng.uniform(-45.0, 45.0))
+    )
     frame = np.arange(timing.frames)
     rise = _minimum_jerk(frame, timing.lift, timing.end)
     clear_of_table = timing.lift + 0.2 * (timing.end - timing.lift)
@@ -96,7 +103,9 @@ def clear_approach(grasp: Grasp, timing: Timing, rng: np.random.Generator) -> Ha
 
 def place_hand(pos: np.ndarray, rotation: Rotation, angles: np.ndarray, side: str) -> np.ndarray:
     """[T, 21, 3] keypoints of a hand for wrist positions [T, 3], T wrist orientations and joint angles [T, 17]."""
-    return np.einsum("nij,nkj->nki", rotation.as_matrix(), hand.keypoints(angles, side)) + pos[:, None]
+    return (
+        np.einsum("nij,nkj->nki", rotation.as_matrix(), hand.keypoints(angles, side)) + pos[:, None]
+    )
 
 
 def _approach(grasp: Grasp, timing: Timing, rng: np.random.Generator) -> HandPath:
@@ -119,7 +128,10 @@ def _approach(grasp: Grasp, timing: Timing, rng: np.random.Generator) -> HandPat
     entering = _minimum_jerk(frame, 0.5 * timing.reach, timing.close)[:, None]
     wrist_pos = start + coming * (before - start) + entering * (grasp.wrist_pos - before)
     turning = _minimum_jerk(frame, 0, 0.85 * timing.reach)[:, None]
-    wrist_rot = Rotation.from_rotvec((1 - turning) * (start_rot * grasp.wrist_rot.inv()).as_rotvec()) * grasp.wrist_rot
+    wrist_rot = (
+        Rotation.from_rotvec((1 - turning) * (start_rot * grasp.wrist_rot.inv()).as_rotvec())
+        * grasp.wrist_rot
+    )
 
     opened = np.clip(grasp.angles - _OPENING, hand.LOWER, hand.UPPER)
     opening = _minimum_jerk(frame, 0.1 * timing.reach, 0.65 * timing.reach)[:, None]
@@ -127,7 +139,9 @@ def _approach(grasp: Grasp, timing: Timing, rng: np.random.Generator) -> HandPat
     angles = hand.RELAXED + opening * (opened - hand.RELAXED) + closing * (grasp.angles - opened)
     points = place_hand(wrist_pos, wrist_rot, angles, grasp.side)[: timing.lift]
     gap = min(grasp.solid.distance(points).min(), points[..., 2].min())
-    return HandPath(grasp=grasp, wrist_pos=wrist_pos, wrist_rot=wrist_rot, angles=angles, gap=float(gap))
+    return HandPath(
+        grasp=grasp, wrist_pos=wrist_pos, wrist_rot=wrist_rot, angles=angles, gap=float(gap)
+    )
 
 
 def _minimum_jerk(frame: np.ndarray, start: float, end: float) -> np.ndarray:

@@ -60,7 +60,9 @@ def with_noise(demos: Demos, noise: HandNoise, seed: int = 0) -> Demos:
         errors *= np.minimum(1.0, noise.cap / np.maximum(size, 1e-12))
         seen = demos.hand_valid[frames]
         hand = keypoints[frames][seen]
-        palm = Rotation.from_quat(demos.wrist_quat_wxyz[frames][seen], scalar_first=True).as_matrix()
+        palm = Rotation.from_quat(
+            demos.wrist_quat_wxyz[frames][seen], scalar_first=True
+        ).as_matrix()
         moved = _with_bones(hand, np.einsum("fij,fkj->fki", palm, errors[seen]))
         keypoints[frames][seen] = moved + offset
     return replace(demos, hand_keypoints=keypoints.astype(demos.hand_keypoints.dtype))
@@ -81,5 +83,7 @@ def _with_bones(hand: np.ndarray, errors: np.ndarray) -> np.ndarray:
     for child, parent in enumerate(PARENTS, start=1):
         length = np.linalg.norm(hand[:, child] - hand[:, parent], axis=-1, keepdims=True)
         bone = wanted[:, child] - wanted[:, parent]
-        moved[:, child] = moved[:, parent] + bone * (length / np.linalg.norm(bone, axis=-1, keepdims=True))
+        moved[:, child] = moved[:, parent] + bone * (
+            length / np.linalg.norm(bone, axis=-1, keepdims=True)
+        )
     return moved

@@ -37,7 +37,9 @@ class _Call:
         self.state = state
 
 
-class _Unpickler(pickle._Unpickler):  # the one in C reserves memory for any index that a file states
+class _Unpickler(
+    pickle._Unpickler
+):  # the one in C reserves memory for any index that a file states
     dispatch: dict[int, Any] = pickle._Unpickler.dispatch.copy()
 
     def find_class(self, module: str, name: str) -> Any:

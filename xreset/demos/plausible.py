@@ -49,11 +49,16 @@ def doubts(demos: Demos) -> list[str]:
     at_goal = (distance < _SAME_PLACE) & (angle < _SAME_TURN)
     for wrong, sentence in (
         (off_table, "far from the table's top, z = 0. Are these coordinates of a camera?"),
-        (at_goal, "at its goal already. A policy that leaves the object untouched solves such a demonstration."),
+        (
+            at_goal,
+            "at its goal already. A policy that leaves the object untouched solves such a demonstration.",
+        ),
     ):
         if wrong.any():
             first = demos.sequence_name[np.argmax(wrong)]
-            found.append(f"{wrong.sum()} of {len(demos)} sequences begin with the object {sentence} First: {first}.")
+            found.append(
+                f"{wrong.sum()} of {len(demos)} sequences begin with the object {sentence} First: {first}."
+            )
     return found
 
 
@@ -61,7 +66,10 @@ def start_to_goal(demos: Demos) -> tuple[np.ndarray, np.ndarray]:
     """Return the distance [S] in metres and the angle [S] in radians from each object's first to its last pose."""
     start_pos, start_quat = demos.start_pose
     goal_pos, goal_quat = demos.goal_pose
-    turn = Rotation.from_quat(goal_quat, scalar_first=True) * Rotation.from_quat(start_quat, scalar_first=True).inv()
+    turn = (
+        Rotation.from_quat(goal_quat, scalar_first=True)
+        * Rotation.from_quat(start_quat, scalar_first=True).inv()
+    )
     return np.linalg.norm(goal_pos - start_pos, axis=1), turn.magnitude()
 
 

@@ -86,7 +86,9 @@ def synthesize(
         starts = [_start(spec, np.array(up), side) for up in _REST_UP.get(spec.name, (_Z,))]
         for index in range(per_object):
             name = f"{SUBJECT}/{spec.name}_{side}_{seed}_{index:03d}"
-            rng = np.random.default_rng([seed, index, zlib.crc32(spec.name.encode()), side == "left"])
+            rng = np.random.default_rng(
+                [seed, index, zlib.crc32(spec.name.encode()), side == "left"]
+            )
             parts.append(_sequence(spec, starts, name, side, fps, rng))
             progress(len(parts), len(specs) * per_object)
     return merge_demos(parts)
@@ -114,7 +116,9 @@ def _sequence(
     # From the lift on, the hand moves with the object.
     moved = object_rot * solid.rotation.inv()
     held = (np.arange(timing.frames) >= timing.lift)[:, None]
-    wrist_pos = np.where(held, moved.apply(grasp.wrist_pos - solid.pos) + object_pos, path.wrist_pos)
+    wrist_pos = np.where(
+        held, moved.apply(grasp.wrist_pos - solid.pos) + object_pos, path.wrist_pos
+    )
     wrist_quat = np.where(held, (moved * grasp.wrist_rot).as_quat(), path.wrist_rot.as_quat())
     wrist_rot = Rotation.from_quat(wrist_quat)
     return one_sequence(
@@ -133,7 +137,11 @@ def _sequence(
 def _start(obj: ObjectSpec, up: np.ndarray, side: str) -> tuple[Solid, list[Contacts]]:
     """Return the object at rest at the origin, and the best plans to hold it."""
     quat = resting_orientation(obj, up)
-    solid = Solid.of(obj, np.array([0.0, 0.0, rest_height(obj, quat)]), Rotation.from_quat(quat, scalar_first=True))
+    solid = Solid.of(
+        obj,
+        np.array([0.0, 0.0, rest_height(obj, quat)]),
+        Rotation.from_quat(quat, scalar_first=True),
+    )
     plans = plan_contacts(solid, np.radians(np.arange(0.0, 360.0, 20.0)), side)
     if not plans:
         raise DemoError(
@@ -143,7 +151,9 @@ def _start(obj: ObjectSpec, up: np.ndarray, side: str) -> tuple[Solid, list[Cont
     return solid, [plan for plan in plans if plan.cost < plans[0].cost + _NEAR_BEST]
 
 
-def _grasp(obj: ObjectSpec, resting: Solid, plans: Sequence[Contacts], side: str, rng: np.random.Generator) -> Grasp:
+def _grasp(
+    obj: ObjectSpec, resting: Solid, plans: Sequence[Contacts], side: str, rng: np.random.Generator
+) -> Grasp:
     """Return a grasp of the object somewhere on the table."""
 
     def attempt() -> Grasp:
@@ -164,6 +174,10 @@ def _grasp(obj: ObjectSpec, resting: Solid, plans: Sequence[Contacts], side: str
     return best_of(
         _TRIES,
         attempt,
-        is_good=lambda grasp: grasp.tip_error < _GOOD_TIP_ERROR and grasp.penetration < _GOOD_PENETRATION,
-        cost=lambda grasp: grasp.tip_error / _GOOD_TIP_ERROR + grasp.penetration / _GOOD_PENETRATION,
+        is_good=lambda grasp: (
+            grasp.tip_error < _GOOD_TIP_ERROR and grasp.penetration < _GOOD_PENETRATION
+        ),
+        cost=lambda grasp: (
+            grasp.tip_error / _GOOD_TIP_ERROR + grasp.penetration / _GOOD_PENETRATION
+        ),
     )

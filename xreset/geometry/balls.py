@@ -137,7 +137,9 @@ def _joined(parts: Sequence[np.ndarray], *shape: int) -> Tensor:
     return torch.as_tensor(np.concatenate([np.zeros((0, *shape)), *parts]))
 
 
-def bounding_balls(centers: Sequence[np.ndarray], radii: Sequence[np.ndarray]) -> tuple[Tensor, Tensor]:
+def bounding_balls(
+    centers: Sequence[np.ndarray], radii: Sequence[np.ndarray]
+) -> tuple[Tensor, Tensor]:
     """Return centers [G, 3] and radii [G] of one ball around each of G groups of balls, centers [n, 3] and radii
     [n]."""
     middles = []
@@ -146,7 +148,9 @@ def bounding_balls(centers: Sequence[np.ndarray], radii: Sequence[np.ndarray]) -
         middle = (own_centers.max(axis=0) + own_centers.min(axis=0)) / 2
         middles.append(middle)
         reaches.append((np.linalg.norm(own_centers - middle, axis=1) + own_radii).max())
-    return torch.as_tensor(np.array(middles).reshape(-1, 3)), torch.tensor(reaches, dtype=torch.float64)
+    return torch.as_tensor(np.array(middles).reshape(-1, 3)), torch.tensor(
+        reaches, dtype=torch.float64
+    )
 
 
 def _apart(centers: np.ndarray, radii: np.ndarray, spacing: float) -> np.ndarray:
@@ -192,7 +196,9 @@ def inscribed_balls(geometry: Geometry) -> tuple[np.ndarray, float]:
 def _grid(half: Iterable[float], radius: float) -> np.ndarray:
     """[n, 3] an even grid over [-half, half] with steps of at most the radius or :data:`SPACING`."""
     step = max(radius, SPACING)
-    rows = [np.linspace(-h, h, int(np.ceil(2 * h / step - 1e-9)) + 1) if h > 0 else [0.0] for h in half]
+    rows = [
+        np.linspace(-h, h, int(np.ceil(2 * h / step - 1e-9)) + 1) if h > 0 else [0.0] for h in half
+    ]
     return np.array(list(product(*rows)))
 
 

@@ -45,7 +45,9 @@ def support_points(shape: Shape) -> tuple[np.ndarray, float]:
     elif geometry.kind == "cylinder":
         angle = np.arange(_RIM_POINTS) * (2 * np.pi / _RIM_POINTS)
         rim = np.stack((size[0] * np.cos(angle), size[0] * np.sin(angle)), axis=1)
-        points = np.concatenate([np.column_stack((rim, np.full(_RIM_POINTS, z))) for z in (-size[1], size[1])])
+        points = np.concatenate(
+            [np.column_stack((rim, np.full(_RIM_POINTS, z))) for z in (-size[1], size[1])]
+        )
     else:
         points = np.asarray(geometry.vertices, dtype=float)
     return points @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3], radius
@@ -139,7 +141,9 @@ class SelfCollision:
         self._center = np.array(centers).reshape(-1, 3)
         self._radius = np.array(radii)
         pairs = combinations(dict.fromkeys(self._link), 2)
-        counted = [pair for pair in pairs if _may_collide(robot, kinematics.tree, *pair, moved_by_arm)]
+        counted = [
+            pair for pair in pairs if _may_collide(robot, kinematics.tree, *pair, moved_by_arm)
+        ]
         self._count(counted)
         home = kinematics.lower.new_tensor(robot.home[kinematics.joint_indices])
         overlapping = self.near(kinematics.link_poses(kinematics.clamp(home))[None].numpy(), 0.0)
@@ -172,7 +176,10 @@ class SelfCollision:
             arguments = []
             for shape in self._pairs[pair]:
                 pose = T[b, shape] @ self._T_link_shape[shape]
-                arguments += [self._geometry[shape], self._coal.Transform3s(pose[:3, :3], pose[:3, 3])]
+                arguments += [
+                    self._geometry[shape],
+                    self._coal.Transform3s(pose[:3, :3], pose[:3, 3]),
+                ]
             result.clear()
             distance = self._coal.distance(*arguments, request, result)
             if distance < margin:
@@ -193,7 +200,9 @@ def _may_collide(robot: RobotSpec, tree: RobotTree, a: str, b: str, moved_by_arm
     """Return whether a pair of links counts: see :class:`SelfCollision`."""
     joint_above = {joint.child: joint for joint in tree.joints}
     bodies = {tree.moving_ancestor(a), tree.moving_ancestor(b)}
-    parents = {tree.moving_ancestor(joint_above[body].parent) for body in bodies if body in joint_above}
+    parents = {
+        tree.moving_ancestor(joint_above[body].parent) for body in bodies if body in joint_above
+    }
     if len(bodies) == 1 or bodies & parents:
         return False
     for pair in robot.collision_exclude:

@@ -25,10 +25,14 @@ def mass_matrix(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
     links = [kinematics.tree.link(name) for name in kinematics.link_names]
     com = torch.tensor(np.stack([link.com for link in links]))
     q = torch.as_tensor(joint_pos, dtype=torch.float64)
-    _, rot, linear, angular = (x.numpy() for x in kinematics.jacobian(q, kinematics.link_names, com))
+    _, rot, linear, angular = (
+        x.numpy() for x in kinematics.jacobian(q, kinematics.link_names, com)
+    )
     mass = np.array([link.mass for link in links])
     inertia = rot @ np.stack([link.inertia for link in links]) @ rot.transpose(0, 2, 1)
-    return np.einsum("l,lai,laj->ij", mass, linear, linear) + np.einsum("lai,lab,lbj->ij", angular, inertia, angular)
+    return np.einsum("l,lai,laj->ij", mass, linear, linear) + np.einsum(
+        "lai,lab,lbj->ij", angular, inertia, angular
+    )
 
 
 def drive_shares(robot: RobotSpec) -> np.ndarray:

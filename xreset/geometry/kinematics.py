@@ -107,7 +107,9 @@ class Kinematics:
                 )
             driven.add(mimics[joint.name].source if joint.name in mimics else joint.name)
         if unknown := driven - actuated:
-            raise RobotError(f"robot {robot.name!r}: mimic joints follow {sorted(unknown)}, which are not actuated.")
+            raise RobotError(
+                f"robot {robot.name!r}: mimic joints follow {sorted(unknown)}, which are not actuated."
+            )
         indices = [i for i, name in enumerate(robot.joint_names) if name in driven]
         self.joint_indices = np.array(indices, dtype=np.int64)
         """[J] indices of this kinematics' joints in the robot's joint order; all of them when the root is the
@@ -136,7 +138,9 @@ class Kinematics:
             coupling[row, source] = mimic.multiplier
             constant[row] = mimic.offset
             if mimic.multiplier:
-                ends = [(end - mimic.offset) / mimic.multiplier for end in (joint.lower, joint.upper)]
+                ends = [
+                    (end - mimic.offset) / mimic.multiplier for end in (joint.lower, joint.upper)
+                ]
                 lower[source] = max(lower[source], min(ends))
                 upper[source] = min(upper[source], max(ends))
         self._coupling = self._tensor(coupling)
@@ -310,7 +314,11 @@ class Kinematics:
                     origin = origin + axis * values[:, joint, None]
                 else:
                     still, turn, turn_twice = rotation.split(3, dim=-1)
-                    rotation = still + sines[:, joint, None, None] * turn + cosines[:, joint, None, None] * turn_twice
+                    rotation = (
+                        still
+                        + sines[:, joint, None, None] * turn
+                        + cosines[:, joint, None, None] * turn_twice
+                    )
             rotations[i] = rotation
             positions[i] = origin
         rot = torch.stack([rotations[i] for i in wanted], dim=1)

@@ -88,7 +88,9 @@ def matrix_to_quat(R: Tensor) -> Tensor:
     f = symmetric[..., 2, 1]
     t = torch.stack((1 + x + y + z, 1 + x - y - z, 1 - x + y - z, 1 - x - y + z), dim=-1)
     t0, t1, t2, t3 = t.unbind(-1)
-    candidates = torch.stack((t0, a, b, c, a, t1, d, e, b, d, t2, f, c, e, f, t3), dim=-1).unflatten(-1, (4, 4))
+    candidates = torch.stack(
+        (t0, a, b, c, a, t1, d, e, b, d, t2, f, c, e, f, t3), dim=-1
+    ).unflatten(-1, (4, 4))
     best = t.argmax(dim=-1)[..., None, None].expand(*t.shape[:-1], 1, 4)
     return quat_normalize(candidates.gather(-2, best).squeeze(-2))
 

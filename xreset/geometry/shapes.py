@@ -45,7 +45,9 @@ def transform(R: ArrayLike, position: ArrayLike) -> np.ndarray:
 def box(center: ArrayLike, size: Sequence[float]) -> Shape:
     """Make an axis-aligned box of edge lengths ``size``."""
     half = tuple(float(edge) / 2 for edge in size)
-    return Shape(geometry=Geometry(kind="box", size=half), T_body_shape=transform(np.eye(3), center))
+    return Shape(
+        geometry=Geometry(kind="box", size=half), T_body_shape=transform(np.eye(3), center)
+    )
 
 
 def cylinder(center: ArrayLike, radius: float, height: float) -> Shape:
@@ -72,11 +74,15 @@ def hull(points: np.ndarray, tolerance: float = 0.0) -> Shape:
         convex = ConvexHull(points)
     except (QhullError, ValueError) as error:
         reason = str(error).splitlines()[0]
-        raise ObjectError(f"{len(points)} points span no volume, so they have no convex hull: {reason}") from error
+        raise ObjectError(
+            f"{len(points)} points span no volume, so they have no convex hull: {reason}"
+        ) from error
     index = np.full(len(points), -1)
     index[convex.vertices] = np.arange(len(convex.vertices))
     normals = _triangle_normals(points[convex.simplices])
-    inward = (normals * convex.equations[:, :3]).sum(axis=1) < 0  # qhull's triangles have no consistent winding
+    inward = (normals * convex.equations[:, :3]).sum(
+        axis=1
+    ) < 0  # qhull's triangles have no consistent winding
     faces = convex.simplices.copy()
     faces[inward] = faces[inward][:, ::-1]
     return Shape(
@@ -129,8 +135,13 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
         _check_memory(path, size)
         # Processing would drop damaged vertices silently.
         scene = trimesh.load_scene(path, skip_materials=True, process=False)
-        sizes = [scene.geometry[scene.graph[node][1]].vertices.nbytes for node in scene.graph.nodes_geometry]
-        _check_memory(path, _PER_VERTEX_BYTE * sum(sizes))  # a scene may show a mesh any number of times
+        sizes = [
+            scene.geometry[scene.graph[node][1]].vertices.nbytes
+            for node in scene.graph.nodes_geometry
+        ]
+        _check_memory(
+            path, _PER_VERTEX_BYTE * sum(sizes)
+        )  # a scene may show a mesh any number of times
         mesh = scene.to_mesh()
     except ObjectError:
         raise
@@ -204,7 +215,9 @@ def shape_mesh(shape: Shape, *, coarse: bool = False) -> trimesh.Trimesh:
     elif geometry.kind == "sphere":
         mesh = trimesh.creation.icosphere(2 if coarse else 3, size[0])
     elif geometry.kind == "cylinder":
-        mesh = trimesh.creation.cylinder(size[0], 2 * size[1], sections=24 if coarse else CYLINDER_SECTIONS)
+        mesh = trimesh.creation.cylinder(
+            size[0], 2 * size[1], sections=24 if coarse else CYLINDER_SECTIONS
+        )
     elif geometry.kind == "capsule":
         count = (10, 14) if coarse else (32, 32)
         mesh = trimesh.creation.capsule(radius=size[0], height=2 * size[1], count=count)
@@ -229,10 +242,14 @@ def half_spaces(shape: Shape) -> np.ndarray:
     """[P, 4] planes of a convex shape, (outward unit normal, offset): x is inside where normal . x + offset <= 0 for
     all."""
     vertices = np.asarray(shape_mesh(shape).vertices, dtype=float)
-    return np.unique(ConvexHull(vertices).equations.round(9), axis=0)  # coplanar triangles share a plane
+    return np.unique(
+        ConvexHull(vertices).equations.round(9), axis=0
+    )  # coplanar triangles share a plane
 
 
-def mass_properties(vertices: np.ndarray, faces: np.ndarray, mass: float) -> tuple[np.ndarray, np.ndarray]:
+def mass_properties(
+    vertices: np.ndarray, faces: np.ndarray, mass: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Return center of mass [3] and inertia [3, 3] about it of a closed mesh of uniform density and the given mass.
 
     In a mesh of several closed parts each part counts in full, so a volume where two parts overlap counts twice.
@@ -243,7 +260,9 @@ def mass_properties(vertices: np.ndarray, faces: np.ndarray, mass: float) -> tup
     return np.asarray(solid.center_mass), np.asarray(solid.inertia) * (mass / solid.mass)
 
 
-def shell_properties(vertices: np.ndarray, faces: np.ndarray, mass: float) -> tuple[np.ndarray, np.ndarray]:
+def shell_properties(
+    vertices: np.ndarray, faces: np.ndarray, mass: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Return center of mass [3] and inertia [3, 3] about it of a thin wall of constant thickness along the triangles.
 
     The second moment of a triangle, the mean of x x^T, is (the sum over its corners + that of the corners' sum) / 12.
@@ -254,7 +273,9 @@ def shell_properties(vertices: np.ndarray, faces: np.ndarray, mass: float) -> tu
     com = np.einsum("f,fi->i", weight, corners.mean(axis=1)) / mass
     local = corners - com
     total = local.sum(axis=1)
-    second = np.einsum("f,fki,fkj->ij", weight, local, local) + np.einsum("f,fi,fj->ij", weight, total, total)
+    second = np.einsum("f,fki,fkj->ij", weight, local, local) + np.einsum(
+        "f,fi,fj->ij", weight, total, total
+    )
     second /= 12
     return com, np.trace(second) * np.eye(3) - second
 

@@ -64,13 +64,17 @@ class Surface:
             return inside[tuple(index.T)]
 
         outward = _GRID_SPACING * np.asarray(mesh.face_normals)[owners]
-        exposed = ~(is_inside(points + outward) & is_inside(points - outward))  # not where pieces overlap
+        exposed = ~(
+            is_inside(points + outward) & is_inside(points - outward)
+        )  # not where pieces overlap
         self._owners = owners[exposed]
         self._tree = cKDTree(points[exposed])
 
         flat_nodes = nodes.reshape(-1, 3)
         distance, _ = self._tree.query(flat_nodes)
-        near = distance < 2 * _GRID_SPACING + _SAMPLE_SPACING  # farther nodes keep the distance to the nearest sample
+        near = (
+            distance < 2 * _GRID_SPACING + _SAMPLE_SPACING
+        )  # farther nodes keep the distance to the nearest sample
         _, distance[near] = self.nearest(flat_nodes[near])
         signed = np.where(inside.reshape(-1), -distance, distance).reshape(counts)
         self.field = DistanceFields.on_grid(signed, origin, _GRID_SPACING, self.low, self.high)
@@ -88,7 +92,9 @@ class Surface:
 
         _, near = self._tree.query(points, k=_CANDIDATES)
         triangles = self._triangles[self._owners[near].reshape(-1)]
-        candidates = trimesh.triangles.closest_point(triangles, np.repeat(points, _CANDIDATES, axis=0))
+        candidates = trimesh.triangles.closest_point(
+            triangles, np.repeat(points, _CANDIDATES, axis=0)
+        )
         candidates = candidates.reshape(-1, _CANDIDATES, 3)
         distances = np.linalg.norm(candidates - points[:, None], axis=-1)
         rows = np.arange(len(points))
@@ -106,7 +112,11 @@ def _nodes_inside(pieces: Sequence[Shape], nodes: np.ndarray) -> np.ndarray:
     inside = np.zeros(len(shifted), dtype=bool)
     for piece in pieces:
         vertices, _ = surface_of([piece])
-        in_box = ((shifted >= vertices.min(axis=0)) & (shifted <= vertices.max(axis=0))).all(axis=1).nonzero()[0]
+        in_box = (
+            ((shifted >= vertices.min(axis=0)) & (shifted <= vertices.max(axis=0)))
+            .all(axis=1)
+            .nonzero()[0]
+        )
         planes = half_spaces(piece)
         height = shifted[in_box] @ planes[:, :3].T + planes[:, 3]
         inside[in_box[(height <= 0).all(axis=1)]] = True

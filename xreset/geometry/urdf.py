@@ -116,7 +116,9 @@ class RobotTree:
     def _named(self, kind: str, parts, name: str):
         by_name = {part.name: part for part in parts}
         if name not in by_name:
-            raise RobotError(f"robot {self.name!r} has no {kind} {name!r}. Choose from: {', '.join(by_name)}.")
+            raise RobotError(
+                f"robot {self.name!r} has no {kind} {name!r}. Choose from: {', '.join(by_name)}."
+            )
         return by_name[name]
 
     def below(self, root: str) -> list[str]:
@@ -167,7 +169,9 @@ def load_urdf(path: str | Path) -> RobotTree:
         raise RobotError(f"{shown(str(path))} is not a file. Expected a URDF there.")
     path = Path(path).resolve()
     if path.stat().st_size > max_bytes() // 16:
-        raise RobotError(f"{path} has {path.stat().st_size >> 20} MB, which is too large for a URDF.")
+        raise RobotError(
+            f"{path} has {path.stat().st_size >> 20} MB, which is too large for a URDF."
+        )
     files = (path, *mesh_files(path))
     return _load(path, tuple(file.stat().st_mtime_ns for file in files))
 
@@ -176,7 +180,12 @@ def parse_xml(path: Path) -> Element:
     """Return the root element of a file, or raise ``RobotError``; expat refuses entities that grow to any size."""
     try:
         return ElementTree.parse(path).getroot()
-    except (OSError, ElementTree.ParseError, ValueError, LookupError) as error:  # the last two: encodings
+    except (
+        OSError,
+        ElementTree.ParseError,
+        ValueError,
+        LookupError,
+    ) as error:  # the last two: encodings
         raise RobotError(f"{path} cannot be read as XML: {shown(str(error))}") from error
 
 
@@ -194,7 +203,9 @@ def _load(path: Path, changed: tuple[int, ...]) -> RobotTree:
     if xml.tag == "mujoco":
         raise RobotError(f"{path} is MJCF, not URDF; `xreset robots import` makes a robot of it.")
     if xml.tag != "robot":
-        raise RobotError(f"{path} starts with <{shown(xml.tag)[1:-1]}>, which is not a URDF. Expected <robot>.")
+        raise RobotError(
+            f"{path} starts with <{shown(xml.tag)[1:-1]}>, which is not a URDF. Expected <robot>."
+        )
     try:
         with np.errstate(invalid="ignore"):  # check_tree refuses what is not finite
             robot = _parsed(xml)
@@ -205,7 +216,9 @@ def _load(path: Path, changed: tuple[int, ...]) -> RobotTree:
     except RobotError as error:
         raise RobotError(f"{path} cannot be read as a URDF: {error}") from error
     except Exception as error:  # yourdfpy raises whatever its parsing meets
-        raise RobotError(f"{path} cannot be read as a URDF: {shown(f'{type(error).__name__}: {error}')}") from error
+        raise RobotError(
+            f"{path} cannot be read as a URDF: {shown(f'{type(error).__name__}: {error}')}"
+        ) from error
     return tree
 
 
@@ -240,10 +253,14 @@ def _ordered(name: str, links: list[Link], joints: list[Joint]) -> RobotTree:
     for joint in joints:
         for end in (joint.parent, joint.child):
             if end not in link_by_name:
-                raise RobotError(f"joint {joint.name!r} names link {end!r}, which the file does not define.")
+                raise RobotError(
+                    f"joint {joint.name!r} names link {end!r}, which the file does not define."
+                )
     roots = [link for link in link_by_name if link not in joint_above]
     if len(roots) != 1:
-        raise RobotError(f"expected one root link, found {len(roots)} ({', '.join(roots) or 'none'}).")
+        raise RobotError(
+            f"expected one root link, found {len(roots)} ({', '.join(roots) or 'none'})."
+        )
     order: list[str] = []
     stack = list(roots)
     while stack:
@@ -252,7 +269,9 @@ def _ordered(name: str, links: list[Link], joints: list[Joint]) -> RobotTree:
         children = [joint.child for joint in joints if joint.parent == parent]
         stack.extend(reversed(children))
     if len(order) != len(links):
-        raise RobotError(f"links {sorted(set(link_by_name) - set(order))} are not connected to the root {roots[0]!r}.")
+        raise RobotError(
+            f"links {sorted(set(link_by_name) - set(order))} are not connected to the root {roots[0]!r}."
+        )
     return RobotTree(
         name=name,
         root=roots[0],
@@ -271,7 +290,9 @@ def check_tree(tree: RobotTree) -> None:
             parts += [shape.T_body_shape, geometry.size]
             if geometry.vertices is not None:
                 parts.append(geometry.vertices)
-            positive = geometry.size[:1] if geometry.kind == "capsule" else geometry.size  # a capsule may be a ball
+            positive = (
+                geometry.size[:1] if geometry.kind == "capsule" else geometry.size
+            )  # a capsule may be a ball
             least = min(positive, default=math.inf)
             if least < _SMALLEST:
                 raise RobotError(
@@ -284,7 +305,9 @@ def check_tree(tree: RobotTree) -> None:
     for joint in tree.joints:
         numbers = [*joint.axis, joint.effort, joint.stiffness, joint.rotor]
         if not ((np.abs(joint.T_parent_joint) < _LARGEST).all() and np.isfinite(numbers).all()):
-            raise RobotError(f"joint {joint.name!r} has a number that is not finite, or far too large.")
+            raise RobotError(
+                f"joint {joint.name!r} has a number that is not finite, or far too large."
+            )
         if math.isnan(joint.velocity) or not joint.lower <= joint.upper:
             raise RobotError(
                 f"joint {joint.name!r} has the limits {joint.lower} to {joint.upper}. Expected the lower one first."
@@ -342,7 +365,9 @@ def _mesh_hull(mesh: yourdfpy.Mesh, link: str, path: Path) -> Geometry:
     name = mesh.filename
     file = find_mesh(name, path)
     if file is None:
-        raise RobotError(f"link {link!r} uses the mesh {shown(name)}, which is not in its folders. Put it there.")
+        raise RobotError(
+            f"link {link!r} uses the mesh {shown(name)}, which is not in its folders. Put it there."
+        )
     try:
         vertices = np.asarray(load_mesh(file).vertices)
         if not (np.abs(vertices) < _LARGEST).all():
@@ -350,7 +375,9 @@ def _mesh_hull(mesh: yourdfpy.Mesh, link: str, path: Path) -> Geometry:
         scale = 1.0 if mesh.scale is None else np.asarray(mesh.scale, dtype=float)
         return hull(vertices * np.broadcast_to(scale, 3), HULL_TOLERANCE).geometry
     except (ObjectError, ValueError) as error:
-        raise RobotError(f"link {link!r} uses the mesh {name!r}, which cannot be read: {shown(str(error))}") from error
+        raise RobotError(
+            f"link {link!r} uses the mesh {name!r}, which cannot be read: {shown(str(error))}"
+        ) from error
 
 
 def find_mesh(name: str, urdf: Path) -> Path | None:
@@ -375,7 +402,9 @@ def _joint(joint: yourdfpy.Joint) -> Joint:
     name = _checked_name(joint.name)
     kind = joint.type
     if kind not in ("revolute", "continuous", "prismatic", "fixed"):
-        raise RobotError(f"joint {name!r} has type {kind!r}; supported are revolute, continuous, prismatic and fixed.")
+        raise RobotError(
+            f"joint {name!r} has type {kind!r}; supported are revolute, continuous, prismatic and fixed."
+        )
     axis = np.array([1.0, 0, 0]) if joint.axis is None else np.asarray(joint.axis, dtype=float)
     if axis.shape != (3,):
         raise ValueError(f"joint {name!r} has an axis of {axis.size} numbers, expected 3 numbers")
@@ -398,7 +427,9 @@ def _joint(joint: yourdfpy.Joint) -> Joint:
         offset = joint.mimic.offset or 0.0
         if not math.isfinite(multiplier + offset):
             raise RobotError(f"joint {name!r} follows another by a number that is not finite.")
-        mimic = MimicSpec(joint=name, source=joint.mimic.joint, multiplier=multiplier, offset=offset)
+        mimic = MimicSpec(
+            joint=name, source=joint.mimic.joint, multiplier=multiplier, offset=offset
+        )
     return Joint(
         name=name,
         type="revolute" if kind == "continuous" else kind,

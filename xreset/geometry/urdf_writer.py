@@ -48,12 +48,24 @@ def axes(*, x: Sequence[float] | np.ndarray, z: Sequence[float] | np.ndarray) ->
 
 def frame(name: str) -> Link:
     """Make a link that is only a frame: no shape, and a mass too small to matter."""
-    return Link(name=name, mass=FRAME_MASS, com=np.zeros(3), inertia=np.eye(3) * FRAME_INERTIA, collisions=())
+    return Link(
+        name=name,
+        mass=FRAME_MASS,
+        com=np.zeros(3),
+        inertia=np.eye(3) * FRAME_INERTIA,
+        collisions=(),
+    )
 
 
 def fixed(parent: str, child: str, T_parent_child: np.ndarray) -> Joint:
     """Make a fixed joint."""
-    return Joint(name=f"{child}_fixed", type="fixed", parent=parent, child=child, T_parent_joint=T_parent_child)
+    return Joint(
+        name=f"{child}_fixed",
+        type="fixed",
+        parent=parent,
+        child=child,
+        T_parent_joint=T_parent_child,
+    )
 
 
 def urdf_text(tree: RobotTree, comment: str = "") -> str:
@@ -86,7 +98,13 @@ def urdf_text(tree: RobotTree, comment: str = "") -> str:
             velocity=joint.velocity,
         )
         if mimic := joint.mimic:
-            _add(element, "mimic", joint=mimic.source, multiplier=mimic.multiplier, offset=mimic.offset)
+            _add(
+                element,
+                "mimic",
+                joint=mimic.source,
+                multiplier=mimic.multiplier,
+                offset=mimic.offset,
+            )
     ElementTree.indent(robot)
     comment = comment.replace("--", "- -")  # XML allows no -- in a comment
     head = "".join(f"  {line}\n" for line in comment.splitlines())
@@ -116,7 +134,13 @@ def _add_link(robot: Element, link: Link) -> None:
     inertial = SubElement(element, "inertial")
     _add(inertial, "origin", xyz=link.com)
     _add(inertial, "mass", value=link.mass)
-    moments = dict(zip(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), link.inertia[np.triu_indices(3)], strict=True))
+    moments = dict(
+        zip(
+            ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"),
+            link.inertia[np.triu_indices(3)],
+            strict=True,
+        )
+    )
     _add(inertial, "inertia", **moments)
     for number, shape in enumerate(link.collisions):
         collision = SubElement(element, "collision")

@@ -20,7 +20,10 @@ from xreset.text import shown
 def _are_tensors(values: Any) -> bool:
     if not isinstance(values, dict):
         return False
-    return all(isinstance(value, torch.Tensor) and bool(value.isfinite().all()) for value in values.values())
+    return all(
+        isinstance(value, torch.Tensor) and bool(value.isfinite().all())
+        for value in values.values()
+    )
 
 
 def _is_optimizer(values: dict[str, Any]) -> bool:
@@ -38,7 +41,9 @@ class Checkpoint:
     actor_state_dict: _Networks
     critic_state_dict: _Networks = field(default_factory=dict)
     """Empty in a distillation, which has none."""
-    optimizer_state_dict: Annotated[dict[str, Any], Rule("the state of an optimizer", _is_optimizer)]
+    optimizer_state_dict: Annotated[
+        dict[str, Any], Rule("the state of an optimizer", _is_optimizer)
+    ]
     iteration: NotNegative[int]
     """Iterations done."""
     env_steps: NotNegative[int]
@@ -100,4 +105,6 @@ def load_moments(optimizer: torch.optim.Optimizer, moments: dict[int, Any]) -> N
     for parameter, moments in optimizer.state.items():
         for name, value in moments.items():
             if value.shape not in ((), parameter.shape):
-                raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {tuple(parameter.shape)}")
+                raise ValueError(
+                    f"{name} has shape {tuple(value.shape)}, expected {tuple(parameter.shape)}"
+                )

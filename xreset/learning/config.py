@@ -11,7 +11,10 @@ import numpy as np
 from xreset.checks import Checked, NotNegative, Positive, Rule, Share
 from xreset.task.config import TaskConfig
 
-Widths = Annotated[tuple[int, ...], Rule("one width or more, each above 0", lambda widths: min(widths, default=0) >= 1)]
+Widths = Annotated[
+    tuple[int, ...],
+    Rule("one width or more, each above 0", lambda widths: min(widths, default=0) >= 1),
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +110,8 @@ def is_schedule(points: Points) -> bool:
 ShareSchedule = Annotated[
     Points,
     Rule(
-        "pairs of a share of the run and a value, all from 0 to 1, each share greater than the one before", is_schedule
+        "pairs of a share of the run and a value, all from 0 to 1, each share greater than the one before",
+        is_schedule,
     ),
 ]
 

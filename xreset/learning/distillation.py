@@ -31,7 +31,13 @@ class SequenceDistillation(Distillation):
     """
 
     def __init__(
-        self, obs: TensorDict, num_actions: int, config: TrainConfig, device: str, processes: Processes, teacher: Path
+        self,
+        obs: TensorDict,
+        num_actions: int,
+        config: TrainConfig,
+        device: str,
+        processes: Processes,
+        teacher: Path,
     ) -> None:
         """Make student, teacher and storage; ``obs`` are the observations of all worlds of this process."""
         p = config.ppo
@@ -74,13 +80,17 @@ class SequenceDistillation(Distillation):
             for worlds in order.tensor_split(self.num_mini_batches):
                 states = piece_states(storage.saved_hidden_state_a, worlds, self.sequence_length)
                 first = first_steps(storage, worlds)
-                actions = self.student(storage.observations[:, worlds], masks=first, hidden_state=states)
+                actions = self.student(
+                    storage.observations[:, worlds], masks=first, hidden_state=states
+                )
                 loss = self.loss_fn(actions, storage.privileged_actions[:, worlds])
                 self.optimizer.zero_grad()
                 loss.backward()
                 if self.is_multi_gpu:
                     self.reduce_parameters()
-                torch.nn.utils.clip_grad_norm_(self.student.parameters(), self.max_grad_norm or torch.inf)
+                torch.nn.utils.clip_grad_norm_(
+                    self.student.parameters(), self.max_grad_norm or torch.inf
+                )
                 self.optimizer.step()
                 total += loss.detach()
         self.student.update_normalization(storage.observations.flatten(0, 1))

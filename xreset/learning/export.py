@@ -32,7 +32,11 @@ _CHECKPOINT_KEY = "xreset-checkpoint"
 
 
 def export_onnx(
-    actor: PointNetLstmModel, path: str | Path, contract: dict[str, Any], *, checkpoint: Path | None = None
+    actor: PointNetLstmModel,
+    path: str | Path,
+    contract: dict[str, Any],
+    *,
+    checkpoint: Path | None = None,
 ) -> None:
     """Write the deterministic policy as one ONNX file.
 
@@ -76,7 +80,14 @@ def export_onnx(
 def _drop_exporter_notes(model: ModelProto) -> None:
     """Remove, in place, the exporter's notes on nodes and values: lines of source code with paths of its machine."""
     graph = model.graph
-    for noted in (graph, *graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer):
+    for noted in (
+        graph,
+        *graph.node,
+        *graph.input,
+        *graph.output,
+        *graph.value_info,
+        *graph.initializer,
+    ):
         del noted.metadata_props[:]
         noted.doc_string = ""
 
@@ -99,7 +110,9 @@ def export_checkpoint(out: Path, checkpoint: Path, policy: Path) -> None:
     """Write the policy of one of a run's checkpoints as an ONNX file."""
     info = read_run(out)
     shapes = observation_shapes(info.contract, str(out))
-    example = TensorDict({name: torch.zeros(1, *shape) for name, shape in shapes.items()}, batch_size=[1])
+    example = TensorDict(
+        {name: torch.zeros(1, *shape) for name, shape in shapes.items()}, batch_size=[1]
+    )
     actor = make_actor(example, len(info.contract["joint_names"]), info.config)
     with must_fit(checkpoint):
         actor.load_state_dict(read_checkpoint(checkpoint).actor_state_dict)
@@ -131,7 +144,10 @@ def _is_of(policy: Path, checkpoint: Path) -> bool:
     from google.protobuf.message import DecodeError
 
     try:
-        entries = {entry.key: entry.value for entry in onnx.load(str(policy), load_external_data=False).metadata_props}
+        entries = {
+            entry.key: entry.value
+            for entry in onnx.load(str(policy), load_external_data=False).metadata_props
+        }
     except DecodeError:
         return False
     return entries.get(_CHECKPOINT_KEY) == file_hash(checkpoint)

@@ -85,7 +85,10 @@ def _forward(
     bias2 = tl.load(b2 + b)
     bias3 = tl.load(b3 + c)
     for frame in range(tl.program_id(0), frames, tl.num_programs(0)):
-        z2 = tl.dot(_elu(_first_layer(cloud, frame, w1, b1, P, K, A)).to(second.dtype), second) + bias2[None, :]
+        z2 = (
+            tl.dot(_elu(_first_layer(cloud, frame, w1, b1, P, K, A)).to(second.dtype), second)
+            + bias2[None, :]
+        )
         z3 = tl.dot(_elu(z2).to(second.dtype), third)
         best, point = tl.max(z3, axis=0, return_indices=True)
         at = frame * C + c
@@ -122,7 +125,9 @@ def _backward(
         a2 = _elu(tl.dot(a1_low, second) + bias2[None, :])
         at = frame * C + c
         g3 = tl.where(
-            tl.load(winner + at).to(tl.int32)[None, :] == p[:, None], tl.load(gradient + at)[None, :], 0.0
+            tl.load(winner + at).to(tl.int32)[None, :] == p[:, None],
+            tl.load(gradient + at)[None, :],
+            0.0,
         ).to(second.dtype)
         if LOWER:
             points = tl.trans(_points(cloud, frame, second.dtype, P, K, W))
@@ -148,7 +153,14 @@ class _FusedPointNet(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, cloud: Tensor, w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, w3: Tensor, b3: Tensor
+        ctx: Any,
+        cloud: Tensor,
+        w1: Tensor,
+        b1: Tensor,
+        w2: Tensor,
+        b2: Tensor,
+        w3: Tensor,
+        b3: Tensor,
     ) -> Tensor:
         frames, points, width = cloud.shape
         sizes = {"P": points, "K": width, "A": len(w1), "B": len(w2), "C": len(w3)}
@@ -210,7 +222,11 @@ def _columns(width: int) -> int:
 @functools.cache
 def _processors(device: torch.device) -> int:
     """Multiprocessors of a GPU; 2 elsewhere, where Triton's interpreter runs the programs one after the other."""
-    return torch.cuda.get_device_properties(device).multi_processor_count if device.type == "cuda" else 2
+    return (
+        torch.cuda.get_device_properties(device).multi_processor_count
+        if device.type == "cuda"
+        else 2
+    )
 
 
 def supports(points: int, widths: tuple[int, ...]) -> bool:
@@ -224,7 +240,9 @@ def supports(points: int, widths: tuple[int, ...]) -> bool:
     )
 
 
-def fused_pointnet(cloud: Tensor, w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, w3: Tensor, b3: Tensor) -> Tensor:
+def fused_pointnet(
+    cloud: Tensor, w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, w3: Tensor, b3: Tensor
+) -> Tensor:
     """Embed clouds [..., P, K] as [..., C]: layers K -> A -> B -> C (weights as of ``nn.Linear``) with ELU between,
     maximum over points.
 

@@ -24,7 +24,14 @@ class TrainingLog:
     it."""
 
     def __init__(
-        self, folder: Path, num_envs: int, device: str, total: int, wandb: str | None = None, *, done: int = 0
+        self,
+        folder: Path,
+        num_envs: int,
+        device: str,
+        total: int,
+        wandb: str | None = None,
+        *,
+        done: int = 0,
     ) -> None:
         """Start the log of a run.
 
@@ -46,14 +53,20 @@ class TrainingLog:
             with needs("wandb, which sends learning curves,", "wandb"):
                 from wandb import init  # pyright: ignore[reportMissingImports]
             self._online = init(
-                project=wandb, name=folder.name, dir=str(folder), config=read_json(folder / "run.json"), reinit=True
+                project=wandb,
+                name=folder.name,
+                dir=str(folder),
+                config=read_json(folder / "run.json"),
+                reinit=True,
             )
         self._folder = folder
         self._lift = read_lift(folder).up_to(done) if done else Lift()
         self._curves = SummaryWriter(str(folder))
         self._returns = torch.zeros(num_envs, device=device)
         self._lengths = torch.zeros(num_envs, device=device)
-        self._finished = torch.zeros(3, device=device)  # sum of returns, sum of lengths, number of episodes
+        self._finished = torch.zeros(
+            3, device=device
+        )  # sum of returns, sum of lengths, number of episodes
         self._recent: deque[list[float]] = deque(maxlen=RECENT)
         self._names: tuple[str, ...] = ()
         self._sums: Tensor | float = 0.0
@@ -66,14 +79,18 @@ class TrainingLog:
         ended = done.float()
         self._returns += reward
         self._lengths += 1
-        self._finished += torch.stack(((self._returns * ended).sum(), (self._lengths * ended).sum(), ended.sum()))
+        self._finished += torch.stack(
+            ((self._returns * ended).sum(), (self._lengths * ended).sum(), ended.sum())
+        )
         self._returns *= 1 - ended
         self._lengths *= 1 - ended
         self._names = tuple(log)
         self._sums = self._sums + torch.stack(list(log.values()))
         self._steps += 1
 
-    def write(self, iteration: int, env_steps: int, elapsed: float, scalars: dict[str, float]) -> None:
+    def write(
+        self, iteration: int, env_steps: int, elapsed: float, scalars: dict[str, float]
+    ) -> None:
         """Write an iteration's curves and line, and start the sums of the next one.
 
         Args:
@@ -95,7 +112,9 @@ class TrainingLog:
             self._online.log(curves, step=iteration)
         from_home = means["task/success_from_home"]
         before = self._lift
-        self._lift = before.after(from_home, iteration=iteration, env_steps=env_steps, seconds=elapsed)
+        self._lift = before.after(
+            from_home, iteration=iteration, env_steps=env_steps, seconds=elapsed
+        )
         if self._lift.passed != before.passed:
             self.write_lift()
         if time.monotonic() - self._last_line > _LINE_SECONDS or iteration == self._total:

@@ -48,7 +48,9 @@ class PointNet(nn.Module):
 
             if fused.supports(cloud.shape[-2], tuple(layer.out_features for layer in linear)):
                 one, two, three = linear
-                return fused.fused_pointnet(cloud, one.weight, one.bias, two.weight, two.bias, three.weight, three.bias)
+                return fused.fused_pointnet(
+                    cloud, one.weight, one.bias, two.weight, two.bias, three.weight, three.bias
+                )
         with torch.autocast("cuda", dtype=torch.bfloat16):
             return self.mlp(cloud).amax(dim=-2).float()
 
@@ -62,7 +64,13 @@ class ImageEncoder(nn.Module):
         kernels = [5, *[3] * (len(channels) - 1)]
         count, height, width = shape
         self.cnn = CNN(
-            (height, width), count, list(channels), kernel_size=kernels, stride=2, padding="zeros", activation="elu"
+            (height, width),
+            count,
+            list(channels),
+            kernel_size=kernels,
+            stride=2,
+            padding="zeros",
+            activation="elu",
         )
         features = self.cnn.output_dim
         assert isinstance(features, int), "a flattened output has one width"
@@ -92,7 +100,9 @@ def embed_sequences(pointnet: PointNet | ImageEncoder, cloud: Tensor, first: Ten
     # [L, 1, H] step of which each frame was the newest
     shifted = step[:, None, None] + torch.arange(1 - history, 1, device=cloud.device)
     source = torch.maximum(shifted, begin[..., None]) + history - 1
-    return embedded.transpose(0, 1)[torch.arange(cloud.shape[1], device=cloud.device)[:, None], source]
+    return embedded.transpose(0, 1)[
+        torch.arange(cloud.shape[1], device=cloud.device)[:, None], source
+    ]
 
 
 def run_lstm(lstm: nn.LSTM, x: Tensor, keep: Tensor, state: LstmState) -> tuple[Tensor, LstmState]:
@@ -120,14 +130,18 @@ def run_lstm(lstm: nn.LSTM, x: Tensor, keep: Tensor, state: LstmState) -> tuple[
     low = x.dtype
     padding = (0, -x.shape[-1] % 8)
     weight, recurrent, bias, recurrent_bias = lstm.all_weights[0]
-    inputs = nn.functional.linear(nn.functional.pad(x, padding), nn.functional.pad(weight, padding).to(low))
+    inputs = nn.functional.linear(
+        nn.functional.pad(x, padding), nn.functional.pad(weight, padding).to(low)
+    )
     recurrent = recurrent.to(low)
     h = h[0]
     c = c[0]
     for step, kept in zip(inputs, keep.to(h.dtype)[..., None], strict=True):
         gates = nn.functional.linear((h * kept).to(low), recurrent).to(h.dtype)
         # torch has no public name for the cell's kernel
-        h, c, _ = torch.ops.aten._thnn_fused_lstm_cell(step.to(h.dtype), gates, c * kept, bias, recurrent_bias)
+        h, c, _ = torch.ops.aten._thnn_fused_lstm_cell(
+            step.to(h.dtype), gates, c * kept, bias, recurrent_bias
+        )
         out.append(h)
     return torch.stack(out), (h[None], c[None])
 
@@ -156,7 +170,9 @@ class Trunk(nn.Module):
         It already has the precision of the LSTM's factors, so that later copies move half as much.
         """
         dtype = torch.bfloat16 if self.pointnet.use_bfloat16 and flat.is_cuda else flat.dtype
-        return torch.cat((self.normalizer(flat).to(dtype), embeddings.flatten(-2).to(dtype)), dim=-1)
+        return torch.cat(
+            (self.normalizer(flat).to(dtype), embeddings.flatten(-2).to(dtype)), dim=-1
+        )
 
     def forward(self, flat: Tensor, cloud: Tensor, state: LstmState) -> tuple[Tensor, LstmState]:
         """One step for N worlds: [N, D], [N, H, P, K], LSTM state of [1, N, lstm] each -> [N, lstm], new state."""
@@ -206,7 +222,12 @@ class PointNetLstmModel(MLPModel):
         *flat, self.cloud_group = groups
         self._latent_dim = config.lstm
         super().__init__(
-            obs, {"flat": flat}, "flat", output_dim, config.mlp, distribution_cfg=gaussian if stochastic else None
+            obs,
+            {"flat": flat},
+            "flat",
+            output_dim,
+            config.mlp,
+            distribution_cfg=gaussian if stochastic else None,
         )
         normalizer = EmpiricalNormalization(self.obs_dim)
         shape = obs[self.cloud_group].shape[1:]
@@ -220,7 +241,9 @@ class PointNetLstmModel(MLPModel):
         self.trunk = Trunk(self.obs_dim, encoder, width, config.lstm, normalizer)
         self.state: LstmState | None = None
 
-    def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: HiddenState = None) -> Tensor:
+    def get_latent(
+        self, obs: TensorDict, masks: Tensor | None = None, hidden_state: HiddenState = None
+    ) -> Tensor:
         """Return the MLP's input: [N, lstm] in a rollout, [T, N, lstm] in an update.
 
         In an update the T steps are cut into pieces; ``hidden_state`` [1, pieces * N, lstm] has the state with which
@@ -237,7 +260,9 @@ class PointNetLstmModel(MLPModel):
             keep = torch.ones_like(joined[..., 0], dtype=torch.bool)
             out, self.state = run_lstm(trunk.lstm, joined, keep, self.state)
             return trunk.norm(out[0])
-        assert isinstance(hidden_state, tuple), "an update needs the LSTM state of each sequence's start"
+        assert isinstance(hidden_state, tuple), (
+            "an update needs the LSTM state of each sequence's start"
+        )
         joined = trunk.join(flat, self._embed_rollout(cloud, masks))
         pieces = hidden_state[0].shape[1] // joined.shape[1]
 
@@ -334,13 +359,17 @@ class ExportedPolicy(nn.Module):
         self.trunk.pointnet.use_bfloat16 = False
         self.mlp = copy.deepcopy(model.mlp)
         self.output = (
-            model.distribution.as_deterministic_output_module() if model.distribution is not None else nn.Identity()
+            model.distribution.as_deterministic_output_module()
+            if model.distribution is not None
+            else nn.Identity()
         )
         self.flat_dim: int = model.obs_dim
         self.lstm_dim: int = model._latent_dim
         self.cpu().eval()
 
-    def forward(self, flat: Tensor, cloud: Tensor, h_in: Tensor, c_in: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(
+        self, flat: Tensor, cloud: Tensor, h_in: Tensor, c_in: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """One control step."""
         latent, (h, c) = self.trunk(flat, cloud, (h_in, c_in))
         return self.output(self.mlp(latent)), h, c
@@ -350,7 +379,9 @@ def make_actor(obs: TensorDict, num_actions: int, config: TrainConfig) -> PointN
     """Return a new actor; ``obs`` is an example of the observations."""
     vision = config.task.vision
     conv = config.model.conv if vision.cameras and vision.view == "depth" else ()
-    actor = PointNetLstmModel(obs, config.task.policy_groups, num_actions, config.model, conv=conv, stochastic=True)
+    actor = PointNetLstmModel(
+        obs, config.task.policy_groups, num_actions, config.model, conv=conv, stochastic=True
+    )
     actor.trunk.pointnet.use_bfloat16 = config.ppo.precision == "bfloat16"
     return actor
 
@@ -359,6 +390,11 @@ def make_critic(obs: TensorDict, config: TrainConfig) -> PointNetLstmModel:
     """Return a new critic; ``obs`` is an example of the observations."""
     m = config.model
     kind = ReturnCritic if m.normalize_returns else PointNetLstmModel
-    critic = kind(obs, ("policy", "proprio", "privileged", "perception"), 1, replace(m, mlp=m.critic_mlp or m.mlp))
+    critic = kind(
+        obs,
+        ("policy", "proprio", "privileged", "perception"),
+        1,
+        replace(m, mlp=m.critic_mlp or m.mlp),
+    )
     critic.trunk.pointnet.use_bfloat16 = config.ppo.precision == "bfloat16"
     return critic

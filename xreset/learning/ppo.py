@@ -55,7 +55,12 @@ class SequencePpo(PPO):
     """
 
     def __init__(
-        self, obs: TensorDict, num_actions: int, config: TrainConfig, device: str, processes: Processes
+        self,
+        obs: TensorDict,
+        num_actions: int,
+        config: TrainConfig,
+        device: str,
+        processes: Processes,
     ) -> None:
         """Make networks and storage; ``obs`` are the observations of all worlds of this process."""
         p = config.ppo
@@ -84,11 +89,15 @@ class SequencePpo(PPO):
         self.bounds_loss = p.bounds_loss
         on_gpu = device.startswith("cuda")
         count = self.storage.num_envs
-        self._rate = torch.tensor(self.learning_rate, device=device, dtype=torch.float32 if on_gpu else torch.float64)
+        self._rate = torch.tensor(
+            self.learning_rate, device=device, dtype=torch.float32 if on_gpu else torch.float64
+        )
         self._sums = torch.zeros(4, device=device)
         self._worlds = torch.zeros(count // self.num_mini_batches, dtype=torch.long, device=device)
         self._graphs = GraphRunner(torch.device(device))
-        self._graphs.active &= not self.is_multi_gpu and count % self.num_mini_batches == 0  # all minibatches alike
+        self._graphs.active &= (
+            not self.is_multi_gpu and count % self.num_mini_batches == 0
+        )  # all minibatches alike
 
     def update(self) -> dict[str, float]:
         """Learn from the rollout; return the mean losses of its minibatches.
@@ -102,7 +111,10 @@ class SequencePpo(PPO):
         self._rate.fill_(self.learning_rate)
         self._use_rate()
         self._sums.zero_()
-        orders = [torch.randperm(storage.num_envs, device=self.device) for _ in range(self.num_learning_epochs)]
+        orders = [
+            torch.randperm(storage.num_envs, device=self.device)
+            for _ in range(self.num_learning_epochs)
+        ]
         for order in orders:
             for worlds in order.tensor_split(self.num_mini_batches):
                 if self._graphs.active:
@@ -141,7 +153,12 @@ class SequencePpo(PPO):
         surrogate = torch.max(-advantages * ratio, -advantages * clipped).mean()
         value = self._value_loss(values, storage.values[:, worlds], storage.returns[:, worlds])
         excess = (self.actor.output_mean.abs() - BOUND).clamp_min(0.0).square().sum(dim=-1).mean()
-        loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy + self.bounds_loss * excess
+        loss = (
+            surrogate
+            + self.value_loss_coef * value
+            - self.entropy_coef * entropy
+            + self.bounds_loss * excess
+        )
         self.optimizer.zero_grad()
         loss.backward()
         if self.is_multi_gpu:
@@ -155,7 +172,9 @@ class SequencePpo(PPO):
         """Return the mean squared error of values, in units of the returns' deviation if the critic knows it."""
         unit = self.critic.return_std if isinstance(self.critic, ReturnCritic) else 1.0
         error = (values - returns) / unit
-        near = old_values + unit * ((values - old_values) / unit).clamp(-self.clip_param, self.clip_param)
+        near = old_values + unit * ((values - old_values) / unit).clamp(
+            -self.clip_param, self.clip_param
+        )
         return torch.max(error.square(), ((near - returns) / unit).square()).mean()
 
     @torch.no_grad()
@@ -193,7 +212,9 @@ class SequencePpo(PPO):
                 model.reset(hidden_state=(torch.zeros_like(h), torch.zeros_like(c)))
         return super().act(obs)
 
-    def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]) -> None:
+    def process_env_step(
+        self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]
+    ) -> None:
         """Record one environment step; ``extras["faulty"]`` [N] bool marks worlds whose step teaches nothing."""
         step = self.storage.step
         if not step:

@@ -102,9 +102,16 @@ def student_config(teacher: TaskConfig, vision: VisionConfig) -> TrainConfig:
         camera_latency=(0.0, round(1 / 30 / control_dt, 3)),
     )
     return TrainConfig(
-        task=replace(teacher, vision=vision, randomization=randomization, reward=replace(teacher.reward, own={})),
+        task=replace(
+            teacher,
+            vision=vision,
+            randomization=randomization,
+            reward=replace(teacher.reward, own={}),
+        ),
         model=ModelConfig(pointnet=(64, 128, 128), lstm=256, mlp=(256, 128), initial_std=0.1),
-        ppo=PpoConfig(horizon=24, sequence_length=12, mini_epochs=2, minibatch_size=8192, learning_rate=5e-4),
+        ppo=PpoConfig(
+            horizon=24, sequence_length=12, mini_epochs=2, minibatch_size=8192, learning_rate=5e-4
+        ),
         schedule=ScheduleConfig(teacher=((0.0, 1.0), (0.2, 0.0))),
         iterations=2000,
     )

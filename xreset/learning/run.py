@@ -96,7 +96,9 @@ def latest_checkpoint(folder: Path) -> Path:
     """Return the newest checkpoint; ``RunError`` if there is none."""
     found = checkpoints(folder)
     if not found:
-        raise RunError(f"{folder} has no checkpoint yet. Train it: xreset train --out {folder} --resume")
+        raise RunError(
+            f"{folder} has no checkpoint yet. Train it: xreset train --out {folder} --resume"
+        )
     return found[-1]
 
 
@@ -111,7 +113,9 @@ def policy_file(policy: str | Path, *, also: Sequence[str] = ()) -> Path:
         PolicyError: there is none of that name.
     """
     if os.path.isdir(policy):
-        from xreset.learning.export import ensure_policy  # rsl-rl, which playing a file does not need
+        from xreset.learning.export import (
+            ensure_policy,
+        )  # rsl-rl, which playing a file does not need
 
         return ensure_policy(Path(policy))
     path = Path(policy)
@@ -120,5 +124,7 @@ def policy_file(policy: str | Path, *, also: Sequence[str] = ()) -> Path:
     files = shipped()
     if str(policy) not in files:
         known = ", ".join((*also, *files))
-        raise PolicyError(f"Unknown policy {str(policy)!r}. Give a run folder, a .onnx file, or one of: {known}.")
+        raise PolicyError(
+            f"Unknown policy {str(policy)!r}. Give a run folder, a .onnx file, or one of: {known}."
+        )
     return files[str(policy)]

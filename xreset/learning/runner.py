@@ -16,7 +16,13 @@ from tensordict import TensorDict
 
 from xreset.env import ManipulationEnv
 from xreset.errors import RunError
-from xreset.learning.checkpoint import Checkpoint, load_moments, must_fit, read_checkpoint, write_checkpoint
+from xreset.learning.checkpoint import (
+    Checkpoint,
+    load_moments,
+    must_fit,
+    read_checkpoint,
+    write_checkpoint,
+)
 from xreset.learning.config import TrainConfig, value_at
 from xreset.learning.distillation import SequenceDistillation
 from xreset.learning.distributed import Processes
@@ -63,18 +69,24 @@ class TrainingRunner:
         self.folder = folder
         self.wandb = wandb
         self.device = str(env.device)
-        torch.set_float32_matmul_precision("highest" if config.ppo.precision == "float32" else "high")
+        torch.set_float32_matmul_precision(
+            "highest" if config.ppo.precision == "float32" else "high"
+        )
         self.processes = Processes.of_environment()
         self.processes.join(self.device)
         made_of = (env.get_observations(), env.num_actions, config, self.device, self.processes)
-        self.alg = SequencePpo(*made_of) if teacher is None else SequenceDistillation(*made_of, teacher)
+        self.alg = (
+            SequencePpo(*made_of) if teacher is None else SequenceDistillation(*made_of, teacher)
+        )
         self.iteration = 0
         self.env_steps = 0
         self.elapsed = 0.0
         self._faults_before = torch.zeros(2, dtype=torch.long, device=self.device)
         self._recent_faults: deque[list[int]] = deque(maxlen=WINDOW)
 
-    def learn(self, total: int, *, init_at_random_ep_len: bool = False, seconds: float = math.inf) -> None:
+    def learn(
+        self, total: int, *, init_at_random_ep_len: bool = False, seconds: float = math.inf
+    ) -> None:
         """Train until a number of iterations is done in all, and write a checkpoint. Ctrl-C ends after an iteration.
 
         Args:
@@ -84,14 +96,18 @@ class TrainingRunner:
         """
         env = self.env
         if init_at_random_ep_len:
-            env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=int(env.max_episode_length))
+            env.episode_length_buf = torch.randint_like(
+                env.episode_length_buf, high=int(env.max_episode_length)
+            )
         self.alg.train_mode()
         if self.processes.count > 1:
             self.alg.broadcast_parameters()
         obs = env.get_observations()
         log = None
         if self.processes.is_main:
-            log = TrainingLog(self.folder, env.num_envs, self.device, total, self.wandb, done=self.iteration)
+            log = TrainingLog(
+                self.folder, env.num_envs, self.device, total, self.wandb, done=self.iteration
+            )
         saved_at = self.iteration
         steps = self.config.ppo.horizon * env.num_envs * self.processes.count
         begin = time.perf_counter()
@@ -159,7 +175,10 @@ class TrainingRunner:
         if not self.processes.is_main:
             return
         content = Checkpoint(
-            **{f"{name}_state_dict": network.state_dict() for name, network in self.alg.networks.items()},
+            **{
+                f"{name}_state_dict": network.state_dict()
+                for name, network in self.alg.networks.items()
+            },
             optimizer_state_dict=self.alg.optimizer.state_dict(),
             iteration=self.iteration,
             env_steps=self.env_steps,

@@ -33,7 +33,9 @@ def load_teacher(path: Path) -> PointNetLstmModel:
 
     policy = OnnxPolicy(path)
     shapes = observation_shapes(policy.contract, str(path))
-    observations = TensorDict({name: torch.randn(2, *shape) for name, shape in shapes.items()}, batch_size=[2])
+    observations = TensorDict(
+        {name: torch.randn(2, *shape) for name, shape in shapes.items()}, batch_size=[2]
+    )
     try:
         graph = onnx.load(str(path)).graph
         weights = _weights(graph)
@@ -52,9 +54,13 @@ def load_teacher(path: Path) -> PointNetLstmModel:
         with torch.no_grad():
             difference = (model(observations).clamp(-1, 1) - policy.act(observations)).abs().max()
     except (KeyError, IndexError, StopIteration, RuntimeError, ValueError) as error:
-        raise PolicyError(f"{path} cannot teach: its network is not built as xreset exports it ({error}).") from error
+        raise PolicyError(
+            f"{path} cannot teach: its network is not built as xreset exports it ({error})."
+        ) from error
     if not difference < _CLOSE:
-        raise PolicyError(f"{path} cannot teach: rebuilt from its file, its network acts otherwise ({difference:.2g}).")
+        raise PolicyError(
+            f"{path} cannot teach: rebuilt from its file, its network acts otherwise ({difference:.2g})."
+        )
     model.reset()
     return model.requires_grad_(False)
 
@@ -72,9 +78,13 @@ def _weights(graph: GraphProto) -> dict[str, Tensor]:
     weights = {name: value for name, value in found.items() if name.startswith(("trunk.", "mlp."))}
     for node in graph.node:
         last = node.input[1] if len(node.input) > 1 else ""
-        if node.op_type == "MatMul" and last in found:  # the exporter has transposed the weights of a linear layer
+        if (
+            node.op_type == "MatMul" and last in found
+        ):  # the exporter has transposed the weights of a linear layer
             bias = next(
-                other.input[1] for other in graph.node if other.op_type == "Add" and node.output[0] in other.input
+                other.input[1]
+                for other in graph.node
+                if other.op_type == "Add" and node.output[0] in other.input
             )
             weights[bias.removesuffix("bias") + "weight"] = found[last].T
         if node.op_type == "Div" and last in found:

@@ -22,7 +22,15 @@ from xreset.learning.config import TrainConfig
 from xreset.learning.distributed import Processes, leave
 from xreset.learning.export import export_onnx
 from xreset.learning.recipes import default_recipe, own_terms_flag, starting_config, student_config
-from xreset.learning.run import TEACHER, RunInfo, checkpoints, latest_checkpoint, policy_file, read_run, write_run
+from xreset.learning.run import (
+    TEACHER,
+    RunInfo,
+    checkpoints,
+    latest_checkpoint,
+    policy_file,
+    read_run,
+    write_run,
+)
 from xreset.learning.runner import TrainingRunner
 from xreset.plugins import backend_class, device_for
 from xreset.policy import OnnxPolicy, check_contract, policy_contract
@@ -92,11 +100,15 @@ def train(
         config = replace(config, iterations=iterations)
     device = device or device_for(engine, "cuda" if torch.cuda.is_available() else "cpu")
     if checkpoints(out):
-        raise RunError(f"{out} holds a run already. Continue it with --resume, or choose another --out.")
+        raise RunError(
+            f"{out} holds a run already. Continue it with --resume, or choose another --out."
+        )
     if num_envs < 1:
         raise RunError(f"--num-envs is {num_envs}, expected at least 1.")
     if device_for(engine, device) != device:
-        raise RunError(f"The engine {engine!r} does not run on {device!r}. Omit --device, or choose another --backend.")
+        raise RunError(
+            f"The engine {engine!r} does not run on {device!r}. Omit --device, or choose another --backend."
+        )
     file = _file_of(out, bank, goals)
     inputs = load_inputs(file, robot=robot, objects=objects, accept=("bank", "goals"))
     if isinstance(inputs.data, GoalSet):
@@ -132,7 +144,9 @@ def train(
     return out
 
 
-def _file_of(out: Path, bank: str | Path | ResetBank | None, goals: str | Path | GoalSet | None) -> Path:
+def _file_of(
+    out: Path, bank: str | Path | ResetBank | None, goals: str | Path | GoalSet | None
+) -> Path:
     """Return the file of a bank, of a goal set, or of both together; what has none is written into the run folder."""
     if bank is not None and goals is not None:
         bank = bank if isinstance(bank, ResetBank) else read_bank(bank)
@@ -183,13 +197,17 @@ def distill(
     if config is None:
         unknown = [name for name in cameras if isinstance(name, str) and name not in CAMERAS]
         if unknown:
-            raise XResetError(f"Unknown camera {', '.join(unknown)}. Choose from: {', '.join(CAMERAS)}.")
+            raise XResetError(
+                f"Unknown camera {', '.join(unknown)}. Choose from: {', '.join(CAMERAS)}."
+            )
         chosen = tuple(CAMERAS[camera] if isinstance(camera, str) else camera for camera in cameras)
         told = OnnxPolicy(policy_file(teacher)).contract["task"]
         vision = replace(vision or VisionConfig(), cameras=chosen)
         config = student_config(from_dict(TaskConfig, told, f"{teacher}: task"), vision)
     if not config.task.vision.cameras:
-        raise XResetError("A student needs a camera. Give one or two of: " + ", ".join(CAMERAS) + ".")
+        raise XResetError(
+            "A student needs a camera. Give one or two of: " + ", ".join(CAMERAS) + "."
+        )
     return train(bank, out=out, config=config, teacher=teacher, **options)
 
 
@@ -197,8 +215,12 @@ def _copy_teacher(teacher: Path, out: Path, inputs: Inputs, config: TrainConfig)
     """Copy the policy of a teacher into a run folder, if it fits the robot and the task."""
     contract = OnnxPolicy(teacher).contract
     if contract["task"].get("vision", {}).get("cameras"):
-        raise PolicyError(f"{teacher} sees through cameras itself. Give a teacher that is told pose and shape.")
-    check_contract(str(teacher), contract, inputs.robot, replace(config.task, vision=VisionConfig()))
+        raise PolicyError(
+            f"{teacher} sees through cameras itself. Give a teacher that is told pose and shape."
+        )
+    check_contract(
+        str(teacher), contract, inputs.robot, replace(config.task, vision=VisionConfig())
+    )
     write_whole(out / TEACHER, teacher.read_bytes())
 
 
@@ -247,7 +269,9 @@ def resume(
         )
     if iterations is not None:
         info = replace(info, config=replace(info.config, iterations=iterations))
-    inputs = load_inputs(info.resets, robot=info.robot, objects=info.objects, accept=("bank", "goals"))
+    inputs = load_inputs(
+        info.resets, robot=info.robot, objects=info.objects, accept=("bank", "goals")
+    )
     if inputs.hash != info.resets_hash:
         raise RunError(
             f"{info.resets} is not the file that this run was started with. Put it back, or start a new run."
@@ -260,7 +284,15 @@ _NO_MEMORY = re.compile("Failed to allocate|out of memory")
 """How Warp reports too little memory, as a ``RuntimeError``."""
 
 
-def _run(out: Path, info: RunInfo, inputs: Inputs, *, minutes: float, resumed: bool, wandb: str | None = None) -> None:
+def _run(
+    out: Path,
+    info: RunInfo,
+    inputs: Inputs,
+    *,
+    minutes: float,
+    resumed: bool,
+    wandb: str | None = None,
+) -> None:
     """Train while this process alone writes the folder, and leave the process's global state as it was."""
     if not minutes > 0:
         raise RunError(f"--minutes is {minutes}, expected more than 0.")
@@ -273,25 +305,40 @@ def _run(out: Path, info: RunInfo, inputs: Inputs, *, minutes: float, resumed: b
             stack.enter_context(claim_folder(out))
             stack.enter_context(claim_folder(out / "checkpoints"))
         try:
-            runner = stack.enter_context(_runner(processes, out, info, inputs, resumed=resumed, wandb=wandb))
+            runner = stack.enter_context(
+                _runner(processes, out, info, inputs, resumed=resumed, wandb=wandb)
+            )
             runner.learn(info.config.iterations, init_at_random_ep_len=True, seconds=60 * minutes)
         except (MemoryError, RuntimeError) as error:
             if isinstance(error, RuntimeError) and not _NO_MEMORY.search(str(error)):
                 raise
-            state = "the last checkpoint can be used" if checkpoints(out) else "no checkpoint was written"
+            state = (
+                "the last checkpoint can be used"
+                if checkpoints(out)
+                else "no checkpoint was written"
+            )
             raise RunError(
                 f"{info.num_envs} worlds on {info.device} need more memory than there is; {state}. "
                 "Start with fewer (--num-envs), or smaller minibatches (--config.ppo.minibatch-size), in another --out."
             ) from error
         if processes.is_main:
             export_onnx(
-                runner.alg.networks["actor"], out / "policy.onnx", info.contract, checkpoint=latest_checkpoint(out)
+                runner.alg.networks["actor"],
+                out / "policy.onnx",
+                info.contract,
+                checkpoint=latest_checkpoint(out),
             )
 
 
 @contextmanager
 def _runner(
-    processes: Processes, out: Path, info: RunInfo, inputs: Inputs, *, resumed: bool, wandb: str | None
+    processes: Processes,
+    out: Path,
+    info: RunInfo,
+    inputs: Inputs,
+    *,
+    resumed: bool,
+    wandb: str | None,
 ) -> Iterator[TrainingRunner]:
     """Yield a run's runner, which has read the checkpoint that it continues from, or the networks that it begins
     with."""
@@ -304,7 +351,9 @@ def _runner(
     torch.manual_seed(seed)
     scene = (inputs.robot, inputs.objects, inputs.bank)
     task = info.config.task
-    with make_env(*scene, task, engine=info.backend, num_envs=info.num_envs, device=device, seed=seed) as env:
+    with make_env(
+        *scene, task, engine=info.backend, num_envs=info.num_envs, device=device, seed=seed
+    ) as env:
         if env.vision is not None:
             env.vision.check_sees_objects()
         teacher = out / TEACHER if info.teacher else None
@@ -321,5 +370,8 @@ def _runner(
             write_run(out, info)
             if resumed:
                 done = f"continuing after iteration {runner.iteration}"
-                print(done if begin else "there is no checkpoint yet: starting from the beginning", flush=True)
+                print(
+                    done if begin else "there is no checkpoint yet: starting from the beginning",
+                    flush=True,
+                )
         yield runner

@@ -64,7 +64,11 @@ def deploy_contract(
     for each in objects:
         points = surface_points(each, task.observation.cloud_points).astype(np.float32)
         middle = center(each).astype(np.float32)
-        listed[each.name] = {"source": each.source, "points": points.tolist(), "center": middle.tolist()}
+        listed[each.name] = {
+            "source": each.source,
+            "points": points.tolist(),
+            "center": middle.tolist(),
+        }
     observation = asdict(task.observation)
     observation.pop("noise")
     contract = {
@@ -171,6 +175,10 @@ def write_deployed(
     contract = deploy_contract(robot, task, objects, policy)
     with atomic_folder(out) as folder:
         shutil.copyfile(policy, folder / files.POLICY)
-        shutil.copytree(Path(files.__file__).parent, folder / "runtime", ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(
+            Path(files.__file__).parent,
+            folder / "runtime",
+            ignore=shutil.ignore_patterns("__pycache__"),
+        )
         write_json(folder / files.CONTRACT, contract)
     return contract

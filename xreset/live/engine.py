@@ -23,7 +23,11 @@ class EngineDriver(Driver):
     """
 
     def __init__(
-        self, env: ManipulationEnv, look: Callable[[int], None] = lambda step: None, *, real_time: bool = False
+        self,
+        env: ManipulationEnv,
+        look: Callable[[int], None] = lambda step: None,
+        *,
+        real_time: bool = False,
     ) -> None:
         """Wrap worlds that were just reset.
 
@@ -113,4 +117,6 @@ def begin(controller: Controller, env: ManipulationEnv) -> None:
     names = [env.backend.scene.objects[i].name for i in env.backend.object_index.tolist()]
     points = np.stack([controller.points(name) for name in names])
     centers = np.stack([controller.center(name) for name in names])
-    controller.begin(points, _array(env.goal_pos), _array(env.goal_quat), _array(env.joint_target), centers)
+    controller.begin(
+        points, _array(env.goal_pos), _array(env.goal_quat), _array(env.joint_target), centers
+    )

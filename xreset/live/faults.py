@@ -101,11 +101,15 @@ class FaultyDriver(EngineDriver):
         if not faults.drawn_delays:
             share = np.ones_like(share)
         self._interval = max(1, round(faults.tracker_interval / self._dt))
-        self._pose_delay = np.maximum(0.0, faults.pose_delay * share[:, 0] + faults.pose_jitter * drawn(steps))
+        self._pose_delay = np.maximum(
+            0.0, faults.pose_delay * share[:, 0] + faults.pose_jitter * drawn(steps)
+        )
         bias = np.repeat((faults.position_bias, faults.angle_bias), 3)
         noise = np.repeat((faults.position_noise, faults.angle_noise), 3)
         self._error = bias * drawn(1, 6) + noise * drawn(steps, 6)
-        self._lost = self._gaps(faults.lost_frames, drawn(int(seconds / Faults.LOSS_PERIOD) + 1), steps)
+        self._lost = self._gaps(
+            faults.lost_frames, drawn(int(seconds / Faults.LOSS_PERIOD) + 1), steps
+        )
         is_arm = env.actions.is_arm.cpu().numpy()
         delay = np.where(is_arm, faults.arm_delay * share[:, 1], faults.hand_delay * share[:, 2])
         self._delay = np.round(delay / scene.timestep).astype(np.int64)
@@ -160,7 +164,9 @@ class FaultyDriver(EngineDriver):
             arrived = frame["arrival"] <= now + 1e-9
             for name in ("object_pos", "object_quat", "object_time"):
                 old = self._shown.get(name, frame[name])
-                self._shown[name] = np.where(arrived.reshape(-1, *[1] * (old.ndim - 1)), frame[name], old)
+                self._shown[name] = np.where(
+                    arrived.reshape(-1, *[1] * (old.ndim - 1)), frame[name], old
+                )
             frame["arrival"][arrived] = np.inf
         self._frames = [frame for frame in self._frames if np.isfinite(frame["arrival"]).any()]
         return replace(reading, **self._shown)
@@ -170,7 +176,9 @@ class FaultyDriver(EngineDriver):
         error = self._error[:, k]
         wrong = error.any(axis=1)[:, None]
         pos = (reading.object_pos + error[:, :3]).astype(np.float32)
-        turned = Rotation.from_rotvec(error[:, 3:]) * Rotation.from_quat(reading.object_quat, scalar_first=True)
+        turned = Rotation.from_rotvec(error[:, 3:]) * Rotation.from_quat(
+            reading.object_quat, scalar_first=True
+        )
         quat = turned.as_quat(scalar_first=True).astype(np.float32)
         return {
             "object_pos": np.where(wrong, pos, reading.object_pos),
@@ -189,7 +197,9 @@ class FaultyDriver(EngineDriver):
         k = self._step
         if self._velocity.any():
             mass = self.env.variation.parameters["object_mass"][:, None]
-            velocity = torch.as_tensor(self._velocity[:, k], dtype=torch.float32, device=backend.device)
+            velocity = torch.as_tensor(
+                self._velocity[:, k], dtype=torch.float32, device=backend.device
+            )
             backend.set_object_wrench(mass * velocity / self._dt, torch.zeros_like(velocity))
         at = self._substeps
         end = at + substeps

@@ -30,7 +30,9 @@ _PATIENCE = 5.0
 class PolicyServer:
     """Listens until it is closed. Each client has an episode of its own."""
 
-    def __init__(self, contract: dict[str, Any], policy: bytes, *, host: str = "127.0.0.1", port: int = 8765) -> None:
+    def __init__(
+        self, contract: dict[str, Any], policy: bytes, *, host: str = "127.0.0.1", port: int = 8765
+    ) -> None:
         """Begin to listen.
 
         Args:
@@ -59,7 +61,9 @@ class PolicyServer:
                 close_timeout=1.0,
             )
         except OSError as error:
-            raise XResetError(f"Cannot listen at {host}:{port}: {error.strerror}. Choose another --port.") from error
+            raise XResetError(
+                f"Cannot listen at {host}:{port}: {error.strerror}. Choose another --port."
+            ) from error
         self.url = f"ws://{host}:{self._server.socket.getsockname()[1]}"
 
     def serve(self) -> None:
@@ -126,7 +130,9 @@ class _Episode:
             points = _numbers(given, "points", contract["observation"]["cloud_points"], 3)
             center = _numbers(given, "center", 3) if "center" in given else None
         target = _numbers(given, "target", len(contract["joints"]))
-        controller.begin(points, _numbers(given, "goal_pos", 3), _quaternion(given, "goal_quat"), target, center)
+        controller.begin(
+            points, _numbers(given, "goal_pos", 3), _quaternion(given, "goal_quat"), target, center
+        )
         self._has_begun = True
         return {"begun": True}
 
@@ -168,12 +174,16 @@ def _numbers(given: dict[str, Any], name: str, *shape: int) -> np.ndarray:
     except (TypeError, ValueError, OverflowError):
         raise LiveError(f"{name} holds something that is not a number.") from None
     if value.shape != shape or not np.isfinite(value).all():
-        raise LiveError(f"{name} has shape {value.shape}, or a number too large. Expected finite numbers {shape}.")
+        raise LiveError(
+            f"{name} has shape {value.shape}, or a number too large. Expected finite numbers {shape}."
+        )
     return value
 
 
 def _quaternion(given: dict[str, Any], name: str) -> np.ndarray:
     value = _numbers(given, name, 4)
     if abs(np.linalg.norm(value) - 1.0) > 0.01:
-        raise LiveError(f"{name} has length {np.linalg.norm(value):.3f}, expected a unit quaternion (w, x, y, z).")
+        raise LiveError(
+            f"{name} has length {np.linalg.norm(value):.3f}, expected a unit quaternion (w, x, y, z)."
+        )
     return value

@@ -28,7 +28,11 @@ _NUMBERS = {
     "com": Field((3,), "f", within=POSITION),
     "inertia": Field((3, 3), "f"),
 }
-SCHEMA = {"vertices": Field(("V", 3), "f", within=POSITION), "offsets": Field(("K+1",), "i"), **_NUMBERS}
+SCHEMA = {
+    "vertices": Field(("V", 3), "f", within=POSITION),
+    "offsets": Field(("K+1",), "i"),
+    **_NUMBERS,
+}
 _ALGORITHM = 2
 """Raise it when :mod:`xreset.objects.decompose` gives other pieces than before."""
 
@@ -45,7 +49,9 @@ def cached_pieces(mesh: trimesh.Trimesh, source: str, settings: Settings) -> Pie
     if path.is_file():
         try:
             arrays = read_npz(path, SCHEMA_NAME, SCHEMA, what="cached convex pieces")
-            shapes = tuple(hull(part) for part in np.split(arrays["vertices"], arrays["offsets"][1:-1]))
+            shapes = tuple(
+                hull(part) for part in np.split(arrays["vertices"], arrays["offsets"][1:-1])
+            )
             numbers: dict[str, Any] = {name: arrays[name][()] for name in _NUMBERS}
             return Pieces(shapes=shapes, **numbers)
         except (FileFormatError, ObjectError):

@@ -54,13 +54,17 @@ def canonical_names(names: Iterable[str], known: Iterable[str] = STAND_INS) -> t
     for name in names:
         key = _key(name)
         matches = [name] if name in known else []
-        matches = matches or [other for other in known if key in (_key(other), _key(other).partition("_")[2])]
+        matches = matches or [
+            other for other in known if key in (_key(other), _key(other).partition("_")[2])
+        ]
         if len(matches) == 1:
             found.append(matches[0])
         else:
             unknown.append(repr(name))
     if unknown:
-        listing = [f"{other} ({_ALIAS_OF[other]})" if other in _ALIAS_OF else other for other in known]
+        listing = [
+            f"{other} ({_ALIAS_OF[other]})" if other in _ALIAS_OF else other for other in known
+        ]
         what = f"Unknown object{'s' * (len(unknown) > 1)} {', '.join(dict.fromkeys(unknown))}"
         raise ObjectError(f"{what}. Choose from: {', '.join(listing) or 'none'}.")
     return tuple(found)

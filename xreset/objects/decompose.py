@@ -172,12 +172,24 @@ def as_solid(mesh: trimesh.Trimesh) -> Manifold:
     corner_sides = WALL / 2 * mesh.vertex_normals[mesh.faces]
     face_sides = WALL / 2 * mesh.face_normals[:, None]
     plates = np.concatenate(
-        (corners + corner_sides, corners - corner_sides, corners + face_sides, corners - face_sides), axis=1
+        (
+            corners + corner_sides,
+            corners - corner_sides,
+            corners + face_sides,
+            corners - face_sides,
+        ),
+        axis=1,
     )
-    union = m3.Manifold.batch_boolean([m3.Manifold.hull_points(points) for points in plates], m3.OpType.Add)
-    outer = [part for part in union.decompose() if part.volume() > 0]  # surfaces of cavities have negative volume
+    union = m3.Manifold.batch_boolean(
+        [m3.Manifold.hull_points(points) for points in plates], m3.OpType.Add
+    )
+    outer = [
+        part for part in union.decompose() if part.volume() > 0
+    ]  # surfaces of cavities have negative volume
     if not outer:
-        raise ObjectError("The mesh encloses no solid, even with its holes closed. Repair it, for example in MeshLab.")
+        raise ObjectError(
+            "The mesh encloses no solid, even with its holes closed. Repair it, for example in MeshLab."
+        )
     return m3.Manifold.batch_boolean(outer, m3.OpType.Add)
 
 
@@ -202,9 +214,16 @@ def _capped(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     for loop, edges in openings(mesh):
         center = mesh.vertices[loop].mean(axis=0)
         a, b = edges.T
-        area = np.linalg.norm(np.cross(mesh.vertices[a] - center, mesh.vertices[b] - center), axis=1).sum() / 2
+        area = (
+            np.linalg.norm(
+                np.cross(mesh.vertices[a] - center, mesh.vertices[b] - center), axis=1
+            ).sum()
+            / 2
+        )
         if area <= _SMALL_HOLE * mesh.area:
-            faces.append(np.column_stack((b, a, np.full(len(a), len(mesh.vertices) + len(centers)))))
+            faces.append(
+                np.column_stack((b, a, np.full(len(a), len(mesh.vertices) + len(centers))))
+            )
             centers.append(center)
     vertices = np.concatenate((mesh.vertices, np.reshape(centers, (-1, 3))))
     return trimesh.Trimesh(vertices, np.concatenate(faces), process=False)
@@ -238,7 +257,9 @@ class _Surface:
         farthest = 0.0
         pool = vertices[faces]
         middle = pool.mean(axis=1)
-        bound: np.ndarray = self._tree.query(middle)[0] + np.linalg.norm(pool - middle[:, None], axis=2).max(axis=1)
+        bound: np.ndarray = self._tree.query(middle)[0] + np.linalg.norm(
+            pool - middle[:, None], axis=2
+        ).max(axis=1)
         while bound.size and bound.max() > farthest + _EXACT:
             first, rest = np.split(np.argsort(-bound, kind="stable"), [_BATCH])
             corners = pool[first]
@@ -250,7 +271,10 @@ class _Surface:
             ab = (a + b) / 2
             bc = (b + c) / 2
             ca = (c + a) / 2
-            quarters = [np.stack(quarter, axis=1) for quarter in ((ab, bc, ca), (a, ab, ca), (b, bc, ab), (c, ca, bc))]
+            quarters = [
+                np.stack(quarter, axis=1)
+                for quarter in ((ab, bc, ca), (a, ab, ca), (b, bc, ab), (c, ca, bc))
+            ]
             pool = np.concatenate((pool[rest], *quarters))
             bound = np.concatenate((bound[rest], np.tile(least[unsure], 4)))
         return farthest
@@ -262,7 +286,9 @@ class _Surface:
 
         middle = corners.mean(axis=1)
         near = self.vertices[self.faces[self._face[self._tree.query(middle, _NEAREST)[1]]]]
-        points = np.stack((middle, *corners.transpose(1, 0, 2)))[:, :, None].repeat(_NEAREST, axis=2)
+        points = np.stack((middle, *corners.transpose(1, 0, 2)))[:, :, None].repeat(
+            _NEAREST, axis=2
+        )
         near = np.broadcast_to(near, (4, *near.shape)).reshape(-1, 3, 3)
         # in millimetres, for which closest_point has its tolerance
         closest = closest_point(1e3 * near, 1e3 * points.reshape(-1, 3)) / 1e3
@@ -288,7 +314,9 @@ class _Solid(_Surface):
         outside = piece - self.solid
         if outside.volume() < _SPECK / 100:
             return 0.0
-        return self.quick_deviation(*_arrays(outside)) if quick else self.deviation(*_arrays(outside))
+        return (
+            self.quick_deviation(*_arrays(outside)) if quick else self.deviation(*_arrays(outside))
+        )
 
 
 # Cutting and joining
@@ -310,7 +338,9 @@ class _Cutter:
         most = self._settings.max_pieces
         tolerance = _QUICK * self._settings.tolerance
         parts = [part for part in self._solid.solid.decompose() if part.volume() > _SPECK]
-        cut = self._cut_worst(parts, self._quick_excess, self._best_cut, tolerance, int(2 * _FEW * most))
+        cut = self._cut_worst(
+            parts, self._quick_excess, self._best_cut, tolerance, int(2 * _FEW * most)
+        )
         pieces = [part.hull() for *_, part in cut]
         tolerance = max(tolerance, *(self._solid.excess(piece, quick=True) for piece in pieces))
         pieces = self._joined(pieces, tolerance)
@@ -423,7 +453,11 @@ class _Cutter:
         number = len(hulls)
         while queue:
             _, one, other, both = heapq.heappop(queue)
-            if one in alive and other in alive and self._solid.excess(both, quick=False) <= tolerance / _QUICK:
+            if (
+                one in alive
+                and other in alive
+                and self._solid.excess(both, quick=False) <= tolerance / _QUICK
+            ):
                 del alive[one], alive[other]
                 add(number, both)
                 number += 1
@@ -434,7 +468,9 @@ def _planes(vertices: np.ndarray, faces: np.ndarray) -> list[list[tuple[np.ndarr
     """Return the sets of planes (normal, offset) that are tried on a part: across its principal axes and x, y, z, then
     some in pairs."""
     corners = vertices[faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
     if not area.sum():
         return []
     middle = corners.mean(axis=1)
@@ -483,7 +519,9 @@ def limited_hull(points: np.ndarray) -> Shape:
     along = vertices @ np.vstack((np.eye(3), _DIAGONALS)).T
     chosen = np.unique((along.argmin(axis=0), along.argmax(axis=0))).tolist()
     while len(chosen) < _MAX_VERTICES:
-        inner = ConvexHull(vertices[chosen], qhull_options="QJ")  # joggled: the first few may be coplanar
+        inner = ConvexHull(
+            vertices[chosen], qhull_options="QJ"
+        )  # joggled: the first few may be coplanar
         outside = (vertices @ inner.equations[:, :3].T + inner.equations[:, 3]).max(axis=1)
         outside[chosen] = -np.inf
         chosen.append(int(outside.argmax()))

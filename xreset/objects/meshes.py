@@ -114,18 +114,28 @@ def import_with_notes(path: str | Path, name: str) -> Import:
     own = properties_of(path)
     source = file_hash(path)
     try:
-        settings = Settings() if own.tolerance is None else Settings(hull_depth=0.0, tolerance=own.tolerance)
+        settings = (
+            Settings()
+            if own.tolerance is None
+            else Settings(hull_depth=0.0, tolerance=own.tolerance)
+        )
         pieces = cached_pieces(mesh, source, settings)
     except QhullError as error:
-        raise ObjectError(f"{path} spans no volume: it is flat, or damaged. A solid object is needed.") from error
+        raise ObjectError(
+            f"{path} spans no volume: it is flat, or damaged. A solid object is needed."
+        ) from error
     notes = []
     if not mesh.is_volume:
         widths = [1e3 * np.ptp(mesh.vertices[loop], axis=0).max() for loop, _ in openings(mesh)]
         problem = "the mesh is not closed"
         if widths:
-            problem += f" ({len(widths)} hole{'s' * (len(widths) > 1)}, the widest {max(widths):.0f} mm)"
+            problem += (
+                f" ({len(widths)} hole{'s' * (len(widths) > 1)}, the widest {max(widths):.0f} mm)"
+            )
         if len(pieces.shapes) == 1:
-            notes.append(f"{problem}: volume, center of mass and inertia are those of its convex hull")
+            notes.append(
+                f"{problem}: volume, center of mass and inertia are those of its convex hull"
+            )
         elif pieces.volume < 1.5 * mesh.area * WALL:
             notes.append(f"{problem}: it is taken as a wall {1e3 * WALL:g} mm thick")
         else:
@@ -142,15 +152,21 @@ def import_with_notes(path: str | Path, name: str) -> Import:
         mass_source = f"{density:g} kg/m^3"
         inertia = pieces.inertia * mass
         if own.density is None:
-            notes.append(f"its mass is unknown: {mass:.3f} kg by a density of {DEFAULT_DENSITY:.0f} kg/m^3")
+            notes.append(
+                f"its mass is unknown: {mass:.3f} kg by a density of {DEFAULT_DENSITY:.0f} kg/m^3"
+            )
     elif mesh.is_volume and mass / pieces.volume < _HOLLOW:
         com, inertia = shell_properties(np.asarray(mesh.vertices), np.asarray(mesh.faces), mass)
         litres = pieces.volume * 1e3
-        notes.append(f"{mass:.3f} kg in {litres:.2f} l is a hollow object: its mass is put on its surface")
+        notes.append(
+            f"{mass:.3f} kg in {litres:.2f} l is a hollow object: its mass is put on its surface"
+        )
     else:
         inertia = pieces.inertia * mass
     if not pieces.finished:
-        notes.append("cutting took too long and was stopped: a mesh with fewer triangles would fit better")
+        notes.append(
+            "cutting took too long and was stopped: a mesh with fewer triangles would fit better"
+        )
     obj = ObjectSpec(
         name=name,
         pieces=pieces.shapes,
@@ -185,7 +201,9 @@ def add_mesh(
         XResetError: the files cannot be written.
     """
     if not re.fullmatch("[A-Za-z0-9_-]{1,200}", name):
-        raise ObjectError(f"{shown(name)} cannot be an object's name. Use letters, digits, - and _.")
+        raise ObjectError(
+            f"{shown(name)} cannot be an object's name. Use letters, digits, - and _."
+        )
     target = folder / f"{name}.obj"
     facts = target.with_suffix(".toml")
     properties = properties or Properties()
@@ -197,7 +215,9 @@ def add_mesh(
     from trimesh.exchange.obj import export_obj
 
     mesh = read_mesh(path, scale=scale)
-    text = export_obj(mesh, include_normals=False, include_color=False, include_texture=False, header="")
+    text = export_obj(
+        mesh, include_normals=False, include_color=False, include_texture=False, header=""
+    )
     with tempfile.TemporaryDirectory() as temporary:
         draft = Path(temporary) / target.name
         draft.write_text(text)
@@ -238,7 +258,9 @@ def _checked(mesh: trimesh.Trimesh, path: Path) -> trimesh.Trimesh:
         raise ObjectError(f"{path} has a vertex that is not finite; it is damaged.")
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
         raise ObjectError(f"{path} has a triangle of an unknown vertex; it is damaged.")
-    if mesh.extents is not None and mesh.extents.max() > _LARGEST:  # before merging, which rounds by the size
+    if (
+        mesh.extents is not None and mesh.extents.max() > _LARGEST
+    ):  # before merging, which rounds by the size
         raise ObjectError(
             f"{path} measures {_size(mesh)}; meshes must be in metres. Is it in millimetres (--scale 0.001)?"
         )

@@ -79,7 +79,9 @@ def _write(path: Path, pieces: list[Shape], rng: np.random.Generator) -> None:
 # Families -------------------------------------------------------------------------------------------------------------
 
 
-def _rod(start: np.ndarray, end: np.ndarray, u: np.ndarray, v: np.ndarray, power: float = 2.0) -> Shape:
+def _rod(
+    start: np.ndarray, end: np.ndarray, u: np.ndarray, v: np.ndarray, power: float = 2.0
+) -> Shape:
     """Return a straight rod whose cross sections are superellipses with half axes u and v."""
     return loft([section(place, u, v, power=power, count=_CORNERS) for place in (start, end)])
 
@@ -129,7 +131,9 @@ def _wedge(rng: np.random.Generator) -> list[Shape]:
     corners = int(rng.integers(3, 8))
     angles = (np.arange(corners) + rng.uniform(-0.2, 0.2, corners)) * 2 * np.pi / corners
     radii = rng.uniform(0.028, 0.05, corners)
-    outline = [(r * np.cos(angle), 0.8 * r * np.sin(angle)) for r, angle in zip(radii, angles, strict=True)]
+    outline = [
+        (r * np.cos(angle), 0.8 * r * np.sin(angle)) for r, angle in zip(radii, angles, strict=True)
+    ]
     return [prism(outline, 0.0, rng.uniform(0.03, 0.15))]
 
 
@@ -175,10 +179,13 @@ def _banana(rng: np.random.Generator) -> list[Shape]:
         return section(bend * outward, size * outward, size * _Z, count=12)
 
     ends = pairwise(np.linspace(-1.0, 1.0, 7))
-    return [loft((ring(start - 0.02), ring(end + 0.02))) for start, end in ends]  # overlapping, so that no seam is open
+    return [
+        loft((ring(start - 0.02), ring(end + 0.02))) for start, end in ends
+    ]  # overlapping, so that no seam is open
 
 
 _FAMILIES: dict[str, Callable[[np.random.Generator], list[Shape]]] = {
-    make.__name__.strip("_"): make for make in (_box, _can, _cup, _egg, _wedge, _bottle, _hammer, _banana)
+    make.__name__.strip("_"): make
+    for make in (_box, _can, _cup, _egg, _wedge, _bottle, _hammer, _banana)
 }
 """Name -> function that makes a random shape."""

@@ -36,7 +36,11 @@ class Properties(Checked):
 
     def to_toml(self) -> str:
         """Return the text of the file; empty if nothing is known."""
-        return "".join(f"{name} = {float(value)!r}\n" for name, value in vars(self).items() if value is not None)
+        return "".join(
+            f"{name} = {float(value)!r}\n"
+            for name, value in vars(self).items()
+            if value is not None
+        )
 
 
 def properties_of(mesh: Path) -> Properties:

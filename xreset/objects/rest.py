@@ -21,7 +21,11 @@ def rest_height(obj: ObjectSpec, quat: np.ndarray) -> np.ndarray | float:
     """
     w, x, y, z = np.moveaxis(np.asarray(quat, dtype=float), -1, 0)
     norm = w * w + x * x + y * y + z * z
-    last_row = (2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z)  # of the rotation matrix
+    last_row = (
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        w * w - x * x - y * y + z * z,
+    )  # of the rotation matrix
     up = np.stack(last_row, axis=-1) / norm[..., None]
     height = -(up @ obj.vertices.T).min(axis=-1)
     return float(height) if np.ndim(height) == 0 else height
@@ -35,7 +39,9 @@ def resting_orientation(obj: ObjectSpec, up: np.ndarray) -> np.ndarray:
     convex = ConvexHull(obj.vertices)
     corners = obj.vertices[convex.simplices]
     normals = convex.equations[:, :3]
-    distance = normals @ obj.com + convex.equations[:, 3]  # of the center of mass, negative as it is inside
+    distance = (
+        normals @ obj.com + convex.equations[:, 3]
+    )  # of the center of mass, negative as it is inside
     foot = obj.com - distance[:, None] * normals
     stable = (points_to_barycentric(corners, foot) >= -1e-9).all(axis=1)
     top = -normals[stable][np.argmin(normals[stable] @ up)]
@@ -43,4 +49,6 @@ def resting_orientation(obj: ObjectSpec, up: np.ndarray) -> np.ndarray:
     sine = np.linalg.norm(axis)
     if sine < 1e-12:  # no turn, or half a turn about any horizontal axis
         return np.array([1.0, 0.0, 0.0, 0.0]) if top[2] > 0 else np.array([0.0, 1.0, 0.0, 0.0])
-    return Rotation.from_rotvec(axis / sine * np.arctan2(sine, top[2])).as_quat(canonical=True, scalar_first=True)
+    return Rotation.from_rotvec(axis / sine * np.arctan2(sine, top[2])).as_quat(
+        canonical=True, scalar_first=True
+    )

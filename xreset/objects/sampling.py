@@ -24,7 +24,9 @@ def surface_points(obj: ObjectSpec, count: int = 64, seed: int = 0) -> np.ndarra
     Uniform samples by area, without those inside the solid (where pieces of a stand-in overlap), thinned by
     farthest-point selection.
     """
-    points, _, normals = sample_surface(obj.vertices, obj.faces, max(_CANDIDATES_PER_POINT * count, 256), seed)
+    points, _, normals = sample_surface(
+        obj.vertices, obj.faces, max(_CANDIDATES_PER_POINT * count, 256), seed
+    )
     outside = winding_number(points + _PROBE * normals, obj.vertices, obj.faces) < 0.5
     return farthest_points(points[outside], count)
 
@@ -81,7 +83,9 @@ def winding_number(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) 
         a, b, c = np.moveaxis(away, 2, 0)
         la, lb, lc = (np.sqrt(_dot(v, v)) for v in (a, b, c))
         volume = _dot(a, np.cross(b, c))
-        angle = np.arctan2(volume, la * lb * lc + _dot(a, b) * lc + _dot(b, c) * la + _dot(c, a) * lb)
+        angle = np.arctan2(
+            volume, la * lb * lc + _dot(a, b) * lc + _dot(b, c) * la + _dot(c, a) * lb
+        )
         numbers.append(angle.sum(axis=1) / (2 * np.pi))
     return np.concatenate(numbers)
 

@@ -10,7 +10,16 @@ import numpy as np
 
 from xreset.errors import ObjectError
 from xreset.files import read_toml
-from xreset.geometry.shapes import box, cylinder, hull, loft, mass_properties, prism, section, surface_of
+from xreset.geometry.shapes import (
+    box,
+    cylinder,
+    hull,
+    loft,
+    mass_properties,
+    prism,
+    section,
+    surface_of,
+)
 from xreset.objects.ycb import MASSES
 from xreset.spec import ObjectSpec, Shape
 
@@ -34,7 +43,13 @@ def stand_in(name: str) -> ObjectSpec:
     mass = MASSES[name]
     com, inertia = mass_properties(vertices, faces, mass)
     return ObjectSpec(
-        name=name, pieces=tuple(pieces), mass=mass, com=com, inertia=inertia, vertices=vertices, faces=faces
+        name=name,
+        pieces=tuple(pieces),
+        mass=mass,
+        com=com,
+        inertia=inertia,
+        vertices=vertices,
+        faces=faces,
     )
 
 
@@ -54,7 +69,9 @@ def _lofts(made: dict[str, Any]) -> list[Shape]:
     for outline in made["pieces"]:
         rings = []
         for z, a, b, power in outline:
-            ring = section(center + z * _MM * _UP, a * _MM * u, b * _MM * v, power=power, count=made["corners"])
+            ring = section(
+                center + z * _MM * _UP, a * _MM * u, b * _MM * v, power=power, count=made["corners"]
+            )
             rings.append(ring)
         shapes.append(loft(rings))
     return shapes
@@ -66,7 +83,9 @@ def _hulls(made: dict[str, Any]) -> list[Shape]:
     center = _metres([*made["center"], 0.0])
     shapes = []
     for points in made["pieces"]:
-        corners = [center + out * _MM * u + z * _MM * _UP + side * _MM * v for out, z, side in points]
+        corners = [
+            center + out * _MM * u + z * _MM * _UP + side * _MM * v for out, z, side in points
+        ]
         shapes.append(hull(np.array(corners)))
     return shapes
 
@@ -76,7 +95,11 @@ def _ribs(made: dict[str, Any]) -> list[Shape]:
     rings = []
     for x, y, z, width, height, degrees in made["ribs"]:
         _, across = _axes(degrees)
-        rings.append(section(_metres([x, y, z]), width * _MM * across, height * _MM * _UP, count=made["corners"]))
+        rings.append(
+            section(
+                _metres([x, y, z]), width * _MM * across, height * _MM * _UP, count=made["corners"]
+            )
+        )
     return [loft(pair) for pair in pairwise(rings)]
 
 
@@ -90,14 +113,18 @@ def _bars(made: dict[str, Any]) -> list[Shape]:
             center[axis] = place * _MM
             center[1 - axis] = (low + high) / 2 * _MM
             half = (high - low) / 2 * _MM * np.eye(3)[1 - axis]
-            rings.append(section(center, half, depth * _MM * _UP, power=power, count=made["corners"]))
+            rings.append(
+                section(center, half, depth * _MM * _UP, power=power, count=made["corners"])
+            )
         shapes.append(loft(rings))
     return shapes
 
 
 def _prisms(made: list[dict[str, Any]]) -> list[Shape]:
     """Polygons between two heights."""
-    return [prism(_metres(part["outline"]), part["bottom"] * _MM, part["top"] * _MM) for part in made]
+    return [
+        prism(_metres(part["outline"]), part["bottom"] * _MM, part["top"] * _MM) for part in made
+    ]
 
 
 def _metres(lengths: Any) -> np.ndarray:

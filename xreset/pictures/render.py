@@ -42,7 +42,11 @@ from xreset.spec import SceneSpec
 
 SKY_COLORS: tuple[Color, Color] = ((0.90, 0.93, 0.97), (0.98, 0.98, 0.98))
 """Background at the upper and lower edge of a picture."""
-AXIS_COLORS: tuple[Color, Color, Color] = ((0.90, 0.15, 0.15), (0.15, 0.70, 0.20), (0.15, 0.35, 0.95))
+AXIS_COLORS: tuple[Color, Color, Color] = (
+    (0.90, 0.15, 0.15),
+    (0.15, 0.70, 0.20),
+    (0.15, 0.35, 0.95),
+)
 
 _LIGHT = np.array([0.1506, -0.3515, 0.9240], np.float32)
 """Direction to the light, world frame."""
@@ -81,7 +85,9 @@ class Camera:
         y, x = np.mgrid[:height, :width].astype(np.float32) + 0.5
         right = (x - width / 2) / self.focal_length(height)
         down = (y - height / 2) / self.focal_length(height)
-        return np.stack((right, down, np.ones_like(x)), axis=-1).reshape(-1, 3) @ np.float32(self.axes())
+        return np.stack((right, down, np.ones_like(x)), axis=-1).reshape(-1, 3) @ np.float32(
+            self.axes()
+        )
 
     def project(self, points: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
         """Return pixels [P, 2] and distances along the view axis [P] of world points [P, 3] that are before the
@@ -170,13 +176,17 @@ class Renderer:
         _draw_points(image, camera, points)
         return np.asarray(image.reduce(2))
 
-    def link_frames(self, joint_pos: np.ndarray, links: Sequence[str], *, length: float = 0.03) -> list[Points]:
+    def link_frames(
+        self, joint_pos: np.ndarray, links: Sequence[str], *, length: float = 0.03
+    ) -> list[Points]:
         """Return the axes of links as lines of dots (x red, y green, z blue); ``RobotError`` for an unknown link."""
         poses = self._link_poses(joint_pos, links)
         lines = []
         for axis, color in enumerate(AXIS_COLORS):
             tips = poses[:, :3, 3] + length * poses[:, :3, axis]
-            lines.append(Points(pos=np.linspace(poses[:, :3, 3], tips, _AXIS_DOTS), color=color, radius=0.0))
+            lines.append(
+                Points(pos=np.linspace(poses[:, :3, 3], tips, _AXIS_DOTS), color=color, radius=0.0)
+            )
         return lines
 
     def _link_poses(self, joint_pos: np.ndarray, links: Sequence[str] | None = None) -> np.ndarray:
@@ -185,14 +195,19 @@ class Renderer:
 
     def _robot(self, joint_pos: np.ndarray, robot_tint: Color | None) -> list[Triangles]:
         parts = []
-        for mesh, color, pose in zip(self._links, self._colors, self._link_poses(joint_pos), strict=True):
+        for mesh, color, pose in zip(
+            self._links, self._colors, self._link_poses(joint_pos), strict=True
+        ):
             if mesh is not None:
                 parts.append(place(mesh, tint(color, robot_tint) if robot_tint else color, pose))
         return parts
 
 
 def draw_bodies(
-    meshes: Sequence[trimesh.Trimesh], colors: Sequence[Color], camera: Camera, size: tuple[int, int]
+    meshes: Sequence[trimesh.Trimesh],
+    colors: Sequence[Color],
+    camera: Camera,
+    size: tuple[int, int],
 ) -> np.ndarray:
     """Return a [H, W, 3] uint8 picture of meshes, each in its color, without a table."""
     bodies = []
@@ -217,7 +232,9 @@ def add_caption(picture: np.ndarray, caption: Sequence[str], lines: int) -> np.n
     pen = ImageDraw.Draw(image)
     color = "black"
     for number, line in enumerate(caption):
-        pen.text((6, height + 3 + number * _LINE), line, fill=color, font=ImageFont.load_default(13))
+        pen.text(
+            (6, height + 3 + number * _LINE), line, fill=color, font=ImageFont.load_default(13)
+        )
         color = "dimgray"
     return np.asarray(image)
 
@@ -253,7 +270,9 @@ def _image(
     return image.resize((2 * width, 2 * height), Image.Resampling.NEAREST)
 
 
-def _shade(picture: np.ndarray, scene: Triangles, camera: Camera, rays: np.ndarray, *, shadows: bool) -> np.ndarray:
+def _shade(
+    picture: np.ndarray, scene: Triangles, camera: Camera, rays: np.ndarray, *, shadows: bool
+) -> np.ndarray:
     """Paint what the rays [N, 3] hit into the picture [N, 3]; return the depths [N], infinite where nothing is hit."""
     tree = _ray_tree(scene)
     eye = np.array(camera.eye, np.float32)

@@ -39,7 +39,9 @@ def shipped() -> dict[str, Path]:
 def card(file: Path) -> Card:
     """The card of a policy's file; ``FileFormatError`` if it is missing or damaged."""
     path = file.with_suffix(".toml")
-    return from_dict(Card, read_toml(path, SCHEMA, hint=f" It is the card of {file.name}."), str(path))
+    return from_dict(
+        Card, read_toml(path, SCHEMA, hint=f" It is the card of {file.name}."), str(path)
+    )
 
 
 def results_folder(name: str) -> Path:

@@ -21,7 +21,15 @@ from xreset.accounts import Account, accounts
 from xreset.demos.archive import ObjectMotions
 from xreset.errors import FileFormatError
 from xreset.geometry.urdf import robot_tree
-from xreset.records import JOINT, POSITION, Field, read_record, schema_of, unique_problem, write_record
+from xreset.records import (
+    JOINT,
+    POSITION,
+    Field,
+    read_record,
+    schema_of,
+    unique_problem,
+    write_record,
+)
 from xreset.retarget.file import Retargeted
 from xreset.spec import ObjectSpec, RobotSpec
 
@@ -72,7 +80,9 @@ class ResetBank:
 
     # Rejected candidates
     rejected_sequence_index: Annotated[np.ndarray, Field(("C",), "i")] = _empty(dtype=np.int32)
-    rejected_frame_index: Annotated[np.ndarray, Field(("C",), "i", within=(0, inf))] = _empty(dtype=np.int32)
+    rejected_frame_index: Annotated[np.ndarray, Field(("C",), "i", within=(0, inf))] = _empty(
+        dtype=np.int32
+    )
     rejected_post_contact: Annotated[np.ndarray, Field(("C",), "b")] = _empty(dtype=np.bool_)
     rejected_reason: Annotated[np.ndarray, Field(("C",), "i")] = _empty(dtype=np.int32)
     """[C] index into ``reason_names``."""
@@ -103,7 +113,9 @@ class ResetBank:
     def accounts(self) -> list[Account]:
         """Count the demonstrated frames that were kept and lost, by object and phase; states between frames do not
         count."""
-        object_name = np.concatenate((self.object_name, self.sequence_object[self.rejected_sequence_index]))
+        object_name = np.concatenate(
+            (self.object_name, self.sequence_object[self.rejected_sequence_index])
+        )
         post_contact = np.concatenate((self.post_contact, self.rejected_post_contact))
         lost = np.asarray(self.reason_names)[self.rejected_reason]
         reason = np.concatenate((np.full(self.num_states, ""), lost))
@@ -132,7 +144,9 @@ def no_states(robot: RobotSpec) -> dict[str, Any]:
     }
 
 
-def starts_and_goals(motions: ObjectMotions, robot: RobotSpec, sources: Mapping[str, str] | None = None) -> ResetBank:
+def starts_and_goals(
+    motions: ObjectMotions, robot: RobotSpec, sources: Mapping[str, str] | None = None
+) -> ResetBank:
     """Return a bank of demonstrations or trajectories without states; ``sources`` maps objects to where their geometry
     came from."""
     start_pos, start_quat = motions.start_pose
@@ -152,7 +166,9 @@ def starts_and_goals(motions: ObjectMotions, robot: RobotSpec, sources: Mapping[
     )
 
 
-def write_bank(path: str | Path, bank: ResetBank, *, config: Mapping[str, Any], inputs: Mapping[str, str]) -> None:
+def write_bank(
+    path: str | Path, bank: ResetBank, *, config: Mapping[str, Any], inputs: Mapping[str, str]
+) -> None:
     """Write a bank; see :func:`xreset.records.write_record`."""
     write_record(path, SCHEMA, bank, config=config, inputs=inputs)
 
@@ -202,7 +218,9 @@ def check_retargeted(path: str | Path, data: Retargeted, robot: RobotSpec) -> No
     tree = robot_tree(robot)
     lower = np.array([tree.joint(name).lower for name in data.joint_names])
     upper = np.array([tree.joint(name).upper for name in data.joint_names])
-    beyond = np.where(data.valid[:, None], np.maximum(lower - data.joint_pos, data.joint_pos - upper), -np.inf)
+    beyond = np.where(
+        data.valid[:, None], np.maximum(lower - data.joint_pos, data.joint_pos - upper), -np.inf
+    )
     frame, joint = np.unravel_index(int(beyond.argmax()), beyond.shape)
     if beyond[frame, joint] > _TOLERANCE:
         raise FileFormatError(

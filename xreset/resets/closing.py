@@ -60,11 +60,15 @@ def _frames_to_follow(retargeted: Retargeted, fingers: Fingers, within: float) -
     moved = np.linalg.norm(retargeted.object_pos - retargeted.object_pos[start], axis=-1) > MOVED
     over = grasped | moved
     count = np.cumsum(over)
-    over = count - (count - over)[start] > 0  # in this frame, or in an earlier one of the same sequence
+    over = (
+        count - (count - over)[start] > 0
+    )  # in this frame, or in an earlier one of the same sequence
     gap = fingers.nearest.numpy()
     near = np.minimum(gap[:-1], gap[1:]) < within
     same_sequence = owner[:-1] == owner[1:]
-    return np.flatnonzero(same_sequence & retargeted.valid[:-1] & retargeted.valid[1:] & ~over[:-1] & near)
+    return np.flatnonzero(
+        same_sequence & retargeted.valid[:-1] & retargeted.valid[1:] & ~over[:-1] & near
+    )
 
 
 def positions_between(values: np.ndarray, frame: np.ndarray, part: np.ndarray) -> np.ndarray:

@@ -72,7 +72,9 @@ def bank_starts(bank: ResetBank, rows: np.ndarray) -> Reset:
 class _Grouped:
     """Rows of a table sorted by the object that each belongs to, to be drawn by object."""
 
-    def __init__(self, owners: np.ndarray, object_names: tuple[str, ...], device: torch.device | str) -> None:
+    def __init__(
+        self, owners: np.ndarray, object_names: tuple[str, ...], device: torch.device | str
+    ) -> None:
         """Sort; ``owners`` names each row's object. Rows of objects that are not in ``object_names`` are left out."""
         number = {name: i for i, name in enumerate(object_names)}
         index = np.array([number.get(name, -1) for name in owners], dtype=np.int64)
@@ -88,7 +90,9 @@ class _Grouped:
         """Return places in the sorted order, drawn evenly from the rows of given objects [M] by numbers [M] in [0,
         1)."""
         count = self.count[object_index]
-        return self._first[object_index] + torch.minimum((uniform * count).long(), (count - 1).clamp_min(0))
+        return self._first[object_index] + torch.minimum(
+            (uniform * count).long(), (count - 1).clamp_min(0)
+        )
 
 
 class ResetDistribution:
@@ -142,9 +146,13 @@ class ResetDistribution:
         joints = [robot_tree(robot).joint(name) for name in robot.joint_names]
         self._lower = _tensor(np.array([float(joint.lower) for joint in joints]), device)
         self._upper = _tensor(np.array([float(joint.upper) for joint in joints]), device)
-        self._goal_shift = torch.tensor([config.goal_xy, config.goal_xy, config.goal_z, config.goal_yaw], device=device)
+        self._goal_shift = torch.tensor(
+            [config.goal_xy, config.goal_xy, config.goal_z, config.goal_yaw], device=device
+        )
         self._home = _tensor(robot.home, device)
-        self._home_std = _tensor(np.array([robot.home_std[joint.group == "hand"] for joint in robot.joints]), device)
+        self._home_std = _tensor(
+            np.array([robot.home_std[joint.group == "hand"] for joint in robot.joints]), device
+        )
 
     def start_pose(self, sequence: Tensor) -> tuple[Tensor, Tensor]:
         """Return the object's pose at the start of given demonstrations [M]: position [M, 3] and quaternion [M, 4]."""
@@ -164,11 +172,15 @@ class ResetDistribution:
         home = self.home(sequence, generator)
         if not len(self._states.state):
             return home
-        from_bank = (uniform[:, 0] < self.config.demo_probability) & (self._grouped_states.count[object_index] > 0)
+        from_bank = (uniform[:, 0] < self.config.demo_probability) & (
+            self._grouped_states.count[object_index] > 0
+        )
         row = self._grouped_states.draw(object_index, uniform[:, 1])
         row = torch.where(from_bank, row, 0)  # a valid row for home worlds; its values are not used
         gravity = uniform[:, 3] if self.config.random_gravity else torch.ones_like(uniform[:, 3])
-        return where(from_bank, replace(self._states[row], state=row, gravity_fraction=gravity), home)
+        return where(
+            from_bank, replace(self._states[row], state=row, gravity_fraction=gravity), home
+        )
 
     def home(self, sequence: Tensor, generator: torch.Generator) -> Reset:
         """Return home resets for given demonstrations [M], perturbed as configured."""
@@ -185,7 +197,9 @@ class ResetDistribution:
         start_pos, start_quat = self.start_pose(sequence)
         object_quat = quat_multiply(quat_from_axis_angle(yaw), start_quat)
         object_pos = self._turned(start_pos, start_quat, object_quat, sequence) + offset
-        gravity = 1.0 + torch.randn(m, generator=generator, device=device) * c.home_gravity_std / GRAVITY
+        gravity = (
+            1.0 + torch.randn(m, generator=generator, device=device) * c.home_gravity_std / GRAVITY
+        )
         goal_pos, goal_quat = self._moved_goal(sequence, generator)
         return Reset(
             joint_pos=joint_pos,

@@ -113,10 +113,14 @@ def make_bank(
     object_quat = rotations_between(retargeted.object_quat_wxyz, frame, part)
     target = joint_pos.astype(np.float32)
 
-    def try_candidates(rows: np.ndarray, report: Callable[[int], None] = lambda done: None) -> np.ndarray:
+    def try_candidates(
+        rows: np.ndarray, report: Callable[[int], None] = lambda done: None
+    ) -> np.ndarray:
         """Return the reasons for which candidates [rows] are rejected, -1 where every engine accepts them."""
         arrays = (joint_pos, object_pos, object_quat, target)
-        states = State.at_rest(*(torch.as_tensor(array[rows], dtype=torch.float32) for array in arrays))
+        states = State.at_rest(
+            *(torch.as_tensor(array[rows], dtype=torch.float32) for array in arrays)
+        )
         reason = np.full(len(rows), -1, dtype=np.int64)
         for number, name in enumerate(engines):
             left = np.flatnonzero(reason < 0)
@@ -141,7 +145,9 @@ def make_bank(
     reason = try_candidates(np.arange(len(frame)), lambda done: progress(done, work))
     if squeeze.force > 0:
         rows = np.flatnonzero((reason < 0) & post_contact)
-        fingers = fingers_of(robot, used, object_name[rows], joint_pos[rows], object_pos[rows], object_quat[rows])
+        fingers = fingers_of(
+            robot, used, object_name[rows], joint_pos[rows], object_pos[rows], object_quat[rows]
+        )
         target[rows] = squeeze_targets(robot, fingers, joint_pos[rows], squeeze)
         refused = rows[try_candidates(rows) >= 0]
         target[refused] = joint_pos[refused]

@@ -69,7 +69,10 @@ def fingers_of(
         object_pos: [M, 3]
         object_quat: [M, 4]
     """
-    q, pos, quat = (torch.as_tensor(array, dtype=torch.float64) for array in (joint_pos, object_pos, object_quat))
+    q, pos, quat = (
+        torch.as_tensor(array, dtype=torch.float64)
+        for array in (joint_pos, object_pos, object_quat)
+    )
     links: list[str] = []
     finger: list[int] = []
     for number, tip in enumerate(robot.fingertips):
@@ -88,12 +91,16 @@ def fingers_of(
         R = poses[:, g, :3, :3]
         world = centers @ R.mT + poses[:, g, None, :3, 3]
         local = quat_rotate_inverse(quat[:, None].expand(-1, len(centers), 4), world - pos[:, None])
-        distance, gradient = fields.signed_distance(local.flatten(0, 1), which.repeat_interleave(len(centers)))
+        distance, gradient = fields.signed_distance(
+            local.flatten(0, 1), which.repeat_interleave(len(centers))
+        )
         gap[:, g], nearest = (distance.view(-1, len(centers)) - radii).min(dim=-1)
         gradient = gradient.view(-1, len(centers), 3)[torch.arange(len(nearest)), nearest]
         inward[:, g] = -quat_rotate(quat, torch.nn.functional.normalize(gradient, dim=-1))
         point[:, g] = centers[nearest] + radii[nearest, None] * matvec(R.mT, inward[:, g])
-    return Fingers(links=tuple(links), finger=torch.tensor(finger), gap=gap, point=point, inward=inward)
+    return Fingers(
+        links=tuple(links), finger=torch.tensor(finger), gap=gap, point=point, inward=inward
+    )
 
 
 def _balls(kinematics: Kinematics, link: str) -> tuple[Tensor, Tensor]:
@@ -106,7 +113,9 @@ def _balls(kinematics: Kinematics, link: str) -> tuple[Tensor, Tensor]:
     return torch.as_tensor(centers), torch.as_tensor(radii)
 
 
-def squeeze_targets(robot: RobotSpec, fingers: Fingers, joint_pos: np.ndarray, config: SqueezeConfig) -> np.ndarray:
+def squeeze_targets(
+    robot: RobotSpec, fingers: Fingers, joint_pos: np.ndarray, config: SqueezeConfig
+) -> np.ndarray:
     """Return drive targets [M, J] with which the fingers press, within joint limits and the drives' largest torques.
 
     A finger that presses on the object with a normal force f needs joint torques J^T f. A drive gives them where its
@@ -123,7 +132,9 @@ def squeeze_targets(robot: RobotSpec, fingers: Fingers, joint_pos: np.ndarray, c
     kinematics = Kinematics(robot)
     jacobian = kinematics.jacobian(q, fingers.links, fingers.point).linear
     pressing = fingers.leading & (fingers.gap < config.reach)
-    torque = torch.einsum("mgi,mgij->mj", config.force * pressing[..., None] * fingers.inward, jacobian)
+    torque = torch.einsum(
+        "mgi,mgij->mj", config.force * pressing[..., None] * fingers.inward, jacobian
+    )
     effort = torch.tensor([joint.drive.effort for joint in robot.joints], dtype=torch.float64)
     kp = torch.tensor([joint.drive.kp for joint in robot.joints], dtype=torch.float64)
     is_hand = torch.tensor([joint.group == "hand" and joint.drive.kp > 0 for joint in robot.joints])

@@ -132,7 +132,9 @@ def make_goals(
             partial(_draw, obj, rests[obj.name], own, config),
             lambda count, done=done: progress(done + count, len(wanted) * len(specs)),
         )
-        if missing := [f"{family}_{number:03d}" for family, number in wanted if (family, number) not in found]:
+        if missing := [
+            f"{family}_{number:03d}" for family, number in wanted if (family, number) not in found
+        ]:
             raise GoalError(
                 f"{spec.name} cannot reach {len(missing)} of {len(wanted)} goals of {obj.name}, such as {missing[0]}: "
                 "no grasp holds the object both at its start and there. Lower the lift or the angle, leave out the "
@@ -174,10 +176,14 @@ def with_goals(bank: ResetBank, goals: GoalSet) -> ResetBank:
         if field.shape[:1] == ("S",):
             joined[name] = np.concatenate((getattr(bank, name), getattr(goals, name)))
     names = tuple(sorted(sources))
-    return replace(bank, **joined, object_names=names, object_sources=tuple(sources[name] for name in names))
+    return replace(
+        bank, **joined, object_names=names, object_sources=tuple(sources[name] for name in names)
+    )
 
 
-def checked_goals(where: str, goals: GoalSet, robot: RobotSpec, objects: Sequence[ObjectSpec]) -> GoalSet:
+def checked_goals(
+    where: str, goals: GoalSet, robot: RobotSpec, objects: Sequence[ObjectSpec]
+) -> GoalSet:
     """Return a goal set for a robot. If it was made for another one, the reach of this robot is tried here.
 
     Args:
@@ -228,13 +234,17 @@ def _own_pose(pose: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
     values = np.asarray(pose, dtype=float)
     length = np.linalg.norm(values[3:]) if values.shape == (7,) else 0.0
     if not np.isfinite(values).all() or not length > 0:
-        raise GoalError(f"The pose {tuple(pose)} is not a pose; expected x, y, z [m] and a quaternion w, x, y, z.")
+        raise GoalError(
+            f"The pose {tuple(pose)} is not a pose; expected x, y, z [m] and a quaternion w, x, y, z."
+        )
     return values[:3], values[3:] / length
 
 
 def _check_above_table(name: str, depth: float) -> None:
     if depth > _INSIDE:
-        raise GoalError(f"{name}: the goal is {100 * depth:.1f} cm inside the table. Raise it by as much.")
+        raise GoalError(
+            f"{name}: the goal is {100 * depth:.1f} cm inside the table. Raise it by as much."
+        )
 
 
 def _resting_poses(
@@ -269,7 +279,9 @@ def _resting_poses(
     for obj in objects:
         rows = [row for row in listed[obj.name] if at_rest[row]]
         if not rows:
-            raise GoalError(f"{obj.name} does not come to rest on the table: it rolls or falls over in MuJoCo.")
+            raise GoalError(
+                f"{obj.name} does not come to rest on the table: it rolls or falls over in MuJoCo."
+            )
         turns = Rotation.from_quat(settled.start_quat_wxyz[rows], scalar_first=True)
         heights = settled.start_pos[rows, 2] + turns.apply(obj.com)[:, 2]
         rests[obj.name] = list(zip(heights, turns, strict=True))
@@ -307,7 +319,9 @@ def _draw(
             turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * random.uniform(0.0, np.pi))
         elif family in _TURN_AXES:
             side = random.choice((-1.0, 1.0))
-            turn = Rotation.from_rotvec(side * np.radians(config.angle) * np.array(_TURN_AXES[family]))
+            turn = Rotation.from_rotvec(
+                side * np.radians(config.angle) * np.array(_TURN_AXES[family])
+            )
         goal += np.array([config.goal_xy, config.goal_xy, config.goal_z]) * at_goal[:3]
         goal_turn = _about_z(np.radians(config.goal_yaw) * at_goal[3]) * turn * heading
     return _Episode(
@@ -337,12 +351,18 @@ def _reached(
     for attempt in range(_DRAWS):
         drawn = [draw(*item, attempt) for item in wanted if item not in found]
         drawn = [
-            e for e in drawn if e.goal[2] >= rest_height(e.obj, _quat(e.goal_turn)) + e.goal_turn.apply(e.obj.com)[2]
+            e
+            for e in drawn
+            if e.goal[2] >= rest_height(e.obj, _quat(e.goal_turn)) + e.goal_turn.apply(e.obj.com)[2]
         ]
         if drawn:
             turns = Rotation.concatenate([e.goal_turn * e.start_turn.inv() for e in drawn])
-            held = reach.holds(np.stack([e.start for e in drawn]), np.stack([e.goal for e in drawn]), turns)
-            found |= {(e.family, e.number): e for e, holds in zip(drawn, held, strict=True) if holds}
+            held = reach.holds(
+                np.stack([e.start for e in drawn]), np.stack([e.goal for e in drawn]), turns
+            )
+            found |= {
+                (e.family, e.number): e for e, holds in zip(drawn, held, strict=True) if holds
+            }
         progress(len(found))
     return found
 

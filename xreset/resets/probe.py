@@ -48,7 +48,9 @@ def probe(
     worlds = torch.as_tensor(plan.object_index)
     verdicts = None
     done = 0
-    with make_backend(engine, scene, len(worlds), object_index=worlds, device=device_for(engine, device)) as backend:
+    with make_backend(
+        engine, scene, len(worlds), object_index=worlds, device=device_for(engine, device)
+    ) as backend:
         for items, fresh in plan:
             start = states[torch.as_tensor(items)].to(backend.device)
             settle(backend, start, gravity=gravity, steps=steps)

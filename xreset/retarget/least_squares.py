@@ -32,7 +32,9 @@ class Quadratic(Tensors):
     @staticmethod
     def of_residuals(residuals: Tensor, jacobian: Tensor) -> Quadratic:
         """Return the sum of the squares of residuals [B, R] with their derivatives [B, R, n]."""
-        return Quadratic(residuals.square().sum(1), matvec(jacobian.mT, residuals), jacobian.mT @ jacobian)
+        return Quadratic(
+            residuals.square().sum(1), matvec(jacobian.mT, residuals), jacobian.mT @ jacobian
+        )
 
     def __add__(self, other: Self) -> Self:
         """Return the sum of two costs of the same variables."""

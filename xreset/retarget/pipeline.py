@@ -59,7 +59,9 @@ def rest_on_table(demos: Demos, objects: Sequence[ObjectSpec]) -> Demos:
     return grounded(levelled(demos), _by_name(demos, objects))
 
 
-def human_contacts(demos: Demos, surfaces: Mapping[str, Surface], distance: float) -> tuple[np.ndarray, np.ndarray]:
+def human_contacts(
+    demos: Demos, surfaces: Mapping[str, Surface], distance: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Find where human hands touch the objects.
 
     Args:
@@ -70,7 +72,9 @@ def human_contacts(demos: Demos, surfaces: Mapping[str, Surface], distance: floa
     Returns:
         Contact points [F, 21, 3] in the world, zero where there is no contact, and whether there is one [F, 21].
     """
-    keypoints = np.where(demos.hand_valid[:, None, None], demos.hand_keypoints.astype(np.float64), np.nan)
+    keypoints = np.where(
+        demos.hand_valid[:, None, None], demos.hand_keypoints.astype(np.float64), np.nan
+    )
     object_pos = demos.object_pos.astype(np.float64)
     object_quat = demos.object_quat_wxyz.astype(np.float64)
     points = np.zeros_like(keypoints)
@@ -78,7 +82,9 @@ def human_contacts(demos: Demos, surfaces: Mapping[str, Surface], distance: floa
     object_name = demos.object_name[demos.sequence_of_frame]
     for name in np.unique(object_name).tolist():
         rows = object_name == name
-        contacts = keypoint_contacts(surfaces[name], keypoints[rows], object_pos[rows], object_quat[rows], distance)
+        contacts = keypoint_contacts(
+            surfaces[name], keypoints[rows], object_pos[rows], object_quat[rows], distance
+        )
         points[rows], touching[rows] = contacts
     return points, touching
 
@@ -177,7 +183,10 @@ def wrist_paths(
     :func:`retarget_demos`."""
     hands = HandMotions(demos, robot, objects, config)
     arm = ArmModel(robot)
-    return [_arm_targets(hands.model, arm, targets, motion) for _, targets, motion in hands.batches(progress)]
+    return [
+        _arm_targets(hands.model, arm, targets, motion)
+        for _, targets, motion in hands.batches(progress)
+    ]
 
 
 def _by_name(demos: Demos, objects: Sequence[ObjectSpec]) -> dict[str, ObjectSpec]:
@@ -212,9 +221,13 @@ class HandMotions:
         self._objects = list(surfaces)
         self._fields = DistanceFields.join([surface.field for surface in surfaces.values()])
         self.demos = demos = rest_on_table(demos, objects)
-        self._contact_points, self.touching = human_contacts(demos, surfaces, config.contact_distance)
+        self._contact_points, self.touching = human_contacts(
+            demos, surfaces, config.contact_distance
+        )
         """Contact points [F, 21, 3] of the human keypoints, and which of them [F, 21] touch the object."""
-        self._keypoints = np.where(demos.hand_valid[:, None, None], demos.hand_keypoints, 0.0).astype(np.float64)
+        self._keypoints = np.where(
+            demos.hand_valid[:, None, None], demos.hand_keypoints, 0.0
+        ).astype(np.float64)
 
     def batches(
         self, progress: Callable[[int, int], None] = lambda done, total: None
@@ -247,7 +260,9 @@ class HandMotions:
         keypoints = self._keypoints[:, hand.keypoint_indices]
         if hand.is_jaw and self._config.jaw == "analytic":
             keypoints = jaw_keypoints(hand, self._keypoints)
-        held = np.logical_and(self.touching[:, _THUMB].any(axis=1), self.touching[:, _FINGERS].any(axis=1))
+        held = np.logical_and(
+            self.touching[:, _THUMB].any(axis=1), self.touching[:, _FINGERS].any(axis=1)
+        )
         which = [self._objects.index(name) for name in demos.object_name[list(sequences)].tolist()]
         return HandTargets(
             keypoints=padded(keypoints),
@@ -262,7 +277,9 @@ class HandMotions:
         )
 
 
-def _arm_targets(hand: HandModel, arm: ArmModel, targets: HandTargets, motion: HandState) -> ArmTargets:
+def _arm_targets(
+    hand: HandModel, arm: ArmModel, targets: HandTargets, motion: HandState
+) -> ArmTargets:
     """Return the path that a hand's motion demands of the arm."""
     followed = hand.keypoints(**vars(motion.to(hand.device))).to(targets.keypoints.device)
     tips_off = (followed - targets.keypoints)[:, :, hand.is_tip.cpu()].norm(dim=-1)

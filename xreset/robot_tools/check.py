@@ -65,9 +65,8 @@ def check(name_or_folder: str | Path) -> list[Finding]:
         spec = load_robot(name_or_folder)
     except XResetError as error:
         return [Finding("error", "description", str(error))]
-    counts = (
-        f"{len(spec.arm_indices)} arm joints, {len(spec.hand_indices)} hand joints, {len(spec.fingertips)} fingertips"
-    )
+    joints = f"{len(spec.arm_indices)} arm joints, {len(spec.hand_indices)} hand joints"
+    counts = f"{joints}, {len(spec.fingertips)} fingertips"
     found = [Finding("ok", "description", f"{folder / DESCRIPTION}: {counts}")]
     try:
         tree = robot_tree(spec)
@@ -77,16 +76,30 @@ def check(name_or_folder: str | Path) -> list[Finding]:
     mass = sum(link.mass for link in tree.links)
     content = f"{len(tree.links)} links, {len(tree.joints)} joints, {shapes} collision shapes, {mass:.1f} kg"
     found.append(Finding("ok", "URDF", content))
-    found += _topic("joints", _joints(spec, tree), f"{len(spec.joints)} actuated joints are at home within limits")
-    found += _topic("mimic joints", _mimics(spec, tree), f"{len(spec.mimics)} follow an actuated joint")
-    found += _topic("links", _links(spec, tree), "palm, fingertips, keypoints and collision links exist")
-    found += _topic("inertias", _inertias(tree), "masses are positive, inertias are those of solid bodies")
+    found += _topic(
+        "joints",
+        _joints(spec, tree),
+        f"{len(spec.joints)} actuated joints are at home within limits",
+    )
+    found += _topic(
+        "mimic joints", _mimics(spec, tree), f"{len(spec.mimics)} follow an actuated joint"
+    )
+    found += _topic(
+        "links", _links(spec, tree), "palm, fingertips, keypoints and collision links exist"
+    )
+    found += _topic(
+        "inertias", _inertias(tree), "masses are positive, inertias are those of solid bodies"
+    )
     if any(finding.level == "error" for finding in found):
         return [*found, Finding("skipped", "home", "fix the errors above first")]
     q = _around_home(spec)
     found += _topic("drives", _drives(spec), "damping ratios at home are between 0.5 and 5")
-    found += _topic("frames", _frames(spec, tree), "the palm frame is in the palm, and looks along the fingers")
-    found += _topic("fingers", _fingers(spec, tree), "no fingertip opposes the others more than the thumb")
+    found += _topic(
+        "frames", _frames(spec, tree), "the palm frame is in the palm, and looks along the fingers"
+    )
+    found += _topic(
+        "fingers", _fingers(spec, tree), "no fingertip opposes the others more than the thumb"
+    )
     found += _topic("home and table", _above_table(spec, q))
     found += _topic("home and self", _free_of_itself(spec, q))
     found += _topic("retargeting", _size(spec))
@@ -121,9 +134,15 @@ def _joints(spec: RobotSpec, tree: RobotTree) -> Problems:
         if found.type == "fixed":
             yield "error", f"{joint.name!r} is fixed in the URDF; an actuated joint must move."
         elif not np.isfinite((found.lower, found.upper)).all() or found.lower >= found.upper:
-            yield "error", f"{joint.name!r} has the limits {limits}; expected finite ones, the lower one first."
+            yield (
+                "error",
+                f"{joint.name!r} has the limits {limits}; expected finite ones, the lower one first.",
+            )
         elif not found.lower <= joint.home <= found.upper:
-            yield "error", f"{joint.name!r} is at home at {joint.home:g}, outside its limits {limits}."
+            yield (
+                "error",
+                f"{joint.name!r} is at home at {joint.home:g}, outside its limits {limits}.",
+            )
         elif (found.child in inside) != (joint.group == "hand"):
             where = "below" if found.child in inside else "not below"
             text = f"{joint.name!r} is of group {joint.group!r} but lies {where} the hand's root {spec.hand_root!r}."
@@ -143,7 +162,9 @@ def _mimics(spec: RobotSpec, tree: RobotTree) -> Problems:
         if own is None:
             yield "error", f"{mimic.joint!r} is not a moving joint of the URDF."
         elif source is not None:
-            low, high = sorted(mimic.multiplier * limit + mimic.offset for limit in (source.lower, source.upper))
+            low, high = sorted(
+                mimic.multiplier * limit + mimic.offset for limit in (source.lower, source.upper)
+            )
             if low < own.lower - _LIMIT_SLACK or high > own.upper + _LIMIT_SLACK:
                 yield (
                     "error",
@@ -169,14 +190,20 @@ def _links(spec: RobotSpec, tree: RobotTree) -> Problems:
         for link in links:
             if link not in known:
                 absent = True
-                yield "error", f"{where}: the URDF has no link {link!r}. Choose from: {', '.join(known)}."
+                yield (
+                    "error",
+                    f"{where}: the URDF has no link {link!r}. Choose from: {', '.join(known)}.",
+                )
     if absent:
         return
     inside = tree.below(spec.hand_root)[1:]
     for tip in spec.fingertips:
         if not any(known[link].collisions for link in tip.contact_links):
             links = ", ".join(tip.contact_links)
-            yield "error", f"fingertip {tip.name!r}: none of {links} has a collision shape, so it can touch nothing."
+            yield (
+                "error",
+                f"fingertip {tip.name!r}: none of {links} has a collision shape, so it can touch nothing.",
+            )
         if tip.link not in inside:
             text = f"{tip.link!r} does not lie below the hand's root {spec.hand_root!r}."
             yield "error", f"fingertip {tip.name!r}: {text}"
@@ -191,10 +218,11 @@ def _inertias(tree: RobotTree) -> Problems:
         name = link.name
         if link.mass <= 0:
             if name in moved:
-                text = (
-                    f"{name!r} moves but has the mass {link.mass:g} kg; every moving link needs a mass and an inertia."
+                yield (
+                    "error",
+                    f"{name!r} moves but has the mass {link.mass:g} kg; every moving link needs a mass and an "
+                    "inertia.",
                 )
-                yield "error", text
             continue
         moments = ", ".join(f"{moment:.3g}" for moment in np.linalg.eigvalsh(link.inertia))
         has = f"{name!r} has the principal moments {moments} kg m^2"
@@ -203,7 +231,10 @@ def _inertias(tree: RobotTree) -> Problems:
             yield "error", f"{has}. {text}"
         elif not plausible(link):
             text = f"{link.mass:.3g} kg of its size can have {largest_moment(link):.2g} at most"
-            yield "warning", f"{has}; {text}. Is it a placeholder? `xreset robots import` replaces such."
+            yield (
+                "warning",
+                f"{has}; {text}. Is it a placeholder? `xreset robots import` replaces such.",
+            )
 
 
 # Physics --------------------------------------------------------------------------------------------------------------
@@ -258,7 +289,9 @@ def _frames(spec: RobotSpec, tree: RobotTree) -> Problems:
 def _chains(spec: RobotSpec, tree: RobotTree) -> list[list[str]]:
     """Return for each fingertip the moving links from the hand's body to it, the body's neighbor first."""
     inside = tree.below(tree.moving_ancestor(spec.hand_root))[1:]
-    moving = [joint.child for joint in tree.joints if joint.type != "fixed" and joint.child in inside]
+    moving = [
+        joint.child for joint in tree.joints if joint.type != "fixed" and joint.child in inside
+    ]
     return [[link for link in moving if tip.link in tree.below(link)] for tip in spec.fingertips]  # noqa: XR002
 
 
@@ -284,7 +317,10 @@ def _thumb(spec: RobotSpec) -> Problems:
     best = int(scores.argmax())
     met = [", ".join(names[i] for i in np.flatnonzero(row)) or "no other" for row in meetings]  # noqa: XR002
     if scores[best] == 0:
-        yield "warning", "no fingertip can come near another and press against it. Are the joints' limits right?"
+        yield (
+            "warning",
+            "no fingertip can come near another and press against it. Are the joints' limits right?",
+        )
     elif scores[0] < _LESS_OPPOSED * scores[best]:
         yield (
             "error",
@@ -299,7 +335,9 @@ def _around_home(spec: RobotSpec) -> torch.Tensor:
     home = torch.tensor(spec.home)
     spread = torch.zeros_like(home)
     spread[spec.arm_indices], spread[spec.hand_indices] = spec.home_std
-    noise = torch.randn(_SAMPLES, len(home), generator=torch.Generator().manual_seed(0), dtype=home.dtype)
+    noise = torch.randn(
+        _SAMPLES, len(home), generator=torch.Generator().manual_seed(0), dtype=home.dtype
+    )
     return torch.cat((home[None], Kinematics(spec).clamp(home + spread * noise)))
 
 
@@ -311,14 +349,20 @@ def _above_table(spec: RobotSpec, q: torch.Tensor) -> Problems:
         level = "error"
     elif height[0] < _MIN_CLEARANCE or share > 0.01:
         level = "warning"
-    yield level, f"lowest at {1e3 * height[0]:.0f} mm above the table; {100 * share:.0f} % of the spread below it"
+    yield (
+        level,
+        f"lowest at {1e3 * height[0]:.0f} mm above the table; {100 * share:.0f} % of the spread below it",
+    )
 
 
 def _free_of_itself(spec: RobotSpec, q: torch.Tensor) -> Problems:
     kinematics = Kinematics(spec)
     collision = SelfCollision(spec, kinematics)
     for pair in collision.overlapping_at_home:
-        yield "error", f"{' and '.join(pair)} overlap at home: move home, or add the pair to collision.exclude."
+        yield (
+            "error",
+            f"{' and '.join(pair)} overlap at home: move home, or add the pair to collision.exclude.",
+        )
     near = collision.near(kinematics.link_poses(q).numpy(), 0.0)
     share = 100 * len({configuration for configuration, _, _ in near}) / len(q)
     if share > 20:

@@ -180,7 +180,9 @@ class Couplings:
         gaps = np.max([np.abs(self._gaps(q)) for q in positions], axis=0, initial=0)
         kinds = self.model.eq_type[self.data.efc_id[: len(gaps)]]
         is_loop = np.isin(kinds, (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)))
-        return float(gaps[rows & is_loop].max(initial=0)), float(gaps[rows & ~is_loop].max(initial=0))
+        return float(gaps[rows & is_loop].max(initial=0)), float(
+            gaps[rows & ~is_loop].max(initial=0)
+        )
 
     def _closed(self, free: np.ndarray, start: np.ndarray) -> np.ndarray:
         """Return positions of the free joints that meet what couples them, while the others stay at ``start`` [Q]."""

@@ -73,7 +73,9 @@ def draft_spec(
 def link_places(spec: RobotSpec, positions: dict[str, float]) -> dict[str, np.ndarray]:
     """Link -> pose [4, 4] in the frame of the hand's root, at joint positions; others are at home."""
     kinematics = Kinematics(spec)
-    q = torch.tensor([positions.get(joint.name, joint.home) for joint in spec.joints], dtype=torch.float64)
+    q = torch.tensor(
+        [positions.get(joint.name, joint.home) for joint in spec.joints], dtype=torch.float64
+    )
     poses = kinematics.link_poses(kinematics.clamp(q)).numpy()
     root = np.linalg.inv(poses[kinematics.link_index(spec.hand_root)])
     return {name: root @ poses[kinematics.link_index(name)] for name in kinematics.link_names}
@@ -83,7 +85,11 @@ def description_text(spec: RobotSpec, notes: Sequence[str]) -> str:
     """The robot's ``robot.toml``, every part explained; ``notes`` say what was guessed."""
     loader = jinja2.FileSystemLoader(Path(__file__).with_name("templates"))
     pages = jinja2.Environment(
-        loader=loader, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, autoescape=False
+        loader=loader,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        autoescape=False,
     )
     pages.filters["toml"] = lambda value: json.dumps(value, ensure_ascii=False)
     return pages.get_template("robot.toml").render(spec=spec, notes=notes, schema=SCHEMA)

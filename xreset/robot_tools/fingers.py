@@ -124,7 +124,11 @@ def _palm_link(tree: RobotTree, notes: list[str]) -> str:
             body = tree.moving_ancestor(link)
             children = []
             for joint in tree.joints:
-                if joint.type != "fixed" and joint.child in inside and tree.moving_ancestor(joint.parent) == body:
+                if (
+                    joint.type != "fixed"
+                    and joint.child in inside
+                    and tree.moving_ancestor(joint.parent) == body
+                ):
                     children.append(joint)
             if len(children) != 1:
                 break
@@ -139,7 +143,9 @@ def _palm_link(tree: RobotTree, notes: list[str]) -> str:
     return link
 
 
-def _find_fingers(spec: RobotSpec, tree: RobotTree, at: Poses, thumb: str | None, notes: list[str]) -> list[Finger]:
+def _find_fingers(
+    spec: RobotSpec, tree: RobotTree, at: Poses, thumb: str | None, notes: list[str]
+) -> list[Finger]:
     """Return the hand's fingers, thumb first, then from the thumb's side on."""
     chains = _without_bars(spec, _chains(tree, spec.hand_root), notes)
     if len(chains) < 2:
@@ -168,7 +174,9 @@ def _find_fingers(spec: RobotSpec, tree: RobotTree, at: Poses, thumb: str | None
     return [replace(first, name="thumb"), *others]
 
 
-def _find_thumb(spec: RobotSpec, at: Poses, chains: list[Finger], thumb: str | None, notes: list[str]) -> Finger:
+def _find_thumb(
+    spec: RobotSpec, at: Poses, chains: list[Finger], thumb: str | None, notes: list[str]
+) -> Finger:
     """Return the chain with the stated link or joint, the one that is called so, or the one that opposes the others."""
     known = "; ".join(", ".join(chain.links) for chain in chains)  # noqa: XR002
     if thumb is None:
@@ -176,7 +184,9 @@ def _find_thumb(spec: RobotSpec, at: Poses, chains: list[Finger], thumb: str | N
     else:
         marked = [chain for chain in chains if thumb in (*chain.links, *chain.joints, *chain.rest)]
         if len(marked) != 1:
-            raise RobotError(f"--thumb {thumb!r} is in {len(marked)} fingers; their links are {known}.")
+            raise RobotError(
+                f"--thumb {thumb!r} is in {len(marked)} fingers; their links are {known}."
+            )
     if len(marked) == 1:
         return marked[0]
     ends = [chain.links[-1] for chain in chains]
@@ -184,9 +194,13 @@ def _find_thumb(spec: RobotSpec, at: Poses, chains: list[Finger], thumb: str | N
     scores = np.sqrt(opposition(spec, ends, tips)).sum(axis=1)
     first = int(scores.argmax())
     if scores[first] == 0 and len(chains) > 2:
-        raise RobotError(f"no finger can oppose the others. Name a link of the thumb with --thumb: {known}.")
+        raise RobotError(
+            f"no finger can oppose the others. Name a link of the thumb with --thumb: {known}."
+        )
     why = "it can oppose the others" if scores[first] else "the two are alike"
-    notes.append(f"the thumb is the finger of {', '.join(chains[first].links)}: {why} (--thumb says another)")
+    notes.append(
+        f"the thumb is the finger of {', '.join(chains[first].links)}: {why} (--thumb says another)"
+    )
     return chains[first]
 
 
@@ -202,7 +216,13 @@ def _chains(tree: RobotTree, hand_root: str) -> list[Finger]:
             joints = [moved_by[name] for name in links]
             fixed_joints = [joint.name for joint in tree.joints if joint.child in rest]
             name = _stated_finger(" ".join((*links, *joints, *rest, *fixed_joints)))
-            finger = Finger(name=name, links=tuple(links), joints=tuple(joints), rest=tuple(rest), points=np.empty(0))
+            finger = Finger(
+                name=name,
+                links=tuple(links),
+                joints=tuple(joints),
+                rest=tuple(rest),
+                points=np.empty(0),
+            )
             chains.append(finger)
     return chains
 
@@ -221,7 +241,9 @@ def _without_bars(spec: RobotSpec, chains: list[Finger], notes: list[str]) -> li
         if not chain.name and len(chain.links) < max(len(other.links) for other in same):
             bars.append(chain)
     if bars:
-        notes.append(f"not fingers, but bars of a linkage: {', '.join(bar.links[-1] for bar in bars)}")
+        notes.append(
+            f"not fingers, but bars of a linkage: {', '.join(bar.links[-1] for bar in bars)}"
+        )
     return [chain for chain in chains if chain not in bars]
 
 
@@ -257,11 +279,15 @@ def _find_palm(
                 continue
             bent[name] = _BEND * closing
             if finger.name != "thumb":
-                T = link_places(spec, {name: float(np.clip(0.0, joint.lower, joint.upper)) + 0.5 * closing})[last]
+                T = link_places(
+                    spec, {name: float(np.clip(0.0, joint.lower, joint.upper)) + 0.5 * closing}
+                )[last]
                 moved += T[:3, :3] @ _in_link(straight[last], end) + T[:3, 3] - end
     z = moved - (moved @ x) * x
     if is_jaw:
-        z = np.cross(x, ends[1] - ends[0])  # as in a right hand, whose thumb is against the palm's y
+        z = np.cross(
+            x, ends[1] - ends[0]
+        )  # as in a right hand, whose thumb is against the palm's y
     if np.linalg.norm(z) < 0.01:
         raise RobotError(
             "the fingers do not bend to one side when their joints move, so the palm's inner side is unknown."
@@ -284,11 +310,15 @@ def _with_frames(
     keypoints = [KeypointSpec(keypoint="wrist", link="wrist_frame")]
     for finger in fingers:
         last = finger.links[-1]
-        T = transform(straight[last][:3, :3].T @ palm[:3, :3], _in_link(straight[last], finger.points[-1]))
+        T = transform(
+            straight[last][:3, :3].T @ palm[:3, :3], _in_link(straight[last], finger.points[-1])
+        )
         tip = FingertipSpec(
             name=finger.name,
             link=f"{finger.name}_tip_frame",
-            contact_links=tuple(name for name in (last, *finger.rest) if tree.link(name).collisions),
+            contact_links=tuple(
+                name for name in (last, *finger.rest) if tree.link(name).collisions
+            ),
             keypoint=f"{finger.name}4",
         )
         tips.append(tip)
@@ -304,7 +334,9 @@ def _with_frames(
     for name, parent, T in frames:
         if name in tree.link_names:
             raise RobotError(f"the hand has a link {name!r} already; rename it.")
-        tree = replace(tree, links=(*tree.links, frame(name)), joints=(*tree.joints, fixed(parent, name, T)))
+        tree = replace(
+            tree, links=(*tree.links, frame(name)), joints=(*tree.joints, fixed(parent, name, T))
+        )
     return tree, tips, keypoints
 
 
@@ -336,7 +368,9 @@ def _surface(tree: RobotTree, links: Iterable[str], at: Poses) -> np.ndarray:
     points = [np.zeros((0, 3))]
     for name in links:
         if tree.link(name).collisions:
-            points.append(surface_of(tree.link(name).collisions)[0] @ at[name][:3, :3].T + at[name][:3, 3])
+            points.append(
+                surface_of(tree.link(name).collisions)[0] @ at[name][:3, :3].T + at[name][:3, 3]
+            )
     return np.concatenate(points)
 
 
@@ -353,7 +387,9 @@ def _points(tree: RobotTree, finger: Finger, at: Poses) -> np.ndarray:
     last = finger.links[-1]
     cloud = _surface(tree, (last, *finger.rest), at)
     if not len(cloud):
-        raise RobotError(f"the last link of a finger, {last!r}, has no collision shape, so it can touch nothing.")
+        raise RobotError(
+            f"the last link of a finger, {last!r}, has no collision shape, so it can touch nothing."
+        )
     middle = _middle(cloud)
     away = middle - _on_axis(tree, last, at, cloud)
     away /= max(float(np.linalg.norm(away)), 1e-9)

@@ -102,7 +102,9 @@ def import_robot(
             rpy = _turned(found.palm[:3, 0], ahead)
             if any(rpy):
                 angles = " ".join(f"{angle:g}" for angle in rpy)
-                notes.append(f"the hand is turned by --rpy {angles}: its fingers point along {along}")
+                notes.append(
+                    f"the hand is turned by --rpy {angles}: its fingers point along {along}"
+                )
         if offset is None:
             distance = _stand_off(found, rpy, ahead)
             offset = tuple((distance * ahead).tolist())
@@ -113,7 +115,9 @@ def import_robot(
                 )
         T = pose(offset, rpy=rpy)
         whole = combined(arm_tree, _with_rotors(found, notes), flange, T, name or out.name)
-        spec = draft_spec(whole, found.root, work, tips=found.tips, keypoints=found.keypoints, bent=found.bent)
+        spec = draft_spec(
+            whole, found.root, work, tips=found.tips, keypoints=found.keypoints, bent=found.bent
+        )
         spec = _with_arm_home(spec, found.palm_in_hand, notes)
         spec = _with_drives(spec, whole, notes)
         pairs = SelfCollision(spec, Kinematics(spec)).overlapping_at_home

@@ -148,7 +148,12 @@ def judge(
             "xreset resets and xreset retarget."
         )
     fingers = fingers_of(
-        robot, objects, lifted.object_name, lifted.joint_pos, lifted.object_pos, lifted.object_quat_wxyz
+        robot,
+        objects,
+        lifted.object_name,
+        lifted.joint_pos,
+        lifted.object_pos,
+        lifted.object_quat_wxyz,
     )
     chosen = _tightest(fingers, lifted, states, squeeze.reach)
     if not len(chosen):
@@ -164,9 +169,14 @@ def judge(
     names = [spec.name for spec in used]
     scene = SceneSpec(robot=robot, objects=tuple(used))
     index = np.array([names.index(name) for name in tried.object_name.tolist()])
-    poses = (torch.as_tensor(array) for array in (tried.joint_pos, tried.object_pos, tried.object_quat_wxyz, targets))
+    poses = (
+        torch.as_tensor(array)
+        for array in (tried.joint_pos, tried.object_pos, tried.object_quat_wxyz, targets)
+    )
     start = State.at_rest(*poses)
-    moments = torch.cat((start.joint_pos, start.object_pos, start.object_quat), dim=1)[:, None].numpy()
+    moments = torch.cat((start.joint_pos, start.object_pos, start.object_quat), dim=1)[
+        :, None
+    ].numpy()
     judged = []
     shots: dict[str, np.ndarray] = {}
     for number, name in enumerate(backends):
@@ -182,7 +192,9 @@ def judge(
         for label, mine in {**groups, "all": np.arange(count)}.items():
             counts = dict(zip(PHASES, passed[mine].sum(axis=0).tolist(), strict=True))
             fails = int((~reached[mine]).sum())
-            judged.append(Judged(backend=name, object_name=label, tried=len(mine), arm_fails=fails, **counts))
+            judged.append(
+                Judged(backend=name, object_name=label, tried=len(mine), arm_fails=fails, **counts)
+            )
         if not shots:
             for label, mine in groups.items():
                 best = mine[passed[mine].sum(axis=1).argmax()]
@@ -219,17 +231,30 @@ def _play(kinematics: Kinematics, backend: Backend, start: State) -> Tensor:
     left, left_error = arm_path(kinematics, up[-1], palm, rise=HEIGHT, turn=-TURN)
     turn = torch.where((turn_error <= left_error)[:, None], right, left)
     turn_error = turn_error.minimum(left_error)
-    pos, quat = _relative(start.object_pos, start.object_quat, palm[:, :3, 3], matrix_to_quat(palm[:, :3, :3]))
+    pos, quat = _relative(
+        start.object_pos, start.object_quat, palm[:, :3, 3], matrix_to_quat(palm[:, :3, :3])
+    )
     kept = torch.ones(len(joints), dtype=torch.bool)
     passed = []
     moments = []
     before = joints
-    for path, error in ((joints[None], torch.zeros(len(joints))), (up, up_error), (turn, turn_error)):
-        _move(backend, start.joint_target.double(), torch.cat((before[None], path)), kinematics.robot.arm_indices)
+    for path, error in (
+        (joints[None], torch.zeros(len(joints))),
+        (up, up_error),
+        (turn, turn_error),
+    ):
+        _move(
+            backend,
+            start.joint_target.double(),
+            torch.cat((before[None], path)),
+            kinematics.robot.arm_indices,
+        )
         before = path[-1]
         now = backend.state().to("cpu")
         links = backend.links().to("cpu")
-        now_pos, now_quat = _relative(now.object_pos, now.object_quat, links.pos[:, 0], links.quat[:, 0])
+        now_pos, now_quat = _relative(
+            now.object_pos, now.object_quat, links.pos[:, 0], links.quat[:, 0]
+        )
         near = ((now_pos - pos).norm(dim=-1) < DISTANCE) & (quat_angle(now_quat, quat) < ANGLE)
         kept = kept & near & (error < 1)
         passed.append(kept)
@@ -237,10 +262,14 @@ def _play(kinematics: Kinematics, backend: Backend, start: State) -> Tensor:
     health = backend.health()
     sound = ~(health.nonfinite | health.overflow).cpu()
     reached = (up_error < 1) & (turn_error < 1)
-    return torch.cat((reached[:, None], torch.stack(passed, dim=1) & sound[:, None], *moments), dim=1)
+    return torch.cat(
+        (reached[:, None], torch.stack(passed, dim=1) & sound[:, None], *moments), dim=1
+    )
 
 
-def _relative(pos: Tensor, quat: Tensor, frame_pos: Tensor, frame_quat: Tensor) -> tuple[Tensor, Tensor]:
+def _relative(
+    pos: Tensor, quat: Tensor, frame_pos: Tensor, frame_quat: Tensor
+) -> tuple[Tensor, Tensor]:
     """Return poses in the frame of others."""
     frame = frame_quat.double()
     relative = quat_rotate_inverse(frame, pos.double() - frame_pos.double())
@@ -277,7 +306,9 @@ def arm_path(
         for _ in range(_ITERATIONS):
             at = kinematics.jacobian(joints, links)
             away = quat_multiply(goal_quat, quat_conjugate(matrix_to_quat(at.rot[:, 0])))
-            error = torch.cat((goal - at.pos[:, 0], quat_to_axis_angle(quat_normalize(away))), dim=1)
+            error = torch.cat(
+                (goal - at.pos[:, 0], quat_to_axis_angle(quat_normalize(away))), dim=1
+            )
             J = torch.cat((at.linear[:, 0], at.angular[:, 0]), dim=1)[..., arm]
             damping = 1e-4 * torch.eye(len(arm), dtype=J.dtype)
             step = torch.linalg.solve(J.mT @ J + damping, J.mT @ error[..., None])[..., 0]
@@ -300,14 +331,18 @@ def _move(backend: Backend, targets: Tensor, path: Tensor, arm: np.ndarray) -> N
         backend.step()
 
 
-def judge_picture(judgement: Judgement, robot: RobotSpec, objects: Sequence[ObjectSpec]) -> np.ndarray:
+def judge_picture(
+    judgement: Judgement, robot: RobotSpec, objects: Sequence[ObjectSpec]
+) -> np.ndarray:
     """[H, W, 3] uint8: one row for each object: its best state at the start, and after each phase in the first engine,
     with the share of states that pass the phase in each engine."""
     by_name = {spec.name: spec for spec in objects}
     pictures = []
     for name, moments in judgement.shots.items():
         rows = [row for row in judgement.rows if row.object_name == name]
-        renderer = Renderer(SceneSpec(robot=robot, objects=(by_name[name],)), size=_TILE, smooth=True)
+        renderer = Renderer(
+            SceneSpec(robot=robot, objects=(by_name[name],)), size=_TILE, smooth=True
+        )
         tiles = []
         for phase, moment in zip(("start", *PHASES), moments, strict=True):
             target = moment[-7:-4]
@@ -315,7 +350,10 @@ def judge_picture(judgement: Judgement, robot: RobotSpec, objects: Sequence[Obje
             tile = renderer.draw(moment[:-7], pose_matrix(target, moment[-4:]), camera=camera)
             caption = [name]
             if phase != "start":
-                caption = [phase, *(f"{row.backend} {getattr(row, phase) / row.tried:.0%}" for row in rows)]
+                caption = [
+                    phase,
+                    *(f"{row.backend} {getattr(row, phase) / row.tried:.0%}" for row in rows),
+                ]
             tiles.append(add_caption(tile, caption, 1 + len(rows)))
         pictures.append(np.hstack(tiles))
     return np.vstack(pictures)

@@ -73,7 +73,8 @@ def read_mjcf(path: Path, root: ElementTree.Element, notes: list[str]) -> RobotT
 def _refuse(path: Path, problems: list[str]) -> None:
     if problems:
         raise RobotError(
-            f"{path} uses what xreset does not have:" + "".join(f"\n  - {problem}" for problem in problems)
+            f"{path} uses what xreset does not have:"
+            + "".join(f"\n  - {problem}" for problem in problems)
         )
 
 
@@ -91,7 +92,9 @@ def _check_sizes(path: Path, root: ElementTree.Element) -> None:
                 with suppress(ValueError):  # MuJoCo says what is wrong
                     entries *= float(text)
         if entries > _MOST:
-            raise RobotError(f"{path}: a {element.tag} has {entries:.3g} entries, which is too many.")
+            raise RobotError(
+                f"{path}: a {element.tag} has {entries:.3g} entries, which is too many."
+            )
 
 
 def _unsupported(model: mujoco.MjModel) -> list[str]:
@@ -99,7 +102,9 @@ def _unsupported(model: mujoco.MjModel) -> list[str]:
     problems = []
     for joint in map(model.joint, range(model.njnt)):
         if joint.type[0] == int(mujoco.mjtJoint.mjJNT_BALL):
-            problems.append(f"the ball joint {joint.name!r}. Replace it by three hinges of the same body")
+            problems.append(
+                f"the ball joint {joint.name!r}. Replace it by three hinges of the same body"
+            )
     for geom in map(model.geom, range(model.ngeom)):
         kind = _kind(geom)
         if _is_solid(geom) and kind not in _SIZES:
@@ -123,14 +128,18 @@ def _pulls(model: mujoco.MjModel, problems: list[str], notes: list[str]) -> dict
         elif kind == mujoco.mjtTrn.mjTRN_TENDON:
             begin = model.tendon_adr[target]
             wraps = slice(begin, begin + model.tendon_num[target])
-            pulls[actuator] = dict(zip(model.wrap_objid[wraps].tolist(), model.wrap_prm[wraps].tolist(), strict=True))
+            pulls[actuator] = dict(
+                zip(model.wrap_objid[wraps].tolist(), model.wrap_prm[wraps].tolist(), strict=True)
+            )
             if (model.wrap_type[wraps] != int(mujoco.mjtWrap.mjWRAP_JOINT)).any():
                 problems.append(
                     f"the tendon {model.tendon(target).name!r}, which runs through space. Drive its joint by a "
                     "position actuator of its own, or couple its joints by an equality"
                 )
         else:
-            notes.append(f"left out: the actuator {model.actuator(actuator).name!r}, which drives no joint")
+            notes.append(
+                f"left out: the actuator {model.actuator(actuator).name!r}, which drives no joint"
+            )
     return pulls
 
 
@@ -142,7 +151,9 @@ def _tree(path: Path, model: mujoco.MjModel, couplings: Couplings) -> RobotTree:
     names = [model.body(i).name or f"body{i}" for i in range(model.nbody)]
     tops = [names[i] for i in range(1, model.nbody) if model.body_parentid[i] == 0]
     if len(tops) != 1:
-        raise RobotError(f"{path}: expected one body in the world, found {', '.join(tops) or 'none'}.")
+        raise RobotError(
+            f"{path}: expected one body in the world, found {', '.join(tops) or 'none'}."
+        )
     data = mujoco.MjData(model)
     data.qpos[model.jnt_qposadr[model.jnt_type >= SLIDE]] = 0.0
     for joint, line in couplings.lines.items():
@@ -157,7 +168,9 @@ def _tree(path: Path, model: mujoco.MjModel, couplings: Couplings) -> RobotTree:
         moving = np.flatnonzero((model.jnt_bodyid == number) & (model.jnt_type >= SLIDE)).tolist()
         above = names[int(body.parentid[0])]
         if number == 1 and moving:
-            raise RobotError(f"{path}: the first body {body.name!r} has joints; put it into a body that does not move.")
+            raise RobotError(
+                f"{path}: the first body {body.name!r} has joints; put it into a body that does not move."
+            )
         T = transform(data.xmat[number], data.xpos[number])
         children = [*(f"{names[number]}_axis{i}" for i in range(len(moving) - 1)), names[number]]
         for child, joint in zip(children, moving, strict=False):
@@ -165,7 +178,11 @@ def _tree(path: Path, model: mujoco.MjModel, couplings: Couplings) -> RobotTree:
             poses[child] = T
             links[child] = frame(child)
             between = np.linalg.inv(poses[above]) @ T
-            joints.append(_joint(model, couplings, joint, above, child, between, T[:3, :3].T @ data.xaxis[joint]))
+            joints.append(
+                _joint(
+                    model, couplings, joint, above, child, between, T[:3, :3].T @ data.xaxis[joint]
+                )
+            )
             above = child
         poses[names[number]] = T
         if not moving and number > 1:
@@ -179,7 +196,12 @@ def _tree(path: Path, model: mujoco.MjModel, couplings: Couplings) -> RobotTree:
             collisions=tuple(_shapes(model, data, number, T)),
         )
     order = [tops[0], *(joint.child for joint in joints)]
-    return RobotTree(name=path.stem, root=tops[0], links=tuple(links[name] for name in order), joints=tuple(joints))
+    return RobotTree(
+        name=path.stem,
+        root=tops[0],
+        links=tuple(links[name] for name in order),
+        joints=tuple(joints),
+    )
 
 
 def _joint(
@@ -215,7 +237,9 @@ def _joint(
     )
 
 
-def _shapes(model: mujoco.MjModel, data: mujoco.MjData, body: int, T_world_link: np.ndarray) -> Iterator[Shape]:
+def _shapes(
+    model: mujoco.MjModel, data: mujoco.MjData, body: int, T_world_link: np.ndarray
+) -> Iterator[Shape]:
     """Yield the collision shapes of a body."""
     for number in np.flatnonzero(model.geom_bodyid == body):
         geom = model.geom(number)
@@ -231,7 +255,9 @@ def _shapes(model: mujoco.MjModel, data: mujoco.MjData, body: int, T_world_link:
             try:
                 geometry = hull(vertices, HULL_TOLERANCE).geometry
             except ObjectError as error:
-                raise RobotError(f"the mesh {mesh.name!r} of a body cannot be used: {error}") from error
+                raise RobotError(
+                    f"the mesh {mesh.name!r} of a body cannot be used: {error}"
+                ) from error
         yield Shape(geometry=geometry, T_body_shape=T)
 
 

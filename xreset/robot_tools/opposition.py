@@ -42,9 +42,14 @@ def opposition(robot: RobotSpec, links: Sequence[str], offsets: np.ndarray) -> n
     """
     kinematics = Kinematics(robot, root=robot.hand_root)
     generator = torch.Generator().manual_seed(0)
-    draw = torch.rand(_SAMPLES, len(kinematics.joint_names), generator=generator, dtype=torch.float64)
+    draw = torch.rand(
+        _SAMPLES, len(kinematics.joint_names), generator=generator, dtype=torch.float64
+    )
     q = kinematics.lower + draw * (kinematics.upper - kinematics.lower)
-    ranges = [closing_range(*ends) for ends in zip(kinematics.lower.tolist(), kinematics.upper.tolist(), strict=True)]
+    ranges = [
+        closing_range(*ends)
+        for ends in zip(kinematics.lower.tolist(), kinematics.upper.tolist(), strict=True)
+    ]
     step = q.new_tensor([_STEP * np.sign(closing or 0.0) for closing in ranges])
     tips = torch.as_tensor(offsets)
     here = kinematics.points(q, links, tips)

@@ -43,5 +43,7 @@ def robot_picture(robot: RobotSpec) -> np.ndarray:
     panels = []
     for camera, links, length in views:
         renderer = Renderer(scene, size=_PANEL, camera=camera, smooth=True)
-        panels.append(renderer.draw(robot.home, points=renderer.link_frames(robot.home, links, length=length)))
+        panels.append(
+            renderer.draw(robot.home, points=renderer.link_frames(robot.home, links, length=length))
+        )
     return np.vstack((np.hstack(panels[:2]), np.hstack(panels[2:])))

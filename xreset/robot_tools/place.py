@@ -87,7 +87,9 @@ def place(
     for number in range(config.rounds):
         elite = found[: config.elite]
         least = _rank(elite[-1][0])[0] if len(elite) == config.elite else 0
-        for candidate in _candidates(robot, avoid, config, random, number, [candidate for _, candidate in elite]):
+        for candidate in _candidates(
+            robot, avoid, config, random, number, [candidate for _, candidate in elite]
+        ):
             found.append((reach(candidate, tried, least), candidate))
             best = max(best, found[-1][0], key=_rank)
             done += 1
@@ -100,7 +102,9 @@ def place(
     for candidate in chosen:
         finalists.append(_finalist(candidate, robot, kept, paths))
         progress(0.8 + 0.2 * len(finalists) / len(chosen), best[0])
-    return sorted(finalists, key=lambda finalist: (finalist.home_rule != "", finalist.followed), reverse=True)
+    return sorted(
+        finalists, key=lambda finalist: (finalist.home_rule != "", finalist.followed), reverse=True
+    )
 
 
 def _rank(reached: tuple[float, float]) -> tuple[int, float]:
@@ -108,7 +112,9 @@ def _rank(reached: tuple[float, float]) -> tuple[int, float]:
     return round(reached[0] * 200), reached[1]
 
 
-def _finalist(placed: RobotSpec, robot: RobotSpec, wrists: ArmTargets, paths: list[ArmTargets]) -> Finalist:
+def _finalist(
+    placed: RobotSpec, robot: RobotSpec, wrists: ArmTargets, paths: list[ArmTargets]
+) -> Finalist:
     """Try a placement of a robot on more frames and on whole motions."""
     reached, dexterity = reach(placed, wrists)
     model = ArmModel(placed)
@@ -136,7 +142,9 @@ def reach(robot: RobotSpec, wrists: ArmTargets, least: int = 0) -> tuple[float, 
     were not tried count as reached.
     """
     model = ArmModel(robot)
-    thresholds = Thresholds(hand_error=np.inf, wrist_position=_POSITION, wrist_orientation=_ORIENTATION)
+    thresholds = Thresholds(
+        hand_error=np.inf, wrist_position=_POSITION, wrist_orientation=_ORIENTATION
+    )
     effort = ArmConfig(restarts=4, branches=2, first_iterations=40, reseeds=0)
     frames = len(wrists.annotated)
     possible = frames
@@ -149,7 +157,9 @@ def reach(robot: RobotSpec, wrists: ArmTargets, least: int = 0) -> tuple[float, 
         possible -= int((~reached).sum())
         configurations = model.full(joints[reached, 0], part.hand_joints[reached, 0])
         jacobian = model.kinematics.jacobian(configurations, [robot.hand_root])
-        rows = torch.cat((jacobian.linear[:, 0] / _LENGTH, jacobian.angular[:, 0]), dim=1)[..., model.arm]
+        rows = torch.cat((jacobian.linear[:, 0] / _LENGTH, jacobian.angular[:, 0]), dim=1)[
+            ..., model.arm
+        ]
         dexterity = torch.cat((dexterity, torch.linalg.svdvals(rows)[:, -1]))
     return possible / frames, float(dexterity.mean()) if len(dexterity) else 0.0
 

@@ -82,7 +82,9 @@ def write_placement(path: Path, robot: RobotSpec, best: Finalist, command: str) 
     for pattern, new in edits:
         match = re.search(pattern, text, flags=re.MULTILINE)
         if match is None:
-            raise RobotError(f"{path} has no line like {pattern!r} to change; edit it by hand: {new}")
+            raise RobotError(
+                f"{path} has no line like {pattern!r} to change; edit it by hand: {new}"
+            )
         text = text[: match.start(1)] + new + text[match.end(1) :]
     write_whole(path, text)
 

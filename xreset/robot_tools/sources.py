@@ -21,8 +21,25 @@ _ROTOR_AT_MOST = 0.01
 _TURNS = 2 * math.pi
 """[rad] Range in either direction of a joint without limits."""
 _FLANGES = (
-    *("tool0", "flange", "tool_link", "ee_link", "link_eef", "link_ee", "end_effector_link", "attachment"),
-    *("panda_link8", "fr3_link8", "fer_link8", "iiwa_link_ee", "lbr_link_ee", "lbr_iiwa_link_7", "bracelet_link"),
+    *(
+        "tool0",
+        "flange",
+        "tool_link",
+        "ee_link",
+        "link_eef",
+        "link_ee",
+        "end_effector_link",
+        "attachment",
+    ),
+    *(
+        "panda_link8",
+        "fr3_link8",
+        "fer_link8",
+        "iiwa_link_ee",
+        "lbr_link_ee",
+        "lbr_iiwa_link_7",
+        "bracelet_link",
+    ),
 )
 """Links that carry the tool in the makers' files: UR, ABB and Fanuc (ROS-Industrial), xArm, Panda and FR3, iiwa,
 Kinova."""
@@ -68,7 +85,9 @@ def last_link(arm: RobotTree) -> str:
     parents = {joint.parent for joint in arm.joints}
     ends = [link for link in arm.link_names if link not in parents]
     if len(ends) > 1:
-        raise RobotError(f"the arm ends in {', '.join(ends)}. Name the link that carries the hand with --flange.")
+        raise RobotError(
+            f"the arm ends in {', '.join(ends)}. Name the link that carries the hand with --flange."
+        )
     return ends[0]
 
 
@@ -76,7 +95,9 @@ def bare(arm: RobotTree, flange: str, notes: list[str]) -> RobotTree:
     """Return an arm without what its flange carries, and with no moving joint that does not move the flange."""
     removed = set(arm.below(flange)) - {flange}
     if removed:
-        notes.append(f"left out, because it hangs on the flange where the hand goes: {', '.join(sorted(removed))}")
+        notes.append(
+            f"left out, because it hangs on the flange where the hand goes: {', '.join(sorted(removed))}"
+        )
     joints = []
     stiff = []
     for joint in arm.joints:
@@ -87,7 +108,9 @@ def bare(arm: RobotTree, flange: str, notes: list[str]) -> RobotTree:
             joint = replace(joint, type="fixed", mimic=None)
         joints.append(joint)
     if stiff:
-        notes.append(f"joints of the arm that do not move the hand are fixed at 0: {', '.join(stiff)}")
+        notes.append(
+            f"joints of the arm that do not move the hand are fixed at 0: {', '.join(stiff)}"
+        )
     links = tuple(link for link in arm.links if link.name not in removed)
     return replace(arm, links=links, joints=tuple(joints))
 
@@ -113,7 +136,9 @@ def renamed(hand: RobotTree, arm: RobotTree) -> RobotTree:
     )
 
 
-def combined(arm: RobotTree, hand: RobotTree, flange: str, T_flange_hand: np.ndarray, name: str) -> RobotTree:
+def combined(
+    arm: RobotTree, hand: RobotTree, flange: str, T_flange_hand: np.ndarray, name: str
+) -> RobotTree:
     """Return a bare arm with a renamed hand whose root link has a pose [4, 4] in the frame of the arm's flange."""
     return RobotTree(
         name=name,
@@ -129,7 +154,9 @@ def _with_limits(tree: RobotTree, path: Path, notes: list[str]) -> RobotTree:
     joints = {}
     for joint in tree.joints:
         if joint.type != "fixed" and not np.isfinite((joint.lower, joint.upper)).all():
-            notes.append(f"the joint {joint.name!r} has no limits; it gets one turn in either direction")
+            notes.append(
+                f"the joint {joint.name!r} has no limits; it gets one turn in either direction"
+            )
             joint = replace(joint, lower=-_TURNS, upper=_TURNS)
         if joint.type != "fixed" and not 0 < joint.velocity < math.inf:
             joint = replace(joint, velocity=math.pi)
@@ -143,13 +170,20 @@ def _with_limits(tree: RobotTree, path: Path, notes: list[str]) -> RobotTree:
             passed.append(mimic.source)
             above = joints[mimic.source].mimic
             offset = mimic.multiplier * above.offset + mimic.offset
-            mimic = replace(mimic, source=above.source, multiplier=mimic.multiplier * above.multiplier, offset=offset)
+            mimic = replace(
+                mimic,
+                source=above.source,
+                multiplier=mimic.multiplier * above.multiplier,
+                offset=offset,
+            )
         if mimic.source in passed:
             raise RobotError(
                 f"{path}: joints follow one another in a circle: {', '.join(passed)}. Let one of them follow nothing."
             )
         if mimic.source not in joints:
-            raise RobotError(f"{path}: {name!r} mimics {mimic.source!r}, which is not a joint of the same file.")
+            raise RobotError(
+                f"{path}: {name!r} mimics {mimic.source!r}, which is not a joint of the same file."
+            )
         driver = joints[mimic.source]
         ends = mimic.multiplier * np.array((driver.lower, driver.upper)) + mimic.offset
         low, high = sorted(ends.tolist())
@@ -171,9 +205,15 @@ def _with_masses(tree: RobotTree, notes: list[str]) -> RobotTree:
     for link in tree.links:
         if not link.collisions:
             if link.mass <= FRAME_MASS or not plausible(link):
-                link = replace(link, mass=max(link.mass, FRAME_MASS), inertia=np.eye(3) * FRAME_INERTIA)
+                link = replace(
+                    link, mass=max(link.mass, FRAME_MASS), inertia=np.eye(3) * FRAME_INERTIA
+                )
         elif link.mass <= 0 or not plausible(link):
-            why = "have no mass" if link.mass <= 0 else "have an inertia that their mass and size do not allow"
+            why = (
+                "have no mass"
+                if link.mass <= 0
+                else "have an inertia that their mass and size do not allow"
+            )
             link = _with_mass_of_shapes(link)
             replaced.setdefault(why, []).append(f"{link.name} ({link.mass:.3g} kg)")
         links.append(link)
@@ -190,7 +230,9 @@ def _with_mass_of_shapes(link: Link) -> Link:
         mass = _DENSITY * float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
     com, inertia = mass_properties(vertices, faces, mass)
     if not (np.isfinite(com).all() and np.isfinite(inertia).all()):
-        raise RobotError(f"the shapes of link {link.name!r} have no volume. State the mass and inertia of the link.")
+        raise RobotError(
+            f"the shapes of link {link.name!r} have no volume. State the mass and inertia of the link."
+        )
     return replace(link, mass=mass, com=com, inertia=inertia)
 
 
@@ -210,4 +252,7 @@ def plausible(link: Link) -> bool:
 def largest_moment(link: Link) -> float:
     """[kg m^2] Moment of the link's mass at twice the reach of its shapes, and of the rotor of a joint."""
     vertices, _ = surface_of(link.collisions)
-    return link.mass * (2 * float(np.linalg.norm(vertices - link.com, axis=1).max())) ** 2 + _ROTOR_AT_MOST
+    return (
+        link.mass * (2 * float(np.linalg.norm(vertices - link.com, axis=1).max())) ** 2
+        + _ROTOR_AT_MOST
+    )

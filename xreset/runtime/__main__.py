@@ -24,9 +24,16 @@ def main() -> None:
     home = np.array([joint["home"] for joint in contract["joints"]])
     pos = np.array([0.5, 0.0, 0.1])
     quat = np.array([1.0, 0.0, 0.0, 0.0])
-    controller.begin(np.zeros((contract["observation"]["cloud_points"], 3)), pos, quat, home, np.zeros(3))
+    controller.begin(
+        np.zeros((contract["observation"]["cloud_points"], 3)), pos, quat, home, np.zeros(3)
+    )
     reading = Reading(
-        joint_pos=home, joint_vel=0.0 * home, joint_time=0.0, object_pos=pos, object_quat=quat, object_time=0.0
+        joint_pos=home,
+        joint_vel=0.0 * home,
+        joint_time=0.0,
+        object_pos=pos,
+        object_quat=quat,
+        object_time=0.0,
     )
     milliseconds = []
     for _ in range(_STEPS):
@@ -34,7 +41,9 @@ def main() -> None:
         controller.step(reading.batched())
         milliseconds.append(1000.0 * (time.perf_counter() - began))
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(f"{contract['robot']}, {len(contract['joints'])} joints, one step every {1000 * controller.dt:.1f} ms")
+    print(
+        f"{contract['robot']}, {len(contract['joints'])} joints, one step every {1000 * controller.dt:.1f} ms"
+    )
     print(f"objects: {', '.join(contract['objects'])}")
     slowest = np.percentile(milliseconds, 99)
     print(

@@ -40,7 +40,9 @@ def check_contract(contract: dict[str, Any], source: str) -> None:
     if contract.get("schema") != SCHEMA:
         problem = f"has schema {str(contract.get('schema'))[:60]!r}, this runtime reads {SCHEMA!r}"
     if problem:
-        raise LiveError(f"{source} {problem}. Export the policy again and use the runtime of the same folder.")
+        raise LiveError(
+            f"{source} {problem}. Export the policy again and use the runtime of the same folder."
+        )
 
 
 def read_contract(folder: str | Path) -> dict[str, Any]:
@@ -55,7 +57,9 @@ def read_contract(folder: str | Path) -> dict[str, Any]:
         contract = json.loads(path.read_text())
         content = (folder / POLICY).read_bytes()
     except (OSError, ValueError) as error:
-        raise LiveError(f"{folder} is no exported policy ({error}). Make one: xreset export deploy") from error
+        raise LiveError(
+            f"{folder} is no exported policy ({error}). Make one: xreset export deploy"
+        ) from error
     check_contract(contract, str(path))
     found = hashlib.sha256(content).hexdigest()
     if found != contract["policy_sha256"]:

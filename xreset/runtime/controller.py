@@ -27,15 +27,21 @@ class OnnxActor:
         options.log_severity_level = 3
         options.intra_op_num_threads = 1
         try:
-            self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+            self._session = onnxruntime.InferenceSession(
+                content, options, providers=["CPUExecutionProvider"]
+            )
         except Exception as error:
-            raise LiveError(f"The policy cannot be read as ONNX: {error}. Export it again.") from error
+            raise LiveError(
+                f"The policy cannot be read as ONNX: {error}. Export it again."
+            ) from error
         self._inputs = self._session.get_inputs()
         self._state: list[Array] = []
 
     def begin(self, robots: int) -> None:
         """Forget everything."""
-        self._state = [np.zeros((1, robots, given.shape[2]), np.float32) for given in self._inputs[2:]]
+        self._state = [
+            np.zeros((1, robots, given.shape[2]), np.float32) for given in self._inputs[2:]
+        ]
 
     def act(self, flat: Array, cloud: Array) -> Array:
         """[N, J] actions for observations [N, F] and clouds [N, H, P, K]."""
@@ -80,12 +86,19 @@ class Controller:
         self.upper = column("upper", np.inf)
         self._scaled_lower = column("lower", -np.pi)
         self._scaled_upper = column("upper", np.pi)
-        self._mapping = {name: column(name, 0.0) for name in ("step", "lead", "zero", "below", "above")}
+        self._mapping = {
+            name: column(name, 0.0) for name in ("step", "lead", "zero", "below", "above")
+        }
         self.step_size = self._mapping["step"]
         self._is_arm = np.array([joint["group"] == "arm" for joint in joints])
 
     def begin(
-        self, object_points: Array, goal_pos: Array, goal_quat: Array, target: Array, center: Array | None = None
+        self,
+        object_points: Array,
+        goal_pos: Array,
+        goal_quat: Array,
+        target: Array,
+        center: Array | None = None,
     ) -> None:
         """Begin an episode.
 
@@ -102,11 +115,15 @@ class Controller:
         expected = self.contract["observation"]["cloud_points"]
         points = np.asarray(object_points, dtype=np.float32)
         if points.shape[-2:] != (expected, 3):
-            raise LiveError(f"The object has points of shape {points.shape}, expected ({expected}, 3).")
+            raise LiveError(
+                f"The object has points of shape {points.shape}, expected ({expected}, 3)."
+            )
         self._center: Array | None = None
         if self.contract["object_frame"] == "center":
             if center is None:
-                raise LiveError("This policy needs the center of the object. Give center, as Controller.center does.")
+                raise LiveError(
+                    "This policy needs the center of the object. Give center, as Controller.center does."
+                )
             self._center = np.broadcast_to(np.asarray(center, dtype=np.float32), (count, 3))
             points = points - self._center[:, None]
         self._points = np.broadcast_to(points, (count, expected, 3))
@@ -130,7 +147,9 @@ class Controller:
         """[P, 3] points of an object of the contract."""
         objects = self.contract["objects"]
         if name not in objects:
-            raise LiveError(f"The contract has no object {name!r}. Choose from: {', '.join(objects)}.")
+            raise LiveError(
+                f"The contract has no object {name!r}. Choose from: {', '.join(objects)}."
+            )
         return np.array(objects[name]["points"], dtype=np.float32)
 
     def center(self, name: str) -> Array:

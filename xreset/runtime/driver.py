@@ -60,7 +60,9 @@ class Reading:
         rows = {}
         for name, value in vars(self).items():
             if value is not None:
-                rows[name] = np.asarray(value, dtype=np.float64 if name.endswith("_time") else np.float32)[None]
+                rows[name] = np.asarray(
+                    value, dtype=np.float64 if name.endswith("_time") else np.float32
+                )[None]
         return Reading(**rows)
 
 

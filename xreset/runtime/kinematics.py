@@ -18,7 +18,12 @@ class Kinematics:
         for step in chain["steps"]:
             axis = np.array(step["axis"])
             cross = np.cross(np.eye(3), axis)  # cross @ v = axis x v
-            arrays = {"origin": np.array(step["origin"]), "axis": axis, "cross": cross, "twice": cross @ cross}
+            arrays = {
+                "origin": np.array(step["origin"]),
+                "axis": axis,
+                "cross": cross,
+                "twice": cross @ cross,
+            }
             self._steps.append(step | arrays)
 
     def links(self, joint_pos: Array, joint_vel: Array) -> Links:
@@ -27,13 +32,18 @@ class Kinematics:
         for step in self._steps:
             pose = poses[step["parent"]] @ step["origin"]
             if step["joint"] is not None:
-                value = step["multiplier"] * joint_pos[:, step["joint"], None].astype(np.float64) + step["offset"]
+                value = (
+                    step["multiplier"] * joint_pos[:, step["joint"], None].astype(np.float64)
+                    + step["offset"]
+                )
                 rotation = pose[:, :3, :3]
                 if step["type"] == "prismatic":
                     pose[:, :3, 3] += value * (rotation @ step["axis"])
                 else:  # Rodrigues' formula
                     angle = value[:, None]
-                    pose[:, :3, :3] += rotation @ (np.sin(angle) * step["cross"] + (1 - np.cos(angle)) * step["twice"])
+                    pose[:, :3, :3] += rotation @ (
+                        np.sin(angle) * step["cross"] + (1 - np.cos(angle)) * step["twice"]
+                    )
             poses.append(pose)
         palm = self._chain["palm"]
         palm_pos = poses[palm][:, :3, 3]
@@ -56,7 +66,9 @@ class Kinematics:
             palm_quat=_quaternion(poses[palm][:, :3, :3]).astype(np.float32),
             palm_linvel=linvel.astype(np.float32),
             palm_angvel=angvel.astype(np.float32),
-            tip_pos=np.stack([poses[tip][:, :3, 3] for tip in self._chain["tips"]], axis=1).astype(np.float32),
+            tip_pos=np.stack([poses[tip][:, :3, 3] for tip in self._chain["tips"]], axis=1).astype(
+                np.float32
+            ),
         )
 
 
@@ -69,7 +81,9 @@ def _quaternion(matrix: Array) -> Array:
     candidates[:, 0, 0] = 1.0 + trace
     candidates[:, 0, 1:] = vector
     candidates[:, 1:, 0] = vector
-    candidates[:, 1:, 1:] = matrix + matrix.transpose(0, 2, 1) + np.eye(3) * (1.0 - trace)[:, None, None]
+    candidates[:, 1:, 1:] = (
+        matrix + matrix.transpose(0, 2, 1) + np.eye(3) * (1.0 - trace)[:, None, None]
+    )
     best = np.diagonal(candidates, axis1=1, axis2=2).argmax(axis=1)
     chosen = candidates[np.arange(len(matrix)), best]
     return chosen / np.linalg.norm(chosen, axis=1, keepdims=True)

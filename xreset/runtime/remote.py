@@ -34,19 +34,33 @@ class RemoteController(Controller):
         try:
             self._socket = connect(url, open_timeout=5, max_size=None, compression=None)
         except Exception as error:
-            raise LiveError(f"No policy is served at {url} ({error}). Start it: xreset serve POLICY") from error
+            raise LiveError(
+                f"No policy is served at {url} ({error}). Start it: xreset serve POLICY"
+            ) from error
         hello = self._receive()
         if hello.get("schema") != LIVE_SCHEMA:
-            raise LiveError(f"{url} speaks {str(hello.get('schema'))[:60]!r}, this runtime speaks {LIVE_SCHEMA!r}.")
+            raise LiveError(
+                f"{url} speaks {str(hello.get('schema'))[:60]!r}, this runtime speaks {LIVE_SCHEMA!r}."
+            )
         check_contract(hello["contract"], url)
         super().__init__(hello["contract"])
 
     def begin(
-        self, object_points: Array, goal_pos: Array, goal_quat: Array, target: Array, center: Array | None = None
+        self,
+        object_points: Array,
+        goal_pos: Array,
+        goal_quat: Array,
+        target: Array,
+        center: Array | None = None,
     ) -> None:
         """Begin an episode of one robot."""
         self.target = np.atleast_2d(np.asarray(target, dtype=np.float32))
-        values = {"points": object_points, "goal_pos": goal_pos, "goal_quat": goal_quat, "target": target}
+        values = {
+            "points": object_points,
+            "goal_pos": goal_pos,
+            "goal_quat": goal_quat,
+            "target": target,
+        }
         self._ask({"begin": _lists(values | {"center": center})})
 
     def set_goal(self, pos: Array, quat: Array) -> None:
@@ -57,7 +71,9 @@ class RemoteController(Controller):
         """[1, J] new joint targets for a reading with the axis N."""
         names = ("joint_pos", "joint_vel", "object_pos", "object_quat", "tip_force")
         values = {name: getattr(reading, name) for name in names}
-        found = self._ask({"step": _lists({name: None if v is None else v[0] for name, v in values.items()})})
+        found = self._ask(
+            {"step": _lists({name: None if v is None else v[0] for name, v in values.items()})}
+        )
         self.target = np.array([found["target"]], dtype=np.float32)
         return self.target
 

@@ -54,7 +54,9 @@ class Runner:
     ignored. After a fault the targets slow down within ``slow_down``, and then stay.
     """
 
-    def __init__(self, controller: Controller, driver: Driver, limits: Limits | None = None) -> None:
+    def __init__(
+        self, controller: Controller, driver: Driver, limits: Limits | None = None
+    ) -> None:
         """Prepare a run.
 
         Args:
@@ -133,7 +135,11 @@ class Runner:
         self._check(now)
         going = np.isinf(self._stopped_at)
         reading = self._reading
-        has_come = np.isfinite(reading.object_time) & np.isfinite(reading.joint_time) if reading else ~going
+        has_come = (
+            np.isfinite(reading.object_time) & np.isfinite(reading.joint_time)
+            if reading
+            else ~going
+        )
         if reading is None or not going.any() or not has_come[going].all():
             return self._sent
         try:
@@ -160,7 +166,10 @@ class Runner:
             old = replace(new, joint_time=nothing, object_time=nothing)
         usable = np.ones_like(pose_sound)
         for fine, problem in (
-            (new.object_time <= now + 0.1, "newer ones have time stamps ahead of the robot's clock"),
+            (
+                new.object_time <= now + 0.1,
+                "newer ones have time stamps ahead of the robot's clock",
+            ),
             (new.object_time >= old.object_time, "the time stamps of newer ones run backwards"),
             (pose_sound, "newer ones hold numbers that are not finite, or no unit quaternion"),
         ):
@@ -171,7 +180,10 @@ class Runner:
         for robot in np.flatnonzero(usable & (new.object_time > old.object_time)):
             self._refusals[robot] = "no newer one has come"
         joint_names = ("joint_pos", "joint_vel", "joint_time", "tip_force", "links")
-        kept = {name: _rows(joints_sound, getattr(new, name), getattr(old, name)) for name in joint_names}
+        kept = {
+            name: _rows(joints_sound, getattr(new, name), getattr(old, name))
+            for name in joint_names
+        }
         for name in ("object_pos", "object_quat", "object_time"):
             kept[name] = _rows(usable, getattr(new, name), getattr(old, name))
         self._reading = Reading(**kept)
@@ -182,8 +194,16 @@ class Runner:
         assert reading is not None
         limits = self.limits
         for time_of, limit, text in (
-            (reading.object_time, limits.pose_age, "The pose of the object is {age:.2f} s old: {refusal}."),
-            (reading.joint_time, limits.joint_age, "The joint positions are {age:.2f} s old, or not finite."),
+            (
+                reading.object_time,
+                limits.pose_age,
+                "The pose of the object is {age:.2f} s old: {refusal}.",
+            ),
+            (
+                reading.joint_time,
+                limits.joint_age,
+                "The joint positions are {age:.2f} s old, or not finite.",
+            ),
         ):
             age = now - np.maximum(time_of, self._begun)
             for robot in np.flatnonzero(age > limit):
@@ -218,6 +238,9 @@ def _rows(chosen: Array, new: Any, old: Any) -> Any:
     if new is None or chosen.all():
         return new
     if isinstance(new, Links):
-        parts = {each.name: _rows(chosen, getattr(new, each.name), getattr(old, each.name)) for each in fields(Links)}
+        parts = {
+            each.name: _rows(chosen, getattr(new, each.name), getattr(old, each.name))
+            for each in fields(Links)
+        }
         return Links(**parts)
     return np.where(chosen.reshape(-1, *[1] * (new.ndim - 1)), new, old)

@@ -42,7 +42,9 @@ class ActionSpace:
     config: ActionConfig
 
     @classmethod
-    def of(cls, robot: RobotSpec, config: ActionConfig, device: torch.device | str = "cpu") -> ActionSpace:
+    def of(
+        cls, robot: RobotSpec, config: ActionConfig, device: torch.device | str = "cpu"
+    ) -> ActionSpace:
         """Return the action space of a robot."""
         tree = robot_tree(robot)
         joints = [tree.joint(name) for name in robot.joint_names]

@@ -188,9 +188,9 @@ class RewardConfig(Checked):
     """Whether ``action`` and ``action_rate`` penalise actions as the policy gave them, instead of limited to [-1, 1].
     Beyond the limit noise explores nothing, and only a penalty of the raw action pulls the mean back (as in Isaac Lab's
     action terms)."""
-    own: Annotated[dict[str, float], Rule("module:function and a finite number", _are_own_terms)] = field(
-        default_factory=dict
-    )
+    own: Annotated[
+        dict[str, float], Rule("module:function and a finite number", _are_own_terms)
+    ] = field(default_factory=dict)
     """Reward terms of the user: ``module:function`` -> weight (:func:`xreset.task.rewards.own_term`)."""
     scale: Positive[Finite[float]] = 0.01
     """Factor on the total (Table VIII)."""
@@ -283,7 +283,10 @@ class TrackerConfig(Checked):
     @property
     def has_errors(self) -> bool:
         """Whether poses are wrong."""
-        return max(self.position_bias, self.rotation_bias, self.position_noise, self.rotation_noise) > 0
+        return (
+            max(self.position_bias, self.rotation_bias, self.position_noise, self.rotation_noise)
+            > 0
+        )
 
     @property
     def skips_steps(self) -> bool:
@@ -296,7 +299,8 @@ class PushConfig(Checked):
     """Pushes on object and arm, each during one control step. All are off by default."""
 
     probability: Annotated[
-        tuple[float, float], Rule("two numbers above 0 and at most 1", lambda x: 0 < x[0] <= x[1] <= 1)
+        tuple[float, float],
+        Rule("two numbers above 0 and at most 1", lambda x: 0 < x[0] <= x[1] <= 1),
     ] = (0.001, 0.1)
     """Range of the probability of a push per control step. Each episode draws one, log-uniformly."""
     object_velocity: NotNegative[float] = 0.0
@@ -385,16 +389,22 @@ class RandomizationConfig(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.tracker.jitter and not self.observation_latency[1]:
-            raise ValueError("tracker.jitter changes observation_latency, which is 0. Set observation_latency")
+            raise ValueError(
+                "tracker.jitter changes observation_latency, which is 0. Set observation_latency"
+            )
 
     def draws(self, *names: str) -> bool:
         """Whether one of these ranges differs from its default."""
-        return self.enabled and any(getattr(self, name) != getattr(_AS_STATED, name) for name in names)
+        return self.enabled and any(
+            getattr(self, name) != getattr(_AS_STATED, name) for name in names
+        )
 
     @property
     def scales_drives(self) -> bool:
         """Whether drives differ from what the robot spec says."""
-        return self.draws("arm_stiffness", "arm_damping", "hand_stiffness", "hand_damping", "effort")
+        return self.draws(
+            "arm_stiffness", "arm_damping", "hand_stiffness", "hand_damping", "effort"
+        )
 
 
 _AS_STATED = RandomizationConfig()
@@ -426,7 +436,11 @@ class TaskConfig(Checked):
     @property
     def policy_groups(self) -> tuple[str, str, str]:
         """Names of the observation groups that a policy gets: two flat ones, then clouds or images."""
-        return ("goal", "proprio", "view") if self.vision.cameras else ("policy", "proprio", "perception")
+        return (
+            ("goal", "proprio", "view")
+            if self.vision.cameras
+            else ("policy", "proprio", "perception")
+        )
 
     @property
     def picture_shape(self) -> tuple[int, int, int]:

@@ -22,7 +22,9 @@ class DelayLine:
             longest: largest delay [steps].
             by_column: whether each of the D numbers has a delay of its own.
         """
-        self.values = torch.zeros(like.shape[0], math.ceil(longest) + 1, like.shape[1], device=like.device)
+        self.values = torch.zeros(
+            like.shape[0], math.ceil(longest) + 1, like.shape[1], device=like.device
+        )
         """[N, K, D]"""
         self.delay = torch.zeros_like(like if by_column else like[:, :1])
         """[N, 1] steps, or [N, D]."""

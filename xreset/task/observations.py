@@ -104,7 +104,10 @@ def layout(
 
 
 def policy_group(
-    x: ObservationInput, c: ObservationConfig, generator: torch.Generator, points: Tensor | None = None
+    x: ObservationInput,
+    c: ObservationConfig,
+    generator: torch.Generator,
+    points: Tensor | None = None,
 ) -> Tensor:
     """[N, 15 + J] object pose (noisy), goal pose, gravity fraction, previous action.
 
@@ -125,9 +128,14 @@ def policy_group(
     observed_quat = quat_multiply(turn, x.observed_quat)
     if c.rotation == "to_goal":
         to_goal = _shown(quat_multiply(x.goal_quat, quat_conjugate(observed_quat)), c)
-        return torch.cat((pos, x.goal_pos, to_goal, x.gravity_fraction[:, None], x.previous_action), dim=-1)
+        return torch.cat(
+            (pos, x.goal_pos, to_goal, x.gravity_fraction[:, None], x.previous_action), dim=-1
+        )
     rotation, goal_rotation = _shown(torch.stack((observed_quat, x.goal_quat)), c)
-    return torch.cat((pos, rotation, x.goal_pos, goal_rotation, x.gravity_fraction[:, None], x.previous_action), dim=-1)
+    return torch.cat(
+        (pos, rotation, x.goal_pos, goal_rotation, x.gravity_fraction[:, None], x.previous_action),
+        dim=-1,
+    )
 
 
 def goal_group(x: ObservationInput, c: ObservationConfig) -> Tensor:
@@ -173,7 +181,9 @@ def privileged_group(x: ObservationInput, c: ObservationConfig) -> Tensor:
     if c.content == "published":
         force = (c.contact_force_scale * x.tip_force).clamp(-1.0, 1.0)
         unobserved = (c.joint_vel_scale * x.state.joint_vel, force.flatten(1))
-    rotation_error = quat_to_axis_angle(quat_multiply(x.goal_quat, quat_conjugate(x.state.object_quat)))
+    rotation_error = quat_to_axis_angle(
+        quat_multiply(x.goal_quat, quat_conjugate(x.state.object_quat))
+    )
     return torch.cat(
         (
             x.state.object_linvel,
@@ -189,7 +199,9 @@ def privileged_group(x: ObservationInput, c: ObservationConfig) -> Tensor:
     )
 
 
-def cloud_frame(points: Tensor, x: ObservationInput, c: ObservationConfig, generator: torch.Generator) -> Tensor:
+def cloud_frame(
+    points: Tensor, x: ObservationInput, c: ObservationConfig, generator: torch.Generator
+) -> Tensor:
     """[N, P, K] one frame of the object's points [N, P, 3] (object frame) in the world frame, times ``cloud_scale``.
 
     The present positions are noisy. With ``cloud="paired"`` the goal positions and the differences follow them.

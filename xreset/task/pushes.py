@@ -30,21 +30,31 @@ class Pushes:
         low, high = (log(limit) for limit in config.probability)
         scene = backend.scene
         self._control_dt = scene.control_dt
-        self._inertia = torch.stack([torch.as_tensor(o.inertia / o.mass, dtype=torch.float32) for o in scene.objects])
+        self._inertia = torch.stack(
+            [torch.as_tensor(o.inertia / o.mass, dtype=torch.float32) for o in scene.objects]
+        )
         self._inertia = self._inertia.to(device)[backend.object_index]
         """[N, 3, 3] for a mass of 1 kg, in the mesh frame."""
-        effort_over_stiffness = [joint.drive.effort / joint.drive.kp for joint in scene.robot.joints]
-        self._largest_offset = torch.where(is_arm, torch.tensor(effort_over_stiffness, device=device), 0.0)
+        effort_over_stiffness = [
+            joint.drive.effort / joint.drive.kp for joint in scene.robot.joints
+        ]
+        self._largest_offset = torch.where(
+            is_arm, torch.tensor(effort_over_stiffness, device=device), 0.0
+        )
         self._largest_offset *= config.arm_torque
         self._probability = faults.keep(
-            "pushes.probability", faults.zeros(), lambda generator: sample_range(n, (low, high), generator).exp()
+            "pushes.probability",
+            faults.zeros(),
+            lambda generator: sample_range(n, (low, high), generator).exp(),
         )
         """[N] of a push in a control step."""
         self.force = faults.zeros(3)
         self.torque = faults.zeros(3)
         self.gate = faults.keep("pushes.gate", faults.zeros().bool())
 
-    def act(self, state: State, mass: Tensor, inertia_scale: Tensor | float, generator: torch.Generator) -> Tensor:
+    def act(
+        self, state: State, mass: Tensor, inertia_scale: Tensor | float, generator: torch.Generator
+    ) -> Tensor:
         """Set force and torque on the object for this step, and return offsets [N, J] of the joints' targets.
 
         Args:
@@ -55,7 +65,10 @@ class Pushes:
         """
         c = self.config
         n = len(mass)
-        happens = torch.rand(n, 3, generator=generator, device=generator.device) < self._probability[:, None]
+        happens = (
+            torch.rand(n, 3, generator=generator, device=generator.device)
+            < self._probability[:, None]
+        )
         if c.moves_object:
             allowed = happens[:, :2] if c.when == "always" else happens[:, :2] & self.gate[:, None]
             velocity = sample_offset(n, (0.0, c.object_velocity), generator) * allowed[:, :1]
@@ -64,5 +77,8 @@ class Pushes:
             local = quat_rotate_inverse(state.object_quat, spin)
             moment = (self._inertia @ local[..., None])[..., 0] * (mass * inertia_scale)[:, None]
             self.torque.copy_(quat_rotate(state.object_quat, moment) / self._control_dt)
-        size = 2.0 * torch.rand(state.joint_pos.shape, generator=generator, device=generator.device) - 1.0
+        size = (
+            2.0 * torch.rand(state.joint_pos.shape, generator=generator, device=generator.device)
+            - 1.0
+        )
         return self._largest_offset * size * happens[:, 2:]

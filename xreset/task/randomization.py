@@ -45,7 +45,13 @@ class Drawn:
         return self.keep(name, self.zeros(*shape), partial(sample_range, self.num_worlds, limits))
 
     def delay_line(
-        self, name: str, width: int, longest: float, sample: Sample | None, *, by_column: bool = False
+        self,
+        name: str,
+        width: int,
+        longest: float,
+        sample: Sample | None,
+        *,
+        by_column: bool = False,
     ) -> DelayLine:
         """Add a :class:`DelayLine` of [N, ``width``] whose delays are drawn, and return it."""
         line = DelayLine(self.zeros(width), longest, by_column=by_column)
@@ -58,7 +64,9 @@ class Drawn:
         return [(sample(generator).view_as(buffer), buffer) for sample, buffer in self._samples]
 
 
-def pair_friction(material: Tensor, c: RandomizationConfig, link: Tensor | float | None = None) -> Tensor:
+def pair_friction(
+    material: Tensor, c: RandomizationConfig, link: Tensor | float | None = None
+) -> Tensor:
     """[M, 3] friction of the pairs object-fingertip, object-link, object-table.
 
     Args:
@@ -78,7 +86,9 @@ def sample_friction(count: int, c: RandomizationConfig, generator: torch.Generat
     low, high = c.friction
     if not c.enabled:
         return pair_friction(torch.full((count,), (low + high) / 2, device=generator.device), c)
-    bucket = torch.randint(c.friction_buckets, (count,), generator=generator, device=generator.device)
+    bucket = torch.randint(
+        c.friction_buckets, (count,), generator=generator, device=generator.device
+    )
     link = None if c.hand_friction is None else sample_range(count, c.hand_friction, generator)
     return pair_friction(low + (high - low) * (bucket + 0.5) / c.friction_buckets, c, link)
 
@@ -89,7 +99,9 @@ def own_friction(materials: Sequence[float | None], c: RandomizationConfig) -> T
     The known coefficient replaces the middle of the range, and a pair's coefficient is the mean of two materials.
     """
     middle = sum(c.friction) / 2
-    return torch.tensor([[0.0 if material is None else (material - middle) / 2] for material in materials])
+    return torch.tensor(
+        [[0.0 if material is None else (material - middle) / 2] for material in materials]
+    )
 
 
 def sample_range(count: int, limits: tuple[float, float], generator: torch.Generator) -> Tensor:
@@ -101,19 +113,31 @@ def sample_range(count: int, limits: tuple[float, float], generator: torch.Gener
 def sample_offset(count: int, limits: tuple[float, float], generator: torch.Generator) -> Tensor:
     """[M, 3] vectors in any direction, of uniform lengths of a range."""
     direction = torch.randn(count, 3, generator=generator, device=generator.device)
-    return sample_range(count, limits, generator)[:, None] * torch.nn.functional.normalize(direction, dim=-1)
+    return sample_range(count, limits, generator)[:, None] * torch.nn.functional.normalize(
+        direction, dim=-1
+    )
 
 
-def sample_drives(is_arm: Tensor, count: int, c: RandomizationConfig, generator: torch.Generator) -> Tensor:
+def sample_drives(
+    is_arm: Tensor, count: int, c: RandomizationConfig, generator: torch.Generator
+) -> Tensor:
     """[M, 3, J] factors on the drives' stiffness, damping and effort limit.
 
     Args:
         is_arm: [J] bool.
         count: M.
     """
-    ranges = ((c.arm_stiffness, c.hand_stiffness), (c.arm_damping, c.hand_damping), (c.effort, c.effort))
+    ranges = (
+        (c.arm_stiffness, c.hand_stiffness),
+        (c.arm_damping, c.hand_damping),
+        (c.effort, c.effort),
+    )
     rows = [
-        torch.where(is_arm, sample_range(count, arm, generator)[:, None], sample_range(count, hand, generator)[:, None])
+        torch.where(
+            is_arm,
+            sample_range(count, arm, generator)[:, None],
+            sample_range(count, hand, generator)[:, None],
+        )
         for arm, hand in ranges
     ]
     return torch.stack(rows, dim=1)

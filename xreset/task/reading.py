@@ -28,7 +28,9 @@ class Reading:
     """The state with the object's origin where the task has it (``TaskConfig.object_frame``)."""
 
     @classmethod
-    def of(cls, backend: Backend, surface_points: Tensor, bad_action: Tensor, center: Tensor | None) -> Self:
+    def of(
+        cls, backend: Backend, surface_points: Tensor, bad_action: Tensor, center: Tensor | None
+    ) -> Self:
         """Read a backend.
 
         Args:
@@ -46,7 +48,9 @@ class Reading:
             )
         links = backend.links()
         health = backend.health()
-        local = quat_rotate_inverse(state.object_quat[:, None], links.pos[:, 1:] - state.object_pos[:, None])
+        local = quat_rotate_inverse(
+            state.object_quat[:, None], links.pos[:, 1:] - state.object_pos[:, None]
+        )
         return cls(
             state=state,
             links=links,
@@ -81,4 +85,6 @@ def step_log(
     values = torch.stack([value.float() for value, _ in rows.values()])
     masks = torch.stack([mask for _, mask in rows.values()])
     means = torch.where(masks, values, 0).sum(dim=-1) / masks.sum(dim=-1).clamp_min(1)
-    return (*rows, *totals), torch.cat((means, torch.stack([value.float() for value in totals.values()])))
+    return (*rows, *totals), torch.cat(
+        (means, torch.stack([value.float() for value in totals.values()]))
+    )

@@ -101,9 +101,13 @@ def own_term(name: str) -> OwnTerm:
         found: Any = getattr(import_module(module), function)
     except Exception as error:  # a user's module may fail in any way
         reason = f"{type(error).__name__}: {error}"
-        raise RunError(f"the reward term {name!r} cannot be loaded ({reason}). Is its folder in PYTHONPATH?") from error
+        raise RunError(
+            f"the reward term {name!r} cannot be loaded ({reason}). Is its folder in PYTHONPATH?"
+        ) from error
     if not callable(found):
-        raise RunError(f"the reward term {name!r} is {found!r}, expected a function of a RewardInput.")
+        raise RunError(
+            f"the reward term {name!r} is {found!r}, expected a function of a RewardInput."
+        )
     return cast(OwnTerm, found)
 
 
@@ -122,19 +126,25 @@ def contact_gate(tip_force: Tensor, threshold: float, *, opposing: bool = False)
     return pressing[:, 0] & others.any(dim=-1)
 
 
-def point_distances(pos: Tensor, quat: Tensor, goal_pos: Tensor, goal_quat: Tensor, points: Tensor) -> Tensor:
+def point_distances(
+    pos: Tensor, quat: Tensor, goal_pos: Tensor, goal_quat: Tensor, points: Tensor
+) -> Tensor:
     """[N, P] distance |o_i - g_i| of each object-frame point [N, P, 3] from its place at the goal [m]."""
     here = pos[:, None] + quat_rotate(quat[:, None], points)
     goal = goal_pos[:, None] + quat_rotate(goal_quat[:, None], points)
     return (here - goal).norm(dim=-1)
 
 
-def keypoint_distance(pos: Tensor, quat: Tensor, goal_pos: Tensor, goal_quat: Tensor, keypoints: Tensor) -> Tensor:
+def keypoint_distance(
+    pos: Tensor, quat: Tensor, goal_pos: Tensor, goal_quat: Tensor, keypoints: Tensor
+) -> Tensor:
     """[N] pose error d(o, g) = max_i |o_i - g_i| of object-frame keypoints [N, 4, 3] (the draft)."""
     return point_distances(pos, quat, goal_pos, goal_quat, keypoints).amax(dim=-1)
 
 
-def mean_distance(pos: Tensor, quat: Tensor, goal_pos: Tensor, goal_quat: Tensor, points: Tensor) -> Tensor:
+def mean_distance(
+    pos: Tensor, quat: Tensor, goal_pos: Tensor, goal_quat: Tensor, points: Tensor
+) -> Tensor:
     """[N] pose error d = mean_i |o_i - g_i| of object-frame surface points [N, P, 3] (the published paper)."""
     return point_distances(pos, quat, goal_pos, goal_quat, points).mean(dim=-1)
 

@@ -14,7 +14,9 @@ def out_of_bounds(object_pos: Tensor, table: TableSpec, c: TerminationConfig) ->
     Args:
         object_pos: [N, 3] origin of the object, world frame.
     """
-    offset = [(object_pos[:, k] - table.center[k]).abs() > table.half_size[k] + c.margin for k in range(2)]
+    offset = [
+        (object_pos[:, k] - table.center[k]).abs() > table.half_size[k] + c.margin for k in range(2)
+    ]
     beside = offset[0] | offset[1]
     return beside | (object_pos[:, 2] < c.object_low) | (object_pos[:, 2] > c.object_high)
 

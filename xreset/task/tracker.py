@@ -27,7 +27,10 @@ class Tracker:
         self._config = config
         c = config.tracker if config.enabled else TrackerConfig()
         self._limits = torch.tensor(
-            [[c.position_bias] * 3 + [c.rotation_bias] * 3, [c.position_noise] * 3 + [c.rotation_noise] * 3],
+            [
+                [c.position_bias] * 3 + [c.rotation_bias] * 3,
+                [c.position_noise] * 3 + [c.rotation_noise] * 3,
+            ],
             device=faults.device,
         )
         self._delays: DelayLine | None = None
@@ -37,7 +40,9 @@ class Tracker:
         self._bias: Tensor | None = None
         if c.has_errors:
             zero = faults.zeros(6)
-            self._bias = faults.keep("tracker.bias", zero, lambda g: self._limits[0] * _symmetric(zero, g))
+            self._bias = faults.keep(
+                "tracker.bias", zero, lambda g: self._limits[0] * _symmetric(zero, g)
+            )
         self._wait: Tensor | None = None
         if c.skips_steps:
             self._wait = faults.keep("tracker.wait", faults.zeros())
@@ -45,7 +50,9 @@ class Tracker:
         self._tracker = c
         self._fault_scale = fault_scale
 
-    def observe(self, pos: Tensor, quat: Tensor, fresh: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    def observe(
+        self, pos: Tensor, quat: Tensor, fresh: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
         """Return position [N, 3] and orientation [N, 4] as they are observed.
 
         Args:
@@ -55,7 +62,9 @@ class Tracker:
             generator: random numbers.
         """
         if self._bias is not None:
-            error = self._bias + self._fault_scale * self._limits[1] * _symmetric(self._bias, generator)
+            error = self._bias + self._fault_scale * self._limits[1] * _symmetric(
+                self._bias, generator
+            )
             pos = pos + error[:, :3]
             quat = quat_multiply(quat_from_axis_angle(error[:, 3:]), quat)
         if self._wait is not None:
@@ -66,7 +75,9 @@ class Tracker:
             chance = torch.rand(self._wait.shape, generator=generator, device=generator.device)
             lost = chance < c.loss * self._fault_scale
             pause = sample_range(len(pos), c.loss_steps, generator).round()
-            until_next = sample_range(len(pos), c.interval, generator).round() + torch.where(lost, pause, 0.0)
+            until_next = sample_range(len(pos), c.interval, generator).round() + torch.where(
+                lost, pause, 0.0
+            )
             self._wait.copy_(torch.where(arrives, until_next, self._wait) - 1.0)
             pos, quat = pose.split((3, 4), dim=-1)
         if self._delays is None:

@@ -38,7 +38,9 @@ class Variation:
         fault_scale: [] factor on delays, lost actions, faults of the tracker and the probability of pushes.
     """
 
-    def __init__(self, backend: Backend, config: RandomizationConfig, is_arm: Tensor, proprio_width: int) -> None:
+    def __init__(
+        self, backend: Backend, config: RandomizationConfig, is_arm: Tensor, proprio_width: int
+    ) -> None:
         """Allocate.
 
         Args:
@@ -51,8 +53,12 @@ class Variation:
         scene = backend.scene
         n = backend.num_worlds
         c = config
-        mass = torch.tensor([o.mass for o in scene.objects], device=backend.device)[backend.object_index]
-        offset = own_friction([o.friction for o in scene.objects], c).to(backend.device)[backend.object_index]
+        mass = torch.tensor([o.mass for o in scene.objects], device=backend.device)[
+            backend.object_index
+        ]
+        offset = own_friction([o.friction for o in scene.objects], c).to(backend.device)[
+            backend.object_index
+        ]
 
         def friction(generator: torch.Generator) -> Tensor:
             drawn = sample_friction(n, c, generator) + offset
@@ -66,14 +72,26 @@ class Variation:
         self.parameters: dict[str, Tensor] = {}
         for name, shape, is_drawn, sample in (
             ("friction", (3,), True, friction),
-            ("object_mass", (), True, lambda generator: mass * sample_range(n, mass_scale, generator)),
+            (
+                "object_mass",
+                (),
+                True,
+                lambda generator: mass * sample_range(n, mass_scale, generator),
+            ),
             ("drives", (3, len(is_arm)), c.scales_drives, partial(sample_drives, is_arm, n, c)),
             ("torsional_friction", (), c.draws("torsional_friction"), torsional),
-            ("object_inertia", (), c.draws("object_inertia"), partial(sample_range, n, c.object_inertia)),
+            (
+                "object_inertia",
+                (),
+                c.draws("object_inertia"),
+                partial(sample_range, n, c.object_inertia),
+            ),
             ("object_com", (3,), c.draws("object_com"), partial(sample_offset, n, c.object_com)),
         ):
             if is_drawn:
-                self.parameters[name] = self._physical.keep(name, self._physical.zeros(*shape), sample)
+                self.parameters[name] = self._physical.keep(
+                    name, self._physical.zeros(*shape), sample
+                )
         pushed = c.draws("push")
         needed = [*self.parameters, *(["object_wrench"] if pushed and c.push.moves_object else [])]
         missing = [name.replace("_", " ") for name in needed if name not in backend.capabilities]
@@ -99,7 +117,9 @@ class Variation:
                 return torch.where(is_arm, of_arm, of_hand)
 
             longest = max(c.action_latency[1], (c.hand_latency or (0.0, 0.0))[1])
-            self._commands = faults.delay_line("commands", len(is_arm), longest, delay, by_column=True)
+            self._commands = faults.delay_line(
+                "commands", len(is_arm), longest, delay, by_column=True
+            )
         self._tracker = Tracker(faults, c, self.fault_scale)
         self._proprio: DelayLine | None = None
         if c.draws("proprio_latency"):
@@ -128,7 +148,10 @@ class Variation:
         """[N, J] the new joint targets, or the old ones in worlds whose action is lost."""
         if self._lost_actions is None:
             return new
-        lost = torch.rand(self._lost_actions.shape, generator=generator, device=new.device) < self._lost_actions
+        lost = (
+            torch.rand(self._lost_actions.shape, generator=generator, device=new.device)
+            < self._lost_actions
+        )
         return torch.where(lost, old, new)
 
     def sent_targets(self, target: Tensor, state: State, generator: torch.Generator) -> Tensor:
@@ -138,7 +161,9 @@ class Variation:
         if self.pushes is None:
             return target
         inertia_scale = self.parameters.get("object_inertia", 1.0)
-        return target + self.pushes.act(state, self.parameters["object_mass"], inertia_scale, generator)
+        return target + self.pushes.act(
+            state, self.parameters["object_mass"], inertia_scale, generator
+        )
 
     def observed_proprio(self, proprio: Tensor, fresh: Tensor) -> Tensor:
         """[N, D] joints, links and forces as they are observed, possibly delayed.
@@ -154,7 +179,9 @@ class Variation:
         """[N, E, 3] forces as they are observed."""
         return force * (1.0 if self.force_gain is None else self.force_gain)
 
-    def observed_pose(self, state: State, fresh: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    def observed_pose(
+        self, state: State, fresh: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
         """Return the object's position [N, 3] and orientation [N, 4] as its tracker reports them.
 
         In the ``fresh`` worlds [N] the present pose becomes the whole past.

@@ -29,14 +29,32 @@ class Vision:
         self._backend = backend
         c = task.randomization
         vision = task.vision
-        cameras = Cameras(backend.scene, backend.object_index, vision, scale=task.observation.cloud_scale)
+        cameras = Cameras(
+            backend.scene, backend.object_index, vision, scale=task.observation.cloud_scale
+        )
         self.cameras = cameras
         drawn = Drawn(backend.num_worlds, backend.device)
         for name, buffer, sample in (
-            ("camera_shift", cameras.shift, partial(sample_offset, cameras.fov_scale.numel(), c.camera_shift)),
-            ("camera_turn", cameras.turn, partial(sample_offset, cameras.fov_scale.numel(), c.camera_turn)),
-            ("camera_fov", cameras.fov_scale, partial(sample_range, cameras.fov_scale.numel(), c.camera_fov)),
-            ("camera_noise", cameras.noise_scale, partial(sample_range, backend.num_worlds, c.camera_noise)),
+            (
+                "camera_shift",
+                cameras.shift,
+                partial(sample_offset, cameras.fov_scale.numel(), c.camera_shift),
+            ),
+            (
+                "camera_turn",
+                cameras.turn,
+                partial(sample_offset, cameras.fov_scale.numel(), c.camera_turn),
+            ),
+            (
+                "camera_fov",
+                cameras.fov_scale,
+                partial(sample_range, cameras.fov_scale.numel(), c.camera_fov),
+            ),
+            (
+                "camera_noise",
+                cameras.noise_scale,
+                partial(sample_range, backend.num_worlds, c.camera_noise),
+            ),
         ):
             drawn.keep(name, buffer, sample if c.draws(name) else None)
         drawn.keep("images", cameras.image)
@@ -46,7 +64,9 @@ class Vision:
         if round(longest):
 
             def age(generator: torch.Generator) -> Tensor:
-                return (vision.latency + sample_range(backend.num_worlds, c.camera_latency, generator)).round()
+                return (
+                    vision.latency + sample_range(backend.num_worlds, c.camera_latency, generator)
+                ).round()
 
             width = cameras.view[0].numel()
             sample = age if c.draws("camera_latency") else None

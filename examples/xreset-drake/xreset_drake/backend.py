@@ -51,15 +51,22 @@ _DEFAULTS = DrakeSettings()
 class DrakeWorld(World):
     """One world of Drake: a diagram and a context of its own."""
 
-    def __init__(self, scene: SceneSpec, object_index: int, *, settings: DrakeSettings = _DEFAULTS) -> None:
+    def __init__(
+        self, scene: SceneSpec, object_index: int, *, settings: DrakeSettings = _DEFAULTS
+    ) -> None:
         """See :class:`World`."""
         robot, thing = mechanism(scene.robot), scene.objects[object_index]
         self._inertia = object_inertia(thing)
         self._at = at = build_model(scene, robot, thing, self._inertia, settings)
-        self._internal_steps, self._dt = settings.internal_steps, scene.timestep / settings.internal_steps
+        self._internal_steps, self._dt = (
+            settings.internal_steps,
+            scene.timestep / settings.internal_steps,
+        )
         self._tips = len(scene.robot.fingertips)
         mimics = scene.robot.mimics
-        self._source = np.array([scene.robot.joint_names.index(mimic.source) for mimic in mimics], dtype=int)
+        self._source = np.array(
+            [scene.robot.joint_names.index(mimic.source) for mimic in mimics], dtype=int
+        )
         self._multiplier = np.array([mimic.multiplier for mimic in mimics])
         self._offset = np.array([mimic.offset for mimic in mimics])
         self._brake = _Brake(scene)
@@ -103,7 +110,9 @@ class DrakeWorld(World):
     def get_state(self) -> dict[str, np.ndarray]:
         """See :meth:`World.get_state`."""
         at, i, j = self._at, self._object_q, self._object_v
-        values = at.plant.GetPositionsAndVelocities(self._context) if self._lost is None else self._lost
+        values = (
+            at.plant.GetPositionsAndVelocities(self._context) if self._lost is None else self._lost
+        )
         q, v = np.split(values, self._sizes[:1])
         self._quat = nearer(q[i : i + 4], self._quat)
         return {
@@ -131,20 +140,26 @@ class DrakeWorld(World):
         load = ExternallyAppliedSpatialForce()
         load.body_index, load.p_BoBq_B = at.object.index(), self._inertia.com
         load.F_Bq_W = SpatialForce(
-            self.torque, self.force - np.array([0.0, 0.0, self._inertia.mass * GRAVITY * self.gravity_fraction])
+            self.torque,
+            self.force - np.array([0.0, 0.0, self._inertia.mass * GRAVITY * self.gravity_fraction]),
         )
         at.plant.get_applied_spatial_force_input_port().FixValue(
             self._context, Value[list[ExternallyAppliedSpatialForce]]([load])
         )
-        for count in [1] * (n * self._internal_steps) if self._brake.needed else [n * self._internal_steps]:
+        for count in (
+            [1] * (n * self._internal_steps) if self._brake.needed else [n * self._internal_steps]
+        ):
             if self._brake.needed:
                 self._brake.apply(at, self._context, self._target, self._dt)
             self._steps += count
             try:
                 self._simulator.AdvanceTo(self._steps * self._dt)
-            except RuntimeError as error:  # its way to say that numbers have grown beyond all bounds
+            except (
+                RuntimeError
+            ) as error:  # its way to say that numbers have grown beyond all bounds
                 warnings.warn(
-                    f"Drake gives up on a world, which counts as not finite from now on: {error}", stacklevel=2
+                    f"Drake gives up on a world, which counts as not finite from now on: {error}",
+                    stacklevel=2,
                 )
                 self._lost = np.full(sum(self._sizes), np.nan)
                 return
@@ -165,11 +180,17 @@ class DrakeWorld(World):
 
     def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See :meth:`World.contacts`: of the last internal step, which is what Drake's output ports report."""
-        tip_force, tip_touch, table_force = np.zeros((self._tips, 3)), np.zeros(self._tips, dtype=bool), np.zeros(3)
+        tip_force, tip_touch, table_force = (
+            np.zeros((self._tips, 3)),
+            np.zeros(self._tips, dtype=bool),
+            np.zeros(3),
+        )
         if self._steps == 0 or self._lost is not None:
             return tip_force, tip_touch, table_force
         results = self._at.plant.get_contact_results_output_port().Eval(self._context)
-        for contact in map(results.hydroelastic_contact_info, range(results.num_hydroelastic_contacts())):
+        for contact in map(
+            results.hydroelastic_contact_info, range(results.num_hydroelastic_contacts())
+        ):
             patch, force = (
                 contact.contact_surface(),
                 contact.F_Ac_W().translational(),
@@ -193,7 +214,15 @@ class DrakeWorld(World):
             about_origin = body.CalcSpatialInertiaInBodyFrame(self._context)
             com = about_origin.get_com()
             central = about_origin.Shift(com).CalcRotationalInertia().CopyToFullMatrix3()
-            found.append(principal(about_origin.get_mass(), com, central, XResetError, f"Drake's body {body.name()!r}"))
+            found.append(
+                principal(
+                    about_origin.get_mass(),
+                    com,
+                    central,
+                    XResetError,
+                    f"Drake's body {body.name()!r}",
+                )
+            )
         return found
 
     def set_object_inertia(self, inertia: Inertia) -> None:
@@ -204,12 +233,17 @@ class DrakeWorld(World):
     def set_friction(self, friction: np.ndarray) -> None:
         """See :meth:`World.set_friction`."""
         self._set_friction(
-            {role: friction_of_other(float(mu)) for role, mu in zip(("tip", "link", "table"), friction, strict=True)}
+            {
+                role: friction_of_other(float(mu))
+                for role, mu in zip(("tip", "link", "table"), friction, strict=True)
+            }
         )
 
     def _set_friction(self, coefficients: Mapping[str, float]) -> None:
         """Give the geometries of some roles a coefficient of their own. Drake rebuilds what has changed, so only that is touched."""
-        changed: Collection[str] = {role for role, mu in coefficients.items() if self._friction.get(role) != mu}
+        changed: Collection[str] = {
+            role for role, mu in coefficients.items() if self._friction.get(role) != mu
+        }
         self._friction |= coefficients
         at = self._at
         for geometry, surface in at.surfaces.items():
@@ -218,22 +252,30 @@ class DrakeWorld(World):
                 mu = self._friction[surface.role]
                 AddContactMaterial(properties, friction=CoulombFriction(mu, mu))
                 at.scene_graph.AssignRole(
-                    self._geometry, at.plant.get_source_id(), geometry, properties, RoleAssign.kReplace
+                    self._geometry,
+                    at.plant.get_source_id(),
+                    geometry,
+                    properties,
+                    RoleAssign.kReplace,
                 )
 
 
 _DAMPED = "drives are integrated by implicit Euler steps, which damp: the difference shrinks with the step"
 _ROCKING = "a brick that is laid on its edge rocks for a second, because contacts dissipate little; then the force is right to 0.1 %"
-_PITCHING = (
-    "friction tilts an object on the compliant table and lags behind its normal force, so that a fast one chatters"
-)
+_PITCHING = "friction tilts an object on the compliant table and lags behind its normal force, so that a fast one chatters"
 
 _KNOWN_DIFFERENCES = (
     KnownDifference(check="joint_tracking", measure="arm, sine, rms", bound=0.003, reason=_DAMPED),
     KnownDifference(check="joint_tracking", measure="hand, sine, rms", bound=0.003, reason=_DAMPED),
-    KnownDifference(check="effort_limit", measure="hand, weak step, peak", bound=0.014, reason=_DAMPED),
-    KnownDifference(check="resting_on_a_side", measure="vertical force", bound=0.15, reason=_ROCKING),
-    KnownDifference(check="resting_on_a_side", measure="horizontal force", bound=0.3, reason=_ROCKING),
+    KnownDifference(
+        check="effort_limit", measure="hand, weak step, peak", bound=0.014, reason=_DAMPED
+    ),
+    KnownDifference(
+        check="resting_on_a_side", measure="vertical force", bound=0.15, reason=_ROCKING
+    ),
+    KnownDifference(
+        check="resting_on_a_side", measure="horizontal force", bound=0.3, reason=_ROCKING
+    ),
     KnownDifference(
         check="rest_and_bounce",
         measure="bounce",
@@ -241,11 +283,18 @@ _KNOWN_DIFFERENCES = (
         reason="more dissipation would stop sliding objects too early",
     ),
     *(
-        KnownDifference(check="sliding_distance", measure=f"mu {mu}, {degrees} degrees", bound=bound, reason=_PITCHING)
+        KnownDifference(
+            check="sliding_distance",
+            measure=f"mu {mu}, {degrees} degrees",
+            bound=bound,
+            reason=_PITCHING,
+        )
         for mu, bound in ((0.5, 0.15), (0.8, 0.3), (1.2, 0.8))
         for degrees in (0, 45)
     ),
-    KnownDifference(check="slope", measure="acceleration, mu 1.2, 0 degrees", bound=1.5, reason=_PITCHING),
+    KnownDifference(
+        check="slope", measure="acceleration, mu 1.2, 0 degrees", bound=1.5, reason=_PITCHING
+    ),
     KnownDifference(
         check="torsional_friction",
         measure="spin lost",
@@ -278,15 +327,21 @@ class _Brake:
     def __init__(self, scene: SceneSpec) -> None:
         drives = [joint.drive for joint in scene.robot.joints]
         self._kp, self._kd, self._effort, self._loss = (
-            np.array([getattr(drive, field) for drive in drives]) for field in ("kp", "kd", "effort", "friction_loss")
+            np.array([getattr(drive, field) for drive in drives])
+            for field in ("kp", "kd", "effort", "friction_loss")
         )
         self.needed = bool(self._loss.any())
 
     def apply(self, at: DrakeModel, context: Context, target: np.ndarray, dt: float) -> None:
         """Set the torques of one step."""
         plant, joints = at.plant, at.joint_velocity
-        position, velocity = plant.GetPositions(context)[at.joint_position], plant.GetVelocities(context)[joints]
-        drive = np.clip(self._kp * (target - position) - self._kd * velocity, -self._effort, self._effort)
+        position, velocity = (
+            plant.GetPositions(context)[at.joint_position],
+            plant.GetVelocities(context)[joints],
+        )
+        drive = np.clip(
+            self._kp * (target - position) - self._kd * velocity, -self._effort, self._effort
+        )
         felt = 1.0 / np.diag(np.linalg.inv(plant.CalcMassMatrix(context)))[joints]
         torque = np.zeros(plant.num_velocities())
         torque[joints] = np.clip(-felt * velocity / dt - drive, -self._loss, self._loss)

@@ -30,7 +30,12 @@ from pydrake.geometry import (
     Sphere,
 )
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.plant import (
+    AddMultibodyPlant,
+    CoulombFriction,
+    MultibodyPlant,
+    MultibodyPlantConfig,
+)
 from pydrake.multibody.tree import (
     FixedOffsetFrame,
     Frame,
@@ -152,11 +157,16 @@ def build_model(
         joint_position=np.array([joint.position_start() for joint in joints], dtype=int),
         joint_velocity=np.array([joint.velocity_start() for joint in joints], dtype=int),
         joint_actuator=np.array(
-            [actuators.index(plant.GetJointActuatorByName(joint.name(), instance).index()) for joint in joints]
+            [
+                actuators.index(plant.GetJointActuatorByName(joint.name(), instance).index())
+                for joint in joints
+            ]
         ),
         mimic_position=np.array([joint.position_start() for joint in mimics], dtype=int),
         mimic_velocity=np.array([joint.velocity_start() for joint in mimics], dtype=int),
-        links=[plant.GetFrameByName(_frame_name(link), instance) for link in scene.robot.tracked_links],
+        links=[
+            plant.GetFrameByName(_frame_name(link), instance) for link in scene.robot.tracked_links
+        ],
         moving=bodies[1:],
         object=body,
         surfaces=parts.surfaces,
@@ -174,12 +184,22 @@ class _Parts:
         self.links: dict[str, list[GeometryId]] = {}
 
     def attach(
-        self, body: RigidBody, shape: Shape, surface: Surface, *, placed: RigidTransform | None = None, link: str = ""
+        self,
+        body: RigidBody,
+        shape: Shape,
+        surface: Surface,
+        *,
+        placed: RigidTransform | None = None,
+        link: str = "",
     ) -> None:
         """Add a collision shape to a body."""
         properties = ProximityProperties()
         settings = self.settings
-        resolution = min(settings.resolution, *shape.geometry.size) if shape.geometry.size else settings.resolution
+        resolution = (
+            min(settings.resolution, *shape.geometry.size)
+            if shape.geometry.size
+            else settings.resolution
+        )
         modulus = {"object": settings.modulus, "table": settings.table_modulus}.get(surface.role)
         if modulus is not None:
             AddCompliantHydroelasticProperties(resolution, modulus, properties)
@@ -206,18 +226,25 @@ def _add_robot(parts: _Parts, robot: Mechanism, instance: ModelInstanceIndex) ->
     bodies: list[RigidBody] = []
     for item in robot.bodies:
         body = plant.AddRigidBody(
-            item.name, instance, spatial_inertia(item.inertia) if item.inertia else SpatialInertia.Zero()
+            item.name,
+            instance,
+            spatial_inertia(item.inertia) if item.inertia else SpatialInertia.Zero(),
         )
         bodies.append(body)
         for part in item.shapes:
             tip = robot.tip_of.get(part.link)
-            parts.attach(body, part.shape, Surface("link" if tip is None else "tip", tip), link=part.link)
+            parts.attach(
+                body, part.shape, Surface("link" if tip is None else "tip", tip), link=part.link
+            )
         if item.joint is None:
             base = RigidTransform(Quaternion(_unit(spec.base_quat)), spec.base_pos)
             plant.WeldFrames(plant.world_frame(), body.body_frame(), base)
             continue
         place = FixedOffsetFrame(
-            f"joint:{item.joint.name}", bodies[item.parent].body_frame(), _transform(item.T_parent_body), instance
+            f"joint:{item.joint.name}",
+            bodies[item.parent].body_frame(),
+            _transform(item.T_parent_body),
+            instance,
         )
         kind = PrismaticJoint if item.joint.type == "prismatic" else RevoluteJoint
         plant.AddJoint(
@@ -233,16 +260,22 @@ def _add_robot(parts: _Parts, robot: Mechanism, instance: ModelInstanceIndex) ->
         )
     for joint in spec.joints:
         drive = joint.drive
-        actuator = plant.AddJointActuator(joint.name, plant.GetJointByName(joint.name, instance), drive.effort)
+        actuator = plant.AddJointActuator(
+            joint.name, plant.GetJointByName(joint.name, instance), drive.effort
+        )
         actuator.set_controller_gains(PdControllerGains(p=drive.kp, d=drive.kd))
         actuator.set_default_rotor_inertia(drive.armature)
         actuator.set_default_gear_ratio(1.0)
     for mimic in spec.mimics:
-        follower, source = (plant.GetJointByName(name, instance) for name in (mimic.joint, mimic.source))
+        follower, source = (
+            plant.GetJointByName(name, instance) for name in (mimic.joint, mimic.source)
+        )
         plant.AddCouplerConstraint(follower, source, mimic.multiplier, mimic.offset)
     for link in dict.fromkeys(spec.tracked_links):
         index, T = robot.frames[link]
-        plant.AddFrame(FixedOffsetFrame(_frame_name(link), bodies[index].body_frame(), _transform(T), instance))
+        plant.AddFrame(
+            FixedOffsetFrame(_frame_name(link), bodies[index].body_frame(), _transform(T), instance)
+        )
     return bodies
 
 
@@ -260,10 +293,16 @@ def _filter_collisions(scene_graph: SceneGraph, parts: _Parts, robot: Mechanism)
     """Let only those pairs collide that the scene says: everything is excluded first, then the wanted pairs are allowed."""
     spec = robot.robot
     of_role = {
-        role: [g for g, surface in parts.surfaces.items() if surface.role == role] for role in ("object", "table")
+        role: [g for g, surface in parts.surfaces.items() if surface.role == role]
+        for role in ("object", "table")
     }
     on_links = [g for geometries in parts.links.values() for g in geometries]
-    above_table = [g for link, geometries in parts.links.items() if link not in spec.table_exclude for g in geometries]
+    above_table = [
+        g
+        for link, geometries in parts.links.items()
+        if link not in spec.table_exclude
+        for g in geometries
+    ]
     rule = CollisionFilterDeclaration().ExcludeWithin(GeometrySet(list(parts.surfaces)))
     rule.AllowBetween(GeometrySet(of_role["object"]), GeometrySet(of_role["table"] + on_links))
     rule.AllowBetween(GeometrySet(of_role["table"]), GeometrySet(above_table))
@@ -277,7 +316,9 @@ def spatial_inertia(inertia: Inertia) -> SpatialInertia:
     """Mass properties about the origin of the body's frame, which is where Drake wants them."""
     R = RotationMatrix(Quaternion(_unit(inertia.quat))).matrix()
     about_com = R @ np.diag(inertia.moments) @ R.T
-    rotational = RotationalInertia(*np.diag(about_com), about_com[0, 1], about_com[0, 2], about_com[1, 2])
+    rotational = RotationalInertia(
+        *np.diag(about_com), about_com[0, 1], about_com[0, 2], about_com[1, 2]
+    )
     return SpatialInertia.MakeFromCentralInertia(inertia.mass, inertia.com, rotational)
 
 

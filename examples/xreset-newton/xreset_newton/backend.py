@@ -49,14 +49,19 @@ _FORCE = newton.solvers.SolverSteel.ObservableKind.CONTACT_F
 class NewtonWorld(World):
     """One world of Newton. Arrays of Warp on the CPU are views of numpy's memory, and are written and read as such."""
 
-    def __init__(self, scene: SceneSpec, object_index: int, *, settings: NewtonSettings = _DEFAULTS) -> None:
+    def __init__(
+        self, scene: SceneSpec, object_index: int, *, settings: NewtonSettings = _DEFAULTS
+    ) -> None:
         """See :class:`World`."""
         robot, thing = mechanism(scene.robot), scene.objects[object_index]
         self._inertia = object_inertia(thing)
         self._at = at = build_model(scene, robot, thing, self._inertia, settings)
         model = self._model = at.model
         self._tips = len(scene.robot.fingertips)
-        self._joints, self._frames = MovingJoints(scene.robot, robot.joint_names), TrackedFrames(robot)
+        self._joints, self._frames = (
+            MovingJoints(scene.robot, robot.joint_names),
+            TrackedFrames(robot),
+        )
         self._pipeline = newton.CollisionPipeline(
             model,
             broad_phase="explicit",
@@ -79,13 +84,16 @@ class NewtonWorld(World):
         self.forces = self._solver.observables({_FORCE}, contacts=self._contacts)
         self._states, self._control = [model.state(), model.state()], model.control()
         self._roles = {
-            role: np.array([s.role == role for s in at.surfaces]) for role in ("tip", "link", "table", "object")
+            role: np.array([s.role == role for s in at.surfaces])
+            for role in ("tip", "link", "table", "object")
         }
         self._tip_of_shape = np.array([surface.tip for surface in at.surfaces])
         self._base = np.array([*scene.robot.base_pos, *np.roll(scene.robot.base_quat, -1)])
         masses = np.array([body.inertia.mass for body in robot.bodies if body.inertia is not None])
         self._robot_weight = masses * (0.0 if scene.robot.gravity_compensated else GRAVITY)
-        self._graph = self._captured(scene.timestep / settings.internal_steps, settings.internal_steps)
+        self._graph = self._captured(
+            scene.timestep / settings.internal_steps, settings.internal_steps
+        )
         self._target, self._quat = scene.robot.home, np.array([1.0, 0.0, 0.0, 0.0])
         self._stepped = False
         self.set_friction(np.array([scene.friction.tip, scene.friction.link, scene.friction.table]))
@@ -97,7 +105,9 @@ class NewtonWorld(World):
         q[:-7], v[:-6] = self._joints.spread(state["joint_pos"], state["joint_vel"])
         self._quat = state["object_quat"] / np.linalg.norm(state["object_quat"])
         q[-7:-4], q[-4:] = state["object_pos"], np.roll(self._quat, -1)
-        v[-6:-3] = state["object_linvel"] + cross(state["object_angvel"], rotate(self._quat, self._inertia.com))
+        v[-6:-3] = state["object_linvel"] + cross(
+            state["object_angvel"], rotate(self._quat, self._inertia.com)
+        )
         v[-3:] = state["object_angvel"]
         newton.eval_fk(self._model, now.joint_q, now.joint_qd, now)
         self._states[1].assign(now)
@@ -143,7 +153,9 @@ class NewtonWorld(World):
             for index in range(internal_steps):
                 now, after = self._states[index % 2], self._states[1 - index % 2]
                 self._pipeline.collide(now, self._contacts)
-                self._solver.step(now, after, self._control, self._contacts, dt, observables=self.forces)
+                self._solver.step(
+                    now, after, self._control, self._contacts, dt, observables=self.forces
+                )
 
         step()  # what is allocated or decided once
         with wp.ScopedCapture(device="cpu") as capture:
@@ -155,11 +167,17 @@ class NewtonWorld(World):
         bodies, now = self._frames.bodies, self._states[0]
         pose = np.vstack((self._base, now.body_q.numpy()))[bodies]
         motion = np.vstack((np.zeros(6), now.body_qd.numpy()))[bodies]
-        return self._frames.locate(pose[:, :3], np.roll(pose[:, 3:], 1, axis=1), motion[:, :3], motion[:, 3:])
+        return self._frames.locate(
+            pose[:, :3], np.roll(pose[:, 3:], 1, axis=1), motion[:, :3], motion[:, 3:]
+        )
 
     def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See :meth:`World.contacts`: of the last internal step."""
-        tip_force, tip_touch, table_force = np.zeros((self._tips, 3)), np.zeros(self._tips, dtype=bool), np.zeros(3)
+        tip_force, tip_touch, table_force = (
+            np.zeros((self._tips, 3)),
+            np.zeros(self._tips, dtype=bool),
+            np.zeros(3),
+        )
         count = int(self._contacts.rigid_contact_count.numpy()[0]) if self._stepped else 0
         first, second = (
             shape.numpy()[:count]
@@ -184,7 +202,11 @@ class NewtonWorld(World):
         """See :meth:`World.mass_properties`."""
         model = self._model
         values = zip(
-            model.body_mass.numpy(), model.body_com.numpy(), model.body_inertia.numpy(), model.body_label, strict=True
+            model.body_mass.numpy(),
+            model.body_com.numpy(),
+            model.body_inertia.numpy(),
+            model.body_label,
+            strict=True,
         )
         return [
             principal(float(m), c.astype(float), i.astype(float), XResetError, f"Newton's {name!r}")
@@ -194,8 +216,14 @@ class NewtonWorld(World):
     def set_object_inertia(self, inertia: Inertia) -> None:
         """See :meth:`World.set_object_inertia`."""
         self._inertia, model, matrix = inertia, self._model, inertia.matrix
-        model.body_mass.numpy()[-1], model.body_inv_mass.numpy()[-1] = inertia.mass, 1.0 / inertia.mass
-        model.body_inertia.numpy()[-1], model.body_inv_inertia.numpy()[-1] = matrix, np.linalg.inv(matrix)
+        model.body_mass.numpy()[-1], model.body_inv_mass.numpy()[-1] = (
+            inertia.mass,
+            1.0 / inertia.mass,
+        )
+        model.body_inertia.numpy()[-1], model.body_inv_inertia.numpy()[-1] = (
+            matrix,
+            np.linalg.inv(matrix),
+        )
         model.body_com.numpy()[-1] = inertia.com
         self._solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
 
@@ -217,7 +245,9 @@ class NewtonWorld(World):
 _DAMPED = "drives are integrated by implicit Euler steps, which damp: the difference shrinks with the step"
 _KNOWN_DIFFERENCES = (
     KnownDifference(check="joint_tracking", measure="hand, sine, rms", bound=0.003, reason=_DAMPED),
-    KnownDifference(check="effort_limit", measure="hand, weak step, peak", bound=0.014, reason=_DAMPED),
+    KnownDifference(
+        check="effort_limit", measure="hand, weak step, peak", bound=0.014, reason=_DAMPED
+    ),
     KnownDifference(
         check="torsional_friction",
         measure="spin lost",

@@ -57,7 +57,11 @@ class NewtonModel:
 
 
 def build_model(
-    scene: SceneSpec, robot: Mechanism, thing: ObjectSpec, inertia: Inertia, settings: NewtonSettings
+    scene: SceneSpec,
+    robot: Mechanism,
+    thing: ObjectSpec,
+    inertia: Inertia,
+    settings: NewtonSettings,
 ) -> NewtonModel:
     """Build the model of one world.
 
@@ -75,7 +79,9 @@ def build_model(
     corner = np.eye(4)
     corner[:3, 3] = *scene.table.center, -scene.table.half_size[2]
     shapes.add(
-        -1, Shape(geometry=Geometry(kind="box", size=scene.table.half_size), T_body_shape=corner), Surface("table")
+        -1,
+        Shape(geometry=Geometry(kind="box", size=scene.table.half_size), T_body_shape=corner),
+        Surface("table"),
     )
     _add_robot(builder, shapes, robot)
     body = builder.add_body(**_mass(inertia), label="object")
@@ -91,7 +97,9 @@ class _Shapes:
 
     def __init__(self, builder: newton.ModelBuilder, settings: NewtonSettings) -> None:
         self._builder = builder
-        self._config = newton.ModelBuilder.ShapeConfig(density=0.0, mu=0.0, gap=settings.contact_gap)
+        self._config = newton.ModelBuilder.ShapeConfig(
+            density=0.0, mu=0.0, gap=settings.contact_gap
+        )
         self.surfaces: list[Surface] = []
         self._links: list[str] = []
 
@@ -104,10 +112,16 @@ class _Shapes:
         elif kind == "sphere":
             self._builder.add_shape_sphere(radius=size[0], **where)
         elif kind == "hull":
-            mesh = newton.Mesh(shape.geometry.vertices, shape.geometry.faces.flatten(), compute_inertia=False)
+            mesh = newton.Mesh(
+                shape.geometry.vertices, shape.geometry.faces.flatten(), compute_inertia=False
+            )
             self._builder.add_shape_convex_hull(mesh=mesh, **where)
         else:
-            add = self._builder.add_shape_capsule if kind == "capsule" else self._builder.add_shape_cylinder
+            add = (
+                self._builder.add_shape_capsule
+                if kind == "capsule"
+                else self._builder.add_shape_cylinder
+            )
             add(radius=size[0], half_height=size[1], **where)
         self.surfaces.append(surface)
         self._links.append(link)
@@ -115,7 +129,12 @@ class _Shapes:
     def colliding(self, robot: Mechanism) -> np.ndarray:
         """[P, 2] pairs of shapes that the scene lets collide."""
         return np.array(
-            [pair for pair in combinations(range(len(self.surfaces)), 2) if self._collide(robot, *pair)], dtype=np.int32
+            [
+                pair
+                for pair in combinations(range(len(self.surfaces)), 2)
+                if self._collide(robot, *pair)
+            ],
+            dtype=np.int32,
         )
 
     def _collide(self, robot: Mechanism, a: int, b: int) -> bool:
@@ -138,7 +157,11 @@ def _add_robot(builder: newton.ModelBuilder, shapes: _Shapes, robot: Mechanism) 
             body = builder.add_link(**_mass(item.inertia), label=item.name)
             drive = drives.get(item.joint.name)
             place = transform(item.T_parent_body)
-            add = builder.add_joint_prismatic if item.joint.type == "prismatic" else builder.add_joint_revolute
+            add = (
+                builder.add_joint_prismatic
+                if item.joint.type == "prismatic"
+                else builder.add_joint_revolute
+            )
             joints[item.joint.name] = add(
                 item.parent - 1,
                 body,
@@ -156,13 +179,18 @@ def _add_robot(builder: newton.ModelBuilder, shapes: _Shapes, robot: Mechanism) 
         for part in item.shapes:
             tip = robot.tip_of.get(part.link, -1)
             placed = (
-                Shape(geometry=part.shape.geometry, T_body_shape=matrix(base) @ part.shape.T_body_shape)
+                Shape(
+                    geometry=part.shape.geometry,
+                    T_body_shape=matrix(base) @ part.shape.T_body_shape,
+                )
                 if body < 0
                 else part.shape
             )
             shapes.add(body, placed, Surface("link" if tip < 0 else "tip", tip), part.link)
     for mimic in spec.mimics:
-        builder.set_joint_mimic(joints[mimic.joint], joints[mimic.source], coeffs=(mimic.offset, mimic.multiplier))
+        builder.set_joint_mimic(
+            joints[mimic.joint], joints[mimic.source], coeffs=(mimic.offset, mimic.multiplier)
+        )
     builder.add_articulation(list(joints.values()))
 
 

@@ -45,7 +45,9 @@ def attribute(
         raise XResetError(f"--backend and --towards are both {backend!r}. Choose two engines.")
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
     a, b = (trial.engine(name, device=setting.device) for name in (backend, towards))
-    played = trial.load_trial(spec, demos, objects=setting.objects, seed=setting.seed, num_envs=setting.num_envs)
+    played = trial.load_trial(
+        spec, demos, objects=setting.objects, seed=setting.seed, num_envs=setting.num_envs
+    )
     out = out or spec.folder.parent / "attribute"
     folder = played.objects_folder
     with Progress() as bar:

@@ -64,7 +64,11 @@ def check(
             }
         )
     if json is not None:
-        content = {"schema": conformance.SCHEMA, "xreset_version": code_version(), "command": this_command()}
+        content = {
+            "schema": conformance.SCHEMA,
+            "xreset_version": code_version(),
+            "command": this_command(),
+        }
         write_json(json, content | {"runs": runs})
         console.print(f"wrote {json}")
     failed = 0
@@ -102,12 +106,16 @@ _STYLE = {
 def _print(result: conformance.CheckResult, verbose: bool) -> None:
     detail = _text(result.worst) if result.measures else result.problem
     verdict = (f"{result.verdict:<16}", _STYLE[result.verdict])
-    console.print(Text.assemble("  ", verdict, f" {result.name:<22} {result.seconds:5.1f} s  {detail}"))
+    console.print(
+        Text.assemble("  ", verdict, f" {result.name:<22} {result.seconds:5.1f} s  {detail}")
+    )
     for measure in result.measures:
         if verbose or measure.verdict != "passed":
             console.print(f"{'':19}{measure.verdict}: {_text(measure)}")
             if measure.verdict == "known difference" and measure.known is not None:
-                console.print(f"{'':19}accepted up to {measure.known.bound:.3g}: {measure.known.reason}")
+                console.print(
+                    f"{'':19}accepted up to {measure.known.bound:.3g}: {measure.known.reason}"
+                )
     if result.verdict == "failed":
         console.print(f"{'':19}asserted: {result.check.statement}")
         if result.problem:

@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING
 
 from rich.text import Text
 
-from xreset.cli._common import AllEngines, Device, Objects, Robot, Several, Source, this_command, usable_engines
+from xreset.cli._common import (
+    AllEngines,
+    Device,
+    Objects,
+    Robot,
+    Several,
+    Source,
+    this_command,
+    usable_engines,
+)
 from xreset.cli._terminal import Progress, console, show_table
 from xreset.files import code_version, file_hash, write_json
 
@@ -42,32 +51,43 @@ def compare(
     from xreset.eval.engines import agreement
     from xreset.inputs import load_inputs
 
-    names = [name for name in dict.fromkeys(backend) or usable_engines() if name != agreement.REFERENCE]
+    names = [
+        name for name in dict.fromkeys(backend) or usable_engines() if name != agreement.REFERENCE
+    ]
     engines = [trial.engine(name, device=device) for name in names]
     if not backend:
         engines = [each for each in engines if not each.slow]
     with Progress() as bar:
         task = bar.add_task("retargeting")
-        loaded = load_inputs(motion, robot=robot, objects=objects, only=only, accept=("demos", "motion"))
+        loaded = load_inputs(
+            motion, robot=robot, objects=objects, only=only, accept=("demos", "motion")
+        )
         grasped = loaded.motion(lambda done, total: bar.update(task, completed=done, total=total))
-        inputs = {"motion": file_hash(motion)}  # now: after minutes of work the file may be another, or gone
+        inputs = {
+            "motion": file_hash(motion)
+        }  # now: after minutes of work the file may be another, or gone
         result = agreement.compare(
             loaded.robot,
             loaded.objects,
             grasped,
             engines,
             grasps=grasps,
-            progress=lambda doing, done, total: bar.update(task, description=doing, completed=done, total=total),
+            progress=lambda doing, done, total: bar.update(
+                task, description=doing, completed=done, total=total
+            ),
         )
     _print(result)
     for tested in (result.reference, result.floor, *result.engines):
         if tested.broken:
             console.print(
-                f"{tested.engine.name}: {tested.broken} worlds were not finite or dropped contacts", style="bold red"
+                f"{tested.engine.name}: {tested.broken} worlds were not finite or dropped contacts",
+                style="bold red",
             )
     if json is not None:
         write_json(
-            json, result.as_dict() | {"xreset_version": code_version(), "command": this_command(), "inputs": inputs}
+            json,
+            result.as_dict()
+            | {"xreset_version": code_version(), "command": this_command(), "inputs": inputs},
         )
         console.print(f"wrote {json}")
     if result.missed:
@@ -82,14 +102,18 @@ def _print(result: agreement.Parity) -> None:
     held = sum(map(sum, holds))
     tried = sum(map(len, holds))
     reference = result.reference.engine.name
-    heads = [f"{tested.engine.name}\n{tested.engine.version}, {tested.engine.device}" for tested in columns]
+    heads = [
+        f"{tested.engine.name}\n{tested.engine.version}, {tested.engine.device}"
+        for tested in columns
+    ]
     table: list[tuple[str | Text, ...]] = [(f"against {reference}", "target", *heads)]
     for i, row in enumerate(result.floor.metrics):
         cells = [_cell(tested.metrics[i]) for tested in columns]
         table.append((row.metric, f"{row.sense} {_number(row.target, row.unit)}", *cells))
     grasps = f"{result.robot.name}, {len(result.objects)} objects: {len(result.closing)} closings, {tried} holds"
     show_table(
-        table, title=f"{grasps}, of which {reference} carries {sum(result.reference.carried['closing'])} and {held}"
+        table,
+        title=f"{grasps}, of which {reference} carries {sum(result.reference.carried['closing'])} and {held}",
     )
 
 

@@ -42,7 +42,11 @@ def trace(
         task = bar.add_task("actions", total=None)
         played = actions.from_file(source, place, object, episode)
         result = replay.trace(
-            played, base, engines, seed=place.seed, progress=lambda name: bar.update(task, description=name)
+            played,
+            base,
+            engines,
+            seed=place.seed,
+            progress=lambda name: bar.update(task, description=name),
         )
         replays = {e.name: e.recording for e in (result.reference, *result.engines)}
         actions.write_actions(out / "actions.npz", played, replays)

@@ -86,7 +86,9 @@ class View:
         if sequence is not None:
             count = len(self.sequence_name)
             if not 0 <= sequence < count:
-                raise XResetError(f"There is no sequence {sequence}: the file has {count}. Choose 0 to {count - 1}.")
+                raise XResetError(
+                    f"There is no sequence {sequence}: the file has {count}. Choose 0 to {count - 1}."
+                )
             keep &= self.sequence == sequence
         if reason is not None:
             keep &= np.array(self.reason) == reason
@@ -110,7 +112,11 @@ class View:
             f"frame {int(self.frame[row])}",
             PHASES[int(self.post_contact[row])],
         ]
-        if self.hand_error is not None and self.wrist_error is not None and np.isfinite(self.hand_error[row]):
+        if (
+            self.hand_error is not None
+            and self.wrist_error is not None
+            and np.isfinite(self.hand_error[row])
+        ):
             tips = 1e3 * self.hand_error[row]
             wrist = 1e3 * self.wrist_error[row]
             lines.append(f"off by {tips:.0f} mm (fingertips), {wrist:.0f} mm (wrist)")

@@ -47,7 +47,9 @@ def load_view(
     data = inputs.data
     if isinstance(data, Demos):
         if demos is not None or robot is not None:
-            raise XResetError(f"{path} holds demonstrations only. Omit --demos and --robot, or give a retargeted file.")
+            raise XResetError(
+                f"{path} holds demonstrations only. Omit --demos and --robot, or give a retargeted file."
+            )
         return _demos_view(data, inputs)
     if isinstance(data, Retargeted):
         view = _retargeted_view(data, inputs)
@@ -97,7 +99,9 @@ def _motion(data: ObjectMotions, objects: Sequence[ObjectSpec]) -> dict[str, Any
 
 def _object_index(names: np.ndarray, objects: Sequence[ObjectSpec]) -> np.ndarray:
     known = [spec.name for spec in objects]
-    return np.array([known.index(canonical_name(name, known)) for name in names.tolist()], dtype=int)
+    return np.array(
+        [known.index(canonical_name(name, known)) for name in names.tolist()], dtype=int
+    )
 
 
 def _retargeted_view(data: Retargeted, inputs: Inputs) -> View:
@@ -106,7 +110,9 @@ def _retargeted_view(data: Retargeted, inputs: Inputs) -> View:
         robot=inputs.robot,
         **_motion(data, inputs.objects),
         post_contact=data.post_contact,
-        reason=tuple("" if reason == 0 else data.reason_names[reason] for reason in data.reason.tolist()),
+        reason=tuple(
+            "" if reason == 0 else data.reason_names[reason] for reason in data.reason.tolist()
+        ),
         reasons=data.reason_names[1:],
         joint_pos=data.joint_pos,
         fingertips=data.fingertip_pos,
@@ -155,7 +161,9 @@ def _human(demos: Demos, objects: Sequence[ObjectSpec]) -> tuple[Demos, dict[str
     """Return the demonstrations with the objects on the table, as retargeting uses them, and the fields of a view of
     their hands."""
     demos = rest_on_table(demos, objects)
-    keypoints = np.where(demos.hand_valid[:, None, None], demos.hand_keypoints.astype(np.float64), np.nan)
+    keypoints = np.where(
+        demos.hand_valid[:, None, None], demos.hand_keypoints.astype(np.float64), np.nan
+    )
     surfaces = {spec.name: Surface(spec) for spec in objects if spec.name in demos.object_name}
     _, touching = human_contacts(demos, surfaces, RetargetConfig().contact_distance)
     return demos, {"human_keypoints": keypoints, "human_touching": touching}

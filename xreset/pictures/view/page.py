@@ -25,7 +25,13 @@ class Page(WebPage):
     """A page at :attr:`url` until :meth:`close`. All visitors see, and move, the same controls."""
 
     def __init__(
-        self, view: View, *, host: str = "127.0.0.1", port: int = 8080, sequence: int | None = None, frame: int = 0
+        self,
+        view: View,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        sequence: int | None = None,
+        frame: int = 0,
     ) -> None:
         """Start the server.
 
@@ -43,7 +49,9 @@ class Page(WebPage):
             sequence = 0
         self._rows = view.choose(sequence=sequence)
         if not 0 <= frame < len(self._rows):
-            raise XResetError(f"There is no frame {frame}: the sequence has {len(self._rows)}, counted from 0.")
+            raise XResetError(
+                f"There is no frame {frame}: the sequence has {len(self._rows)}, counted from 0."
+            )
         self._lock = threading.RLock()
         super().__init__(host, port, "xreset view")
         self._scene = _Scene(view, self._server)
@@ -121,7 +129,9 @@ class Page(WebPage):
         for reason, group in groupby(self.view.reason[row] for row in self._rows):
             color = f"rgb{rgb(reason_color(reason))}"
             slots += f'<div title="{escape(reason)}" style="flex:{len(list(group))};background:{color}"></div>'
-        self._bar.content = f'<div style="display:flex;height:12px;margin:0.6em 1em 0">{slots}</div>'
+        self._bar.content = (
+            f'<div style="display:flex;height:12px;margin:0.6em 1em 0">{slots}</div>'
+        )
 
     def _step(self, by: int) -> None:
         with self._lock:
@@ -159,7 +169,9 @@ class _Scene:
         self._keypoints = add_points("/human/keypoints", HUMAN_COLOR, 0.012)
         self._tips = add_points("/robot/fingertips", REACHED_COLOR, 0.008)
         no_bones = np.zeros((len(BONES), 2, 3), np.float32)
-        self._bones = scene.add_line_segments("/human/bones", no_bones, rgb(HUMAN_COLOR), thickness=0.003)
+        self._bones = scene.add_line_segments(
+            "/human/bones", no_bones, rgb(HUMAN_COLOR), thickness=0.003
+        )
 
     def show(self, row: int) -> None:
         """Place everything as in a row."""

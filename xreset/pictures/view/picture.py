@@ -19,11 +19,17 @@ class Drawer:
     """Draws rows of a view. Colors are those of :mod:`xreset.pictures.view.colors`; the goal is a translucent
     object."""
 
-    def __init__(self, view: View, *, size: tuple[int, int] = (640, 480), smooth: bool = False) -> None:
+    def __init__(
+        self, view: View, *, size: tuple[int, int] = (640, 480), smooth: bool = False
+    ) -> None:
         """Prepare the meshes; see :class:`~xreset.pictures.render.Renderer` for the options."""
-        robot = view.robot or load_robot(robot_names()[0])  # a scene needs one; it is drawn only if the view has one
+        robot = view.robot or load_robot(
+            robot_names()[0]
+        )  # a scene needs one; it is drawn only if the view has one
         self._view = view
-        self._renderer = Renderer(SceneSpec(robot=robot, objects=view.objects), size=size, smooth=smooth)
+        self._renderer = Renderer(
+            SceneSpec(robot=robot, objects=view.objects), size=size, smooth=smooth
+        )
 
     def draw(self, row: int) -> np.ndarray:
         """Return the [H, W, 3] uint8 picture of one row."""

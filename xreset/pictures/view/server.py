@@ -62,7 +62,9 @@ def _start_server(host: str, port: int, label: str) -> Any:
         ) from error
     if not guarded:
         server.stop()
-        raise XResetError("This version of viser cannot be restricted to its own page. Install viser 1.1.")
+        raise XResetError(
+            "This version of viser cannot be restricted to its own page. Install viser 1.1."
+        )
     camera = Camera()
     server.initial_camera.position = camera.eye
     server.initial_camera.look_at = camera.target
@@ -70,7 +72,9 @@ def _start_server(host: str, port: int, label: str) -> Any:
     server.scene.set_up_direction("+z")
     table = TableSpec()
     size = 2 * np.array(table.half_size)
-    server.scene.add_box("/table", rgb(TABLE_COLORS[0]), size, position=(*table.center, -table.half_size[2]))
+    server.scene.add_box(
+        "/table", rgb(TABLE_COLORS[0]), size, position=(*table.center, -table.half_size[2])
+    )
     return server
 
 
@@ -102,18 +106,26 @@ class RobotMeshes:
             if mesh is not None:
                 self._colors[name] = color
                 self.links[name] = scene.add_mesh_simple(
-                    f"/robot/{name}", mesh.vertices, mesh.faces, color=rgb(color), flat_shading=False
+                    f"/robot/{name}",
+                    mesh.vertices,
+                    mesh.faces,
+                    color=rgb(color),
+                    flat_shading=False,
                 )
 
     def place(self, joint_pos: np.ndarray, color: Color | None = None) -> None:
         """Show joint positions [J] [rad, m], with a color mixed into the robot's own."""
-        poses = self._kinematics.link_poses(torch.as_tensor(joint_pos, dtype=torch.float64), tuple(self.links))
+        poses = self._kinematics.link_poses(
+            torch.as_tensor(joint_pos, dtype=torch.float64), tuple(self.links)
+        )
         quats = matrix_to_quat(poses[:, :3, :3]).numpy()
         for (name, link), pose, quat in zip(self.links.items(), poses.numpy(), quats, strict=True):
             link.position = pose[:3, 3]
             link.wxyz = quat
             if color != self._tint:
-                link.color = rgb(self._colors[name] if color is None else tint(self._colors[name], color))
+                link.color = rgb(
+                    self._colors[name] if color is None else tint(self._colors[name], color)
+                )
         self._tint = color
 
 
@@ -133,7 +145,9 @@ def _own_page_only(host: str) -> Iterator[list[str]]:
     def guarded_serve(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
         def check(connection: Any, request: Any) -> Any:
             try:
-                own = is_own_page(request.headers.get("Host", ""), request.headers.get("Origin"), host)
+                own = is_own_page(
+                    request.headers.get("Host", ""), request.headers.get("Origin"), host
+                )
             except Exception:  # several headers of one name, or a damaged address
                 own = False
             if not own:

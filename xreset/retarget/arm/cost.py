@@ -45,12 +45,16 @@ def solve(frame: ArmProblem, q: Tensor, iterations: int, previous: Tensor | None
 
     def step(q: Tensor, here: Quadratic, damping: Tensor) -> Tensor:
         free = free_to_move(q, here.gradient, model.lower, model.upper)
-        ridge = damping[:, None] * here.curvature.diagonal(dim1=-2, dim2=-1).clamp_min(1e-3) * free + (1.0 - free)
+        ridge = damping[:, None] * here.curvature.diagonal(dim1=-2, dim2=-1).clamp_min(
+            1e-3
+        ) * free + (1.0 - free)
         H = here.curvature * free[:, :, None] * free[:, None, :] + torch.diag_embed(ridge)
         moved = q + torch.linalg.solve(H, -here.gradient * free)
         return torch.minimum(torch.maximum(moved, model.lower), model.upper)
 
-    def done(before: Tensor, after: Tensor, *_: Tensor) -> Tensor:  # all together: the batch keeps its size
+    def done(
+        before: Tensor, after: Tensor, *_: Tensor
+    ) -> Tensor:  # all together: the batch keeps its size
         return ((after - before).abs() < _CONVERGED).all().expand(len(before))
 
     return minimize(q, evaluate, step, done, iterations, damping_range=(1e-9, 1e9))
@@ -66,7 +70,9 @@ def system(frame: ArmProblem, q: Tensor, previous: Tensor | None = None) -> Quad
     angular = angular[..., model.arm]
     position_scale = config.position_weight**0.5
     orientation_scale = config.orientation_weight**0.5
-    turn = quat_to_axis_angle(quat_multiply(matrix_to_quat(rot[:, 0]), quat_conjugate(frame.root_quat)))
+    turn = quat_to_axis_angle(
+        quat_multiply(matrix_to_quat(rot[:, 0]), quat_conjugate(frame.root_quat))
+    )
     residuals = [
         position_scale * (origins[:, 0] - frame.root_pos),
         orientation_scale * turn,

@@ -93,7 +93,9 @@ class ArmModel:
         self._hand_collision = SelfCollision(robot, self.hand, only=robot.self_collision_links)
 
         support = table_points(robot, self.kinematics)
-        carrier = np.array([0 if link in in_hand else self.carriers.index(link) for link in support.links])
+        carrier = np.array(
+            [0 if link in in_hand else self.carriers.index(link) for link in support.links]
+        )
         order = np.argsort(carrier, kind="stable")
         starts = np.searchsorted(carrier[order], np.arange(len(self.carriers) + 1)).tolist()
         self._own = [slice(*ends) for ends in pairwise(starts)]
@@ -108,7 +110,9 @@ class ArmModel:
         points = self._points.repeat(*hand_joints.shape[:-1], 1, 1)
         hand = self._own[0]
         if self._hand_links:
-            points[..., hand, :] = self.hand.points(hand_joints, self._hand_links, self._points[hand])
+            points[..., hand, :] = self.hand.points(
+                hand_joints, self._hand_links, self._points[hand]
+            )
         return points
 
     def lowest(self, pos: Tensor, rot: Tensor, support: Tensor) -> tuple[Tensor, Tensor]:
@@ -128,7 +132,9 @@ class ArmModel:
         for carrier, own in enumerate(self._own):
             if own.start < own.stop:
                 levers = matvec(rot[:, carrier, None], support[:, own])
-                heights = height_above_table(levers + pos[:, carrier, None], self._radii[own], self.table)
+                heights = height_above_table(
+                    levers + pos[:, carrier, None], self._radii[own], self.table
+                )
                 height[:, carrier], lowest = heights.min(dim=1)
                 lever[:, carrier] = levers[torch.arange(len(pos)), lowest]
         return height, lever
@@ -136,7 +142,9 @@ class ArmModel:
     def hand_clearance(self, hand_joints: Tensor) -> Tensor:
         """[...] smallest signed distance between those of the hand's shapes that collide in physics [m]."""
         poses = self.hand.link_poses(hand_joints.flatten(0, -2)).numpy()
-        return torch.as_tensor(self._hand_collision.clearance(poses, _SEARCH)).view(hand_joints.shape[:-1])
+        return torch.as_tensor(self._hand_collision.clearance(poses, _SEARCH)).view(
+            hand_joints.shape[:-1]
+        )
 
     def full(self, arm: Tensor, hand_joints: Tensor | float) -> Tensor:
         """[..., J] all joints in joint order."""
@@ -166,15 +174,21 @@ class ArmProblem(ArmTargets):
         shape = joints.shape[:2]
         poses = model.kinematics.link_poses(model.full(joints, self.hand_joints).flatten(0, 1))
         carriers = poses[:, [model.kinematics.link_index(link) for link in model.carriers]]
-        height, _ = model.lowest(carriers[..., :3, 3], carriers[..., :3, :3], self.support.flatten(0, 1))
-        clearance = torch.as_tensor(model.arm_collision.clearance(poses.numpy(), _SEARCH)).view(shape)
+        height, _ = model.lowest(
+            carriers[..., :3, 3], carriers[..., :3, :3], self.support.flatten(0, 1)
+        )
+        clearance = torch.as_tensor(model.arm_collision.clearance(poses.numpy(), _SEARCH)).view(
+            shape
+        )
         root = carriers[:, 0]
         at_limit = (joints <= model.lower + _AT_LIMIT) | (joints >= model.upper - _AT_LIMIT)
         return Measures(
             annotated=self.annotated,
             hand_error=self.hand_error,
             wrist_position=(root[:, :3, 3].view(*shape, 3) - self.root_pos).norm(dim=-1),
-            wrist_orientation=quat_angle(matrix_to_quat(root[:, :3, :3]).view(*shape, 4), self.root_quat),
+            wrist_orientation=quat_angle(
+                matrix_to_quat(root[:, :3, :3]).view(*shape, 4), self.root_quat
+            ),
             at_limit=at_limit.any(-1),
             arm_jump=arm_jump(joints, self.annotated),
             table_clearance=height.amin(1).clamp_max(_SEARCH).view(shape),

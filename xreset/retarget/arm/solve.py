@@ -60,11 +60,15 @@ def track(
     failing = (problem.reasons(joints) > REASONS.index("hand error")).any(dim=1).nonzero()[:, 0]
     if len(failing):
         paths, sound = forwards
-        joints[failing] = _rescued(problem[failing], paths[failing], sound[failing], joints[failing], worth[failing])
+        joints[failing] = _rescued(
+            problem[failing], paths[failing], sound[failing], joints[failing], worth[failing]
+        )
     return joints, problem.measures(joints)
 
 
-def _rescued(problem: ArmProblem, paths: Tensor, sound: Tensor, joints: Tensor, worth: Tensor) -> Tensor:
+def _rescued(
+    problem: ArmProblem, paths: Tensor, sound: Tensor, joints: Tensor, worth: Tensor
+) -> Tensor:
     """[S, T, n] better paths than ``joints`` [S, T, n], where there are any, for sequences with frames that fail.
 
     Args:
@@ -105,7 +109,9 @@ def follow(problem: ArmProblem, start: Tensor) -> Tensor:
 def branches(problem: ArmProblem) -> tuple[Tensor, Tensor]:
     """Return the paths [S, K, T, n] from distinct solutions of the first frame, and which of their frames are good."""
     starts = _first_frames(problem)  # [S, K, n]
-    paths = follow(problem.repeated(starts.shape[1]), starts.flatten(0, 1)).unflatten(0, starts.shape[:2])
+    paths = follow(problem.repeated(starts.shape[1]), starts.flatten(0, 1)).unflatten(
+        0, starts.shape[:2]
+    )
     return paths, is_sound(problem, paths)
 
 
@@ -167,7 +173,9 @@ def _reseeded(problem: ArmProblem, missed: Tensor) -> tuple[Tensor, Tensor]:
     starts = _first_frames(alone)  # [C, K, n]
     count = starts.shape[1]
     is_new = torch.ones(starts.shape[:2], dtype=torch.bool)
-    is_new[:, 1:] = (starts[:, 1:] != starts[:, :-1]).any(-1)  # frames with fewer solutions repeat the last one
+    is_new[:, 1:] = (starts[:, 1:] != starts[:, :-1]).any(
+        -1
+    )  # frames with fewer solutions repeat the last one
     start = starts.flatten(0, 1)
     kept = (alone.repeated(count).reasons(start[:, None])[:, 0] == 0) & is_new.flatten()
     start = start[kept]
@@ -179,7 +187,9 @@ def _reseeded(problem: ArmProblem, missed: Tensor) -> tuple[Tensor, Tensor]:
     if not len(seed):
         return owner, paths
     steps = torch.arange(int(torch.maximum(seed, frames - 1 - seed).max()) + 1)
-    both_ways = torch.cat((seed[:, None] + steps, seed[:, None] - steps)).clamp(0, frames - 1)  # [2B, N] frames
+    both_ways = torch.cat((seed[:, None] + steps, seed[:, None] - steps)).clamp(
+        0, frames - 1
+    )  # [2B, N] frames
     followed = follow(problem[owner.repeat(2)[:, None], both_ways], start.repeat(2, 1))
     row = torch.arange(len(owner)).repeat(2)
     for step in reversed(steps.tolist()):  # the first visit of a frame is the one that stays
@@ -195,7 +205,9 @@ def _first_frames(problem: ArmProblem) -> Tensor:
     home = model.home
     sequences = len(problem.support)
     generator = torch.Generator().manual_seed(config.seed)  # every sequence gets the same starts
-    spread = torch.rand(config.restarts, len(home), generator=generator, dtype=home.dtype) * 2.0 - 1.0
+    spread = (
+        torch.rand(config.restarts, len(home), generator=generator, dtype=home.dtype) * 2.0 - 1.0
+    )
     spread[0] = 0.0
     lower = torch.maximum(model.lower, home - torch.pi)
     upper = torch.minimum(model.upper, home + torch.pi)
@@ -215,7 +227,9 @@ def _first_frames(problem: ArmProblem) -> Tensor:
     for solutions, ranking in zip(solved, order, strict=True):
         kept = [solutions[0]]  # the one that home leads to
         for candidate in solutions[ranking]:
-            if len(kept) < number and all((candidate - other).abs().max() > _DISTINCT for other in kept):
+            if len(kept) < number and all(
+                (candidate - other).abs().max() > _DISTINCT for other in kept
+            ):
                 kept.append(candidate)
         kept += [kept[-1]] * number
         chosen.append(torch.stack(kept[:number]))
@@ -253,7 +267,9 @@ def splice(
     value = worth[:, :, 0] - cost[:, :, 0]
     came_from: list[Tensor] = []
     for t in range(1, frames):
-        change = (paths[:, None, :, t] - paths[:, :, None, t - 1]).abs().amax(-1)  # [S, K before, K now]
+        change = (
+            (paths[:, None, :, t] - paths[:, :, None, t - 1]).abs().amax(-1)
+        )  # [S, K before, K now]
         jumps = (change > jump) & annotated[:, t - 1, None, None]
         total = value[:, :, None] - switch + worth[:, None, :, t] * (~jumps).to(paths.dtype)
         most, before = total.max(dim=1)

@@ -64,7 +64,9 @@ class Objects(NamedTuple):
 
     def nearer(self, points: Tensor, frame: Tensor, limit: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """See :meth:`DistanceFields.nearer`; points [N, 3] of frames [N] and gradients [A, 3] in the world."""
-        near, distance, slope = self.fields.nearer(self.local(points, frame), self.which[frame], limit)
+        near, distance, slope = self.fields.nearer(
+            self.local(points, frame), self.which[frame], limit
+        )
         return near, distance, matvec(self.rot[frame[near]], slope)
 
 
@@ -88,7 +90,9 @@ def too_near(
         object_clearance: distance that balls keep from the object [m].
         self_depth: allowed depth of balls in other links [m].
     """
-    bounds = bodies.pos[:, model.group_body] + matvec(bodies.rot[:, model.group_body], model.balls.bound_centers)
+    bounds = bodies.pos[:, model.group_body] + matvec(
+        bodies.rot[:, model.group_body], model.balls.bound_centers
+    )
     found = (
         *_below_table(model, bodies, bounds, considered),
         *_in_object(model, bodies, bounds, objects, considered, object_clearance),
@@ -105,7 +109,9 @@ def _moved(rot: Tensor, pos: Tensor, points: Tensor) -> Tensor:
     return x * points[:, :1] + y * points[:, 1:2] + z * points[:, 2:] + pos[:, None]
 
 
-def _below_table(model: HandModel, bodies: PointJacobian, bounds: Tensor, considered: Tensor) -> Iterator[Distances]:
+def _below_table(
+    model: HandModel, bodies: PointJacobian, bounds: Tensor, considered: Tensor
+) -> Iterator[Distances]:
     balls = model.balls
     candidates = (bounds[..., 2] < balls.bound_radii) & considered[:, None]
     for link, own in enumerate(balls.slices):
@@ -117,7 +123,9 @@ def _below_table(model: HandModel, bodies: PointJacobian, bounds: Tensor, consid
         centers = centers[row, ball]
         up = centers.new_tensor([0.0, 0.0, 1.0]).expand_as(centers)
         slope = model.point_slope(bodies, frames[row], body, centers, up)
-        yield Distances(frame=frames[row], value=height[row, ball], slope=slope, number=own.start + ball)
+        yield Distances(
+            frame=frames[row], value=height[row, ball], slope=slope, number=own.start + ball
+        )
 
 
 def _in_object(
@@ -136,7 +144,9 @@ def _in_object(
         frames = candidates[:, link].nonzero()[:, 0]
         body = model.group_body[link]
         radii = balls.radii[own]
-        centers = _moved(bodies.rot[frames, body], bodies.pos[frames, body], balls.centers[own]).flatten(0, 1)
+        centers = _moved(
+            bodies.rot[frames, body], bodies.pos[frames, body], balls.centers[own]
+        ).flatten(0, 1)
         frame = frames.repeat_interleave(len(radii))
         limit = (radii + object_clearance).repeat(len(frames))
         near, distance, direction = objects.nearer(centers, frame, limit)
@@ -144,7 +154,9 @@ def _in_object(
         ball = near % len(radii)
         slope = model.point_slope(bodies, frame, body, centers[near], direction)
         value = distance - radii[ball] - object_clearance
-        yield Distances(frame=frame, value=value, slope=slope, number=len(balls.radii) + own.start + ball)
+        yield Distances(
+            frame=frame, value=value, slope=slope, number=len(balls.radii) + own.start + ball
+        )
 
 
 def _in_each_other(
@@ -179,7 +191,9 @@ def _in_each_other(
         radii = balls.guard_radii[own]
         centers = _moved(turn[mine], shift[mine], balls.centers[guards]).flatten(0, 1)
         limit = (radii - self_depth).repeat(len(mine))
-        deep, distance, away = fields.nearer(centers, b[pair[mine]].repeat_interleave(len(radii)), limit)
+        deep, distance, away = fields.nearer(
+            centers, b[pair[mine]].repeat_interleave(len(radii)), limit
+        )
         mine = mine[deep.div(len(radii), rounding_mode="floor")]
         guard = deep % len(radii)
         solid = model.group_body[b[pair[mine]]]
@@ -193,7 +207,9 @@ def _in_each_other(
         yield Distances(frame=row, value=value, slope=slope, number=number)
 
 
-def pad_distances(model: HandModel, bodies: PointJacobian, objects: Objects, frame: Tensor) -> tuple[Tensor, Tensor]:
+def pad_distances(
+    model: HandModel, bodies: PointJacobian, objects: Objects, frame: Tensor
+) -> tuple[Tensor, Tensor]:
     """Compute how far a jaw's pads are from the object.
 
     Args:
@@ -210,6 +226,8 @@ def pad_distances(model: HandModel, bodies: PointJacobian, objects: Objects, fra
     frame = frame.repeat_interleave(count)
     centers = model.ball_centers(bodies, frame, ball)
     distance, direction = objects.signed_distance(centers, frame)
-    slope = model.point_slope(bodies, frame, model.group_body[model.balls.link[ball]], centers, direction)
+    slope = model.point_slope(
+        bodies, frame, model.group_body[model.balls.link[ball]], centers, direction
+    )
     value = distance - model.balls.radii[ball]
     return value.view(-1, count), slope.view(-1, count, slope.shape[-1])

@@ -45,7 +45,9 @@ class HandSystem(Quadratic):
     """[S, T-1, n] diagonals of the blocks next to the diagonal."""
 
 
-def system(model: HandModel, targets: HandTargets, config: HandConfig, state: HandState) -> HandSystem:
+def system(
+    model: HandModel, targets: HandTargets, config: HandConfig, state: HandState
+) -> HandSystem:
     """Compute the cost of every sequence and its Gauss-Newton approximation."""
     sequences, frames, joints = state.joints.shape
     rows = torch.arange(sequences, device=state.joints.device)
@@ -53,7 +55,9 @@ def system(model: HandModel, targets: HandTargets, config: HandConfig, state: Ha
     chunks = [_frames(model, targets[part], config, state[part]) for part in rows.split(size)]
     single = Quadratic.cat(chunks).map(lambda x: x.unflatten(0, (sequences, frames)))
 
-    turn = quat_to_axis_angle(quat_multiply(state.root_quat[:, 1:], quat_conjugate(state.root_quat[:, :-1])))
+    turn = quat_to_axis_angle(
+        quat_multiply(state.root_quat[:, 1:], quat_conjugate(state.root_quat[:, :-1]))
+    )
     changes = torch.cat((state.joints.diff(dim=1), state.root_pos.diff(dim=1), turn), dim=-1)
     weight = changes.new_full((joints + 6,), config.smoothness_weight)
     weight[joints : joints + 3] /= config.length_scale**2
@@ -73,7 +77,9 @@ def system(model: HandModel, targets: HandTargets, config: HandConfig, state: Ha
     )
 
 
-def _frames(model: HandModel, targets: HandTargets, config: HandConfig, state: HandState) -> Quadratic:
+def _frames(
+    model: HandModel, targets: HandTargets, config: HandConfig, state: HandState
+) -> Quadratic:
     """Compute the cost [B] of single frames and its approximation."""
     scale = config.length_scale
     frames = targets.annotated.shape[1]
@@ -114,7 +120,9 @@ def _frames(model: HandModel, targets: HandTargets, config: HandConfig, state: H
     return found
 
 
-def _keypoint_terms(model: HandModel, targets: HandTargets, config: HandConfig, bodies: PointJacobian) -> Quadratic:
+def _keypoint_terms(
+    model: HandModel, targets: HandTargets, config: HandConfig, bodies: PointJacobian
+) -> Quadratic:
     """Compute the terms of the keypoints and of the bones between them."""
     scale = config.length_scale
     x, J = (values / scale for values in model.keypoints_of(bodies))
@@ -126,8 +134,12 @@ def _keypoint_terms(model: HandModel, targets: HandTargets, config: HandConfig, 
     bones = x[:, b] - x[:, a]
     human_bones = human[:, b] - human[:, a]
     local = on.expand(-1, len(a)) * (config.local_weight / len(a))
-    on_bones = terms.difference(bones, human_bones, local) + terms.direction(bones, human_bones, local)
-    alignment = on * config.global_weight * torch.where(model.is_tip, config.tip_factor, 1.0).to(x.dtype)
+    on_bones = terms.difference(bones, human_bones, local) + terms.direction(
+        bones, human_bones, local
+    )
+    alignment = (
+        on * config.global_weight * torch.where(model.is_tip, config.tip_factor, 1.0).to(x.dtype)
+    )
     in_contact = on * config.contact_weight * targets.in_contact.flatten(0, 1)
     contact = terms.contact(
         x,

@@ -55,11 +55,17 @@ def jaw_state(model: HandModel, keypoints: Tensor) -> HandState:
 
     follows = ("wrist", *(tip.keypoint for tip in robot.fingertips))
     if absent := [name for name in follows if name not in model.names]:
-        raise RobotError(f"robot {robot.name!r}: the analytic map of a jaw needs a link for {', '.join(absent)}.")
-    wrist, human_thumb, human_finger = (keypoints[..., model.names.index(name), :] for name in follows)
+        raise RobotError(
+            f"robot {robot.name!r}: the analytic map of a jaw needs a link for {', '.join(absent)}."
+        )
+    wrist, human_thumb, human_finger = (
+        keypoints[..., model.names.index(name), :] for name in follows
+    )
     across = human_finger - human_thumb
     middle = (human_thumb + human_finger) / 2
-    chosen = order[torch.searchsorted(opening, across.norm(dim=-1).contiguous()).clamp_max(_OPENINGS - 1)]
+    chosen = order[
+        torch.searchsorted(opening, across.norm(dim=-1).contiguous()).clamp_max(_OPENINGS - 1)
+    ]
     rot = _axes(across, middle - wrist) @ own.mT
     return HandState(
         joints=tried[chosen],

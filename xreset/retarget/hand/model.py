@@ -110,7 +110,9 @@ class HandModel:
         self.is_jaw = len(self.home) == 1 and len(robot.fingertips) == 2
         """Whether the hand is a jaw: one joint moves two fingers."""
         upright = self.home.new_tensor([1.0, 0.0, 0.0, 0.0])
-        self.at_home = self.keypoints(self.kinematics.clamp(self.home), self.home.new_zeros(3), upright)
+        self.at_home = self.keypoints(
+            self.kinematics.clamp(self.home), self.home.new_zeros(3), upright
+        )
         """[P, 3] keypoints at home, in the root's frame."""
         self.table = TableSpec()
 
@@ -120,7 +122,9 @@ class HandModel:
         pads = self._pads()
         self.pad_balls = torch.cat(pads)
         """[N] the balls of a jaw's two pads, as indices of the balls; empty for any other hand."""
-        self.pad_shares = torch.cat([self.home.new_full((len(pad),), 1.0 / max(len(pad), 1)) for pad in pads])
+        self.pad_shares = torch.cat(
+            [self.home.new_full((len(pad),), 1.0 / max(len(pad), 1)) for pad in pads]
+        )
         """[N] share of each of these balls in its pad: the shares of a pad add up to 1."""
         self._bodies = tuple(dict.fromkeys((*self.links, *self.balls.links)))
         self._keypoint_bodies = self._body_indices(self.links)
@@ -152,7 +156,9 @@ class HandModel:
         centers = matvec(poses[:, :3, :3], balls.centers) + poses[:, :3, 3]
         pads = []
         for tip, ahead in zip(fingertips, (second - first, first - second), strict=True):
-            own = torch.tensor([link in tip.contact_links for link in balls.links], device=self.device)[balls.link]
+            own = torch.tensor(
+                [link in tip.contact_links for link in balls.links], device=self.device
+            )[balls.link]
             if not bool(own.any()):
                 return none
             front = centers @ (ahead / ahead.norm().clamp_min(1e-9)) + balls.radii
@@ -170,8 +176,12 @@ class HandModel:
         world's axes).
         """
         links = self.kinematics.jacobian(joints, self._bodies, base=_pose(root_pos, root_quat))
-        identity = torch.eye(3, dtype=links.pos.dtype, device=links.pos.device).expand(*links.pos.shape[:-1], 3, 3)
-        turn = torch.linalg.cross(identity, (links.pos - root_pos[:, None])[..., None, :])  # row i: e_i x r
+        identity = torch.eye(3, dtype=links.pos.dtype, device=links.pos.device).expand(
+            *links.pos.shape[:-1], 3, 3
+        )
+        turn = torch.linalg.cross(
+            identity, (links.pos - root_pos[:, None])[..., None, :]
+        )  # row i: e_i x r
         return links._replace(
             linear=torch.cat((links.linear, identity, turn.mT), dim=-1),
             angular=torch.cat((links.angular, torch.zeros_like(identity), identity), dim=-1),
@@ -204,7 +214,10 @@ class HandModel:
             direction: [A, 3] unit vectors n.
         """
         lever = torch.linalg.cross(point - bodies.pos[frame, body], direction)
-        along = direction[:, None] @ bodies.linear[frame, body] + lever[:, None] @ bodies.angular[frame, body]
+        along = (
+            direction[:, None] @ bodies.linear[frame, body]
+            + lever[:, None] @ bodies.angular[frame, body]
+        )
         return along[:, 0]
 
 

@@ -50,20 +50,26 @@ def retarget_hand(
     targets = targets.to(model.device)
     if model.is_jaw and config.jaw == "analytic":
         rows = torch.arange(len(targets.annotated), device=model.device)[:, None]
-        return jaw_state(model, targets.keypoints[rows, _nearest_annotated(targets.annotated)]).to(home)
+        return jaw_state(model, targets.keypoints[rows, _nearest_annotated(targets.annotated)]).to(
+            home
+        )
     root_pos, root_quat = _align_root(model, targets)
     joints = model.kinematics.clamp(model.home).expand(*targets.annotated.shape, -1)
     state = HandState(joints, root_pos, root_quat)
     if config.clearance_weight:
         for share in config.clearance_growth:
             stage = replace(
-                config, clearance_weight=share * config.clearance_weight, iterations=config.growth_iterations
+                config,
+                clearance_weight=share * config.clearance_weight,
+                iterations=config.growth_iterations,
             )
             state = _minimize(model, targets, stage, state)
     return _minimize(model, targets, config, state).to(home)
 
 
-def _minimize(model: HandModel, targets: HandTargets, config: HandConfig, start: HandState) -> HandState:
+def _minimize(
+    model: HandModel, targets: HandTargets, config: HandConfig, start: HandState
+) -> HandState:
     """Return the best state that is found from a first guess."""
 
     def evaluate(state: HandState, rows: Tensor) -> HandSystem:
@@ -72,7 +78,9 @@ def _minimize(model: HandModel, targets: HandTargets, config: HandConfig, start:
     def step(state: HandState, here: HandSystem, damping: Tensor) -> HandState:
         return _moved(model, state, _limited_step(model, state, here, damping))
 
-    def done(_before: HandState, _after: HandState, cost: Tensor, tried: Tensor, damping: Tensor) -> Tensor:
+    def done(
+        _before: HandState, _after: HandState, cost: Tensor, tried: Tensor, damping: Tensor
+    ) -> Tensor:
         gain = (cost - tried) / cost.clamp_min(1e-12)
         return ((tried < cost) & (gain < config.tolerance)) | (damping > 1e6)
 
@@ -126,6 +134,8 @@ def _limited_step(model: HandModel, state: HandState, here: HandSystem, damping:
     free[..., :count] = free_to_move(state.joints, here.gradient[..., :count], lower, upper)
     size = here.curvature.diagonal(dim1=-2, dim2=-1).clamp_min(1e-6)
     root = size[..., count:].unflatten(-1, (2, 3)).mean(-1).repeat_interleave(3, dim=-1)
-    ridge = damping[:, None, None] * torch.cat((size[..., :count], root), dim=-1) * free + (1.0 - free)
+    ridge = damping[:, None, None] * torch.cat((size[..., :count], root), dim=-1) * free + (
+        1.0 - free
+    )
     H = here.curvature * free[..., :, None] * free[..., None, :] + torch.diag_embed(ridge)
     return solve_chain(H, here.coupling * free[:, 1:] * free[:, :-1], -here.gradient * free)

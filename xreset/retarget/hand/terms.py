@@ -54,7 +54,9 @@ def direction(x: Tensor, target: Tensor, weight: Tensor) -> Quadratic:
     )
 
 
-def contact(x: Tensor, contact_point: Tensor, weight: Tensor, margin: float, knee: float) -> Quadratic:
+def contact(
+    x: Tensor, contact_point: Tensor, weight: Tensor, margin: float, knee: float
+) -> Quadratic:
     """The paper's contact term, E = w [|c - x| - margin]_+, with its corner rounded, as iteratively reweighted least
     squares.
 

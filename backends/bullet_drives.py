@@ -89,9 +89,8 @@ class BulletDrives:
         joints = self._joints
         dt = self._dt
         wanted = self._kp * (self.target - q[self.driven]) - self._kd * v[self.driven]
-        given = np.minimum(
-            np.maximum(wanted, -self._effort), self._effort
-        )  # np.clip takes three times as long
+        # np.clip takes three times as long
+        given = np.minimum(np.maximum(wanted, -self._effort), self._effort)
         tau = given @ joints.shares
         if len(joints.mimic):
             lag = (

@@ -116,9 +116,8 @@ def _link(name: str, inertia: Inertia, shapes: Sequence[Shape], folder: Path) ->
     ]
     for i, shape in enumerate(shapes):
         geometry = _geometry(shape, folder / f"{name}_{i}.obj")
-        pose = (
-            np.eye(4) if shape.geometry.kind == "hull" else shape.T_body_shape
-        )  # vertices of a hull are moved
+        # vertices of a hull are moved
+        pose = np.eye(4) if shape.geometry.kind == "hull" else shape.T_body_shape
         text.append(f"<collision>{_origin(pose)}<geometry>{geometry}</geometry></collision>")
     return "".join([*text, "</link>"])
 

@@ -63,11 +63,8 @@ _GEOM_TYPES = {
     "hull": mujoco.mjtGeom.mjGEOM_MESH,
 }
 _PARKED_SIZE = 1e-6
-_PARKED_POS = (
-    0.0,
-    0.0,
-    1e3,
-)  # in the object's frame: out of everything's reach wherever the object is
+# in the object's frame: out of everything's reach wherever the object is
+_PARKED_POS = (0.0, 0.0, 1e3)
 
 
 _PATTERS = (
@@ -363,9 +360,8 @@ def _add_object(
     slots: Counter[str] = Counter()
     for i in sorted({*slots_for, index}):
         hulls[i] = _add_hulls(spec, scene.objects[i], i)
-        slots |= Counter(
-            piece.geometry.kind for piece in scene.objects[i].pieces
-        )  # the larger of the two counts
+        # the larger of the two counts
+        slots |= Counter(piece.geometry.kind for piece in scene.objects[i].pieces)
     spare = next(filter(None, chain.from_iterable(hulls.values())), "")
 
     # MuJoCo ignores gravcomp unless it is set while compiling.

@@ -74,9 +74,8 @@ class MujocoWorld(World):
         self._links = (pos, quat, linvel, angvel)
         self._geom_forces = tip_forces.reshape(-1, 3)
         mine = at.sensed_tip == np.arange(links - 1)[:, None]
-        self._sum_by_tip = -mine.astype(
-            np.float64
-        )  # minus, because the forces of the object are sensed
+        # minus, because the forces of the object are sensed
+        self._sum_by_tip = -mine.astype(np.float64)
         self._full = [data.warning[int(kind)] for kind in _FULL]
         self._com = object_inertia(scene.objects[object_index]).com
         self._q_ones = np.ones(model.nq)
@@ -107,9 +106,8 @@ class MujocoWorld(World):
             "object_pos": self._object_pos,
             "object_quat": self._object_quat,
             "object_linvel": self._object_linvel,
-            "object_angvel": _rotate(
-                self._object_quat, self._object_spin
-            ),  # a free joint's is in the body's frame
+            # a free joint's is in the body's frame
+            "object_angvel": _rotate(self._object_quat, self._object_spin),
         }
 
     def set_joint_targets(self, targets: np.ndarray) -> None:
@@ -170,9 +168,8 @@ class MujocoWorld(World):
         model.body_inertia[body] = inertia.moments
         model.body_ipos[body] = nominal.body_ipos[body] + (inertia.com - self._com)
         growth = inertia.mass / nominal.body_mass[body]
-        turning = inertia.moments[0] / (
-            growth * nominal.body_inertia[body, 0]
-        )  # exactly 1 if only the mass changed
+        # exactly 1 if only the mass changed
+        turning = inertia.moments[0] / (growth * nominal.body_inertia[body, 0])
         model.body_invweight0[body] = nominal.body_invweight0[body] / (growth, growth * turning)
         self._ahead = False
 

@@ -90,9 +90,8 @@ def write_state(
     quat = object_quat[world]
     length = wp.sqrt(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3])
     unit = wp.quat(quat[0] / length, quat[1] / length, quat[2] / length, quat[3] / length)
-    turn = _rotate(
-        _conjugate(unit), object_angvel[world]
-    )  # a free joint's angular velocity is in the body's frame
+    # a free joint's angular velocity is in the body's frame
+    turn = _rotate(_conjugate(unit), object_angvel[world])
     for k in range(3):
         qpos[world, object_qpos + k] = object_pos[world][k]
         qvel[world, object_dof + k] = object_linvel[world][k]

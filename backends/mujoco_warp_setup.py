@@ -92,9 +92,8 @@ def contact_room(pieces: int) -> tuple[int, int, int]:
     training; with 96, 64 and 340 it was 16 of 92 million. Room costs a little time: a step of the soup can took 1.3 %
     less with 128 rows than with 220 (H200, 4,096 worlds).
     """
-    more = min(
-        2 * (pieces - 1), 32
-    )  # contacts; only pieces that face a finger or the table have any
+    # contacts; only pieces that face a finger or the table have any
+    more = min(2 * (pieces - 1), 32)
     return 64 + more, 32 + more, 220 + 4 * more
 
 

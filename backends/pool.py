@@ -200,9 +200,8 @@ class PoolBackend(Backend):
         else:
             self._team = WorkerTeam(jobs, layout)
             self._arrays = self._team.arrays
-        self._close = weakref.finalize(
-            self, self._team.close
-        )  # also runs when the interpreter exits
+        # also runs when the interpreter exits
+        self._close = weakref.finalize(self, self._team.close)
         views = {name: torch.from_numpy(array) for name, array in self._arrays.items()}
         self._state = State(**{name: views[name] for name in STATE_FIELDS})
         self._links = Links(**{field.name: views[f"link_{field.name}"] for field in fields(Links)})

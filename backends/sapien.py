@@ -224,9 +224,8 @@ class SapienWorld(World):
             links.append(link)
         base = self._sapien.Pose(robot.base_pos, robot.base_quat)
         for link, body in zip(links, self._mechanism.bodies, strict=True):
-            self._add(
-                link, body.name, base
-            )  # the pose of the root decides; joints place the others
+            # the pose of the root decides; joints place the others
+            self._add(link, body.name, base)
         return links
 
     def _set_joint(self, made: Any, joint: Joint, T_parent_body: np.ndarray) -> None:

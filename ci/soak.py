@@ -49,9 +49,8 @@ def main() -> int:
         + "|---" * 7
         + "|"
     )
-    each = str(
-        options.minutes / len(names)
-    )  # each in a process of its own, whose memory is only that engine's
+    # each in a process of its own, whose memory is only that engine's
+    each = str(options.minutes / len(names))
     return max(
         subprocess.run([sys.executable, __file__, "--one", name, "--minutes", each]).returncode
         for name in names

@@ -11,12 +11,10 @@ def main(meshes: str, name: str, out: str) -> None:
     demos = xreset.synthesize([name], 2, meshes=meshes)  # or xreset.read_demos("demos.npz")
     policy = xreset.load_policy("many-objects")  # or a run folder, or an .onnx file
 
-    motion = xreset.retarget_demos(
-        demos, policy.robot, [thing]
-    )  # robot states that follow the human hand
-    bank = xreset.make_bank(
-        motion, policy.robot, [thing], engine="pybullet"
-    )  # those that the engine finds stable
+    # robot states that follow the human hand
+    motion = xreset.retarget_demos(demos, policy.robot, [thing])
+    # those that the engine finds stable
+    bank = xreset.make_bank(motion, policy.robot, [thing], engine="pybullet")
     with policy.make_env(
         [thing], bank, engine="pybullet"
     ) as env:  # the task that the policy was trained for

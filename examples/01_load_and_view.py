@@ -15,9 +15,8 @@ def main(out: Path) -> None:
     robot = xreset.load_robot("ur7e-sharpa")
     write_png(out / "robot.png", robot_picture(robot))
 
-    can = xreset.load_object(
-        "soup"
-    )  # a built-in stand-in; a folder of meshes is the second argument
+    # a built-in stand-in; a folder of meshes is the second argument
+    can = xreset.load_object("soup")
     demos = xreset.synthesize([can.name], 2, seed=0)  # or xreset.read_demos("demos.npz")
     xreset.write_demos(out / "demos.npz", demos)
     view = load_view(out / "demos.npz", demos=None, robot=None, objects=None)

@@ -16,9 +16,8 @@ def record(file: Path) -> None:
     np.savez(
         file,
         keypoints=1e3
-        * hand.hand_keypoints[
-            seen
-        ],  # [F, 21, 3] wrist, then each finger from base to tip, thumb first
+        # [F, 21, 3] wrist, then each finger from base to tip, thumb first
+        * hand.hand_keypoints[seen],
         object_pos=1e3 * hand.object_pos[seen],  # [F, 3]
         object_quat_xyzw=np.roll(hand.object_quat_wxyz[seen], -1, axis=1),  # [F, 4]
     )
@@ -27,6 +26,7 @@ def record(file: Path) -> None:
 def main(out: Path) -> None:
     """Write ``recorded.npz`` and ``bank.npz``."""
     record(out / "recorded.npz")
+    # what the numbers mean is said, never guessed
     convention = Convention(
         order="mediapipe",
         units="mm",
@@ -34,7 +34,7 @@ def main(out: Path) -> None:
         fps=30.0,
         object_name="005_tomato_soup_can",
         side="right",
-    )  # what the numbers mean is said, never guessed
+    )
     demos = read_keypoints(out / "recorded.npz", convention)
 
     robot, can = xreset.load_robot("openarm"), xreset.load_object("soup")

@@ -21,9 +21,8 @@ def upright(x: RewardInput) -> Tensor:
         x.object_quat, x.object_pos.new_tensor([0.0, 0.0, 1.0]).expand_as(x.object_pos)
     )
     lifted = x.object_pos[:, 2] - x.start_pos[:, 2] > 0.05
-    return (
-        axis[:, 2] * lifted
-    )  # no `if` on what a tensor holds: a GPU replays this as part of a graph
+    # no `if` on what a tensor holds: a GPU replays this as part of a graph
+    return axis[:, 2] * lifted
 
 
 def main(bank: Path) -> None:

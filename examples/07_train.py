@@ -16,9 +16,8 @@ def main(bank: str, out: str) -> None:
     )
     episodes = replace(config.task.termination, episode_seconds=2.0)
     config = replace(config, task=replace(config.task, termination=episodes))
-    xreset.train(
-        bank, out=out, config=config, engine="mujoco", num_envs=8
-    )  # or recipe="minutes", on a GPU
+    # or recipe="minutes", on a GPU
+    xreset.train(bank, out=out, config=config, engine="mujoco", num_envs=8)
     policy = xreset.load_policy(out)
     print(
         f"trained {policy.name} for {config.iterations} iterations, on {', '.join(policy.objects)}"

@@ -16,18 +16,16 @@ def main(bank: Path, iterations: int = 3, num_envs: int = 8) -> None:
     """Train actor and critic on the flat observations for a few iterations; ``bank``: a file of example 02."""
     robot, states = xreset.load_robot("openarm"), xreset.read_bank(bank)
     objects, joints = [xreset.load_object(name) for name in states.object_names], len(robot.joints)
-    envs = xreset.VectorEnv(
-        xreset.make_env(robot, objects, states, num_envs=num_envs)
-    )  # says so where gymnasium is missing
+    # says so where gymnasium is missing
+    envs = xreset.VectorEnv(xreset.make_env(robot, objects, states, num_envs=num_envs))
 
     def flat(seen) -> torch.Tensor:
         return torch.cat([torch.as_tensor(seen[group]) for group in ("policy", "proprio")], dim=1)
 
     seen, ended = flat(envs.reset(seed=0)[0]), torch.zeros(num_envs, dtype=torch.bool)
-    actor, critic = (
-        nn.Sequential(nn.Linear(seen.shape[1], 64), nn.Tanh(), nn.Linear(64, n))
-        for n in (joints, 1)
-    )
+    width = seen.shape[1]
+    actor = nn.Sequential(nn.Linear(width, 64), nn.Tanh(), nn.Linear(64, joints))
+    critic = nn.Sequential(nn.Linear(width, 64), nn.Tanh(), nn.Linear(64, 1))
     log_std = nn.Parameter(torch.full((joints,), -1.0))
     optimizer = torch.optim.Adam([*actor.parameters(), *critic.parameters(), log_std], 3e-4)
     for iteration in range(iterations):
@@ -37,37 +35,23 @@ def main(bank: Path, iterations: int = 3, num_envs: int = 8) -> None:
                 policy = Normal(actor(seen), log_std.exp())
                 action, value = policy.sample(), critic(seen)[:, 0]
                 observations, *outcome, _ = envs.step(action.clamp(-1, 1).numpy())
-                after, (reward, terminated, truncated) = (
-                    flat(observations),
-                    map(torch.as_tensor, outcome),
-                )
-                future = (
-                    critic(after)[:, 0] * ~terminated
-                )  # an episode whose time is over goes on in its value
+                after = flat(observations)
+                reward, terminated, truncated = map(torch.as_tensor, outcome)
+                # an episode whose time is over goes on in its value
+                future = critic(after)[:, 0] * ~terminated
             begins, ended = ended, terminated | truncated
-            rows.append(
-                (
-                    seen,
-                    action,
-                    policy.log_prob(action).sum(1),
-                    value,
-                    reward + DISCOUNT * future,
-                    reward,
-                    begins,
-                    ended,
-                )
-            )
+            logp = policy.log_prob(action).sum(1)
+            target = reward + DISCOUNT * future
+            rows.append((seen, action, logp, value, target, reward, begins, ended))
             seen = after
-        obs, act, logp, value, target, reward, begins, end = (
-            torch.stack(part) for part in zip(*rows, strict=True)
-        )
+        rollout = [torch.stack(part) for part in zip(*rows, strict=True)]
+        obs, act, logp, value, target, reward, begins, end = rollout
         advantage, carry = target - value, torch.zeros(num_envs)
         for t in reversed(range(STEPS)):
             carry = advantage[t] = advantage[t] + DISCOUNT * LAMBDA * ~end[t] * carry
         real = ~begins  # a step that only begins an episode (Gymnasium's NEXT_STEP) teaches nothing
-        obs, act, logp, gain, aim = (
-            x[real] for x in (obs, act, logp, advantage, advantage + value)
-        )
+        aim = advantage + value
+        obs, act, logp, gain, aim = (x[real] for x in (obs, act, logp, advantage, aim))
         gain = (gain - gain.mean()) / (gain.std() + 1e-8)
         for _ in range(EPOCHS):
             ratio = (Normal(actor(obs), log_std.exp()).log_prob(act).sum(1) - logp).exp()
@@ -78,9 +62,8 @@ def main(bank: Path, iterations: int = 3, num_envs: int = 8) -> None:
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
-        print(
-            f"iteration {iteration + 1}: reward per step {reward[real].mean():.4f}, {int(end.sum())} episodes ended"
-        )
+        mean = reward[real].mean()
+        print(f"iteration {iteration + 1}: reward per step {mean:.4f}, {int(end.sum())} ended")
     envs.close()
 
 

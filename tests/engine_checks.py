@@ -147,9 +147,8 @@ class EngineChecks:
             state.object_pos[:] = torch.tensor([0.9, 0.5, 0.05])
             state.joint_pos[:, jaw] = 0.05
             state.joint_target[:, jaw] = 0.005
-            state.joint_target[:, JOINT["finger_b_bend"]] = torch.tensor(
-                [0.6, -0.6]
-            )  # to the other jaw, and away
+            # to the other jaw, and away
+            state.joint_target[:, JOINT["finger_b_bend"]] = torch.tensor([0.6, -0.6])
             backend.set_state(state)
             backend.step(240)
             free, other = backend.state().joint_pos[:, jaw].sort().values.tolist()

@@ -96,9 +96,8 @@ def readers() -> Iterator[dict[str, Reader]]:
     from xreset.spec import SceneSpec
     from xreset.task.config import ObservationConfig, TaskConfig
 
-    logging.disable(
-        logging.WARNING
-    )  # what is left aside of a file is said; here it would be said ten thousand times
+    # what is left aside of a file is said; here it would be said ten thousand times
+    logging.disable(logging.WARNING)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         robot = toy_hand_arm(folder)

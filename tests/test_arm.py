@@ -81,9 +81,8 @@ class PlaceTest(unittest.TestCase):
             np.linalg.norm(avoid - best.robot.base_pos, axis=1).min(), CONFIG.clear
         )
         self.assertEqual(seen, sorted(seen))  # the best yet never gets worse
-        self.assertEqual(
-            best.home_rule, "the joints as they were"
-        )  # home held the hand three metres up
+        # home held the hand three metres up
+        self.assertEqual(best.home_rule, "the joints as they were")
         self.assertEqual(best.robot.joints, self.lost.joints)
 
     def test_a_placement_with_a_home_is_preferred(self):

@@ -244,9 +244,8 @@ class OutcomeTest(unittest.TestCase):
         self.assertAlmostEqual(found.share(found.rows[1]), 0.5)
         self.assertAlmostEqual(found.share(found.rows[3]), -1.0)
         self.assertEqual(found.costs(), found.rows[2])
-        found = self.found(
-            A, row("other", "sapien", 0.33, 0.33, *[0.66] * 6)
-        )  # one demonstration among many
+        # one demonstration among many
+        found = self.found(A, row("other", "sapien", 0.33, 0.33, *[0.66] * 6))
         self.assertIsNone(found.as_dict()["rows"][-1]["share_of_gap"])
         self.assertIsNone(found.costs())
 

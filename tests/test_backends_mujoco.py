@@ -92,10 +92,8 @@ class Model(unittest.TestCase):
         base, column, wrist, jaw_a, pad_b = (
             f"robot/{body}/0" for body in ("base", "column", "wrist", "jaw_a", "finger_b")
         )  # the pad is fixed to finger_b
-        expected = {
-            frozenset((jaw_a, pad_b)),
-            frozenset((column, pad_b)),
-        }  # jaw_a and column are excluded
+        # jaw_a and column are excluded
+        expected = {frozenset((jaw_a, pad_b)), frozenset((column, pad_b))}
         for link in (column, wrist, jaw_a, pad_b):
             expected |= {frozenset(("table", link))}  # the base is excluded
         for other in ("table", base, column, wrist, jaw_a, pad_b):
@@ -131,9 +129,8 @@ class Model(unittest.TestCase):
 
     def test_slots_hold_any_of_the_objects(self):
         models = [compile_scene(self.scene, i, slots_for=range(3)) for i in range(3)]
-        self.assertEqual(
-            [int(m.parked.sum()) for m in models], [3, 3, 2]
-        )  # of one box, one cylinder and two hulls
+        # of one box, one cylinder and two hulls
+        self.assertEqual([int(m.parked.sum()) for m in models], [3, 3, 2])
         same = (
             "geom_type",
             "mesh_vert",
@@ -284,9 +281,8 @@ class Limits(unittest.TestCase):
         backend.step(8)
         self.assertTrue(bool(backend.health().overflow.all()))  # the pool is everyone's
         state = snapshot(backend.state())
-        state = replace(
-            state, object_pos=state.object_pos + torch.tensor([0.0, 0.0, 1.0])
-        )  # no contacts
+        # no contacts
+        state = replace(state, object_pos=state.object_pos + torch.tensor([0.0, 0.0, 1.0]))
         backend.set_state(state[[2]], torch.tensor([2]))
         self.assertEqual(backend.health().overflow.tolist(), [True, True, False, True])
         backend.set_state(state)

@@ -111,9 +111,8 @@ class FrictionTest(unittest.TestCase):
         force = tangential.sum(0)
         torque = np.cross(arms, tangential).sum(0)
         found = friction_forces(arms, normals, np.full(3, 0.8), force, torque)
-        np.testing.assert_allclose(
-            found, tangential, atol=1e-6
-        )  # three contacts: six unknowns, six equations
+        # three contacts: six unknowns, six equations
+        np.testing.assert_allclose(found, tangential, atol=1e-6)
 
 
 if __name__ == "__main__":

@@ -174,9 +174,8 @@ class FingersTest(unittest.TestCase):
         wrist = Kinematics(ROBOT).link_poses(torch.as_tensor(joints), ["wrist"])[:, 0, :3, 0]
         torch.testing.assert_close(fingers.inward[:, 0], -wrist, atol=0.02, rtol=0)
         torch.testing.assert_close(fingers.inward[:, 1], wrist, atol=0.02, rtol=0)
-        np.testing.assert_allclose(
-            fingers.point[:, 0, 0], -0.005, atol=1e-3
-        )  # the jaw's inner side
+        # the jaw's inner side
+        np.testing.assert_allclose(fingers.point[:, 0, 0], -0.005, atol=1e-3)
 
     def test_a_squeeze_is_as_far_beyond_as_its_force_takes(self):
         fingers, joints = self.fingers(0.0201, 0.0501)

@@ -186,9 +186,8 @@ class ProgressTest(Compared):
         a = self.training("a", curves_of((60.0,) * 4, (0.0, 0.2, 0.4, 0.6)))
         b = self.training("a", curves_of((120.0,) * 3, (0.2, 0.6, 0.8)))
         found = line([a, b], "task/success", "minutes")
-        np.testing.assert_allclose(
-            found.index, [2, 3, 4]
-        )  # the first has ended at 4 minutes, the second begins at 2
+        # the first has ended at 4 minutes, the second begins at 2
+        np.testing.assert_allclose(found.index, [2, 3, 4])
         np.testing.assert_allclose(found["low"], [0.2, 0.4, 0.6])
         np.testing.assert_allclose(found["high"], [0.2, 0.4, 0.6])
         np.testing.assert_allclose(

@@ -201,9 +201,8 @@ class Archive(InFolder):
 
     def test_unknown_object(self):
         file = self.folder / "a.npz"
-        write_demos(
-            file, self.changed("object_name", 3, "055_baseball")
-        )  # the archive may hold any object
+        # the archive may hold any object
+        write_demos(file, self.changed("object_name", 3, "055_baseball"))
         with self.assertRaisesRegex(
             DemoError, r"Unknown object '055_baseball'. Choose from: 003_cracker_box"
         ):
@@ -410,9 +409,8 @@ class RealData(unittest.TestCase):
             )
             model = hand.keypoints(hand.RELAXED, side)
             np.testing.assert_allclose(local[KNUCKLES], model[KNUCKLES], atol=0.01)
-            np.testing.assert_allclose(
-                local, model, atol=0.04
-            )  # real fingers are bent more or less
+            # real fingers are bent more or less
+            np.testing.assert_allclose(local, model, atol=0.04)
 
     def test_recorded_demonstrations_are_not_doubted(self):
         for name, _ in ARCHIVES:

@@ -353,9 +353,8 @@ class RobustnessTest(WithEnv):
         for tracker, period in cases:
             env = self.make(self.task(tracker=replace(tracker, position_noise=0.01)))
             poses = [env.step(action)[0]["policy"][:, :3] for action in self.actions(12)]
-            same = [
-                torch.equal(a, b) for a, b in pairwise(poses)
-            ]  # the first pose came with the reset
+            # the first pose came with the reset
+            same = [torch.equal(a, b) for a, b in pairwise(poses)]
             self.assertEqual(same, [(step + 2) % period != 0 for step in range(11)])
 
     def test_a_schedule_scales_all_faults(self):
@@ -522,9 +521,8 @@ class RobustnessTest(WithEnv):
                 self.assertGreater(waiting.operations, 500)
                 self.assertEqual(waiting.found, [])
                 with waiting:
-                    env.step(
-                        self.actions(1)[0]
-                    )  # an engine on the CPU asks which worlds begin anew: that must show
+                    # an engine on the CPU asks which worlds begin anew: that must show
+                    env.step(self.actions(1)[0])
                 self.assertEqual(waiting.found, ["aten.nonzero.default"])
 
 
@@ -695,9 +693,8 @@ class RolloutTest(WithEnv):
     def test_each_repetition_has_a_start_of_its_own_and_the_seed_decides(self):
         class Watching(ZeroPolicy):
             def begin(self, env: ManipulationEnv) -> None:
-                self.seen = (
-                    env.backend.state().object_pos.numpy().copy()
-                )  # worlds: soup, soup, soup, soup, spam, spam
+                # worlds: soup, soup, soup, soup, spam, spam
+                self.seen = env.backend.state().object_pos.numpy().copy()
 
         def starts(**options) -> np.ndarray:
             policy = Watching(7)

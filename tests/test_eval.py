@@ -155,9 +155,8 @@ class MetricsTest(unittest.TestCase):
             ),
         ):
             self.assertAlmostEqual(float(m.reorientation_progress), expected, places=5)
-        there = episode(
-            reading(GOAL), start=reading(GOAL)
-        )  # nothing is left to do: no division by zero
+        # nothing is left to do: no division by zero
+        there = episode(reading(GOAL), start=reading(GOAL))
         self.assertTrue(0.0 <= float(there.reorientation_progress) <= 1.0)
 
     def test_published_success_is_a_mean_distance_of_two_centimetres_at_any_time(self):

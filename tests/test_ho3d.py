@@ -78,9 +78,8 @@ class Ho3d(InFolder):
         found = self.read()
         self.assertEqual(found.num_frames, last - 2)  # cut off at the ends
         middle = (self.demos.object_pos[6] + self.demos.object_pos[8]) / 2
-        np.testing.assert_allclose(
-            found.object_pos[5], middle, atol=1e-5
-        )  # interpolated between others
+        # interpolated between others
+        np.testing.assert_allclose(found.object_pos[5], middle, atol=1e-5)
 
     def test_refusals(self):
         for words, changes in (
@@ -164,9 +163,8 @@ class Pickles(InFolder):
         tracemalloc.start()
         self.addCleanup(tracemalloc.stop)
         self.load(b"\x80\x02}r\x00\x00\x00\x10.")  # a value that is stored under the number 2^28
-        self.refused(
-            "cannot be read", b"\x80\x05\x96" + (1 << 40).to_bytes(8, "little") + b"."
-        )  # a bytearray of 1 TiB
+        # a bytearray of 1 TiB
+        self.refused("cannot be read", b"\x80\x05\x96" + (1 << 40).to_bytes(8, "little") + b".")
         self.refused("more than a megabyte", pickle.dumps({"a": np.zeros(200_000)}))
         self.assertLess(tracemalloc.get_traced_memory()[1], 8 << 20)
 

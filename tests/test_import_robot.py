@@ -195,9 +195,8 @@ class Toy(Robots):
         hand, palm = at_home(self.spec, "hand_base", "palm_frame")
         in_hand = np.linalg.inv(hand) @ palm
         np.testing.assert_allclose(in_hand[:3, :3], np.diag((1, -1, -1)), atol=0.06)
-        np.testing.assert_allclose(
-            palm[:3, 2], (0, 0, -1), atol=0.05
-        )  # at home it looks down at the table
+        # at home it looks down at the table
+        np.testing.assert_allclose(palm[:3, 2], (0, 0, -1), atol=0.05)
 
     def test_home_is_within_the_limits_after_rounding_and_strong_drives_are_stable(self):
         narrow = ARM.replace('lower="-2.9" upper="2.9"', 'lower="0.123446" upper="0.2"')

@@ -47,9 +47,8 @@ class Judge(unittest.TestCase):
                 self.assertEqual(
                     (rows["brick"].tried, rows["brick"].hold, rows["brick"].lift), (3, held, held)
                 )
-                self.assertEqual(
-                    (rows["all"].arm_fails, rows["all"].turn), (3, 0)
-                )  # its arm cannot turn that way
+                # its arm cannot turn that way
+                self.assertEqual((rows["all"].arm_fails, rows["all"].turn), (3, 0))
                 self.assertEqual(found.kept, [])
                 rise = np.diff(found.shots["brick"][:, -5])  # of the object's z
                 self.assertEqual(bool(rise[1] > 0.08), held > 0, rise)

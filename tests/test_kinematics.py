@@ -210,9 +210,8 @@ class KinematicsTest(unittest.TestCase):
             T = slope(lambda q: self.kinematics.link_poses(q, links), self.q, (..., j))
             points = T[..., :3, 3] + (T[..., :3, :3] @ offsets[..., None])[..., 0]
             assert_close(jacobian.linear[..., j], points, atol=1e-8, rtol=0)
-            spin = (
-                T[..., :3, :3] @ jacobian.rot.mT
-            )  # the cross-product matrix of the angular velocity
+            # the cross-product matrix of the angular velocity
+            spin = T[..., :3, :3] @ jacobian.rot.mT
             omega = torch.stack((spin[..., 2, 1], spin[..., 0, 2], spin[..., 1, 0]), dim=-1)
             assert_close(jacobian.angular[..., j], omega, atol=1e-8, rtol=0)
 

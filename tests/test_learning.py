@@ -201,9 +201,8 @@ class StorageTest(unittest.TestCase):
         alg = SequencePpo(obs, A, config, device, Processes())
         alg._graphs.active &= capture
         alg.actor.mlp[-1].bias.data += bias
-        obs["perception"] = obs["perception"][:, -1:].expand(
-            -1, 5, -1, -1
-        )  # a scene in which nothing moves
+        # a scene in which nothing moves
+        obs["perception"] = obs["perception"][:, -1:].expand(-1, 5, -1, -1)
         before = alg.actor(obs).detach()
         alg.actor.reset()
         self.places = []

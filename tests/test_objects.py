@@ -118,9 +118,8 @@ class Sampling(unittest.TestCase):
     def test_keypoints_are_corners_that_span_the_box(self):
         obj = load_object("scissors")
         points = keypoints(obj)
-        self.assertGreater(
-            abs(np.linalg.det(points[1:] - points[0])), 1e-6
-        )  # not coplanar: they see every rotation
+        # not coplanar: they see every rotation
+        self.assertGreater(abs(np.linalg.det(points[1:] - points[0])), 1e-6)
         low, high = bounding_box(obj)
         self.assertTrue((np.isclose(points, low) | np.isclose(points, high)).all())
 
@@ -185,9 +184,8 @@ class MeshImport(InFolder):
         volume = sum(shape_mesh(piece).volume for piece in first.pieces)
         self.assertAlmostEqual(volume / RING.volume, 1.0, delta=0.1)
         np.testing.assert_allclose(first.com, 0, atol=1e-9)
-        self.assertGreater(
-            distance_to_pieces(np.zeros((1, 3)), first)[0], 0.03
-        )  # the hole stays open
+        # the hole stays open
+        self.assertGreater(distance_to_pieces(np.zeros((1, 3)), first)[0], 0.03)
         (file,) = (self.folder / "cache" / "objects").glob("*.npz")
         for content, cuts in (
             (file.read_bytes(), 0),
@@ -267,9 +265,8 @@ class MeshImport(InFolder):
             self.assertRaises(KeyboardInterrupt, add_mesh, path, out, "brick")
         self.assertFalse(out.exists())  # nothing is written before the mesh is cut
         out.mkdir()
-        (out / "brick.toml").write_text(
-            "mass = 0.2\ntolerance = 0.002\n"
-        )  # killed between the two files
+        # killed between the two files
+        (out / "brick.toml").write_text("mass = 0.2\ntolerance = 0.002\n")
         add_mesh(path, out, "brick", properties=Properties(mass=0.2))
         self.assertEqual(load_object("brick", out).mass, 0.2)
 
@@ -405,9 +402,8 @@ class MeshImport(InFolder):
     def test_a_real_can_stays_whole(self):
         obj = load_object("soup", data_dir() / "ycb")
         self.assertEqual(len(obj.pieces), 1)
-        self.assertLess(
-            distance_to_pieces(obj.vertices, obj).max(), 0.002
-        )  # 64 vertices are enough
+        # 64 vertices are enough
+        self.assertLess(distance_to_pieces(obj.vertices, obj).max(), 0.002)
 
 
 @CUTS
@@ -437,14 +433,12 @@ class ThinWalls(unittest.TestCase):
         )
         outside = points[winding_number(points, mug.vertices, mug.faces) < 0.5]
         surface = cKDTree(trimesh.sample.sample_surface(mug, 60000, seed=1)[0])
-        self.assertLess(
-            surface.query(outside)[0].max(), 0.0021
-        )  # measured apart from the importer's own account
+        # measured apart from the importer's own account
+        self.assertLess(surface.query(outside)[0].max(), 0.0021)
         self.assertLess(pieces.deviation, 0.002)
         self.assertLess(len(pieces.shapes), 40)
-        self.assertGreater(
-            self.room(np.array([0, 0, 0.05]), pieces), 0.030
-        )  # the cup's inner radius is 36.5 mm
+        # the cup's inner radius is 36.5 mm
+        self.assertGreater(self.room(np.array([0, 0, 0.05]), pieces), 0.030)
         self.assertGreater(
             self.room(np.array([0.051, 0, 0.045]), pieces), 0.008
         )  # a finger of 16 mm through the handle
@@ -470,9 +464,8 @@ class ThinWalls(unittest.TestCase):
         solid = as_solid(sheet)
         self.assertAlmostEqual(solid.volume(), sheet.area * 0.001, delta=0.1 * sheet.area * 0.001)
         pieces = decompose(sheet)
-        self.assertGreater(
-            self.room(np.array([0, 0, 0.02]), pieces), 0.012
-        )  # 20 mm above the bottom
+        # 20 mm above the bottom
+        self.assertGreater(self.room(np.array([0, 0, 0.02]), pieces), 0.012)
         self.assertLess(pieces.deviation, 0.002)
 
     def test_limits_of_pieces_and_effort(self):

@@ -158,9 +158,8 @@ class Episodes(unittest.TestCase):
         torque = (kp * (target - held))[0]
         before = tips(self.kinematics, self.home)
         line = torch.nn.functional.normalize(before[0, 1:].mean(0) - before[0, 0], dim=0)
-        force = torch.stack(
-            [4.0 * line, *[-1.0 * line] * 4]
-        )  # four fingers share what the thumb bears
+        # four fingers share what the thumb bears
+        force = torch.stack([4.0 * line, *[-1.0 * line] * 4])
         jacobian = self.kinematics.jacobian(
             held, [tip.link for tip in self.robot.fingertips]
         ).linear[0]
@@ -280,9 +279,8 @@ class Numbers(unittest.TestCase):
         total, tip = press_metrics(recording(tip_force=force), recording(), steps=2)
         self.assertAlmostEqual(total.measured or 0.0, 0.1, places=5)  # median of 0.2 and 0
         self.assertEqual(total.n, 2)
-        self.assertAlmostEqual(
-            tip.measured or 0.0, 0.2, places=5
-        )  # median of 0.2, 0.2, 0 and sqrt 2
+        # median of 0.2, 0.2, 0 and sqrt 2
+        self.assertAlmostEqual(tip.measured or 0.0, 0.2, places=5)
         self.assertEqual(tip.n, 4)
 
         force = recording().tip_force.clone()

@@ -98,9 +98,8 @@ class InTheBrowser(unittest.TestCase):
         self.until(lambda: "The object is away" in self.browser.text(), "the object to be away")
         self.browser.press("Put the object back")
         self.until(lambda: not session.away, "the object to be back")
-        problems = [
-            text for text in self.browser.problems if "passive event listener" not in text
-        ]  # viser's own
+        # viser's own
+        problems = [text for text in self.browser.problems if "passive event listener" not in text]
         self.assertEqual(problems, [])
         self.browser.resize(390, 844, phone=True)
         self.assertLessEqual(self.browser.evaluate("document.documentElement.scrollWidth"), 390)

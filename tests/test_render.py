@@ -109,12 +109,8 @@ class Pictures(unittest.TestCase):
     def test_points_are_drawn_over_everything_and_missing_ones_or_far_ones_left_out(self):
         color = (1.0, 0.0, 1.0)
         inside = np.array([0.4, 0.1, 0.3])
-        outside = [
-            [50.0, 0, 0],
-            [1.3, -1.5, 0.9],
-            [1.28, -0.5, 0.9],
-            [np.nan] * 3,
-        ]  # the second is behind the camera
+        # the second is behind the camera
+        outside = [[50.0, 0, 0], [1.3, -1.5, 0.9], [1.28, -0.5, 0.9], [np.nan] * 3]
         points = Points(pos=np.array([inside, *outside]), color=color, radius=0.012)
         picture = self.renderer.draw(self.home, at(*inside), points=[points])
         y, x = np.nonzero((picture == (255, 0, 255)).all(axis=-1))
@@ -136,9 +132,8 @@ class Pictures(unittest.TestCase):
     def test_a_picture_may_have_its_own_camera(self):
         near = Camera(eye=(0.8, -0.1, 0.5), target=(0.4, 0.1, 0.1))
         T = at(0.4, 0.1, 0.04)
-        own = Renderer(self.renderer.scene, size=self.size, camera=near).draw(
-            self.home, T
-        )  # the same, each time
+        # the same, each time
+        own = Renderer(self.renderer.scene, size=self.size, camera=near).draw(self.home, T)
         np.testing.assert_array_equal(self.renderer.draw(self.home, T, camera=near), own)
         self.assertGreater(self.changed(self.renderer.draw(self.home, T), own).mean(), 0.1)
         smooth = Renderer(self.renderer.scene, size=self.size, camera=near, smooth=True).draw(

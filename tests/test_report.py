@@ -244,9 +244,8 @@ class ClipTest(Reported):
 
     def test_a_clip_shows_the_object_on_its_way_at_the_right_speed(self):
         clip = self.draw()
-        self.assertEqual(
-            clip.frames.shape, (3, 300, 400, 3)
-        )  # 5 states of 0.05 s, every second one
+        # 5 states of 0.05 s, every second one
+        self.assertEqual(clip.frames.shape, (3, 300, 400, 3))
         self.assertAlmostEqual(clip.fps, 10.0)
         self.assertTrue(clip.finite)
         orange = [
@@ -290,9 +289,8 @@ class ClipTest(Reported):
             "-",
         ]
         decoded = subprocess.run(command, capture_output=True, check=True)
-        self.assertRegex(
-            decoded.stderr.decode(), r"Video: h264.*yuv420p.*64x48.*10 fps"
-        )  # what browsers play
+        # what browsers play
+        self.assertRegex(decoded.stderr.decode(), r"Video: h264.*yuv420p.*64x48.*10 fps")
         found = np.frombuffer(decoded.stdout, np.uint8).reshape(-1, 48, 64, 3).mean(axis=(1, 2))
         np.testing.assert_allclose(found, colors, atol=12)
 

@@ -147,9 +147,8 @@ class HandTest(unittest.TestCase):
         self.assertLess(
             (self.model.keypoints(**vars(found)) - self.keypoints).norm(dim=-1).max().item(), 1e-4
         )
-        seen = [
-            name != "jaw_a" for name in self.model.kinematics.joint_names
-        ]  # no keypoint follows the jaws
+        # no keypoint follows the jaws
+        seen = [name != "jaw_a" for name in self.model.kinematics.joint_names]
         self.assertLess((found.joints - self.motion.joints)[..., seen].abs().max().item(), 5e-3)
         self.assertLess(quat_angle(found.root_quat, self.motion.root_quat).max().item(), 5e-3)
 

@@ -97,9 +97,8 @@ class BuiltIn(unittest.TestCase):
             q[-1] = position
             thumb, index = Kinematics(robot).link_poses(q, ["thumb_tip", "index_tip"]).numpy()
             apart = index[:3, 3] - thumb[:3, 3]
-            np.testing.assert_allclose(
-                apart @ thumb[:3, 2], gap, atol=1e-4
-            )  # z looks out of the pad, at the other jaw
+            # z looks out of the pad, at the other jaw
+            np.testing.assert_allclose(apart @ thumb[:3, 2], gap, atol=1e-4)
             np.testing.assert_allclose(np.linalg.norm(apart), gap, atol=1e-4)
             np.testing.assert_allclose(thumb[:3, 2], -index[:3, 2], atol=1e-6)
 
@@ -107,9 +106,8 @@ class BuiltIn(unittest.TestCase):
         for name in BUILT_IN:
             robot = load(name)
             ratio = damping_ratio(robot, robot.home)
-            np.testing.assert_allclose(
-                ratio[robot.hand_indices], 0.9, atol=0.01, err_msg=name
-            )  # 1.8 sqrt(kp I)
+            # 1.8 sqrt(kp I)
+            np.testing.assert_allclose(ratio[robot.hand_indices], 0.9, atol=0.01, err_msg=name)
             self.assertGreater(ratio[robot.arm_indices].min(), 0.95, name)
 
     def test_home_is_well_inside_the_limits(self):

@@ -418,9 +418,8 @@ class TablesTest(InFolder):
         rows = fill(plan, plan.study.tables[0]).as_rows("mujoco")
         self.assertRegex(rows[1][3], r"^66\.5 ")
         self.assertEqual([r[3][0] for r in rows[2:]], ["-", "-"])
-        self.write(
-            "ours-tomato_soup_can-seed1", 1.0, 0.33
-        )  # now seed 0 lacks an object, seed 1 does not
+        # now seed 0 lacks an object, seed 1 does not
+        self.write("ours-tomato_soup_can-seed1", 1.0, 0.33)
         self.write("ours-potted_meat_can-seed1", 0.66, 0.0, first=2)
         rows = fill(plan, plan.study.tables[0]).as_rows("mujoco")
         self.assertRegex(rows[1][3], r"^66\.5 \(66-66\)", "the same demonstration in both seeds")

@@ -262,9 +262,8 @@ class ActionTest(WithRobot):
         # a loaded arm that sags would otherwise sink a little further at every step of zero action
         torch.testing.assert_close(still[:, :3], target[:, :3])
         torch.testing.assert_close(still[:, 3:], torch.tensor([[-0.55, 0.55, 0.8, 0.02]]))
-        full = space.targets(
-            torch.full((1, 7), 5.0), target, target
-        )  # actions are limited to [-1, 1]
+        # actions are limited to [-1, 1]
+        full = space.targets(torch.full((1, 7), 5.0), target, target)
         torch.testing.assert_close(full, torch.tensor([[0.15, 0.55, -0.45, 0.5, 1.6, 1.6, 0.04]]))
 
     def test_arm_targets_stay_near_the_joint_and_within_its_limits(self):
@@ -293,9 +292,8 @@ class ActionTest(WithRobot):
 
     def test_a_relative_hand_that_does_nothing_holds_its_targets(self):
         space = self.space(hand="relative", hand_step=0.05, hand_lead=0.4)
-        target = torch.tensor(
-            [[0.1, 0.5, -0.5, -0.2, 0.4, 0.3, 0.01]]
-        )  # the last one slides, by 4 cm in all
+        # the last one slides, by 4 cm in all
+        target = torch.tensor([[0.1, 0.5, -0.5, -0.2, 0.4, 0.3, 0.01]])
         # joints that an object keeps from following
         pressed = target - torch.tensor([0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.004])
         torch.testing.assert_close(
@@ -375,9 +373,8 @@ class ResetTest(WithRobot):
     def test_bank_resets_are_states_of_the_bank(self):
         bank = toy_bank(self.robot)
         reset = self.sample(torch.tensor([0, 1] * 500), demo_probability=1.0)
-        state = (
-            ((reset.object_pos[:, 0] - 0.6) * 100).round().long()
-        )  # the toy bank numbers its states
+        # the toy bank numbers its states
+        state = ((reset.object_pos[:, 0] - 0.6) * 100).round().long()
         torch.testing.assert_close(reset.joint_pos, torch.as_tensor(bank.joint_pos)[state])
         torch.testing.assert_close(reset.object_quat, torch.as_tensor(bank.object_quat_wxyz)[state])
         self.assertEqual(reset.sequence.tolist(), bank.sequence_index[state].tolist())
@@ -452,9 +449,8 @@ class ResetTest(WithRobot):
         lying = toy_bank(
             self.robot, start_quat_wxyz=np.tile(turned(90, (1.0, 0, 0)).numpy(), (3, 1))
         )
-        axis = quat_rotate(
-            self.sample(bank=lying).object_quat, torch.tensor([0.0, 1, 0])
-        )  # y of the object stands up
+        # y of the object stands up
+        axis = quat_rotate(self.sample(bank=lying).object_quat, torch.tensor([0.0, 1, 0]))
         torch.testing.assert_close(
             axis, torch.tensor([0.0, 0, 1]).expand_as(axis), atol=1e-6, rtol=0
         )
@@ -485,9 +481,8 @@ class ResetTest(WithRobot):
         space = ActionSpace.of(self.robot, ActionConfig())
         self.assertTrue(bool(((joints >= space.lower) & (joints <= space.upper)).all()))
         spread = (joints - torch.as_tensor(self.robot.home, dtype=torch.float32)).std(dim=0)
-        self.assertAlmostEqual(
-            float(spread[1]), 0.075, delta=0.004
-        )  # an arm joint far from its limits
+        # an arm joint far from its limits
+        self.assertAlmostEqual(float(spread[1]), 0.075, delta=0.004)
         self.assertAlmostEqual(float(spread[4]), 0.10, delta=0.005)  # a finger joint
         quiet = self.sample(self.SOUPS[:5], home_noise=False)
         torch.testing.assert_close(quiet.joint_pos, torch.full((5, 7), 0.01))
@@ -587,9 +582,8 @@ class ObservationTest(unittest.TestCase):
         c = RECIPES["published"].config.task.observation
         widths = obs.layout(28, 5, c)
         flat = sum(widths["policy"].values()) + sum(widths["proprio"].values())
-        self.assertEqual(
-            (flat, flat + widths["perception"]["paired_cloud"]), (72, 648)
-        )  # the paper's 648 inputs
+        # the paper's 648 inputs
+        self.assertEqual((flat, flat + widths["perception"]["paired_cloud"]), (72, 648))
         points = torch.randn(len(self.x.observed_pos), 64, 3, generator=generator())
         found = obs.policy_group(self.x, c, generator(), points)
         cloud = quat_rotate(self.x.observed_quat[:, None], points) + self.x.observed_pos[:, None]

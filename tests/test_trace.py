@@ -86,9 +86,8 @@ class DivergenceTest(unittest.TestCase):
         pos = torch.zeros(20, 1, 3)
         pos[10:, 0, 1] = 0.006
         quat = torch.tensor([1.0, 0, 0, 0]).repeat(20, 1, 1)
-        quat[15:] = -quat_from_axis_angle(
-            torch.tensor([0.0, 0.0, math.radians(6)])
-        )  # its sign means nothing
+        # its sign means nothing
+        quat[15:] = -quat_from_axis_angle(torch.tensor([0.0, 0.0, math.radians(6)]))
         found = compare(recording(joint_pos=joint, object_pos=pos, object_quat=quat), recording())
         d = found["joints"]
         self.assertEqual(d.where, "turn")

@@ -319,9 +319,8 @@ class TrainingTest(unittest.TestCase):
         info = read_run(out)
         self.assertEqual((info.weights, info.weights_hash), (str(given), file_hash(given)))
         content, before = newest(out), read_checkpoint(given)
-        self.assertEqual(
-            (content.iteration, content.env_steps), (1, 8 * 4)
-        )  # counters start at zero
+        # counters start at zero
+        self.assertEqual((content.iteration, content.env_steps), (1, 8 * 4))
         runner = mock.Mock(config=CONFIG, _load=read_checkpoint)
         TrainingRunner.load_networks(runner, given)
         self.assertEqual(runner.alg.learning_rate, before.learning_rate)  # an adaptive rate goes on

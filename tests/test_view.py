@@ -135,9 +135,8 @@ class Data(WithFiles):
         self.assertEqual(view.text(3)[0], "not annotated")
         can = view.objects[0]
         lowest = view.object_pos[0, 2] + can.vertices[:, 2].min()
-        self.assertAlmostEqual(
-            lowest, 0.0, delta=2e-3
-        )  # the object rests on the table, and the hand has moved with it
+        # the object rests on the table, and the hand has moved with it
+        self.assertAlmostEqual(lowest, 0.0, delta=2e-3)
         np.testing.assert_allclose(
             view.human_keypoints[2, 0], view.object_pos[2] + [0.03, 0, 0], atol=1e-6
         )

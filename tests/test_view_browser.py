@@ -41,9 +41,8 @@ class InTheBrowser(unittest.TestCase):
             page = Page(load_view(path, **options), port=8940)
         self.addCleanup(page.close)
         self.browser.problems.clear()
-        self.addCleanup(
-            self.browser.open, "about:blank"
-        )  # first: a page without its server is a problem
+        # first: a page without its server is a problem
+        self.addCleanup(self.browser.open, "about:blank")
         self.browser.open(page.url)
         self.until(
             lambda: self.exists(INPUT.format(label="sequence")) and "1 of" in self.browser.text(),

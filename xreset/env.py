@@ -355,10 +355,8 @@ class ManipulationEnv:
             world: index of the world.
             size: width and height in pixels.
         """
-        from xreset.pictures.render import (
-            Renderer,
-            pose_matrix,
-        )  # trimesh, which training does not need
+        # trimesh, which training does not need
+        from xreset.pictures.render import Renderer, pose_matrix
 
         if self._renderer is None or self._renderer.size != size:
             self._renderer = Renderer(self.backend.scene, size=size)

@@ -82,9 +82,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             XResetError: the actions have another shape, or are not real numbers.
         """
         action = checked_action(self.env, actions)
-        action = torch.where(
-            self._ended[:, None], 0.0, action
-        )  # ignored: the world begins a new episode
+        # ignored: the world begins a new episode
+        action = torch.where(self._ended[:, None], 0.0, action)
         observations, reward, done, extras = self.env.step(action, begin=self._ended)
         reward = torch.where(self._ended, 0.0, reward)
         faulty = extras["faulty"]

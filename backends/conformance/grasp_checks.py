@@ -26,9 +26,8 @@ def held_object(bench: Bench) -> Measured:
     force = contacts.tip_force
     weight = GRAVITY * bench.objects[0].mass
     total = force.sum(1)
-    squeeze = torch.stack(
-        (force[:, 0] @ closing, -force[:, 1] @ closing), dim=1
-    )  # of each finger towards the other
+    # of each finger towards the other
+    squeeze = torch.stack((force[:, 0] @ closing, -force[:, 1] @ closing), dim=1)
     return {
         "vertical force": total[:, 2] / weight - 1.0,
         "horizontal force": total[:, :2] / weight,

@@ -26,11 +26,8 @@ _WAY = 0.2  # rad, of a joint's step and of the amplitude of its sine
 _SLIDE_WAY = 0.02  # m, the same of a prismatic joint
 _DURATION = 1.5  # s
 _FREQUENCY = 1.0  # Hz
-_DRIVE_SCALES = (
-    (1.0, 1.0, 1.0),
-    (0.7, 1.4, 1.0),
-    (1.3, 0.8, 0.5),
-)  # of stiffness, damping and effort limit
+# of stiffness, damping and effort limit
+_DRIVE_SCALES = ((1.0, 1.0, 1.0), (0.7, 1.4, 1.0), (1.3, 0.8, 0.5))
 
 
 def mass_properties(bench: Bench) -> Measured:

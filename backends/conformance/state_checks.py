@@ -72,9 +72,8 @@ def joint_order(bench: Bench) -> Measured:
         motion = small_motion(kinematics)
         worlds.set(start)
         worlds.set_targets(start.joint_pos + torch.diag(motion))  # world i moves joint i
-        worlds.step(
-            240
-        )  # until they rest, a second for soft drives: an arm in motion shakes its fingers
+        # until they rest, a second for soft drives: an arm in motion shakes its fingers
+        worlds.step(240)
         moved = (worlds.state().joint_pos - start.joint_pos) / motion
     wrong = moved - torch.eye(count)
     return {

@@ -225,9 +225,8 @@ class _Bench:
         steps = int((spin > spin[0] / 2).long().cumprod(0).sum()) - 1
         if steps < 1:
             return float("nan")
-        load = GRAVITY * steps * self._dt + float(
-            log["object_linvel"][steps, world, 2]
-        )  # its impulse, for the mass
+        # its impulse, for the mass
+        load = GRAVITY * steps * self._dt + float(log["object_linvel"][steps, world, 2])
         return _TOP_INERTIA[2] / _SLAB_MASS * float(spin[0] - spin[steps]) / load
 
     def _start(self) -> State:

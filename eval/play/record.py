@@ -45,9 +45,8 @@ def write_trace(path: str | Path, session: Session) -> None:
         object=session.object_name,
         goal_pos=goal_pos[-1],
         goal_quat=goal_quat[-1],
-        joint_target=arrays.pop("joint_target")[
-            1:
-        ],  # those before the first state are of no recorded step
+        # those before the first state are of no recorded step
+        joint_target=arrays.pop("joint_target")[1:],
         **states,
     )
     input_names = []

@@ -45,10 +45,8 @@ def launch(
         What failed, or cannot start: sentences.
     """
     gpus = visible_gpus()
-    free: list[int | None] = [
-        *gpus * per_gpu,
-        None,
-    ]  # None: the CPU, on which steps come one at a time
+    # None: the CPU, on which steps come one at a time
+    free: list[int | None] = [*gpus * per_gpu, None]
     problems = []
     waiting = {}
     for step in steps:

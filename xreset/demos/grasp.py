@@ -33,18 +33,14 @@ MAX_OPENING = 0.095
 MIN_WIDTH = 0.002
 """Thinnest part: the wall of a cup, with the thumb or the fingers inside [m]."""
 
-_STACK = np.array(
-    [0.0, -0.004, -0.026, -0.043, -0.059]
-)  # thumb, then index to little, along the knuckles [m]
+# thumb, then index to little, along the knuckles [m]
+_STACK = np.array([0.0, -0.004, -0.026, -0.043, -0.059])
 _FINGER_ROOM = 0.022  # free space that a finger needs next to the object [m]
 _LEANS = (0.6, 1.0)  # first guesses: lean of the back of the hand to the fingers' side [rad]
 _POSTURE = hand.RELAXED + np.array([0.0, 0.25, 0.25] * 4 + [0.0] * 5)  # of a grasping hand
 _GRID = 0.012  # spacing of the centers that are tried [m]
-_SIDE_TILTS = (
-    0.6,
-    0.4,
-    0.15,
-)  # steepness of a hand that comes from the side [rad]: the first is the most natural
+# steepness of a hand that comes from the side [rad]: the first is the most natural
+_SIDE_TILTS = (0.6, 0.4, 0.15)
 _TILT_COST = 2.0  # of being less steep [1/rad]
 _LOW_OBJECT = 0.07  # objects up to this height are grasped from above [m]
 _TOUCH = 1e-4  # pieces of an object that are this close are one part [m]
@@ -160,9 +156,8 @@ def plan_contacts(solid: Solid, azimuths: np.ndarray, side: str = "right") -> li
     found: list[Contacts] = []
     for azimuth in azimuths:
         closing = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-        away = np.array([closing[1], -closing[0], 0.0]) * handedness(
-            side
-        )  # horizontal, away from the hand
+        # horizontal, away from the hand
+        away = np.array([closing[1], -closing[0], 0.0]) * handedness(side)
         centers = _centers(low, high, closing, away, from_above)
         for tilt in (np.pi / 2,) if from_above else _SIDE_TILTS:
             approach = away * np.cos(tilt) - np.array([0.0, 0.0, np.sin(tilt)])
@@ -216,12 +211,10 @@ def _contacts_at(
     effort: float,
 ) -> list[Contacts]:
     """Return the contacts of a hand that closes upon centers [n, 3]; ``effort`` is added to their cost."""
-    up_hand = np.cross(approach, closing) * handedness(
-        side
-    )  # from the little finger to the thumb's side of the hand
-    origins = (
-        centers[:, None] + _STACK[:, None] * up_hand
-    )  # [n, 5, 3]: the lines of the thumb and the fingers
+    # from the little finger to the thumb's side of the hand
+    up_hand = np.cross(approach, closing) * handedness(side)
+    # [n, 5, 3]: the lines of the thumb and the fingers
+    origins = centers[:, None] + _STACK[:, None] * up_hand
     lines = origins.reshape(-1, 3)
     enter, leave, normal_in, normal_out = solid.crossings(lines, closing)
     # The part of the object around each origin: merge the pieces whose intervals overlap the one that holds it.
@@ -269,9 +262,8 @@ def _contacts_at(
         points[0] = origins[i, 0] + (end[i] + SKIN) * closing
         points[fingers] = origins[i, fingers] + (start[i, fingers] - SKIN)[:, None] * closing
         middle = (points[0] + points[fingers].mean(axis=0)) / 2
-        lever = np.linalg.norm(
-            np.cross(middle - solid.com, approach)
-        )  # of the weight about the grasp
+        # of the weight about the grasp
+        lever = np.linalg.norm(np.cross(middle - solid.com, approach))
         cost = (
             effort
             + lever / 0.03

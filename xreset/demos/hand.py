@@ -59,9 +59,8 @@ def _thumb(angles: np.ndarray) -> np.ndarray:
         (-np.cos(radial) * np.cos(palmar), -np.sin(palmar), np.sin(radial) * np.cos(palmar)),
         axis=-1,
     )
-    bend = np.stack(
-        (zero, -np.sin(twist), -np.cos(twist)), axis=-1
-    )  # where the tip goes when the thumb flexes
+    # where the tip goes when the thumb flexes
+    bend = np.stack((zero, -np.sin(twist), -np.cos(twist)), axis=-1)
     bend = bend - (bend * first).sum(axis=-1, keepdims=True) * first
     bend /= np.linalg.norm(bend, axis=-1, keepdims=True)
     flexion = np.stack((zero, mcp, mcp + ip), axis=-1)[..., None]

@@ -139,9 +139,8 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
             scene.geometry[scene.graph[node][1]].vertices.nbytes
             for node in scene.graph.nodes_geometry
         ]
-        _check_memory(
-            path, _PER_VERTEX_BYTE * sum(sizes)
-        )  # a scene may show a mesh any number of times
+        # a scene may show a mesh any number of times
+        _check_memory(path, _PER_VERTEX_BYTE * sum(sizes))
         mesh = scene.to_mesh()
     except ObjectError:
         raise
@@ -242,9 +241,8 @@ def half_spaces(shape: Shape) -> np.ndarray:
     """[P, 4] planes of a convex shape, (outward unit normal, offset): x is inside where normal . x + offset <= 0 for
     all."""
     vertices = np.asarray(shape_mesh(shape).vertices, dtype=float)
-    return np.unique(
-        ConvexHull(vertices).equations.round(9), axis=0
-    )  # coplanar triangles share a plane
+    # coplanar triangles share a plane
+    return np.unique(ConvexHull(vertices).equations.round(9), axis=0)
 
 
 def mass_properties(

@@ -47,9 +47,8 @@ def link_field(shapes: Sequence[Shape]) -> DistanceFields:
         # On a flat ridge between two shapes the slope says nothing; other nodes are near.
         rim = (values > reach) & (values <= reach + 2 * _SPACING) & (steepness > 0.5)
         beyond = (values[rim] - reach) / steepness[rim]
-        offset_surface = cKDTree(
-            nodes[rim] - beyond[:, None] * slope[rim]
-        )  # points at ``reach`` from the shapes
+        # points at ``reach`` from the shapes
+        offset_surface = cKDTree(nodes[rim] - beyond[:, None] * slope[rim])
         inside = values <= reach
         depth, _ = offset_surface.query(nodes[inside])
         values[inside] = np.minimum(values[inside], reach - depth)

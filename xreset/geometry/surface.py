@@ -64,17 +64,15 @@ class Surface:
             return inside[tuple(index.T)]
 
         outward = _GRID_SPACING * np.asarray(mesh.face_normals)[owners]
-        exposed = ~(
-            is_inside(points + outward) & is_inside(points - outward)
-        )  # not where pieces overlap
+        # not where pieces overlap
+        exposed = ~(is_inside(points + outward) & is_inside(points - outward))
         self._owners = owners[exposed]
         self._tree = cKDTree(points[exposed])
 
         flat_nodes = nodes.reshape(-1, 3)
         distance, _ = self._tree.query(flat_nodes)
-        near = (
-            distance < 2 * _GRID_SPACING + _SAMPLE_SPACING
-        )  # farther nodes keep the distance to the nearest sample
+        # farther nodes keep the distance to the nearest sample
+        near = distance < 2 * _GRID_SPACING + _SAMPLE_SPACING
         _, distance[near] = self.nearest(flat_nodes[near])
         signed = np.where(inside.reshape(-1), -distance, distance).reshape(counts)
         self.field = DistanceFields.on_grid(signed, origin, _GRID_SPACING, self.low, self.high)

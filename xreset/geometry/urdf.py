@@ -290,9 +290,8 @@ def check_tree(tree: RobotTree) -> None:
             parts += [shape.T_body_shape, geometry.size]
             if geometry.vertices is not None:
                 parts.append(geometry.vertices)
-            positive = (
-                geometry.size[:1] if geometry.kind == "capsule" else geometry.size
-            )  # a capsule may be a ball
+            # a capsule may be a ball
+            positive = geometry.size[:1] if geometry.kind == "capsule" else geometry.size
             least = min(positive, default=math.inf)
             if least < _SMALLEST:
                 raise RobotError(

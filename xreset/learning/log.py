@@ -64,9 +64,8 @@ class TrainingLog:
         self._curves = SummaryWriter(str(folder))
         self._returns = torch.zeros(num_envs, device=device)
         self._lengths = torch.zeros(num_envs, device=device)
-        self._finished = torch.zeros(
-            3, device=device
-        )  # sum of returns, sum of lengths, number of episodes
+        # sum of returns, sum of lengths, number of episodes
+        self._finished = torch.zeros(3, device=device)
         self._recent: deque[list[float]] = deque(maxlen=RECENT)
         self._names: tuple[str, ...] = ()
         self._sums: Tensor | float = 0.0

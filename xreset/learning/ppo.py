@@ -95,9 +95,8 @@ class SequencePpo(PPO):
         self._sums = torch.zeros(4, device=device)
         self._worlds = torch.zeros(count // self.num_mini_batches, dtype=torch.long, device=device)
         self._graphs = GraphRunner(torch.device(device))
-        self._graphs.active &= (
-            not self.is_multi_gpu and count % self.num_mini_batches == 0
-        )  # all minibatches alike
+        # all minibatches alike
+        self._graphs.active &= not self.is_multi_gpu and count % self.num_mini_batches == 0
 
     def update(self) -> dict[str, float]:
         """Learn from the rollout; return the mean losses of its minibatches.

@@ -113,9 +113,8 @@ def policy_file(policy: str | Path, *, also: Sequence[str] = ()) -> Path:
         PolicyError: there is none of that name.
     """
     if os.path.isdir(policy):
-        from xreset.learning.export import (
-            ensure_policy,
-        )  # rsl-rl, which playing a file does not need
+        # rsl-rl, which playing a file does not need
+        from xreset.learning.export import ensure_policy
 
         return ensure_policy(Path(policy))
     path = Path(policy)

@@ -183,9 +183,8 @@ def as_solid(mesh: trimesh.Trimesh) -> Manifold:
     union = m3.Manifold.batch_boolean(
         [m3.Manifold.hull_points(points) for points in plates], m3.OpType.Add
     )
-    outer = [
-        part for part in union.decompose() if part.volume() > 0
-    ]  # surfaces of cavities have negative volume
+    # surfaces of cavities have negative volume
+    outer = [part for part in union.decompose() if part.volume() > 0]
     if not outer:
         raise ObjectError(
             "The mesh encloses no solid, even with its holes closed. Repair it, for example in MeshLab."
@@ -519,9 +518,8 @@ def limited_hull(points: np.ndarray) -> Shape:
     along = vertices @ np.vstack((np.eye(3), _DIAGONALS)).T
     chosen = np.unique((along.argmin(axis=0), along.argmax(axis=0))).tolist()
     while len(chosen) < _MAX_VERTICES:
-        inner = ConvexHull(
-            vertices[chosen], qhull_options="QJ"
-        )  # joggled: the first few may be coplanar
+        # joggled: the first few may be coplanar
+        inner = ConvexHull(vertices[chosen], qhull_options="QJ")
         outside = (vertices @ inner.equations[:, :3].T + inner.equations[:, 3]).max(axis=1)
         outside[chosen] = -np.inf
         chosen.append(int(outside.argmax()))

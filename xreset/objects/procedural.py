@@ -179,9 +179,8 @@ def _banana(rng: np.random.Generator) -> list[Shape]:
         return section(bend * outward, size * outward, size * _Z, count=12)
 
     ends = pairwise(np.linspace(-1.0, 1.0, 7))
-    return [
-        loft((ring(start - 0.02), ring(end + 0.02))) for start, end in ends
-    ]  # overlapping, so that no seam is open
+    # overlapping, so that no seam is open
+    return [loft((ring(start - 0.02), ring(end + 0.02))) for start, end in ends]
 
 
 _FAMILIES: dict[str, Callable[[np.random.Generator], list[Shape]]] = {

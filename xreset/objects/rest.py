@@ -21,11 +21,8 @@ def rest_height(obj: ObjectSpec, quat: np.ndarray) -> np.ndarray | float:
     """
     w, x, y, z = np.moveaxis(np.asarray(quat, dtype=float), -1, 0)
     norm = w * w + x * x + y * y + z * z
-    last_row = (
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        w * w - x * x - y * y + z * z,
-    )  # of the rotation matrix
+    # of the rotation matrix
+    last_row = (2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z)
     up = np.stack(last_row, axis=-1) / norm[..., None]
     height = -(up @ obj.vertices.T).min(axis=-1)
     return float(height) if np.ndim(height) == 0 else height
@@ -39,9 +36,8 @@ def resting_orientation(obj: ObjectSpec, up: np.ndarray) -> np.ndarray:
     convex = ConvexHull(obj.vertices)
     corners = obj.vertices[convex.simplices]
     normals = convex.equations[:, :3]
-    distance = (
-        normals @ obj.com + convex.equations[:, 3]
-    )  # of the center of mass, negative as it is inside
+    # of the center of mass, negative as it is inside
+    distance = normals @ obj.com + convex.equations[:, 3]
     foot = obj.com - distance[:, None] * normals
     stable = (points_to_barycentric(corners, foot) >= -1e-9).all(axis=1)
     top = -normals[stable][np.argmin(normals[stable] @ up)]

@@ -60,9 +60,8 @@ def _frames_to_follow(retargeted: Retargeted, fingers: Fingers, within: float) -
     moved = np.linalg.norm(retargeted.object_pos - retargeted.object_pos[start], axis=-1) > MOVED
     over = grasped | moved
     count = np.cumsum(over)
-    over = (
-        count - (count - over)[start] > 0
-    )  # in this frame, or in an earlier one of the same sequence
+    # in this frame, or in an earlier one of the same sequence
+    over = count - (count - over)[start] > 0
     gap = fingers.nearest.numpy()
     near = np.minimum(gap[:-1], gap[1:]) < within
     same_sequence = owner[:-1] == owner[1:]

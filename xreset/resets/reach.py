@@ -63,9 +63,8 @@ class Reach:
         tried = 0
         while tried < len(self._grasps) and not held.all():
             left = np.flatnonzero(~held)
-            grasps = self._grasps[
-                tried : tried + max(1, len(self._grasps) // len(left))
-            ]  # few objects: many at once
+            # few objects: many at once
+            grasps = self._grasps[tried : tried + max(1, len(self._grasps) // len(left))]
             tried += len(grasps)
             rows = np.repeat(left, len(grasps))
             hands = np.tile(grasps, (len(left), 1))

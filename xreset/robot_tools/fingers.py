@@ -285,9 +285,8 @@ def _find_palm(
                 moved += T[:3, :3] @ _in_link(straight[last], end) + T[:3, 3] - end
     z = moved - (moved @ x) * x
     if is_jaw:
-        z = np.cross(
-            x, ends[1] - ends[0]
-        )  # as in a right hand, whose thumb is against the palm's y
+        # as in a right hand, whose thumb is against the palm's y
+        z = np.cross(x, ends[1] - ends[0])
     if np.linalg.norm(z) < 0.01:
         raise RobotError(
             "the fingers do not bend to one side when their joints move, so the palm's inner side is unknown."

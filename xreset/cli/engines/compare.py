@@ -63,9 +63,8 @@ def compare(
             motion, robot=robot, objects=objects, only=only, accept=("demos", "motion")
         )
         grasped = loaded.motion(lambda done, total: bar.update(task, completed=done, total=total))
-        inputs = {
-            "motion": file_hash(motion)
-        }  # now: after minutes of work the file may be another, or gone
+        # now: after minutes of work the file may be another, or gone
+        inputs = {"motion": file_hash(motion)}
         result = agreement.compare(
             loaded.robot,
             loaded.objects,

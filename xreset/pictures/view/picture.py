@@ -23,9 +23,8 @@ class Drawer:
         self, view: View, *, size: tuple[int, int] = (640, 480), smooth: bool = False
     ) -> None:
         """Prepare the meshes; see :class:`~xreset.pictures.render.Renderer` for the options."""
-        robot = view.robot or load_robot(
-            robot_names()[0]
-        )  # a scene needs one; it is drawn only if the view has one
+        # a scene needs one; it is drawn only if the view has one
+        robot = view.robot or load_robot(robot_names()[0])
         self._view = view
         self._renderer = Renderer(
             SceneSpec(robot=robot, objects=view.objects), size=size, smooth=smooth

@@ -173,9 +173,8 @@ def _reseeded(problem: ArmProblem, missed: Tensor) -> tuple[Tensor, Tensor]:
     starts = _first_frames(alone)  # [C, K, n]
     count = starts.shape[1]
     is_new = torch.ones(starts.shape[:2], dtype=torch.bool)
-    is_new[:, 1:] = (starts[:, 1:] != starts[:, :-1]).any(
-        -1
-    )  # frames with fewer solutions repeat the last one
+    # frames with fewer solutions repeat the last one
+    is_new[:, 1:] = (starts[:, 1:] != starts[:, :-1]).any(-1)
     start = starts.flatten(0, 1)
     kept = (alone.repeated(count).reasons(start[:, None])[:, 0] == 0) & is_new.flatten()
     start = start[kept]
@@ -187,9 +186,8 @@ def _reseeded(problem: ArmProblem, missed: Tensor) -> tuple[Tensor, Tensor]:
     if not len(seed):
         return owner, paths
     steps = torch.arange(int(torch.maximum(seed, frames - 1 - seed).max()) + 1)
-    both_ways = torch.cat((seed[:, None] + steps, seed[:, None] - steps)).clamp(
-        0, frames - 1
-    )  # [2B, N] frames
+    # [2B, N] frames
+    both_ways = torch.cat((seed[:, None] + steps, seed[:, None] - steps)).clamp(0, frames - 1)
     followed = follow(problem[owner.repeat(2)[:, None], both_ways], start.repeat(2, 1))
     row = torch.arange(len(owner)).repeat(2)
     for step in reversed(steps.tolist()):  # the first visit of a frame is the one that stays
@@ -267,9 +265,8 @@ def splice(
     value = worth[:, :, 0] - cost[:, :, 0]
     came_from: list[Tensor] = []
     for t in range(1, frames):
-        change = (
-            (paths[:, None, :, t] - paths[:, :, None, t - 1]).abs().amax(-1)
-        )  # [S, K before, K now]
+        # [S, K before, K now]
+        change = (paths[:, None, :, t] - paths[:, :, None, t - 1]).abs().amax(-1)
         jumps = (change > jump) & annotated[:, t - 1, None, None]
         total = value[:, :, None] - switch + worth[:, None, :, t] * (~jumps).to(paths.dtype)
         most, before = total.max(dim=1)

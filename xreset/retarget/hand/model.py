@@ -179,9 +179,8 @@ class HandModel:
         identity = torch.eye(3, dtype=links.pos.dtype, device=links.pos.device).expand(
             *links.pos.shape[:-1], 3, 3
         )
-        turn = torch.linalg.cross(
-            identity, (links.pos - root_pos[:, None])[..., None, :]
-        )  # row i: e_i x r
+        # row i: e_i x r
+        turn = torch.linalg.cross(identity, (links.pos - root_pos[:, None])[..., None, :])
         return links._replace(
             linear=torch.cat((links.linear, identity, turn.mT), dim=-1),
             angular=torch.cat((links.angular, torch.zeros_like(identity), identity), dim=-1),

@@ -5,7 +5,7 @@
 E_coll = w sum of [margin - height]_+^2 over the lowest points above the table of the hand and of each of the arm's
 links.
 
-Shape letters: B batch (sequences, branches or restarts), n arm joints, C carriers.
+Shape letters: B batch (sequences, branches or restarts), n arm joints, C carriers, G links with support points.
 """
 
 from __future__ import annotations
@@ -85,9 +85,11 @@ def system(frame: ArmProblem, q: Tensor, previous: Tensor | None = None) -> Quad
         scale = config.smoothness_weight**0.5
         residuals.append(scale * (q - previous))
         jacobians.append(scale * torch.eye(q.shape[1], dtype=q.dtype).expand(len(q), -1, -1))
-    height, lever = model.lowest(origins, rot, frame.support)
+    low = model.low_points(origins, rot, frame.hand_poses, config.table_margin)
+    at = (low.frame, low.carrier)
+    lift = linear[at] + torch.linalg.cross(angular[at], low.lever[..., None], dim=1)
     scale = config.collision_weight**0.5
-    lift = (linear + torch.linalg.cross(angular, lever[..., None], dim=2))[:, :, 2]
-    residuals.append(scale * (config.table_margin - height).clamp_min(0.0))
-    jacobians.append(-scale * lift * (height < config.table_margin)[..., None])
+    value = scale * (config.table_margin - low.height)
+    residuals.append(q.new_zeros(linear.shape[:2]).index_put(at, value))
+    jacobians.append(q.new_zeros(linear[:, :, 0].shape).index_put(at, -scale * lift[:, 2]))
     return Quadratic.of_residuals(torch.cat(residuals, dim=1), torch.cat(jacobians, dim=1))

@@ -1,13 +1,12 @@
 """A robot as its arm's inverse kinematics sees it, the path that the arm should follow, and how well joints do it.
 
-Shape letters: S sequences, T frames, B batch, n arm joints, J_hand hand joints, J all joints, C carriers, Q support
-points.
+Shape letters: S sequences, T frames, B batch, n arm joints, J_hand hand joints, J all joints, L links, C carriers, G
+links with support points.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Self
 
 import numpy as np
@@ -15,6 +14,7 @@ import torch
 from torch import Tensor
 
 from xreset.errors import RobotError
+from xreset.geometry.balls import bounding_balls
 from xreset.geometry.collision import (
     SelfCollision,
     height_above_table,
@@ -55,6 +55,20 @@ class ArmTargets(Tensors):
         return self.map(lambda x: x.flip(1))
 
 
+@dataclass(frozen=True, kw_only=True)
+class LowPoints(Tensors):
+    """Points of the robot that are low above the table (length A)."""
+
+    frame: Tensor
+    """[A] index in the batch."""
+    carrier: Tensor
+    """[A] index of the link that carries the point."""
+    height: Tensor
+    """[A] height of the robot's shape there above the table [m]."""
+    lever: Tensor
+    """[A, 3] from the carrier's origin to the center of the lowest ball, along the world's axes [m]."""
+
+
 class ArmModel:
     """A robot as its arm's inverse kinematics sees it."""
 
@@ -88,56 +102,69 @@ class ArmModel:
         )
         """Links whose motion the arm's joints determine: the hand root, which carries the hand, then the arm's
         links."""
+        carrier_of = {link: 0 if link in in_hand else self.carriers.index(link) for link in names}
         self.arm_collision = SelfCollision(robot, self.kinematics, moved_by_arm=True)
         """Distances that the arm's joints change."""
         self._hand_collision = SelfCollision(robot, self.hand, only=robot.self_collision_links)
 
         support = table_points(robot, self.kinematics)
-        carrier = np.array(
-            [0 if link in in_hand else self.carriers.index(link) for link in support.links]
-        )
-        order = np.argsort(carrier, kind="stable")
-        starts = np.searchsorted(carrier[order], np.arange(len(self.carriers) + 1)).tolist()
-        self._own = [slice(*ends) for ends in pairwise(starts)]
-        """Support points of each carrier."""
-        self._hand_links = [support.links[i] for i in order[self._own[0]]]
-        """Link of each of the hand's support points."""
+        links = sorted(dict.fromkeys(support.links), key=lambda link: link not in in_hand)
+        self._supported_in_hand = [link for link in links if link in in_hand]
+        """Links with support points; those of the hand come first."""
+        self._carrier = torch.tensor([carrier_of[link] for link in links], dtype=torch.long)
+        """[G] carrier of each link with support points."""
+        rows = [(np.array(support.links) == link).nonzero()[0] for link in links]
+        self._count = torch.tensor([len(own) for own in rows], dtype=torch.long)
+        """[G] number of support points of each link; those of one link follow one another."""
+        order = np.concatenate([np.zeros(0, dtype=int), *rows])
         self._points = torch.as_tensor(support.points[order])
         self._radii = torch.as_tensor(support.radii[order])
+        centers = [support.points[part] for part in rows]
+        self._middles, self._reach = bounding_balls(centers, [support.radii[part] for part in rows])
+        """A ball around the support points of each link, in the link's frame."""
 
-    def support_points(self, hand_joints: Tensor) -> Tensor:
-        """[..., Q, 3] points that may touch the table, in the frames of their carriers: only the hand's move there."""
-        points = self._points.repeat(*hand_joints.shape[:-1], 1, 1)
-        hand = self._own[0]
-        if self._hand_links:
-            points[..., hand, :] = self.hand.points(
-                hand_joints, self._hand_links, self._points[hand]
-            )
-        return points
+    def hand_poses(self, hand_joints: Tensor) -> Tensor:
+        """[..., G, 4, 4] links with support points in the frames of their carriers: only those of the hand move
+        there."""
+        poses = torch.eye(4, dtype=hand_joints.dtype).repeat(
+            *hand_joints.shape[:-1], len(self._carrier), 1, 1
+        )
+        moving = self._supported_in_hand
+        if moving:
+            poses[..., : len(moving), :, :] = self.hand.link_poses(hand_joints, moving)
+        return poses
 
-    def lowest(self, pos: Tensor, rot: Tensor, support: Tensor) -> tuple[Tensor, Tensor]:
-        """Find the lowest point of each carrier's shapes.
+    def low_points(self, pos: Tensor, rot: Tensor, hand_poses: Tensor, below: float) -> LowPoints:
+        """Find the lowest point of each carrier's shapes, where it is lower above the table than ``below`` [m].
 
         Args:
             pos: [B, C, 3] carriers' origins.
             rot: [B, C, 3, 3] their orientations.
-            support: [B, Q, 3] see :meth:`support_points`.
-
-        Returns:
-            Its height [B, C] above the table [m], infinite where there is none, and the lever [B, C, 3] from the
-            carrier's origin to the center of the lowest ball, along the world's axes [m].
+            hand_poses: [B, G, 4, 4] see :meth:`hand_poses`.
+            below: [m]
         """
-        height = pos.new_full(pos.shape[:2], torch.inf)
-        lever = torch.zeros_like(pos)
-        for carrier, own in enumerate(self._own):
-            if own.start < own.stop:
-                levers = matvec(rot[:, carrier, None], support[:, own])
-                heights = height_above_table(
-                    levers + pos[:, carrier, None], self._radii[own], self.table
-                )
-                height[:, carrier], lowest = heights.min(dim=1)
-                lever[:, carrier] = levers[torch.arange(len(pos)), lowest]
-        return height, lever
+        turn = hand_poses[..., :3, :3]
+        shift = hand_poses[..., :3, 3]
+        middle = shift + matvec(turn, self._middles)  # [B, G, 3]
+        height = pos[:, self._carrier, 2] + (rot[:, self._carrier, 2] * middle).sum(-1)
+        frame, link = (height - self._reach < below).nonzero(as_tuple=True)
+        count = self._count[link]
+        position = torch.repeat_interleave(count)
+        before = self._count.cumsum(0)[link] - count.cumsum(0)
+        point = torch.arange(len(position)) + before[position]
+        row = frame[position]
+        own = link[position]
+        carrier = self._carrier[own]
+        local = shift[row, own] + matvec(turn[row, own], self._points[point])
+        lever = matvec(rot[row, carrier], local)
+        heights = height_above_table(lever + pos[row, carrier], self._radii[point], self.table)
+        low = LowPoints(frame=row, carrier=carrier, height=heights, lever=lever)[heights < below]
+        low = low[low.height.argsort(stable=True)]
+        key = low.frame * len(self.carriers) + low.carrier
+        order = key.argsort(stable=True)
+        is_first = torch.ones_like(order, dtype=torch.bool)
+        is_first[1:] = key[order].diff() != 0
+        return low[order[is_first]]
 
     def hand_clearance(self, hand_joints: Tensor) -> Tensor:
         """[...] smallest signed distance between those of the hand's shapes that collide in physics [m]."""
@@ -158,15 +185,15 @@ class ArmModel:
 class ArmProblem(ArmTargets):
     """Targets that paths are searched for. An index selects sequences, or some of their frames."""
 
-    support: Tensor
-    """[S, T, Q, 3] see :meth:`ArmModel.support_points`; computed once from the targets."""
+    hand_poses: Tensor
+    """[S, T, G, 4, 4] see :meth:`ArmModel.hand_poses`; computed once from the targets."""
     model: ArmModel
     thresholds: Thresholds
     config: ArmConfig
 
     def repeated(self, count: int) -> ArmProblem:
         """Return the problem with every sequence repeated, copies next to each other: [S count, ...]."""
-        return self[torch.arange(len(self.support)).repeat_interleave(count)]
+        return self[torch.arange(len(self.hand_poses)).repeat_interleave(count)]
 
     def measures(self, joints: Tensor) -> Measures:
         """Measure every frame [S, T] of the paths ``joints`` [S, T, n]."""
@@ -174,8 +201,11 @@ class ArmProblem(ArmTargets):
         shape = joints.shape[:2]
         poses = model.kinematics.link_poses(model.full(joints, self.hand_joints).flatten(0, 1))
         carriers = poses[:, [model.kinematics.link_index(link) for link in model.carriers]]
-        height, _ = model.lowest(
-            carriers[..., :3, 3], carriers[..., :3, :3], self.support.flatten(0, 1)
+        low = model.low_points(
+            carriers[..., :3, 3], carriers[..., :3, :3], self.hand_poses.flatten(0, 1), _SEARCH
+        )
+        height = poses.new_full((len(poses),), _SEARCH).scatter_reduce(
+            0, low.frame, low.height, "amin"
         )
         clearance = torch.as_tensor(model.arm_collision.clearance(poses.numpy(), _SEARCH)).view(
             shape
@@ -191,7 +221,7 @@ class ArmProblem(ArmTargets):
             ),
             at_limit=at_limit.any(-1),
             arm_jump=arm_jump(joints, self.annotated),
-            table_clearance=height.amin(1).clamp_max(_SEARCH).view(shape),
+            table_clearance=height.view(shape),
             self_clearance=torch.minimum(clearance, self.hand_clearance),
         )
 

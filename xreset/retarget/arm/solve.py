@@ -11,7 +11,8 @@ valid frames wins, because the first frame does not show which branch lasts. Whe
 backwards from the last frame: the branch that reaches the goal may look worse than others at the start. Where the wrist
 is still missed, some of those frames are solved again and followed both ways, and all paths are spliced into one.
 
-Shape letters: S sequences, T frames, K paths of a sequence, B paths of all, C chosen frames, n arm joints.
+Shape letters: S sequences, T frames, K paths of a sequence, B paths of all, C chosen frames, n arm joints, G links with
+support points.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ def track(
     problem = ArmProblem(
         **vars(targets),
         model=model,
-        support=model.support_points(targets.hand_joints),
+        hand_poses=model.hand_poses(targets.hand_joints),
         thresholds=thresholds,
         config=config or ArmConfig(),
     )
@@ -201,7 +202,7 @@ def _first_frames(problem: ArmProblem) -> Tensor:
     model = problem.model
     config = problem.config
     home = model.home
-    sequences = len(problem.support)
+    sequences = len(problem.hand_poses)
     generator = torch.Generator().manual_seed(config.seed)  # every sequence gets the same starts
     spread = (
         torch.rand(config.restarts, len(home), generator=generator, dtype=home.dtype) * 2.0 - 1.0

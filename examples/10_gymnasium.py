@@ -16,7 +16,7 @@ def main(bank: Path, iterations: int = 3, num_envs: int = 8) -> None:
     """Train actor and critic on the flat observations for a few iterations; ``bank``: a file of example 02."""
     robot, states = xreset.load_robot("openarm"), xreset.read_bank(bank)
     objects, joints = [xreset.load_object(name) for name in states.object_names], len(robot.joints)
-    # says so where gymnasium is missing
+    # an error says what to install if gymnasium is missing
     envs = xreset.VectorEnv(xreset.make_env(robot, objects, states, num_envs=num_envs))
 
     def flat(seen) -> torch.Tensor:

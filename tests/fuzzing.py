@@ -96,7 +96,7 @@ def readers() -> Iterator[dict[str, Reader]]:
     from xreset.spec import SceneSpec
     from xreset.task.config import ObservationConfig, TaskConfig
 
-    # what is left aside of a file is said; here it would be said ten thousand times
+    # readers log what they leave out of a file; here they would log it ten thousand times
     logging.disable(logging.WARNING)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

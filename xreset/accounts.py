@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -64,17 +63,19 @@ def accounts(
         "post-contact": post_contact,
         "both": np.ones(len(reason), dtype=bool),
     }
-    names = np.unique(object_name).tolist()
-    rows = []
-    for name, phase in [*product(names, list(of_phase)[:2]), *product(["all"], of_phase)]:
-        chosen = of_phase[phase]
-        if name != "all":
-            chosen = chosen & (object_name == name)
+
+    def account(name: str, phase: Phase, chosen: np.ndarray) -> Account:
         counts = Counter(reason[chosen].tolist())
         kept = counts.pop("", 0)
-        rows.append(
-            Account(object_name=name, phase=phase, kept=kept, lost=dict(counts.most_common()))
-        )
+        return Account(object_name=name, phase=phase, kept=kept, lost=dict(counts.most_common()))
+
+    rows = []
+    phases: tuple[Phase, ...] = ("pre-contact", "post-contact")
+    for name in np.unique(object_name).tolist():
+        for phase in phases:
+            rows.append(account(name, phase, of_phase[phase] & (object_name == name)))
+    for phase, chosen in of_phase.items():
+        rows.append(account("all", phase, chosen))
     return rows
 
 

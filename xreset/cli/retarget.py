@@ -64,8 +64,9 @@ def retarget(
         inputs={"demos": file_hash(demos), "robot": spec.fingerprint}
         | {f"object {s.name}": s.source for s in specs.values()},
     )
-    write_accounts(accounts_path(out), of="frames", rows=result.accounts())
-    annotated = [row.without("not annotated") for row in result.accounts()]
+    accounts = result.accounts()
+    write_accounts(accounts_path(out), of="frames", rows=accounts)
+    annotated = [row.without("not annotated") for row in accounts]
     show_accounts(annotated, f"annotated frames retargeted to {result.robot}: those that are valid")
     tips = result.hand_error[result.annotated]
     if len(tips):

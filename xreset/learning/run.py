@@ -112,7 +112,7 @@ def policy_file(policy: str | Path, *, also: Sequence[str] = ()) -> Path:
     Raises:
         PolicyError: there is none of that name.
     """
-    if os.path.isdir(policy):
+    if os.path.isdir(policy):  # unlike Path.is_dir, it takes names of any length
         # rsl-rl, which playing a file does not need
         from xreset.learning.export import ensure_policy
 

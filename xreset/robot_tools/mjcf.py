@@ -93,7 +93,8 @@ def _check_sizes(path: Path, root: ElementTree.Element) -> None:
                     entries *= float(text)
         if entries > _MOST:
             raise RobotError(
-                f"{path}: a {element.tag} has {entries:.3g} entries, which is too many."
+                f"{path}: a {element.tag} has {entries:.3g} entries, expected at most {_MOST}. "
+                "Leave it out: robots need none."
             )
 
 

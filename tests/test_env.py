@@ -366,9 +366,9 @@ class RobustnessTest(WithEnv):
         )
         for scale in (0.0, 0.5):
             env = self.make(faulty)
-            env.variation.fault_scale.fill_(scale)
+            env.drawn.fault_scale.fill_(scale)
             env.reset()
-            kept = env.variation.lasting
+            kept = env.drawn.lasting
             for name in (
                 "commands.delay",
                 "poses.delay",
@@ -390,10 +390,9 @@ class RobustnessTest(WithEnv):
         config = RandomizationConfig(
             observation_latency=(2.0, 2.0), tracker=TrackerConfig(jitter=3.0)
         )
-        tracker = Tracker(drawn, config, torch.ones(()))
+        tracker = Tracker(drawn, config)
         generator = torch.Generator().manual_seed(0)
-        for value, kept in drawn.draw(generator):
-            kept.copy_(value)
+        drawn.draw(torch.ones(200, dtype=torch.bool), generator)
         upright = torch.tensor([1.0, 0, 0, 0]).expand(200, 4)
         for step in range(4):
             now = torch.full((200, 3), float(step))

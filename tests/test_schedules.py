@@ -26,7 +26,7 @@ class ScheduleTest(unittest.TestCase):
     def test_a_training_moves_its_limit_of_success_and_its_faults(self):
         """On straight lines between the points."""
         env = mock.Mock(success_position=torch.zeros(()))
-        env.variation.fault_scale = torch.zeros(())
+        env.drawn.fault_scale = torch.zeros(())
         schedule = ScheduleConfig(
             success_position=((0.2, 0.05), (1.0, 0.01)), faults=((0.0, 0.0), (0.5, 1.0))
         )
@@ -39,7 +39,7 @@ class ScheduleTest(unittest.TestCase):
         ):
             TrainingRunner._follow_schedule(runner, progress)
             self.assertAlmostEqual(float(env.success_position), limit)
-            self.assertAlmostEqual(float(env.variation.fault_scale), scale)
+            self.assertAlmostEqual(float(env.drawn.fault_scale), scale)
 
 
 if __name__ == "__main__":

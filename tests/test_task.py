@@ -34,7 +34,7 @@ from xreset.task.config import (
     evaluation_task,
 )
 from xreset.task.latency import DelayLine
-from xreset.task.randomization import pair_friction, sample_friction
+from xreset.task.randomization import Drawn, pair_friction, sample_friction
 from xreset.task.rewards import RewardInput, compute_reward, contact_gate
 from xreset.task.terminations import out_of_bounds
 
@@ -322,8 +322,9 @@ class ActionTest(WithRobot):
 
 class LatencyTest(unittest.TestCase):
     def test_values_come_late_and_are_mixed_between_whole_steps(self):
-        line = DelayLine(torch.zeros(4, 1), 2.0)
-        line.delay.copy_(torch.tensor([[0.0], [1.0], [1.5], [2.0]]))
+        drawn = Drawn(4, torch.device("cpu"))
+        line = DelayLine(drawn, "line", 1, 2.0, lambda _: torch.tensor([0.0, 1.0, 1.5, 2.0]))
+        drawn.draw(torch.ones(4, dtype=torch.bool), generator())
         line.fill(torch.ones(4, dtype=torch.bool), torch.zeros(4, 1))
         heard = [
             line.push(torch.full((4, 1), float(value)))[:, 0].tolist() for value in (10, 20, 30)

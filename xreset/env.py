@@ -25,6 +25,7 @@ from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 from xreset.task import observations as obs
 from xreset.task.actions import ActionSpace
 from xreset.task.config import TaskConfig
+from xreset.task.randomization import Drawn
 from xreset.task.reading import Reading, step_log
 from xreset.task.rewards import Reward, RewardInput, compute_reward, own_term
 from xreset.task.terminations import episode_steps, out_of_bounds
@@ -120,6 +121,7 @@ class ManipulationEnv:
         success_position: [] limit of success [m], ``task.reward.success_position`` unless it is filled with another.
         nonfinite_count: [] number of episodes that ended because a number was not finite.
         overflow_count: [] number of episodes that ended because the engine dropped contacts.
+        drawn: what is drawn at each reset in addition to the start.
         variation: differences between the worlds, such as masses and delays.
         vision: the cameras; None: the task has none.
     """
@@ -213,14 +215,15 @@ class ManipulationEnv:
             "proprio"
         ]
         randomization = self.task.randomization
+        self.drawn = Drawn(self.num_envs, self.device)
         self.variation = Variation(
-            self.backend, randomization, self.actions.is_arm, sum(proprio.values())
+            self.drawn, self.backend, randomization, self.actions.is_arm, sum(proprio.values())
         )
         self.vision: Vision | None = None
         if self.task.vision.cameras:
             from xreset.task.vision import Vision  # Warp, which other tasks do not need
 
-            self.vision = Vision(self.backend, self.task)
+            self.vision = Vision(self.drawn, self.backend, self.task)
         self._log_names: tuple[str, ...] = ()
         self._log_values = torch.zeros(0, device=self.device)
         self._observations = TensorDict({}, batch_size=[self.num_envs], device=self.device)
@@ -397,9 +400,8 @@ class ManipulationEnv:
     @property
     def _lasting(self) -> dict[str, Any]:
         """Buffers that carry each world from step to step, in addition to the engine's state."""
-        seen = {} if self.vision is None else self.vision.lasting
         own = {name: getattr(self, name) for name in _LASTING}
-        return own | self.variation.lasting | seen | dict(self._observations.items())
+        return own | self.drawn.lasting | dict(self._observations.items())
 
     # Parts
 
@@ -492,11 +494,7 @@ class ManipulationEnv:
         if from_distribution:
             start.map(Tensor.copy_, self.resets.sample(self.backend.object_index, self.generator))
         self.variation.begin(fresh, start.joint_target)
-        for new, old in (
-            *self.variation.draw(self.generator),
-            *(self.vision.draw(self.generator) if self.vision is not None else ()),
-        ):
-            old.copy_(where(fresh, new, old))
+        self.drawn.draw(fresh, self.generator)
         self._episode.map(Tensor.copy_, where(fresh, start, self._episode))
         for cleared in (self._episode_length, self._previous_action, self._reward, self._over):
             cleared.masked_fill_(fresh.view(-1, *[1] * (cleared.ndim - 1)), 0)

@@ -399,6 +399,10 @@ class RandomizationConfig(Checked):
             getattr(self, name) != getattr(_AS_STATED, name) for name in names
         )
 
+    def longest(self, name: str) -> float:
+        """Return the largest delay of a range [control steps]; 0: there is none."""
+        return (getattr(self, name) or (0.0, 0.0))[1] if self.enabled else 0.0
+
     @property
     def scales_drives(self) -> bool:
         """Whether drives differ from what the robot spec says."""
@@ -451,7 +455,7 @@ class TaskConfig(Checked):
         super().__post_init__()
         steps = self.termination.episode_seconds / (self.timestep * self.substeps)
         for name in ("action_latency", "hand_latency", "observation_latency", "proprio_latency"):
-            longest = (getattr(self.randomization, name) or (0.0, 0.0))[1]
+            longest = self.randomization.longest(name)
             if longest >= steps:
                 raise ValueError(
                     f"{name} goes up to {longest:g} control steps, expected fewer than the {steps:.0f} of an episode"

@@ -7,31 +7,50 @@ import math
 import torch
 from torch import Tensor
 
+from xreset.task.randomization import Drawn, Sample
+
 
 class DelayLine:
-    """The last values of N worlds, newest first.
+    """The last values of N worlds, newest first, each read back after a delay that is drawn at a reset.
 
-    All work is done in fixed buffers, so that it can be captured in a graph.
+    All work is done in fixed buffers, so that it can be captured in a graph. A line without delay has no buffers.
     """
 
-    def __init__(self, like: Tensor, longest: float, *, by_column: bool = False) -> None:
+    def __init__(
+        self,
+        drawn: Drawn,
+        name: str,
+        width: int,
+        longest: float,
+        sample: Sample,
+        *,
+        by_column: bool = False,
+        is_fault: bool = True,
+    ) -> None:
         """Allocate.
 
         Args:
-            like: [N, D] the delayed quantity.
+            drawn: what lasts and is drawn; the line adds its buffers.
+            name: the buffers' name.
+            width: D, numbers of a value.
             longest: largest delay [steps].
+            sample: draws the delays [steps].
             by_column: whether each of the D numbers has a delay of its own.
+            is_fault: see :meth:`Drawn.keep`.
         """
-        self.values = torch.zeros(
-            like.shape[0], math.ceil(longest) + 1, like.shape[1], device=like.device
-        )
-        """[N, K, D]"""
-        self.delay = torch.zeros_like(like if by_column else like[:, :1])
-        """[N, 1] steps, or [N, D]."""
+        self.longest = longest
+        if longest:
+            steps = math.ceil(longest) + 1
+            self.values = drawn.keep(f"{name}.values", drawn.zeros(steps, width))
+            """[N, K, D]"""
+            delays = drawn.zeros(width if by_column else 1)
+            self.delay = drawn.keep(f"{name}.delay", delays, sample, is_fault=is_fault)
+            """[N, 1] steps, or [N, D]."""
 
     def fill(self, fresh: Tensor, value: Tensor) -> None:
         """Make a value [N, D] the whole past of the worlds of a mask [N]."""
-        self.values.copy_(torch.where(fresh[:, None, None], value[:, None], self.values))
+        if self.longest:
+            self.values.copy_(torch.where(fresh[:, None, None], value[:, None], self.values))
 
     def push(self, value: Tensor, delay: Tensor | None = None) -> Tensor:
         """Add the newest value [N, D] and return the delayed one [N, D], interpolated between whole steps.
@@ -39,6 +58,8 @@ class DelayLine:
         Args:
             delay: delay in this step, like :attr:`delay`; None: this attribute.
         """
+        if not self.longest:
+            return value
         self.values.copy_(torch.cat((value[:, None], self.values[:, :-1]), dim=1))
         delay = self.delay if delay is None else delay
         whole = delay.floor()

@@ -10,7 +10,7 @@ from torch import Tensor
 from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
 from xreset.physics import Backend, State
 from xreset.task.config import PushConfig
-from xreset.task.randomization import Drawn, sample_offset, sample_range
+from xreset.task.randomization import Drawn, sample_offset, sample_range, symmetric, uniform
 
 
 class Pushes:
@@ -22,35 +22,28 @@ class Pushes:
         gate: [N] bool, whether the reward's gate was open after the last step.
     """
 
-    def __init__(self, faults: Drawn, backend: Backend, config: PushConfig, is_arm: Tensor) -> None:
-        """Allocate, and have the probabilities drawn with the other ``faults``; ``is_arm`` [J] bool."""
+    def __init__(self, drawn: Drawn, backend: Backend, config: PushConfig, is_arm: Tensor) -> None:
+        """Allocate, and have the probabilities drawn with all that is drawn at a reset; ``is_arm`` [J] bool."""
         self.config = config
-        n = backend.num_worlds
-        device = backend.device
         low, high = (log(limit) for limit in config.probability)
         scene = backend.scene
         self._control_dt = scene.control_dt
-        self._inertia = torch.stack(
-            [torch.as_tensor(o.inertia / o.mass, dtype=torch.float32) for o in scene.objects]
-        )
-        self._inertia = self._inertia.to(device)[backend.object_index]
+        inertia = [torch.as_tensor(o.inertia / o.mass, dtype=torch.float32) for o in scene.objects]
+        self._inertia = torch.stack(inertia).to(backend.device)[backend.object_index]
         """[N, 3, 3] for a mass of 1 kg, in the mesh frame."""
-        effort_over_stiffness = [
-            joint.drive.effort / joint.drive.kp for joint in scene.robot.joints
-        ]
-        self._largest_offset = torch.where(
-            is_arm, torch.tensor(effort_over_stiffness, device=device), 0.0
-        )
-        self._largest_offset *= config.arm_torque
-        self._probability = faults.keep(
+        drives = [joint.drive for joint in scene.robot.joints]
+        offsets = torch.tensor([each.effort / each.kp for each in drives], device=backend.device)
+        self._largest_offset = torch.where(is_arm, offsets, 0.0) * config.arm_torque
+        self._probability = drawn.keep(
             "pushes.probability",
-            faults.zeros(),
-            lambda generator: sample_range(n, (low, high), generator).exp(),
+            drawn.zeros(),
+            lambda generator: sample_range(drawn.num_worlds, (low, high), generator).exp(),
+            is_fault=True,
         )
         """[N] of a push in a control step."""
-        self.force = faults.zeros(3)
-        self.torque = faults.zeros(3)
-        self.gate = faults.keep("pushes.gate", faults.zeros().bool())
+        self.force = drawn.zeros(3)
+        self.torque = drawn.zeros(3)
+        self.gate = drawn.keep("pushes.gate", drawn.zeros().bool())
 
     def act(
         self, state: State, mass: Tensor, inertia_scale: Tensor | float, generator: torch.Generator
@@ -65,10 +58,7 @@ class Pushes:
         """
         c = self.config
         n = len(mass)
-        happens = (
-            torch.rand(n, 3, generator=generator, device=generator.device)
-            < self._probability[:, None]
-        )
+        happens = uniform((n, 3), generator) < self._probability[:, None]
         if c.moves_object:
             allowed = happens[:, :2] if c.when == "always" else happens[:, :2] & self.gate[:, None]
             velocity = sample_offset(n, (0.0, c.object_velocity), generator) * allowed[:, :1]
@@ -77,8 +67,5 @@ class Pushes:
             local = quat_rotate_inverse(state.object_quat, spin)
             moment = (self._inertia @ local[..., None])[..., 0] * (mass * inertia_scale)[:, None]
             self.torque.copy_(quat_rotate(state.object_quat, moment) / self._control_dt)
-        size = (
-            2.0 * torch.rand(state.joint_pos.shape, generator=generator, device=generator.device)
-            - 1.0
-        )
+        size = symmetric(state.joint_pos.shape, generator)
         return self._largest_offset * size * happens[:, 2:]

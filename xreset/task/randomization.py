@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 
 import torch
 from torch import Tensor
 
 from xreset.task.config import RandomizationConfig
-from xreset.task.latency import DelayLine
+from xreset.tensors import where
 
 Sample = Callable[[torch.Generator], Tensor]
 """Draws new values of a buffer, as many as it has."""
@@ -20,6 +19,7 @@ class Drawn:
 
     Attributes:
         lasting: all buffers by name, for a snapshot.
+        fault_scale: [] factor on what is drawn of the faults of a real loop.
     """
 
     def __init__(self, num_worlds: int, device: torch.device) -> None:
@@ -27,41 +27,34 @@ class Drawn:
         self.num_worlds = num_worlds
         self.device = device
         self.lasting: dict[str, Tensor] = {}
-        self._samples: list[tuple[Sample, Tensor]] = []
+        self.fault_scale = torch.ones((), device=device)
+        self._samples: list[tuple[Sample, Tensor, bool]] = []
 
     def zeros(self, *shape: int) -> Tensor:
         """[N, ...] zeros that do not last."""
         return torch.zeros(self.num_worlds, *shape, device=self.device)
 
-    def keep(self, name: str, buffer: Tensor, sample: Sample | None = None) -> Tensor:
-        """Add a buffer [N, ...], and return it; ``sample`` None: it is not drawn."""
+    def keep(
+        self, name: str, buffer: Tensor, sample: Sample | None = None, *, is_fault: bool = False
+    ) -> Tensor:
+        """Add a buffer [N, ...], and return it.
+
+        Args:
+            sample: draws its values; None: it is not drawn.
+            is_fault: whether drawn values are multiplied by :attr:`fault_scale`.
+        """
         self.lasting[name] = buffer
         if sample is not None:
-            self._samples.append((sample, buffer))
+            self._samples.append((sample, buffer, is_fault))
         return buffer
 
-    def ranged(self, name: str, limits: tuple[float, float], *shape: int) -> Tensor:
-        """Add a buffer [N, ...] with a uniform number of a range for each world, and return it."""
-        return self.keep(name, self.zeros(*shape), partial(sample_range, self.num_worlds, limits))
-
-    def delay_line(
-        self,
-        name: str,
-        width: int,
-        longest: float,
-        sample: Sample | None,
-        *,
-        by_column: bool = False,
-    ) -> DelayLine:
-        """Add a :class:`DelayLine` of [N, ``width``] whose delays are drawn, and return it."""
-        line = DelayLine(self.zeros(width), longest, by_column=by_column)
-        self.keep(f"{name}.values", line.values)
-        self.keep(f"{name}.delay", line.delay, sample)
-        return line
-
-    def draw(self, generator: torch.Generator) -> list[tuple[Tensor, Tensor]]:
-        """Draw for every world; return pairs of the drawn values [N, ...] and the buffer that they belong to."""
-        return [(sample(generator).view_as(buffer), buffer) for sample, buffer in self._samples]
+    def draw(self, fresh: Tensor, generator: torch.Generator) -> None:
+        """Draw for every world, so that nothing waits for their number; the worlds of a mask [N] take the values."""
+        for sample, buffer, is_fault in self._samples:
+            values = sample(generator).view_as(buffer)
+            if is_fault:
+                values = values * self.fault_scale
+            buffer.copy_(where(fresh, values, buffer))
 
 
 def pair_friction(
@@ -104,10 +97,20 @@ def own_friction(materials: Sequence[float | None], c: RandomizationConfig) -> T
     )
 
 
+def uniform(shape: Sequence[int], generator: torch.Generator) -> Tensor:
+    """Uniform numbers in [0, 1)."""
+    return torch.rand(shape, generator=generator, device=generator.device)
+
+
+def symmetric(shape: Sequence[int], generator: torch.Generator) -> Tensor:
+    """Uniform numbers in [-1, 1)."""
+    return 2.0 * uniform(shape, generator) - 1.0
+
+
 def sample_range(count: int, limits: tuple[float, float], generator: torch.Generator) -> Tensor:
     """[M] uniform numbers of a range."""
     low, high = limits
-    return low + (high - low) * torch.rand(count, generator=generator, device=generator.device)
+    return low + (high - low) * uniform((count,), generator)
 
 
 def sample_offset(count: int, limits: tuple[float, float], generator: torch.Generator) -> Tensor:
@@ -127,17 +130,13 @@ def sample_drives(
         is_arm: [J] bool.
         count: M.
     """
-    ranges = (
+    rows = []
+    for arm, hand in (
         (c.arm_stiffness, c.hand_stiffness),
         (c.arm_damping, c.hand_damping),
         (c.effort, c.effort),
-    )
-    rows = [
-        torch.where(
-            is_arm,
-            sample_range(count, arm, generator)[:, None],
-            sample_range(count, hand, generator)[:, None],
-        )
-        for arm, hand in ranges
-    ]
+    ):
+        of_arm = sample_range(count, arm, generator)[:, None]
+        of_hand = sample_range(count, hand, generator)[:, None]
+        rows.append(torch.where(is_arm, of_arm, of_hand))
     return torch.stack(rows, dim=1)

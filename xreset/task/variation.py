@@ -11,17 +11,19 @@ import torch
 from torch import Tensor
 
 from xreset.errors import CapabilityError
-from xreset.physics import Backend, State
+from xreset.physics import Backend, Parameter, Parameters, State
 from xreset.task.config import RandomizationConfig
 from xreset.task.latency import DelayLine
 from xreset.task.pushes import Pushes
 from xreset.task.randomization import (
     Drawn,
+    Sample,
     own_friction,
     sample_drives,
     sample_friction,
     sample_offset,
     sample_range,
+    uniform,
 )
 from xreset.task.tracker import Tracker
 
@@ -34,64 +36,31 @@ class Variation:
             episode.
         force_gain: [N, 1, 1] factor on the observed forces; None: 1.
         pushes: pushes on object and arm; None: there are none.
-        lasting: all buffers by name, for a snapshot.
-        fault_scale: [] factor on delays, lost actions, faults of the tracker and the probability of pushes.
     """
 
     def __init__(
-        self, backend: Backend, config: RandomizationConfig, is_arm: Tensor, proprio_width: int
+        self,
+        drawn: Drawn,
+        backend: Backend,
+        config: RandomizationConfig,
+        is_arm: Tensor,
+        proprio_width: int,
     ) -> None:
         """Allocate.
 
         Args:
+            drawn: what is drawn at each reset.
             is_arm: [J] bool.
             proprio_width: numbers in the observation group ``proprio``.
 
         Raises:
             CapabilityError: the engine cannot set a parameter that is drawn.
         """
-        scene = backend.scene
-        n = backend.num_worlds
         c = config
-        mass = torch.tensor([o.mass for o in scene.objects], device=backend.device)[
-            backend.object_index
-        ]
-        offset = own_friction([o.friction for o in scene.objects], c).to(backend.device)[
-            backend.object_index
-        ]
-
-        def friction(generator: torch.Generator) -> Tensor:
-            drawn = sample_friction(n, c, generator) + offset
-            return drawn.clamp(min=0.05)  # slippery, not negative
-
-        def torsional(generator: torch.Generator) -> Tensor:
-            return scene.friction.torsional * sample_range(n, c.torsional_friction, generator)
-
-        mass_scale = c.mass_scale if c.enabled else (1.0, 1.0)
-        self._physical = Drawn(n, backend.device)
-        self.parameters: dict[str, Tensor] = {}
-        for name, shape, is_drawn, sample in (
-            ("friction", (3,), True, friction),
-            (
-                "object_mass",
-                (),
-                True,
-                lambda generator: mass * sample_range(n, mass_scale, generator),
-            ),
-            ("drives", (3, len(is_arm)), c.scales_drives, partial(sample_drives, is_arm, n, c)),
-            ("torsional_friction", (), c.draws("torsional_friction"), torsional),
-            (
-                "object_inertia",
-                (),
-                c.draws("object_inertia"),
-                partial(sample_range, n, c.object_inertia),
-            ),
-            ("object_com", (3,), c.draws("object_com"), partial(sample_offset, n, c.object_com)),
-        ):
-            if is_drawn:
-                self.parameters[name] = self._physical.keep(
-                    name, self._physical.zeros(*shape), sample
-                )
+        n = drawn.num_worlds
+        self._is_arm = is_arm
+        self._config = config
+        self.parameters = self._keep_parameters(drawn, backend)
         pushed = c.draws("push")
         needed = [*self.parameters, *(["object_wrench"] if pushed and c.push.moves_object else [])]
         missing = [name.replace("_", " ") for name in needed if name not in backend.capabilities]
@@ -102,45 +71,68 @@ class Variation:
             )
         self.force_gain: Tensor | None = None
         if c.draws("force_gain"):
-            self.force_gain = self._physical.ranged("force_gain", c.force_gain, 1, 1)
-        self.fault_scale = torch.ones((), device=backend.device)
-        faults = Drawn(n, backend.device)
-        self._faults = faults
-        self._commands: DelayLine | None = None
-        if c.draws("action_latency", "hand_latency"):
-
-            def delay(generator: torch.Generator) -> Tensor:
-                of_arm = sample_range(n, c.action_latency, generator)[:, None]
-                of_hand = of_arm
-                if c.hand_latency is not None:
-                    of_hand = sample_range(n, c.hand_latency, generator)[:, None]
-                return torch.where(is_arm, of_arm, of_hand)
-
-            longest = max(c.action_latency[1], (c.hand_latency or (0.0, 0.0))[1])
-            self._commands = faults.delay_line(
-                "commands", len(is_arm), longest, delay, by_column=True
-            )
-        self._tracker = Tracker(faults, c, self.fault_scale)
-        self._proprio: DelayLine | None = None
-        if c.draws("proprio_latency"):
-            age = partial(sample_range, n, c.proprio_latency)
-            self._proprio = faults.delay_line("proprio", proprio_width, c.proprio_latency[1], age)
+            gain = partial(sample_range, n, c.force_gain)
+            self.force_gain = drawn.keep("force_gain", drawn.zeros(1, 1), gain)
+        longest = max(c.longest("action_latency"), c.longest("hand_latency"))
+        self._commands = DelayLine(
+            drawn, "commands", len(is_arm), longest, self._sample_action_latency, by_column=True
+        )
+        self._tracker = Tracker(drawn, c)
+        age = partial(sample_range, n, c.proprio_latency)
+        longest = c.longest("proprio_latency")
+        self._proprio = DelayLine(drawn, "proprio", proprio_width, longest, age)
         self._lost_actions: Tensor | None = None
         if c.draws("lost_actions"):
-            self._lost_actions = faults.ranged("lost_actions", c.lost_actions, 1)
-        self.pushes = Pushes(faults, backend, c.push, is_arm) if pushed else None
-        self.lasting = self._physical.lasting | faults.lasting
+            share = partial(sample_range, n, c.lost_actions)
+            self._lost_actions = drawn.keep("lost_actions", drawn.zeros(1), share, is_fault=True)
+        self.pushes = Pushes(drawn, backend, c.push, is_arm) if pushed else None
 
-    def draw(self, generator: torch.Generator) -> list[tuple[Tensor, Tensor]]:
-        """Draw for every world; return pairs of the drawn values [N, ...] and the buffer that they belong to."""
-        drawn = self._physical.draw(generator)
-        faults = self._faults.draw(generator)
-        return drawn + [(value * self.fault_scale, kept) for value, kept in faults]
+    def _keep_parameters(self, drawn: Drawn, backend: Backend) -> dict[str, Tensor]:
+        """Return the physical parameters that are drawn, by name."""
+        c = self._config
+        n = drawn.num_worlds
+        objects = backend.scene.objects
+        nominal = Parameters.nominal(backend.scene, backend.object_index).to(backend.device).given()
+        of_material = own_friction([o.friction for o in objects], c).to(backend.device)
+        offset = of_material[backend.object_index]
+
+        def friction(generator: torch.Generator) -> Tensor:
+            drawn_friction = sample_friction(n, c, generator) + offset
+            return drawn_friction.clamp(min=0.05)  # slippery, not negative
+
+        def scaled(name: Parameter, limits: tuple[float, float]) -> Sample:
+            return lambda generator: nominal[name] * sample_range(n, limits, generator)
+
+        parameters: dict[str, Tensor] = {}
+
+        def keep(name: Parameter, sample: Sample) -> None:
+            parameters[name] = drawn.keep(name, torch.zeros_like(nominal[name]), sample)
+
+        keep("friction", friction)
+        keep("object_mass", scaled("object_mass", c.mass_scale if c.enabled else (1.0, 1.0)))
+        if c.scales_drives:
+            keep("drives", partial(sample_drives, self._is_arm, n, c))
+        if c.draws("torsional_friction"):
+            keep("torsional_friction", scaled("torsional_friction", c.torsional_friction))
+        if c.draws("object_inertia"):
+            keep("object_inertia", scaled("object_inertia", c.object_inertia))
+        if c.draws("object_com"):
+            keep("object_com", partial(sample_offset, n, c.object_com))
+        return parameters
+
+    def _sample_action_latency(self, generator: torch.Generator) -> Tensor:
+        """[N, J] steps."""
+        c = self._config
+        n = len(self.parameters["object_mass"])
+        of_arm = sample_range(n, c.action_latency, generator)[:, None]
+        of_hand = of_arm
+        if c.hand_latency is not None:
+            of_hand = sample_range(n, c.hand_latency, generator)[:, None]
+        return torch.where(self._is_arm, of_arm, of_hand)
 
     def begin(self, fresh: Tensor, target: Tensor) -> None:
         """Fill the delay line of the worlds of a mask [N] with the start's joint targets [N, J]."""
-        if self._commands is not None:
-            self._commands.fill(fresh, target)
+        self._commands.fill(fresh, target)
         if self.pushes is not None:
             self.pushes.gate &= ~fresh
 
@@ -148,16 +140,12 @@ class Variation:
         """[N, J] the new joint targets, or the old ones in worlds whose action is lost."""
         if self._lost_actions is None:
             return new
-        lost = (
-            torch.rand(self._lost_actions.shape, generator=generator, device=new.device)
-            < self._lost_actions
-        )
+        lost = uniform(self._lost_actions.shape, generator) < self._lost_actions
         return torch.where(lost, old, new)
 
     def sent_targets(self, target: Tensor, state: State, generator: torch.Generator) -> Tensor:
         """[N, J] the joint targets that reach the drives in this step, moved where the arm is pushed."""
-        if self._commands is not None:
-            target = self._commands.push(target)
+        target = self._commands.push(target)
         if self.pushes is None:
             return target
         inertia_scale = self.parameters.get("object_inertia", 1.0)
@@ -170,7 +158,7 @@ class Variation:
 
         In the ``fresh`` worlds [N] the present values become the whole past.
         """
-        if self._proprio is None:
+        if not self._proprio.longest:
             return proprio
         self._proprio.fill(fresh, proprio)
         return self._proprio.push(proprio, self._proprio.delay.round())

@@ -20,60 +20,42 @@ class Vision:
 
     Attributes:
         cameras: the cameras.
-        lasting: all buffers by name, for a snapshot.
-        draw: :meth:`xreset.task.randomization.Drawn.draw`.
     """
 
-    def __init__(self, backend: Backend, task: TaskConfig) -> None:
-        """Allocate, and start the renderer; errors as of :class:`~xreset.cameras.sensor.Cameras`."""
+    def __init__(self, drawn: Drawn, backend: Backend, task: TaskConfig) -> None:
+        """Allocate, and start the renderer; ``drawn`` is what is drawn at each reset.
+
+        Raises:
+            XResetError: as of :class:`~xreset.cameras.sensor.Cameras`.
+        """
         self._backend = backend
         c = task.randomization
         vision = task.vision
+        n = drawn.num_worlds
         cameras = Cameras(
             backend.scene, backend.object_index, vision, scale=task.observation.cloud_scale
         )
         self.cameras = cameras
-        drawn = Drawn(backend.num_worlds, backend.device)
+        count = cameras.fov_scale.numel()
         for name, buffer, sample in (
-            (
-                "camera_shift",
-                cameras.shift,
-                partial(sample_offset, cameras.fov_scale.numel(), c.camera_shift),
-            ),
-            (
-                "camera_turn",
-                cameras.turn,
-                partial(sample_offset, cameras.fov_scale.numel(), c.camera_turn),
-            ),
-            (
-                "camera_fov",
-                cameras.fov_scale,
-                partial(sample_range, cameras.fov_scale.numel(), c.camera_fov),
-            ),
-            (
-                "camera_noise",
-                cameras.noise_scale,
-                partial(sample_range, backend.num_worlds, c.camera_noise),
-            ),
+            ("camera_shift", cameras.shift, partial(sample_offset, count, c.camera_shift)),
+            ("camera_turn", cameras.turn, partial(sample_offset, count, c.camera_turn)),
+            ("camera_fov", cameras.fov_scale, partial(sample_range, count, c.camera_fov)),
+            ("camera_noise", cameras.noise_scale, partial(sample_range, n, c.camera_noise)),
         ):
             drawn.keep(name, buffer, sample if c.draws(name) else None)
         drawn.keep("images", cameras.image)
         drawn.keep("views", cameras.view)
-        longest = vision.latency + (c.camera_latency[1] if c.enabled else 0.0)
-        self._delay: DelayLine | None = None
-        if round(longest):
 
-            def age(generator: torch.Generator) -> Tensor:
-                return (
-                    vision.latency + sample_range(backend.num_worlds, c.camera_latency, generator)
-                ).round()
+        def age(generator: torch.Generator) -> Tensor:
+            steps = torch.full((n,), vision.latency, device=drawn.device)
+            if c.draws("camera_latency"):
+                steps = steps + sample_range(n, c.camera_latency, generator)
+            return steps.round()
 
-            width = cameras.view[0].numel()
-            sample = age if c.draws("camera_latency") else None
-            self._delay = drawn.delay_line("delayed_views", width, longest, sample)
-            self._delay.delay.fill_(round(vision.latency))
-        self.lasting = drawn.lasting
-        self.draw = drawn.draw
+        width = cameras.view[0].numel()
+        longest = round(vision.latency + c.longest("camera_latency"))
+        self._delay = DelayLine(drawn, "delayed_views", width, longest, age, is_fault=False)
 
     def aim(self, state: State, goal_pos: Tensor, goal_quat: Tensor, episode_step: Tensor) -> None:
         """Put bodies and cameras where they are; arguments as of :meth:`Cameras.aim`, and control steps [N] since each
@@ -105,8 +87,6 @@ class Vision:
         In the ``fresh`` worlds [N] the present view becomes the whole past.
         """
         view = self.cameras.observe(generator)
-        if self._delay is None:
-            return view
         values = view.flatten(1)
         self._delay.fill(fresh, values)
         return self._delay.push(values).view_as(view)

@@ -9,7 +9,7 @@ from unittest import mock
 
 from tests.command import xreset as run
 from xreset.cli import COMMANDS
-from xreset.cli.engines import COMMANDS as ENGINES
+from xreset.cli.engines import COMMAND as ENGINES
 
 HEAVY = {
     "torch",

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tests.test_cli import run
 from xreset.cli import COMMANDS
-from xreset.cli.engines import COMMANDS as ENGINES
+from xreset.cli.engines import COMMAND as ENGINES
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

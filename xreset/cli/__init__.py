@@ -11,7 +11,7 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 from io import TextIOWrapper
-from typing import NoReturn
+from typing import Any, NoReturn
 
 COMMANDS: dict[str, str] = {
     "demos": "Import, synthesize, select, merge and describe human demonstrations.",
@@ -38,9 +38,8 @@ COMMANDS: dict[str, str] = {
 }
 """Command -> one line of help.
 
-The module ``xreset.cli.NAME`` has one of: ``COMMAND``, a function or a dictionary of sub-commands; ``command_for``,
-which makes the function from the arguments, if defaults depend on them; or ``COMMANDS`` of its own, whose modules are
-in its folder."""
+The module ``xreset.cli.NAME`` has ``COMMAND``, a function or a dictionary of sub-commands; or ``command_for``, which
+makes the function from the arguments, if defaults depend on them."""
 
 INVOCATION: list[str] = []
 """Arguments of the command that is running."""
@@ -63,7 +62,7 @@ def main(argv: list[str] | None = None) -> None:
         return
     INVOCATION[:] = argv
     try:
-        _run("", COMMANDS, argv)
+        _run(argv)
     except XResetError as error:
         _fail(argv, str(error))
     except KeyboardInterrupt:
@@ -83,54 +82,46 @@ def main(argv: list[str] | None = None) -> None:
 def _fail(argv: list[str], message: str) -> NoReturn:
     from xreset.text import plain
 
-    words = argv[:2] if argv[0] == "engines" else argv[:1]
-    print(f"xreset {' '.join(words)}: {plain(message)}", file=sys.stderr)
+    print(f"xreset {argv[0]}: {plain(message)}", file=sys.stderr)
     raise SystemExit(1) from None
 
 
-def _run(group: str, commands: dict[str, str], argv: list[str]) -> None:
-    """Run the command of a group that the first argument names."""
+def _run(argv: list[str]) -> None:
+    """Run the command that the first argument names."""
     if not argv or argv[0] in ("-h", "--help"):
-        print(_usage(group, commands))
+        print(_usage())
         return
     name = argv[0]
     arguments = argv[1:]
-    if name not in commands:
-        print(
-            f"xreset{group}: Unknown command {name!r}.\n\n{_usage(group, commands)}",
-            file=sys.stderr,
-        )
+    if name not in COMMANDS:
+        print(f"xreset: Unknown command {name!r}.\n\n{_usage()}", file=sys.stderr)
         raise SystemExit(2)
-    module = import_module(f"xreset.cli{group.replace(' ', '.')}.{name}")
-    if hasattr(module, "COMMANDS"):
-        _run(f"{group} {name}", module.COMMANDS, arguments)
-        return
+    module = import_module(f"xreset.cli.{name}")
     import tyro
 
     from xreset.cli._options import checked
 
     command = module.command_for(arguments) if hasattr(module, "command_for") else module.COMMAND
-    program = f"xreset{group} {name}"
-    about = commands[name]
-    if isinstance(command, dict):
-        verbs = {verb: checked(function) for verb, function in command.items()}
-        two = " ".join(arguments[:2])
-        if two in verbs:  # a verb may have two words
-            arguments = [two, *arguments[2:]]
-        tyro.extras.subcommand_cli_from_dict(verbs, prog=program, description=about, args=arguments)
-    else:
-        tyro.cli(checked(command), prog=program, description=about, args=arguments)
+    how: dict[str, Any] = {"prog": f"xreset {name}", "description": COMMANDS[name]}
+    if not isinstance(command, dict):
+        tyro.cli(checked(command), args=arguments, **how)
+        return
+    verbs = {verb: checked(function) for verb, function in command.items()}
+    two = " ".join(arguments[:2])
+    if two in verbs:  # a verb may have two words
+        arguments = [two, *arguments[2:]]
+    tyro.extras.subcommand_cli_from_dict(verbs, args=arguments, **how)
 
 
-def _usage(group: str, commands: dict[str, str]) -> str:
-    width = max(map(len, commands))
-    lines = [f"  {name:<{width}}  {text}" for name, text in commands.items()]
+def _usage() -> str:
+    width = max(map(len, COMMANDS))
+    lines = [f"  {name:<{width}}  {text}" for name, text in COMMANDS.items()]
     return "\n".join(
         [
-            f"usage: xreset{group} COMMAND ...",
+            "usage: xreset COMMAND ...",
             "",
             *lines,
             "",
-            f"xreset{group} COMMAND --help shows the options of one command.",
+            "xreset COMMAND --help shows the options of one command.",
         ]
     )

@@ -6,13 +6,14 @@ import shlex
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import tyro
 
 from xreset.accounts import Account, described
 from xreset.cli import INVOCATION
 from xreset.cli._terminal import Progress, console, show_table
+from xreset.files import code_version, write_json
 from xreset.plugins import backend_names, backend_status
 
 if TYPE_CHECKING:
@@ -100,6 +101,20 @@ def usable_engines() -> list[str]:
         if status.reason is not None:
             console.print(f"without {status.name}: {status.reason}")
     return [status.name for status in statuses if status.reason is None]
+
+
+def quick_engines(names: Sequence[str], device: str) -> list[trial.Engine]:
+    """Return the engines of these names; without names, all that can be used here and are not slow on the device."""
+    engines = chosen_engines(names or usable_engines(), device)
+    return [each for each in engines if names or not each.slow]
+
+
+def write_measured(path: Path | None, content: dict[str, Any]) -> None:
+    """Write results with the version and the command that measured them; None: nothing is written."""
+    if path is not None:
+        made_by = {"xreset_version": code_version(), "command": this_command()}
+        write_json(path, content | made_by)
+        console.print(f"wrote {path}")
 
 
 def this_command() -> str:

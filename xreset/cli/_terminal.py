@@ -60,6 +60,15 @@ class Progress(rich.progress.Progress):
         task = self.add_task(what, total=None)
         return lambda done, total: self.update(task, completed=done, total=total)
 
+    def stages(self) -> Callable[..., None]:
+        """Add a bar that shows one stage after another; returns the function that moves it: (stage, done, in all)."""
+        task = self.add_task("", total=None)
+
+        def move(stage: str, done: float = 0, total: float | None = None) -> None:
+            self.update(task, description=stage, completed=done, total=total or None)
+
+        return move
+
 
 def show_table(rows: Sequence[Sequence[str | Text]], **options: Any) -> None:
     """Print a table whose first row is its head, with columns of figures to the right; ``options`` are rich's."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from xreset.cli._common import Flat, Policy, Several, chosen_engines, engine_bars, usable_engines
+from xreset.cli._common import Flat, Policy, Several, engine_bars, quick_engines
 from xreset.cli._terminal import console, show_table
 from xreset.eval.setting import Setting
 
@@ -36,9 +36,7 @@ def rehearse(
     from xreset.eval import policy_spec
     from xreset.eval import rehearse as rehearsal
 
-    engines = chosen_engines(backend or usable_engines(), setting.device)
-    if not backend:
-        engines = [each for each in engines if not each.slow]
+    engines = quick_engines(backend, setting.device)
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
     folder = out or spec.folder.parent / "rehearsal"
     with engine_bars([e.name for e in engines]) as progress:

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from rich.text import Text
 
-from xreset import __version__
 from xreset.cli._common import (
     AllEngines,
     Device,
@@ -18,10 +17,10 @@ from xreset.cli._common import (
     Source,
     this_command,
     usable_engines,
+    write_measured,
 )
 from xreset.cli._terminal import Progress, console, show_table
 from xreset.errors import RobotError
-from xreset.files import write_json
 from xreset.plugins import robot_names
 from xreset.resets.config import SqueezeConfig
 from xreset.robot_tools import placement
@@ -148,12 +147,10 @@ def place(
         paths = pipeline.wrist_paths(chosen, spec, specs, progress=bar.count("hand retargeting"))
         wrists = np.concatenate([path.root_pos[path.annotated].numpy() for path in paths])
         avoid = np.concatenate((wrists, pipeline.rest_on_table(chosen, specs).object_pos))
-        task = bar.add_task("placements", total=1.0)
+        move = bar.stages()
 
         def report(done: float, reached: float) -> None:
-            bar.update(
-                task, completed=done, description=f"placements (best yet reaches {reached:.0%})"
-            )
+            move(f"placements (best yet reaches {reached:.0%})", done, 1.0)
 
         found = places.place(spec, paths, avoid, search, report)
     table = [("follows", "reaches", "dexterity", "base.pos", "base.quat", "home")]
@@ -235,11 +232,7 @@ def judge(
     console.print(
         f"at least half of the states hold, lift and turn these objects in every engine: {', '.join(found.kept) or '-'}"
     )
-    if json is not None:
-        write_json(
-            json, {**found.as_dict(), "xreset_version": __version__, "command": this_command()}
-        )
-        console.print(f"wrote {json}")
+    write_measured(json, found.as_dict())
     if picture is not None:
         render.write_png(picture, judging.judge_picture(found, loaded.robot, loaded.objects))
         console.print(f"wrote {picture}")

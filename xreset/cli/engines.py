@@ -1,0 +1,383 @@
+"""``xreset engines``: list, check, compare, trace and attribute differences between physics engines."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+from rich.text import Text
+
+from xreset.cli._common import (
+    AllEngines,
+    Device,
+    Flat,
+    Objects,
+    PolicyOrBaseline,
+    Robot,
+    Several,
+    Source,
+    quick_engines,
+    usable_engines,
+    write_measured,
+)
+from xreset.cli._terminal import Progress, console, show_table
+from xreset.errors import XResetError
+from xreset.eval.setting import Place, Setting
+from xreset.files import file_hash, write_json, write_whole
+from xreset.plugins import backend_class, backend_names, backend_status, make_backend
+from xreset.spec import SceneSpec
+
+if TYPE_CHECKING:
+    from xreset.backends import conformance
+    from xreset.eval.engines import agreement
+
+
+def list_() -> None:
+    """List physics engines: name, version, device, and why one cannot be used here."""
+    table = [("backend", "engine version", "device", "available")]
+    for name in backend_names():
+        status = backend_status(name)
+        available = "yes" if status.reason is None else f"no: {status.reason}"
+        table.append((name, status.version or "-", status.device, available))
+    show_table(table)
+
+
+def check(
+    *,
+    backend: AllEngines = (),
+    robot: str | None = None,
+    device: Device = "cpu",
+    only: Annotated[tuple[str, ...], tyro.conf.arg(name="check"), tyro.conf.UseAppendAction] = (),
+    json: Path | None = None,
+    verbose: bool = False,
+) -> None:
+    """Test whether physics engines keep their contract. Exits with 1 if one does not.
+
+    Args:
+        robot: Name or folder of the robot to test with. Default: a gripper, with which every check can run.
+        only: Check to run; give it again for more. Default: all.
+        json: File to write the results to.
+        verbose: Show every measured number, not only the one nearest to its tolerance.
+    """
+    from xreset import description
+    from xreset.backends import conformance
+
+    known = [c.name for c in conformance.CHECKS]
+    if unknown := sorted(set(only) - set(known)):
+        raise XResetError(f"Unknown check {', '.join(unknown)}. Choose from: {', '.join(known)}.")
+    spec = description.load_robot(robot) if robot else conformance.scene().robot
+    runs = []
+    for name in dict.fromkeys(backend) or usable_engines():
+        status = backend_status(name)
+        used = device if device.split(":")[0] in status.device else "cpu"
+        what = f" {status.version}, {spec.name}, {used}: verdict, check, and what came nearest to its tolerance"
+        console.print(Text.assemble((name, "bold"), what))
+        results = conformance.run(
+            _maker(name, used),
+            robot=spec,
+            only=only or None,
+            report=lambda result: _print_check(result, verbose),
+        )
+        runs.append(
+            {
+                "engine": name,
+                "engine_version": status.version,
+                "robot": spec.name,
+                "device": used,
+                "capabilities": sorted(backend_class(name).capabilities),
+                "seconds": round(sum(result.seconds for result in results), 3),
+                "checks": [result.as_dict() for result in results],
+            }
+        )
+    write_measured(json, {"schema": conformance.SCHEMA, "runs": runs})
+    failed = 0
+    for record in runs:
+        failed += sum(result["verdict"] == "failed" for result in record["checks"])
+    if failed:
+        console.print(f"{failed} checks failed", style="bold red")
+        raise SystemExit(1)
+    console.print("no check failed", style="bold green")
+
+
+def _maker(name: str, device: str) -> conformance.MakeBackend:
+    """Return what builds worlds on a device. A few worlds run in this process, which is faster than to start others."""
+    from xreset.backends import conformance, pool
+
+    pooled = issubclass(backend_class(name), pool.PoolBackend)
+
+    def make(scene: SceneSpec, num_worlds: int, **chosen: Any) -> Any:
+        here = pooled and num_worlds != conformance.Bench.NUM_WORLDS and num_worlds <= 24
+        options = {"workers": 0} if here else {}
+        return make_backend(name, scene, num_worlds, device=device, **chosen, **options)
+
+    return make
+
+
+_STYLE = {
+    "passed": "green",
+    "known difference": "cyan",
+    "failed": "bold red",
+    "unsupported": "yellow",
+    "skipped": "dim",
+}
+
+
+def _print_check(result: conformance.CheckResult, verbose: bool) -> None:
+    detail = _text(result.worst) if result.measures else result.problem
+    verdict = (f"{result.verdict:<16}", _STYLE[result.verdict])
+    console.print(
+        Text.assemble("  ", verdict, f" {result.name:<22} {result.seconds:5.1f} s  {detail}")
+    )
+    for measure in result.measures:
+        if verbose or measure.verdict != "passed":
+            console.print(f"{'':19}{measure.verdict}: {_text(measure)}")
+            if measure.verdict == "known difference" and measure.known is not None:
+                console.print(
+                    f"{'':19}accepted up to {measure.known.bound:.3g}: {measure.known.reason}"
+                )
+    if result.verdict == "failed":
+        console.print(f"{'':19}asserted: {result.check.statement}")
+        if result.problem:
+            console.print(f"{'':19}raised: {result.problem}")
+        console.print(f"{'':19}likely: {result.check.cause}")
+
+
+def _text(measure: conformance.Measure | None) -> str:
+    if measure is None:
+        return ""
+    return f"{measure.what}: {measure.measured:.2g}, tolerance {measure.tolerance:.2g} {measure.unit}".rstrip()
+
+
+def compare(
+    motion: Source,
+    *,
+    robot: Robot = None,
+    objects: Objects = None,
+    only: Several = (),
+    backend: AllEngines = (),
+    grasps: int = 48,
+    device: Device = "cpu",
+    json: Path | None = None,
+) -> None:
+    """Measure how far physics engines agree with MuJoCo on grasps. Exits with 1 if one misses a target.
+
+    Press: a hand closes on an object that cannot move. Closing: a hand closes on an object on the table, lifts and
+    shakes it. Hold: lift and shake from a common state. The column of MuJoCo at half the timestep shows how far two
+    solutions of the same equations differ. MuJoCo-Warp is left out on a CPU, where it is slow, unless it is named.
+
+    Args:
+        motion: File with the grasps: of `xreset retarget`, or of `xreset demos`, which is retargeted first.
+        only: Object to use; give it again for more. Default: all objects of the file.
+        grasps: Number of closings, and of holds.
+        json: File to write the results to.
+    """
+    from xreset.eval.engines import agreement
+    from xreset.inputs import load_inputs
+
+    engines = [each for each in quick_engines(backend, device) if each.name != agreement.REFERENCE]
+    with Progress() as bar:
+        move = bar.stages()
+        loaded = load_inputs(
+            motion, robot=robot, objects=objects, only=only, accept=("demos", "motion")
+        )
+        grasped = loaded.motion(partial(move, "retargeting"))
+        # now: after minutes of work the file may be another, or gone
+        inputs = {"motion": file_hash(motion)}
+        result = agreement.compare(
+            loaded.robot,
+            loaded.objects,
+            grasped,
+            engines,
+            grasps=grasps,
+            progress=move,
+        )
+    _print(result)
+    for tested in (result.reference, result.floor, *result.engines):
+        if tested.broken:
+            console.print(
+                f"{tested.engine.name}: {tested.broken} worlds were not finite or dropped contacts",
+                style="bold red",
+            )
+    write_measured(json, result.as_dict() | {"inputs": inputs})
+    if result.missed:
+        console.print(f"missed: {'; '.join(result.missed)}", style="bold red")
+        raise SystemExit(1)
+    console.print("all targets met", style="bold green")
+
+
+def _print(result: agreement.Parity) -> None:
+    columns: tuple[agreement.EngineParity, ...] = (result.floor, *result.engines)
+    holds = [flags for name, flags in result.reference.carried.items() if name != "closing"]
+    held = sum(map(sum, holds))
+    tried = sum(map(len, holds))
+    reference = result.reference.engine.name
+    heads = [
+        f"{tested.engine.name}\n{tested.engine.version}, {tested.engine.device}"
+        for tested in columns
+    ]
+    table: list[tuple[str | Text, ...]] = [(f"against {reference}", "target", *heads)]
+    for i, row in enumerate(result.floor.metrics):
+        cells = [_cell(tested.metrics[i]) for tested in columns]
+        table.append((row.metric, f"{row.sense} {_number(row.target, row.unit)}", *cells))
+    grasps = f"{result.robot.name}, {len(result.objects)} objects: {len(result.closing)} closings, {tried} holds"
+    show_table(
+        table,
+        title=f"{grasps}, of which {reference} carries {sum(result.reference.carried['closing'])} and {held}",
+    )
+
+
+def _cell(metric: agreement.Metric) -> Text:
+    style = "green" if metric.ok else "bold red"
+    return Text.assemble((_number(metric.measured, metric.unit), style), f" (n = {metric.n})")
+
+
+def _number(value: float | None, unit: str) -> str:
+    if value is None:
+        return "not measured"
+    return f"{value:.3g} {unit}" if unit else f"{100 * value:.1f} %"
+
+
+def trace(
+    source: Source,
+    *,
+    backend: Several = (),
+    reference: str = "mujoco",
+    object: str | None = None,
+    episode: int = 0,
+    place: Flat[Place] = Place(),
+    out: Path = Path("runs/trace"),
+) -> None:
+    """Replay the same actions from the same state in several engines, and show when and by how much they diverge.
+
+    Args:
+        source: Source of the actions. Demonstrations or robot motion: an open-loop grasp and lift. The trace of an
+            evaluation (eval/BACKEND.trace.npz): an episode of the policy. An actions.npz of this command.
+        backend: Engine to compare with the reference; give it again for more. Default: all that can be used here.
+        reference: Engine that the others are compared with.
+        object: Object, if the source has several; default: the first.
+        episode: Which of the object's grasps or recorded episodes.
+        place: Robot, meshes, seed, device.
+        out: Folder for trace.json, trace.png, and actions.npz: the actions, and what every engine did.
+    """
+    from xreset.eval import trial
+    from xreset.eval.engines import actions, replay, trace_view
+
+    base = trial.engine(reference, device=place.device)
+    names = [name for name in dict.fromkeys(backend) or usable_engines() if name != reference]
+    engines = [trial.engine(name, device=place.device) for name in names]
+    with Progress() as bar:
+        move = bar.stages()
+        move("actions")
+        played = actions.from_file(source, place, object, episode)
+        result = replay.trace(
+            played,
+            base,
+            engines,
+            seed=place.seed,
+            progress=move,
+        )
+        replays = {e.name: e.recording for e in (result.reference, *result.engines)}
+        actions.write_actions(out / "actions.npz", played, replays)
+        write_json(out / "trace.json", result.as_dict())
+        trace_view.write_plot(out / "trace.png", result)
+    console.print(trace_view.rich_table(result))
+    for sentence in trace_view.sentences(result):
+        console.print(sentence)
+    console.print(f"results in {out}")
+
+
+def attribute(
+    policy: PolicyOrBaseline,
+    *,
+    demos: Path,
+    towards: str,
+    backend: str = "mujoco",
+    only: Several = (),
+    episodes: int = 1,
+    setting: Flat[Setting] = Setting(),
+    out: Path | None = None,
+) -> None:
+    """Find the physical difference between two engines that costs a policy its skill.
+
+    First both engines are measured through their interface: friction, drive stiffness and damping, timestep. Then the
+    policy plays the same episodes in one engine, in that engine with one property changed to the value of the other
+    engine, with all properties changed, and in the other engine.
+
+    Args:
+        demos: Demonstrations (xreset demos) or retargeted trajectories (xreset retarget): starts and goals, and the
+            path of ik. `xreset demos select` makes a file of some objects.
+        towards: Engine towards which the properties are changed, usually the one in which the policy does worse.
+        backend: Engine in which they are changed.
+        only: Property to change; give it again for more. Default: all in which the engines differ.
+        episodes: Episodes per demonstration.
+        setting: Robot, meshes, seed of the perturbations of the starts, device and worlds.
+        out: Folder for attribution.json; default: attribute/ next to the policy's results.
+    """
+    from xreset.eval import policy_spec, trial
+    from xreset.eval.engines import attribution, attribution_view
+
+    if backend == towards:
+        raise XResetError(f"--backend and --towards are both {backend!r}. Choose two engines.")
+    spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
+    a, b = (trial.engine(name, device=setting.device) for name in (backend, towards))
+    played = trial.load_trial(
+        spec, demos, objects=setting.objects, seed=setting.seed, num_envs=setting.num_envs
+    )
+    out = out or spec.folder.parent / "attribute"
+    folder = played.objects_folder
+    with Progress() as bar:
+        found = attribution.attribute(
+            spec, a, b, played, episodes=episodes, only=only, progress=bar.stages()
+        )
+    demonstrations = len(played.bank.sequence_name)
+    count = f"{len(found.rows[0].episodes)} episodes of {demonstrations} demonstrations, seed {setting.seed}"
+    title = f"{spec.name} on {spec.robot.name}: what costs the skill between {backend} and {towards}\n{count}"
+    content = found.as_dict() | {
+        "policy": spec.name,
+        "robot": spec.robot.name,
+        "seed": setting.seed,
+        "demonstrations": demonstrations,
+        "versions": {a.name: a.version, b.name: b.version},
+        "objects_folder": str(folder) if folder else None,
+        "inputs": played.inputs,
+    }
+    write_json(out / "attribution.json", content)
+    console.print(attribution_view.rich_table(found, title))
+    for line in attribution_view.not_tried(found):
+        console.print(line, style="dim")
+    console.print(attribution_view.verdict(found))
+    console.print(f"results in {out}")
+
+
+def page(
+    *,
+    source: Annotated[tuple[Path, ...], tyro.conf.arg(name="from"), tyro.conf.UseAppendAction],
+    out: Path | None = None,
+) -> None:
+    """Make a Markdown page of what was measured of the engines.
+
+    Args:
+        source: File of `xreset engines check --json`; give it again for more. Of two results of the same check,
+            engine, device and robot, the later one counts.
+        out: File to write; default: print it.
+    """
+    from xreset.eval.engines import page as matrix
+
+    text = matrix.page(matrix.read(source))
+    if out is None:
+        print(text, end="")
+        return
+    write_whole(out, text)
+    print(f"wrote {out}")
+
+
+COMMAND = {
+    "list": list_,
+    "check": check,
+    "compare": compare,
+    "trace": trace,
+    "attribute": attribute,
+    "page": page,
+}

@@ -85,7 +85,7 @@ def _measure(env: ManipulationEnv, config: TrainConfig, options: Options, folder
         )
     env.reset()
     runner = TrainingRunner(env, config, folder / "run")
-    runner.learn(2, init_at_random_ep_len=True)
+    runner.learn(2)
     alg, horizon = runner.alg, config.ppo.horizon
     obs = env.get_observations()
 

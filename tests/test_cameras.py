@@ -143,11 +143,11 @@ class TestCameras(unittest.TestCase):
             )
         )
         self.look(cameras)
-        before = cameras.rays.camera.clone()
+        before = cameras.pose.clone()
         joints = self.state.joint_pos.clone()
         joints[:, self.robot.joint_names.index("arm_3")] += 0.1
         self.look(cameras, replace(self.state, joint_pos=joints))
-        moved = (cameras.rays.camera - before)[0, 0, :3, 3].norm()
+        moved = (cameras.pose - before)[0, 0, :3, 3].norm()
         self.assertAlmostEqual(float(moved), 0.1, places=5)
 
     def test_refusals(self):

@@ -102,7 +102,7 @@ def trained(
     torch.manual_seed(seed)
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(StringIO()):
         runner = TrainingRunner(environment(seed, backend), config, Path(folder))
-        runner.learn(config.iterations, init_at_random_ep_len=True)
+        runner.learn(config.iterations)
         curves = read_curves(Path(folder))
     return shares(lambda name: curves[name].iloc[-LAST:].mean()), runner.env_steps
 

@@ -74,10 +74,7 @@ class RayCaster:
     """Casts the rays of N worlds with C cameras each, and B bodies each.
 
     Attributes:
-        camera: [N, C, 4, 4] poses of the cameras: x to the right, y down, z forward.
-        tangent: [N, C] tangent of half the vertical field of view.
         pose: [N, B, 4, 4] poses of the bodies.
-        due: [N] bool: the worlds whose images :meth:`cast` draws; the other images stay.
         depth: [N, C, H, W] distance along the view axis [m]; 0 where a ray hits nothing.
         body: [N, C, H, W] int8, index of the body that a ray hits, or -1.
     """
@@ -86,31 +83,27 @@ class RayCaster:
         self,
         meshes: Sequence[trimesh.Trimesh],
         bodies: Tensor,
-        cameras: int,
+        camera: Tensor,
+        tangent: Tensor,
+        due: Tensor,
         size: tuple[int, int],
-        device: torch.device,
     ) -> None:
-        """Build the meshes' trees and compile the kernel.
+        """Build the meshes' trees and compile the kernel. The buffers of the cameras are read whenever rays are cast.
 
         Args:
             meshes: closed surfaces.
             bodies: [N, B] index of each body's mesh.
-            cameras: C.
+            camera: [N, C, 4, 4] poses of the cameras: x to the right, y down, z forward.
+            tangent: [N, C] tangent of half the vertical field of view.
+            due: [N] bool: the worlds whose images :meth:`cast` draws; the other images stay.
             size: height and width [pixels].
-            device: where everything lives.
 
         Raises:
             XResetError: Warp cannot be used here.
         """
-        shape = (len(bodies), cameras)
-
-        def poses(*shape: int) -> Tensor:
-            return torch.eye(4, device=device).repeat(*shape, 1, 1)
-
-        self.camera = poses(*shape)
-        self.tangent = torch.ones(shape, device=device)
-        self.pose = poses(*bodies.shape)
-        self.due = torch.ones(len(bodies), dtype=torch.bool, device=device)
+        shape = tangent.shape
+        device = bodies.device
+        self.pose = torch.eye(4, device=device).repeat(*bodies.shape, 1, 1)
         self.depth = torch.zeros(*shape, *size, device=device)
         self.body = torch.zeros(*shape, *size, dtype=torch.int8, device=device)
         balls = torch.tensor([_ball(mesh) for mesh in meshes], dtype=torch.float32)
@@ -120,13 +113,12 @@ class RayCaster:
                 self._on_stream = TorchStream(device)
                 with self._on_stream():
                     self._meshes = [_warp_mesh(mesh) for mesh in meshes]
-                    self._ids = torch.tensor([mesh.id for mesh in self._meshes])[bodies.cpu()].to(
-                        device
-                    )
+                    ids = torch.tensor([mesh.id for mesh in self._meshes])
+                    self._ids = ids[bodies.cpu()].to(device)
                     arrays = [
-                        wp.from_torch(self.due, dtype=wp.bool),
-                        wp.from_torch(self.camera, dtype=wp.mat44),
-                        wp.from_torch(self.tangent),
+                        wp.from_torch(due, dtype=wp.bool),
+                        wp.from_torch(camera, dtype=wp.mat44),
+                        wp.from_torch(tangent),
                         wp.from_torch(self.pose, dtype=wp.mat44),
                         wp.from_torch(self._ids, dtype=wp.uint64),
                         wp.from_torch(self._sphere, dtype=wp.vec4),

@@ -5,6 +5,7 @@ Shape letters: N worlds, C cameras, H x W pixels, B bodies, P points.
 
 from __future__ import annotations
 
+from dataclasses import astuple
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ class Cameras:
     """Fixed buffers of N worlds. Apart from the rays, a step is torch operations that can be captured in a graph.
 
     Attributes:
+        pose: [N, C, 4, 4] poses of the cameras: x to the right, y down, z forward.
         rays: what the cameras hit. The last body of a world is its object.
         shift: [N, C, 3] how far each camera is from where it should be, in its own frame [m].
         turn: [N, C, 3] rotation of each camera from how it should be, axis times angle, in its own frame [rad].
@@ -76,34 +78,22 @@ class Cameras:
         size = (config.height, config.width)
         count = len(config.cameras)
         surfaces = [*bodies.values(), _table(scene.table), *objects]
-        self.rays = RayCaster(surfaces, torch.cat((fixed, held), dim=1), count, size, device)
-        self._goal_rays = (
-            RayCaster(objects, object_index[:, None], count, size, device)
-            if config.goal_image
-            else None
-        )
+        self.pose = torch.eye(4, device=device).repeat(worlds, count, 1, 1)
+        self._tangent = torch.ones(worlds, count, device=device)
+        self._due = torch.ones(worlds, dtype=torch.bool, device=device)
+        views = (self.pose, self._tangent, self._due, size)
+        self.rays = RayCaster(surfaces, torch.cat((fixed, held), dim=1), *views)
+        self._goal_rays: RayCaster | None = None
+        if config.goal_image:
+            self._goal_rays = RayCaster(objects, object_index[:, None], *views)
 
         def tensor(values: Any) -> Tensor:
             return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=device)
 
-        rows = []
-        for camera in config.cameras:
-            noise = camera.noise
-            rows.append(
-                (
-                    camera.near,
-                    camera.far,
-                    noise.spread,
-                    noise.step,
-                    noise.holes,
-                    noise.edges,
-                    noise.edge,
-                )
-            )
-        columns = tensor(rows).T[..., None, None]
-        self._near, self._far, self._spread, self._step, self._holes, self._edges, self._edge = (
-            columns
-        )
+        limits = tensor([(c.near, c.far) for c in config.cameras])
+        self._near, self._far = limits.T[..., None, None]
+        noise = tensor([astuple(c.noise) for c in config.cameras])
+        self._spread, self._step, self._holes, self._edges, self._edge = noise.T[..., None, None]
         self._half_fov = tensor([c.fov / 2 for c in config.cameras])
         self._mounted = tensor(np.stack([mounted_pose(c) for c in config.cameras]))
         y, x = torch.meshgrid(
@@ -141,14 +131,11 @@ class Cameras:
         moved[..., :3, 3] = self.shift
         moved[..., :3, :3] = quat_to_matrix(quat_from_axis_angle(self.turn))
         moved[..., 3, 3] = 1.0
-        rays.camera.copy_(self._believed @ moved)
-        rays.tangent.copy_((self.fov_scale * self._half_fov).tan())
-        rays.due.copy_(due)
-        if (goal := self._goal_rays) is not None:
-            _set_pose(goal.pose[:, 0], goal_pos, goal_quat)
-            goal.camera.copy_(rays.camera)
-            goal.tangent.copy_(rays.tangent)
-            goal.due.copy_(due)
+        self.pose.copy_(self._believed @ moved)
+        self._tangent.copy_((self.fov_scale * self._half_fov).tan())
+        self._due.copy_(due)
+        if self._goal_rays is not None:
+            _set_pose(self._goal_rays.pose[:, 0], goal_pos, goal_quat)
 
     def cast(self) -> None:
         """Draw the images of the worlds that are due."""
@@ -161,7 +148,7 @@ class Cameras:
 
         Depths are 1 at the camera's least depth, 0 at its largest one, and 0 where a pixel sees nothing.
         """
-        due = self.rays.due.view(-1, 1, 1, 1)
+        due = self._due.view(-1, 1, 1, 1)
         self.image.copy_(
             torch.where(due, self._with_errors(self.rays.depth, generator), self.image)
         )
@@ -169,12 +156,7 @@ class Cameras:
         if self._goal_rays is not None:
             images.append(self._in_range(self._goal_rays.depth))
         if self.config.view == "depth":
-            shown = []
-            for image in images:
-                shown.append(
-                    torch.where(image > 0, (self._far - image) / (self._far - self._near), 0.0)
-                )
-            view = torch.cat(shown, dim=1)
+            view = torch.cat([self._nearness(image) for image in images], dim=1)
         else:
             is_object = [self.rays.body == self.rays.pose.shape[1] - 1, images[-1] > 0]
             clouds = []
@@ -192,9 +174,7 @@ class Cameras:
             width: width of the picture in pixels; its height is even.
         """
         images = self.image[world]
-        near = torch.where(
-            images > 0, 0.2 + 0.8 * (self._far - images) / (self._far - self._near), 0.0
-        )
+        near = torch.where(images > 0, 0.2 + 0.8 * self._nearness(images), 0.0)
         pixels = Image.fromarray((255 * torch.cat(tuple(near), dim=1)).byte().cpu().numpy())
         height = 2 * round(width * pixels.height / pixels.width / 2)
         return np.asarray(pixels.resize((width, height), Image.Resampling.NEAREST).convert("RGB"))
@@ -219,6 +199,10 @@ class Cameras:
                         f"Camera {i + 1} at {camera.pos} is inside the robot's link {name!r} and sees nothing else. "
                         "Move it out (pos)."
                     )
+
+    def _nearness(self, depth: Tensor) -> Tensor:
+        """[..., C, H, W] 1 at a camera's least depth, 0 at its largest one, and 0 where a pixel sees nothing."""
+        return torch.where(depth > 0, (self._far - depth) / (self._far - self._near), 0.0)
 
     def _in_range(self, depth: Tensor) -> Tensor:
         return torch.where((depth >= self._near) & (depth <= self._far), depth, 0.0)

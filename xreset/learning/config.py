@@ -56,7 +56,7 @@ class PpoConfig(Checked):
 
     REMOVED: ClassVar[dict[str, Any]] = {"critic_learning_rate": None, "clip_values": True}
 
-    horizon: Positive[int] = 16
+    horizon: Annotated[int, Rule("a number above 1", lambda steps: steps > 1)] = 16
     """Control steps per world and iteration."""
     sequence_length: Positive[int] = 4
     """Length of truncated back-propagation through time; divides the horizon."""

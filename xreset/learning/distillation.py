@@ -64,9 +64,9 @@ class SequenceDistillation(Distillation):
         transition.hidden_states = (self.student.get_hidden_state(), None)
         acted = self.student(obs, stochastic_output=True).detach()
         taught = self.teacher(obs).clamp(-1.0, 1.0).detach()
+        led = int(self.teacher_share * len(taught))
         transition.observations = obs
         transition.privileged_actions = taught
-        led = int(self.teacher_share * len(taught))
         transition.actions = torch.cat((taught[:led], acted[led:]))
         return transition.actions
 

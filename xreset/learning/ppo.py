@@ -89,6 +89,7 @@ class SequencePpo(PPO):
         self.bounds_loss = p.bounds_loss
         on_gpu = device.startswith("cuda")
         count = self.storage.num_envs
+        self._faulty = torch.zeros(p.horizon, count, dtype=torch.bool, device=device)
         self._rate = torch.tensor(
             self.learning_rate, device=device, dtype=torch.float32 if on_gpu else torch.float64
         )
@@ -201,26 +202,11 @@ class SequencePpo(PPO):
             for state in self.optimizer.state.values():
                 state["step"] = state["step"].to(self.device)
 
-    def act(self, obs: TensorDict) -> Tensor:
-        """Sample actions. The first step of a run starts from a zero LSTM state, which is stored like any other."""
-        for model in (self.actor, self.critic):
-            if model.get_hidden_state() is None:
-                with torch.no_grad():
-                    model(obs)
-                h, c = model.get_hidden_state()  # pyright: ignore[reportGeneralTypeIssues]
-                model.reset(hidden_state=(torch.zeros_like(h), torch.zeros_like(c)))
-        return super().act(obs)
-
     def process_env_step(
         self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]
     ) -> None:
         """Record one environment step; ``extras["faulty"]`` [N] bool marks worlds whose step teaches nothing."""
-        step = self.storage.step
-        if not step:
-            steps = self.storage.num_transitions_per_env
-            self._faulty = torch.zeros(steps, *dones.shape, dtype=torch.bool, device=self.device)
-        if "faulty" in extras:
-            self._faulty[step] = extras["faulty"]
+        self._faulty[self.storage.step] = extras.get("faulty", False)
         super().process_env_step(obs, rewards, dones, extras)
 
     def compute_returns(self, obs: TensorDict) -> None:

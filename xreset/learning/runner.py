@@ -84,21 +84,19 @@ class TrainingRunner:
         self._faults_before = torch.zeros(2, dtype=torch.long, device=self.device)
         self._recent_faults: deque[list[int]] = deque(maxlen=WINDOW)
 
-    def learn(
-        self, total: int, *, init_at_random_ep_len: bool = False, seconds: float = math.inf
-    ) -> None:
+    def learn(self, total: int, *, seconds: float = math.inf) -> None:
         """Train until a number of iterations is done in all, and write a checkpoint. Ctrl-C ends after an iteration.
+
+        The first episodes start at random times, so that the worlds do not end them together.
 
         Args:
             total: iterations in all, those of a resumed run included.
-            init_at_random_ep_len: start the first episodes at random times.
             seconds: most time to spend here; the present iteration is completed.
         """
         env = self.env
-        if init_at_random_ep_len:
-            env.episode_length_buf = torch.randint_like(
-                env.episode_length_buf, high=int(env.max_episode_length)
-            )
+        env.episode_length_buf = torch.randint_like(
+            env.episode_length_buf, high=env.max_episode_length
+        )
         self.alg.train_mode()
         if self.processes.count > 1:
             self.alg.broadcast_parameters()

@@ -308,7 +308,7 @@ def _run(
             runner = stack.enter_context(
                 _runner(processes, out, info, inputs, resumed=resumed, wandb=wandb)
             )
-            runner.learn(info.config.iterations, init_at_random_ep_len=True, seconds=60 * minutes)
+            runner.learn(info.config.iterations, seconds=60 * minutes)
         except (MemoryError, RuntimeError) as error:
             if isinstance(error, RuntimeError) and not _NO_MEMORY.search(str(error)):
                 raise

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 import trimesh
 
+from ci import build_robot
 from tests.data import InFolder, run
 from xreset import plugins
 from xreset.description import load_robot as load
@@ -19,7 +20,6 @@ from xreset.geometry.urdf import find_mesh, robot_tree
 from xreset.plugins import robot_folder, robot_names
 from xreset.policy import check_contract, policy_contract
 from xreset.robot_tools.check import check
-from xreset.robots import build
 from xreset.task.config import TaskConfig
 
 BUILT_IN = (
@@ -51,7 +51,7 @@ class BuiltIn(unittest.TestCase):
         for name in BUILT_IN:
             with self.subTest(name):
                 self.assertEqual(
-                    load(name).urdf.read_text(), build.robot_urdf(name.replace("-", "_"))
+                    load(name).urdf.read_text(), build_robot.robot_urdf(name.replace("-", "_"))
                 )
 
     def test_efforts_in_the_description_are_those_of_the_urdf(self):

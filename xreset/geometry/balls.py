@@ -21,7 +21,7 @@ from torch import Tensor
 from xreset.geometry.collision import SelfCollision, support_points
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.shapes import half_spaces, shape_mesh
+from xreset.geometry.shapes import half_spaces, shape_mesh, transformed
 from xreset.geometry.solids import link_field
 from xreset.spec import Geometry, RobotSpec, Shape
 from xreset.tensors import Tensors
@@ -258,6 +258,6 @@ def link_balls(shapes: Sequence[Shape]) -> tuple[np.ndarray, np.ndarray]:
         shell, small = shell_balls(shape.geometry, inner, radius)
         sharp = sharp_points(shape.geometry, max(min(radius, small), SPACING))
         points = np.concatenate((inner, shell, sharp))
-        centers.append(points @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3])
+        centers.append(transformed(points, shape.T_body_shape))
         radii.append(np.repeat([radius, small, 0.0], [len(inner), len(shell), len(sharp)]))
     return np.concatenate(centers), np.concatenate(radii)

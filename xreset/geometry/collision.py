@@ -18,6 +18,7 @@ from torch import Tensor
 
 from xreset.errors import XResetError
 from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.shapes import transformed
 from xreset.geometry.urdf import RobotTree
 from xreset.spec import Geometry, RobotSpec, Shape, TableSpec
 
@@ -50,7 +51,7 @@ def support_points(shape: Shape) -> tuple[np.ndarray, float]:
         )
     else:
         points = np.asarray(geometry.vertices, dtype=float)
-    return points @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3], radius
+    return transformed(points, shape.T_body_shape), radius
 
 
 class SupportPoints(NamedTuple):
@@ -140,10 +141,17 @@ class SelfCollision:
         self._T_link_shape = np.array(local).reshape(-1, 4, 4)
         self._center = np.array(centers).reshape(-1, 3)
         self._radius = np.array(radii)
+        tree = kinematics.tree
         pairs = combinations(dict.fromkeys(self._link), 2)
-        counted = [
-            pair for pair in pairs if _may_collide(robot, kinematics.tree, *pair, moved_by_arm)
-        ]
+        counted = [pair for pair in pairs if _may_collide(robot, tree, *pair)]
+        if moved_by_arm:
+            arm = [joint.name for joint in robot.joints if joint.group == "arm"]
+            moved = [tree.below(tree.joint(name).child) for name in arm]
+
+            def movers(link: str) -> list[bool]:
+                return [link in links for links in moved]
+
+            counted = [(a, b) for a, b in counted if movers(a) != movers(b)]
         self._count(counted)
         home = kinematics.lower.new_tensor(robot.home[kinematics.joint_indices])
         overlapping = self.near(kinematics.link_poses(kinematics.clamp(home))[None].numpy(), 0.0)
@@ -196,30 +204,17 @@ class SelfCollision:
         return clearance
 
 
-def _may_collide(robot: RobotSpec, tree: RobotTree, a: str, b: str, moved_by_arm: bool) -> bool:
-    """Return whether a pair of links counts: see :class:`SelfCollision`."""
-    joint_above = {joint.child: joint for joint in tree.joints}
+def _may_collide(robot: RobotSpec, tree: RobotTree, a: str, b: str) -> bool:
+    """Return whether two links are on bodies that are neither neighbors nor an excluded pair."""
     bodies = {tree.moving_ancestor(a), tree.moving_ancestor(b)}
-    parents = {
-        tree.moving_ancestor(joint_above[body].parent) for body in bodies if body in joint_above
-    }
+    joints = [tree.moved_by[body] for body in bodies if body in tree.moved_by]
+    parents = {tree.moving_ancestor(joint.parent) for joint in joints}
     if len(bodies) == 1 or bodies & parents:
         return False
     for pair in robot.collision_exclude:
         if {tree.moving_ancestor(name) for name in pair} == bodies:
             return False
-    if not moved_by_arm:
-        return True
-    arm = {joint.name for joint in robot.joints if joint.group == "arm"}
-
-    def arm_joints(link: str) -> set[str]:
-        above = set()
-        while link in joint_above:
-            above.add(joint_above[link].name)
-            link = joint_above[link].parent
-        return above & arm
-
-    return arm_joints(a) != arm_joints(b)
+    return True
 
 
 def coal_geometry(coal, geometry: Geometry):

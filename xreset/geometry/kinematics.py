@@ -83,14 +83,9 @@ class Kinematics:
         self.root = tree.link(root or tree.root).name
         self.dtype = dtype
         self.device = torch.device(device)
-        below = {self.root}
-        joints = []
-        for joint in tree.joints:  # parents come before children
-            if joint.parent in below:
-                below.add(joint.child)
-                joints.append(joint)
-        self.link_names: tuple[str, ...] = (self.root, *(joint.child for joint in joints))
+        self.link_names: tuple[str, ...] = tuple(tree.below(self.root))
         """Links from the root down, parents before children (length L)."""
+        joints = [tree.above[name] for name in self.link_names[1:]]
         self._link_index = {name: i for i, name in enumerate(self.link_names)}
 
         moving = [joint for joint in joints if joint.type != "fixed"]
@@ -132,8 +127,7 @@ class Kinematics:
         lower = np.full(len(self.joint_names), -np.inf)
         upper = np.full(len(self.joint_names), np.inf)
         for row, joint in enumerate(moving):
-            itself = MimicSpec(joint=joint.name, source=joint.name, multiplier=1.0, offset=0.0)
-            mimic = mimics.get(joint.name, itself)
+            mimic = mimics.get(joint.name, MimicSpec(joint=joint.name, source=joint.name))
             source = self.joint_names.index(mimic.source)
             coupling[row, source] = mimic.multiplier
             constant[row] = mimic.offset

@@ -42,6 +42,11 @@ def transform(R: ArrayLike, position: ArrayLike) -> np.ndarray:
     return T
 
 
+def transformed(points: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """[n, 3] points [n, 3] of a frame, in the frame in which the first one has the pose T [4, 4]."""
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
 def box(center: ArrayLike, size: Sequence[float]) -> Shape:
     """Make an axis-aligned box of edge lengths ``size``."""
     half = tuple(float(edge) / 2 for edge in size)

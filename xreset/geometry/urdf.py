@@ -10,7 +10,7 @@ import io
 import math
 import os
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 from xml.etree import ElementTree
@@ -105,6 +105,16 @@ class RobotTree:
         """How joints follow others, as the URDF has it."""
         return tuple(joint.mimic for joint in self.joints if joint.mimic is not None)
 
+    @cached_property
+    def above(self) -> dict[str, Joint]:
+        """Link -> the joint between its parent and it; the root has none."""
+        return {joint.child: joint for joint in self.joints}
+
+    @cached_property
+    def moved_by(self) -> dict[str, Joint]:
+        """Link -> the joint that moves it; links that are fixed to their parents have none."""
+        return {link: joint for link, joint in self.above.items() if joint.type != "fixed"}
+
     def link(self, name: str) -> Link:
         """Return the link of that name, or raise ``RobotError``."""
         return self._named("link", self.links, name)
@@ -132,9 +142,8 @@ class RobotTree:
     def moving_ancestor(self, name: str) -> str:
         """Return the link of the rigid body of a link: itself, or the nearest ancestor that a joint moves (or the
         root)."""
-        by_child = {joint.child: joint for joint in self.joints}
-        while name in by_child and by_child[name].type == "fixed":
-            name = by_child[name].parent
+        while name != self.root and name not in self.moved_by:
+            name = self.above[name].parent
         return name
 
 

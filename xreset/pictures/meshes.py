@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 
+from xreset.geometry.shapes import transformed
 from xreset.geometry.urdf import robot_tree
 from xreset.spec import ObjectSpec, RobotSpec, TableSpec
 
@@ -46,7 +47,7 @@ class Triangles:
 
 def place(mesh: trimesh.Trimesh, color: Color, pose: np.ndarray) -> Triangles:
     """Return the triangles of a mesh at a pose [4, 4], in one color."""
-    vertices = np.float32(mesh.vertices @ pose[:3, :3].T + pose[:3, 3])
+    vertices = np.float32(transformed(mesh.vertices, pose))
     normals = np.float32(mesh.vertex_normals @ pose[:3, :3].T)
     faces = np.asarray(mesh.faces)
     return Triangles(vertices[faces], normals[faces], np.full((len(faces), 3), color, np.float32))
@@ -75,19 +76,16 @@ def object_mesh(obj: ObjectSpec) -> trimesh.Trimesh:
 def link_colors(robot: RobotSpec) -> list[Color]:
     """Return the color of each link of the robot's URDF: arm, palm, fingers and fingertips differ."""
     tree = robot_tree(robot)
-    parent = {joint.child: joint.parent for joint in tree.joints}
     tips: set[str] = set()
     for tip in robot.fingertips:
         tips.update(tip.contact_links)
+    hand = tree.below(robot.hand_root)
     palm_body = tree.moving_ancestor(robot.hand_root)
     colors = []
     for name in tree.link_names:
-        ancestor: str | None = name
-        while ancestor is not None and ancestor != robot.hand_root:
-            ancestor = parent.get(ancestor)
         if name in tips:
             colors.append(TIP_COLOR)
-        elif ancestor is None:
+        elif name not in hand:
             colors.append(ARM_COLOR)
         elif tree.moving_ancestor(name) == palm_body:
             colors.append(PALM_COLOR)

@@ -123,7 +123,7 @@ def _topic(topic: str, problems: Problems, otherwise: str = "") -> list[Finding]
 
 def _joints(spec: RobotSpec, tree: RobotTree) -> Problems:
     known = {joint.name: joint for joint in tree.joints}
-    moving = [joint.name for joint in tree.joints if joint.type != "fixed"]
+    moving = [joint.name for joint in tree.moved_by.values()]
     inside = set(tree.below(spec.hand_root)[1:])
     for joint in spec.joints:
         found = known.get(joint.name)
@@ -155,7 +155,7 @@ def _joints(spec: RobotSpec, tree: RobotTree) -> Problems:
 
 
 def _mimics(spec: RobotSpec, tree: RobotTree) -> Problems:
-    known = {joint.name: joint for joint in tree.joints if joint.type != "fixed"}
+    known = {joint.name: joint for joint in tree.moved_by.values()}
     for mimic in spec.mimics:
         own = known.get(mimic.joint)
         source = known.get(mimic.source)
@@ -213,11 +213,10 @@ def _links(spec: RobotSpec, tree: RobotTree) -> Problems:
 
 
 def _inertias(tree: RobotTree) -> Problems:
-    moved = {joint.child for joint in tree.joints if joint.type != "fixed"}
     for link in tree.links:
         name = link.name
         if link.mass <= 0:
-            if name in moved:
+            if name in tree.moved_by:
                 yield (
                     "error",
                     f"{name!r} moves but has the mass {link.mass:g} kg; every moving link needs a mass and an "
@@ -289,9 +288,7 @@ def _frames(spec: RobotSpec, tree: RobotTree) -> Problems:
 def _chains(spec: RobotSpec, tree: RobotTree) -> list[list[str]]:
     """Return for each fingertip the moving links from the hand's body to it, the body's neighbor first."""
     inside = tree.below(tree.moving_ancestor(spec.hand_root))[1:]
-    moving = [
-        joint.child for joint in tree.joints if joint.type != "fixed" and joint.child in inside
-    ]
+    moving = [link for link in inside if link in tree.moved_by]
     return [[link for link in moving if tip.link in tree.below(link)] for tip in spec.fingertips]  # noqa: XR002
 
 

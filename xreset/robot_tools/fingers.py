@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from xreset.errors import RobotError
-from xreset.geometry.shapes import surface_of, transform
+from xreset.geometry.shapes import surface_of, transform, transformed
 from xreset.geometry.urdf import RobotTree
 from xreset.geometry.urdf_writer import axes, fixed, frame
 from xreset.robot_tools.draft import draft_spec, link_places
 from xreset.robot_tools.opposition import closing_range, opposition
-from xreset.spec import FingertipSpec, KeypointSpec, RobotSpec
+from xreset.spec import FingertipSpec, KeypointSpec
 
 _FINGERS = ("index", "middle", "ring", "little")
 _NAMES = {
@@ -42,9 +42,6 @@ _PALM_BEHIND = 0.04
 _BEND = 0.15
 """Share of its range by which a finger's joint is bent at home."""
 
-Poses = dict[str, np.ndarray]
-"""Link -> pose [4, 4] in the frame of the hand's root."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Finger:
@@ -61,190 +58,288 @@ class Finger:
     """[links + 1, 3] its joints, in the middle of the finger, and its tip in the frame of the hand's root, straight."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class Hand:
-    """What is known of a hand."""
+    """A hand, with what its geometry tells of palm and fingers."""
 
-    tree: RobotTree
-    """Its links, with frames for palm, wrist, fingertips and keypoints."""
-    root: str
-    """Link after which the fingers part."""
-    body: np.ndarray
-    """[V, 3] vertices of the shapes that are fixed to the tree's root, in its frame."""
-    palm: np.ndarray
-    """[4, 4] pose of the palm in the frame of the tree's root, with a straight wrist."""
-    palm_in_hand: np.ndarray
-    """[4, 4] pose of the palm in the frame of the hand's root."""
-    tips: tuple[FingertipSpec, ...]
-    """Thumb first."""
-    keypoints: tuple[KeypointSpec, ...]
-    bent: dict[str, float]
-    """Joint -> angle by which it is bent at home [rad]."""
+    def __init__(self, tree: RobotTree, folder: Path, thumb: str | None, notes: list[str]) -> None:
+        """Find palm and fingers.
 
+        Args:
+            tree: the hand.
+            folder: where its URDF is written.
+            thumb: a link or joint of the thumb.
+            notes: what is guessed is appended.
+        """
+        self.tree = tree
+        """Its links, with frames for palm, wrist, fingertips and keypoints."""
+        self._notes = notes
+        self.root = self._palm_link()
+        """Link after which the fingers part."""
+        self._spec = draft_spec(tree, self.root, folder)
+        self._at = link_places(self._spec, {})
+        """Link -> pose [4, 4] in the frame of the hand's root, with straight fingers."""
+        fingers = self._find_fingers(thumb)
+        self.bent: dict[str, float] = {}
+        """Joint -> angle by which it is bent at home [rad]."""
+        self.palm_in_hand = self._find_palm(fingers)
+        """[4, 4] pose of the palm in the frame of the hand's root."""
+        self.tips: list[FingertipSpec] = []
+        """Thumb first."""
+        self.keypoints = [KeypointSpec(keypoint="wrist", link="wrist_frame")]
+        self._add_frames(fingers)
+        T_root_hand = np.linalg.inv(self._at[tree.root])
+        self.palm = T_root_hand @ self.palm_in_hand
+        """[4, 4] pose of the palm in the frame of the tree's root, with a straight wrist."""
+        body = [name for name in self._at if tree.moving_ancestor(name) == tree.root]
+        self.body = transformed(self._surface(body), T_root_hand)
+        """[V, 3] vertices of the shapes that are fixed to the tree's root, in its frame."""
 
-def find_hand(tree: RobotTree, folder: Path, thumb: str | None, notes: list[str]) -> Hand:
-    """Find palm and fingers of a hand.
-
-    Args:
-        tree: the hand.
-        folder: where its URDF is written.
-        thumb: a link or joint of the thumb.
-        notes: what is guessed is appended.
-    """
-    root = _palm_link(tree, notes)
-    spec = draft_spec(tree, root, folder)
-    straight = link_places(spec, {})
-    fingers = _find_fingers(spec, tree, straight, thumb, notes)
-    palm, bent = _find_palm(spec, tree, straight, fingers)
-    tree, tips, keypoints = _with_frames(tree, root, fingers, palm, straight)
-    T_root_hand = np.linalg.inv(straight[tree.root])
-    body = [name for name in straight if tree.moving_ancestor(name) == tree.root]
-    return Hand(
-        tree=tree,
-        root=root,
-        body=_surface(tree, body, {name: T_root_hand @ straight[name] for name in body}),
-        palm=T_root_hand @ palm,
-        palm_in_hand=palm,
-        tips=tuple(tips),
-        keypoints=tuple(keypoints),
-        bent=bent,
-    )
-
-
-def _palm_link(tree: RobotTree, notes: list[str]) -> str:
-    """Return the link after which the fingers part: the first one with shapes, or with more than one child, behind the
-    joints of a wrist."""
-    wrist = []
-    link = tree.root
-    while True:
-        children = [joint for joint in tree.joints if joint.parent == link]
-        is_carrier = tree.link(link).collisions or len(children) != 1
-        if is_carrier:
-            inside = tree.below(link)[1:]
-            body = tree.moving_ancestor(link)
-            children = []
-            for joint in tree.joints:
-                if (
-                    joint.type != "fixed"
-                    and joint.child in inside
-                    and tree.moving_ancestor(joint.parent) == body
-                ):
-                    children.append(joint)
+    def _palm_link(self) -> str:
+        """Return the link after which the fingers part, behind the joints of a wrist: the first one of its body that
+        has shapes, or more than one child."""
+        tree = self.tree
+        link = tree.root
+        wrist = []
+        while True:
+            moving = [
+                joint
+                for joint in tree.moved_by.values()
+                if tree.moving_ancestor(joint.parent) == link
+            ]
+            if len(moving) != 1:
+                break
+            wrist.append(moving[0].name)
+            link = moving[0].child
+        if wrist:
+            self._notes.append(
+                f"{', '.join(wrist)} move the whole hand: they are the last joints of the arm. To keep a wrist still, "
+                "make its joints fixed in the hand's file"
+            )
+        while not tree.link(link).collisions:
+            children = [joint.child for joint in tree.joints if joint.parent == link]
             if len(children) != 1:
                 break
-        if children[0].type != "fixed":
-            wrist.append(children[0].name)
-        link = children[0].child
-    if wrist:
-        notes.append(
-            f"{', '.join(wrist)} move the whole hand: they are the last joints of the arm. To keep a wrist still, make "
-            "its joints fixed in the hand's file"
-        )
-    return link
+            link = children[0]
+        return link
 
-
-def _find_fingers(
-    spec: RobotSpec, tree: RobotTree, at: Poses, thumb: str | None, notes: list[str]
-) -> list[Finger]:
-    """Return the hand's fingers, thumb first, then from the thumb's side on."""
-    chains = _without_bars(spec, _chains(tree, spec.hand_root), notes)
-    if len(chains) < 2:
-        raise RobotError(
-            f"below {spec.hand_root!r} there are {len(chains)} chains of moving links, expected a thumb and at least "
-            "one finger."
-        )
-    chains = [replace(chain, points=_points(tree, chain, at)) for chain in chains]
-    first = _find_thumb(spec, at, chains, thumb, notes)
-    others = [chain for chain in chains if chain is not first]
-    names = {chain.name for chain in others}
-    if not names <= set(_FINGERS) or len(names) < len(others):
-        if len(others) > len(_FINGERS):
+    def _find_fingers(self, thumb: str | None) -> list[Finger]:
+        """Return the hand's fingers, thumb first, then from the thumb's side on."""
+        chains = self._without_bars(self._chains())
+        if len(chains) < 2:
             raise RobotError(
-                f"the hand has {len(others)} fingers beside the thumb; xreset knows {', '.join(_FINGERS)}."
+                f"below {self.root!r} there are {len(chains)} chains of moving links, expected a thumb and at least "
+                "one finger."
             )
-        bases = np.array([chain.points[0] for chain in others])
-        middle = bases.mean(axis=0)
-        across = np.linalg.svd(bases - middle)[2][0]
-        across *= np.sign((first.points[-1] - middle) @ across) or 1.0
-        order = np.argsort(-(bases @ across), kind="stable")
-        others = [replace(others[i], name=name) for i, name in zip(order, _FINGERS, strict=False)]
-        listed = "; ".join(f"{finger.name} is {finger.links[-1]}" for finger in others)
-        notes.append(f"fingers are named from the thumb's side on: {listed}")
-    others.sort(key=lambda finger: _FINGERS.index(finger.name))
-    return [replace(first, name="thumb"), *others]
+        chains = [replace(chain, points=self._points(chain)) for chain in chains]
+        first = self._find_thumb(chains, thumb)
+        others = [chain for chain in chains if chain is not first]
+        names = {chain.name for chain in others}
+        if not names <= set(_FINGERS) or len(names) < len(others):
+            if len(others) > len(_FINGERS):
+                raise RobotError(
+                    f"the hand has {len(others)} fingers beside the thumb; xreset knows {', '.join(_FINGERS)}."
+                )
+            bases = np.array([chain.points[0] for chain in others])
+            middle = bases.mean(axis=0)
+            across = np.linalg.svd(bases - middle)[2][0]
+            across *= np.sign((first.points[-1] - middle) @ across) or 1.0
+            order = np.argsort(-(bases @ across), kind="stable")
+            others = [
+                replace(others[i], name=name) for i, name in zip(order, _FINGERS, strict=False)
+            ]
+            listed = "; ".join(f"{finger.name} is {finger.links[-1]}" for finger in others)
+            self._notes.append(f"fingers are named from the thumb's side on: {listed}")
+        others.sort(key=lambda finger: _FINGERS.index(finger.name))
+        return [replace(first, name="thumb"), *others]
 
-
-def _find_thumb(
-    spec: RobotSpec, at: Poses, chains: list[Finger], thumb: str | None, notes: list[str]
-) -> Finger:
-    """Return the chain with the stated link or joint, the one that is called so, or the one that opposes the others."""
-    known = "; ".join(", ".join(chain.links) for chain in chains)  # noqa: XR002
-    if thumb is None:
-        marked = [chain for chain in chains if chain.name == "thumb"]
-    else:
-        marked = [chain for chain in chains if thumb in (*chain.links, *chain.joints, *chain.rest)]
-        if len(marked) != 1:
+    def _find_thumb(self, chains: list[Finger], thumb: str | None) -> Finger:
+        """Return the chain with the stated link or joint, the one that is called so, or the one that opposes the
+        others."""
+        known = "; ".join(", ".join(chain.links) for chain in chains)  # noqa: XR002
+        if thumb is None:
+            marked = [chain for chain in chains if chain.name == "thumb"]
+        else:
+            marked = [
+                chain for chain in chains if thumb in (*chain.links, *chain.joints, *chain.rest)
+            ]
+            if len(marked) != 1:
+                raise RobotError(
+                    f"--thumb {thumb!r} is in {len(marked)} fingers; their links are {known}."
+                )
+        if len(marked) == 1:
+            return marked[0]
+        ends = [chain.links[-1] for chain in chains]
+        tips = np.array([self._in_link(chain.links[-1], chain.points[-1]) for chain in chains])
+        scores = np.sqrt(opposition(self._spec, ends, tips)).sum(axis=1)
+        first = int(scores.argmax())
+        if scores[first] == 0 and len(chains) > 2:
             raise RobotError(
-                f"--thumb {thumb!r} is in {len(marked)} fingers; their links are {known}."
+                f"no finger can oppose the others. Name a link of the thumb with --thumb: {known}."
             )
-    if len(marked) == 1:
-        return marked[0]
-    ends = [chain.links[-1] for chain in chains]
-    tips = np.array([_in_link(at[chain.links[-1]], chain.points[-1]) for chain in chains])
-    scores = np.sqrt(opposition(spec, ends, tips)).sum(axis=1)
-    first = int(scores.argmax())
-    if scores[first] == 0 and len(chains) > 2:
-        raise RobotError(
-            f"no finger can oppose the others. Name a link of the thumb with --thumb: {known}."
+        why = "it can oppose the others" if scores[first] else "the two are alike"
+        self._notes.append(
+            f"the thumb is the finger of {', '.join(chains[first].links)}: {why} (--thumb says another)"
         )
-    why = "it can oppose the others" if scores[first] else "the two are alike"
-    notes.append(
-        f"the thumb is the finger of {', '.join(chains[first].links)}: {why} (--thumb says another)"
-    )
-    return chains[first]
+        return chains[first]
 
+    def _chains(self) -> list[Finger]:
+        """Return the chains of moving links below the hand's root; each ends in a link that carries no moving one.
 
-def _chains(tree: RobotTree, hand_root: str) -> list[Finger]:
-    """Return the chains of moving links below the hand's root; each ends in a link that carries no moving one."""
-    moved_by = {joint.child: joint.name for joint in tree.joints if joint.type != "fixed"}
-    moving = [name for name in tree.below(hand_root)[1:] if name in moved_by]
-    chains = []
-    for end in moving:
-        rest = tree.below(end)[1:]
-        if not moved_by.keys() & set(rest):
+        Their points are not known yet.
+        """
+        tree = self.tree
+        moving = [name for name in tree.below(self.root)[1:] if name in tree.moved_by]
+        chains = []
+        for end in moving:
+            rest = tree.below(end)[1:]
+            if tree.moved_by.keys() & set(rest):
+                continue
             links = [name for name in moving if end in tree.below(name)]
-            joints = [moved_by[name] for name in links]
-            fixed_joints = [joint.name for joint in tree.joints if joint.child in rest]
-            name = _stated_finger(" ".join((*links, *joints, *rest, *fixed_joints)))
-            finger = Finger(
-                name=name,
+            joints = [tree.moved_by[name].name for name in links]
+            fixed_joints = [tree.above[name].name for name in rest]
+            chain = Finger(
+                name=_stated_finger(" ".join((*links, *joints, *rest, *fixed_joints))),
                 links=tuple(links),
                 joints=tuple(joints),
                 rest=tuple(rest),
                 points=np.empty(0),
             )
-            chains.append(finger)
-    return chains
+            chains.append(chain)
+        return chains
 
+    def _drives_of(self, finger: Finger) -> set[str]:
+        """Return the joints with a drive that move a finger."""
+        sources = {mimic.joint: mimic.source for mimic in self._spec.mimics}
+        return {sources.get(joint, joint) for joint in finger.joints}
 
-def _drives_of(finger: Finger, spec: RobotSpec) -> set[str]:
-    """Return the joints with a drive that move a finger."""
-    sources = {mimic.joint: mimic.source for mimic in spec.mimics}
-    return {sources.get(joint, joint) for joint in finger.joints}
+    def _without_bars(self, chains: list[Finger]) -> list[Finger]:
+        """Return the chains without the bars of linkages: shorter chains of the same drive that no name calls a
+        finger."""
+        bars = []
+        for chain in chains:
+            drives = self._drives_of(chain)
+            same = [len(other.links) for other in chains if self._drives_of(other) == drives]
+            if not chain.name and len(chain.links) < max(same):
+                bars.append(chain)
+        if bars:
+            self._notes.append(
+                f"not fingers, but bars of a linkage: {', '.join(bar.links[-1] for bar in bars)}"
+            )
+        return [chain for chain in chains if chain not in bars]
 
+    def _find_palm(self, fingers: list[Finger]) -> np.ndarray:
+        """Return the palm's frame [4, 4] in the hand root's, and note how far each joint is bent at home."""
+        is_jaw = len(fingers) == 2 and len(set.union(*map(self._drives_of, fingers))) == 1
+        along = fingers if is_jaw else fingers[1:]
+        bases = np.array([finger.points[0] for finger in along])
+        ends = np.array([finger.points[-1] for finger in along])
+        x = ((ends - bases) / np.linalg.norm(ends - bases, axis=1, keepdims=True)).mean(axis=0)
+        x /= np.linalg.norm(x)
+        moved = np.zeros(3)
+        for finger in fingers:
+            last = finger.links[-1]
+            tip = self._in_link(last, finger.points[-1])
+            for name in finger.joints:
+                joint = self.tree.joint(name)
+                closing = closing_range(joint.lower, joint.upper)
+                if name not in self._spec.joint_names or closing is None:
+                    continue
+                self.bent[name] = _BEND * closing
+                if finger.name != "thumb":
+                    halfway = float(np.clip(0.0, joint.lower, joint.upper)) + 0.5 * closing
+                    T = link_places(self._spec, {name: halfway})[last]
+                    moved += T[:3, :3] @ tip + T[:3, 3] - finger.points[-1]
+        z = moved - (moved @ x) * x
+        if is_jaw:
+            # as in a right hand, whose thumb is against the palm's y
+            z = np.cross(x, ends[1] - ends[0])
+        if np.linalg.norm(z) < 0.01:
+            raise RobotError(
+                "the fingers do not bend to one side when their joints move, so the palm's inner side is unknown."
+            )
+        z /= np.linalg.norm(z)
+        T = axes(x=x, z=z)
+        T[:3, 3] = bases.mean(axis=0) - _PALM_BEHIND * x
+        return T
 
-def _without_bars(spec: RobotSpec, chains: list[Finger], notes: list[str]) -> list[Finger]:
-    """Return the chains without the bars of linkages: shorter chains of the same drive that no name calls a finger."""
-    bars = []
-    for chain in chains:
-        same = [other for other in chains if _drives_of(other, spec) == _drives_of(chain, spec)]
-        if not chain.name and len(chain.links) < max(len(other.links) for other in same):
-            bars.append(chain)
-    if bars:
-        notes.append(
-            f"not fingers, but bars of a linkage: {', '.join(bar.links[-1] for bar in bars)}"
-        )
-    return [chain for chain in chains if chain not in bars]
+    def _add_frames(self, fingers: list[Finger]) -> None:
+        """Add frames for palm, wrist, fingertips and keypoints, and note which link follows which human keypoint."""
+        palm = self.palm_in_hand
+        wrist = palm.copy()
+        wrist[:3, 3] -= (_WRIST_BEHIND - _PALM_BEHIND) * palm[:3, 0]
+        self._add_frame("palm_frame", self.root, palm)
+        self._add_frame("wrist_frame", self.root, wrist)
+        for finger in fingers:
+            last = finger.links[-1]
+            ends = (last, *finger.rest)
+            tip = FingertipSpec(
+                name=finger.name,
+                link=f"{finger.name}_tip_frame",
+                contact_links=tuple(name for name in ends if self.tree.link(name).collisions),
+                keypoint=f"{finger.name}4",
+            )
+            self.tips.append(tip)
+            R = self._at[last][:3, :3].T @ palm[:3, :3]
+            self._add_frame(tip.link, last, transform(R, self._in_link(last, finger.points[-1])))
+            for keypoint, near in _keypoint_joints(finger).items():
+                link = finger.links[near]
+                beside = self._in_link(link, finger.points[near])
+                if np.linalg.norm(beside) > _BESIDE:
+                    self._add_frame(f"{keypoint}_frame", link, transform(np.eye(3), beside))
+                    link = f"{keypoint}_frame"
+                self.keypoints.append(KeypointSpec(keypoint=keypoint, link=link))
+            self.keypoints.append(KeypointSpec(keypoint=tip.keypoint, link=tip.link))
+
+    def _add_frame(self, name: str, parent: str, T: np.ndarray) -> None:
+        tree = self.tree
+        if name in tree.link_names:
+            raise RobotError(f"the hand has a link {name!r} already; rename it.")
+        joints = (*tree.joints, fixed(parent, name, T))
+        self.tree = replace(tree, links=(*tree.links, frame(name)), joints=joints)
+
+    def _in_link(self, link: str, point: np.ndarray) -> np.ndarray:
+        """[3] a point of the hand root's frame, in a link's."""
+        pose = self._at[link]
+        return pose[:3, :3].T @ (point - pose[:3, 3])
+
+    def _surface(self, links: Iterable[str]) -> np.ndarray:
+        """[V, 3] vertices of the shapes of links in the hand root's frame."""
+        points = [np.zeros((0, 3))]
+        for name in links:
+            if shapes := self.tree.link(name).collisions:
+                points.append(transformed(surface_of(shapes)[0], self._at[name]))
+        return np.concatenate(points)
+
+    def _points(self, finger: Finger) -> np.ndarray:
+        """[links + 1, 3] the joints and the tip of a finger.
+
+        A joint is the point of its axis that is nearest to the middle of its link's shapes: makers put origins anywhere
+        along an axis. The tip is a fixed link called so, or the point of the shapes that is farthest from the last
+        joint.
+        """
+        points = [self._on_axis(link, self._surface([link])) for link in finger.links]
+        tips = [name for name in finger.rest if "tip" in name.lower()]
+        if tips:
+            return np.array([*points, self._at[tips[0]][:3, 3]])
+        last = finger.links[-1]
+        cloud = self._surface((last, *finger.rest))
+        if not len(cloud):
+            raise RobotError(
+                f"the last link of a finger, {last!r}, has no collision shape, so it can touch nothing."
+            )
+        middle = _middle(cloud)
+        away = middle - self._on_axis(last, cloud)
+        away /= max(float(np.linalg.norm(away)), 1e-9)
+        return np.array([*points, middle + away * float(((cloud - middle) @ away).max())])
+
+    def _on_axis(self, link: str, cloud: np.ndarray) -> np.ndarray:
+        """[3] the point of the axis before a link that is nearest to the middle of points; the origin if there is
+        none."""
+        origin = self._at[link][:3, 3]
+        if not len(cloud):
+            return origin
+        axis = self._at[link][:3, :3] @ self.tree.above[link].axis
+        return origin + axis * float((_middle(cloud) - origin) @ axis)
 
 
 def _stated_finger(names: str) -> str:
@@ -254,89 +349,6 @@ def _stated_finger(names: str) -> str:
         if re.search(rf"(?<![a-z])({words}|{code}{_BONE})", text):
             return finger
     return ""
-
-
-def _find_palm(
-    spec: RobotSpec, tree: RobotTree, straight: Poses, fingers: list[Finger]
-) -> tuple[np.ndarray, dict[str, float]]:
-    """Return the palm's frame [4, 4] in the hand root's, and how far each joint is bent at home [rad]."""
-    drives = _drives_of(fingers[0], spec) | _drives_of(fingers[1], spec)
-    is_jaw = len(fingers) == 2 and len(drives) == 1
-    along = fingers if is_jaw else fingers[1:]
-    bases = np.array([finger.points[0] for finger in along])
-    ends = np.array([finger.points[-1] for finger in along])
-    x = ((ends - bases) / np.linalg.norm(ends - bases, axis=1, keepdims=True)).mean(axis=0)
-    x /= np.linalg.norm(x)
-    bent = {}
-    moved = np.zeros(3)
-    for finger in fingers:
-        last = finger.links[-1]
-        end = finger.points[-1]
-        for joint in [tree.joint(name) for name in finger.joints if name in spec.joint_names]:
-            name = joint.name
-            closing = closing_range(joint.lower, joint.upper)
-            if closing is None:
-                continue
-            bent[name] = _BEND * closing
-            if finger.name != "thumb":
-                T = link_places(
-                    spec, {name: float(np.clip(0.0, joint.lower, joint.upper)) + 0.5 * closing}
-                )[last]
-                moved += T[:3, :3] @ _in_link(straight[last], end) + T[:3, 3] - end
-    z = moved - (moved @ x) * x
-    if is_jaw:
-        # as in a right hand, whose thumb is against the palm's y
-        z = np.cross(x, ends[1] - ends[0])
-    if np.linalg.norm(z) < 0.01:
-        raise RobotError(
-            "the fingers do not bend to one side when their joints move, so the palm's inner side is unknown."
-        )
-    z /= np.linalg.norm(z)
-    T = axes(x=x, z=z)
-    T[:3, 3] = bases.mean(axis=0) - _PALM_BEHIND * x
-    return T, bent
-
-
-def _with_frames(
-    tree: RobotTree, hand_root: str, fingers: list[Finger], palm: np.ndarray, straight: Poses
-) -> tuple[RobotTree, list[FingertipSpec], list[KeypointSpec]]:
-    """Return the tree with frames for palm, wrist and fingertips, the fingertips, and which link follows which human
-    keypoint."""
-    wrist = palm.copy()
-    wrist[:3, 3] -= (_WRIST_BEHIND - _PALM_BEHIND) * palm[:3, 0]
-    frames = [("palm_frame", hand_root, palm), ("wrist_frame", hand_root, wrist)]
-    tips = []
-    keypoints = [KeypointSpec(keypoint="wrist", link="wrist_frame")]
-    for finger in fingers:
-        last = finger.links[-1]
-        T = transform(
-            straight[last][:3, :3].T @ palm[:3, :3], _in_link(straight[last], finger.points[-1])
-        )
-        tip = FingertipSpec(
-            name=finger.name,
-            link=f"{finger.name}_tip_frame",
-            contact_links=tuple(
-                name for name in (last, *finger.rest) if tree.link(name).collisions
-            ),
-            keypoint=f"{finger.name}4",
-        )
-        tips.append(tip)
-        frames.append((tip.link, last, T))
-        for keypoint, near in _keypoint_joints(finger).items():
-            link = finger.links[near]
-            beside = _in_link(straight[link], finger.points[near])
-            if np.linalg.norm(beside) > _BESIDE:
-                frames.append((f"{keypoint}_frame", link, transform(np.eye(3), beside)))
-                link = f"{keypoint}_frame"
-            keypoints.append(KeypointSpec(keypoint=keypoint, link=link))
-        keypoints.append(KeypointSpec(keypoint=tip.keypoint, link=tip.link))
-    for name, parent, T in frames:
-        if name in tree.link_names:
-            raise RobotError(f"the hand has a link {name!r} already; rename it.")
-        tree = replace(
-            tree, links=(*tree.links, frame(name)), joints=(*tree.joints, fixed(parent, name, T))
-        )
-    return tree, tips, keypoints
 
 
 def _keypoint_joints(finger: Finger) -> dict[str, int]:
@@ -357,53 +369,6 @@ def _keypoint_joints(finger: Finger) -> dict[str, int]:
     return found
 
 
-def _in_link(pose: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """[3] a point of the hand root's frame, in a link's."""
-    return pose[:3, :3].T @ (point - pose[:3, 3])
-
-
-def _surface(tree: RobotTree, links: Iterable[str], at: Poses) -> np.ndarray:
-    """[V, 3] vertices of the shapes of links in the hand root's frame."""
-    points = [np.zeros((0, 3))]
-    for name in links:
-        if tree.link(name).collisions:
-            points.append(
-                surface_of(tree.link(name).collisions)[0] @ at[name][:3, :3].T + at[name][:3, 3]
-            )
-    return np.concatenate(points)
-
-
-def _points(tree: RobotTree, finger: Finger, at: Poses) -> np.ndarray:
-    """[links + 1, 3] the joints and the tip of a finger.
-
-    A joint is the point of its axis that is nearest to the middle of its link's shapes: makers put origins anywhere
-    along an axis. The tip is a fixed link called so, or the point of the shapes that is farthest from the last joint.
-    """
-    points = [_on_axis(tree, link, at, _surface(tree, [link], at)) for link in finger.links]
-    tips = [name for name in finger.rest if "tip" in name.lower()]
-    if tips:
-        return np.array([*points, at[tips[0]][:3, 3]])
-    last = finger.links[-1]
-    cloud = _surface(tree, (last, *finger.rest), at)
-    if not len(cloud):
-        raise RobotError(
-            f"the last link of a finger, {last!r}, has no collision shape, so it can touch nothing."
-        )
-    middle = _middle(cloud)
-    away = middle - _on_axis(tree, last, at, cloud)
-    away /= max(float(np.linalg.norm(away)), 1e-9)
-    return np.array([*points, middle + away * float(((cloud - middle) @ away).max())])
-
-
 def _middle(points: np.ndarray) -> np.ndarray:
     """[3] middle of the bounding box."""
     return (points.max(axis=0) + points.min(axis=0)) / 2
-
-
-def _on_axis(tree: RobotTree, link: str, at: Poses, cloud: np.ndarray) -> np.ndarray:
-    """[3] the point of the axis before a link that is nearest to the middle of points; the origin if there is none."""
-    origin = at[link][:3, 3]
-    if not len(cloud):
-        return origin
-    axis = at[link][:3, :3] @ next(joint.axis for joint in tree.joints if joint.child == link)
-    return origin + axis * float((_middle(cloud) - origin) @ axis)

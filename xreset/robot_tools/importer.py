@@ -24,7 +24,7 @@ from xreset.geometry.shapes import surface_of
 from xreset.geometry.urdf import RobotTree
 from xreset.geometry.urdf_writer import axes, pose, roll_pitch_yaw
 from xreset.robot_tools.draft import description_text, draft_spec
-from xreset.robot_tools.fingers import Hand, find_hand
+from xreset.robot_tools.fingers import Hand
 from xreset.robot_tools.homes import hold_near
 from xreset.robot_tools.sources import bare, combined, last_link, read_source, renamed
 from xreset.spec import RobotSpec, SceneSpec
@@ -97,7 +97,7 @@ def import_robot(
     along = f"the flange's {sign}{'xyz'[int(np.abs(ahead).argmax())]} axis"
     hand_tree = renamed(read_source(hand, notes), arm_tree)
     with atomic_folder(out) as work:
-        found = find_hand(hand_tree, work, thumb, notes)
+        found = Hand(hand_tree, work, thumb, notes)
         if rpy is None:
             rpy = _turned(found.palm[:3, 0], ahead)
             if any(rpy):
@@ -148,15 +148,12 @@ def _out_of_flange(arm: RobotTree, flange: str) -> np.ndarray:
     before that joint. It is z where the joint turns about none of the flange's axes."""
     T = np.eye(4)  # pose of the flange in the frame of the link
     link = flange
-    above = {joint.child: joint for joint in arm.joints}
-    while link in above and above[link].type == "fixed":
-        T = above[link].T_parent_joint @ T
-        link = above[link].parent
-    if link not in above:
-        return np.array((0.0, 0.0, 1.0))
-    joint = above[link]
-    axis = T[:3, :3].T @ joint.axis
-    if np.abs(axis).max() < _ALONG:
+    while link != arm.root and link not in arm.moved_by:
+        T = arm.above[link].T_parent_joint @ T
+        link = arm.above[link].parent
+    joint = arm.moved_by.get(link)
+    axis = np.zeros(3) if joint is None else T[:3, :3].T @ joint.axis
+    if joint is None or np.abs(axis).max() < _ALONG:
         return np.array((0.0, 0.0, 1.0))
     before = np.zeros(3)
     if arm.link(joint.parent).collisions:
@@ -190,13 +187,12 @@ def _stand_off(hand: Hand, rpy: tuple[float, float, float], ahead: np.ndarray) -
 
 def _with_rotors(hand: Hand, notes: list[str]) -> RobotTree:
     """Return the tree of a hand whose moving links carry their rotors."""
-    moved_by = {joint.child: joint for joint in hand.tree.joints if joint.type != "fixed"}
     inside = hand.tree.below(hand.root)[1:]
     links = []
     for link in hand.tree.links:
-        if link.name in moved_by and link.name in inside:
-            rotor = moved_by[link.name].rotor or _ROTOR
-            link = replace(link, inertia=link.inertia + rotor * np.eye(3))
+        joint = hand.tree.moved_by.get(link.name)
+        if joint is not None and link.name in inside:
+            link = replace(link, inertia=link.inertia + (joint.rotor or _ROTOR) * np.eye(3))
         links.append(link)
     notes.append(
         f"moving links of the hand carry {_ROTOR:g} kg m^2 of rotor inertia, or what the MJCF states as armature"

@@ -27,7 +27,7 @@ def robot_picture(robot: RobotSpec) -> np.ndarray:
     points = poses[:, :3, 3]
     middle = points.mean(axis=0)
     distance = max(3.0 * float(np.ptp(points, axis=0).max()), 0.25)
-    moving = [joint.child for joint in kinematics.tree.joints if joint.type != "fixed"]
+    moving = list(kinematics.tree.moved_by)
     followed = list(dict.fromkeys(keypoint.link for keypoint in robot.keypoints))
     close = []
     for side in _SIDES:

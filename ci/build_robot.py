@@ -1,4 +1,4 @@
-"""Write the ``robot.urdf`` of a built-in robot from the figures in its ``build.toml``: ``python -m xreset.robots.build
+"""Writes the ``robot.urdf`` of a built-in robot from the figures in its ``build.toml``: ``python ci/build_robot.py
 FOLDER``.
 
 ``build.toml`` names its sources. Units are m, rad, kg, N and N m; quaternions are (w, x, y, z).
@@ -31,13 +31,14 @@ from xreset.geometry.urdf_writer import axes, fixed, frame, pose, urdf_text
 from xreset.spec import Geometry, MimicSpec, Shape
 
 Figures = dict[str, Any]
+ROBOTS = Path(__file__).parents[1] / "robots"
 SHARED = {"arm_of": ("base", "arm"), "hand_of": ("palm", "hand", "frames", "rotor")}
 """What a robot takes from another one."""
 
 
 def read_figures(folder: str) -> Figures:
     """Return the content of a robot's ``build.toml``, completed with what it takes from other robots."""
-    figures = tomllib.loads((Path(__file__).parent / folder / "build.toml").read_text())
+    figures = tomllib.loads((ROBOTS / folder / "build.toml").read_text())
     for key, names in SHARED.items():
         if key in figures:
             other = read_figures(figures[key])
@@ -122,6 +123,6 @@ def _shape(kind: Any, first: list[float], second: list[float], radius: float = 0
 
 
 if __name__ == "__main__":
-    path = Path(__file__).parent / sys.argv[1] / "robot.urdf"
+    path = ROBOTS / sys.argv[1] / "robot.urdf"
     path.write_text(robot_urdf(sys.argv[1]))
     print(f"wrote {path}")

@@ -145,7 +145,7 @@ class Pictures(unittest.TestCase):
     def test_parts_are_told_apart_by_color(self):
         for name in ("openarm", "ur7e-sharpa"):
             robot = load(name)
-            colors = dict(zip(Kinematics(robot).link_names, link_colors(robot), strict=True))
+            colors = link_colors(robot)
             self.assertEqual(colors[robot.hand_root], meshes.PALM_COLOR)
             for tip in robot.fingertips:
                 for link in tip.contact_links:

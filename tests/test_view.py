@@ -157,7 +157,6 @@ class Data(WithFiles):
             "off by 12 mm (fingertips), 3 mm (wrist)",
         )
         self.assertEqual(view.text(6)[2:], text)
-        self.assertEqual(view.counts(), {"": 6, "joint limit": 2, "arm jump": 0})
         np.testing.assert_array_equal(view.choose(reason="joint limit"), [1, 5])
         np.testing.assert_array_equal(view.choose(sequence=1, reason=""), [4, 6, 7])
 
@@ -275,10 +274,8 @@ class Served(WithFiles):
 
     def test_frames_of_one_reason_are_picked(self):
         page = self.page(self.retargeted)
-        self.assertEqual(page._bar.content.count("flex:"), 3)  # valid, joint limit, valid
         page._sequence.value = "all"
         page._choose()
-        self.assertEqual(page._bar.content.count("flex:"), 5)
         page._reason.value = "joint limit (2)"
         page._choose()
         np.testing.assert_array_equal(page._rows, [1, 5])

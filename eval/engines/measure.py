@@ -21,7 +21,7 @@ from xreset.errors import XResetError
 from xreset.eval.trial import Engine
 from xreset.geometry.dynamics import mass_matrix
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.shapes import hull
+from xreset.geometry.shapes import hull, transformed
 from xreset.geometry.urdf import link_meshes, robot_tree
 from xreset.physics import Backend, State
 from xreset.spec import GRAVITY, ObjectSpec, SceneSpec
@@ -320,14 +320,15 @@ def _reachable(scene: SceneSpec, *, tip: bool) -> tuple[np.ndarray, np.ndarray, 
     """
     robot = scene.robot
     kinematics = Kinematics(robot)
-    poses = kinematics.link_poses(torch.as_tensor(robot.home, dtype=torch.float64)).numpy()
+    meshes = link_meshes(robot)
+    home = torch.as_tensor(robot.home, dtype=torch.float64)
+    poses = kinematics.link_poses(home, list(meshes)).numpy()
     contact_links = set()
     for finger in robot.fingertips:
         contact_links.update(finger.contact_links)
     points: dict[bool, list[np.ndarray]] = {True: [], False: []}
-    for name, mesh, T in zip(kinematics.link_names, link_meshes(robot), poses, strict=True):
-        if mesh is not None:
-            points[name in contact_links].append(mesh.vertices @ T[:3, :3].T + T[:3, 3])
+    for (name, mesh), T in zip(meshes.items(), poses, strict=True):
+        points[name in contact_links].append(transformed(mesh.vertices, T))
     mine = np.concatenate(points[tip])
     others = np.concatenate(points[not tip])
     best = None

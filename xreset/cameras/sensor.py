@@ -60,8 +60,7 @@ class Cameras:
         device = object_index.device
         robot = scene.robot
         self._kinematics = Kinematics(robot, dtype=torch.float32, device=device)
-        meshes = dict(zip(self._kinematics.link_names, link_meshes(robot), strict=True))
-        bodies = {name: mesh for name, mesh in meshes.items() if mesh is not None}
+        bodies = link_meshes(robot)
         objects = [trimesh.Trimesh(o.vertices, o.faces, process=False) for o in scene.objects]
         first_object = len(bodies) + 1
         self._num_links = len(bodies)

@@ -211,10 +211,11 @@ def _may_collide(robot: RobotSpec, tree: RobotTree, a: str, b: str) -> bool:
     parents = {tree.moving_ancestor(joint.parent) for joint in joints}
     if len(bodies) == 1 or bodies & parents:
         return False
-    for pair in robot.collision_exclude:
-        if {tree.moving_ancestor(name) for name in pair} == bodies:
-            return False
-    return True
+    excluded = [
+        {tree.moving_ancestor(one), tree.moving_ancestor(other)}
+        for one, other in robot.collision_exclude
+    ]
+    return bodies not in excluded
 
 
 def coal_geometry(coal, geometry: Geometry):

@@ -152,15 +152,15 @@ def robot_tree(robot: RobotSpec) -> RobotTree:
     return load_urdf(robot.urdf)
 
 
-def link_meshes(robot: RobotSpec) -> list[trimesh.Trimesh | None]:
-    """Return the collision shapes of each link of the robot's URDF as one mesh in the link's frame; None for no
-    shape."""
+def link_meshes(robot: RobotSpec) -> dict[str, trimesh.Trimesh]:
+    """Return the collision shapes of each link of the robot's URDF that has some, as one mesh in the link's frame."""
     import trimesh
 
-    meshes = []
+    meshes = {}
     for link in robot_tree(robot).links:
-        shapes = [shape_mesh(shape, coarse=True) for shape in link.collisions]
-        meshes.append(trimesh.util.concatenate(shapes) if shapes else None)
+        if link.collisions:
+            shapes = [shape_mesh(shape, coarse=True) for shape in link.collisions]
+            meshes[link.name] = trimesh.util.concatenate(shapes)
     return meshes
 
 
@@ -174,13 +174,7 @@ def load_urdf(path: str | Path) -> RobotTree:
         RobotError: the file is missing or damaged, a mesh is missing, the links form no tree, or a joint type is not
             supported.
     """
-    if not os.path.isfile(path):  # Path.is_file() raises OSError for a name that is too long
-        raise RobotError(f"{shown(str(path))} is not a file. Expected a URDF there.")
     path = Path(path).resolve()
-    if path.stat().st_size > max_bytes() // 16:
-        raise RobotError(
-            f"{path} has {path.stat().st_size >> 20} MB, which is too large for a URDF."
-        )
     files = (path, *mesh_files(path))
     return _load(path, tuple(file.stat().st_mtime_ns for file in files))
 
@@ -188,13 +182,10 @@ def load_urdf(path: str | Path) -> RobotTree:
 def parse_xml(path: Path) -> Element:
     """Return the root element of a file, or raise ``RobotError``; expat refuses entities that grow to any size."""
     try:
+        if path.stat().st_size > max_bytes() // 16:
+            raise ValueError("it is too large to describe a robot")
         return ElementTree.parse(path).getroot()
-    except (
-        OSError,
-        ElementTree.ParseError,
-        ValueError,
-        LookupError,
-    ) as error:  # the last two: encodings
+    except (OSError, ElementTree.ParseError, ValueError, LookupError) as error:  # also encodings
         raise RobotError(f"{path} cannot be read as XML: {shown(str(error))}") from error
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
@@ -33,8 +33,7 @@ _TABLE_CELL = 0.1
 """Side of a square of the table's chequerboard [m]."""
 
 
-@dataclass(frozen=True)
-class Triangles:
+class Triangles(NamedTuple):
     """Triangles in the world, ready to be drawn: arrays of float32."""
 
     corners: np.ndarray
@@ -55,11 +54,7 @@ def place(mesh: trimesh.Trimesh, color: Color, pose: np.ndarray) -> Triangles:
 
 def join(parts: Sequence[Triangles]) -> Triangles:
     """Return all triangles of several sets as one set."""
-    return Triangles(
-        np.concatenate([part.corners for part in parts]),
-        np.concatenate([part.normals for part in parts]),
-        np.concatenate([part.colors for part in parts]),
-    )
+    return Triangles(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def shade_smoothly(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -73,7 +68,7 @@ def object_mesh(obj: ObjectSpec) -> trimesh.Trimesh:
     return trimesh.Trimesh(obj.vertices, obj.faces, process=False)
 
 
-def link_colors(robot: RobotSpec) -> list[Color]:
+def link_colors(robot: RobotSpec) -> dict[str, Color]:
     """Return the color of each link of the robot's URDF: arm, palm, fingers and fingertips differ."""
     tree = robot_tree(robot)
     tips: set[str] = set()
@@ -81,21 +76,23 @@ def link_colors(robot: RobotSpec) -> list[Color]:
         tips.update(tip.contact_links)
     hand = tree.below(robot.hand_root)
     palm_body = tree.moving_ancestor(robot.hand_root)
-    colors = []
+    colors = {}
     for name in tree.link_names:
         if name in tips:
-            colors.append(TIP_COLOR)
+            colors[name] = TIP_COLOR
         elif name not in hand:
-            colors.append(ARM_COLOR)
+            colors[name] = ARM_COLOR
         elif tree.moving_ancestor(name) == palm_body:
-            colors.append(PALM_COLOR)
+            colors[name] = PALM_COLOR
         else:
-            colors.append(HAND_COLOR)
+            colors[name] = HAND_COLOR
     return colors
 
 
-def tint(color: Color, other: Color) -> Color:
-    """Mix more than half of another color into a color: parts of different colors still differ."""
+def tint(color: Color, other: Color | None) -> Color:
+    """Mix more than half of another color, if there is one, into a color: parts of different colors still differ."""
+    if other is None:
+        return color
     red, green, blue = 0.4 * np.array(color) + 0.6 * np.array(other)
     return red, green, blue
 

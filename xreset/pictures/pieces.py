@@ -27,14 +27,13 @@ def draw_pieces(objects: Sequence[ObjectSpec], captions: Sequence[str]) -> np.nd
     """
     rows = []
     for obj, caption in zip(objects, captions, strict=True):
-        low = obj.vertices.min(axis=0)
-        high = obj.vertices.max(axis=0)
-        middle = (low + high) / 2
-        eye = middle + np.array([0.55, -0.75, 0.75]) * 1.15 * np.linalg.norm(high - low)
+        mesh = object_mesh(obj)
+        middle = mesh.bounds.mean(axis=0)
+        eye = middle + np.array([0.55, -0.75, 0.75]) * 1.15 * mesh.scale
         camera = Camera(eye=tuple(eye.tolist()), target=tuple(middle.tolist()))
         pieces = [shape_mesh(piece) for piece in obj.pieces]
         hues = [colorsys.hsv_to_rgb(0.618 * i % 1, 0.55, 0.95) for i in range(len(pieces))]
-        whole = draw_bodies([object_mesh(obj)], [OBJECT_COLOR], camera, TILE_SIZE)
+        whole = draw_bodies([mesh], [OBJECT_COLOR], camera, TILE_SIZE)
         parts = draw_bodies(pieces, hues, camera, TILE_SIZE)
         rows.append(add_caption(np.hstack((whole, parts)), [caption], 1))
     return np.vstack(rows)

@@ -23,6 +23,7 @@ from xreset.cameras.pose import look_at
 from xreset.errors import XResetError
 from xreset.files import write_whole
 from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.shapes import transform
 from xreset.geometry.urdf import link_meshes
 from xreset.pictures.meshes import (
     GOAL_COLOR,
@@ -133,7 +134,8 @@ class Renderer:
         self.camera = camera or Camera()
         self._smooth = smooth
         self._kinematics = Kinematics(scene.robot)
-        self._links = [mesh and shade_smoothly(mesh) for mesh in link_meshes(scene.robot)]
+        meshes = link_meshes(scene.robot)
+        self._links = {name: shade_smoothly(mesh) for name, mesh in meshes.items()}
         self._colors = link_colors(scene.robot)
         self._objects = [shade_smoothly(object_mesh(obj)) for obj in scene.objects]
         self._table = table_top(scene.table)
@@ -189,17 +191,15 @@ class Renderer:
             )
         return lines
 
-    def _link_poses(self, joint_pos: np.ndarray, links: Sequence[str] | None = None) -> np.ndarray:
+    def _link_poses(self, joint_pos: np.ndarray, links: Sequence[str]) -> np.ndarray:
         joints = torch.as_tensor(np.asarray(joint_pos), dtype=torch.float64)
         return self._kinematics.link_poses(joints, links).numpy()
 
     def _robot(self, joint_pos: np.ndarray, robot_tint: Color | None) -> list[Triangles]:
+        poses = self._link_poses(joint_pos, list(self._links))
         parts = []
-        for mesh, color, pose in zip(
-            self._links, self._colors, self._link_poses(joint_pos), strict=True
-        ):
-            if mesh is not None:
-                parts.append(place(mesh, tint(color, robot_tint) if robot_tint else color, pose))
+        for (name, mesh), pose in zip(self._links.items(), poses, strict=True):
+            parts.append(place(mesh, tint(self._colors[name], robot_tint), pose))
         return parts
 
 
@@ -218,10 +218,8 @@ def draw_bodies(
 
 def pose_matrix(pos: np.ndarray, quat: np.ndarray) -> np.ndarray:
     """[4, 4] pose from a position [3] and a quaternion [4] (w, x, y, z)."""
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_quat(np.asarray(quat, dtype=float), scalar_first=True).as_matrix()
-    T[:3, 3] = pos
-    return T
+    rotation = Rotation.from_quat(np.asarray(quat, dtype=float), scalar_first=True)
+    return transform(rotation.as_matrix(), pos)
 
 
 def add_caption(picture: np.ndarray, caption: Sequence[str], lines: int) -> np.ndarray:

@@ -65,11 +65,7 @@ def hold_near(robot: RobotSpec, T_world_root: np.ndarray) -> tuple[RobotSpec, st
     step = (100 * steps[chosen]).tolist()
     moved = f", moved by ({', '.join(f'{value:.0f}' for value in step)}) cm" if any(step) else ""
     positions = rounded(joints[chosen, 0].numpy(), model.lower.numpy(), model.upper.numpy())
-    return _with_arm_at(robot, positions), moved
-
-
-def _with_arm_at(robot: RobotSpec, positions: np.ndarray) -> RobotSpec:
-    joints = [*robot.joints]
+    spec_joints = [*robot.joints]
     for index, position in zip(robot.arm_indices, positions.tolist(), strict=True):
-        joints[index] = replace(joints[index], home=position)
-    return replace(robot, joints=tuple(joints))
+        spec_joints[index] = replace(spec_joints[index], home=position)
+    return replace(robot, joints=tuple(spec_joints)), moved

@@ -156,54 +156,53 @@ def judge(
         lifted.object_quat_wxyz,
     )
     chosen = _tightest(fingers, lifted, states, squeeze.reach)
-    if not len(chosen):
+    if not chosen:
         raise RobotError(
             f"robot {robot.name!r}: in no lifted state are the thumb and another finger within "
             f"{1e3 * squeeze.reach:g} mm of the object. Check the fingertips' frames (xreset robots check --picture), "
             "or raise --squeeze.reach."
         )
     targets = squeeze_targets(robot, fingers, lifted.joint_pos, squeeze)[chosen]
-    tried = lifted.with_states(chosen)
-    count = len(chosen)
+    tried = lifted.with_states(np.array(chosen))
     used = [spec for spec in objects if spec.name in tried.object_name]
     names = [spec.name for spec in used]
     scene = SceneSpec(robot=robot, objects=tuple(used))
     index = np.array([names.index(name) for name in tried.object_name.tolist()])
-    poses = (
-        torch.as_tensor(array)
-        for array in (tried.joint_pos, tried.object_pos, tried.object_quat_wxyz, targets)
-    )
-    start = State.at_rest(*poses)
-    moments = torch.cat((start.joint_pos, start.object_pos, start.object_quat), dim=1)[
-        :, None
-    ].numpy()
-    judged = []
+    arrays = (tried.joint_pos, tried.object_pos, tried.object_quat_wxyz, targets)
+    start = State.at_rest(*map(torch.as_tensor, arrays))
+    groups = {name: np.flatnonzero(index == number) for number, name in enumerate(names)}
+    rows = []
     shots: dict[str, np.ndarray] = {}
-    for number, name in enumerate(backends):
+    for number, backend in enumerate(backends):
+        before = number * len(chosen)
         table = probe(
-            name, scene, index, start, partial(_play, Kinematics(robot)), gravity=0.0, steps=_CLOSE_STEPS,
+            backend, scene, index, start, partial(_play, Kinematics(robot)), gravity=0.0, steps=_CLOSE_STEPS,
             num_envs=num_envs, device=device,
-            progress=lambda done, number=number: progress(number * count + done, len(backends) * count),
+            progress=lambda done, before=before: progress(before + done, len(backends) * len(chosen)),
         )  # fmt: skip
-        reached = table[:, 0] > 0
-        passed = table[:, 1 : 1 + len(PHASES)] > 0
-        later = table[:, 1 + len(PHASES) :].reshape(len(table), len(PHASES), -1)
-        groups = {label: np.flatnonzero(tried.object_name == label) for label in names}
-        for label, mine in {**groups, "all": np.arange(count)}.items():
-            counts = dict(zip(PHASES, passed[mine].sum(axis=0).tolist(), strict=True))
-            fails = int((~reached[mine]).sum())
-            judged.append(
-                Judged(backend=name, object_name=label, tried=len(mine), arm_fails=fails, **counts)
+        verdicts = table[:, : 1 + len(PHASES)].astype(int)
+        for name, mine in {**groups, "all": np.arange(len(chosen))}.items():
+            able, hold, lift, turn = verdicts[mine].sum(axis=0).tolist()
+            row = Judged(
+                backend=backend,
+                object_name=name,
+                tried=len(mine),
+                hold=hold,
+                lift=lift,
+                turn=turn,
+                arm_fails=len(mine) - able,
             )
-        if not shots:
-            for label, mine in groups.items():
-                best = mine[passed[mine].sum(axis=1).argmax()]
-                shots[label] = np.concatenate((moments[best], later[best]))
+            rows.append(row)
+        if number == 0:
+            for name, mine in groups.items():
+                best = mine[verdicts[mine, 1:].sum(axis=1).argmax()]
+                later = table[best, 1 + len(PHASES) :].reshape(len(PHASES), -1)
+                shots[name] = np.vstack((_moment(start[[best]]).numpy(), later))
     without = sorted({*bank.object_names} - set(names))
-    return Judgement(robot=robot.name, rows=tuple(judged), without=tuple(without), shots=shots)
+    return Judgement(robot=robot.name, rows=tuple(rows), without=tuple(without), shots=shots)
 
 
-def _tightest(fingers: Fingers, bank: ResetBank, count: int, reach: float) -> np.ndarray:
+def _tightest(fingers: Fingers, bank: ResetBank, count: int, reach: float) -> list[int]:
     """Return rows of the states that grasp most tightly, ``count`` of each object, from its sequences in turn."""
     thumb = fingers.gap[:, fingers.finger == 0].amin(dim=-1)
     other = fingers.gap[:, fingers.finger != 0].amin(dim=-1)
@@ -216,7 +215,12 @@ def _tightest(fingers: Fingers, bank: ResetBank, count: int, reach: float) -> np
     for name in np.unique(bank.object_name):
         mine = np.flatnonzero((bank.object_name == name) & (gap < reach))
         chosen += mine[np.lexsort((gap[mine], rank[mine]))][:count].tolist()
-    return np.array(sorted(chosen), dtype=np.int64)
+    return sorted(chosen)
+
+
+def _moment(state: State) -> Tensor:
+    """[N, J + 7] joint positions, and position and orientation of the object."""
+    return torch.cat((state.joint_pos, state.object_pos, state.object_quat), dim=1)
 
 
 def _play(kinematics: Kinematics, backend: Backend, start: State) -> Tensor:
@@ -234,12 +238,13 @@ def _play(kinematics: Kinematics, backend: Backend, start: State) -> Tensor:
     pos, quat = _relative(
         start.object_pos, start.object_quat, palm[:, :3, 3], matrix_to_quat(palm[:, :3, :3])
     )
-    kept = torch.ones(len(joints), dtype=torch.bool)
+    able = (up_error < 1) & (turn_error < 1)
+    kept = torch.ones_like(able)
     passed = []
     moments = []
     before = joints
     for path, error in (
-        (joints[None], torch.zeros(len(joints))),
+        (joints[None], torch.zeros_like(up_error)),
         (up, up_error),
         (turn, turn_error),
     ):
@@ -258,13 +263,10 @@ def _play(kinematics: Kinematics, backend: Backend, start: State) -> Tensor:
         near = ((now_pos - pos).norm(dim=-1) < DISTANCE) & (quat_angle(now_quat, quat) < ANGLE)
         kept = kept & near & (error < 1)
         passed.append(kept)
-        moments.append(torch.cat((now.joint_pos, now.object_pos, now.object_quat), dim=1))
+        moments.append(_moment(now))
     health = backend.health()
     sound = ~(health.nonfinite | health.overflow).cpu()
-    reached = (up_error < 1) & (turn_error < 1)
-    return torch.cat(
-        (reached[:, None], torch.stack(passed, dim=1) & sound[:, None], *moments), dim=1
-    )
+    return torch.cat((able[:, None], torch.stack(passed, dim=1) & sound[:, None], *moments), dim=1)
 
 
 def _relative(

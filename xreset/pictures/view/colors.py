@@ -9,8 +9,6 @@ TOUCH_COLOR: Color = (1.00, 0.80, 0.00)
 """Keypoints in contact with the object."""
 REACHED_COLOR: Color = (0.10, 0.55, 0.90)
 """The robot's fingertips."""
-GOOD_COLOR: Color = (0.30, 0.70, 0.35)
-"""Valid frames on the time line."""
 
 REASON_COLORS: dict[str, Color] = {
     "not annotated": (0.55, 0.55, 0.55),
@@ -22,11 +20,9 @@ REASON_COLORS: dict[str, Color] = {
     "table collision": (0.86, 0.13, 0.13),
     "self collision": (0.95, 0.35, 0.60),
 }
-"""Reason -> color of its frames on the time line, and of the robot in these frames."""
+"""Reason -> color that is mixed into the robot's in the frames that it makes invalid."""
 
 
-def reason_color(reason: str) -> Color:
-    """Return the color of a reason; green for none (empty text), red for an unknown one."""
-    if not reason:
-        return GOOD_COLOR
-    return REASON_COLORS.get(reason, INVALID_COLOR)
+def reason_color(reason: str) -> Color | None:
+    """Return the color of a reason; None without a reason (empty text), red for an unknown one."""
+    return REASON_COLORS.get(reason, INVALID_COLOR) if reason else None

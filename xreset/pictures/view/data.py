@@ -5,7 +5,6 @@ Shape letters: N rows (frames of trajectories, or states of a bank), S sequences
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass
 from typing import Literal
 
@@ -57,8 +56,6 @@ class View:
     """[N] bool: at or after the sequence's first contact."""
     reason: tuple[str, ...]
     """[N] why a row is not valid (not stable, not annotated); empty text for a good row."""
-    reasons: tuple[str, ...]
-    """Every possible reason, in the order of the tests."""
     joint_pos: np.ndarray | None = None
     """[N, J]"""
     fingertips: np.ndarray | None = None
@@ -77,7 +74,7 @@ class View:
 
         Args:
             sequence: None: all sequences.
-            reason: one of :attr:`reasons`; empty text for good rows; None: all rows.
+            reason: a reason; empty text for good rows; None: all rows.
 
         Raises:
             XResetError: unknown sequence.
@@ -93,11 +90,6 @@ class View:
         if reason is not None:
             keep &= np.array(self.reason) == reason
         return np.flatnonzero(keep)
-
-    def counts(self) -> dict[str, int]:
-        """Return the number of rows with each reason, also 0; the number of good rows is under the empty text."""
-        found = Counter(self.reason)
-        return {reason: found[reason] for reason in ("", *self.reasons)}
 
     def text(self, row: int) -> tuple[str, ...]:
         """Return lines that describe a row, the most important one first."""

@@ -74,7 +74,6 @@ def _demos_view(demos: Demos, inputs: Inputs) -> View:
         **_motion(demos, inputs.objects),
         post_contact=np.concatenate(touched),
         reason=tuple("" if valid else "not annotated" for valid in demos.hand_valid),
-        reasons=("not annotated",),
         **human,
     )
 
@@ -113,7 +112,6 @@ def _retargeted_view(data: Retargeted, inputs: Inputs) -> View:
         reason=tuple(
             "" if reason == 0 else data.reason_names[reason] for reason in data.reason.tolist()
         ),
-        reasons=data.reason_names[1:],
         joint_pos=data.joint_pos,
         fingertips=data.fingertip_pos,
         hand_error=data.hand_error,
@@ -137,7 +135,6 @@ def _bank_view(bank: ResetBank, inputs: Inputs) -> View:
         goal_quat=bank.goal_quat_wxyz,
         post_contact=bank.post_contact,
         reason=("",) * bank.num_states,
-        reasons=(),
         joint_pos=bank.joint_pos,
     )
 

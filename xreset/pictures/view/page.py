@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from html import escape
-from itertools import groupby
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -56,7 +55,6 @@ class Page(WebPage):
         super().__init__(host, port, "xreset view")
         self._scene = _Scene(view, self._server)
         self._make_controls(sequence)
-        self._show_choice()
         self._frame.value = frame
         self.show()
 
@@ -92,20 +90,18 @@ class Page(WebPage):
         gui: Any = self._server.gui
         view = self.view
         self._reasons = {}
-        for reason, count in view.counts().items():
-            if count:
-                self._reasons[f"{reason or GOOD[view.kind]} ({count})"] = reason
+        for reason, count in Counter(view.reason).most_common():
+            self._reasons[f"{reason or GOOD[view.kind]} ({count})"] = reason
         names = [f"{number}: {name}" for number, name in enumerate(view.sequence_name)]
         first = _ALL if sequence is None else names[sequence]
         self._sequence = gui.add_dropdown("sequence", [_ALL, *names], initial_value=first)
-        self._reason = gui.add_dropdown("state", [_ALL, *self._reasons], visible=bool(view.reasons))
+        self._reason = gui.add_dropdown("state", [_ALL, *self._reasons], visible=any(view.reason))
         label = "number" if view.kind == "reset states" else "frame"
         self._frame = gui.add_slider(label, 0, _slider_end(self._rows), 1, 0)
         gui.add_button("previous").on_click(lambda _: self._step(-1))
         gui.add_button("next").on_click(lambda _: self._step(1))
         self._play = gui.add_checkbox("play", False)
         self._speed = gui.add_slider("speed", 0.1, 2.0, 0.1, 1.0)
-        self._bar = gui.add_html("")
         self._text = gui.add_markdown("")
         for control in (self._sequence, self._reason):
             control.on_update(lambda _: self._choose())
@@ -119,19 +115,9 @@ class Page(WebPage):
             if self._reason.value != _ALL:
                 chosen["reason"] = self._reasons[self._reason.value]
             self._rows = self.view.choose(**chosen)
-            self._show_choice()
             self._frame.max = _slider_end(self._rows)
             self._frame.value = 0
             self.show()
-
-    def _show_choice(self) -> None:
-        slots = ""
-        for reason, group in groupby(self.view.reason[row] for row in self._rows):
-            color = f"rgb{rgb(reason_color(reason))}"
-            slots += f'<div title="{escape(reason)}" style="flex:{len(list(group))};background:{color}"></div>'
-        self._bar.content = (
-            f'<div style="display:flex;height:12px;margin:0.6em 1em 0">{slots}</div>'
-        )
 
     def _step(self, by: int) -> None:
         with self._lock:
@@ -190,8 +176,7 @@ class _Scene:
         if view.fingertips is not None:
             self._tips.points = view.fingertips[row].astype(np.float32)
         if self._robot is not None and view.joint_pos is not None:
-            reason = view.reason[row]
-            self._robot.place(view.joint_pos[row], reason_color(reason) if reason else None)
+            self._robot.place(view.joint_pos[row], reason_color(view.reason[row]))
 
     def _show_human(self, row: int) -> None:
         view = self._view

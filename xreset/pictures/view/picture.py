@@ -34,7 +34,6 @@ class Drawer:
         """Return the [H, W, 3] uint8 picture of one row."""
         view = self._view
         sequence = view.sequence[row]
-        reason = view.reason[row]
         points = []
         if view.human_keypoints is not None and view.human_touching is not None:
             points += _human_points(view.human_keypoints[row], view.human_touching[row])
@@ -45,7 +44,7 @@ class Drawer:
             pose_matrix(view.object_pos[row], view.object_quat[row]),
             goal_pose=pose_matrix(view.goal_pos[sequence], view.goal_quat[sequence]),
             object_index=int(view.object_index[row]),
-            robot_tint=reason_color(reason) if reason else None,
+            robot_tint=reason_color(view.reason[row]),
             points=points,
         )
 

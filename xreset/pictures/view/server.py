@@ -99,19 +99,16 @@ class RobotMeshes:
         """Add the meshes to a viser scene."""
         self._kinematics = Kinematics(robot)
         self._tint: Color | None = None
-        self._colors: dict[str, Color] = {}
+        self._colors = link_colors(robot)
         self.links: dict[str, Any] = {}
-        names = self._kinematics.link_names
-        for name, mesh, color in zip(names, link_meshes(robot), link_colors(robot), strict=True):
-            if mesh is not None:
-                self._colors[name] = color
-                self.links[name] = scene.add_mesh_simple(
-                    f"/robot/{name}",
-                    mesh.vertices,
-                    mesh.faces,
-                    color=rgb(color),
-                    flat_shading=False,
-                )
+        for name, mesh in link_meshes(robot).items():
+            self.links[name] = scene.add_mesh_simple(
+                f"/robot/{name}",
+                mesh.vertices,
+                mesh.faces,
+                color=rgb(self._colors[name]),
+                flat_shading=False,
+            )
 
     def place(self, joint_pos: np.ndarray, color: Color | None = None) -> None:
         """Show joint positions [J] [rad, m], with a color mixed into the robot's own."""
@@ -123,9 +120,7 @@ class RobotMeshes:
             link.position = pose[:3, 3]
             link.wxyz = quat
             if color != self._tint:
-                link.color = rgb(
-                    self._colors[name] if color is None else tint(self._colors[name], color)
-                )
+                link.color = rgb(tint(self._colors[name], color))
         self._tint = color
 
 

@@ -562,17 +562,17 @@ class BankTest(InFolder):
             return {name: array}
 
         for words, changes in (
-            ("'sequence_index' points beyond the 3 sequences", with_value("sequence_index", 1, 3)),
+            ("'sequence_index' points beyond 'sequence_name'", with_value("sequence_index", 1, 3)),
             ("another object than its sequence", with_value("object_name", 0, SPAM)),
             (
                 f"does not list \\['{SPAM}'\\]",
                 {"object_names": (SOUP,), "object_sources": ("stand-in",)},
             ),
             (
-                "'rejected_sequence_index' points beyond the 3 sequences",
+                "'rejected_sequence_index' points beyond 'sequence_name'",
                 with_value("rejected_sequence_index", 0, 7),
             ),
-            ("'rejected_reason' points beyond the 2 reasons", with_value("rejected_reason", 0, 2)),
+            ("'rejected_reason' points beyond 'reason_names'", with_value("rejected_reason", 0, 2)),
             ("but J = 7", {"joint_pos": np.zeros((6, 8), dtype=np.float32)}),
         ):
             self.write(**changes)

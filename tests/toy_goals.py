@@ -9,6 +9,7 @@ import numpy as np
 from tests.toy_bank import SOUP, SPAM
 from xreset.objects.catalogue import load_object
 from xreset.objects.rest import rest_height
+from xreset.resets.bank import no_states
 from xreset.resets.goals import GoalSet
 from xreset.spec import RobotSpec
 
@@ -22,11 +23,7 @@ def toy_goals(robot: RobotSpec, **changes: Any) -> GoalSet:
     start = np.array(
         [[0.5 + 0.03 * i, 0.3, height] for i, height in enumerate(heights)], np.float32
     )
-    fields: dict[str, Any] = {
-        "robot": robot.name,
-        "robot_fingerprint": robot.fingerprint,
-        "joint_names": robot.joint_names,
-        "joint_pos": np.zeros((0, len(robot.joints)), np.float32),
+    fields = no_states(robot) | {
         "sequence_name": np.array([f"{name}/lift_{i:03d}" for i, name in enumerate(owners)]),
         "sequence_object": np.array(owners),
         "family": np.array(["lift"] * 4),

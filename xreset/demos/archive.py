@@ -38,6 +38,14 @@ SIDES = ("right", "left")
 
 _HAND = 0.5
 """Largest distance of a keypoint from its wrist [m]; the longest hand on record has 0.33 m."""
+Text = Annotated[str, Field((), "U")]
+SequenceTexts = Annotated[np.ndarray, Field(("S",), "U")]
+SequencePositions = Annotated[np.ndarray, Field(("S", 3), "f", within=POSITION)]
+SequenceQuaternions = Annotated[np.ndarray, Field(("S", 4), "f", unit=True)]
+FrameFlags = Annotated[np.ndarray, Field(("F",), "b")]
+FramePositions = Annotated[np.ndarray, Field(("F", 3), "f", within=POSITION)]
+FrameQuaternions = Annotated[np.ndarray, Field(("F", 4), "f", unit=True)]
+
 _PER_SEQUENCE = ("sequence_name", "subject", "object_name", "hand_side")
 _PER_FRAME = ("hand_keypoints", "hand_valid", "wrist_quat_wxyz", "object_pos", "object_quat_wxyz")
 
@@ -78,26 +86,26 @@ class ObjectMotions:
 class Demos(ObjectMotions):
     """Demonstrations of one or several objects; the attributes are the arrays of the file."""
 
-    sequence_name: Annotated[np.ndarray, Field(("S",), "U")]
+    sequence_name: SequenceTexts
     """[S] text; unique."""
-    subject: Annotated[np.ndarray, Field(("S",), "U")]
+    subject: SequenceTexts
     """[S] text: the demonstrating person."""
-    object_name: Annotated[np.ndarray, Field(("S",), "U")]
+    object_name: SequenceTexts
     """[S] text: the grasped object's official name."""
-    hand_side: Annotated[np.ndarray, Field(("S",), "U")]
+    hand_side: SequenceTexts
     """[S] ``right`` or ``left``."""
     frame_offsets: Annotated[np.ndarray, Field(("S+1",), "i", dtype=np.int32)]
     """[S+1] sequence i owns frames ``frame_offsets[i] : frame_offsets[i + 1]``; see :meth:`frames`."""
     hand_keypoints: Annotated[np.ndarray, Field(("F", 21, 3), "f", within=None)]
     """[F, 21, 3] NaN where the hand was not annotated."""
-    hand_valid: Annotated[np.ndarray, Field(("F",), "b")]
+    hand_valid: FrameFlags
     """[F] bool: whether the hand was annotated."""
     wrist_quat_wxyz: Annotated[np.ndarray, Field(("F", 4), "f", within=None)]
     """[F, 4] orientation of MANO's root: a right hand's fingers point along its -x, its palm faces -y; NaN where not
     annotated."""
-    object_pos: Annotated[np.ndarray, Field(("F", 3), "f", within=POSITION)]
+    object_pos: FramePositions
     """[F, 3] origin of the object's mesh frame."""
-    object_quat_wxyz: Annotated[np.ndarray, Field(("F", 4), "f", unit=True)]
+    object_quat_wxyz: FrameQuaternions
     """[F, 4]"""
     fps: Annotated[float, Field((), "f", within=RATE, dtype=np.float32)]
     """Frames per second."""

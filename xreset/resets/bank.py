@@ -5,12 +5,10 @@ Starts and goals do not depend on the states: a demonstration whose states were 
 goal (the paper's appendix D.c). Shape letters: L states, C rejected candidates, S sequences, J joints.
 """
 
-# ruff: noqa: RUF009  (the function _empty returns a dataclass field)
-
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,7 +16,13 @@ from typing import Annotated, Any
 import numpy as np
 
 from xreset.accounts import Account, accounts
-from xreset.demos.archive import ObjectMotions
+from xreset.demos.archive import (
+    ObjectMotions,
+    SequencePositions,
+    SequenceQuaternions,
+    SequenceTexts,
+    Text,
+)
 from xreset.errors import FileFormatError
 from xreset.geometry.urdf import robot_tree
 from xreset.records import (
@@ -35,11 +39,12 @@ from xreset.spec import ObjectSpec, RobotSpec
 
 SCHEMA = "xreset-resets/1"
 
+_KINDS = {"f": np.float32, "i": np.int32, "b": np.bool_, "U": np.str_}
+"""Types of arrays without rows."""
 
-def _empty(*shape: int, dtype: type = np.float32) -> Any:
-    """Return a dataclass field whose default is an array without rows: a bank of starts and goals alone has no
-    states."""
-    return field(default_factory=lambda: np.zeros((0, *shape), dtype))
+StateJoints = Annotated[np.ndarray, Field(("L", "J"), "f", within=JOINT)]
+StateIndices = Annotated[np.ndarray, Field(("L",), "i", within=(0, inf))]
+RejectedIndices = Annotated[np.ndarray, Field(("C",), "i", within=(0, inf))]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,49 +52,47 @@ class ResetBank:
     """Contents of a reset bank: starts and goals of demonstrations [S], stable states [L] and rejected candidates
     [C]."""
 
-    robot: Annotated[str, Field((), "U")]
-    robot_fingerprint: Annotated[str, Field((), "U")]
+    robot: Text
+    robot_fingerprint: Text
     """:attr:`xreset.spec.RobotSpec.fingerprint` of the robot that the bank was made for."""
-    backends: Annotated[tuple[str, ...], Field(("B",), "U")] = ()
+    backends: Annotated[tuple[str, ...], Field(("B",), "U")]
     """Engines in which every state was stable."""
     joint_names: Annotated[tuple[str, ...], Field(("J",), "U")]
 
     # States
-    joint_pos: Annotated[np.ndarray, Field(("L", "J"), "f", within=JOINT)]
-    object_pos: Annotated[np.ndarray, Field(("L", 3), "f", within=POSITION)] = _empty(3)
-    object_quat_wxyz: Annotated[np.ndarray, Field(("L", 4), "f", unit=True)] = _empty(4)
-    object_name: Annotated[np.ndarray, Field(("L",), "U")] = _empty(dtype=np.str_)
-    sequence_index: Annotated[np.ndarray, Field(("L",), "i")] = _empty(dtype=np.int32)
-    frame_index: Annotated[np.ndarray, Field(("L",), "i", within=(0, inf))] = _empty(dtype=np.int32)
-    post_contact: Annotated[np.ndarray, Field(("L",), "b")] = _empty(dtype=np.bool_)
+    joint_pos: StateJoints
+    object_pos: Annotated[np.ndarray, Field(("L", 3), "f", within=POSITION)]
+    object_quat_wxyz: Annotated[np.ndarray, Field(("L", 4), "f", unit=True)]
+    object_name: Annotated[np.ndarray, Field(("L",), "U")]
+    sequence_index: StateIndices
+    frame_index: StateIndices
+    post_contact: Annotated[np.ndarray, Field(("L",), "b")]
     """[L] bool: whether the human hand had touched the object by that frame."""
 
     # Starts and goals
-    sequence_name: Annotated[np.ndarray, Field(("S",), "U")]
-    sequence_object: Annotated[np.ndarray, Field(("S",), "U")]
-    start_pos: Annotated[np.ndarray, Field(("S", 3), "f", within=POSITION)]
+    sequence_name: SequenceTexts
+    sequence_object: SequenceTexts
+    start_pos: SequencePositions
     """[S, 3] object position in frame 0."""
-    start_quat_wxyz: Annotated[np.ndarray, Field(("S", 4), "f", unit=True)]
-    goal_pos: Annotated[np.ndarray, Field(("S", 3), "f", within=POSITION)]
+    start_quat_wxyz: SequenceQuaternions
+    goal_pos: SequencePositions
     """[S, 3] object position in the last frame."""
-    goal_quat_wxyz: Annotated[np.ndarray, Field(("S", 4), "f", unit=True)]
+    goal_quat_wxyz: SequenceQuaternions
     object_names: Annotated[tuple[str, ...], Field(("O",), "U")]
     """Objects of the sequences, sorted."""
     object_sources: Annotated[tuple[str, ...], Field(("O",), "U")]
     """Where each object's geometry came from (:attr:`xreset.spec.ObjectSpec.source`)."""
 
     # Rejected candidates
-    rejected_sequence_index: Annotated[np.ndarray, Field(("C",), "i")] = _empty(dtype=np.int32)
-    rejected_frame_index: Annotated[np.ndarray, Field(("C",), "i", within=(0, inf))] = _empty(
-        dtype=np.int32
-    )
-    rejected_post_contact: Annotated[np.ndarray, Field(("C",), "b")] = _empty(dtype=np.bool_)
-    rejected_reason: Annotated[np.ndarray, Field(("C",), "i")] = _empty(dtype=np.int32)
+    rejected_sequence_index: RejectedIndices
+    rejected_frame_index: RejectedIndices
+    rejected_post_contact: Annotated[np.ndarray, Field(("C",), "b")]
+    rejected_reason: RejectedIndices
     """[C] index into ``reason_names``."""
-    reason_names: Annotated[tuple[str, ...], Field(("R",), "U")] = ()
+    reason_names: Annotated[tuple[str, ...], Field(("R",), "U")]
 
     # What files of earlier versions do not have
-    joint_target: Annotated[np.ndarray, Field(("L", "J"), "f", within=JOINT)] | None = None
+    joint_target: StateJoints | None = None
     """[L, J] drive targets; None: the joints' positions (:attr:`targets`)."""
     frame_part: Annotated[np.ndarray, Field(("L",), "f", within=(0.0, 1.0))] | None = None
     """[L] how far a state is on the way from its frame to the next, in [0, 1); None: every state is a frame."""
@@ -135,13 +138,20 @@ class ResetBank:
 
 
 def no_states(robot: RobotSpec) -> dict[str, Any]:
-    """Return the fields of a bank of a robot that hold no states, all without a default."""
-    return {
+    """Return the fields of a bank of a robot without states and without rejected candidates."""
+    empty: dict[str, Any] = {
         "robot": robot.name,
         "robot_fingerprint": robot.fingerprint,
         "joint_names": robot.joint_names,
         "joint_pos": np.zeros((0, len(robot.joints)), np.float32),
+        "backends": (),
+        "reason_names": (),
     }
+    for name, schema in schema_of(ResetBank).items():
+        if schema.required and name != "joint_pos" and schema.shape[:1] in (("L",), ("C",)):
+            columns = [int(size) for size in schema.shape[1:]]
+            empty[name] = np.zeros((0, *columns), _KINDS[schema.kind])
+    return empty
 
 
 def starts_and_goals(
@@ -248,14 +258,13 @@ def bank_problem(arrays: dict[str, np.ndarray]) -> str | None:
     """Return what contradicts itself between the arrays of a bank, or None."""
     if problem := unique_problem(arrays["sequence_name"]):
         return problem
-    for name, target, what in (
-        ("sequence_index", "sequence_name", "sequences"),
-        ("rejected_sequence_index", "sequence_name", "sequences"),
-        ("rejected_reason", "reason_names", "reasons"),
+    for name, target in (
+        ("sequence_index", "sequence_name"),
+        ("rejected_sequence_index", "sequence_name"),
+        ("rejected_reason", "reason_names"),
     ):
-        count = len(arrays[target])
-        if ((arrays[name] < 0) | (arrays[name] >= count)).any():
-            return f"array {name!r} points beyond the {count} {what}."
+        if (arrays[name] >= len(arrays[target])).any():
+            return f"array {name!r} points beyond {target!r}."
     if (arrays["sequence_object"][arrays["sequence_index"]] != arrays["object_name"]).any():
         return "a state names another object than its sequence."
     missing = set(arrays["sequence_object"].tolist()) - set(arrays["object_names"].tolist())

@@ -13,7 +13,17 @@ from typing import Annotated, Any
 import numpy as np
 
 from xreset.accounts import Account, accounts
-from xreset.demos.archive import SIDES, ObjectMotions
+from xreset.demos.archive import (
+    SIDES,
+    FrameFlags,
+    FramePositions,
+    FrameQuaternions,
+    ObjectMotions,
+    SequencePositions,
+    SequenceQuaternions,
+    SequenceTexts,
+    Text,
+)
 from xreset.records import (
     JOINT,
     POSITION,
@@ -27,11 +37,6 @@ from xreset.text import shown
 
 SCHEMA = "xreset-retargeted/1"
 
-Text = Annotated[str, Field((), "U")]
-SequenceTexts = Annotated[np.ndarray, Field(("S",), "U")]
-FrameFlags = Annotated[np.ndarray, Field(("F",), "b")]
-FramePositions = Annotated[np.ndarray, Field(("F", 3), "f", within=POSITION)]
-FrameQuaternions = Annotated[np.ndarray, Field(("F", 4), "f", unit=True)]
 FrameDistances = Annotated[np.ndarray, Field(("F",), "f", within=None)]
 
 
@@ -60,9 +65,9 @@ class Retargeted(ObjectMotions):
     object_pos: FramePositions
     """[F, 3] object position of the demonstration, put onto the table; meaningful in every frame, valid or not."""
     object_quat_wxyz: FrameQuaternions
-    goal_pos: Annotated[np.ndarray, Field(("S", 3), "f", within=POSITION)]
+    goal_pos: SequencePositions
     """[S, 3] object position in the last frame."""
-    goal_quat_wxyz: Annotated[np.ndarray, Field(("S", 4), "f", unit=True)]
+    goal_quat_wxyz: SequenceQuaternions
     annotated: FrameFlags
     """[F] whether the human hand was annotated."""
     valid: FrameFlags

@@ -17,6 +17,7 @@ from xreset.description import load_robot
 from xreset.errors import DemoError, FileFormatError
 from xreset.files import file_hash
 from xreset.objects.catalogue import canonical_names, load_objects
+from xreset.progress import Progress, unseen
 from xreset.records import npz_schema
 from xreset.resets.bank import SCHEMA as BANK
 from xreset.resets.bank import (
@@ -92,9 +93,7 @@ class Inputs:
             return starts_and_goals(rest_on_table(self.data, self.objects), self.robot)
         return starts_and_goals(self.data, self.robot)
 
-    def motion(
-        self, progress: Callable[[float, int], None] = lambda done, total: None
-    ) -> Retargeted:
+    def motion(self, progress: Progress = unseen) -> Retargeted:
         """Return the robot's motion; demonstrations are retargeted here, which takes about a second for each.
 
         Args:

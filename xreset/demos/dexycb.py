@@ -13,7 +13,7 @@ The world frame is the master camera's; the table frame is the AprilTag's. Objec
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from xreset.checks import is_rigid
 from xreset.demos.archive import SIDES, Demos, merge_demos, one_sequence
 from xreset.errors import DemoError, FileFormatError
 from xreset.objects.ycb import NAME_OF_ID
+from xreset.progress import Progress, unseen
 from xreset.records import Field, read_npz
 from xreset.text import shown
 
@@ -34,9 +35,7 @@ _Poses = Mapping[str, np.ndarray]
 """Camera serial, or ``apriltag`` -> pose [4, 4] in the world frame."""
 
 
-def read_dexycb(
-    root: str | Path, *, progress: Callable[[int, int], None] = lambda done, total: None
-) -> Demos:
+def read_dexycb(root: str | Path, *, progress: Progress = unseen) -> Demos:
     """Read all sequences below a DexYCB folder, in the table frame.
 
     Args:

@@ -9,7 +9,7 @@ simulated.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -23,6 +23,7 @@ from xreset.demos.motion import clear_approach, object_path, place_hand, random_
 from xreset.errors import DemoError
 from xreset.objects.catalogue import load_object, object_names
 from xreset.objects.rest import rest_height, resting_orientation
+from xreset.progress import Progress, unseen
 from xreset.spec import ObjectSpec
 
 SUBJECT = "synthetic"
@@ -54,7 +55,7 @@ def synthesize(
     fps: float = 30.0,
     side: Literal["right", "left"] = "right",
     meshes: str | Path | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = unseen,
 ) -> Demos:
     """Make synthetic demonstrations of the built-in stand-ins, or of the objects of a folder of meshes, which stand
     with z up.

@@ -6,7 +6,7 @@ recordings the object tips or rolls by more than 10 degrees before a hand arrive
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from xreset.physics import Backend, State
+from xreset.progress import Progress, unseen
 from xreset.resets.bank import ResetBank
 from xreset.resets.probe import probe
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
@@ -36,7 +37,7 @@ def settle_starts(
     *,
     num_envs: int = 64,
     device: str = "cpu",
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = unseen,
 ) -> tuple[ResetBank, np.ndarray]:
     """Return a bank whose episodes from home begin with objects at rest.
 

@@ -5,7 +5,7 @@ Shape letters: F frames of all sequences, S sequences of a batch padded to T fra
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,6 +18,7 @@ from xreset.errors import DemoError
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.rotations import matrix_to_quat
 from xreset.geometry.surface import Surface, keypoint_contacts
+from xreset.progress import Progress, unseen
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track
@@ -95,7 +96,7 @@ def retarget_demos(
     objects: Sequence[ObjectSpec],
     config: RetargetConfig | None = None,
     *,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = unseen,
     device: str = "cpu",
 ) -> Retargeted:
     """Retarget demonstrations. Sequences are independent of one another, and only the arguments decide the result.
@@ -177,7 +178,7 @@ def wrist_paths(
     objects: Sequence[ObjectSpec],
     config: RetargetConfig | None = None,
     *,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = unseen,
 ) -> list[ArmTargets]:
     """Return the paths that hand retargeting demands of the arm, in batches. Arguments and errors as in
     :func:`retarget_demos`."""
@@ -230,7 +231,7 @@ class HandMotions:
         ).astype(np.float64)
 
     def batches(
-        self, progress: Callable[[int, int], None] = lambda done, total: None
+        self, progress: Progress = unseen
     ) -> Iterator[tuple[list[int], HandTargets, HandState]]:
         """Retarget the hand alone, in batches of those sequences that have a hand: sequences, the hand's targets, its
         motion."""

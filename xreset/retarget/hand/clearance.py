@@ -7,7 +7,7 @@ variables.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -90,12 +90,28 @@ def too_near(
         object_clearance: distance that balls keep from the object [m].
         self_depth: allowed depth of balls in other links [m].
     """
+    balls = model.balls
     bounds = bodies.pos[:, model.group_body] + matvec(
-        bodies.rot[:, model.group_body], model.balls.bound_centers
+        bodies.rot[:, model.group_body], balls.bound_centers
     )
+    every = torch.arange(len(bounds), device=bounds.device)[:, None].expand(bounds.shape[:2])
+    from_box = objects.fields.box_distance(objects.local(bounds, every), objects.which[every])
+
+    def below_table(centers: Tensor, frame: Tensor, radii: Tensor) -> tuple[Tensor, ...]:
+        height = height_above_table(centers, radii, model.table)
+        near = (height < 0).nonzero()[:, 0]
+        up = centers.new_tensor([0.0, 0.0, 1.0]).expand(len(near), 3)
+        return near, height[near], up
+
+    def in_object(centers: Tensor, frame: Tensor, radii: Tensor) -> tuple[Tensor, ...]:
+        near, distance, direction = objects.nearer(centers, frame, radii + object_clearance)
+        return near, distance - radii[near] - object_clearance, direction
+
+    over_table = considered[:, None] & (bounds[..., 2] < balls.bound_radii)
+    at_object = considered[:, None] & (from_box < balls.bound_radii + object_clearance)
     found = (
-        *_below_table(model, bodies, bounds, considered),
-        *_in_object(model, bodies, bounds, objects, considered, object_clearance),
+        *_outside(model, bodies, over_table, below_table, 0),
+        *_outside(model, bodies, at_object, in_object, len(balls.radii)),
         *_in_each_other(model, bodies, bounds, considered, self_depth),
     )
     together = Distances.cat(found)
@@ -104,59 +120,41 @@ def too_near(
 
 
 def _moved(rot: Tensor, pos: Tensor, points: Tensor) -> Tensor:
-    """[B, N, 3] points [N, 3] in each of the poses rot [B, 3, 3], pos [B, 3]."""
+    """[B N, 3] points [N, 3] in each of the poses rot [B, 3, 3], pos [B, 3]."""
     x, y, z = rot[:, None].unbind(-1)
-    return x * points[:, :1] + y * points[:, 1:2] + z * points[:, 2:] + pos[:, None]
+    moved = x * points[:, :1] + y * points[:, 1:2] + z * points[:, 2:] + pos[:, None]
+    return moved.flatten(0, 1)
 
 
-def _below_table(
-    model: HandModel, bodies: PointJacobian, bounds: Tensor, considered: Tensor
-) -> Iterator[Distances]:
-    balls = model.balls
-    candidates = (bounds[..., 2] < balls.bound_radii) & considered[:, None]
-    for link, own in enumerate(balls.slices):
-        frames = candidates[:, link].nonzero()[:, 0]
-        body = model.group_body[link]
-        centers = _moved(bodies.rot[frames, body], bodies.pos[frames, body], balls.centers[own])
-        height = height_above_table(centers, balls.radii[own], model.table)
-        row, ball = (height < 0).nonzero(as_tuple=True)
-        centers = centers[row, ball]
-        up = centers.new_tensor([0.0, 0.0, 1.0]).expand_as(centers)
-        slope = model.point_slope(bodies, frames[row], body, centers, up)
-        yield Distances(
-            frame=frames[row], value=height[row, ball], slope=slope, number=own.start + ball
-        )
-
-
-def _in_object(
+def _outside(
     model: HandModel,
     bodies: PointJacobian,
-    bounds: Tensor,
-    objects: Objects,
-    considered: Tensor,
-    object_clearance: float,
+    candidates: Tensor,
+    measure: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, ...]],
+    first: int,
 ) -> Iterator[Distances]:
+    """Yield the distances of each link's balls from something outside the hand.
+
+    Args:
+        model: the hand.
+        bodies: its B configurations.
+        candidates: [B, G] the links that may be too near.
+        measure: returns which of some balls are too near, their distances and the directions away from the thing,
+            given their centers [N, 3], frames [N] and radii [N].
+        first: number of the first ball.
+    """
     balls = model.balls
-    every = torch.arange(len(bounds), device=bounds.device)[:, None].expand(bounds.shape[:2])
-    distance = objects.fields.box_distance(objects.local(bounds, every), objects.which[every])
-    candidates = (distance < balls.bound_radii + object_clearance) & considered[:, None]
     for link, own in enumerate(balls.slices):
         frames = candidates[:, link].nonzero()[:, 0]
         body = model.group_body[link]
         radii = balls.radii[own]
-        centers = _moved(
-            bodies.rot[frames, body], bodies.pos[frames, body], balls.centers[own]
-        ).flatten(0, 1)
+        centers = _moved(bodies.rot[frames, body], bodies.pos[frames, body], balls.centers[own])
         frame = frames.repeat_interleave(len(radii))
-        limit = (radii + object_clearance).repeat(len(frames))
-        near, distance, direction = objects.nearer(centers, frame, limit)
+        near, value, direction = measure(centers, frame, radii.repeat(len(frames)))
         frame = frame[near]
-        ball = near % len(radii)
         slope = model.point_slope(bodies, frame, body, centers[near], direction)
-        value = distance - radii[ball] - object_clearance
-        yield Distances(
-            frame=frame, value=value, slope=slope, number=len(balls.radii) + own.start + ball
-        )
+        number = first + own.start + near % len(radii)
+        yield Distances(frame=frame, value=value, slope=slope, number=number)
 
 
 def _in_each_other(
@@ -189,7 +187,7 @@ def _in_each_other(
         body = model.group_body[link]
         guards = balls.guards[own]
         radii = balls.guard_radii[own]
-        centers = _moved(turn[mine], shift[mine], balls.centers[guards]).flatten(0, 1)
+        centers = _moved(turn[mine], shift[mine], balls.centers[guards])
         limit = (radii - self_depth).repeat(len(mine))
         deep, distance, away = fields.nearer(
             centers, b[pair[mine]].repeat_interleave(len(radii)), limit

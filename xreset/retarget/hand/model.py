@@ -88,11 +88,6 @@ class HandModel:
         """Human keypoint of each mapped keypoint (length P)."""
         self.links: tuple[str, ...] = tuple(spec.link for spec in robot.keypoints)
         """Link of each mapped keypoint."""
-        for name in self.names:
-            if name not in KEYPOINTS:
-                raise RobotError(
-                    f"robot {robot.name!r}: unknown human keypoint {name!r}. Choose from: {', '.join(KEYPOINTS)}."
-                )
         count = len(set(self.links))
         if count < 3:
             raise RobotError(

@@ -1,0 +1,12 @@
+"""What callers of long functions may pass to see how far they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+Progress = Callable[[float, int], None]
+"""Called with what is done and what is to be done in all."""
+
+
+def unseen(done: float, total: int) -> None:
+    """Show nothing."""

@@ -340,14 +340,15 @@ class _Cutter:
         cut = self._cut_worst(
             parts, self._quick_excess, self._best_cut, tolerance, int(2 * _FEW * most)
         )
-        pieces = [part.hull() for _, part in cut]
+        pieces = [part.hull() for *_, part in cut]
         tolerance = max(tolerance, *(self._solid.excess(piece, quick=True) for piece in pieces))
         pieces = self._joined(pieces, tolerance)
         while len(pieces) > _FEW * most and self.effort > 0:
             tolerance *= 1.1
             pieces = self._joined(pieces, tolerance)
         cut = self._cut_worst(pieces, self._excess, self._cut_piece, self._settings.tolerance, most)
-        return [_shape(piece) for _, piece in cut], max(excess for excess, _ in cut)
+        cut.sort(key=lambda entry: entry[1])
+        return [_shape(piece) for *_, piece in cut], max(-excess for excess, *_ in cut)
 
     def _spend(self, *solids: Manifold) -> None:
         self.effort -= sum(solid.num_tri() for solid in solids)
@@ -359,25 +360,34 @@ class _Cutter:
         cut: Callable[[Manifold], list[Manifold]],
         tolerance: float,
         most: int,
-    ) -> list[tuple[float, Manifold]]:
+    ) -> list[tuple[float, int, Manifold]]:
         """Cut the part with the largest excess until none exceeds the tolerance, or there would be too many.
 
         Returns:
-            The excess that is left [m], and the part, of all parts.
+            The negative excess that is left [m], a running number, and the part, of all parts.
         """
-        measured = [(excess(part), part) for part in parts]
-        whole: list[tuple[float, Manifold]] = []
-        while measured and len(measured) + len(whole) < most and self.effort > 0:
-            worst = max(measured, key=lambda entry: entry[0])
-            if worst[0] <= tolerance:
-                break
-            measured.remove(worst)
-            smaller = cut(worst[1])
-            if 1 < len(smaller) <= most - len(measured) - len(whole):
-                measured += [(excess(part), part) for part in smaller]
+        count = itertools.count()
+        queue: list[tuple[float, int, Manifold]] = []
+        whole: list[tuple[float, int, Manifold]] = []
+
+        def add(part: Manifold) -> None:
+            entry = (-excess(part), next(count), part)
+            if -entry[0] > tolerance:
+                heapq.heappush(queue, entry)
+            else:
+                whole.append(entry)
+
+        for part in parts:
+            add(part)
+        while queue and len(queue) + len(whole) < most and self.effort > 0:
+            worst = heapq.heappop(queue)
+            smaller = cut(worst[2])
+            if 1 < len(smaller) <= most - len(queue) - len(whole):
+                for part in smaller:
+                    add(part)
             else:
                 whole.append(worst)
-        return whole + measured
+        return whole + queue
 
     def _quick_excess(self, part: Manifold) -> float:
         self._spend(self._solid.solid, part)

@@ -213,8 +213,8 @@ def checked_goals(
             _check_above_table(name, depth)
         if reach is None or not len(rows):
             continue
-        start_turns = Rotation.from_quat(goals.start_quat_wxyz[rows], scalar_first=True)
-        goal_turns = Rotation.from_quat(goals.goal_quat_wxyz[rows], scalar_first=True)
+        start_turns = _turns(goals.start_quat_wxyz[rows])
+        goal_turns = _turns(goals.goal_quat_wxyz[rows])
         start = goals.start_pos[rows] + start_turns.apply(obj.com)
         goal = goals.goal_pos[rows] + goal_turns.apply(obj.com)
         held = reach.holds(start, goal, goal_turns * start_turns.inv())
@@ -258,33 +258,30 @@ def _resting_poses(
         GoalError: an object does not come to rest.
     """
     episodes: list[_Episode] = []
-    listed: dict[str, list[int]] = {}
+    rows: dict[str, np.ndarray] = {}
     for obj in objects:
         random = np.random.default_rng(zlib.crc32(obj.name.encode()))
         directions = np.array([_Z]) if upright else random.normal(size=(_DIRECTIONS, 3))
-        ups: dict[int, np.ndarray] = {}
-        listed[obj.name] = []
-        for direction in directions:
-            quat = resting_orientation(obj, direction / np.linalg.norm(direction))
-            turn = Rotation.from_quat(quat, scalar_first=True)
-            up = turn.inv().apply(_Z)
-            known = [row for row, other in ups.items() if other @ up > _SAME_POSE]
-            listed[obj.name].append(known[0] if known else len(episodes))
-            if not known:
-                ups[len(episodes)] = up
-                center = np.array([*_MIDDLE, rest_height(obj, quat)]) + turn.apply(obj.com)
-                place = {"start": center, "start_turn": turn, "goal": center, "goal_turn": turn}
-                episodes.append(_Episode(obj=obj, family="rest", number=len(episodes), **place))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        turns = _turns(np.array([resting_orientation(obj, up) for up in directions]))
+        ups = turns.inv().apply(_Z)
+        # of each direction, the first one that leads to the same pose
+        poses, which = np.unique((ups @ ups.T > _SAME_POSE).argmax(axis=1), return_inverse=True)
+        rows[obj.name] = len(episodes) + which
+        for turn in turns[poses]:
+            center = np.array([*_MIDDLE, rest_height(obj, _quat(turn))]) + turn.apply(obj.com)
+            place = {"start": center, "start_turn": turn, "goal": center, "goal_turn": turn}
+            episodes.append(_Episode(obj=obj, family="rest", number=len(episodes), **place))
     settled, at_rest = settle_starts(_goal_set(robot, episodes), robot, objects)
     rests = {}
     for obj in objects:
-        rows = [row for row in listed[obj.name] if at_rest[row]]
-        if not rows:
+        own = rows[obj.name][at_rest[rows[obj.name]]]
+        if not len(own):
             raise GoalError(
                 f"{obj.name} does not come to rest on the table: it rolls or falls over in MuJoCo."
             )
-        turns = Rotation.from_quat(settled.start_quat_wxyz[rows], scalar_first=True)
-        heights = settled.start_pos[rows, 2] + turns.apply(obj.com)[:, 2]
+        turns = _turns(settled.start_quat_wxyz[own])
+        heights = settled.start_pos[own, 2] + turns.apply(obj.com)[:, 2]
         rests[obj.name] = list(zip(heights, turns, strict=True))
     return rests
 
@@ -309,7 +306,7 @@ def _draw(
     at_goal = np.random.default_rng([_GOAL_SEED, *key]).uniform(-1.0, 1.0, 4)  # x, y, z, yaw
     if family == OWN:
         pos, quat = own[number]
-        goal_turn = Rotation.from_quat(quat, scalar_first=True)
+        goal_turn = _turns(quat)
         goal = pos + goal_turn.apply(obj.com)
     else:
         goal = place + np.array([0.0, 0.0, config.lift])
@@ -366,6 +363,10 @@ def _reached(
             }
         progress(len(found))
     return found
+
+
+def _turns(quats: np.ndarray) -> Rotation:
+    return Rotation.from_quat(quats, scalar_first=True)
 
 
 def _quat(turn: Rotation) -> np.ndarray:

@@ -138,7 +138,7 @@ def errors(
     parts: list[tuple[np.ndarray, ...]] = []
     beyond = 0.0
     hands = HandMotions(demos, robot, specs, RetargetConfig(hand=config), device=options.device)
-    for sequences, _, motion in hands.batches():
+    for batch, _, _, motion in hands.batches():
         followed = hand.keypoints(**vars(motion)).numpy()
         beyond = max(
             beyond,
@@ -148,7 +148,7 @@ def errors(
                 ).max()
             ),
         )
-        for slot, i in enumerate(sequences):
+        for slot, i in enumerate(np.unique(on_table.sequence_of_frame[batch])):
             rows = on_table.frames(i)
             seen = on_table.hand_valid[rows]
             robot_points = followed[slot, : len(seen)]

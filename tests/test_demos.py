@@ -108,7 +108,7 @@ class Archive(InFolder):
             ),
             (
                 self.changed("hand_side", 2, "Right"),
-                r"sequence 2 .* hand_side 'Right', expected 'right' or 'left'",
+                r"sequence .* hand_side 'Right', expected 'right' or 'left'",
             ),
             (self.changed("frame_offsets", 2, 0), "frame_offsets must increase"),
             (self.changed("sequence_name", 1, self.demos.sequence_name[0]), "must be unique"),

@@ -96,7 +96,7 @@ class PadsTest(unittest.TestCase):
         objects = list(demo_objects(demos).values())
         config = HandConfig(clearance_growth=(), iterations=0)
         hands = HandMotions(demos, self.model.robot, objects, RetargetConfig(hand=config))
-        [(_, targets, _)] = hands.batches()
+        [(*_, targets, _)] = hands.batches()
         self.assertFalse(targets.held[0, 0])
         self.assertTrue(targets.held[0, -1])
 

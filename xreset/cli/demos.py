@@ -166,7 +166,7 @@ class Selection(Options):
     """Only sequences of this hand."""
     per_object: int | None = None
     """Keep at most this many sequences of each object."""
-    share: float | None = None
+    share: float = 1.0
     """Keep this share of each object's sequences, at least one: a number from 0 to 1."""
     pick: Literal["first", "spread", "random"] = "first"
     """Which sequences --per-object and --share keep: the first, or some from all over the archive."""
@@ -175,7 +175,7 @@ class Selection(Options):
 
     def conditions(self) -> dict[str, Any]:
         """Return the arguments of ``Demos.select``."""
-        if self.pick != "first" and self.per_object is None and self.share is None:
+        if self.pick != "first" and self.per_object is None and self.share == 1:
             raise DemoError(
                 f"--pick {self.pick} needs a number of sequences. Add --per-object or --share."
             )

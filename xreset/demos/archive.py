@@ -139,7 +139,7 @@ class Demos(ObjectMotions):
         sides: Iterable[str] | None = None,
         subjects: Iterable[str] | None = None,
         max_per_object: int | None = None,
-        share: float | None = None,
+        share: float = 1.0,
         spread: bool = False,
         seed: int | None = None,
     ) -> Demos:
@@ -164,10 +164,10 @@ class Demos(ObjectMotions):
         chosen = np.arange(len(self))
         if indices is not None:
             chosen = np.asarray(list(indices), dtype=np.int64)
-        if ((chosen < 0) | (chosen >= len(self))).any():
-            raise DemoError(
-                f"Unknown sequence index in {chosen.tolist()}: there are {len(self)} sequences."
-            )
+            if not np.isin(chosen, range(len(self))).all():
+                raise DemoError(
+                    f"Unknown sequence index in {chosen.tolist()}: there are {len(self)} sequences."
+                )
         if objects is not None:
             try:
                 objects = canonical_names(objects, sorted(set(self.object_name.tolist())))
@@ -182,13 +182,10 @@ class Demos(ObjectMotions):
         for field, values in wanted.items():
             if values is not None:
                 chosen = chosen[np.isin(getattr(self, field)[chosen], self._known(field, values))]
-        if share is not None and not 0 < share <= 1:
+        if not 0 < share <= 1:
             raise DemoError(f"The share is {share:g}, expected a number above 0 and at most 1.")
-        if max_per_object is not None or share is not None:
-            most = len(self) if max_per_object is None else max_per_object
-            chosen = self._few_per_object(
-                chosen, most, 1.0 if share is None else share, spread, seed
-            )
+        if max_per_object is not None or share < 1:
+            chosen = self._few_per_object(chosen, max_per_object, share, spread, seed)
         if not len(chosen):
             raise DemoError("No sequence meets all conditions of the selection. Relax one of them.")
         frames = [np.arange(self.frame_offsets[i], self.frame_offsets[i + 1]) for i in chosen]
@@ -215,34 +212,32 @@ class Demos(ObjectMotions):
         """Return the wanted values of a field, all of which exist."""
         wanted = list(wanted)
         known = sorted(set(getattr(self, field).tolist()))
-        missing = [name for name in wanted if name not in known]
-        if missing:
+        if missing := [name for name in wanted if name not in known]:
             raise DemoError(
                 f"The demonstrations have no {field} {', '.join(missing)}. Choose from: {shown(known)}."
             )
         return wanted
 
     def _few_per_object(
-        self, chosen: np.ndarray, most: int, share: float, spread: bool, seed: int | None
+        self, chosen: np.ndarray, most: int | None, share: float, spread: bool, seed: int | None
     ) -> np.ndarray:
         names = self.object_name[chosen]
         objects = np.unique(names)
         kept = []
         for number, name in enumerate(objects):
             rows = np.flatnonzero(names == name)
-            count = min(most, max(1, round(share * len(rows))))
-            picks = np.arange(count)
+            count = max(1, round(share * len(rows)))
+            if most is not None:
+                count = min(count, max(most, 0))
             if seed is not None:
-                picks = np.random.default_rng([seed, zlib.crc32(name.encode())]).permutation(
-                    len(rows)
-                )[:count]
-            elif (
-                spread
-            ):  # one from each of n even parts, at another place in the parts for every object
+                random = np.random.default_rng([seed, zlib.crc32(name.encode())])
+                rows = random.permutation(rows)
+            elif spread:
+                # one from each of n even parts, at another place in the parts for every object
                 place = (number + 0.5) / len(objects)
-                picks = ((picks + place) * len(rows) / max(len(picks), 1)).astype(int)
-            kept.extend(rows[picks])
-        return chosen[np.sort(kept)] if kept else chosen[:0]
+                rows = rows[((np.arange(count) + place) * len(rows) / count).astype(int)]
+            kept.extend(rows[:count])
+        return chosen[np.sort(np.array(kept, dtype=int))]
 
 
 def one_sequence(
@@ -323,40 +318,33 @@ def levelled(demos: Demos) -> Demos:
     if demos.T_level_from_table is None or demos.subjects is None:
         return demos
     known = demos.subjects.tolist()
-    missing = sorted(set(demos.subject.tolist()) - set(known))
-    if missing:
+    if missing := sorted(set(demos.subject.tolist()) - set(known)):
         raise DemoError(
             f"T_level_from_table is given for {', '.join(known)}, but not for {', '.join(missing)}."
         )
     subject = np.array([known.index(name) for name in demos.subject.tolist()])
-    T = demos.T_level_from_table[subject[demos.sequence_of_frame]]
+    T = demos.T_level_from_table[subject][demos.sequence_of_frame]
     R = T[:, :3, :3]
-    turn = Rotation.from_matrix(R)
-
-    def rotate(quats: np.ndarray) -> np.ndarray:
-        return (
-            (turn * Rotation.from_quat(quats, scalar_first=True))
-            .as_quat(scalar_first=True)
-            .astype(quats.dtype)
-        )
-
-    kind = demos.object_pos.dtype
-    valid = demos.hand_valid[:, None]
-    wrist = np.where(
-        valid,
-        demos.wrist_quat_wxyz,
-        np.array([1.0, 0.0, 0.0, 0.0], dtype=demos.wrist_quat_wxyz.dtype),
-    )
-    keypoints = np.einsum("fij,f...j->f...i", R, demos.hand_keypoints) + T[:, None, :3, 3]
+    valid = demos.hand_valid
+    wrist = demos.wrist_quat_wxyz.copy()
+    wrist[valid] = _turned(R[valid], wrist[valid])
+    keypoints = np.einsum("fij,fkj->fki", R, demos.hand_keypoints) + T[:, None, :3, 3]
+    pos = np.einsum("fij,fj->fi", R, demos.object_pos) + T[:, :3, 3]
     return replace(
         demos,
         hand_keypoints=keypoints.astype(demos.hand_keypoints.dtype),
-        wrist_quat_wxyz=np.where(valid, rotate(wrist), demos.wrist_quat_wxyz),
-        object_pos=(np.einsum("fij,f...j->f...i", R, demos.object_pos) + T[:, :3, 3]).astype(kind),
-        object_quat_wxyz=rotate(demos.object_quat_wxyz),
+        wrist_quat_wxyz=wrist,
+        object_pos=pos.astype(demos.object_pos.dtype),
+        object_quat_wxyz=_turned(R, demos.object_quat_wxyz),
         subjects=None,
         T_level_from_table=None,
     )
+
+
+def _turned(R: np.ndarray, quats: np.ndarray) -> np.ndarray:
+    """[F, 4] orientations turned by rotation matrices [F, 3, 3]."""
+    turned = Rotation.from_matrix(R) * Rotation.from_quat(quats, scalar_first=True)
+    return turned.as_quat(scalar_first=True).astype(quats.dtype)
 
 
 def read_demos(path: str | Path) -> Demos:
@@ -413,6 +401,15 @@ def _offsets(lengths: Sequence[int] | np.ndarray) -> np.ndarray:
     return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
 
 
+def sides_problem(arrays: Mapping[str, Any]) -> str | None:
+    """Return what is wrong with the sides of the hands [S]."""
+    names = arrays["sequence_name"]
+    for name, side in zip(names.tolist(), arrays["hand_side"].tolist(), strict=True):
+        if side not in SIDES:
+            return f"sequence {name} has hand_side {shown(side)}, expected 'right' or 'left'."
+    return None
+
+
 def _check(demos: Demos) -> None:
     arrays = arrays_of(demos)
     problem = wrong_value(arrays, schema_of(Demos)) or _problem(arrays)
@@ -422,22 +419,19 @@ def _check(demos: Demos) -> None:
 
 def _problem(arrays: Mapping[str, Any]) -> str | None:
     """Return the first contradiction, or None. Types, shapes and the fields' own ranges have been checked."""
-    offsets = np.asarray(arrays["frame_offsets"])
+    offsets = arrays["frame_offsets"]
     names = arrays["sequence_name"]
-    problem = offsets_problem(arrays, len(arrays["object_pos"]))
-    if problem:
+    if problem := offsets_problem(arrays, len(arrays["object_pos"])):
         return problem
-    wrong_side = ~np.isin(arrays["hand_side"], SIDES)
-    if wrong_side.any():
-        i = int(np.argmax(wrong_side))
-        return f"sequence {i} ({names[i]!s}) has hand_side {str(arrays['hand_side'][i])!r}, expected 'right' or 'left'."
+    if problem := sides_problem(arrays):
+        return problem
     level = arrays.get("T_level_from_table")
     if (arrays.get("subjects") is None) != (level is None):
         return "subjects and T_level_from_table belong together, but one of them is missing."
     if level is not None and not all(is_rigid(T) for T in np.asarray(level, dtype=float)):
         return "T_level_from_table has a matrix that is not a rotation and translation."
     # the values of the hand's arrays do not matter in frames without a hand
-    valid = np.asarray(arrays["hand_valid"])
+    valid = arrays["hand_valid"]
     hand = np.where(valid[:, None, None], arrays["hand_keypoints"], 0.0)
     with np.errstate(invalid="ignore"):
         size = np.linalg.norm(hand[:, 1:] - hand[:, :1], axis=2).max(axis=1)

@@ -14,7 +14,6 @@ import numpy as np
 
 from xreset.accounts import Account, accounts
 from xreset.demos.archive import (
-    SIDES,
     FrameFlags,
     FramePositions,
     FrameQuaternions,
@@ -23,6 +22,7 @@ from xreset.demos.archive import (
     SequenceQuaternions,
     SequenceTexts,
     Text,
+    sides_problem,
 )
 from xreset.records import (
     JOINT,
@@ -33,7 +33,6 @@ from xreset.records import (
     read_record,
     write_record,
 )
-from xreset.text import shown
 
 SCHEMA = "xreset-retargeted/1"
 
@@ -125,8 +124,8 @@ def _check(arrays: dict[str, np.ndarray]) -> str | None:
     offsets = arrays["frame_offsets"]
     if problem := offsets_problem(arrays, len(arrays["joint_pos"])):
         return problem
-    if (wrong := ~np.isin(arrays["hand_side"], SIDES)).any():
-        return f"array 'hand_side' contains {shown(str(arrays['hand_side'][wrong][0]))}, expected right or left."
+    if problem := sides_problem(arrays):
+        return problem
     if ((arrays["reason"] < 0) | (arrays["reason"] >= len(arrays["reason_names"]))).any():
         return "array 'reason' points beyond 'reason_names'."
     if (arrays["valid"] != (arrays["reason"] == 0)).any():

@@ -123,20 +123,16 @@ def retarget_demos(
     joint_pos = np.tile(robot.home, (demos.num_frames, 1))
     reason = np.full(demos.num_frames, REASONS.index("not annotated"), dtype=np.int32)
     hand_error, wrist_error = np.full((2, demos.num_frames), np.inf)
-    for sequences, targets, motion in hands.batches(progress):
+    for rows, is_frame, targets, motion in hands.batches(progress):
         path = _arm_targets(hands.model, arm, targets, motion)
         with one_thread():
             joints, measures = track(arm, path, config.thresholds, config.arm)
-        full = arm.full(joints, path.hand_joints)
-        reasons = classify(measures, config.thresholds)
-        for slot, sequence in enumerate(sequences):
-            rows = demos.frames(sequence)
-            own = slice(rows.stop - rows.start)
-            annotated = demos.hand_valid[rows]
-            joint_pos[rows] = full[slot, own]
-            reason[rows] = reasons[slot, own]
-            hand_error[rows][annotated] = path.hand_error[slot, own][annotated]
-            wrist_error[rows][annotated] = measures.wrist_position[slot, own][annotated]
+        joint_pos[rows] = arm.full(joints, path.hand_joints)[is_frame]
+        reason[rows] = classify(measures, config.thresholds)[is_frame]
+        hand_error[rows] = path.hand_error[is_frame]
+        wrist_error[rows] = measures.wrist_position[is_frame]
+    hand_error[~demos.hand_valid] = np.inf
+    wrist_error[~demos.hand_valid] = np.inf
 
     links = arm.kinematics.link_poses(torch.as_tensor(joint_pos), robot.tracked_links)
     contact = np.asarray(hands.touching.any(axis=1))
@@ -186,7 +182,7 @@ def wrist_paths(
     arm = ArmModel(robot)
     return [
         _arm_targets(hands.model, arm, targets, motion)
-        for _, targets, motion in hands.batches(progress)
+        for *_, targets, motion in hands.batches(progress)
     ]
 
 
@@ -232,30 +228,35 @@ class HandMotions:
 
     def batches(
         self, progress: Progress = unseen
-    ) -> Iterator[tuple[list[int], HandTargets, HandState]]:
-        """Retarget the hand alone, in batches of those sequences that have a hand: sequences, the hand's targets, its
-        motion."""
-        demos = self.demos
-        todo = [i for i in range(len(demos)) if demos.hand_valid[demos.frames(i)].any()]
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, HandTargets, HandState]]:
+        """Retarget the hand alone, in batches of those sequences that have a hand.
+
+        Returns of each batch of S sequences, padded to T frames: the frames [B] of all, where they are in the batch
+        [S, T], the hand's targets, and its motion.
+        """
+        owner = self.demos.sequence_of_frame
+        lengths = np.diff(self.demos.frame_offsets)
+        todo = np.unique(owner[self.demos.hand_valid])
         for begin in range(0, len(todo), _SEQUENCES_PER_BATCH):
             sequences = todo[begin : begin + _SEQUENCES_PER_BATCH]
-            targets = self._targets(sequences)
+            rows = np.flatnonzero(np.isin(owner, sequences))
+            is_frame = np.arange(lengths[sequences].max()) < lengths[sequences, None]
+            targets = self._targets(sequences, rows, is_frame)
             with one_thread():
                 motion = retarget_hand(self.model, targets, self._config)
-            yield sequences, targets, motion
+            yield rows, is_frame, targets, motion
             progress(begin + len(sequences), len(todo))
 
-    def _targets(self, sequences: Sequence[int]) -> HandTargets:
-        """Return the targets of some sequences, padded with frames that are not annotated."""
+    def _targets(
+        self, sequences: np.ndarray, rows: np.ndarray, is_frame: np.ndarray
+    ) -> HandTargets:
+        """Return the targets of a batch, padded with frames that are not annotated."""
         demos = self.demos
         hand = self.model
-        rows = [demos.frames(i) for i in sequences]
-        frames = max(row.stop - row.start for row in rows)
 
         def padded(values: np.ndarray) -> Tensor:
-            out = np.zeros((len(rows), frames, *values.shape[1:]), dtype=values.dtype)
-            for slot, row in enumerate(rows):
-                out[slot, : row.stop - row.start] = values[row]
+            out = np.zeros((*is_frame.shape, *values.shape[1:]), dtype=values.dtype)
+            out[is_frame] = values[rows]
             return torch.as_tensor(out)
 
         keypoints = self._keypoints[:, hand.keypoint_indices]
@@ -264,7 +265,7 @@ class HandMotions:
         held = np.logical_and(
             self.touching[:, _THUMB].any(axis=1), self.touching[:, _FINGERS].any(axis=1)
         )
-        which = [self._objects.index(name) for name in demos.object_name[list(sequences)].tolist()]
+        which = [self._objects.index(name) for name in demos.object_name[sequences].tolist()]
         return HandTargets(
             keypoints=padded(keypoints),
             annotated=padded(demos.hand_valid),

@@ -23,7 +23,7 @@ from xreset.eval.trial import Engine
 from xreset.geometry.rotations import quat_angle
 from xreset.geometry.urdf import robot_tree
 from xreset.physics import State
-from xreset.spec import RobotSpec
+from xreset.spec import SceneSpec
 
 SCHEMA = "xreset-divergence/1"
 PERTURBED = 4
@@ -65,48 +65,39 @@ class Divergence:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Differences:
-    """Differences of one world to the reference over time, up to the last step at which both are finite."""
+class EngineTrace:
+    """What one engine did, and how it differs from the reference."""
 
-    time: np.ndarray
-    """[T] end of each control step [s]."""
-    value: dict[str, np.ndarray]
-    """[T] difference of each quantity."""
-    where: dict[str, list[str]]
-    """[T] names of joint or fingers, for the quantities that have them."""
-    diverged: dict[str, np.ndarray]
-    """[T] bool: whether the difference counts."""
+    engine: Engine
+    recording: Recording
+    """Its first world is the sequence's own."""
+    differences: pd.DataFrame
+    """A column for each quantity of :data:`THRESHOLDS`, a row for each control step (index: its end [s]), up to the last
+    step at which both engines are finite."""
+    divergences: tuple[Divergence, ...]
+    """How each quantity diverges; empty if no step is finite."""
 
-    def first(self) -> tuple[Divergence, ...]:
-        """Return how each quantity diverges; nothing if no step is finite."""
-        found = []
-        for quantity, value in self.value.items() if len(self.time) else ():
-            step = int(self.diverged[quantity].argmax())
-            diverges = bool(self.diverged[quantity][step])
-            found.append(
-                Divergence(
-                    quantity=quantity,
-                    time=float(self.time[step]) if diverges else None,
-                    where=self.where[quantity][step] if diverges and quantity in self.where else "",
-                    end=float(value[-1]),
-                    largest=float(value.max()),
-                )
-            )
-        return tuple(found)
+    @property
+    def lifted(self) -> float | None:
+        """Height of the object at the end above its start [m]; None if it is not finite."""
+        height = float(self.recording.lifted[0])
+        return height if math.isfinite(height) else None
 
 
-def differences(
-    found: Recording, reference: Recording, robot: RobotSpec, dt: float, *, world: int = 0
-) -> Differences:
+def compared(
+    engine: Engine, found: Recording, reference: Recording, scene: SceneSpec, *, world: int = 0
+) -> EngineTrace:
     """Compare a world of a recording with the first world of the reference's recording, which is as long.
 
     Args:
-        found: the tested recording.
+        engine: engine of the recording.
+        found: the recording.
         reference: the reference's recording.
-        robot: names joints and fingers.
-        dt: control step [s].
+        scene: scene of both.
         world: world of ``found``.
     """
+    robot = scene.robot
+    dt = scene.control_dt
     tree = robot_tree(robot)
     scale = [10.0 if tree.joint(name).type == "prismatic" else 1.0 for name in robot.joint_names]
     fingers = robot.fingertip_names
@@ -126,79 +117,55 @@ def differences(
     change = np.abs(force - other)
     touch = force >= TOUCH
     differs = touch != (other >= TOUCH)
-    contacts = []
-    for row, touches in zip(differs, touch, strict=True):
-        names = [
-            f"{fingers[i]} {'touches' if touches[i] else 'does not touch'}"
-            for i in np.flatnonzero(row)
-        ]
-        contacts.append(", ".join(names))
-    value = {
-        "joints": joint[steps].max(axis=1),
-        "object position": position[steps],
-        "object orientation": angle[steps],
-        "contacts": differs.sum(axis=1),
-        "contact force": change.max(axis=1),
-    }
-    diverged = {quantity: values >= THRESHOLDS[quantity] for quantity, values in value.items()}
+    values = pd.DataFrame(
+        {
+            "joints": joint[steps].max(axis=1),
+            "object position": position[steps],
+            "object orientation": angle[steps],
+            "contacts": differs.sum(axis=1),
+            "contact force": change.max(axis=1),
+        },
+        index=(np.arange(len(touch)) + 1) * dt,
+    )
+    diverged = values >= pd.Series(THRESHOLDS)
     lasting = np.ones(max(1, round(CONTACT_TIME / dt)))
     diverged["contacts"] = binary_opening(diverged["contacts"], lasting)
-    return Differences(
-        time=(np.arange(len(touch)) + 1) * dt,
-        value=value,
-        where={
-            "joints": [robot.joint_names[i] for i in joint[steps].argmax(axis=1)],
-            "contacts": contacts,
-            "contact force": [fingers[i] for i in change.argmax(axis=1)],
-        },
-        diverged=diverged,
-    )
 
-
-def worst(several: Sequence[tuple[Divergence, ...]]) -> tuple[Divergence, ...]:
-    """Return, for each quantity, the earliest time and the largest differences of several worlds."""
-    out = []
-    for same in zip(*several, strict=True):
-        first = min(same, key=lambda d: math.inf if d.time is None else d.time)
-        out.append(
-            replace(first, end=max(d.end for d in same), largest=max(d.largest for d in same))
+    def where(quantity: str, step: int) -> str:
+        """Return which joint or which fingers differ."""
+        if quantity == "joints":
+            return robot.joint_names[joint[step].argmax()]
+        if quantity == "contact force":
+            return fingers[change[step].argmax()]
+        if quantity != "contacts":
+            return ""
+        return ", ".join(
+            f"{fingers[i]} {'touches' if touch[step, i] else 'does not touch'}"
+            for i in np.flatnonzero(differs[step])
         )
-    return tuple(out)
+
+    divergences = []
+    for quantity, value in values.items() if len(values) else ():
+        step = int(diverged[quantity].argmax())
+        diverges = bool(diverged[quantity].iloc[step])
+        divergences.append(
+            Divergence(
+                quantity=str(quantity),
+                time=float(values.index[step]) if diverges else None,
+                where=where(str(quantity), step) if diverges else "",
+                end=float(value.iloc[-1]),
+                largest=float(value.max()),
+            )
+        )
+    return EngineTrace(
+        engine=engine, recording=found, differences=values, divergences=tuple(divergences)
+    )
 
 
 def _averaged(force: np.ndarray, dt: float) -> np.ndarray:
     """[T, E] mean over the window that ends at each step; shorter at the beginning."""
     steps = max(1, round(WINDOW / dt))
     return pd.DataFrame(force).rolling(steps, min_periods=1).mean().to_numpy()
-
-
-# Replays --------------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, kw_only=True)
-class EngineTrace:
-    """What one engine did, and where it diverges from the reference."""
-
-    engine: Engine
-    recording: Recording
-    """Its first world is the sequence's own."""
-    differences: Differences
-
-    @property
-    def name(self) -> str:
-        """Name of the engine."""
-        return self.engine.name
-
-    @property
-    def divergences(self) -> tuple[Divergence, ...]:
-        """How each quantity diverges; empty if no step is finite."""
-        return self.differences.first()
-
-    @property
-    def lifted(self) -> float | None:
-        """Height of the object at the end above its start [m]; None if it is not finite."""
-        height = float(self.recording.lifted[0])
-        return height if math.isfinite(height) else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -209,19 +176,25 @@ class TraceResult:
     reference: EngineTrace
     engines: tuple[EngineTrace, ...]
     """The other engines."""
-    noise: tuple[Differences, ...]
+    noise: tuple[EngineTrace, ...]
     """The reference from each perturbed start against itself."""
 
     @property
     def worst_noise(self) -> tuple[Divergence, ...]:
-        """The worst of the perturbed starts for each quantity."""
-        return worst([noise.first() for noise in self.noise])
+        """The earliest time and the largest differences of the perturbed starts for each quantity."""
+        out = []
+        for same in zip(*(noise.divergences for noise in self.noise), strict=True):
+            first = min(same, key=lambda d: d.time or math.inf)
+            out.append(
+                replace(first, end=max(d.end for d in same), largest=max(d.largest for d in same))
+            )
+        return tuple(out)
 
     def within_noise(self, found: Divergence) -> bool:
         """Whether the reference diverges as far from itself, and no later, from a start that hardly differs."""
         for noise in self.worst_noise:
             if noise.quantity == found.quantity and found.largest <= noise.largest:
-                return found.time is None or (noise.time is not None and noise.time <= found.time)
+                return found.time is None or (noise.time or math.inf) <= found.time
         return False
 
     def as_dict(self) -> dict[str, Any]:
@@ -231,11 +204,11 @@ class TraceResult:
         for e in (self.reference, *self.engines):
             engines.append(
                 {
-                    "name": e.name,
+                    "name": e.engine.name,
                     "version": e.engine.version,
                     "device": e.engine.device,
                     "lifted_m": e.lifted,
-                    "finite_steps": len(e.differences.time),
+                    "finite_steps": len(e.differences),
                     "divergences": [
                         asdict(d) | {"within_noise": self.within_noise(d)} for d in e.divergences
                     ],
@@ -248,7 +221,7 @@ class TraceResult:
             "object": actions.object.name,
             "steps": len(actions.joint_target),
             "thresholds": THRESHOLDS,
-            "reference": self.reference.name,
+            "reference": self.reference.engine.name,
             "noise": [asdict(d) for d in self.worst_noise],
             "engines": engines,
         }
@@ -274,36 +247,29 @@ def trace(
     Raises:
         XResetError: the reference itself does not stay finite.
     """
-    dt = actions.scene.control_dt
+    scene = actions.scene
 
     def replayed(engine: Engine, start: State) -> Recording:
         progress(engine.name)
         worlds = len(start.joint_pos)
         targets = actions.joint_target[:, None].expand(-1, worlds, -1).contiguous()
-        with engine.make(actions.scene, worlds, torch.zeros(worlds, dtype=torch.long)) as backend:
+        with engine.make(scene, worlds, torch.zeros(worlds, dtype=torch.long)) as backend:
             return play(backend, start, targets)
 
-    def compared(engine: Engine, recording: Recording) -> EngineTrace:
-        found = differences(recording, expected, actions.robot, dt)
-        return EngineTrace(engine=engine, recording=recording, differences=found)
-
     expected = replayed(reference, _perturbed(actions.start, seed))
-    base = compared(reference, expected)
-    steps = len(base.differences.time)
+    base, *noise = (
+        compared(reference, expected, expected, scene, world=i) for i in range(1 + PERTURBED)
+    )
+    steps = len(base.differences)
     if steps < len(actions.joint_target):
         raise XResetError(
-            f"the reference {reference.name!r} is not finite after {steps * dt:.3f} s of this sequence, so nothing can "
-            "be compared with it. Choose another --reference, or another sequence."
+            f"the reference {reference.name!r} is not finite after {steps * scene.control_dt:.3f} s of this sequence, "
+            "so nothing can be compared with it. Choose another --reference, or another sequence."
         )
-    noise = [
-        differences(expected, expected, actions.robot, dt, world=1 + i) for i in range(PERTURBED)
+    traces = [
+        compared(engine, replayed(engine, actions.start), expected, scene) for engine in engines
     ]
-    return TraceResult(
-        actions=actions,
-        reference=base,
-        engines=tuple(compared(engine, replayed(engine, actions.start)) for engine in engines),
-        noise=tuple(noise),
-    )
+    return TraceResult(actions=actions, reference=base, engines=tuple(traces), noise=tuple(noise))
 
 
 def _perturbed(start: State, seed: int) -> State:

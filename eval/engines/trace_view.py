@@ -37,27 +37,24 @@ def shown(quantity: str, value: float) -> str:
 
 def rich_table(result: TraceResult) -> Table:
     """One column for each engine and one for the reference's noise; a row for each quantity."""
-    reference = result.reference
+    reference = result.reference.engine.name
     title = f"{result.actions.label}\n{result.actions.robot.name}: when, where and by how much engines diverge"
-    table = Table("", title=f"{title} from {reference.name}", title_justify="left", show_lines=True)
+    table = Table("", title=f"{title} from {reference}", title_justify="left", show_lines=True)
     for e in result.engines:
-        table.add_column(f"{e.name} {e.engine.version}")
-    table.add_column(f"{reference.name}, {len(result.noise)} starts moved by {PERTURBATION:.0e}")
-    table.add_row("object lifted by", *(_height(e) for e in (*result.engines, reference)))
+        table.add_column(f"{e.engine.name} {e.engine.version}")
+    table.add_column(f"{reference}, {len(result.noise)} starts moved by {PERTURBATION:.0e}")
+    table.add_row("object lifted by", *map(_height, (*result.engines, result.reference)))
     for i, noise in enumerate(result.worst_noise):
         cells = []
         for e in result.engines:
-            cells.append(
-                _cell(result, e.divergences[i], result.within_noise(e.divergences[i]))
-                if e.divergences
-                else "-"
-            )
+            found = e.divergences[i] if e.divergences else None
+            cells.append(_cell(found, result.within_noise(found)) if found else "-")
         quantity = f"{noise.quantity}\n(from {shown(noise.quantity, THRESHOLDS[noise.quantity])})"
-        table.add_row(quantity, *cells, _cell(result, noise, False))
+        table.add_row(quantity, *cells, _cell(noise, False))
     return table
 
 
-def _cell(result: TraceResult, found: Divergence, noise: bool) -> Text:
+def _cell(found: Divergence, noise: bool) -> Text:
     lines = ["never"]
     if found.time is not None:
         lines = [f"{found.time:.3f} s"]
@@ -78,22 +75,20 @@ def _height(engine: EngineTrace) -> str:
 
 def sentences(result: TraceResult) -> Iterator[str]:
     """Yield one sentence for each engine: where it diverges first."""
-    same = result.reference.name
-    for engine in result.engines:
-        steps = len(engine.differences.time)
-        beyond = []
-        for found in engine.divergences:
-            if found.time is not None and not result.within_noise(found):
-                beyond.append((found.time, found))
+    same = result.reference.engine.name
+    for traced in result.engines:
+        name = traced.engine.name
+        steps = len(traced.differences)
+        beyond = [d for d in traced.divergences if d.time and not result.within_noise(d)]
         if steps < len(result.actions.joint_target):
             end = steps * result.actions.scene.control_dt
-            yield f"{engine.name} is no longer finite after {end:.3f} s, where the comparison ends."
+            yield f"{name} is no longer finite after {end:.3f} s, where the comparison ends."
         elif not beyond:
-            yield f"{engine.name} stays with {same}: within the thresholds, or as near as {same} stays to itself."
+            yield f"{name} stays with {same}: within the thresholds, or as near as {same} stays to itself."
         else:
-            time, first = min(beyond, key=lambda timed: timed[0])
+            first = min(beyond, key=lambda d: d.time or 0.0)
             where = f": {first.where}" if first.where else ""
-            yield f"{engine.name} diverges first in {first.quantity} at {time:.3f} s{where}."
+            yield f"{name} diverges first in {first.quantity} at {first.time:.3f} s{where}."
 
 
 def write_plot(path: Path, result: TraceResult) -> None:
@@ -105,7 +100,7 @@ def write_plot(path: Path, result: TraceResult) -> None:
     quantities = [quantity for quantity in THRESHOLDS if quantity != "contacts"]
     with picture(path, (10, 1.7 * len(quantities) + 0.9), dpi=110, font_size=9) as figure:
         figure.suptitle(
-            f"{result.actions.label}: distance to {result.reference.name}", fontweight="bold"
+            f"{result.actions.label}: distance to {result.reference.engine.name}", fontweight="bold"
         )
         axes = figure.subplots(len(quantities), 1, sharex=True)
         for ax, quantity in zip(axes, quantities, strict=True):
@@ -119,25 +114,17 @@ def _draw_differences(ax, result: TraceResult, quantity: str) -> None:
     unit, scale = _SHOWN[quantity]
     threshold = scale * THRESHOLDS[quantity]
     floor = 1e-4 * threshold
-    label = f"{result.reference.name}, start moved by {PERTURBATION:.0e}"
-    for d in result.noise:
-        ax.plot(
-            d.time,
-            np.maximum(scale * d.value[quantity], floor),
-            color="#999999",
-            linewidth=0.7,
-            label=label,
-        )
+
+    def draw(traced: EngineTrace, label: str | None, color: str, linewidth: float) -> None:
+        values = np.maximum(scale * traced.differences[quantity], floor)
+        ax.plot(values.index, values, label=label, color=color, linewidth=linewidth)
+
+    label = f"{result.reference.engine.name}, start moved by {PERTURBATION:.0e}"
+    for noise in result.noise:
+        draw(noise, label, "#999999", 0.7)
         label = None
-    for engine, color in zip(result.engines, COLORS[1:], strict=False):
-        d = engine.differences
-        ax.plot(
-            d.time,
-            np.maximum(scale * d.value[quantity], floor),
-            color=color,
-            linewidth=1.3,
-            label=engine.name,
-        )
+    for traced, color in zip(result.engines, COLORS[1:], strict=False):
+        draw(traced, traced.engine.name, color, 1.3)
     ax.axhline(threshold, color="black", linestyle="--", linewidth=0.8, label="threshold")
     ax.set_yscale("log")
     ax.set_ylim(bottom=floor)

@@ -278,7 +278,7 @@ def trace(
             seed=place.seed,
             progress=move,
         )
-        replays = {e.name: e.recording for e in (result.reference, *result.engines)}
+        replays = {e.engine.name: e.recording for e in (result.reference, *result.engines)}
         actions.write_actions(out / "actions.npz", played, replays)
         write_json(out / "trace.json", result.as_dict())
         trace_view.write_plot(out / "trace.png", result)

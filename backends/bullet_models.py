@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from xreset.backends.rigid import OTHER_LINK, Inertia, Mechanism, rotate
+from xreset.geometry.shapes import transform
 from xreset.geometry.urdf import Joint
 from xreset.spec import Shape
 
@@ -161,7 +162,5 @@ def _numbers(values: Any) -> str:
 
 def inertial_frame(inertia: Inertia) -> np.ndarray:
     """[4, 4] pose of the centre of mass and the principal axes in the body's frame."""
-    T = np.eye(4)
-    T[:3, :3] = np.stack([rotate(inertia.quat, axis) for axis in np.eye(3)], axis=1)
-    T[:3, 3] = inertia.com
-    return T
+    axes = np.stack([rotate(inertia.quat, axis) for axis in np.eye(3)], axis=1)
+    return transform(axes, inertia.com)

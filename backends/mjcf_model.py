@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from xreset.backends.rigid import OTHER_LINK, TABLE, Body, Mechanism, MovingJoints
+from xreset.backends.rigid import OTHER_LINK, TABLE, Body, Mechanism, MovingJoints, matrix_to_quat
 from xreset.spec import SceneSpec
 
 OBJECT = -3
@@ -71,7 +70,7 @@ def body_name(body: Body) -> str:
 
 def pos_quat(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Position [3] and quaternion [4] (w, x, y, z) of a pose [4, 4]."""
-    return T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
+    return T[:3, 3], matrix_to_quat(T[:3, :3])
 
 
 _NET_FORCE = (1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1)

@@ -11,7 +11,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from xreset.backends.pool import PoolBackend, World
-from xreset.backends.rigid import Inertia, object_inertia
+from xreset.backends.rigid import Inertia, conjugate, object_inertia
 from xreset.physics import Capability, KnownDifference, unavailable
 from xreset.spec import SceneSpec
 
@@ -93,9 +93,7 @@ class MujocoWorld(World):
         self._object_pos[:] = state["object_pos"]
         self._object_quat[:] = quat = state["object_quat"] / np.linalg.norm(state["object_quat"])
         self._object_linvel[:] = state["object_linvel"]
-        self._object_spin[:] = _rotate(
-            quat * np.array([1.0, -1.0, -1.0, -1.0]), state["object_angvel"]
-        )
+        self._object_spin[:] = _rotate(conjugate(quat), state["object_angvel"])
         self._ahead = False
 
     def get_state(self) -> dict[str, np.ndarray]:

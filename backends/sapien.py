@@ -40,6 +40,7 @@ from xreset.backends.rigid import (
     sum_contacts,
 )
 from xreset.backends.sapien_robot import OBJECT_BIT, TABLE_BIT, SapienJoints, self_collision_bits
+from xreset.geometry.shapes import transform
 from xreset.geometry.urdf import Joint
 from xreset.physics import Capability, KnownDifference, unavailable
 from xreset.spec import GRAVITY, Geometry, SceneSpec, Shape
@@ -229,8 +230,7 @@ class SapienWorld(World):
         return links
 
     def _set_joint(self, made: Any, joint: Joint, T_parent_body: np.ndarray) -> None:
-        T_joint_axis = np.eye(4)
-        T_joint_axis[:3, :3] = _x_to(joint.axis)
+        T_joint_axis = transform(_x_to(joint.axis), np.zeros(3))
         made.name = joint.name
         made.type = "prismatic" if joint.type == "prismatic" else "revolute_unwrapped"
         made.pose_in_parent = self._pose(T_parent_body @ T_joint_axis)
@@ -260,8 +260,8 @@ class SapienWorld(World):
                 else physx.PhysxCollisionShapeCylinder
             )
             made = kind(radius=size[0], half_length=size[1], material=material)
-            T = T.copy()
-            T[:3, :3] = T[:3, :3] @ _x_to(np.array([0.0, 0.0, 1.0]))  # PhysX has them along x
+            along_x = _x_to(np.array([0.0, 0.0, 1.0]))  # as PhysX has them
+            T = transform(T[:3, :3] @ along_x, T[:3, 3])
         made.local_pose = self._pose(T)
         made.set_collision_groups([*groups, 0, 0])
         body.attach(made)

@@ -14,7 +14,6 @@ import pickle
 import signal
 import subprocess
 import sys
-import tempfile
 import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -77,9 +76,7 @@ def arrays_in(memory: Any, layout: np.dtype) -> dict[str, np.ndarray]:
 
 def usable_cores() -> int:
     """Return the number of cores that this process may run on."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(os.sched_getaffinity(0))
 
 
 # The worlds of one process --------------------------------------------------------------------------------------------
@@ -97,20 +94,15 @@ class Job:
     object_index: tuple[int, ...]
 
 
+@dataclass
 class WorldFailure(Exception):
-    """A world raised. The failure crosses process boundaries, so it holds text.
+    """A world raised. The failure crosses process boundaries, so it holds text."""
 
-    ``kind`` is set for errors that the user can fix.
-    """
-
-    def __init__(
-        self, world: int, kind: type[XResetError] | None, message: str, trace: str
-    ) -> None:
-        super().__init__(world, kind, message, trace)
-        self.world = world
-        self.kind = kind
-        self.message = message
-        self.trace = trace
+    world: int
+    kind: type[XResetError] | None
+    """Set for errors that the user can fix."""
+    message: str
+    trace: str
 
 
 _MOVING = ("build", "set_state", "step")
@@ -160,12 +152,10 @@ class LocalWorlds:
                 for row in rows:
                     self._publish(row)
         except Exception as error:
-            known = isinstance(error, XResetError)
-            message = str(error) if known else f"{type(error).__name__}: {error}"
+            kind = type(error) if isinstance(error, XResetError) else None
+            message = str(error) if kind else f"{type(error).__name__}: {error}"
             world = self._job.first + row
-            raise WorldFailure(
-                world, type(error) if known else None, message, traceback.format_exc()
-            ) from error
+            raise WorldFailure(world, kind, message, traceback.format_exc()) from error
 
     def close(self) -> None:
         """Close the worlds."""
@@ -218,10 +208,8 @@ class LocalWorlds:
         for name, value in state.items():
             arrays[name][i] = value
         nonfinite, overflow = world.health(state)
-        if nonfinite:
-            arrays["nonfinite"][i] = True
-        if overflow:
-            arrays["overflow"][i] = True
+        arrays["nonfinite"][i] |= nonfinite
+        arrays["overflow"][i] |= overflow
         readings = (*world.contacts(), *world.links())
         for name, value in zip((*CONTACT_FIELDS, *LINK_FIELDS), readings, strict=True):
             arrays[name][i] = value
@@ -243,16 +231,15 @@ class WorkerTeam:
                 f"{world_class.__qualname__} is defined in {world_class.__module__!r}, where worker processes cannot "
                 "import it. Move it to a module, or pass workers=0."
             )
-        in_memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
         self._workers: list[_Worker] = []
         try:
-            with tempfile.TemporaryFile(dir=in_memory) as file:
+            with open(os.memfd_create("xreset"), "wb") as file:
                 file.truncate(layout.itemsize)
                 self.arrays = arrays_in(mmap.mmap(file.fileno(), layout.itemsize), layout)
                 for job in jobs:
                     self._workers.append(_Worker(job, file.fileno()))
             for worker in self._workers:
-                worker.send(pickle.dumps((layout, worker.job)))
+                worker.send((layout, worker.job))
             for worker in self._workers:
                 worker.receive("start")
         except BaseException:
@@ -262,14 +249,13 @@ class WorkerTeam:
     def command(self, method: str, worlds: np.ndarray | None, argument: Any) -> None:
         """Have all workers concerned run a command at the same time, and wait for all of them."""
         asked = []
-        message = pickle.dumps((method, None, argument))
         for worker in self._workers:
+            mine = worlds
             if worlds is not None:
                 mine = worlds[(worlds >= worker.first) & (worlds < worker.stop)]
                 if not mine.size:
                     continue
-                message = pickle.dumps((method, mine, argument))
-            worker.send(message)
+            worker.send((method, mine, argument))
             asked.append(worker)
         failures = []
         for worker in asked:
@@ -283,7 +269,7 @@ class WorkerTeam:
     def close(self) -> None:
         """Close the pipes, which ends the workers; kill those that do not end in time."""
         for worker in self._workers:
-            worker.hang_up()
+            worker.pipe.close()
         for worker in self._workers:
             worker.wait()
         self._workers.clear()
@@ -299,7 +285,7 @@ class _Worker:
         self.job = job
         self.first = job.first
         self.stop = job.first + len(job.object_index)
-        self._pipe, pipe_of_worker = Pipe()
+        self.pipe, pipe_of_worker = Pipe()
         path = [os.path.abspath(entry) for entry in sys.path]
         with pipe_of_worker:
             boot = _BOOT.format(path=path, pipe=pipe_of_worker.fileno(), memory=memory)
@@ -312,23 +298,19 @@ class _Worker:
                 start_new_session=True,  # Ctrl-C is for the parent, which then closes the pipe
             )
 
-    def send(self, message: bytes) -> None:
-        """Send a pickled message; a dead worker is noticed at the reply."""
+    def send(self, message: tuple[Any, ...]) -> None:
+        """Send a message; a dead worker is noticed at the reply."""
         with contextlib.suppress(OSError):
-            self._pipe.send_bytes(message)
+            self.pipe.send_bytes(pickle.dumps(message))
 
     def receive(self, command: str) -> None:
         """Wait for the reply, and raise the failure that it holds."""
         try:
-            failure = self._pipe.recv_bytes()
+            failure = self.pipe.recv_bytes()
         except (EOFError, OSError) as error:
             raise XResetError(self._cause_of_death(command)) from error
         if failure:
             raise pickle.loads(failure)
-
-    def hang_up(self) -> None:
-        """Close the pipe."""
-        self._pipe.close()
 
     def wait(self) -> None:
         """Wait for the end, and force it if need be."""
@@ -339,7 +321,7 @@ class _Worker:
             self._process.wait()
 
     def _cause_of_death(self, command: str) -> str:
-        self.hang_up()
+        self.pipe.close()
         self.wait()
         code = self._process.returncode
         how = (

@@ -20,7 +20,7 @@ import torch
 from tests.engine_checks import EngineChecks
 from xreset.backends import mujoco_warp as mujoco_warp_backend
 from xreset.backends.conformance.grasp_checks import grasp
-from xreset.backends.conformance.harness import Bench, snapshot
+from xreset.backends.conformance.harness import Bench
 from xreset.backends.conformance.scene import gripper, objects, scene, shape, solid
 from xreset.backends.mjcf import compile_scene
 from xreset.backends.mjcf_model import SceneModel
@@ -245,7 +245,7 @@ class Steps(unittest.TestCase):
                 mock.patch.object(mujoco_warp_backend, "engine_step", return_value=step),
                 MujocoWarpBackend(scene(), 8) as backend,
             ):
-                state = snapshot(backend.state())
+                state = backend.state().clone()
                 backend.set_state(
                     replace(
                         state, object_linvel=state.object_linvel + torch.tensor([0.3, 0.0, -0.5])
@@ -280,7 +280,7 @@ class Limits(unittest.TestCase):
             backend = MujocoWarpBackend(scene(), 4, object_index=torch.zeros(4, dtype=torch.long))
         backend.step(8)
         self.assertTrue(bool(backend.health().overflow.all()))  # the pool is everyone's
-        state = snapshot(backend.state())
+        state = backend.state().clone()
         # no contacts
         state = replace(state, object_pos=state.object_pos + torch.tensor([0.0, 0.0, 1.0]))
         backend.set_state(state[[2]], torch.tensor([2]))
@@ -315,7 +315,7 @@ class Limits(unittest.TestCase):
         self.assertTrue(bool(backend.health().overflow[0]))
         backend.step(1)
         self.assertTrue(bool(backend.health().overflow[0]), "it stays until the state is set")
-        backend.set_state(snapshot(backend.state()))
+        backend.set_state(backend.state().clone())
         backend.step(1)
         self.assertFalse(bool(backend.health().overflow[0]))
 

@@ -26,6 +26,8 @@ from xreset.eval.engines.agreement import (
     press_metrics,
 )
 from xreset.eval.engines.grasps import (
+    AMPLITUDE,
+    REACH,
     GraspMotion,
     Grasps,
     carried_palm,
@@ -151,9 +153,8 @@ class Episodes(unittest.TestCase):
             torch.testing.assert_close(q[:, arm], home[:, arm], rtol=0, atol=0)
 
     def test_the_squeeze_is_a_force(self):
-        motion = GraspMotion(squeeze=4.0)
-        held = moved_fingertips(self.kinematics, self.home, motion.reach)
-        target = squeezed(self.kinematics, self.home, motion)
+        held = moved_fingertips(self.kinematics, self.home, REACH)
+        target = squeezed(self.kinematics, self.home, 4.0)
         kp = torch.tensor([joint.drive.kp for joint in self.robot.joints], dtype=torch.float64)
         torque = (kp * (target - held))[0]
         before = tips(self.kinematics, self.home)
@@ -191,7 +192,7 @@ class Episodes(unittest.TestCase):
         self.assertLess(float(height[:closing].abs().max()), 1e-6)
         self.assertAlmostEqual(float(height[closing + 31]), 0.1, delta=1e-3)
         swing = (palm[closing + 42 :] - palm[closing + 41]).abs().amax(0)
-        self.assertGreater(float(swing[:2].min()), 0.7 * BRISK.amplitude)
+        self.assertGreater(float(swing[:2].min()), 0.7 * AMPLITUDE)
         self.assertLess(float(targets.diff(dim=0).abs().max()), 0.1)  # nothing jumps
         state = replace(start, joint_target=targets[closing - 1])
         lifted = lifting_targets(self.robot, state, DT, BRISK)
@@ -295,9 +296,9 @@ class Numbers(unittest.TestCase):
         high = torch.zeros(3, 2, 3)
         high[-1, :, 2] = torch.tensor([0.06, 0.04])
         up = recording(object_pos=high)
-        self.assertEqual(carried(up, 0.1).tolist(), [True, False])
-        self.assertFalse(carried(replace(up, broken=torch.tensor([True, False])), 0.1).any())
-        metric = outcome_metric("closing, outcome", [up], [recording(object_pos=high.flip(1))], 0.1)
+        self.assertEqual(carried(up).tolist(), [True, False])
+        self.assertFalse(carried(replace(up, broken=torch.tensor([True, False]))).any())
+        metric = outcome_metric("closing, outcome", [up], [recording(object_pos=high.flip(1))])
         self.assertEqual((metric.measured, metric.n, metric.ok), (0.0, 2, False))
         none = recording(tip_force=torch.zeros(3, 2, 2, 3))
         for metric in press_metrics(none, none, steps=1):

@@ -273,15 +273,18 @@ class SceneSpec:
         return self.timestep * self.substeps
 
 
-def lowest_point(shapes: Sequence[Shape]) -> float:
-    """Smallest z of the shapes, in the frame of their body [m]."""
-    return min(_lowest(shape) for shape in shapes)
+def lowest_point(shapes: Sequence[Shape], turn: np.ndarray | None = None) -> float:
+    """Smallest z of the shapes above the origin of their body, which is turned by a rotation matrix [3, 3] [m]."""
+    up = np.array([0.0, 0.0, 1.0]) if turn is None else turn[2]
+    return min(_lowest(shape, up) for shape in shapes)
 
 
-def _lowest(shape: Shape) -> float:
+def _lowest(shape: Shape, up: np.ndarray) -> float:
     geometry = shape.geometry
-    z = shape.T_body_shape[2, 3]
-    row = shape.T_body_shape[2, :3]  # height of a point p of the shape's own frame: z + row . p
+    z = up @ shape.T_body_shape[:3, 3]
+    row = (
+        up @ shape.T_body_shape[:3, :3]
+    )  # height of a point p of the shape's own frame: z + row . p
     if geometry.kind == "hull":
         return float(z + (geometry.vertices @ row).min())
     if geometry.kind == "box":

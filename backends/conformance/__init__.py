@@ -13,6 +13,7 @@ from __future__ import annotations
 import time
 import tomllib
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 
 from xreset.backends.conformance import (
@@ -36,7 +37,6 @@ from xreset.backends.conformance.results import (
 )
 from xreset.backends.conformance.scene import scene
 from xreset.errors import BackendUnavailableError, CapabilityError
-from xreset.physics import Backend
 from xreset.spec import RobotSpec
 
 __all__ = [
@@ -97,15 +97,8 @@ def run(
         for check in CHECKS:
             if check.name in wanted:
                 start = time.perf_counter()
-                verdict, problem, measures = _run_one(check, bench)
-                seconds = time.perf_counter() - start
-                result = CheckResult(
-                    check=check,
-                    verdict=verdict,
-                    measures=measures,
-                    problem=problem,
-                    seconds=seconds,
-                )
+                result = _run_one(check, bench)
+                result = replace(result, seconds=time.perf_counter() - start)
                 results.append(result)
                 report(result)
     finally:
@@ -113,37 +106,38 @@ def run(
     return results
 
 
-def _run_one(check: Check, bench: Bench) -> tuple[Verdict, str, tuple[Measure, ...]]:
-    """Return verdict, problem and measures."""
+def _run_one(check: Check, bench: Bench) -> CheckResult:
+    def ended(verdict: Verdict, problem: str) -> CheckResult:
+        return CheckResult(check=check, verdict=verdict, problem=problem, measures=tuple(measures))
+
+    measures = []
     if check.own_robot_only and not bench.own_robot:
-        return "skipped", "it needs the suite's own robot", ()
+        return ended("skipped", "it needs the suite's own robot")
     try:
         errors = check.run(bench)
     except Skipped as reason:
-        return "skipped", str(reason), ()
+        return ended("skipped", str(reason))
     except CapabilityError as error:
         lacking = set(check.capabilities) - bench.backend.capabilities
-        return "unsupported" if lacking else "failed", str(error), ()
+        return ended("unsupported" if lacking else "failed", str(error))
     except BackendUnavailableError:  # nothing can be tested
         raise
     except Exception as error:
-        return "failed", f"{type(error).__name__}: {error}", ()
-    measures = []
+        return ended("failed", f"{type(error).__name__}: {error}")
+    backend = bench.backend
     for what, found in errors.items():
         measured, where = largest(found)
-        tolerance, unit = check.limit(what, bench.backend.device.type, _TABLE["states"])
-        known = _known_difference(bench.backend, check.name, what, bench.scene.robot.name)
+        tolerance, unit = check.limit(what, backend.device.type, _TABLE["states"])
+        known = None
+        for difference in backend.known_differences:
+            same = (difference.check, difference.measure) == (check.name, what)
+            if same and difference.robot in (None, bench.scene.robot.name):
+                known = difference
         measures.append(Measure(what, measured, tolerance, unit, where, known))
-    lacking = set(check.capabilities) - bench.backend.capabilities
+    lacking = set(check.capabilities) - backend.capabilities
     if lacking:
-        problem = f"the backend says that it cannot do {', '.join(sorted(lacking))}, but did not refuse to"
-        return "failed", problem, tuple(measures)
-    return judge(measures), "", tuple(measures)
-
-
-def _known_difference(backend: Backend, check: str, measure: str, robot: str):
-    """Return the known difference that the backend declares for a measure; None if there is none."""
-    for known in backend.known_differences:
-        if (known.check, known.measure) == (check, measure) and known.robot in (None, robot):
-            return known
-    return None
+        return ended(
+            "failed",
+            f"the backend says that it cannot do {', '.join(sorted(lacking))}, but did not refuse to",
+        )
+    return ended(judge(measures), "")

@@ -7,9 +7,15 @@ import math
 import torch
 from torch import Tensor
 
-from xreset.backends.conformance.harness import Bench, Worlds, rotation_angle
+from xreset.backends.conformance.harness import Bench, Worlds
 from xreset.backends.conformance.results import Measured
-from xreset.geometry.rotations import matrix_to_quat, quat_conjugate, quat_multiply, quat_rotate
+from xreset.geometry.rotations import (
+    matrix_to_quat,
+    quat_angle,
+    quat_conjugate,
+    quat_multiply,
+    quat_rotate_inverse,
+)
 from xreset.physics import State
 from xreset.spec import GRAVITY
 
@@ -54,7 +60,7 @@ def shaken_grasp(bench: Bench) -> Measured:
     pos, quat = _in_palm(bench, worlds)
     return {
         "slip in the palm": pos - pos_before,
-        "turn in the palm": rotation_angle(quat, quat_before),
+        "turn in the palm": quat_angle(quat.double(), quat_before.double()),
         "fingers that let go": float((~worlds.contacts().tip_touch[bench.twins]).sum()),
     }
 
@@ -63,10 +69,9 @@ def _in_palm(bench: Bench, worlds: Worlds) -> tuple[Tensor, Tensor]:
     """Position and orientation of the held objects in the palm's frame."""
     links = worlds.links()[bench.twins]
     now = worlds.state()[bench.twins]
-    inverse = quat_conjugate(links.quat[:, 0])
-    return quat_rotate(inverse, now.object_pos - links.pos[:, 0]), quat_multiply(
-        inverse, now.object_quat
-    )
+    palm = links.quat[:, 0]
+    pos = quat_rotate_inverse(palm, now.object_pos - links.pos[:, 0])
+    return pos, quat_multiply(quat_conjugate(palm), now.object_quat)
 
 
 def tip_friction(bench: Bench) -> Measured:

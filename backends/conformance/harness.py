@@ -94,7 +94,7 @@ class Worlds:
 
     def state(self) -> State:
         """Return the state."""
-        return snapshot(self.backend.state())
+        return self.backend.state().to("cpu").clone()
 
     def links(self) -> Links:
         """Return the tracked links."""
@@ -156,14 +156,11 @@ class Bench:
     def worlds(self) -> Worlds:
         """Return the shared worlds in their initial state, with nominal parameters."""
         if self._shared is None:
-            self._shared = Worlds(
-                self._make(self.scene, self.NUM_WORLDS, object_index=torch.tensor(self.which))
-            )
+            self._shared = self._made(self.scene, self.which)
         worlds = self._shared
         if worlds.altered:
-            for name, value in (
-                Parameters.nominal(self.scene, torch.tensor(self.which)).given().items()
-            ):
+            nominal = Parameters.nominal(self.scene, torch.tensor(self.which))
+            for name, value in nominal.given().items():
                 if name in worlds.backend.capabilities:
                     worlds.set_parameter(name, value)
             worlds.altered = False
@@ -173,11 +170,12 @@ class Bench:
     @contextmanager
     def other(self, scene: SceneSpec, which: Sequence[int] = (0,)) -> Iterator[Worlds]:
         """Worlds of another scene with the given objects, closed at the end of the block."""
-        backend = self._make(scene, len(which), object_index=torch.tensor(which))
-        try:
-            yield Worlds(backend)
-        finally:
-            backend.close()
+        worlds = self._made(scene, which)
+        with worlds.backend:
+            yield worlds
+
+    def _made(self, scene: SceneSpec, which: Sequence[int]) -> Worlds:
+        return Worlds(self._make(scene, len(which), object_index=torch.tensor(which)))
 
     @contextmanager
     def reference(self, scene: SceneSpec, which: Sequence[int]) -> Iterator[Worlds]:
@@ -227,40 +225,18 @@ def free_place(scene: SceneSpec) -> tuple[float, float]:
     x, y = scene.table.center
     half_x, half_y, _ = scene.table.half_size
     palm = Kinematics(robot).link_poses(torch.as_tensor(robot.home), [robot.palm])[0, :2, 3].numpy()
-    avoid = np.stack((palm, np.array(robot.base_pos[:2])))
+    avoid = np.stack((palm, robot.base_pos[:2]))
     xs = (x - (half_x - 0.25), x + (half_x - 0.25))
     ys = (y - (half_y - 0.2), y + (half_y - 0.2))
-    return max(
-        product(xs, ys),
-        key=lambda corner: float(np.linalg.norm(avoid - np.array(corner), axis=1).min()),
-    )
+    return max(product(xs, ys), key=lambda corner: np.linalg.norm(avoid - corner, axis=1).min())
 
 
 def replace_fields(state: State, **changes: Tensor) -> State:
     """Return the state with some fields replaced; values broadcast over the worlds."""
     new = {}
     for name, value in changes.items():
-        present = getattr(state, name)
-        new[name] = torch.as_tensor(value, dtype=torch.float32, device=present.device).expand_as(
-            present
-        )
+        new[name] = value.float().expand_as(getattr(state, name))
     return replace(state, **new).clone()
-
-
-def snapshot(state: State) -> State:
-    """Return a copy on the CPU that later steps do not change."""
-    return state.to("cpu").clone()
-
-
-def rotation_angle(a: Tensor, b: Tensor) -> Tensor:
-    """[...] angle between the orientations of unit quaternions [..., 4].
-
-    Precise for small angles, where the arc cosine is not.
-    """
-    aw, av = a.double().split((1, 3), dim=-1)
-    bw, bv = b.double().split((1, 3), dim=-1)
-    vector = aw * bv - bw * av - torch.linalg.cross(av, bv)  # of conjugate(a) b
-    return 2.0 * torch.atan2(vector.norm(dim=-1), (a.double() * b.double()).sum(-1).abs())
 
 
 def random_state(bench: Bench, scene: SceneSpec, num_worlds: int, seed: int) -> State:

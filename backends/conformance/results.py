@@ -103,14 +103,14 @@ class Check:
         self, what: str, device: str, state_limits: Mapping[str, Mapping[str, Any]]
     ) -> tuple[float, str]:
         """Return tolerance and unit of a measure on a device, ``cpu`` or ``cuda``."""
-        for pattern, limit in self.tolerance.items():
+        for pattern, (largest, unit) in self.tolerance.items():
             if fnmatchcase(what, pattern):
-                return limit[0], limit[1]
+                return largest, unit
         words, _, name = what.rpartition(" ")
         kind = self.states[words]
-        if kind == "exact" and device == "cpu":
-            return 0.0, state_limits[name]["unit"]
-        return state_limits[name]["same" if kind == "exact" else kind], state_limits[name]["unit"]
+        limits = {"exact": 0.0 if device == "cpu" else state_limits[name]["same"]}
+        limits |= state_limits[name]
+        return limits[kind], limits["unit"]
 
 
 class Skipped(Exception):
@@ -136,15 +136,7 @@ class CheckResult:
     @property
     def worst(self) -> Measure | None:
         """The measure nearest to its tolerance, or furthest beyond it."""
-
-        def share(measure: Measure) -> float:
-            if not math.isfinite(measure.measured):
-                return math.inf
-            if measure.tolerance:
-                return measure.measured / measure.tolerance
-            return math.inf if measure.measured else 0.0
-
-        return max(self.measures, key=share, default=None)
+        return max(self.measures, key=lambda m: share_of(m.measured, m.tolerance), default=None)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content of the results file."""
@@ -158,6 +150,15 @@ class CheckResult:
             "seconds": round(self.seconds, 3),
             "measures": [measure.as_dict() for measure in self.measures],
         }
+
+
+def share_of(measured: float, tolerance: float) -> float:
+    """Return what was measured as a share of its tolerance; infinite if it is not finite."""
+    if not math.isfinite(measured):
+        return math.inf
+    if tolerance:
+        return measured / tolerance
+    return math.inf if measured else 0.0
 
 
 def largest(errors: Errors) -> tuple[float, str]:

@@ -12,6 +12,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from xreset.description import read_description
+from xreset.geometry.shapes import transform
 from xreset.geometry.urdf import robot_tree
 from xreset.spec import Geometry, ObjectSpec, PairFriction, RobotSpec, SceneSpec, Shape
 
@@ -87,17 +88,14 @@ def shape(
     Sizes [m]: half edges of a box, or of a box that is given as a hull; radius and half height of a cylinder; radius
     of a sphere.
     """
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("z", yaw).as_matrix()
-    T[:3, 3] = pos
+    geometry = Geometry(kind=kind, size=tuple(size))  # pyright: ignore[reportArgumentType]
     if kind == "hull":
         mesh = trimesh.creation.box(extents=2.0 * np.array(size))
         geometry = Geometry(
             kind="hull", vertices=np.asarray(mesh.vertices), faces=np.asarray(mesh.faces)
         )
-    else:
-        geometry = Geometry(kind=kind, size=tuple(size))  # pyright: ignore[reportArgumentType]
-    return Shape(geometry=geometry, T_body_shape=T)
+    turn = Rotation.from_euler("z", yaw).as_matrix()
+    return Shape(geometry=geometry, T_body_shape=transform(turn, pos))
 
 
 def solid(

@@ -10,14 +10,13 @@ from torch import Tensor
 from xreset.backends.conformance.harness import (
     Bench,
     random_state,
-    rotation_angle,
     small_motion,
     state_errors,
 )
 from xreset.backends.conformance.results import Measured, Skipped
 from xreset.backends.conformance.scene import reorder_joints
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.rotations import matrix_to_quat
+from xreset.geometry.rotations import matrix_to_quat, quat_angle
 from xreset.geometry.urdf import robot_tree
 from xreset.physics import Links, State
 from xreset.spec import SceneSpec
@@ -95,7 +94,7 @@ def _link_errors(kinematics: Kinematics, state: State, links: Links) -> dict[str
     jacobian = kinematics.jacobian(q, tracked)
     return {
         "pos": links.pos.double() - poses[..., :3, 3],
-        "angle": rotation_angle(links.quat, matrix_to_quat(poses[..., :3, :3])),
+        "angle": quat_angle(links.quat.double(), matrix_to_quat(poses[..., :3, :3])),
         "linvel": links.linvel.double() - (jacobian.linear @ qd)[..., 0],
         "angvel": links.angvel.double() - (jacobian.angular @ qd)[..., 0],
     }

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from xreset.eval.engines.grasps import (
+    LIFT_HEIGHT,
     STANDARD,
     GraspMotion,
     Grasps,
@@ -115,11 +116,9 @@ def try_closings(
     start, targets = closing_episode(scene.robot, grasps, dt, tries)
     with tested.make(scene, len(grasps), grasps.object_index) as backend:
         whole = play(backend, start, targets)
-        mass = torch.tensor(
-            [scene.objects[i].mass for i in grasps.object_index.tolist()], device=backend.device
-        )
-        backend.set_object_mass(PRESS_MASS * mass)
-        backend.set_object_gravity(torch.zeros_like(mass))
+        mass = torch.tensor([thing.mass for thing in scene.objects])[grasps.object_index]
+        backend.set_object_mass(PRESS_MASS * mass.to(backend.device))
+        backend.set_object_gravity(torch.zeros_like(mass, device=backend.device))
         return play(backend, start, targets[: tries.closing_steps(dt)]), whole
 
 
@@ -161,7 +160,7 @@ def common_states(
         tries: how grasps are tried.
     """
     shown = air[: round(count * IN_AIR)]
-    closed = squeezed(Kinematics(robot), shown.joint_pos, tries)
+    closed = squeezed(Kinematics(robot), shown.joint_pos, tries.squeeze)
     states = [State.at_rest(shown.joint_pos, shown.object_pos, shown.object_quat, closed)]
     labels = [f"{label} as demonstrated" for label in shown.label]
     index = [shown.object_index]
@@ -277,22 +276,17 @@ def compare(
     scene = SceneSpec(robot=robot, objects=tuple(objects))
 
     table = find_grasps(motion, robot, objects, grasps, where="table")
-    presses: list[Recording] = []
-    closings: list[Recording] = []
+    closings: dict[str, tuple[Recording, Recording]] = {}
     for done, e in enumerate(everyone):
         progress(f"{e.name}: closing {len(table)} hands", done, total)
-        press, closing = try_closings(e, scene, table, tries)
-        presses.append(press)
-        closings.append(closing)
+        closings[e.name] = try_closings(e, scene, table, tries)
     air = find_grasps(motion, robot, objects, grasps, where="air")
-    closed = {
-        e.name: closing for e, closing in zip(everyone, closings, strict=True) if e is not floor
-    }
+    closed = {name: whole for name, (_, whole) in closings.items() if name != floor.name}
     common = common_states(robot, table, air, closed, grasps, scene.control_dt, tries)
-    holds: list[tuple[Recording, ...]] = []
+    holds: dict[str, tuple[Recording, ...]] = {}
     for done, e in enumerate(everyone, len(everyone)):
         progress(f"{e.name}: holding {len(common.label)} objects", done, total)
-        holds.append(try_holds(e, scene, common, tries))
+        holds[e.name] = try_holds(e, scene, common, tries)
     progress("", total, total)
 
     surfaces = [
@@ -300,32 +294,31 @@ def compare(
     ]
     points = torch.stack(surfaces)[common.object_index]
     window = round(PRESS_TIME / scene.control_dt)
-    judged = []
-    for i, e in enumerate(everyone):
+
+    def judged(e: Engine) -> EngineParity:
+        press, closing = closings[e.name]
+        press_there, closing_there = closings[reference.name]
         metrics = (
-            *press_metrics(presses[i], presses[0], window),
-            *hold_metrics(holds[i], holds[0], points, tries.height),
-            outcome_metric("closing, outcome", closings[i : i + 1], closings[:1], tries.height),
+            *press_metrics(press, press_there, window),
+            *hold_metrics(holds[e.name], holds[reference.name], points),
+            outcome_metric("closing, outcome", [closing], [closing_there]),
         )
-        outcomes = {"closing": closings[i]}
-        for mu, recording in zip(FRICTIONS, holds[i], strict=True):
+        outcomes = {"closing": closing}
+        for mu, recording in zip(FRICTIONS, holds[e.name], strict=True):
             outcomes[f"hold {mu:g}"] = recording
-        judged.append(
-            EngineParity(
-                engine=e,
-                metrics=metrics if i else (),
-                carried={
-                    name: tuple(carried(r, tries.height).tolist()) for name, r in outcomes.items()
-                },
-                broken=sum(int(r.broken.sum()) for r in (*outcomes.values(), presses[i])),
-            )
+        return EngineParity(
+            engine=e,
+            metrics=() if e is reference else metrics,
+            carried={name: tuple(carried(r).tolist()) for name, r in outcomes.items()},
+            broken=sum(int(r.broken.sum()) for r in (*outcomes.values(), press)),
         )
+
     return Parity(
         robot=robot,
         objects=tuple(objects),
-        reference=judged[0],
-        floor=judged[1],
-        engines=tuple(judged[2:]),
+        reference=judged(reference),
+        floor=judged(floor),
+        engines=tuple(judged(e) for e in everyone[2:]),
         closing=table,
         hold=common,
     )
@@ -356,29 +349,27 @@ def press_metrics(found: Recording, reference: Recording, steps: int) -> list[Me
 
 
 def hold_metrics(
-    found: Sequence[Recording], reference: Sequence[Recording], points: Tensor, lift: float
+    found: Sequence[Recording], reference: Sequence[Recording], points: Tensor
 ) -> list[Metric]:
     """Compare outcome and object pose over all frictions together; points [G, P, 3] of the objects' surfaces."""
     distances = []
     for mine, other in zip(found, reference, strict=True):
-        both = carried(mine, lift) & carried(other, lift)
+        both = carried(mine) & carried(other)
         distances.append(palm_distance(mine, other, points)[both])
     return [
-        outcome_metric("hold, outcome", found, reference, lift),
+        outcome_metric("hold, outcome", found, reference),
         Metric.of("hold, object in palm", 1e3 * torch.cat(distances)),
     ]
 
 
-def carried(recording: Recording, lift: float) -> Tensor:
-    """[G] bool: whether the object ends at least half as far above its start as the palm was lifted [m]."""
-    return (recording.lifted > lift / 2) & ~recording.broken
+def carried(recording: Recording) -> Tensor:
+    """[G] bool: whether the object ends at least half as far above its start as the palm was lifted."""
+    return (recording.lifted > LIFT_HEIGHT / 2) & ~recording.broken
 
 
-def outcome_metric(
-    name: str, found: Sequence[Recording], reference: Sequence[Recording], lift: float
-) -> Metric:
+def outcome_metric(name: str, found: Sequence[Recording], reference: Sequence[Recording]) -> Metric:
     """Return the share of the tries that end alike, carried or not."""
-    same = [carried(a, lift) == carried(b, lift) for a, b in zip(found, reference, strict=True)]
+    same = [carried(a) == carried(b) for a, b in zip(found, reference, strict=True)]
     return Metric.of(name, torch.cat(same), q=None)
 
 

@@ -114,23 +114,15 @@ def find_grasps(
     object_index = [names.index(name) for name in motion.object_name[sequence].tolist()]
     object_quat = motion.object_quat_wxyz[chosen]
     object_pos = motion.object_pos[chosen].astype(np.float64)
-    lowest = [_lowest(objects[i], quat) for i, quat in zip(object_index, object_quat, strict=True)]
-    object_pos[:, 2] = np.maximum(object_pos[:, 2], CLEARANCE - np.array(lowest))
+    turns = Rotation.from_quat(object_quat, scalar_first=True).as_matrix()
+    for pos, i, turn in zip(object_pos, object_index, turns, strict=True):
+        pos[2] = max(pos[2], CLEARANCE - lowest_point(objects[i].pieces, turn))
     return Grasps(
         label=tuple(f"{motion.sequence_name[s]}:{f}" for s, f in zip(sequence, frame, strict=True)),
         object_index=torch.tensor(object_index, dtype=torch.long),
         joint_pos=torch.as_tensor(motion.joint_pos[chosen], dtype=torch.float64),
         object_pos=torch.as_tensor(object_pos),
         object_quat=torch.as_tensor(object_quat, dtype=torch.float64),
-    )
-
-
-def _lowest(thing: ObjectSpec, quat: np.ndarray) -> float:
-    """Return the smallest z of the object turned by ``quat``, relative to the origin of its mesh frame [m]."""
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_quat(quat, scalar_first=True).as_matrix()
-    return lowest_point(
-        [replace(piece, T_body_shape=T @ piece.T_body_shape) for piece in thing.pieces]
     )
 
 
@@ -179,14 +171,22 @@ _TURN_LENGTH = 0.3
 """[m] Makes turning the palm comparable to moving it."""
 
 
+OPENING = 0.025
+"""Distance of the fingertips at the start from where they hold, away from the opposite fingertips [m]."""
+REACH = 0.010
+"""Distance that they move on towards the opposite ones [m]: demonstrated tips may not touch the robot's object."""
+LIFT_HEIGHT = 0.10
+"""Height by which the palm is lifted [m]."""
+AMPLITUDE = 0.015
+"""Amplitude of the shake [m]."""
+_FREQUENCY = 2.5
+"""Frequency of the shake [Hz]; its amplitude grows from nothing and fades again."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class GraspMotion:
-    """How a grasp is tried. Durations in seconds."""
+    """How hard and how fast a grasp is tried. Durations in seconds."""
 
-    opening: float = 0.025
-    """Distance of the fingertips at the start from where they hold, away from the opposite fingertips [m]."""
-    reach: float = 0.010
-    """Distance that they move on towards the opposite ones [m]: demonstrated tips may not touch the robot's object."""
     squeeze: float = 12.0
     """Force [N] with which thumb and fingers press against each other if the object is there."""
     settle: float = 0.2
@@ -197,14 +197,8 @@ class GraspMotion:
     """Time before and after the lift."""
     lift: float = 0.8
     """Time for the lift, with the least jerk."""
-    height: float = 0.10
-    """Height by which the palm is lifted [m]."""
     shake: float = 0.8
     """Time for the shake along x, and again along y."""
-    amplitude: float = 0.015
-    """Amplitude of the shake [m]."""
-    frequency: float = 2.5
-    """Frequency of the shake [Hz]; its amplitude grows from nothing and fades again."""
 
     def closing_steps(self, dt: float) -> int:
         """Return the number of control steps of :func:`closing_episode` before the lift begins."""
@@ -221,8 +215,8 @@ def closing_episode(
     and shakes; dt: control step [s]."""
     kinematics = Kinematics(robot)
     held = grasps.joint_pos
-    opened = moved_fingertips(kinematics, held, -motion.opening)
-    closed = squeezed(kinematics, held, motion)
+    opened = moved_fingertips(kinematics, held, -OPENING)
+    closed = squeezed(kinematics, held, motion.squeeze)
     parts = (
         torch.zeros(round(motion.settle / dt)),
         torch.linspace(0, 1, round(motion.close / dt) + 1)[1:],
@@ -260,7 +254,7 @@ def moved_fingertips(kinematics: Kinematics, joint_pos: Tensor, distance: float)
     return q
 
 
-def squeezed(kinematics: Kinematics, joint_pos: Tensor, motion: GraspMotion) -> Tensor:
+def squeezed(kinematics: Kinematics, joint_pos: Tensor, squeeze: float) -> Tensor:
     """Return joint targets [G, J] with which the hand reaches and squeezes.
 
     Held where the reach ends, each joint's drive gives the torque J^T f of the fingertip forces f, because its target
@@ -269,17 +263,17 @@ def squeezed(kinematics: Kinematics, joint_pos: Tensor, motion: GraspMotion) -> 
     Args:
         kinematics: of the robot.
         joint_pos: [G, J] the hand as it holds the object (rad, m).
-        motion: reach and force.
+        squeeze: force [N].
     """
     robot = kinematics.robot
     hand = torch.as_tensor(robot.hand_indices)
     stiffness = torch.tensor(
         [robot.joints[i].drive.kp for i in robot.hand_indices], dtype=joint_pos.dtype
     )
-    q = moved_fingertips(kinematics, joint_pos, motion.reach)
+    q = moved_fingertips(kinematics, joint_pos, REACH)
     share = torch.full((len(robot.fingertips), 1), 1.0 / (len(robot.fingertips) - 1), dtype=q.dtype)
     share[0] = 1.0
-    force = (_closing_direction(kinematics, joint_pos) * share * motion.squeeze).flatten(-2)
+    force = (_closing_direction(kinematics, joint_pos) * share * squeeze).flatten(-2)
     torque = (_tip_jacobian(kinematics, q).mT @ force[..., None])[..., 0]
     return kinematics.clamp(q.index_add(-1, hand, torque / stiffness))
 
@@ -343,17 +337,15 @@ def _carried(kinematics: Kinematics, closed: Tensor, motion: GraspMotion, dt: fl
     """[T, G, J] targets that lift, hold and shake the object in the closed hand [G, J]."""
     t = torch.linspace(0, 1, round(motion.lift / dt) + 1)[1:]
     up = torch.zeros(len(t) + round(motion.hold / dt), 3)
-    up[:, 2] = motion.height
+    up[:, 2] = LIFT_HEIGHT
     up[: len(t), 2] *= t**3 * (10 - 15 * t + 6 * t**2)
     steps = round(motion.shake / dt)
     t = torch.arange(1, steps + 1) / steps
     wave = (
-        motion.amplitude
-        * torch.sin(math.pi * t)
-        * torch.sin(2 * math.pi * motion.frequency * motion.shake * t)
+        AMPLITUDE * torch.sin(math.pi * t) * torch.sin(2 * math.pi * _FREQUENCY * motion.shake * t)
     )
     shake = torch.zeros(2, steps, 3)
     shake[0, :, 0] = wave
     shake[1, :, 1] = wave
-    shake[..., 2] = motion.height
+    shake[..., 2] = LIFT_HEIGHT
     return carried_palm(kinematics, closed, torch.cat((up, shake.flatten(0, 1))))

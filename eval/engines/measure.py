@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -24,7 +25,7 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import hull, transformed
 from xreset.geometry.urdf import link_meshes, robot_tree
 from xreset.physics import Backend, State
-from xreset.spec import GRAVITY, ObjectSpec, SceneSpec
+from xreset.spec import GRAVITY, ObjectSpec, SceneSpec, Shape
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,24 +126,26 @@ class _Bench:
 
     def __init__(self, scene: SceneSpec) -> None:
         self._robot = scene.robot
-        self._thing = scene.objects[0]
-        squares = np.square(_SLAB_HALF)
-        slab = _block("slab", inertia=_SLAB_MASS / 3 * (sum(h * h for h in _SLAB_HALF) - squares))
-        paddle = _block("paddle", inertia=np.ones(3))
-        self.scene = replace(scene, objects=(slab, paddle, self._thing, _top()))
-        self._presses = {"tip": _reachable(scene, tip=True), "link": _reachable(scene, tip=False)}
+        half = np.square(_SLAB_HALF)
+        slab = _solid("slab", shape("box", _SLAB_HALF), _SLAB_MASS / 3 * (half.sum() - half))
+        paddle = _solid("paddle", shape("box", _SLAB_HALF), (1.0, 1.0, 1.0))
+        angle = np.arange(8) * np.pi / 4
+        rim = np.full((8, 3), _TOP_HEIGHT)
+        rim[:, 0] = _TOP_RADIUS * np.cos(angle)
+        rim[:, 1] = _TOP_RADIUS * np.sin(angle)
+        top = _solid("top", hull(np.concatenate((np.zeros((1, 3)), rim))), _TOP_INERTIA)
+        self.scene = replace(scene, objects=(slab, paddle, scene.objects[0], top))
         self._dt = scene.timestep
         self._place = free_place(scene)
-        self._push = 2.0 * self._thing.mass  # [N] for 2 m/s^2
-        friction = scene.friction
-        self._pull = {
-            "tip": _PULL * _PRESS * max(friction.tip, 0.1),
-            "link": _PULL * _PRESS * max(friction.link, 0.1),
-        }
+        self._push = 2.0 * scene.objects[0].mass  # [N] for 2 m/s^2
+        self._presses = {}
+        self._pull = {}
+        for link in ("tip", "link"):
+            self._presses[link] = _reachable(scene, tip=link == "tip")
+            self._pull[link] = _PULL * _PRESS * max(getattr(scene.friction, link), 0.1)
         # Four times the spin [rad/s] that the stated torsional friction takes; not so much that a contact patters.
-        self._spin = (
-            4.0 * max(friction.torsional, 1e-3) * _SLAB_MASS * GRAVITY / _TOP_INERTIA[2] * _TIME
-        )
+        torsional = max(scene.friction.torsional, 1e-3)
+        self._spin = 4.0 * torsional * _SLAB_MASS * GRAVITY / _TOP_INERTIA[2] * _TIME
 
     def run(self, backend: Backend) -> dict[str, Tensor]:
         """Play all experiments; returns the worlds' states [T, N, ...] after each physics step, the start first."""
@@ -151,7 +154,7 @@ class _Bench:
         backend.set_object_gravity(torch.tensor(grounded).float().to(backend.device))
         backend.set_state(start.to(backend.device))
         targets = start.joint_target.clone()
-        targets[_AT["drives"]] += torch.tensor(self._drive_steps(), dtype=torch.float32)
+        targets[_AT["drives"]] += torch.as_tensor(self._drive_steps())
         rows = {name: [value] for name, value in vars(start).items()}
         for step in range(round(_TIME / self._dt)):
             force = self._loads(step).to(backend.device)
@@ -163,9 +166,7 @@ class _Bench:
             for name, values in rows.items():
                 values.append(getattr(state, name).cpu().clone())
         log = {name: torch.stack(values).double() for name, values in rows.items()}
-        sound = torch.stack(
-            [values.isfinite().flatten(2).all(-1).all(0) for values in log.values()]
-        ).all(0)
+        sound = torch.cat(list(log.values()), dim=-1).isfinite().all(-1).all(0)
         broken = [name for name, i in _AT.items() if not sound[i]]
         if broken:
             raise XResetError(
@@ -232,20 +233,16 @@ class _Bench:
     def _start(self) -> State:
         start = State.initial(self.scene, torch.tensor(list(_WORLDS.values())))
         pos = start.object_pos
-        for name, i in _AT.items():
-            thing = _WORLDS[name]
-            if thing == _SLAB:
-                pos[i] = torch.tensor([*self._place, _SLAB_HALF[2]])
-            elif thing == _PADDLE:
-                point, normal, _ = self._presses[name]
-                pos[i] = torch.as_tensor(point + (_SLAB_HALF[2] + 5e-4) * normal)
-                start.object_quat[i] = torch.as_tensor(_z_to(normal))
-            elif thing == _THING:
-                pos[i] = torch.tensor([*self._place, 0.6])
-            else:
-                pos[i] = torch.tensor([*self._place, 0.0])
-                start.object_angvel[i, 2] = self._spin
+        pos[:, :2] = torch.tensor(self._place)
+        pos[_AT["slide"], 2] = _SLAB_HALF[2]
+        pos[_AT["spin"], 2] = 0.0
+        for name in ("force", "drives"):
+            pos[_AT[name], 2] = 0.6
+        for name, (point, normal, _) in self._presses.items():
+            pos[_AT[name]] = torch.as_tensor(point + (_SLAB_HALF[2] + 5e-4) * normal)
+            start.object_quat[_AT[name]] = torch.as_tensor(_z_to(normal))
         start.object_linvel[_AT["slide"], 0] = _SPEED
+        start.object_angvel[_AT["spin"], 2] = self._spin
         return start
 
     def _loads(self, step: int) -> Tensor:
@@ -258,34 +255,33 @@ class _Bench:
             force[_AT["force"], 0] = self._push
         return torch.as_tensor(force, dtype=torch.float32)
 
-    def _drive_steps(self) -> list[float]:
+    def _drive_steps(self) -> np.ndarray:
         """[J] change of each target, away from the nearer joint limit."""
         tree = robot_tree(self._robot)
-        out = []
-        for joint in self._robot.joints:
+        steps = np.zeros(len(self._robot.joints), dtype=np.float32)
+        for i, joint in enumerate(self._robot.joints):
             limits = tree.joint(joint.name)
-            size = min(
+            steps[i] = min(
                 _STEP,
                 0.4 * joint.drive.effort / joint.drive.kp,
                 0.2 * (limits.upper - limits.lower),
             )
-            out.append(size if limits.upper - joint.home >= joint.home - limits.lower else -size)
-        return out
+            if limits.upper - joint.home < joint.home - limits.lower:
+                steps[i] *= -1
+        return steps
 
     def _drives(self, log: dict[str, Tensor]) -> np.ndarray:
         """[2, J] shares of kp and kd, after a step of the targets."""
         position = log["joint_pos"][:, _AT["drives"]].numpy()
         velocity = log["joint_vel"][:, _AT["drives"]].numpy()
         drives = [joint.drive for joint in self._robot.joints]
-        change = np.array(self._drive_steps(), dtype=np.float32).astype(float)
         M = mass_matrix(self._robot, self._robot.home) + np.diag(
             [drive.armature for drive in drives]
         )
         loss = np.array([drive.friction_loss for drive in drives])
         momentum = velocity @ M + np.cumsum(loss * np.sign(velocity), axis=0) * self._dt
-        lag = position[0] + change - position
-        pulled = np.zeros_like(lag)
-        pulled[1:] = np.cumsum((lag[1:] + lag[:-1]) / 2 * self._dt, axis=0)
+        lag = position[0] + self._drive_steps() - position
+        pulled = cumulative_trapezoid(lag, dx=self._dt, axis=0, initial=0)
         gains = []
         for j, drive in enumerate(drives):
             columns = np.stack((pulled[:, j], position[0, j] - position[:, j]), axis=1)
@@ -294,19 +290,10 @@ class _Bench:
         return np.transpose(gains)
 
 
-def _block(name: str, *, inertia: np.ndarray) -> ObjectSpec:
-    block = solid(name, _SLAB_MASS, (shape("box", _SLAB_HALF, (0, 0, 0)),))
-    return replace(block, com=np.zeros(3), inertia=np.diag(inertia))
-
-
-def _top() -> ObjectSpec:
-    """Return a cone upside down. Its origin and its centre of mass are its point."""
-    angle = np.arange(8) * np.pi / 4
-    rim = np.stack(
-        (_TOP_RADIUS * np.cos(angle), _TOP_RADIUS * np.sin(angle), np.full(8, _TOP_HEIGHT)), axis=1
-    )
-    cone = solid("top", _SLAB_MASS, (hull(np.concatenate((np.zeros((1, 3)), rim))),))
-    return replace(cone, com=np.zeros(3), inertia=np.diag(_TOP_INERTIA))
+def _solid(name: str, piece: Shape, inertia: Sequence[float] | np.ndarray) -> ObjectSpec:
+    """Return an object of the slab's mass whose centre of mass is its origin; inertia [3] along the axes."""
+    thing = solid(name, _SLAB_MASS, (piece,))
+    return replace(thing, com=np.zeros(3), inertia=np.diag(inertia))
 
 
 def _reachable(scene: SceneSpec, *, tip: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -323,9 +310,7 @@ def _reachable(scene: SceneSpec, *, tip: bool) -> tuple[np.ndarray, np.ndarray, 
     meshes = link_meshes(robot)
     home = torch.as_tensor(robot.home, dtype=torch.float64)
     poses = kinematics.link_poses(home, list(meshes)).numpy()
-    contact_links = set()
-    for finger in robot.fingertips:
-        contact_links.update(finger.contact_links)
+    contact_links = set().union(*(finger.contact_links for finger in robot.fingertips))
     points: dict[bool, list[np.ndarray]] = {True: [], False: []}
     for (name, mesh), T in zip(meshes.items(), poses, strict=True):
         points[name in contact_links].append(transformed(mesh.vertices, T))

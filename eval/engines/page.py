@@ -5,7 +5,6 @@ Nothing on the page is written by hand: every number is read from a file, and ev
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
@@ -13,6 +12,7 @@ from typing import Any, get_args
 from jinja2 import UndefinedError
 
 from xreset.backends.conformance.results import SCHEMA as CONFORMANCE
+from xreset.backends.conformance.results import share_of
 from xreset.errors import FileFormatError, XResetError
 from xreset.eval.pages import render
 from xreset.eval.table import markdown
@@ -20,12 +20,7 @@ from xreset.files import read_json
 from xreset.physics import Capability
 from xreset.text import shown
 
-_NONE = "-"
 Json = Mapping[str, Any]
-
-
-Checks = dict[str, dict[str, Json]]
-"""Checks of each engine on each device, by title of its column and by name, as in the file."""
 
 
 def read(paths: Iterable[Path]) -> list[Json]:
@@ -68,120 +63,98 @@ def page(files: Iterable[Json]) -> str:
     """
     commands = []
     capabilities: dict[str, set[str]] = {}
-    robots: dict[str, Checks] = {}
+    """Of each engine on each device, by title of its column."""
+    robots: dict[str, dict[str, dict[str, Json]]] = {}
+    """Robot -> name of a check -> title of a column -> the check as in the file."""
     for data in files:
         covers = []
         for run in data["runs"]:
             engine = f"{run['engine']} {run['engine_version']}"
             covers.append(f"{engine} with {run['robot']} on {run['device']}")
             column = engine if run["device"] == "cpu" else f"{engine}, {run['device']}"
-            found = robots.setdefault(run["robot"], {}).setdefault(column, {})
-            found.update({check["check"]: check for check in run["checks"]})
             capabilities.setdefault(column, set()).update(run["capabilities"])
+            checks = robots.setdefault(run["robot"], {})
+            for check in run["checks"]:
+                checks.setdefault(check["check"], {})[column] = check
         command = f"`{data['command']}`" if data.get("command") else "not recorded"
         commands.append(("; ".join(covers), command, data.get("xreset_version", "")))
+    # In the order of the files, with each engine's versions and devices next to each other.
+    engines = [column.split()[0] for column in capabilities]
+    columns = sorted(capabilities, key=lambda column: engines.index(column.split()[0]))
+    able = []
+    for name in dict.fromkeys(
+        (*get_args(Capability), *sorted(set().union(*capabilities.values())))
+    ):
+        cells = ["yes" if name in capabilities[column] else "no" for column in columns]
+        able.append((name.replace("_", " "), *cells))
+    summaries = {}
     known = []
     not_done = []
     for robot, checks in robots.items():
-        for column in _order(checks):
-            for name, check in checks[column].items():
-                where = (column, robot)
-                for m in check["measures"]:
-                    if m["verdict"] == "known difference":
-                        amounts = [_amount(m[key], m) for key in ("measured", "tolerance", "bound")]
-                        known.append((*where, f"`{name}`: {m['what']}", *amounts, m["reason"]))
-                if check["verdict"] in ("failed", "unsupported", "skipped"):
-                    not_done.append(
-                        (
-                            *where,
-                            f"`{name}`",
-                            check["verdict"],
-                            check["problem"] or _failures(check),
-                        )
-                    )
+        tested_here = set().union(*checks.values())
+        tested = [column for column in columns if column in tested_here]
+        summaries[robot] = _summary(checks, tested)
+        for column in tested:
+            for name, results in checks.items():
+                if column in results:
+                    where = (column, robot, f"`{name}`")
+                    known += _known_differences(results[column], *where)
+                    not_done += _not_done(results[column], *where)
     measured = ("engine", "robot", "measure", "measured", "tolerance", "accepted up to", "why")
     return render(
         "engines.md.j2",
         commands=_table(("what", "command", "xreset"), commands),
-        capabilities=_capabilities(capabilities),
-        summaries={robot: _summary(checks) for robot, checks in robots.items()},
+        capabilities=_table(("", *columns), able),
+        summaries=summaries,
         known_differences=_table(measured, known),
         not_done=_table(("engine", "robot", "check", "", "why"), not_done),
     )
 
 
-def _order(columns: Iterable[str]) -> list[str]:
-    """Engines in the order of the files, with each one's versions and devices next to each other."""
-    known = list(columns)
-    engines = list(dict.fromkeys(column.split()[0] for column in known))
-    return sorted(known, key=lambda column: engines.index(column.split()[0]))
-
-
-def _capabilities(found: Mapping[str, set[str]]) -> str:
-    columns = _order(found)
-    others = sorted(set().union(*found.values()))
+def _known_differences(check: Json, engine: str, robot: str, name: str) -> list[tuple[str, ...]]:
     rows = []
-    for name in dict.fromkeys((*get_args(Capability), *others)) if found else ():
-        rows.append(
-            (
-                name.replace("_", " "),
-                *("yes" if name in found[column] else "no" for column in columns),
-            )
-        )
-    return _table(("", *columns), rows)
+    for m in check["measures"]:
+        if m["verdict"] == "known difference":
+            amounts = [_amount(m[key], m) for key in ("measured", "tolerance", "bound")]
+            rows.append((engine, robot, f"{name}: {m['what']}", *amounts, m["reason"]))
+    return rows
 
 
-def _summary(checks: Checks) -> str:
-    columns = _order(checks)
-    every: dict[str, Json] = {}
-    for column in columns:
-        every = every | checks[column] | every  # an earlier column wins
+def _not_done(check: Json, *where: str) -> list[tuple[str, ...]]:
+    if check["verdict"] in ("passed", "known difference"):
+        return []
+    failures = []
+    for m in check["measures"]:
+        if m["verdict"] == "failed":
+            amounts = [_amount(m[key], m) for key in ("measured", "tolerance")]
+            failures.append(f"{m['what']}: {amounts[0]}, tolerance {amounts[1]}")
+    return [(*where, check["verdict"], check["problem"] or "; ".join(failures))]
+
+
+def _summary(checks: Mapping[str, Mapping[str, Json]], columns: Sequence[str]) -> str:
     rows = []
     group = None
-    for name, check in every.items():
+    for name, results in checks.items():
+        check = next(iter(results.values()))
         if check["group"] != group:
             group = check["group"]
             rows.append((f"**{group}**", *[""] * (1 + len(columns))))
-        rows.append(
-            (
-                f"`{name}`",
-                check["statement"],
-                *(_verdict(checks[column].get(name)) for column in columns),
-            )
-        )
+        verdicts = [_verdict(results.get(column)) for column in columns]
+        rows.append((f"`{name}`", check["statement"], *verdicts))
     return _table(("check", "what must hold", *columns), rows)
 
 
 def _verdict(check: Json | None) -> str:
     if check is None or check["verdict"] == "skipped":
-        return _NONE
+        return "-"
     if check["verdict"] == "unsupported":
         return "none"
-    worst = max((_share(m) for m in check["measures"]), default=0.0)
+    shares = [share_of(float(m["measured"]), m["tolerance"]) for m in check["measures"]]
+    worst = max(shares, default=0.0)
     share = "< 0.01" if 0 < worst < 0.01 else f"{worst:.2f}" if worst < 10 else f"{worst:.3g}"
     return {"passed": share, "known difference": f"known, {share}"}.get(
         check["verdict"], f"**failed, {share}**"
     )
-
-
-def _failures(check: Json) -> str:
-    parts = []
-    for m in check["measures"]:
-        if m["verdict"] == "failed":
-            parts.append(
-                f"{m['what']}: {_amount(m['measured'], m)}, tolerance {_amount(m['tolerance'], m)}"
-            )
-    return "; ".join(parts)
-
-
-def _share(measure: Json) -> float:
-    measured = float(measure["measured"])
-    tolerance = measure["tolerance"]
-    if not math.isfinite(measured):
-        return math.inf
-    if tolerance:
-        return measured / tolerance
-    return 0.0 if measured == 0 else math.inf
 
 
 def _amount(value: Any, measure: Json) -> str:

@@ -71,9 +71,8 @@ class EngineTrace:
     engine: Engine
     recording: Recording
     """Its first world is the sequence's own."""
-    differences: pd.DataFrame
-    """A column for each quantity of :data:`THRESHOLDS`, a row for each control step (index: its end [s]), up to the last
-    step at which both engines are finite."""
+    steps: int
+    """Control steps up to the last at which both engines are finite."""
     divergences: tuple[Divergence, ...]
     """How each quantity diverges; empty if no step is finite."""
 
@@ -111,25 +110,19 @@ def compared(
         found.object_quat[:, world].double(), reference.object_quat[:, 0].double()
     ).numpy()
     broken = ~np.isfinite(np.column_stack((joint, position, angle, force, other))).all(axis=1)
-    steps = slice(int(broken.argmax()) if broken.any() else len(joint))
-    force = _averaged(force[steps], dt)
-    other = _averaged(other[steps], dt)
+    steps = int(broken.argmax()) if broken.any() else len(joint)
+    force = _averaged(force[:steps], dt)
+    other = _averaged(other[:steps], dt)
     change = np.abs(force - other)
     touch = force >= TOUCH
     differs = touch != (other >= TOUCH)
-    values = pd.DataFrame(
-        {
-            "joints": joint[steps].max(axis=1),
-            "object position": position[steps],
-            "object orientation": angle[steps],
-            "contacts": differs.sum(axis=1),
-            "contact force": change.max(axis=1),
-        },
-        index=(np.arange(len(touch)) + 1) * dt,
-    )
-    diverged = values >= pd.Series(THRESHOLDS)
-    lasting = np.ones(max(1, round(CONTACT_TIME / dt)))
-    diverged["contacts"] = binary_opening(diverged["contacts"], lasting)
+    values = {
+        "joints": joint[:steps].max(axis=1),
+        "object position": position[:steps],
+        "object orientation": angle[:steps],
+        "contacts": differs.sum(axis=1),
+        "contact force": change.max(axis=1),
+    }
 
     def where(quantity: str, step: int) -> str:
         """Return which joint or which fingers differ."""
@@ -145,21 +138,22 @@ def compared(
         )
 
     divergences = []
-    for quantity, value in values.items() if len(values) else ():
-        step = int(diverged[quantity].argmax())
-        diverges = bool(diverged[quantity].iloc[step])
+    for quantity, value in values.items() if steps else ():
+        beyond = value >= THRESHOLDS[quantity]
+        if quantity == "contacts":
+            beyond = binary_opening(beyond, np.ones(max(1, round(CONTACT_TIME / dt))))
+        step = int(beyond.argmax())
+        diverges = bool(beyond[step])
         divergences.append(
             Divergence(
-                quantity=str(quantity),
-                time=float(values.index[step]) if diverges else None,
-                where=where(str(quantity), step) if diverges else "",
-                end=float(value.iloc[-1]),
+                quantity=quantity,
+                time=(step + 1) * dt if diverges else None,
+                where=where(quantity, step) if diverges else "",
+                end=float(value[-1]),
                 largest=float(value.max()),
             )
         )
-    return EngineTrace(
-        engine=engine, recording=found, differences=values, divergences=tuple(divergences)
-    )
+    return EngineTrace(engine=engine, recording=found, steps=steps, divergences=tuple(divergences))
 
 
 def _averaged(force: np.ndarray, dt: float) -> np.ndarray:
@@ -208,7 +202,7 @@ class TraceResult:
                     "version": e.engine.version,
                     "device": e.engine.device,
                     "lifted_m": e.lifted,
-                    "finite_steps": len(e.differences),
+                    "finite_steps": e.steps,
                     "divergences": [
                         asdict(d) | {"within_noise": self.within_noise(d)} for d in e.divergences
                     ],
@@ -260,11 +254,10 @@ def trace(
     base, *noise = (
         compared(reference, expected, expected, scene, world=i) for i in range(1 + PERTURBED)
     )
-    steps = len(base.differences)
-    if steps < len(actions.joint_target):
+    if base.steps < len(actions.joint_target):
         raise XResetError(
-            f"the reference {reference.name!r} is not finite after {steps * scene.control_dt:.3f} s of this sequence, "
-            "so nothing can be compared with it. Choose another --reference, or another sequence."
+            f"the reference {reference.name!r} is not finite after {base.steps * scene.control_dt:.3f} s of this "
+            "sequence, so nothing can be compared with it. Choose another --reference, or another sequence."
         )
     traces = [
         compared(engine, replayed(engine, actions.start), expected, scene) for engine in engines

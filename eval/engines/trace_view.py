@@ -1,12 +1,10 @@
-"""A comparison of replays for a terminal and as a picture."""
+"""A comparison of replays for a terminal."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from pathlib import Path
 
-import numpy as np
 from rich.table import Table
 from rich.text import Text
 
@@ -17,7 +15,6 @@ from xreset.eval.engines.replay import (
     EngineTrace,
     TraceResult,
 )
-from xreset.eval.plots import COLORS, picture
 
 _SHOWN = {
     "joints": ("mrad", 1e3),
@@ -78,10 +75,9 @@ def sentences(result: TraceResult) -> Iterator[str]:
     same = result.reference.engine.name
     for traced in result.engines:
         name = traced.engine.name
-        steps = len(traced.differences)
         beyond = [d for d in traced.divergences if d.time and not result.within_noise(d)]
-        if steps < len(result.actions.joint_target):
-            end = steps * result.actions.scene.control_dt
+        if traced.steps < len(result.actions.joint_target):
+            end = traced.steps * result.actions.scene.control_dt
             yield f"{name} is no longer finite after {end:.3f} s, where the comparison ends."
         elif not beyond:
             yield f"{name} stays with {same}: within the thresholds, or as near as {same} stays to itself."
@@ -89,44 +85,3 @@ def sentences(result: TraceResult) -> Iterator[str]:
             first = min(beyond, key=lambda d: d.time or 0.0)
             where = f": {first.where}" if first.where else ""
             yield f"{name} diverges first in {first.quantity} at {first.time:.3f} s{where}."
-
-
-def write_plot(path: Path, result: TraceResult) -> None:
-    """Write the plot as PNG.
-
-    Rows of differences on logarithmic axes, with the thresholds (dashed) and the reference's distance to itself from
-    perturbed starts (grey).
-    """
-    quantities = [quantity for quantity in THRESHOLDS if quantity != "contacts"]
-    with picture(path, (10, 1.7 * len(quantities) + 0.9), dpi=110, font_size=9) as figure:
-        figure.suptitle(
-            f"{result.actions.label}: distance to {result.reference.engine.name}", fontweight="bold"
-        )
-        axes = figure.subplots(len(quantities), 1, sharex=True)
-        for ax, quantity in zip(axes, quantities, strict=True):
-            _draw_differences(ax, result, quantity)
-        axes[-1].set_xlabel("time [s]")
-        handles, labels = axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False)
-
-
-def _draw_differences(ax, result: TraceResult, quantity: str) -> None:
-    unit, scale = _SHOWN[quantity]
-    threshold = scale * THRESHOLDS[quantity]
-    floor = 1e-4 * threshold
-
-    def draw(traced: EngineTrace, label: str | None, color: str, linewidth: float) -> None:
-        values = np.maximum(scale * traced.differences[quantity], floor)
-        ax.plot(values.index, values, label=label, color=color, linewidth=linewidth)
-
-    label = f"{result.reference.engine.name}, start moved by {PERTURBATION:.0e}"
-    for noise in result.noise:
-        draw(noise, label, "#999999", 0.7)
-        label = None
-    for traced, color in zip(result.engines, COLORS[1:], strict=False):
-        draw(traced, traced.engine.name, color, 1.3)
-    ax.axhline(threshold, color="black", linestyle="--", linewidth=0.8, label="threshold")
-    ax.set_yscale("log")
-    ax.set_ylim(bottom=floor)
-    ax.grid(axis="y", alpha=0.2)
-    ax.set_title(f"{quantity} [{unit}]", loc="left", fontsize="medium")

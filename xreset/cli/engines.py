@@ -259,7 +259,7 @@ def trace(
         object: Object, if the source has several; default: the first.
         episode: Which of the object's grasps or recorded episodes.
         place: Robot, meshes, seed, device.
-        out: Folder for trace.json, trace.png, and actions.npz: the actions, and what every engine did.
+        out: Folder for trace.json, and actions.npz: the actions, and what every engine did.
     """
     from xreset.eval import trial
     from xreset.eval.engines import actions, replay, trace_view
@@ -281,7 +281,6 @@ def trace(
         replays = {e.engine.name: e.recording for e in (result.reference, *result.engines)}
         actions.write_actions(out / "actions.npz", played, replays)
         write_json(out / "trace.json", result.as_dict())
-        trace_view.write_plot(out / "trace.png", result)
     console.print(trace_view.rich_table(result))
     for sentence in trace_view.sentences(result):
         console.print(sentence)

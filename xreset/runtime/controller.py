@@ -111,33 +111,32 @@ class Controller:
                 where the contract's ``object_frame`` is ``center``.
         """
         self.target = np.atleast_2d(np.asarray(target, dtype=np.float32))
-        count = len(self.target)
         expected = self.contract["observation"]["cloud_points"]
-        points = np.asarray(object_points, dtype=np.float32)
-        if points.shape[-2:] != (expected, 3):
-            raise LiveError(
-                f"The object has points of shape {points.shape}, expected ({expected}, 3)."
-            )
+        shape = np.shape(object_points)
+        if shape[-2:] != (expected, 3):
+            raise LiveError(f"The object has points of shape {shape}, expected ({expected}, 3).")
+        self._points = self._of_each(object_points, expected, 3)
         self._center: Array | None = None
         if self.contract["object_frame"] == "center":
             if center is None:
                 raise LiveError(
                     "This policy needs the center of the object. Give center, as Controller.center does."
                 )
-            self._center = np.broadcast_to(np.asarray(center, dtype=np.float32), (count, 3))
-            points = points - self._center[:, None]
-        self._points = np.broadcast_to(points, (count, expected, 3))
+            self._center = self._of_each(center, 3)
+            self._points = self._points - self._center[:, None]
         self.set_goal(goal_pos, goal_quat)
         self.action = np.zeros_like(self.target)
         self._cloud: Array | None = None
-        self._actor.begin(count)
+        self._actor.begin(len(self.target))
 
     def set_goal(self, pos: Array, quat: Array) -> None:
         """Set the goal pose, also while the policy acts; shapes as for :meth:`begin`."""
-        count = len(self.target)
-        self._goal_quat = np.broadcast_to(np.asarray(quat, dtype=np.float32), (count, 4))
-        goal_pos = np.broadcast_to(np.asarray(pos, dtype=np.float32), (count, 3))
-        self._goal_pos = self._origin(goal_pos, self._goal_quat)
+        self._goal_quat = self._of_each(quat, 4)
+        self._goal_pos = self._origin(self._of_each(pos, 3), self._goal_quat)
+
+    def _of_each(self, values: Array, *shape: int) -> Array:
+        """[N, ...] values of every robot in float32, given those [N, ...] or one robot's [...]."""
+        return np.broadcast_to(np.asarray(values, np.float32), (len(self.target), *shape))
 
     def _origin(self, pos: Array, quat: Array) -> Array:
         """[N, 3] where the policy's origin of the object is, for poses [N, 3], [N, 4] of the object's frame."""

@@ -60,8 +60,9 @@ class RemoteController(Controller):
             "goal_pos": goal_pos,
             "goal_quat": goal_quat,
             "target": target,
+            "center": center,
         }
-        self._ask({"begin": _lists(values | {"center": center})})
+        self._ask({"begin": _lists(values)})
 
     def set_goal(self, pos: Array, quat: Array) -> None:
         """Set the goal pose."""
@@ -69,11 +70,11 @@ class RemoteController(Controller):
 
     def step(self, reading: Reading) -> Array:
         """[1, J] new joint targets for a reading with the axis N."""
-        names = ("joint_pos", "joint_vel", "object_pos", "object_quat", "tip_force")
-        values = {name: getattr(reading, name) for name in names}
-        found = self._ask(
-            {"step": _lists({name: None if v is None else v[0] for name, v in values.items()})}
-        )
+        values = {}
+        for name in ("joint_pos", "joint_vel", "object_pos", "object_quat", "tip_force"):
+            rows = getattr(reading, name)
+            values[name] = None if rows is None else rows[0]
+        found = self._ask({"step": _lists(values)})
         self.target = np.array([found["target"]], dtype=np.float32)
         return self.target
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -47,6 +47,9 @@ class Outcome:
         return self.reasons[0]
 
 
+_NO_NEWER = "no newer one has come"
+
+
 class Runner:
     """Keeps a policy's rate on a driver, and stops softly when it cannot go on.
 
@@ -72,7 +75,8 @@ class Runner:
         self._stopped_at = np.full(count, np.inf)
         self._reading: Reading | None = None
         self._one_robot = False  # whether the driver's arrays have no axis N
-        self._refusals = ["no newer one has come"] * count
+        self._refusals = np.full(count, _NO_NEWER, dtype=object)
+        """[N] why no newer pose is used."""
         self._sent = controller.target
         self._move = np.zeros_like(self._sent)
         self._begun = driver.now()
@@ -128,19 +132,14 @@ class Runner:
         try:
             newest = self.driver.read()
             self._one_robot = np.ndim(newest.joint_pos) == 1
-            self._take(newest.batched(), now)
+            reading = self._reading = self._merged(newest.batched(), now)
         except Exception as error:
             self._stop_all(f"The driver could not read: {error}.")
             return self._sent
-        self._check(now)
+        self._check(reading, now)
         going = np.isinf(self._stopped_at)
-        reading = self._reading
-        has_come = (
-            np.isfinite(reading.object_time) & np.isfinite(reading.joint_time)
-            if reading
-            else ~going
-        )
-        if reading is None or not going.any() or not has_come[going].all():
+        has_come = np.isfinite(reading.object_time) & np.isfinite(reading.joint_time)
+        if not going.any() or not has_come[going].all():
             return self._sent
         try:
             target = self.controller.step(reading)
@@ -153,8 +152,8 @@ class Runner:
             self._stop(int(robot), "The policy gave numbers that are not finite.")
         return np.where(sound[:, None], target, self._sent)
 
-    def _take(self, new: Reading, now: float) -> None:
-        """Keep what is sound of a reading, and the last sound values of the rest."""
+    def _merged(self, new: Reading, now: float) -> Reading:
+        """Return what is sound of a reading, and the last sound values of the rest."""
         joints_sound = _finite(new.joint_pos) & _finite(new.joint_vel)
         if new.tip_force is not None:
             joints_sound &= _finite(new.tip_force.reshape(len(joints_sound), -1))
@@ -174,24 +173,17 @@ class Runner:
             (pose_sound, "newer ones hold numbers that are not finite, or no unit quaternion"),
         ):
             usable &= fine
-            for robot in np.flatnonzero(~fine):
-                self._refusals[robot] = problem
+            self._refusals[~fine] = problem
         self.outcome.refused += ~usable
-        for robot in np.flatnonzero(usable & (new.object_time > old.object_time)):
-            self._refusals[robot] = "no newer one has come"
-        joint_names = ("joint_pos", "joint_vel", "joint_time", "tip_force", "links")
-        kept = {
-            name: _rows(joints_sound, getattr(new, name), getattr(old, name))
-            for name in joint_names
-        }
-        for name in ("object_pos", "object_quat", "object_time"):
-            kept[name] = _rows(usable, getattr(new, name), getattr(old, name))
-        self._reading = Reading(**kept)
+        self._refusals[usable & (new.object_time > old.object_time)] = _NO_NEWER
+        kept = {}
+        for name in vars(new):
+            chosen = usable if name.startswith("object") else joints_sound
+            kept[name] = _rows(chosen, getattr(new, name), getattr(old, name))
+        return Reading(**kept)
 
-    def _check(self, now: float) -> None:
+    def _check(self, reading: Reading, now: float) -> None:
         """Stop the robots whose data are too old, or whose joints are beyond a limit."""
-        reading = self._reading
-        assert reading is not None
         limits = self.limits
         for time_of, limit, text in (
             (
@@ -238,9 +230,8 @@ def _rows(chosen: Array, new: Any, old: Any) -> Any:
     if new is None or chosen.all():
         return new
     if isinstance(new, Links):
-        parts = {
-            each.name: _rows(chosen, getattr(new, each.name), getattr(old, each.name))
-            for each in fields(Links)
-        }
+        parts = {}
+        for name, value in vars(new).items():
+            parts[name] = _rows(chosen, value, getattr(old, name))
         return Links(**parts)
     return np.where(chosen.reshape(-1, *[1] * (new.ndim - 1)), new, old)

@@ -11,8 +11,15 @@ from scipy.spatial.transform import Rotation
 
 from tests.data import InFolder, data_dir, run
 from xreset.demos import hand
-from xreset.demos.align import grounded, on_something
-from xreset.demos.archive import demo_objects, levelled, merge_demos, read_demos, write_demos
+from xreset.demos.archive import (
+    demo_objects,
+    grounded,
+    levelled,
+    merge_demos,
+    on_something,
+    read_demos,
+    write_demos,
+)
 from xreset.demos.dexycb import read_dexycb
 from xreset.demos.grasp import TIPS, Solid
 from xreset.demos.keypoints import ORDERS

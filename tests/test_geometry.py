@@ -12,6 +12,7 @@ from xreset.geometry.balls import BARE, SPACING, inscribed_balls, link_balls, sh
 from xreset.geometry.collision import SelfCollision, height_above_table
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.rotations import quat_to_matrix
 from xreset.geometry.shapes import box, half_spaces, hull, shape_mesh
 from xreset.geometry.solids import link_field, signed_distance
 from xreset.geometry.surface import Surface, keypoint_contacts
@@ -193,7 +194,9 @@ class SelfCollisionTest(unittest.TestCase):
         above = torch.tensor([0.0, 0.0, 1.0], dtype=FLOAT).expand(3, 3)
         quat = UPRIGHT.expand(3, 4)
         field = link_field([box((0, 0, 0), (0.1, 0.1, 0.1))])
-        nothing = Objects.at(above + 10.0, quat, torch.zeros(3, dtype=torch.long), field)
+        nothing = Objects(
+            above + 10.0, quat_to_matrix(quat), torch.zeros(3, dtype=torch.long), field
+        )
 
         def found(q: torch.Tensor):
             return too_near(

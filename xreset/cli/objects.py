@@ -101,13 +101,13 @@ _HEAD: tuple[str, ...] = ("object", "alias", "kg", "size, mm", "pieces")
 
 
 def _cells(obj: ObjectSpec) -> tuple[str, ...]:
-    from xreset.objects import catalogue, sampling
+    from xreset.objects import sampling, ycb
 
     low, high = sampling.bounding_box(obj)
     kinds = {piece.geometry.kind for piece in obj.pieces}
     return (
         obj.name,
-        next((alias for alias, name in catalogue.ALIASES.items() if name == obj.name), ""),
+        ycb.ALIAS_OF.get(obj.name, ""),
         f"{obj.mass:.3f}",
         "x".join(f"{1000 * length:.0f}" for length in high - low),
         f"{len(obj.pieces)} {' + '.join(sorted(kinds))}",

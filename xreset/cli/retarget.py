@@ -37,8 +37,7 @@ def retarget(
         hand: Weights of hand retargeting.
         arm: Weights and effort of the arm's inverse kinematics.
     """
-    from xreset.demos.align import on_something
-    from xreset.demos.archive import demo_objects, levelled, read_demos
+    from xreset.demos.archive import demo_objects, levelled, on_something, read_demos
     from xreset.demos.plausible import doubts
     from xreset.description import load_robot
     from xreset.retarget.file import write_retargeted

@@ -38,8 +38,8 @@ def read_ho3d(
         root: the folder that holds ``train``.
         fps: frames per second; consecutive numbers are consecutive frames.
         cameras: a file with the camera's pose in the table frame for all sequences (x right, y down, z forward; see
-            :func:`xreset.demos.keypoints.read_transform`), or a folder with ``SEQUENCE.txt`` or ``.npy``, where
-            sequences without one are omitted.
+            :func:`xreset.demos.keypoints.read_transform`), or a folder with ``SEQUENCE.txt``, where sequences without
+            one are omitted.
 
     Raises:
         DemoError: the folder is not in this layout, or a sequence contradicts itself.
@@ -53,7 +53,7 @@ def read_ho3d(
     poses = {}
     for folder in folders:
         name = folder.parent.name
-        for path in (cameras / f"{name}.txt", cameras / f"{name}.npy", cameras):
+        for path in (cameras / f"{name}.txt", cameras):
             if path.is_file():
                 poses[folder] = read_transform(path)
                 break

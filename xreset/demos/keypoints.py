@@ -9,7 +9,6 @@ fits. ``docs/demonstrations.md`` has the layout of the files.
 from __future__ import annotations
 
 import csv
-import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -151,7 +150,7 @@ def read_keypoints(path: str | Path, convention: Convention) -> Demos:
 
 
 def read_transform(path: str | Path) -> np.ndarray:
-    """Read a [4, 4] matrix from a text file of four rows, or an npy file.
+    """Read a [4, 4] matrix from a text file of four rows.
 
     Raises:
         DemoError: it cannot be read, or is no rotation and translation in metres.
@@ -160,11 +159,7 @@ def read_transform(path: str | Path) -> np.ndarray:
     try:
         if path.stat().st_size > _MATRIX_BYTES:
             raise ValueError(f"it has {path.stat().st_size} bytes")
-        T = (
-            np.load(path, mmap_mode="r", allow_pickle=False)
-            if path.suffix == ".npy"
-            else np.loadtxt(path, ndmin=2)
-        )
+        T = np.loadtxt(path, ndmin=2)
     except Exception as error:  # numpy's parsers raise any kind of error
         raise DemoError(
             f"{path} cannot be read as a matrix: {shown(str(error))}. Write its four rows as four lines of four"
@@ -206,7 +201,7 @@ def _read_csv(path: Path, name: str) -> Iterator[dict[str, np.ndarray]]:
         for field, names in _COLUMNS.items():
             missing = sorted(set(names) - set(table))
             if not missing:
-                numbers = np.column_stack([_numbers(table.pop(column)) for column in names])
+                numbers = np.column_stack([_numbers(table[column]) for column in names])
                 arrays[field] = numbers.reshape(-1, *_FILE[field].shape[1:])
             elif field == "keypoints" or len(missing) < len(names):
                 raise ValueError(
@@ -214,21 +209,17 @@ def _read_csv(path: Path, name: str) -> Iterator[dict[str, np.ndarray]]:
                 )
     except (OSError, ValueError, csv.Error) as error:
         raise DemoError(f"{path} cannot be read as a CSV table: {error}.") from error
-    texts = {text: table.pop(text) for text in _TEXTS if text in table}
-    unknown = sorted(set(table) - {"frame"})
-    if unknown:
-        logging.getLogger(__name__).warning(
-            "%s also has the columns %s, which are ignored.", path, shown(unknown)
-        )
     frames = range(len(rows) - 1)
-    sequences = texts.pop("sequence", [name] * len(frames))
+    sequences = table.get("sequence", [name] * len(frames))
     for sequence, part in groupby(frames, key=sequences.__getitem__):
         own = list(part)
         found = {"sequence": np.array(sequence)} | {
             field: values[own] for field, values in arrays.items()
         }
-        for text, cells in texts.items():
-            values = {cells[frame].strip() for frame in own}
+        for text in _TEXTS[1:]:
+            if text not in table:
+                continue
+            values = {table[text][frame].strip() for frame in own}
             if len(values) > 1:
                 raise DemoError(
                     f"{path}, sequence {sequence}: the column {text} changes: {shown(sorted(values))}."

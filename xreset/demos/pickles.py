@@ -41,18 +41,12 @@ class _Unpickler(
     pickle._Unpickler
 ):  # the one in C reserves memory for any index that a file states
     dispatch: dict[int, Any] = pickle._Unpickler.dispatch.copy()
+    dispatch.pop(pickle.BYTEARRAY8[0])  # makes an array of any length that a file states
 
     def find_class(self, module: str, name: str) -> Any:
         if module.partition(".")[0] not in ("numpy", "_codecs"):
             raise ValueError(f"it asks for {shown(f'{module}.{name}')}, expected arrays only")
         return _Call(name)
-
-    def load_bytearray(self) -> None:
-        """Read first: the inherited method makes an array of any length that a file states."""
-        size = int.from_bytes(self.read(8), "little")  # pyright: ignore[reportAttributeAccessIssue]
-        self.append(self.read(size))  # pyright: ignore[reportAttributeAccessIssue]
-
-    dispatch[pickle.BYTEARRAY8[0]] = load_bytearray
 
 
 def read_pickle(path: Path) -> dict[Any, Any]:
@@ -76,11 +70,7 @@ def read_pickle(path: Path) -> dict[Any, Any]:
 
 def array_of(call: Any) -> np.ndarray:
     """Return an array of numbers from numpy's calls; any kind of error if it is not one."""
-    if call.function == "_reconstruct":
-        _, shape, dtype, is_fortran, data = call.state
-        order = "F" if is_fortran else "C"
-    else:  # _frombuffer, from protocol 5 on
-        data, dtype, shape, order = call.arguments
+    _, shape, dtype, is_fortran, data = call.state
     if isinstance(data, _Call):  # encode: bytes in a pickle for Python 2
         data = data.arguments[0]
     if isinstance(data, str):  # written by Python 2, or for it
@@ -89,4 +79,4 @@ def array_of(call: Any) -> np.ndarray:
     if kind not in _NUMBERS:
         raise ValueError(f"an array of {shown(kind)}, expected numbers")
     numbers = np.dtype(kind).newbyteorder(">" if dtype.state[1] == ">" else "<")
-    return np.frombuffer(data, dtype=numbers).reshape(shape, order=order)
+    return np.frombuffer(data, dtype=numbers).reshape(shape, order="F" if is_fortran else "C")

@@ -9,21 +9,11 @@ from pathlib import Path
 from xreset.errors import ObjectError
 from xreset.objects.meshes import import_mesh, mesh_files
 from xreset.objects.standins import STAND_INS, stand_in
+from xreset.objects.ycb import ALIAS_OF
 from xreset.spec import ObjectSpec
 
-ALIASES = {
-    "cheez-its": "003_cracker_box",
-    "soup": "005_tomato_soup_can",
-    "mustard": "006_mustard_bottle",
-    "tuna": "007_tuna_fish_can",
-    "spam": "010_potted_meat_can",
-    "banana": "011_banana",
-    "pitcher": "019_pitcher_base",
-    "powerdrill": "035_power_drill",
-    "scissors": "037_scissors",
-}
+ALIASES = {alias: name for name, alias in ALIAS_OF.items()}
 """The paper's names -> official names."""
-_ALIAS_OF = {name: alias for alias, name in ALIASES.items()}
 
 
 def object_names(folder: str | Path | None = None) -> tuple[str, ...]:
@@ -53,17 +43,14 @@ def canonical_names(names: Iterable[str], known: Iterable[str] = STAND_INS) -> t
     unknown = []
     for name in names:
         key = _key(name)
-        matches = [name] if name in known else []
-        matches = matches or [
-            other for other in known if key in (_key(other), _key(other).partition("_")[2])
-        ]
+        matches = [name] if name in known else [other for other in known if key in _keys(other)]
         if len(matches) == 1:
             found.append(matches[0])
         else:
             unknown.append(repr(name))
     if unknown:
         listing = [
-            f"{other} ({_ALIAS_OF[other]})" if other in _ALIAS_OF else other for other in known
+            f"{other} ({ALIAS_OF[other]})" if other in ALIAS_OF else other for other in known
         ]
         what = f"Unknown object{'s' * (len(unknown) > 1)} {', '.join(dict.fromkeys(unknown))}"
         raise ObjectError(f"{what}. Choose from: {', '.join(listing) or 'none'}.")
@@ -81,6 +68,12 @@ def official_name(name: str) -> str:
 def _key(name: str) -> str:
     key = name.strip().lower().replace(" ", "_")
     return ALIASES.get(key, key)
+
+
+def _keys(name: str) -> tuple[str, str]:
+    """Return the names of an object with and without its number."""
+    key = _key(name)
+    return key, key.partition("_")[2]
 
 
 def load_object(name: str, folder: str | Path | None = None) -> ObjectSpec:

@@ -23,8 +23,7 @@ from typing import Annotated
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xreset.demos.motion import LIFT
-from xreset.demos.synth import WORKSPACE
+from xreset.demos.synth import LIFT, WORKSPACE
 from xreset.description import load_robot
 from xreset.errors import FileFormatError, GoalError
 from xreset.objects.catalogue import load_objects, object_names
@@ -268,7 +267,8 @@ def _resting_poses(
         # of each direction, the first one that leads to the same pose
         poses, which = np.unique((ups @ ups.T > _SAME_POSE).argmax(axis=1), return_inverse=True)
         rows[obj.name] = len(episodes) + which
-        for turn in turns[poses]:
+        for pose in poses:
+            turn = turns[int(pose)]
             center = np.array([*_MIDDLE, rest_height(obj, _quat(turn))]) + turn.apply(obj.com)
             place = {"start": center, "start_turn": turn, "goal": center, "goal_turn": turn}
             episodes.append(_Episode(obj=obj, family="rest", number=len(episodes), **place))

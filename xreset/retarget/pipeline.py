@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.demos.align import grounded
-from xreset.demos.archive import Demos, levelled
+from xreset.demos.archive import Demos, grounded, levelled
 from xreset.errors import DemoError
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.rotations import matrix_to_quat

@@ -18,7 +18,7 @@ from xreset.geometry.balls import STAND_IN
 from xreset.geometry.collision import height_above_table
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import PointJacobian
-from xreset.geometry.rotations import matvec, quat_to_matrix
+from xreset.geometry.rotations import matvec
 from xreset.retarget.hand.model import HandModel
 from xreset.tensors import Tensors
 
@@ -47,11 +47,6 @@ class Objects(NamedTuple):
     which: Tensor
     """[B] index into the objects of ``fields``."""
     fields: DistanceFields
-
-    @staticmethod
-    def at(pos: Tensor, quat: Tensor, which: Tensor, fields: DistanceFields) -> Objects:
-        """Return objects at positions [B, 3] and orientations [B, 4]."""
-        return Objects(pos, quat_to_matrix(quat), which, fields)
 
     def local(self, points: Tensor, frame: Tensor) -> Tensor:
         """[..., 3] points in the mesh frame of the object of their frame [...]."""

@@ -20,6 +20,7 @@ from xreset.geometry.rotations import (
     quat_conjugate,
     quat_multiply,
     quat_to_axis_angle,
+    quat_to_matrix,
 )
 from xreset.retarget.hand import terms
 from xreset.retarget.hand.clearance import (
@@ -87,9 +88,9 @@ def _frames(
     bodies = model.bodies(*(value.flatten(0, 1) for value in vars(state).values()))
     found = _keypoint_terms(model, targets, config, bodies)
 
-    objects = Objects.at(
+    objects = Objects(
         targets.object_pos.flatten(0, 1),
-        targets.object_quat.flatten(0, 1),
+        quat_to_matrix(targets.object_quat.flatten(0, 1)),
         targets.object_index.repeat_interleave(frames),
         targets.fields,
     )

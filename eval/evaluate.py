@@ -8,8 +8,7 @@ from pathlib import Path
 
 from xreset.eval.policy_spec import PolicySpec, load_policy
 from xreset.eval.results import Evaluation, episode_table, summarize, write_results
-from xreset.eval.rollout import roll_out
-from xreset.eval.trial import Engine, engine, load_trial
+from xreset.eval.rollout import Engine, engine, load_trial, roll_out
 from xreset.files import claim_folder
 from xreset.inputs import Data
 

@@ -13,8 +13,7 @@ from xreset.env import ManipulationEnv, make_env
 from xreset.errors import PolicyError
 from xreset.eval.baselines import KinematicRetargeting
 from xreset.files import file_hash
-from xreset.learning.choice import read_choice
-from xreset.learning.run import policy_file, read_run
+from xreset.learning.run import policy_file, read_choice, read_run
 from xreset.objects.catalogue import object_names
 from xreset.policies import results_folder
 from xreset.policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_contract
@@ -47,6 +46,8 @@ class PolicySpec:
     """SHA-256 of the policy's file; None: a baseline."""
     file: Path | None = None
     """The exported policy; None: a baseline."""
+    selection_seed: int | None = None
+    """Seed of the starts that chose this checkpoint (``xreset select``); None: it was not chosen."""
 
     @property
     def follows_motion(self) -> bool:
@@ -137,8 +138,7 @@ class PolicySpec:
         Raises:
             PolicyError: ``xreset select`` used the seed.
         """
-        choice = read_choice(self.folder.parent) if self.hash else None
-        if choice is not None and choice.policy_hash == self.hash and choice.seed == seed:
+        if seed == self.selection_seed:
             raise PolicyError(
                 f"Seed {seed} chose this checkpoint (xreset select). Use another --seed."
             )
@@ -179,6 +179,9 @@ def load_policy(
     spec = load_robot(robot or contract["robot"])
     task = from_dict(TaskConfig, contract["task"], f"{file}: task")
     check_contract(str(file), contract, spec, task)
+    digest = file_hash(file)
+    choice = read_choice(folder)
+    is_chosen = choice is not None and choice.policy_hash == digest
     return PolicySpec(
         name=name,
         start=lambda motion: OnnxPolicy(file),
@@ -187,8 +190,9 @@ def load_policy(
         folder=folder / "eval",
         objects_folder=objects_folder,
         objects=tuple(contract["objects"]),
-        hash=file_hash(file),
+        hash=digest,
         file=file,
+        selection_seed=choice.seed if is_chosen else None,
     )
 
 

@@ -14,8 +14,6 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from xreset.demos.synth import synthesize
 from xreset.env import ManipulationEnv
 from xreset.errors import XResetError
@@ -23,15 +21,22 @@ from xreset.eval.metrics import EpisodeMetrics
 from xreset.eval.pages import render
 from xreset.eval.plots import COLORS, svg
 from xreset.eval.policy_spec import PolicySpec, load_policy
-from xreset.eval.rollout import Episode, episode_of, episode_starts, play_rounds
+from xreset.eval.results import Episode
+from xreset.eval.rollout import (
+    Engine,
+    Trial,
+    engine,
+    episode_of,
+    in_order,
+    load_trial,
+    play_rounds,
+)
 from xreset.eval.sensitivity import FAULTS, SWEEPS, Property, amount, chosen, nominal_task
 from xreset.eval.stress import COSTLY, Stress, by_property, draw_curves, plot_size, sweep
-from xreset.eval.trial import Engine, Trial, engine, load_trial
 from xreset.files import claim_folder, write_json, write_whole
 from xreset.inputs import Data
 from xreset.live.engine import begin, make_controller
 from xreset.live.faults import Faults, FaultyDriver
-from xreset.resets.distribution import Reset
 from xreset.runtime import OnnxActor, Runner
 from xreset.task.terminations import out_of_bounds
 
@@ -177,45 +182,36 @@ def _play(
     stopped: Counter[str],
 ) -> tuple[Episode, ...]:
     """Play every demonstration through the loop with a fault; count in ``stopped`` why the runner stopped robots."""
-    bank = trial.bank
-    sequence = np.repeat(np.arange(len(bank.sequence_name)), repetitions)
-    repetition = np.tile(np.arange(repetitions), len(bank.sequence_name))
-    objects = [trial.names.index(name) for name in bank.sequence_object[sequence]]
-    starts = trial.starts()
-    found: dict[int, Episode] = {}
-
-    def start(items: np.ndarray) -> Reset:
-        return episode_starts(starts, sequence[items], repetition[items], trial.seed)
-
-    with closing(play_rounds(engine, trial, objects, start)) as rounds:
+    episodes: list[Episode] = []
+    with closing(play_rounds(engine, trial, repetitions)) as rounds:
         for r in rounds:
             env = r.env
             controller = make_controller(env, actor)
             begin(controller, env)
-            result = EpisodeMetrics(env.reading(), env.goal_pos, env.goal_quat, r.points)
+            metrics = EpisodeMetrics(env.reading(), env.goal_pos, env.goal_quat, r.points)
 
             def look(
-                step: int, env: ManipulationEnv = env, result: EpisodeMetrics = result
+                step: int, env: ManipulationEnv = env, metrics: EpisodeMetrics = metrics
             ) -> None:
                 reading = env.reading()
                 table = env.backend.scene.table
-                result.update(
+                metrics.update(
                     reading,
                     out_of_bounds(reading.task_state.object_pos, table, env.task.termination),
                 )
 
-            seeds = [(trial.seed, int(sequence[item]), int(repetition[item])) for item in r.items]
+            seeds = [
+                (trial.seed, int(sequence), int(repetition))
+                for sequence, repetition in zip(r.sequence, r.repetition, strict=True)
+            ]
             driver = FaultyDriver(env, fault, seeds, look, real_time=real_time)
             outcome = Runner(controller, driver).run(env.max_episode_length * controller.dt)
             for world in r.fresh:
-                item = int(r.items[world])
-                found[item] = episode_of(
-                    result, world, bank, int(sequence[item]), int(repetition[item])
-                )
+                episodes.append(episode_of(metrics, r, world, trial.bank))
                 reason = outcome.reasons[world]
                 if reason is not None:
                     stopped[re.sub(r"-?\d+\.\d+", "...", reason)] += 1
-    return tuple(found[item] for item in sorted(found))
+    return in_order(episodes)
 
 
 def judge(found: Sequence[Rehearsal]) -> tuple[str, list[str]]:

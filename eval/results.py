@@ -17,10 +17,9 @@ import pandas as pd
 
 from xreset.checks import Checked, NotNegative, Positive, Range, Rule, Share, from_dict
 from xreset.errors import FileFormatError
-from xreset.eval.rollout import Episode, Rollouts, Trace
 from xreset.eval.stats import bootstrap_ci95
 from xreset.eval.table import table_text
-from xreset.files import read_json, write_json
+from xreset.files import read_json, read_typed, write_json
 from xreset.records import POSITION, UNIT_TOLERANCE, Field, read_npz, write_npz
 
 SCHEMA = "xreset-eval/1"
@@ -46,7 +45,7 @@ _STACKED = {
     "goal_pos": "goal_pos",
     "goal_quat": "goal_quat_wxyz",
 }
-"""Field of :class:`~xreset.eval.rollout.Trace` -> array in the file."""
+"""Field of :class:`Trace` -> array in the file."""
 _LARGEST_STATE = 1e6
 """[m, rad] An object may fall for a while and a joint may run away, but not further."""
 
@@ -55,6 +54,71 @@ if TYPE_CHECKING:
     Table = Any  # pandas' own types do not tell the rows of a table from one of its columns
 else:
     Table = pd.DataFrame
+
+
+@dataclass(frozen=True, kw_only=True)
+class Episode:
+    """Result of one episode."""
+
+    sequence: NotNegative[int]
+    """Index of the demonstration."""
+    sequence_name: str
+    object: str
+    repetition: NotNegative[int]
+    """Number of the perturbation of the demonstration's start."""
+    approach: bool
+    grasp: bool
+    reorient: bool
+    reorient_once: bool
+    """Whether the object was at the goal at any time."""
+    reorientation_progress: Share[float]
+    task_progress: Share[float]
+    out_of_bounds: bool
+    nonfinite: bool
+    overflow: bool
+    """Whether the engine dropped contacts or constraints."""
+    published_success: bool | None = None
+    """Whether ``least_distance`` is at most 2 cm: the success of the published paper. None, as in the fields below:
+    recorded by an earlier version, which did not measure it."""
+    least_distance: NotNegative[float] | None = None
+    """Least mean distance of 64 surface points to the goal over the episode [m]."""
+    final_distance: NotNegative[float] | None = None
+    """This distance at the end; of an episode that ended early, before its end [m]."""
+    final_position_error: NotNegative[float] | None = None
+    """Distance of the object's origin from its place at the goal, likewise [m]."""
+    final_angle: NotNegative[float] | None = None
+    """Angle between the object and the goal, likewise [rad]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trace:
+    """States of one episode, for pictures, and the drives' targets, for replays."""
+
+    sequence: int
+    object: str
+    goal_pos: np.ndarray
+    goal_quat: np.ndarray
+    time: np.ndarray
+    """[T] s"""
+    joint_pos: np.ndarray
+    """[T, J]"""
+    object_pos: np.ndarray
+    """[T, 3]"""
+    object_quat: np.ndarray
+    """[T, 4]"""
+    joint_target: np.ndarray | None = None
+    """[C, J] of every control step; None in files of older versions."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rollouts:
+    """All episodes of one policy in one engine."""
+
+    episodes: tuple[Episode, ...]
+    traces: tuple[Trace, ...]
+    """The first episode of each demonstration."""
+    control_steps_per_second: float
+    """World steps per second of wall time, policy and observations included."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +145,7 @@ class DemoResult(Checked):
     published_success_rate: Share[float] | None = None
     """None, as in the next field: an earlier version did not measure it."""
     least_distance: NotNegative[float] | None = None
-    """Mean of :attr:`~xreset.eval.rollout.Episode.least_distance` [m]."""
+    """Mean of :attr:`Episode.least_distance` [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,7 +194,13 @@ class EvalResult(Checked):
     published_success_ci95: Range | None = None
     """95 % bootstrap interval over demonstrations."""
     least_distance: NotNegative[float] | None = None
-    """Mean of :attr:`~xreset.eval.rollout.Episode.least_distance` [m]."""
+    """Mean of :attr:`Episode.least_distance` [m]."""
+
+    def meshes(self, given: Path | None) -> Path | None:
+        """Return the given folder of meshes, or else that of the evaluation; None: the stand-ins."""
+        if given is not None or self.objects_folder is None:
+            return given
+        return Path(self.objects_folder)
 
 
 class Evaluation(list[EvalResult]):
@@ -155,7 +225,7 @@ class Evaluation(list[EvalResult]):
 def episode_table(result: EvalResult, episodes: Sequence[Episode], run: str = "") -> Table:
     """Return a table with one row for each episode.
 
-    Columns: run, policy, engine, robot and seed, then the fields of :class:`~xreset.eval.rollout.Episode`: sequence
+    Columns: run, policy, engine, robot and seed, then the fields of :class:`Episode`: sequence
     (index of the demonstration), sequence_name, object, repetition, approach, grasp, reorient (at the goal at the end),
     reorient_once, reorientation_progress, task_progress, out_of_bounds, nonfinite, overflow, published_success,
     least_distance, final_distance, final_position_error [m], final_angle [rad]. What an earlier version did not measure
@@ -247,14 +317,6 @@ def _rates(episodes: Table) -> dict[str, Any]:
     }
 
 
-def mesh_folder(given: Path | None, recorded: str | None) -> Path | None:
-    """Return the folder of meshes to use: the given one, else the one that a run or its results name; None: the
-    stand-ins."""
-    if given is not None or recorded is None:
-        return given
-    return Path(recorded)
-
-
 # Files ----------------------------------------------------------------------------------------------------------------
 
 
@@ -327,7 +389,7 @@ def read_result(path: Path) -> EvalResult:
     Raises:
         FileFormatError: the file is damaged, or lacks an entry; the message names the entry.
     """
-    return from_dict(EvalResult, read_json(path, SCHEMA), str(path))
+    return read_typed(EvalResult, path, SCHEMA)
 
 
 def read_episodes(folder: Path, backend: str) -> tuple[Episode, ...]:
@@ -372,6 +434,28 @@ def read_traces(folder: Path, backend: str, joint_names: tuple[str, ...]) -> tup
         )
         traces.append(trace)
     return tuple(traces)
+
+
+def recorded(episodes: Table, engine: str, traces: Sequence[Trace]) -> Table:
+    """Return the episodes that traces show, each with its ``trace``: the first repetition of a demonstration.
+
+    Args:
+        episodes: episodes, of any engines.
+        traces: recorded episodes of the engine.
+
+    Raises:
+        FileFormatError: a trace shows a demonstration of which no episode is known.
+    """
+    own = episodes[episodes["engine"] == engine].sort_values("repetition", kind="stable")
+    own = own.drop_duplicates("sequence").set_index("sequence", drop=False)
+    for trace in traces:
+        if trace.sequence not in own.index:
+            raise FileFormatError(
+                f"{engine}.trace.npz has a trace of demonstration {trace.sequence}, of which no episode is known. "
+                "Evaluate again."
+            )
+    shown = own.loc[[trace.sequence for trace in traces]]
+    return shown.assign(trace=list(traces)).reset_index(drop=True)
 
 
 def _trace_problem(arrays: dict[str, np.ndarray]) -> str | None:

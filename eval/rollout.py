@@ -1,27 +1,38 @@
-"""Rollouts of a policy in one engine: the same episodes, from the same states, in every engine.
+"""Plays a policy in one engine: the same episodes, from the same states, in every engine.
 
-Shape letters: N worlds, T recorded states, C control steps, J joints.
+Shape letters: N worlds, J joints.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator
-from contextlib import closing
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from xreset.checks import NotNegative, Share
-from xreset.env import ManipulationEnv
+from xreset.env import ManipulationEnv, make_scene, object_origins
 from xreset.eval.metrics import EpisodeMetrics, MetricPoints
-from xreset.eval.trial import Engine, Trial
+from xreset.eval.policy_spec import PolicySpec
+from xreset.eval.results import Episode, Rollouts, Trace
+from xreset.inputs import Data, load_inputs
+from xreset.physics import Backend
+from xreset.plugins import backend_class, device_for, make_backend
 from xreset.policy import Policy
 from xreset.resets.bank import ResetBank
 from xreset.resets.distribution import Reset, ResetDistribution
+from xreset.resets.goals import GoalSet
+from xreset.resets.settle import settle_starts
+from xreset.retarget.file import Retargeted
 from xreset.schedule import schedule
+from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
+from xreset.task.config import TaskConfig, evaluation_task
+from xreset.task.randomization import sample_friction
 from xreset.task.reading import Reading
 from xreset.task.terminations import out_of_bounds
 
@@ -31,70 +42,173 @@ TRACE_INTERVAL = 0.05
 Progress = Callable[[int, int], None]
 """Called with (control steps done, control steps in all)."""
 
+MakeBackend = Callable[[SceneSpec, int, Tensor], Backend]
+"""Makes the worlds of a scene, given their number and the index of the object in each world [N]."""
 
-@dataclass(frozen=True, kw_only=True)
-class Episode:
-    """Result of one episode."""
-
-    sequence: NotNegative[int]
-    """Index of the demonstration."""
-    sequence_name: str
-    object: str
-    repetition: NotNegative[int]
-    """Number of the perturbation of the demonstration's start."""
-    approach: bool
-    grasp: bool
-    reorient: bool
-    reorient_once: bool
-    """Whether the object was at the goal at any time."""
-    reorientation_progress: Share[float]
-    task_progress: Share[float]
-    out_of_bounds: bool
-    nonfinite: bool
-    overflow: bool
-    """Whether the engine dropped contacts or constraints."""
-    published_success: bool | None = None
-    """Whether ``least_distance`` is at most 2 cm: the success of the published paper. None, as in the fields below:
-    recorded by an earlier version, which did not measure it."""
-    least_distance: NotNegative[float] | None = None
-    """Least mean distance of 64 surface points to the goal over the episode [m]."""
-    final_distance: NotNegative[float] | None = None
-    """This distance at the end; of an episode that ended early, before its end [m]."""
-    final_position_error: NotNegative[float] | None = None
-    """Distance of the object's origin from its place at the goal, likewise [m]."""
-    final_angle: NotNegative[float] | None = None
-    """Angle between the object and the goal, likewise [rad]."""
+SLOW_ON_CPU = frozenset({"mujoco-warp"})
+"""Backends that need a GPU to play many episodes."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trace:
-    """States of one episode, for pictures, and the drives' targets, for replays."""
+class Engine:
+    """An engine to play in."""
 
-    sequence: int
-    object: str
-    goal_pos: np.ndarray
-    goal_quat: np.ndarray
-    time: np.ndarray
-    """[T] s"""
-    joint_pos: np.ndarray
-    """[T, J]"""
-    object_pos: np.ndarray
-    """[T, 3]"""
-    object_quat: np.ndarray
-    """[T, 4]"""
-    joint_target: np.ndarray | None = None
-    """[C, J] of every control step; None in files of older versions."""
+    name: str
+    make: MakeBackend
+    version: str
+    device: str = "cpu"
+    slow: bool = False
+    """Whether it is too slow on its device to play many episodes."""
+
+
+def engine(name: str, *, device: str = "cpu", **options: Any) -> Engine:
+    """Return an installed backend.
+
+    Args:
+        name: name of the backend.
+        device: where the backend runs if it can run there; else it runs on the CPU.
+        options: keywords of the backend.
+
+    Raises:
+        BackendUnavailableError: the backend cannot be used here.
+    """
+    version = backend_class(name).engine_version()
+    used = device_for(name, device)
+
+    def make(scene: SceneSpec, num_worlds: int, object_index: Tensor) -> Backend:
+        return make_backend(
+            name, scene, num_worlds, object_index=object_index, device=used, **options
+        )
+
+    return Engine(
+        name=name,
+        make=make,
+        version=version,
+        device=used,
+        slow=name in SLOW_ON_CPU and used == "cpu",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rollouts:
-    """All episodes of one policy in one engine."""
+class Trial:
+    """Everything that decides how an episode goes, except the policy and the engine."""
 
-    episodes: tuple[Episode, ...]
-    traces: tuple[Trace, ...]
-    """The first episode of each demonstration."""
-    control_steps_per_second: float
-    """World steps per second of wall time, policy and observations included."""
+    robot: RobotSpec
+    objects: tuple[ObjectSpec, ...]
+    bank: ResetBank
+    """Starts and goals; and states, for episodes that begin with them."""
+    task: TaskConfig
+    """Usually :func:`xreset.task.config.evaluation_task` of the policy's own task."""
+    seed: int = 0
+    """Seed of the perturbations of robot and object: the same in every engine and for every number of worlds."""
+    num_envs: int = 64
+    """Worlds that run at the same time."""
+    motion: Retargeted | None = None
+    """Motion for the baseline ``ik``; None for other policies."""
+    objects_folder: Path | None = None
+    """Folder of the object meshes; None: the stand-ins."""
+    inputs: dict[str, str] = field(default_factory=dict)
+    """SHA-256 of the files of policy and data, by what they are."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the objects."""
+        return tuple(o.name for o in self.objects)
+
+    @property
+    def scene(self) -> SceneSpec:
+        """The scene of the task. Its friction is a placeholder, because the environment sets friction itself."""
+        return make_scene(self.robot, self.objects, self.task)
+
+    @property
+    def nominal_scene(self) -> SceneSpec:
+        """The scene with the pair friction of an evaluation, which draws none at random."""
+        return nominal_scene(self.robot, self.objects, self.task)
+
+    def starts(self, device: str | torch.device = "cpu") -> ResetDistribution:
+        """Return the distribution of starts. Drawn on the CPU, they are the same in every engine."""
+        pivots = object_origins(self.objects, self.task)
+        return ResetDistribution(self.bank, self.robot, self.names, self.task.reset, device, pivots)
+
+    @contextmanager
+    def worlds(
+        self, engine: Engine, object_index: Tensor
+    ) -> Iterator[tuple[ManipulationEnv, MetricPoints]]:
+        """Open an environment in an engine.
+
+        Args:
+            engine: where to play.
+            object_index: [N] index of the object in each world.
+
+        Yields:
+            The environment, and the metric's points of each world's object.
+        """
+        with engine.make(self.scene, len(object_index), object_index) as backend:
+            env = ManipulationEnv(backend, self.task, self.starts(backend.device), seed=self.seed)
+            yield (
+                env,
+                MetricPoints.of(self.objects, self.task.object_frame).to(backend.device)[
+                    backend.object_index
+                ],
+            )
+
+
+def load_trial(
+    policy: PolicySpec,
+    source: str | Path | Data,
+    *,
+    objects: str | Path | None = None,
+    seed: int = 0,
+    num_envs: int = 64,
+    settle: bool = False,
+) -> Trial:
+    """Load what a policy is to play. For the baseline ``ik``, demonstrations are retargeted here.
+
+    Args:
+        policy: the policy, whose robot and task are taken.
+        source: demonstrations, motion or a goal set, or a file of them; or a loaded bank. The starts of a goal set are
+            played as they are, because they are perturbed already; only the robot's joints are.
+        objects: folder of object meshes; default: the folder of the policy's training.
+        seed: seed of the perturbations.
+        num_envs: worlds that run at the same time.
+        settle: whether objects come to rest before episodes begin (:mod:`xreset.resets.settle`), in MuJoCo for every
+            engine, so that all engines play the same starts. Default: the recorded poses, as in the paper.
+    """
+    folder = policy.meshes(objects)
+    inputs = load_inputs(
+        source, robot=policy.robot, objects=folder, accept=("demos", "motion", "goals")
+    )
+    hashes = {} if policy.hash is None else {"policy": policy.hash}
+    if inputs.hash is not None:
+        is_bank = isinstance(inputs.data, ResetBank) and not isinstance(inputs.data, GoalSet)
+        hashes["resets" if is_bank else "demos"] = inputs.hash
+    bank = inputs.bank
+    used = [o for o in inputs.objects if o.name in bank.sequence_object]
+    if settle:
+        bank, _ = settle_starts(bank, policy.robot, used, num_envs=num_envs)
+        hashes["starts"] = "settled"
+    task = evaluation_task(policy.task)
+    if isinstance(inputs.data, GoalSet):
+        task = replace(task, reset=replace(task.reset, spawn_xy=0.0, spawn_yaw=0.0))
+    return Trial(
+        robot=policy.robot,
+        objects=tuple(sorted(used, key=lambda o: o.name)),
+        bank=bank,
+        task=task,
+        seed=seed,
+        num_envs=num_envs,
+        motion=inputs.motion() if policy.follows_motion else None,
+        objects_folder=folder,
+        inputs=hashes,
+    )
+
+
+def nominal_scene(robot: RobotSpec, objects: tuple[ObjectSpec, ...], task: TaskConfig) -> SceneSpec:
+    """Return the scene of :attr:`Trial.nominal_scene`."""
+    scene = make_scene(robot, objects, task)
+    nominal = replace(task.randomization, enabled=False)
+    tip, link, table = sample_friction(1, nominal, torch.Generator())[0].tolist()
+    return replace(scene, friction=replace(scene.friction, tip=tip, link=link, table=table))
 
 
 def roll_out(
@@ -114,30 +228,18 @@ def roll_out(
         repetitions: episodes of each demonstration, each with another perturbation of robot and object.
         progress: called with (control steps done, control steps in all).
     """
-    bank = trial.bank
-    count = len(bank.sequence_name)
-    sequences = np.repeat(np.arange(count), repetitions)
-    repetition = np.tile(np.arange(repetitions), count)
-    objects = [trial.names.index(name) for name in bank.sequence_object[sequences]]
-    starts = trial.starts()
-    found: dict[int, Episode] = {}
+    episodes: list[Episode] = []
     traces: list[Trace] = []
     steps = 0
     seconds = 0.0
-
-    def start(items: np.ndarray) -> Reset:
-        return episode_starts(starts, sequences[items], repetition[items], trial.seed)
-
-    with closing(play_rounds(engine, trial, objects, start)) as rounds:
+    with closing(play_rounds(engine, trial, repetitions)) as rounds:
         for r in rounds:
             env = r.env
             length = env.max_episode_length
-            recorder = _Recorder(
-                env, [world for world in r.fresh if repetition[r.items[world]] == 0]
-            )
+            recorder = _Recorder(env, [world for world in r.fresh if r.repetition[world] == 0])
             policy.begin(env)
             reading = env.reading()
-            result = EpisodeMetrics(reading, env.task_goal_pos, env.goal_quat, r.points)
+            metrics = EpisodeMetrics(reading, env.task_goal_pos, env.goal_quat, r.points)
             recorder.look(0, reading)
             for step in range(1, length + 1):
                 before = time.perf_counter()
@@ -145,19 +247,15 @@ def roll_out(
                 lost = out_of_bounds(
                     reading.task_state.object_pos, env.backend.scene.table, env.task.termination
                 )
-                result.update(reading, lost)
+                metrics.update(reading, lost)
                 seconds += time.perf_counter() - before
                 recorder.look(step, reading)
                 progress(r.number * length + step, r.total * length)
             steps += length * env.num_envs
             traces += recorder.traces(trial.names)
-            for world in r.fresh:
-                item = int(r.items[world])
-                found[item] = episode_of(
-                    result, world, bank, int(sequences[item]), int(repetition[item])
-                )
+            episodes += [episode_of(metrics, r, world, trial.bank) for world in r.fresh]
     return Rollouts(
-        episodes=tuple(found[i] for i in sorted(found)),
+        episodes=in_order(episodes),
         traces=tuple(sorted(traces, key=lambda t: t.sequence)),
         control_steps_per_second=steps / seconds,
     )
@@ -170,36 +268,36 @@ class Round:
     env: ManipulationEnv
     points: MetricPoints
     """The metric's points of each world's object."""
-    items: np.ndarray
-    """[N] item of each world."""
+    sequence: np.ndarray
+    """[N] index of each world's demonstration."""
+    repetition: np.ndarray
+    """[N] number of the perturbation of its start."""
     fresh: list[int]
-    """Worlds whose item was not played before; the others only keep busy."""
+    """Worlds whose episode was not played before; the others only keep busy."""
     number: int
     total: int
     """Number of rounds."""
 
 
-def play_rounds(
-    engine: Engine, trial: Trial, object_index: list[int], start: Callable[[np.ndarray], Reset]
-) -> Generator[Round]:
-    """Open an engine, and yield as many rounds as its worlds need to play one episode for each of some items.
-
-    Args:
-        engine: where to play.
-        trial: what to play.
-        object_index: index of each item's object.
-        start: makes the starts [N] of items [N].
-    """
-    plan = schedule(np.array(object_index), trial.num_envs)
+def play_rounds(engine: Engine, trial: Trial, repetitions: int) -> Generator[Round]:
+    """Open an engine, and yield as many rounds as its worlds need to play each demonstration ``repetitions`` times."""
+    bank = trial.bank
+    count = len(bank.sequence_name)
+    sequence = np.repeat(np.arange(count), repetitions)
+    repetition = np.tile(np.arange(repetitions), count)
+    objects = [trial.names.index(name) for name in bank.sequence_object[sequence]]
+    plan = schedule(np.array(objects), trial.num_envs)
+    starts = trial.starts()
     with trial.worlds(engine, torch.as_tensor(plan.object_index)) as (env, points):
         for number, (items, fresh) in enumerate(plan):
-            env.reset(start=start(items).to(env.device))
-            worlds = np.flatnonzero(fresh).tolist()
+            start = episode_starts(starts, sequence[items], repetition[items], trial.seed)
+            env.reset(start=start.to(env.device))
             yield Round(
                 env=env,
                 points=points,
-                items=items,
-                fresh=worlds,
+                sequence=sequence[items],
+                repetition=repetition[items],
+                fresh=np.flatnonzero(fresh).tolist(),
                 number=number,
                 total=len(plan.rounds),
             )
@@ -217,22 +315,26 @@ def episode_starts(
     return Reset.cat(parts)
 
 
-def episode_of(
-    result: EpisodeMetrics, world: int, bank: ResetBank, sequence: int, repetition: int
-) -> Episode:
-    """Return the result of one world, which has played a start of a demonstration."""
+def episode_of(metrics: EpisodeMetrics, played: Round, world: int, bank: ResetBank) -> Episode:
+    """Return the result of one world of a round."""
     values: dict[str, Any] = {}
-    for field in fields(Episode):
-        if hasattr(result, field.name):
-            value = getattr(result, field.name)[world].item()
-            values[field.name] = value if isinstance(value, bool) else round(value, 6)
+    for f in fields(Episode):
+        if hasattr(metrics, f.name):
+            value = getattr(metrics, f.name)[world].item()
+            values[f.name] = value if isinstance(value, bool) else round(value, 6)
+    sequence = int(played.sequence[world])
     return Episode(
         sequence=sequence,
         sequence_name=str(bank.sequence_name[sequence]),
         object=str(bank.sequence_object[sequence]),
-        repetition=repetition,
+        repetition=int(played.repetition[world]),
         **values,
     )
+
+
+def in_order(episodes: list[Episode]) -> tuple[Episode, ...]:
+    """Return episodes in the order of the demonstrations, then of the perturbations of a start."""
+    return tuple(sorted(episodes, key=lambda e: (e.sequence, e.repetition)))
 
 
 _STATES = ("joint_pos", "object_pos", "object_quat")

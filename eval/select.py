@@ -13,14 +13,18 @@ from pathlib import Path
 import numpy as np
 
 from xreset.eval.policy_spec import load_policy
-from xreset.eval.results import mesh_folder
-from xreset.eval.rollout import roll_out
+from xreset.eval.rollout import Engine, load_trial, roll_out
 from xreset.eval.setting import Setting
-from xreset.eval.trial import Engine, load_trial
 from xreset.files import file_hash, write_whole
-from xreset.learning.choice import Candidate, Choice, write_choice
 from xreset.learning.export import export_checkpoint
-from xreset.learning.run import checkpoints, latest_checkpoint, read_run
+from xreset.learning.run import (
+    Candidate,
+    Choice,
+    checkpoints,
+    latest_checkpoint,
+    read_run,
+    write_choice,
+)
 
 SEED = 1_000_003
 """Seed of the starts that decide; evaluations use 0 by default."""
@@ -67,7 +71,7 @@ def select(
         RunError: there is nothing to choose from.
     """
     found = candidates_in(folder, most)
-    meshes = mesh_folder(setting.objects, read_run(folder).objects)
+    meshes = setting.objects or read_run(folder).objects
     played: list[Candidate] = []
     best: Candidate | None = None
     with tempfile.TemporaryDirectory(prefix="xreset-") as scratch:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from xreset.errors import XResetError
-from xreset.eval.rollout import Episode
+from xreset.eval.results import Episode
 from xreset.eval.stats import bootstrap_ci95, mean_of_known
 from xreset.physics import Capability
 from xreset.task.config import RandomizationConfig, TaskConfig

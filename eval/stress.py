@@ -13,14 +13,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from xreset.checks import from_dict
 from xreset.errors import XResetError
 from xreset.eval.plots import COLORS, picture
 from xreset.eval.policy_spec import PolicySpec
-from xreset.eval.rollout import Episode, roll_out
+from xreset.eval.results import Episode
+from xreset.eval.rollout import Engine, Trial, roll_out
 from xreset.eval.sensitivity import SWEEPS, Effect, Interval, Property, amount, nominal_task
-from xreset.eval.trial import Engine, Trial
-from xreset.files import read_json, write_json
+from xreset.files import read_typed, write_json
 from xreset.plugins import backend_class
 
 if TYPE_CHECKING:
@@ -111,7 +110,7 @@ def stress(
 
     Args:
         policy: what is tried.
-        trial: what is played, from :func:`~xreset.eval.trial.load_trial`.
+        trial: what is played, from :func:`~xreset.eval.rollout.load_trial`.
         engines: where it is tried.
         out: folder for the results.
         sweeps: properties and values.
@@ -217,10 +216,7 @@ def read_stress(folder: Path, policy: str | None = None) -> tuple[Stress, ...]:
     Raises:
         FileFormatError: a file is damaged, or of another version.
     """
-    found = [
-        from_dict(Stress, read_json(path, SCHEMA), str(path))
-        for path in sorted(folder.glob("*.json"))
-    ]
+    found = [read_typed(Stress, path, SCHEMA) for path in sorted(folder.glob("*.json"))]
     return tuple(
         card for card in found if policy is None or card.inputs.get("policy", policy) == policy
     )

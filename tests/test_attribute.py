@@ -15,8 +15,8 @@ from xreset.errors import XResetError
 from xreset.eval.engines.attribution import Attribution, Row, attribute, change_towards
 from xreset.eval.engines.attribution_view import not_tried, rich_table, verdict
 from xreset.eval.engines.measure import Measured, measure
+from xreset.eval.rollout import Engine, engine
 from xreset.eval.sensitivity import COMPARED, Effect, nominal_task
-from xreset.eval.trial import Engine, engine
 from xreset.spec import SceneSpec
 from xreset.task.config import RandomizationConfig, ResetConfig, TaskConfig, TerminationConfig
 from xreset.task.randomization import pair_friction

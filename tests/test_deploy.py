@@ -25,8 +25,7 @@ from xreset.cameras.config import CameraConfig, VisionConfig
 from xreset.demos.synth import synthesize
 from xreset.errors import PolicyError
 from xreset.eval.policy_spec import load_policy
-from xreset.eval.rollout import episode_starts
-from xreset.eval.trial import engine, load_trial
+from xreset.eval.rollout import engine, episode_starts, load_trial
 from xreset.live.deploy import deploy_contract, write_deployed
 from xreset.live.engine import EngineDriver
 from xreset.policy import policy_contract

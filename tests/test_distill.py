@@ -18,7 +18,7 @@ from xreset import robots
 from xreset.cameras.config import FRONT, WRIST, VisionConfig
 from xreset.env import make_env
 from xreset.errors import PolicyError, XResetError
-from xreset.eval.report.clips import missed_by_student
+from xreset.eval.report.fairness import missed_by_student
 from xreset.learning.checkpoint import read_checkpoint
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.recipes import student_config

@@ -19,8 +19,7 @@ from tests.toy_robot import toy_hand_arm
 from xreset.env import ManipulationEnv, make_scene, object_origins
 from xreset.errors import CapabilityError
 from xreset.eval.metrics import EpisodeMetrics, MetricPoints
-from xreset.eval.rollout import roll_out
-from xreset.eval.trial import Engine, Trial
+from xreset.eval.rollout import Engine, Trial, roll_out
 from xreset.geometry.rotations import quat_rotate
 from xreset.learning.recipes import RECIPES
 from xreset.objects.catalogue import load_object, load_objects

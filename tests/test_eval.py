@@ -19,11 +19,10 @@ from xreset.errors import FileFormatError, XResetError
 from xreset.eval.evaluate import evaluate
 from xreset.eval.metrics import EpisodeMetrics, MetricPoints
 from xreset.eval.policy_spec import PolicySpec, load_policy
-from xreset.eval.results import EvalResult, read_results, read_traces, write_results
-from xreset.eval.rollout import Episode, roll_out
+from xreset.eval.results import Episode, EvalResult, read_results, read_traces, write_results
+from xreset.eval.rollout import engine, load_trial, roll_out
 from xreset.eval.stats import bootstrap_ci95
 from xreset.eval.table import result_rows
-from xreset.eval.trial import engine, load_trial
 from xreset.files import claim_folder
 from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.objects.catalogue import load_object

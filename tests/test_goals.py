@@ -15,8 +15,7 @@ from tests.toy_goals import toy_goals
 from xreset.description import load_robot
 from xreset.errors import DemoError, FileFormatError, GoalError
 from xreset.eval.policy_spec import load_policy
-from xreset.eval.rollout import roll_out
-from xreset.eval.trial import engine, load_trial
+from xreset.eval.rollout import engine, load_trial, roll_out
 from xreset.inputs import load_inputs
 from xreset.objects.catalogue import load_object
 from xreset.objects.rest import rest_height

@@ -11,8 +11,7 @@ import numpy as np
 import torch
 
 from tests import toy_grasp
-from xreset.eval.rollout import episode_starts
-from xreset.eval.trial import engine
+from xreset.eval.rollout import engine, episode_starts
 from xreset.learning.recipes import RECIPES
 from xreset.live.engine import EngineDriver, make_controller
 from xreset.runtime import Driver, Reading, Runner

@@ -38,7 +38,7 @@ from xreset.eval.engines.grasps import (
     squeezed,
 )
 from xreset.eval.engines.recording import Recording
-from xreset.eval.trial import engine
+from xreset.eval.rollout import engine
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.objects.catalogue import load_object

@@ -5,6 +5,7 @@ import json
 import os
 import tempfile
 import unittest
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from unittest import mock
@@ -19,6 +20,7 @@ from xreset.demos.archive import write_demos
 from xreset.demos.synth import synthesize
 from xreset.errors import PolicyError
 from xreset.eval.policy_spec import load_policy
+from xreset.learning.run import Candidate, Choice, write_choice
 from xreset.policy import OnnxPolicy, policy_contract
 from xreset.task.config import ObservationConfig, TaskConfig, TerminationConfig
 
@@ -113,6 +115,23 @@ class ShippedTest(WithPolicy):
         )
         self.assertEqual(subject.task, TASK)
         self.assertEqual(subject.hash, load_policy(self.file).hash)
+
+    def test_a_policy_knows_the_seed_that_chose_it(self):
+        candidate = Candidate(name="1.pt", task_progress={"mujoco": 0.5})
+        choice = Choice(
+            chosen="1.pt",
+            policy_hash=load_policy("skilled").hash or "",
+            candidates=(candidate,),
+            engines={"mujoco": "1"},
+            seed=7,
+            episodes_per_demo=1,
+            demos="",
+        )
+        folder = Path("runs/skilled")
+        folder.mkdir(parents=True)
+        for policy_hash, seed in ((choice.policy_hash, 7), ("another", None)):
+            write_choice(folder, replace(choice, policy_hash=policy_hash))
+            self.assertEqual(load_policy("skilled").selection_seed, seed)
 
     def test_the_list_is_of_cards(self):
         code, _, err = run("policies", "list")

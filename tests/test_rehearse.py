@@ -16,8 +16,8 @@ from tests.command import xreset
 from tests.toy_bank import SOUP
 from tests.toy_results import episodes
 from xreset.eval.rehearse import PROPERTIES, Rehearsal, judge, page
+from xreset.eval.rollout import engine
 from xreset.eval.stress import curve
-from xreset.eval.trial import engine
 from xreset.files import read_json
 from xreset.live.engine import EngineDriver
 from xreset.live.faults import Faults, FaultyDriver

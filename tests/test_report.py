@@ -21,23 +21,18 @@ from xreset.eval.report import figures
 from xreset.eval.report.clips import (
     Clip,
     best_everywhere,
-    camera_for,
-    count_failures,
-    draw_clip,
+    draw_clips,
     encode_mp4,
-    recorded,
     worst_episodes,
 )
 from xreset.eval.report.film import make_film
 from xreset.eval.report.make import make_report
-from xreset.eval.report.page import headline, page
+from xreset.eval.report.page import count_failures, headline, page
 from xreset.eval.report.read import collect
-from xreset.eval.results import TaskProgress, episode_table
-from xreset.eval.rollout import Episode
+from xreset.eval.results import Episode, TaskProgress, episode_table, recorded
 from xreset.files import claim_folder, write_json
-from xreset.learning.choice import Candidate, Choice, write_choice
 from xreset.learning.config import TrainConfig
-from xreset.objects.catalogue import load_object
+from xreset.learning.run import Candidate, Choice, write_choice
 
 VOID = {"meta", "br", "link", "img", "input", "hr"}
 
@@ -221,26 +216,30 @@ class ClipTest(Reported):
             (mixed, traces, [1] * 4),
             (alike, {"mujoco": (first,), "sapien": (second,)}, []),
         ):
-            best = best_everywhere(recorded(episodes, shown))
+            parts = [recorded(episodes, engine, found) for engine, found in shown.items()]
+            best = best_everywhere(pd.concat(parts, ignore_index=True))
             self.assertEqual(
                 (best["sequence"].tolist(), set(best["repetition"]) - {0}), (expected, set())
             )
         with self.assertRaisesRegex(
             FileFormatError, "mujoco.trace.npz has a trace of demonstration 1000000"
         ):
-            recorded(alike, {"mujoco": [replace(first, sequence=1_000_000)]})
+            recorded(alike, "mujoco", [replace(first, sequence=1_000_000)])
 
     def draw(self, strip: bool = False, **changes) -> Clip:
         self.folder.mkdir(exist_ok=True)
         robot = toy_hand_arm(self.folder)
-        trace = toy_rollouts(robot.home).traces[0]
+        rollouts = toy_rollouts(robot.home)
         trace = replace(
-            trace,
-            **{k: np.array(change(getattr(trace, k).copy())) for k, change in changes.items()},
+            rollouts.traces[0],
+            **{
+                k: np.array(change(getattr(rollouts.traces[0], k).copy()))
+                for k, change in changes.items()
+            },
         )
-        return draw_clip(
-            row_of(0), trace, robot, load_object(SOUP), camera_for([trace]), strip=strip
-        )
+        episodes = table_of(replace(rollouts.episodes[0], object=SOUP)).assign(trace=[trace])
+        (clip,) = draw_clips(episodes, robot, None, strips=strip)
+        return clip
 
     def test_a_clip_shows_the_object_on_its_way_at_the_right_speed(self):
         clip = self.draw()
@@ -332,7 +331,7 @@ class FailureTest(Reported):
                 }
                 episodes.append(replace(rollouts.episodes[0], sequence=i, object=name, **outcome))
                 traces.append(replace(rollouts.traces[0], sequence=i, object=name))
-            found = worst_episodes(recorded(table_of(*episodes), {"mujoco": traces}), count)
+            found = worst_episodes(recorded(table_of(*episodes), "mujoco", traces), count)
             with self.subTest(progress=progress, count=count):
                 self.assertEqual(found["sequence"].tolist(), expected)
 

@@ -12,7 +12,7 @@ from tests.toy_bank import SOUP, SPAM, toy_bank
 from xreset.demos.synth import synthesize
 from xreset.description import load_robot
 from xreset.eval.policy_spec import load_policy
-from xreset.eval.trial import load_trial
+from xreset.eval.rollout import load_trial
 from xreset.objects.catalogue import load_object
 from xreset.plugins import make_backend
 from xreset.resets.settle import settle_starts

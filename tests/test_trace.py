@@ -28,9 +28,8 @@ from xreset.eval.engines.recording import Recording
 from xreset.eval.engines.replay import THRESHOLDS, Divergence, TraceResult, compared, trace
 from xreset.eval.engines.trace_view import rich_table, sentences
 from xreset.eval.results import write_results
-from xreset.eval.rollout import roll_out
+from xreset.eval.rollout import engine, roll_out
 from xreset.eval.setting import Place
-from xreset.eval.trial import engine
 from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.physics import State
 from xreset.spec import PairFriction, SceneSpec

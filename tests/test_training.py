@@ -27,11 +27,17 @@ from xreset.cli import main
 from xreset.errors import FileFormatError, RunError, XResetError
 from xreset.files import claim, file_hash
 from xreset.learning.checkpoint import Checkpoint, load_moments, read_checkpoint
-from xreset.learning.choice import Candidate, Choice, write_choice
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
-from xreset.learning.export import ensure_policy
 from xreset.learning.recipes import RECIPES
-from xreset.learning.run import checkpoints, latest_checkpoint, read_run
+from xreset.learning.run import (
+    Candidate,
+    Choice,
+    checkpoints,
+    latest_checkpoint,
+    policy_file,
+    read_run,
+    write_choice,
+)
 from xreset.learning.runner import TrainingRunner, _stop_on_interrupt
 from xreset.learning.train import resume, train
 from xreset.plugins import make_backend
@@ -339,7 +345,7 @@ class TrainingTest(unittest.TestCase):
         policy = out / "policy.onnx"
         contract = OnnxPolicy(policy).contract
         policy.unlink()
-        newest_policy = ensure_policy(out).read_bytes()
+        newest_policy = policy_file(out).read_bytes()
         self.assertEqual(OnnxPolicy(policy).contract, contract)
         names = ("000002.pt", "000001.pt")
         candidates = tuple(Candidate(name=name, task_progress={"mujoco": 0.5}) for name in names)
@@ -357,15 +363,15 @@ class TrainingTest(unittest.TestCase):
             "000001.pt, .* of 2 checkpoints in 1 engines; the newest, 000002.pt, has 50",
         )
         write_choice(out, choice)
-        first = ensure_policy(out).read_bytes()
+        first = policy_file(out).read_bytes()
         self.assertNotEqual(first, newest_policy)
         written = policy.stat().st_mtime_ns
         os.utime(latest_checkpoint(out), (2e9, 2e9))  # copied: its time says nothing
-        ensure_policy(out)
+        policy_file(out)
         self.assertEqual(policy.stat().st_mtime_ns, written)
         shutil.copy(out / "checkpoints" / "000002.pt", out / "checkpoints" / "000003.pt")
         self.assertNotEqual(
-            ensure_policy(out).read_bytes(), first, "the choice did not know the newest one"
+            policy_file(out).read_bytes(), first, "the choice did not know the newest one"
         )
 
     def test_what_cannot_be_trained_is_refused_and_leaves_no_run(self):

@@ -14,7 +14,7 @@ from tests.toy_bank import toy_bank
 from xreset.backends.conformance.scene import gripper, objects
 from xreset.eval.engines.recording import Recording
 from xreset.eval.policy_spec import PolicySpec
-from xreset.eval.trial import Engine, Trial
+from xreset.eval.rollout import Engine, Trial
 from xreset.geometry.kinematics import Kinematics
 from xreset.physics import State
 from xreset.resets.bank import ResetBank

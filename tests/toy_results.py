@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from tests.toy_bank import SOUP, SPAM
-from xreset.eval.results import EvalResult, summarize, write_results
-from xreset.eval.rollout import Episode, Rollouts, Trace
+from xreset.eval.results import Episode, EvalResult, Rollouts, Trace, summarize, write_results
 from xreset.learning.config import TrainConfig
 from xreset.learning.run import RunInfo, write_run
 

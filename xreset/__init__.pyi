@@ -20,7 +20,7 @@ from xreset.eval.rehearse import Rehearsal as Rehearsal
 from xreset.eval.rehearse import rehearse as rehearse
 from xreset.eval.results import EvalResult as EvalResult
 from xreset.eval.results import Evaluation as Evaluation
-from xreset.eval.trial import Engine as Engine
+from xreset.eval.rollout import Engine as Engine
 from xreset.learning.config import TrainConfig as TrainConfig
 from xreset.learning.train import distill as distill
 from xreset.learning.train import train as train

@@ -18,12 +18,14 @@ from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 from xreset import __version__
+from xreset.checks import from_dict
 from xreset.errors import FileFormatError, XResetError
 from xreset.text import is_plain, shown
 
+T = TypeVar("T")
 RAISE_LIMIT = "If it is what you expect, raise the limit: set XRESET_MAX_FILE_MB (default 1024)."
 """Advice for a file that is too large."""
 
@@ -302,6 +304,16 @@ def read_json(
         if not keep_version:
             data.pop("xreset", None)
     return data
+
+
+def read_typed(cls: type[T], path: Path, schema: str) -> T:
+    """Read a JSON file of a schema as a dataclass.
+
+    Raises:
+        FileFormatError: the file is damaged, of another schema, or an entry does not fit; the message names the entry.
+    """
+    data = read_json(path, schema)
+    return from_dict(cls, data, str(path))
 
 
 def read_toml(

@@ -121,11 +121,10 @@ def read_npz(
         FileFormatError: the file is damaged or does not match.
     """
     path = Path(path)
-    must_exist(path, what)
     own = dict(schema)
     arrays: dict[str, np.ndarray] = {}
     sizes: dict[str, int] = {}
-    with _opened(path, f"cannot be read as {what}") as (archive, packed):
+    with _opened(path, what, f"cannot be read as {what}") as (archive, packed):
         if schema_name is not None:
             check_schema(path, _stated_schema(archive, packed), schema_name)
             own |= {"schema": Field((), "U"), "meta": Field((), "U", required=False)}
@@ -160,8 +159,8 @@ def npz_schema(path: str | Path) -> str:
         FileFormatError: it is no npz file, or states none.
     """
     path = Path(path)
-    must_exist(path, "one of xreset's npz files")
-    with _opened(path, "is not one of xreset's npz files") as (archive, packed):
+    what = "one of xreset's npz files"
+    with _opened(path, what, f"is not {what}") as (archive, packed):
         stated = _stated_schema(archive, packed)
     if stated is None:
         raise FileFormatError(
@@ -171,9 +170,12 @@ def npz_schema(path: str | Path) -> str:
 
 
 @contextmanager
-def _opened(path: Path, failure: str) -> Iterator[tuple[Mapping[str, Any], dict[str, int]]]:
+def _opened(
+    path: Path, what: str, failure: str
+) -> Iterator[tuple[Mapping[str, Any], dict[str, int]]]:
     """Yield the arrays of an npz file, and the size of each, unpacked [bytes]; whatever zipfile, zlib and numpy raise
     at damage becomes one error."""
+    must_exist(path, what)
     try:
         with zipfile.ZipFile(path) as file:
             sizes = {

@@ -3,7 +3,7 @@
 .. code-block:: python
 
     from xreset.eval.engines.agreement import compare
-    from xreset.eval.trial import engine
+    from xreset.eval.rollout import engine
     from xreset.inputs import load_inputs
     inputs = load_inputs(Path("retargeted.npz"))
     result = compare(inputs.robot, inputs.objects, inputs.motion(), [engine("pybullet"), engine("sapien")])

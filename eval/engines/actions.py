@@ -21,10 +21,9 @@ from xreset.description import load_robot
 from xreset.errors import DemoError, FileFormatError
 from xreset.eval.engines.grasps import STANDARD, Grasps, closing_episode, find_grasps
 from xreset.eval.engines.recording import Recording
-from xreset.eval.results import TRACE_SCHEMA, mesh_folder, read_result, read_traces
-from xreset.eval.rollout import Trace
+from xreset.eval.results import TRACE_SCHEMA, Trace, read_result, read_traces
+from xreset.eval.rollout import nominal_scene
 from xreset.eval.setting import Place
-from xreset.eval.trial import nominal_scene
 from xreset.inputs import load_inputs
 from xreset.objects.catalogue import load_object
 from xreset.physics import State
@@ -130,7 +129,7 @@ def _from_evaluation(source: Path, place: Place, wanted: str | None, episode: in
     mine = [trace for trace in traces if trace.object == chosen]
     _check_episode(episode, len(mine), f"{source} records {len(mine)} episodes of {chosen}")
     found = mine[episode]
-    thing = load_object(chosen, mesh_folder(place.objects, summary.objects_folder))
+    thing = load_object(chosen, summary.meshes(place.objects))
     return recorded_actions(
         spec, thing, found, label=f"{summary.policy} in {name}, demonstration {found.sequence}"
     )

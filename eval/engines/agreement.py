@@ -27,7 +27,7 @@ from xreset.eval.engines.grasps import (
     squeezed,
 )
 from xreset.eval.engines.recording import Recording, play
-from xreset.eval.trial import Engine, engine
+from xreset.eval.rollout import Engine, engine
 from xreset.geometry.kinematics import Kinematics
 from xreset.objects.sampling import surface_points
 from xreset.physics import Backend, State

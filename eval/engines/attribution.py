@@ -16,9 +16,9 @@ import numpy as np
 from xreset.errors import XResetError
 from xreset.eval.engines.measure import Measured, measure
 from xreset.eval.policy_spec import PolicySpec
-from xreset.eval.rollout import Episode, roll_out
+from xreset.eval.results import Episode
+from xreset.eval.rollout import Engine, Trial, roll_out
 from xreset.eval.sensitivity import COMPARED, Effect, Property, nominal_task
-from xreset.eval.trial import Engine, Trial
 from xreset.plugins import backend_class
 from xreset.task.config import TaskConfig
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from xreset.backends.conformance.harness import free_place
 from xreset.backends.conformance.scene import shape, solid
 from xreset.errors import XResetError
-from xreset.eval.trial import Engine
+from xreset.eval.rollout import Engine
 from xreset.geometry.dynamics import mass_matrix
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import hull, transformed

@@ -19,7 +19,7 @@ from scipy.ndimage import binary_opening
 from xreset.errors import XResetError
 from xreset.eval.engines.actions import Actions
 from xreset.eval.engines.recording import Recording, play
-from xreset.eval.trial import Engine
+from xreset.eval.rollout import Engine
 from xreset.geometry.rotations import quat_angle
 from xreset.geometry.urdf import robot_tree
 from xreset.physics import State

@@ -19,7 +19,7 @@ from xreset.cameras.config import CAMERAS, VisionConfig
 from xreset.errors import XResetError, needs
 from xreset.eval.export.recorded import Recording
 from xreset.eval.report.clips import draw_state, draw_view, encode_mp4, policy_cameras
-from xreset.eval.rollout import Trace
+from xreset.eval.results import Trace
 from xreset.files import atomic_folder, write_json
 from xreset.objects.catalogue import load_object
 from xreset.pictures.render import Renderer

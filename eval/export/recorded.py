@@ -15,10 +15,9 @@ import pandas as pd
 
 from xreset.description import load_robot
 from xreset.errors import FileFormatError, RunError
-from xreset.eval.report.clips import finite_states, recorded
+from xreset.eval.report.clips import finite_states
 from xreset.eval.report.read import results_in
-from xreset.eval.results import Table, mesh_folder, read_evaluation, read_traces
-from xreset.eval.rollout import Trace
+from xreset.eval.results import Table, Trace, read_evaluation, read_traces, recorded
 from xreset.records import write_npz
 from xreset.spec import RobotSpec
 from xreset.text import short_name
@@ -96,8 +95,9 @@ def read_recorded(
             name = robot or result.robot
             if name not in robots:
                 robots[name] = load_robot(name)
-            traces_here = {engine: read_traces(results, engine, robots[name].joint_names)}
-            for episode in recorded(evaluation.to_frame(), traces_here).to_dict("records"):
+            traces = read_traces(results, engine, robots[name].joint_names)
+            shown = recorded(evaluation.to_frame(), engine, traces)
+            for episode in shown.to_dict("records"):
                 trace = episode.pop("trace")
                 action = _actions(trace, results / f"{engine}.trace.npz")
                 intervals.setdefault(round(float(np.median(np.diff(trace.time))), 6), results)
@@ -113,7 +113,7 @@ def read_recorded(
                     "task": task.replace("{object}", short_name(trace.object)),
                     "trace": trace,
                     "action": action,
-                    "meshes": mesh_folder(objects, result.objects_folder),
+                    "meshes": result.meshes(objects),
                 }
                 rows.append(episode)
     if not rows:

@@ -11,8 +11,7 @@ import numpy as np
 from xreset.errors import XResetError
 from xreset.eval.play.session import Moment, Session
 from xreset.eval.report.clips import encode_mp4
-from xreset.eval.results import write_traces
-from xreset.eval.rollout import Trace
+from xreset.eval.results import Trace, write_traces
 from xreset.files import write_whole
 from xreset.pictures.render import Renderer, pose_matrix
 from xreset.spec import SceneSpec

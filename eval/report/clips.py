@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 import torch
 
 from xreset.cameras.config import VisionConfig
-from xreset.errors import FileFormatError, XResetError, needs
-from xreset.eval.results import Table
-from xreset.eval.rollout import Trace
+from xreset.description import load_robot
+from xreset.errors import XResetError, needs
+from xreset.eval.report.read import ReportData
+from xreset.eval.results import Table, Trace
+from xreset.objects.catalogue import load_object
 from xreset.physics import State
 from xreset.pictures.render import Camera, Renderer, pose_matrix
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
@@ -28,6 +28,8 @@ SIZE = (400, 300)
 FRAMES_PER_SECOND = 10.0
 STRIP_SIZE = (240, 180)
 """Width and height of one picture of a strip [pixels]."""
+FAILURES = 4
+"""Most failures that a report shows."""
 MOMENTS = 6
 """Pictures in a strip, evenly over the episode, first and last state included."""
 
@@ -51,30 +53,6 @@ class Clip:
 # Which episodes -------------------------------------------------------------------------------------------------------
 
 
-def recorded(episodes: Table, traces: Mapping[str, Sequence[Trace]]) -> Table:
-    """Return the episodes that traces show, each with its ``trace``: the first repetition of a demonstration.
-
-    Args:
-        episodes: episodes in all engines.
-        traces: recorded episodes by engine.
-
-    Raises:
-        FileFormatError: a trace shows a demonstration of which no episode is known.
-    """
-    parts = []
-    for engine, found in traces.items():
-        own = episodes[episodes["engine"] == engine].sort_values("repetition", kind="stable")
-        own = own.drop_duplicates("sequence").set_index("sequence", drop=False)
-        for trace in found:
-            if trace.sequence not in own.index:
-                raise FileFormatError(
-                    f"{engine}.trace.npz has a trace of demonstration {trace.sequence}, of which no episode is known. "
-                    "Evaluate again."
-                )
-        parts.append(own.loc[[trace.sequence for trace in found]].assign(trace=list(found)))
-    return pd.concat(parts, ignore_index=True)
-
-
 def best_everywhere(shown: Table) -> Table:
     """Return the episodes, one for each engine, of the demonstration that went best; empty if none was recorded in
     every engine.
@@ -83,7 +61,7 @@ def best_everywhere(shown: Table) -> Table:
     lowest index.
 
     Args:
-        shown: :func:`recorded`.
+        shown: :func:`xreset.eval.results.recorded`.
     """
     engines = shown["engine"].nunique()
     everywhere = shown.groupby("sequence").filter(lambda own: len(own) == engines)
@@ -108,47 +86,17 @@ def worst_episodes(shown: Table, count: int) -> Table:
     return missed.loc[sorted(turns.index[:count])]
 
 
-def count_failures(episodes: Table) -> dict[str, int]:
-    """Return the number of episodes that ended below each stage, by what was missing."""
-    missed = {
-        "never near the object": ~episodes["approach"],
-        "near it, but no grasp": episodes["approach"] & ~episodes["grasp"],
-        "grasped, never at the goal": episodes["grasp"] & ~episodes["reorient_once"],
-        "at the goal, but not in the end": episodes["reorient_once"] & ~episodes["reorient"],
-    }
-    return {what: int(rows.sum()) for what, rows in missed.items()}
-
-
-def missed_by_student(student: Table, teacher: Table) -> str:
-    """Return one sentence: which objects a policy misses in episodes that its teacher ends at the goal.
-
-    Args:
-        student: episodes of the policy.
-        teacher: episodes of its teacher from the same starts, in the same engines.
-    """
-    same = ["engine", "sequence_name", "repetition", "object"]
-    both = student.merge(teacher, on=same, suffixes=("", "_teacher"))
-    solved = both[both["reorient_teacher"]]
-    missed = solved[~solved["reorient"]]
-    parts = []
-    for name, count in missed["object"].value_counts().items():
-        parts.append(f"{name} {count} of {int((solved['object'] == name).sum())}")
-    where = f": {', '.join(parts)}" if parts else ""
-    return f"Of {len(solved)} episodes that the teacher ends at the goal, the student misses {len(missed)}{where}."
-
-
 # Drawing --------------------------------------------------------------------------------------------------------------
 
 
-def camera_for(traces: Sequence[Trace], *, distance: float = 1.0) -> Camera:
+def camera_for(trace: Trace, *, distance: float = 1.0) -> Camera:
     """Return a camera that shows the table between the object's start and its goal, and the hand above them.
 
     Args:
-        traces: traces with the same start and goal; the first decides.
         distance: factor on the camera's distance.
     """
-    start = traces[0].object_pos[0].astype(float)
-    goal = traces[0].goal_pos.astype(float)
+    start = trace.object_pos[0].astype(float)
+    goal = trace.goal_pos.astype(float)
     center = (start + goal) / 2 + (0.0, 0.0, 0.06)
     default = Camera()
     away = np.subtract(default.eye, default.target)
@@ -210,21 +158,40 @@ def policy_cameras(
     return Cameras(SceneSpec(robot=robot, objects=(obj,)), torch.zeros(1, dtype=torch.long), vision)
 
 
-def draw_clip(
-    episode: Any,
-    trace: Trace,
+def draw_clips(
+    episodes: Table,
     robot: RobotSpec,
-    obj: ObjectSpec,
-    camera: Camera,
-    eyes: Cameras | None = None,
+    meshes: Path | None,
+    vision: VisionConfig | None = None,
     *,
-    strip: bool = False,
-) -> Clip:
-    """Draw a trace.
+    strips: bool = False,
+) -> list[Clip]:
+    """Draw recorded episodes: films of one demonstration, all from the same place; or strips, each from its own.
 
     Args:
-        strip: draw :data:`MOMENTS` states, evenly over the episode, in place of a film.
+        episodes: rows of :func:`xreset.eval.results.recorded`.
+        meshes: folder of object meshes; None: the stand-ins.
+        vision: cameras of a policy that sees, whose images are drawn below.
+        strips: draw :data:`MOMENTS` states of each episode, evenly over it, in place of a film.
     """
+    rows = list(episodes.itertuples())
+    clips = []
+    for episode in rows:
+        obj = load_object(episode.object, meshes)
+        if strips:
+            camera = camera_for(episode.trace, distance=0.7)
+        else:
+            camera = camera_for(rows[0].trace)
+        eyes = policy_cameras(robot, obj, vision)
+        scene = SceneSpec(robot=robot, objects=(obj,))
+        clips.append(_draw(episode, scene, camera, eyes, strips))
+    return clips
+
+
+def _draw(
+    episode: Any, scene: SceneSpec, camera: Camera, eyes: Cameras | None, strip: bool
+) -> Clip:
+    trace = episode.trace
     interval = float(trace.time[1] - trace.time[0])
     every = max(1, round(1.0 / (FRAMES_PER_SECOND * interval)))
     rows = np.arange(0, len(trace.time), every)
@@ -235,7 +202,7 @@ def draw_clip(
     finite = finite_states(trace)
     last = len(finite) - 1 if finite.all() else int(np.argmin(finite)) - 1
     drawn = np.minimum(rows, last).tolist()
-    renderer = Renderer(SceneSpec(robot=robot, objects=(obj,)), size=size, camera=camera)
+    renderer = Renderer(scene, size=size, camera=camera)
     pictures = {row: draw_state(renderer, trace, row, eyes) for row in set(drawn)}
     return Clip(
         episode=episode,
@@ -244,6 +211,31 @@ def draw_clip(
         fps=1.0 / (every * interval),
         finite=bool(finite.all()),
     )
+
+
+def draw_report(
+    data: ReportData, robot: str | None, objects: Path | None
+) -> tuple[list[Clip], list[Clip]]:
+    """Draw one episode in every engine, and failures in the first engine as strips.
+
+    Args:
+        robot: name or folder of the robot; None: as the results name it.
+        objects: folder of meshes; None: as the results name it.
+
+    Raises:
+        XResetError: no demonstration was recorded in every engine, or the robot or an object cannot be loaded.
+    """
+    spec = load_robot(robot or data.robot)
+    meshes = data.first.meshes(objects)
+    vision = data.run.config.task.vision if data.run else None
+    shown = data.training.recorded(spec)
+    clips = draw_clips(best_everywhere(shown), spec, meshes, vision)
+    if not clips:
+        raise XResetError(
+            "no demonstration was recorded in every engine. Evaluate all engines in one command."
+        )
+    worst = worst_episodes(shown[shown["engine"] == data.first.backend], FAILURES)
+    return clips, draw_clips(worst, spec, meshes, vision, strips=True)
 
 
 def encode_mp4(frames: np.ndarray, fps: float, *, keyframes: int | None = None) -> bytes:

@@ -103,6 +103,24 @@ def begun(trainings: Sequence[Training]) -> list[str]:
     return found
 
 
+def missed_by_student(student: Table, teacher: Table) -> str:
+    """Return one sentence: which objects a policy misses in episodes that its teacher ends at the goal.
+
+    Args:
+        student: episodes of the policy.
+        teacher: episodes of its teacher from the same starts, in the same engines.
+    """
+    same = ["engine", "sequence_name", "repetition", "object"]
+    both = student.merge(teacher, on=same, suffixes=("", "_teacher"))
+    solved = both[both["reorient_teacher"]]
+    missed = solved[~solved["reorient"]]
+    parts = []
+    for name, count in missed["object"].value_counts().items():
+        parts.append(f"{name} {count} of {int((solved['object'] == name).sum())}")
+    where = f": {', '.join(parts)}" if parts else ""
+    return f"Of {len(solved)} episodes that the teacher ends at the goal, the student misses {len(missed)}{where}."
+
+
 def health(label: str, episodes: Iterable[tuple[Any, Table]]) -> list[str]:
     """Return a sentence for each engine in which it broke down or dropped contacts.
 

@@ -1,4 +1,4 @@
-"""Films of recorded episodes: the best one in every engine, and one labelled film of many objects in every engine."""
+"""A labelled film of the best recorded episode of each object in every engine."""
 
 from __future__ import annotations
 
@@ -7,54 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from xreset.cameras.config import VisionConfig
 from xreset.description import load_robot
 from xreset.errors import RunError
-from xreset.eval.report.clips import (
-    Clip,
-    best_everywhere,
-    camera_for,
-    draw_clip,
-    encode_mp4,
-    policy_cameras,
-    recorded,
-)
-from xreset.eval.report.read import ReportData, collect, results_in
-from xreset.eval.results import Table, mesh_folder, read_traces
+from xreset.eval.report.clips import best_everywhere, draw_clips, encode_mp4
+from xreset.eval.report.read import collect
 from xreset.files import write_whole
-from xreset.objects.catalogue import load_object
 from xreset.pictures.render import add_caption
-from xreset.spec import RobotSpec
 from xreset.text import short_name
-
-
-def draw_best(
-    shown: Table, robot: RobotSpec, meshes: Path | None, vision: VisionConfig | None = None
-) -> list[Clip]:
-    """Draw the episode that went best over all engines, in each of them; empty if no demonstration was recorded in
-    every engine.
-
-    Args:
-        shown: :func:`xreset.eval.report.clips.recorded`.
-        meshes: folder of object meshes; None: the stand-ins.
-        vision: cameras of a policy that sees, whose images are drawn below.
-    """
-    best = list(best_everywhere(shown).itertuples())
-    clips = []
-    for episode in best:
-        camera = camera_for([best[0].trace])
-        obj = load_object(episode.object, meshes)
-        eyes = policy_cameras(robot, obj, vision)
-        clips.append(draw_clip(episode, episode.trace, robot, obj, camera, eyes))
-    return clips
-
-
-def read_recorded(data: ReportData, robot: RobotSpec) -> Table:
-    """Return the recorded episodes of a report; see :func:`xreset.eval.report.clips.recorded`."""
-    training = data.training
-    folder = results_in(training.folder)
-    traces = {engine: read_traces(folder, engine, robot.joint_names) for engine in training.results}
-    return recorded(training.episodes, traces)
 
 
 def make_film(
@@ -77,11 +36,10 @@ def make_film(
     """
     data = collect(folder)
     spec = load_robot(robot or data.robot)
-    shown = read_recorded(data, spec)
-    meshes = mesh_folder(objects, data.first.objects_folder)
+    meshes = data.first.meshes(objects)
     columns = {}
-    for name, own in shown.groupby("object"):
-        if clips := draw_best(own, spec, meshes):
+    for name, own in data.training.recorded(spec).groupby("object"):
+        if clips := draw_clips(best_everywhere(own), spec, meshes):
             columns[str(name)] = clips
     if not columns:
         raise RunError(

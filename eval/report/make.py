@@ -6,26 +6,20 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from xreset.description import load_robot
 from xreset.errors import RunError, XResetError
 from xreset.eval.pages import render
 from xreset.eval.report import fairness, tables
-from xreset.eval.report.clips import Clip, camera_for, draw_clip, policy_cameras, worst_episodes
+from xreset.eval.report.clips import draw_report
 from xreset.eval.report.curves import AXES, X
 from xreset.eval.report.figures import write_picture
-from xreset.eval.report.film import draw_best, read_recorded
 from xreset.eval.report.groups import by_engine, grouped, scores, singles
 from xreset.eval.report.page import page
 from xreset.eval.report.read import ReportData, Training, collect, read_trainings
-from xreset.eval.results import mesh_folder
 from xreset.eval.table import caption
 from xreset.files import claim_folder, write_whole
-from xreset.objects.catalogue import load_object
 
 CURVES = ("task/success", "task/success_from_home")
 """Curves that a comparison draws by default."""
-_FAILURES = 4
-"""Most failures that a report shows."""
 
 
 def make_report(
@@ -46,39 +40,16 @@ def make_report(
     """
     out = folder / "report" if out is None else out
     data = collect(folder)
-    with claim_folder(out):
-        clips = []
-        strips = []
-        try:
-            clips, strips = _draw(data, robot, objects)
-        except XResetError as error:  # numbers are worth a page without films; the page says why
-            data = replace(data, notes=(*data.notes, f"There are no clips: {error}"))
-        write_whole(out / "index.html", page(data, clips, strips))
-    return out / "index.html", data
-
-
-def _draw(
-    data: ReportData, robot: str | None, objects: Path | None
-) -> tuple[list[Clip], list[Clip]]:
-    """Draw one episode in every engine, and the failures in the first engine."""
-    spec = load_robot(robot or data.robot)
-    shown = read_recorded(data, spec)
-    meshes = mesh_folder(objects, data.first.objects_folder)
-    vision = data.run.config.task.vision if data.run else None
-    clips = draw_best(shown, spec, meshes, vision)
-    if not clips:
-        raise XResetError(
-            "no demonstration was recorded in every engine. Evaluate all engines in one command."
-        )
+    clips = []
     strips = []
-    for episode in worst_episodes(
-        shown[shown["engine"] == data.first.backend], _FAILURES
-    ).itertuples():
-        obj = load_object(episode.object, meshes)
-        camera = camera_for([episode.trace], distance=0.7)
-        eyes = policy_cameras(spec, obj, vision)
-        strips.append(draw_clip(episode, episode.trace, spec, obj, camera, eyes, strip=True))
-    return clips, strips
+    try:
+        clips, strips = draw_report(data, robot, objects)
+    except XResetError as error:  # numbers are worth a page without films; the page says why
+        data = replace(data, notes=(*data.notes, f"There are no clips: {error}"))
+    content = page(data, clips, strips)
+    with claim_folder(out):
+        write_whole(out / "index.html", content)
+    return out / "index.html", data
 
 
 def compare(

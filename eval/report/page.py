@@ -11,9 +11,10 @@ import numpy as np
 
 from xreset.eval.pages import percent, render
 from xreset.eval.plots import COLORS
-from xreset.eval.report.clips import Clip, count_failures, encode_mp4
+from xreset.eval.report.clips import Clip, encode_mp4
 from xreset.eval.report.figures import draw_training
 from xreset.eval.report.read import ReportData
+from xreset.eval.results import Table
 from xreset.eval.stress import by_property
 from xreset.eval.table import FIGURES, caption
 from xreset.files import code_version
@@ -58,6 +59,17 @@ def page(data: ReportData, clips: Sequence[Clip], strips: Sequence[Clip] = ()) -
 
 def _base64(content: bytes) -> str:
     return base64.b64encode(content).decode()
+
+
+def count_failures(episodes: Table) -> dict[str, int]:
+    """Return the number of episodes that ended below each stage, by what was missing."""
+    missed = {
+        "never near the object": ~episodes["approach"],
+        "near it, but no grasp": episodes["approach"] & ~episodes["grasp"],
+        "grasped, never at the goal": episodes["grasp"] & ~episodes["reorient_once"],
+        "at the goal, but not in the end": episodes["reorient_once"] & ~episodes["reorient"],
+    }
+    return {what: int(rows.sum()) for what, rows in missed.items()}
 
 
 def headline(data: ReportData) -> str:

@@ -4,24 +4,24 @@ results."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from xreset.errors import FileFormatError, RunError, needs
-from xreset.eval.report.clips import missed_by_student
-from xreset.eval.report.fairness import uneven
-from xreset.eval.results import EvalResult, Table, read_evaluation
+from xreset.eval.report.fairness import missed_by_student, uneven
+from xreset.eval.results import EvalResult, Table, read_evaluation, read_traces, recorded
 from xreset.eval.stress import Stress, read_stress
-from xreset.files import read_json
-from xreset.learning.choice import Choice, read_choice
+from xreset.files import read_json, read_typed
 from xreset.learning.clock import FILE as LIFT_FILE
-from xreset.learning.clock import Lift, read_lift
+from xreset.learning.clock import SCHEMA as LIFT_SCHEMA
+from xreset.learning.clock import Lift
 from xreset.learning.run import SCHEMA as RUN_SCHEMA
-from xreset.learning.run import TEACHER, RunInfo, read_run
+from xreset.learning.run import TEACHER, Choice, RunInfo, read_choice, read_run
 from xreset.policies import results_folder, shipped
+from xreset.spec import RobotSpec
 from xreset.text import short_name
 
 
@@ -30,7 +30,8 @@ class Training:
     """A training or a baseline, as comparisons read it."""
 
     label: str
-    folder: Path
+    results_folder: Path
+    """Folder of the evaluations."""
     facts: dict[str, str]
     """Configuration by name of the field, such as ``task.reset.demo_probability``, as tables show it; empty without
     ``run.json``."""
@@ -42,6 +43,20 @@ class Training:
     """Episodes in all engines (:func:`xreset.eval.results.episode_table`), where ``run`` is the label."""
     lift: Lift | None = None
     """When the training first succeeded from home; None without ``lift.json``."""
+
+    @property
+    def first(self) -> EvalResult:
+        """The result of the first engine."""
+        return next(iter(self.results.values()))
+
+    def recorded(self, robot: RobotSpec) -> Table:
+        """Return the recorded episodes in all engines; see :func:`xreset.eval.results.recorded`."""
+        names = robot.joint_names
+        parts = [
+            recorded(self.episodes, engine, read_traces(self.results_folder, engine, names))
+            for engine in self.results
+        ]
+        return pd.concat(parts, ignore_index=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +77,7 @@ class ReportData:
     @property
     def first(self) -> EvalResult:
         """The result of the first engine."""
-        return next(iter(self.training.results.values()))
+        return self.training.first
 
     @property
     def robot(self) -> str:
@@ -83,28 +98,31 @@ def collect(folder: Path) -> ReportData:
     training = read_training(name_of(folder), folder)
     if not training.results:
         raise RunError(f"{folder} holds no evaluation results. {_evaluate(folder)}")
-    notes = uneven([training])
     run = None
+    not_described = []
     if training.facts:
         try:
             run = read_run(folder)
         except FileFormatError as error:  # results outlive a change of the training's configuration
-            notes.append(f"The training is not described here: {error}")
-    if run is not None and run.teacher is not None:
-        if taught := read_evaluation(folder / "teacher"):
-            notes.append(missed_by_student(training.episodes, taught.to_frame()))
-        else:
-            notes.append(
-                "The teacher was not evaluated from the same starts. Make its results first: "
-                f"xreset eval {folder / TEACHER} --out {folder / 'teacher'} --demos DEMOS"
-            )
-    policies = {result.inputs.get("policy") for result in training.results.values()}
-    place = results_in(folder).parent
+            not_described.append(f"The training is not described here: {error}")
+    place = training.results_folder.parent
     choice = read_choice(place)
+    policies = {result.inputs.get("policy") for result in training.results.values()}
     if choice is not None and choice.policy_hash not in policies:
         choice = None
-    data = ReportData(training=training, run=run, choice=choice, notes=tuple(notes))
-    return replace(data, stress=read_stress(place / "stress", data.first.inputs.get("policy")))
+    stress = read_stress(place / "stress", training.first.inputs.get("policy"))
+    taught = None
+    if run is not None and run.teacher is not None:
+        taught = read_evaluation(folder / "teacher")
+    notes = uneven([training]) + not_described
+    if taught:
+        notes.append(missed_by_student(training.episodes, taught.to_frame()))
+    elif taught is not None:
+        notes.append(
+            "The teacher was not evaluated from the same starts. Make its results first: "
+            f"xreset eval {folder / TEACHER} --out {folder / 'teacher'} --demos DEMOS"
+        )
+    return ReportData(training=training, run=run, choice=choice, stress=stress, notes=tuple(notes))
 
 
 def results_in(folder: Path) -> Path:
@@ -224,21 +242,25 @@ def read_training(label: str, folder: Path, results: Path | None = None) -> Trai
         RunError: the folder does not exist, or holds neither learning curves nor results.
         FileFormatError: a file is damaged or of another version.
     """
-    evaluation = read_evaluation(results or results_in(folder), label)
+    results = results or results_in(folder)
+    evaluation = read_evaluation(results, label)
     curves = read_curves(folder)
-    lift = read_lift(folder) if (folder / LIFT_FILE).is_file() else None
+    lift = None
+    if (folder / LIFT_FILE).is_file():
+        lift = read_typed(Lift, folder / LIFT_FILE, LIFT_SCHEMA)
+    run = None
+    file = folder / "run.json"
+    if file.is_file():
+        run = read_json(file, RUN_SCHEMA, keep_version=True)
     if not evaluation and curves.empty and lift is None:
         raise RunError(
             f"{folder} holds neither learning curves (events.out.tfevents.*) nor evaluation results. "
             + _evaluate(folder)
         )
-    file = folder / "run.json"
     return Training(
         label=label,
-        folder=folder,
-        facts=run_facts(read_json(file, RUN_SCHEMA, keep_version=True), file)
-        if file.is_file()
-        else {},
+        results_folder=results,
+        facts={} if run is None else run_facts(run, file),
         curves=curves,
         results={s.backend: s for s in evaluation},
         episodes=evaluation.to_frame(),

@@ -17,7 +17,7 @@ from xreset.files import code_version, write_json
 from xreset.plugins import backend_names, backend_status
 
 if TYPE_CHECKING:
-    from xreset.eval import trial
+    from xreset.eval import rollout
 
 _T = TypeVar("_T")
 Source = Annotated[Path, tyro.conf.Positional]
@@ -87,11 +87,11 @@ def engine_bars(names: Sequence[str]) -> Iterator[Callable[[str, int, int], None
         yield lambda name, done, total: counts[name](done, total)
 
 
-def chosen_engines(names: Sequence[str], device: str) -> list[trial.Engine]:
+def chosen_engines(names: Sequence[str], device: str) -> list[rollout.Engine]:
     """Return the engines of these names, each once; without names, MuJoCo."""
-    from xreset.eval import trial
+    from xreset.eval import rollout
 
-    return [trial.engine(name, device=device) for name in dict.fromkeys(names or ("mujoco",))]
+    return [rollout.engine(name, device=device) for name in dict.fromkeys(names or ("mujoco",))]
 
 
 def usable_engines() -> list[str]:
@@ -103,7 +103,7 @@ def usable_engines() -> list[str]:
     return [status.name for status in statuses if status.reason is None]
 
 
-def quick_engines(names: Sequence[str], device: str) -> list[trial.Engine]:
+def quick_engines(names: Sequence[str], device: str) -> list[rollout.Engine]:
     """Return the engines of these names; without names, all that can be used here and are not slow on the device."""
     engines = chosen_engines(names or usable_engines(), device)
     return [each for each in engines if names or not each.slow]

@@ -261,12 +261,12 @@ def trace(
         place: Robot, meshes, seed, device.
         out: Folder for trace.json, and actions.npz: the actions, and what every engine did.
     """
-    from xreset.eval import trial
+    from xreset.eval import rollout
     from xreset.eval.engines import actions, replay, trace_view
 
-    base = trial.engine(reference, device=place.device)
+    base = rollout.engine(reference, device=place.device)
     names = [name for name in dict.fromkeys(backend) or usable_engines() if name != reference]
-    engines = [trial.engine(name, device=place.device) for name in names]
+    engines = [rollout.engine(name, device=place.device) for name in names]
     with Progress() as bar:
         move = bar.stages()
         move("actions")
@@ -314,14 +314,14 @@ def attribute(
         setting: Robot, meshes, seed of the perturbations of the starts, device and worlds.
         out: Folder for attribution.json; default: attribute/ next to the policy's results.
     """
-    from xreset.eval import policy_spec, trial
+    from xreset.eval import policy_spec, rollout
     from xreset.eval.engines import attribution, attribution_view
 
     if backend == towards:
         raise XResetError(f"--backend and --towards are both {backend!r}. Choose two engines.")
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
-    a, b = (trial.engine(name, device=setting.device) for name in (backend, towards))
-    played = trial.load_trial(
+    a, b = (rollout.engine(name, device=setting.device) for name in (backend, towards))
+    played = rollout.load_trial(
         spec, demos, objects=setting.objects, seed=setting.seed, num_envs=setting.num_envs
     )
     out = out or spec.folder.parent / "attribute"

@@ -33,14 +33,14 @@ def stress(
         setting: Robot, meshes, seed, device and worlds.
         out: Folder for the results; default: stress/ in the run folder or next to the policy.
     """
-    from xreset.eval import policy_spec, sensitivity, trial
+    from xreset.eval import policy_spec, rollout, sensitivity
     from xreset.eval import stress as sweeps
 
     properties = sensitivity.chosen(property)
     engines = chosen_engines(backend, setting.device)
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
     folder = out or spec.folder.parent / "stress"
-    played = trial.load_trial(
+    played = rollout.load_trial(
         spec, demos, objects=setting.objects, seed=setting.seed, num_envs=setting.num_envs
     )
     with engine_bars([e.name for e in engines]) as progress:

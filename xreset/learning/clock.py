@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from xreset.checks import NotNegative, Share, from_dict
-from xreset.files import read_json, write_json
+from xreset.checks import NotNegative, Share
+from xreset.files import read_typed, write_json
 
 SCHEMA = "xreset-lift/1"
 FILE = "lift.json"
@@ -68,6 +68,4 @@ def read_lift(folder: Path) -> Lift:
         FileFormatError: the file is damaged.
     """
     path = folder / FILE
-    if not path.is_file():
-        return Lift()
-    return from_dict(Lift, read_json(path, SCHEMA), str(path))
+    return read_typed(Lift, path, SCHEMA) if path.is_file() else Lift()

@@ -17,9 +17,8 @@ from tensordict import TensorDict
 
 from xreset.files import atomic_write, code_version, file_hash
 from xreset.learning.checkpoint import must_fit, read_checkpoint
-from xreset.learning.choice import read_choice
 from xreset.learning.model import ExportedPolicy, PointNetLstmModel, make_actor
-from xreset.learning.run import checkpoints, latest_checkpoint, read_run
+from xreset.learning.run import read_run
 from xreset.policy import INPUTS, METADATA_KEY, OUTPUTS, observation_shapes
 
 if TYPE_CHECKING:
@@ -119,26 +118,7 @@ def export_checkpoint(out: Path, checkpoint: Path, policy: Path) -> None:
     export_onnx(actor, policy, info.contract, checkpoint=checkpoint)
 
 
-def ensure_policy(out: Path) -> Path:
-    """Return the run's ``policy.onnx``, exported if it is missing or old.
-
-    It is the policy of the checkpoint that ``xreset select`` chose, if there is none newer, else of the newest one. A
-    run that was copied without its checkpoints keeps its policy.
-    """
-    policy = out / "policy.onnx"
-    if policy.exists() and not checkpoints(out):
-        return policy
-    checkpoint = latest_checkpoint(out)
-    choice = read_choice(out)
-    if choice is not None and choice.candidates[0].name == checkpoint.name:
-        chosen = checkpoint.with_name(choice.chosen)
-        checkpoint = chosen if chosen.exists() else checkpoint
-    if not policy.exists() or not _is_of(policy, checkpoint):
-        export_checkpoint(out, checkpoint, policy)
-    return policy
-
-
-def _is_of(policy: Path, checkpoint: Path) -> bool:
+def is_of(policy: Path, checkpoint: Path) -> bool:
     """Return whether a policy was exported from a checkpoint."""
     import onnx
     from google.protobuf.message import DecodeError

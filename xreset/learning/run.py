@@ -16,11 +16,11 @@ import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from xreset.checks import Checked, NotNegative, Positive, from_dict
+from xreset.checks import Checked, NotNegative, Positive, Rule, Share, from_dict
 from xreset.errors import FileFormatError, PolicyError, RunError
-from xreset.files import read_json, write_json
+from xreset.files import read_json, read_typed, write_json
 from xreset.learning.config import TrainConfig
 from xreset.policies import shipped
 from xreset.text import shown
@@ -113,10 +113,7 @@ def policy_file(policy: str | Path, *, also: Sequence[str] = ()) -> Path:
         PolicyError: there is none of that name.
     """
     if os.path.isdir(policy):  # unlike Path.is_dir, it takes names of any length
-        # rsl-rl, which playing a file does not need
-        from xreset.learning.export import ensure_policy
-
-        return ensure_policy(Path(policy))
+        return _exported_policy(Path(policy))
     path = Path(policy)
     if path.suffix == ".onnx" or os.path.exists(path):
         return path
@@ -127,3 +124,104 @@ def policy_file(policy: str | Path, *, also: Sequence[str] = ()) -> Path:
             f"Unknown policy {str(policy)!r}. Give a run folder, a .onnx file, or one of: {known}."
         )
     return files[str(policy)]
+
+
+def _exported_policy(folder: Path) -> Path:
+    """Return the run's ``policy.onnx``, exported if it is missing or old.
+
+    It is the policy of the checkpoint that ``xreset select`` chose, if there is none newer, else of the newest one. A
+    run that was copied without its checkpoints keeps its policy.
+    """
+    policy = folder / "policy.onnx"
+    if policy.exists() and not checkpoints(folder):
+        return policy
+    checkpoint = latest_checkpoint(folder)
+    choice = read_choice(folder)
+    if choice is not None and choice.candidates[0].name == checkpoint.name:
+        chosen = checkpoint.with_name(choice.chosen)
+        checkpoint = chosen if chosen.exists() else checkpoint
+    # rsl-rl, which playing a file does not need
+    from xreset.learning.export import export_checkpoint, is_of
+
+    if not policy.exists() or not is_of(policy, checkpoint):
+        export_checkpoint(folder, checkpoint, policy)
+    return policy
+
+
+# The checkpoint that ``xreset select`` chose --------------------------------------------------------------------------
+
+CHOICE_FILE = "choice.json"
+CHOICE_SCHEMA = "xreset-choice/1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate(Checked):
+    """One checkpoint."""
+
+    name: str
+    """File name of the checkpoint or policy."""
+    task_progress: Annotated[dict[str, Share[float]], Rule("an engine at least", bool)]
+    """Engine -> mean over the episodes; without engines in which it was not played because it could no longer be
+    chosen."""
+
+    @property
+    def worst(self) -> float:
+        """Task progress in the worst engine."""
+        return min(self.task_progress.values())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choice(Checked):
+    """The candidates that were played, and the one that is best in its worst engine."""
+
+    chosen: str
+    """Name of the candidate."""
+    policy_hash: str
+    """SHA-256 of the chosen candidate as an ONNX file."""
+    candidates: tuple[Candidate, ...]
+    """The newest first."""
+    engines: dict[str, str]
+    """Name -> version."""
+    seed: NotNegative[int]
+    """Seed of the starts that were played; results with another seed are of other starts."""
+    episodes_per_demo: Positive[int]
+    demos: str
+    """SHA-256 of the demonstrations."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.chosen not in [c.name for c in self.candidates]:
+            raise ValueError(f"chosen is {self.chosen!r}, expected one of the candidates")
+
+    @property
+    def candidate(self) -> Candidate:
+        """The chosen candidate."""
+        return next(c for c in self.candidates if c.name == self.chosen)
+
+    def sentence(self) -> str:
+        """Return what was chosen and why, in one line."""
+        newest = self.candidates[0]
+        own = self.candidate
+        engine = min(own.task_progress, key=own.task_progress.__getitem__)
+        against = f"the newest, {newest.name}, has {100 * newest.worst:.1f} %"
+        if newest is own:
+            against = "it is the newest"
+        return (
+            f"{self.chosen}, {100 * own.worst:.1f} % in its worst engine ({engine}), of {len(self.candidates)} "
+            f"checkpoints in {len(self.engines)} engines; {against}."
+        )
+
+
+def write_choice(folder: Path, choice: Choice) -> None:
+    """Write a run's ``choice.json``."""
+    write_json(folder / CHOICE_FILE, {"schema": CHOICE_SCHEMA} | asdict(choice))
+
+
+def read_choice(folder: Path) -> Choice | None:
+    """Return the choice that was made in a folder, or None.
+
+    Raises:
+        FileFormatError: the file is damaged, or of another version.
+    """
+    path = folder / CHOICE_FILE
+    return read_typed(Choice, path, CHOICE_SCHEMA) if path.is_file() else None

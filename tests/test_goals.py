@@ -92,7 +92,11 @@ class MadeTest(unittest.TestCase):
             (GoalError, "is not a pose", {"poses": [(0.5, 0.3, 0.2)]}),
             (GoalError, "Unknown family 'turn'. Choose from: lift, ", {"families": ["turn"]}),
         ):
-            with self.subTest(message), self.assertRaisesRegex(error, message):
+            with (
+                self.subTest(message),
+                mock.patch("xreset.resets.goals._DRAWS", 2),
+                self.assertRaisesRegex(error, message),
+            ):
                 make_goals(["banana"], robot=self.robot, **options)
 
     def test_a_goal_of_ones_own(self):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from xreset.eval.policy_spec import PolicySpec, load_policy
 from xreset.eval.results import Evaluation, episode_table, summarize, write_results
-from xreset.eval.rollout import Engine, engine, load_trial, roll_out
+from xreset.eval.rollout import Engine, chosen_engines, load_trial, roll_out
 from xreset.files import claim_folder
 from xreset.inputs import Data
 
@@ -52,14 +52,9 @@ def evaluate(
         PolicyError: the policy is unknown, or the seed chose this checkpoint.
         XResetError: another process is writing the folder.
     """
-    if not isinstance(policy, PolicySpec):
-        policy = load_policy(policy, robot=robot, seed=seed)
+    policy = load_policy(policy, robot=robot, seed=seed)
     policy.check_seed(seed)
-    if isinstance(engines, str):
-        engines = (engines,)
-    chosen = [
-        e if isinstance(e, Engine) else engine(e, device=device) for e in dict.fromkeys(engines)
-    ]
+    chosen = chosen_engines(engines, device)
     trial = load_trial(policy, demos, objects=objects, seed=seed, num_envs=num_envs, settle=settle)
     folder = Path(out) if out else policy.folder
     results = []

@@ -12,7 +12,6 @@ from xreset.description import load_robot
 from xreset.env import ManipulationEnv, make_env
 from xreset.errors import PolicyError
 from xreset.eval.baselines import KinematicRetargeting
-from xreset.files import file_hash
 from xreset.learning.run import policy_file, read_choice, read_run
 from xreset.objects.catalogue import object_names
 from xreset.policies import results_folder
@@ -145,19 +144,21 @@ class PolicySpec:
 
 
 def load_policy(
-    policy: str | Path, *, robot: str | Path | None = None, seed: int = 0
+    policy: str | Path | PolicySpec, *, robot: str | Path | None = None, seed: int = 0
 ) -> PolicySpec:
     """Find the policy that a name means. A file or folder comes before a shipped policy of the same name.
 
     Args:
         policy: run folder, exported policy (.onnx), name of a policy that ships with xreset, or one of
-            :data:`BASELINES`.
+            :data:`BASELINES`. A loaded policy is returned as it is.
         robot: name or folder of the robot; default: the policy's own. Baselines need it.
         seed: seed of the baseline ``random``.
 
     Raises:
         PolicyError: the policy is unknown, or does not fit the robot.
     """
+    if isinstance(policy, PolicySpec):
+        return policy
     name = str(policy)
     if name in BASELINES:
         return _baseline(name, robot, seed)
@@ -175,22 +176,26 @@ def load_policy(
         name = path.stem
     else:
         folder = results_folder(name)
-    contract = OnnxPolicy(file).contract
+    loaded = OnnxPolicy(file)
+    contract = loaded.contract
     spec = load_robot(robot or contract["robot"])
     task = from_dict(TaskConfig, contract["task"], f"{file}: task")
     check_contract(str(file), contract, spec, task)
-    digest = file_hash(file)
+
+    def start(motion: Retargeted | None) -> Policy:
+        return OnnxPolicy(file)
+
     choice = read_choice(folder)
-    is_chosen = choice is not None and choice.policy_hash == digest
+    is_chosen = choice is not None and choice.policy_hash == loaded.hash
     return PolicySpec(
         name=name,
-        start=lambda motion: OnnxPolicy(file),
+        start=start,
         robot=spec,
         task=task,
         folder=folder / "eval",
         objects_folder=objects_folder,
         objects=tuple(contract["objects"]),
-        hash=digest,
+        hash=loaded.hash,
         file=file,
         selection_seed=choice.seed if is_chosen else None,
     )

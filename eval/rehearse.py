@@ -25,7 +25,7 @@ from xreset.eval.results import Episode
 from xreset.eval.rollout import (
     Engine,
     Trial,
-    engine,
+    chosen_engines,
     episode_of,
     in_order,
     load_trial,
@@ -117,7 +117,7 @@ def rehearse(
         XResetError: a fault is unknown or cannot have a value; nothing was played then.
     """
     properties = chosen(faults, PROPERTIES)
-    spec = policy if isinstance(policy, PolicySpec) else load_policy(policy, robot=robot, seed=seed)
+    spec = load_policy(policy, robot=robot, seed=seed)
     spec.check_seed(seed)
     actor = OnnxActor(spec.exported().read_bytes())
     if demos is None:
@@ -127,8 +127,7 @@ def rehearse(
     for prop in properties:
         for value in prop.values:
             _setting(trial, prop, value)
-    wanted = (engines,) if isinstance(engines, str) else engines
-    opened = [engine(each, device=device) if isinstance(each, str) else each for each in wanted]
+    opened = chosen_engines(engines, device)
     folder = Path(out) if out else spec.folder.parent / "rehearsal"
     found: list[Rehearsal] = []
     with claim_folder(folder):

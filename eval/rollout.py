@@ -6,7 +6,7 @@ Shape letters: N worlds, J joints.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -87,6 +87,15 @@ def engine(name: str, *, device: str = "cpu", **options: Any) -> Engine:
         device=used,
         slow=name in SLOW_ON_CPU and used == "cpu",
     )
+
+
+def chosen_engines(engines: str | Iterable[str | Engine], device: str) -> list[Engine]:
+    """Return engines, given by name or already loaded, each once."""
+    names = (engines,) if isinstance(engines, str) else engines
+    return [
+        engine(each, device=device) if isinstance(each, str) else each
+        for each in dict.fromkeys(names)
+    ]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -286,8 +295,8 @@ def play_rounds(engine: Engine, trial: Trial, repetitions: int) -> Generator[Rou
     sequence = np.repeat(np.arange(count), repetitions)
     repetition = np.tile(np.arange(repetitions), count)
     objects = [trial.names.index(name) for name in bank.sequence_object[sequence]]
-    plan = schedule(np.array(objects), trial.num_envs)
     starts = trial.starts()
+    plan = schedule(np.array(objects), trial.num_envs)
     with trial.worlds(engine, torch.as_tensor(plan.object_index)) as (env, points):
         for number, (items, fresh) in enumerate(plan):
             start = episode_starts(starts, sequence[items], repetition[items], trial.seed)

@@ -493,7 +493,7 @@ class ManipulationEnv:
         start = self._new_start
         if from_distribution:
             start.map(Tensor.copy_, self.resets.sample(self.backend.object_index, self.generator))
-        self.variation.begin(fresh, start.joint_target)
+        self.variation.begin_episodes(fresh, start.joint_target)
         self.drawn.draw(fresh, self.generator)
         self._episode.map(Tensor.copy_, where(fresh, start, self._episode))
         for cleared in (self._episode_length, self._previous_action, self._reward, self._over):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
@@ -164,7 +165,13 @@ def observation_shapes(contract: dict[str, Any], source: str) -> dict[str, tuple
 
 
 class OnnxPolicy:
-    """A trained policy from an ONNX file, with its recurrent state."""
+    """A trained policy from an ONNX file, with its recurrent state.
+
+    Attributes:
+        name: the file's name, or that of the run folder.
+        contract: see :func:`policy_contract`.
+        hash: SHA-256 of the file.
+    """
 
     def __init__(self, path: str | Path) -> None:
         """Load the file.
@@ -186,8 +193,10 @@ class OnnxPolicy:
         # Its threads would otherwise spin between the steps, which costs as much as the physics.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         try:
+            content = path.read_bytes()
+            self.hash = sha256(content).hexdigest()
             self._session = onnxruntime.InferenceSession(
-                path.read_bytes(),
+                content,
                 options,
                 providers=["CPUExecutionProvider"],
                 enable_fallback=0,  # no other provider, which onnxruntime would announce

@@ -55,7 +55,7 @@ def _with_objects(
     objects: str | Path | None,
     only: Sequence[str],
 ) -> tuple[PolicySpec, tuple[ObjectSpec, ...]]:
-    spec = policy if isinstance(policy, PolicySpec) else load_policy(policy, robot=robot)
+    spec = load_policy(policy, robot=robot)
     spec.exported()
     folder = spec.meshes(objects)
     return spec, load_objects(only or spec.objects_of(folder), folder)

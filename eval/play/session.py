@@ -182,8 +182,7 @@ class Session:
         engine: str,
     ) -> None:
         """Open worlds; where this fails, the session stays as it was."""
-        if not isinstance(policy, PolicySpec):
-            policy = load_policy(policy, robot=robot, seed=self._seed)
+        policy = load_policy(policy, robot=robot, seed=self._seed)
         folder = policy.meshes(self._folder)
         source = self._demos
         if source is None:

@@ -91,7 +91,7 @@ def chosen_engines(names: Sequence[str], device: str) -> list[rollout.Engine]:
     """Return the engines of these names, each once; without names, MuJoCo."""
     from xreset.eval import rollout
 
-    return [rollout.engine(name, device=device) for name in dict.fromkeys(names or ("mujoco",))]
+    return rollout.chosen_engines(names or "mujoco", device)
 
 
 def usable_engines() -> list[str]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from xreset.errors import DemoError
 from xreset.geometry.rotations import quat_from_axis_angle, quat_multiply, quat_rotate
@@ -192,8 +193,8 @@ class ResetDistribution:
         joint_pos = torch.minimum(torch.maximum(self._home + noise, self._lower), self._upper)
         shift = 2.0 * torch.rand(m, 3, generator=generator, device=device) - 1.0
         spawn_xy = c.spawn_xy if c.training_xy is None else c.training_xy
-        offset = torch.cat((shift[:, :2] * spawn_xy, torch.zeros(m, 1, device=device)), dim=-1)
-        yaw = torch.cat((torch.zeros(m, 2, device=device), shift[:, 2:] * c.spawn_yaw), dim=-1)
+        offset = pad(shift[:, :2] * spawn_xy, (0, 1))
+        yaw = pad(shift[:, 2:] * c.spawn_yaw, (2, 0))
         start_pos, start_quat = self.start_pose(sequence)
         object_quat = quat_multiply(quat_from_axis_angle(yaw), start_quat)
         object_pos = self._turned(start_pos, start_quat, object_quat, sequence) + offset
@@ -229,10 +230,10 @@ class ResetDistribution:
             return pos, quat
         uniform = torch.rand(len(pos), 4, generator=generator, device=generator.device)
         shift = (2.0 * uniform - 1.0) * self._goal_shift
-        yaw = torch.cat((torch.zeros_like(shift[:, :2]), shift[:, 3:]), dim=-1)
+        yaw = pad(shift[:, 3:], (2, 0))
         new_quat = quat_multiply(quat_from_axis_angle(yaw), quat)
         moved = self._turned(pos, quat, new_quat, sequence)
         start_pos, start_quat = self.start_pose(sequence)
         above_start = (self._turned(pos, quat, start_quat, sequence) - start_pos)[:, 2]
-        rise = torch.maximum(shift[:, 2], -above_start.clamp_min(0.0))
-        return moved + torch.cat((shift[:, :2], rise[:, None]), dim=-1), new_quat
+        shift[:, 2] = torch.maximum(shift[:, 2], -above_start.clamp_min(0.0))
+        return moved + shift[:, :3], new_quat

@@ -130,7 +130,7 @@ class Variation:
             of_hand = sample_range(n, c.hand_latency, generator)[:, None]
         return torch.where(self._is_arm, of_arm, of_hand)
 
-    def begin(self, fresh: Tensor, target: Tensor) -> None:
+    def begin_episodes(self, fresh: Tensor, target: Tensor) -> None:
         """Fill the delay line of the worlds of a mask [N] with the start's joint targets [N, J]."""
         self._commands.fill(fresh, target)
         if self.pushes is not None:

@@ -18,7 +18,7 @@ import torch
 from scipy.spatial import ConvexHull
 from torch import Tensor
 
-from xreset.geometry.collision import SelfCollision, support_points
+from xreset.geometry.collision import SelfCollision, bounding_ball, support_points
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import half_spaces, shape_mesh, transformed
@@ -142,15 +142,10 @@ def bounding_balls(
 ) -> tuple[Tensor, Tensor]:
     """Return centers [G, 3] and radii [G] of one ball around each of G groups of balls, centers [n, 3] and radii
     [n]."""
-    middles = []
-    reaches = []
-    for own_centers, own_radii in zip(centers, radii, strict=True):
-        middle = (own_centers.max(axis=0) + own_centers.min(axis=0)) / 2
-        middles.append(middle)
-        reaches.append((np.linalg.norm(own_centers - middle, axis=1) + own_radii).max())
-    return torch.as_tensor(np.array(middles).reshape(-1, 3)), torch.tensor(
-        reaches, dtype=torch.float64
-    )
+    balls = [bounding_ball(*group) for group in zip(centers, radii, strict=True)]
+    middles = np.array([middle for middle, _ in balls]).reshape(-1, 3)
+    reaches = torch.tensor([reach for _, reach in balls], dtype=torch.float64)
+    return torch.as_tensor(middles), reaches
 
 
 def _apart(centers: np.ndarray, radii: np.ndarray, spacing: float) -> np.ndarray:

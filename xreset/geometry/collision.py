@@ -14,6 +14,7 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from xreset.errors import XResetError
@@ -52,6 +53,13 @@ def support_points(shape: Shape) -> tuple[np.ndarray, float]:
     else:
         points = np.asarray(geometry.vertices, dtype=float)
     return transformed(points, shape.T_body_shape), radius
+
+
+def bounding_ball(points: np.ndarray, radii: ArrayLike = 0.0) -> tuple[np.ndarray, float]:
+    """Return center [3] and radius of a ball around balls at points [H, 3]; the center is that of the points' bounding
+    box."""
+    center = (points.max(axis=0) + points.min(axis=0)) / 2
+    return center, float((np.linalg.norm(points - center, axis=1) + radii).max())
 
 
 class SupportPoints(NamedTuple):
@@ -130,13 +138,12 @@ class SelfCollision:
             if only is not None and name not in only:
                 continue
             for shape in kinematics.tree.link(name).collisions:
-                points, radius = support_points(shape)
-                center = (points.max(axis=0) + points.min(axis=0)) / 2
+                center, radius = bounding_ball(*support_points(shape))
                 self._link.append(name)
                 self._geometry.append(coal_geometry(coal, shape.geometry))
                 local.append(shape.T_body_shape)
                 centers.append(center)
-                radii.append(radius + float(np.linalg.norm(points - center, axis=1).max()))
+                radii.append(radius)
         self._index = [kinematics.link_index(name) for name in self._link]
         self._T_link_shape = np.array(local).reshape(-1, 4, 4)
         self._center = np.array(centers).reshape(-1, 3)

@@ -89,22 +89,17 @@ class Kinematics:
         self._link_index = {name: i for i, name in enumerate(self.link_names)}
 
         moving = [joint for joint in joints if joint.type != "fixed"]
-        actuated = set(robot.joint_names)
         mimics = {mimic.joint: mimic for mimic in robot.mimics}
         for name in [*robot.joint_names, *mimics]:
             tree.joint(name)
         driven = set()
         for joint in moving:
-            if joint.name not in actuated and joint.name not in mimics:
+            if joint.name not in robot.joint_names and joint.name not in mimics:
                 raise RobotError(
                     f"robot {robot.name!r}: the URDF's joint {joint.name!r} moves, but the description neither "
                     "actuates it nor makes it a mimic joint. Add it to either, or make it fixed in the URDF."
                 )
             driven.add(mimics[joint.name].source if joint.name in mimics else joint.name)
-        if unknown := driven - actuated:
-            raise RobotError(
-                f"robot {robot.name!r}: mimic joints follow {sorted(unknown)}, which are not actuated."
-            )
         indices = [i for i, name in enumerate(robot.joint_names) if name in driven]
         self.joint_indices = np.array(indices, dtype=np.int64)
         """[J] indices of this kinematics' joints in the robot's joint order; all of them when the root is the

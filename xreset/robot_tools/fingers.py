@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from xreset.errors import RobotError
+from xreset.geometry.collision import bounding_ball
 from xreset.geometry.shapes import surface_of, transform, transformed
 from xreset.geometry.urdf import RobotTree
 from xreset.geometry.urdf_writer import axes, fixed, frame
@@ -327,7 +328,7 @@ class Hand:
             raise RobotError(
                 f"the last link of a finger, {last!r}, has no collision shape, so it can touch nothing."
             )
-        middle = _middle(cloud)
+        middle = bounding_ball(cloud)[0]
         away = middle - self._on_axis(last, cloud)
         away /= max(float(np.linalg.norm(away)), 1e-9)
         return np.array([*points, middle + away * float(((cloud - middle) @ away).max())])
@@ -339,7 +340,7 @@ class Hand:
         if not len(cloud):
             return origin
         axis = self._at[link][:3, :3] @ self.tree.above[link].axis
-        return origin + axis * float((_middle(cloud) - origin) @ axis)
+        return origin + axis * float((bounding_ball(cloud)[0] - origin) @ axis)
 
 
 def _stated_finger(names: str) -> str:
@@ -367,8 +368,3 @@ def _keypoint_joints(finger: Finger) -> dict[str, int]:
             found[f"{finger.name}{number}"] = near
             first = near + 1
     return found
-
-
-def _middle(points: np.ndarray) -> np.ndarray:
-    """[3] middle of the bounding box."""
-    return (points.max(axis=0) + points.min(axis=0)) / 2

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import trimesh
 
 from xreset.errors import RobotError
 from xreset.geometry.shapes import mass_properties, surface_of
@@ -203,20 +204,18 @@ def _with_masses(tree: RobotTree, notes: list[str]) -> RobotTree:
     links = []
     replaced: dict[str, list[str]] = {}
     for link in tree.links:
-        if not link.collisions:
-            if link.mass <= FRAME_MASS or not plausible(link):
-                link = replace(
-                    link, mass=max(link.mass, FRAME_MASS), inertia=np.eye(3) * FRAME_INERTIA
-                )
-        elif link.mass <= 0 or not plausible(link):
-            why = (
-                "have no mass"
-                if link.mass <= 0
-                else "have an inertia that their mass and size do not allow"
-            )
-            link = _with_mass_of_shapes(link)
-            replaced.setdefault(why, []).append(f"{link.name} ({link.mass:.3g} kg)")
-        links.append(link)
+        why = "have an inertia that their mass and size do not allow"
+        if link.mass <= 0:
+            why = "have no mass"
+        least = 0.0 if link.collisions else FRAME_MASS
+        if link.mass > least and plausible(link):
+            links.append(link)
+        elif link.collisions:
+            links.append(_with_mass_of_shapes(link))
+            replaced.setdefault(why, []).append(f"{link.name} ({links[-1].mass:.3g} kg)")
+        else:
+            mass = max(link.mass, FRAME_MASS)
+            links.append(replace(link, mass=mass, inertia=np.eye(3) * FRAME_INERTIA))
     for why, names in replaced.items():
         notes.append(f"these links {why}, and get that of their shapes: {', '.join(names)}")
     return replace(tree, links=tuple(links))
@@ -226,8 +225,7 @@ def _with_mass_of_shapes(link: Link) -> Link:
     vertices, faces = surface_of(link.collisions)
     mass = link.mass
     if mass <= 0:
-        a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-        mass = _DENSITY * float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+        mass = _DENSITY * float(trimesh.Trimesh(vertices, faces, process=False).volume)
     com, inertia = mass_properties(vertices, faces, mass)
     if not (np.isfinite(com).all() and np.isfinite(inertia).all()):
         raise RobotError(
@@ -244,15 +242,12 @@ def is_solid(link: Link) -> bool:
 
 def plausible(link: Link) -> bool:
     """Return whether a link's moments are those of a solid body, and at most :func:`largest_moment`."""
-    if not link.collisions:
-        return is_solid(link)
-    return is_solid(link) and bool(np.linalg.eigvalsh(link.inertia)[2] <= largest_moment(link))
+    largest = np.linalg.eigvalsh(link.inertia)[2]
+    return is_solid(link) and (not link.collisions or bool(largest <= largest_moment(link)))
 
 
 def largest_moment(link: Link) -> float:
     """[kg m^2] Moment of the link's mass at twice the reach of its shapes, and of the rotor of a joint."""
     vertices, _ = surface_of(link.collisions)
-    return (
-        link.mass * (2 * float(np.linalg.norm(vertices - link.com, axis=1).max())) ** 2
-        + _ROTOR_AT_MOST
-    )
+    reach = float(np.linalg.norm(vertices - link.com, axis=1).max())
+    return link.mass * (2 * reach) ** 2 + _ROTOR_AT_MOST

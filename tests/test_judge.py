@@ -38,20 +38,17 @@ def bank():
 
 
 class Judge(unittest.TestCase):
-    def test_a_firm_grip_holds_and_lifts_and_a_weak_one_drops(self):
-        for force, held in ((4.0, 3), (0.2, 0)):
-            with self.subTest(force=force):
-                squeeze = SqueezeConfig(force=force, reach=0.01)
-                found = judging.judge(bank(), robot(), (brick(),), squeeze=squeeze)
-                rows = {row.object_name: row for row in found.rows}
-                self.assertEqual(
-                    (rows["brick"].tried, rows["brick"].hold, rows["brick"].lift), (3, held, held)
-                )
-                # its arm cannot turn that way
-                self.assertEqual((rows["all"].arm_fails, rows["all"].turn), (3, 0))
-                self.assertEqual(found.kept, [])
-                rise = np.diff(found.shots["brick"][:, -5])  # of the object's z
-                self.assertEqual(bool(rise[1] > 0.08), held > 0, rise)
+    def test_a_firm_grip_holds_and_lifts(self):
+        squeeze = SqueezeConfig(force=4.0, reach=0.01)
+        found = judging.judge(bank(), robot(), (brick(),), squeeze=squeeze, num_envs=1)
+        brick_row, sum_row = found.rows
+        self.assertEqual((brick_row.object_name, sum_row.object_name), ("brick", "all"))
+        self.assertEqual((brick_row.tried, brick_row.hold, brick_row.lift), (3, 3, 3))
+        # its arm cannot turn that way
+        self.assertEqual((sum_row.arm_fails, sum_row.turn), (3, 0))
+        self.assertEqual(found.kept, [])
+        rise = np.diff(found.shots["brick"][:, -5])  # of the object's z
+        self.assertGreater(rise[1], 0.08)
 
     def test_the_arm_raises_and_turns_the_palm(self):
         kinematics = Kinematics(load_robot("ur7e-sharpa"))
@@ -83,16 +80,16 @@ class Judge(unittest.TestCase):
         with self.assertRaisesRegex(RobotError, "within 10 mm of the object"):
             judging.judge(replace(bank(), joint_pos=wide), robot(), (brick(),))
 
-    def test_command(self):
+    def test_a_weak_grip_drops_in_the_command(self):
         folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
         self.enterContext(mock.patch("xreset.inputs.load_robot", return_value=robot()))
         self.enterContext(mock.patch("xreset.inputs.load_objects", return_value=(brick(),)))
         write_bank(folder / "bank.npz", bank(), config={}, inputs={})
-        words = f"--robot gripper --backend mujoco --squeeze.force 4 --json {folder}/judge.json --picture {folder}/judge.png"
+        words = f"--robot gripper --backend mujoco --squeeze.force 0.2 --json {folder}/judge.json --picture {folder}/judge.png"
         with redirect_stdout(io.StringIO()) as output:
             main(["robots", "judge", str(folder / "bank.npz"), *words.split()])
-        self.assertRegex(output.getvalue(), r"brick +│ +3 +│ 3, 3, 0")
-        self.assertEqual(json.loads((folder / "judge.json").read_text())["rows"][0]["lift"], 3)
+        self.assertRegex(output.getvalue(), r"brick +│ +3 +│ 0, 0, 0")
+        self.assertEqual(json.loads((folder / "judge.json").read_text())["rows"][0]["arm_fails"], 3)
         self.assertEqual(Image.open(folder / "judge.png").size[0], 4 * judging._TILE[0])
 
 

@@ -152,6 +152,13 @@ def robot_tree(robot: RobotSpec) -> RobotTree:
     return load_urdf(robot.urdf)
 
 
+def joint_limits(robot: RobotSpec) -> np.ndarray:
+    """[2, J] lower and upper limits of a robot's joints [rad or m]."""
+    tree = robot_tree(robot)
+    joints = [tree.joint(name) for name in robot.joint_names]
+    return np.array([(joint.lower, joint.upper) for joint in joints]).T
+
+
 def link_meshes(robot: RobotSpec) -> dict[str, trimesh.Trimesh]:
     """Return the collision shapes of each link of the robot's URDF that has some, as one mesh in the link's frame."""
     import trimesh

@@ -24,7 +24,7 @@ from xreset.demos.archive import (
     Text,
 )
 from xreset.errors import FileFormatError
-from xreset.geometry.urdf import robot_tree
+from xreset.geometry.urdf import joint_limits
 from xreset.records import (
     JOINT,
     POSITION,
@@ -225,9 +225,7 @@ _TOLERANCE = 1e-4
 def check_retargeted(path: str | Path, data: Retargeted, robot: RobotSpec) -> None:
     """Refuse trajectories of another robot, or with joints outside this robot's limits; ``FileFormatError``."""
     check_robot(path, "retargeted file", data, robot)
-    tree = robot_tree(robot)
-    lower = np.array([tree.joint(name).lower for name in data.joint_names])
-    upper = np.array([tree.joint(name).upper for name in data.joint_names])
+    lower, upper = joint_limits(robot)
     beyond = np.where(
         data.valid[:, None], np.maximum(lower - data.joint_pos, data.joint_pos - upper), -np.inf
     )

@@ -16,7 +16,7 @@ from torch.nn.functional import pad
 
 from xreset.errors import DemoError
 from xreset.geometry.rotations import quat_from_axis_angle, quat_multiply, quat_rotate
-from xreset.geometry.urdf import robot_tree
+from xreset.geometry.urdf import joint_limits
 from xreset.resets.bank import ResetBank
 from xreset.spec import GRAVITY, RobotSpec
 from xreset.task.config import ResetConfig
@@ -46,6 +46,18 @@ class Reset(Tensors):
     def from_bank(self) -> Tensor:
         """[M] bool"""
         return self.state >= 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Demonstrations(Tensors):
+    """Starts and goals of demonstrations [S]."""
+
+    start_pos: Tensor
+    start_quat: Tensor
+    goal_pos: Tensor
+    goal_quat: Tensor
+    pivot: Tensor
+    """[S, 3] point of the object, in its mesh frame, about which starts and goals are turned."""
 
 
 def _tensor(array: np.ndarray, device: torch.device | str = "cpu") -> Tensor:
@@ -135,18 +147,16 @@ class ResetDistribution:
         self._states = bank_starts(bank, self._grouped_states.rows).to(device)
         self._grouped_sequences = _Grouped(bank.sequence_object, object_names, device)
         self._sequences = _tensor(self._grouped_sequences.rows, device)
-        self._start_pos = _tensor(bank.start_pos, device)
-        self._start_quat = _tensor(bank.start_quat_wxyz, device)
-        self._goal_pos = _tensor(bank.goal_pos, device)
-        self._goal_quat = _tensor(bank.goal_quat_wxyz, device)
-        self._pivots: Tensor | None = None
-        """[S, 3] of each demonstration's object."""
-        if pivots is not None:
-            of_known = [pivots.get(str(name), np.zeros(3)) for name in bank.sequence_object]
-            self._pivots = _tensor(np.array(of_known), device)
-        joints = [robot_tree(robot).joint(name) for name in robot.joint_names]
-        self._lower = _tensor(np.array([float(joint.lower) for joint in joints]), device)
-        self._upper = _tensor(np.array([float(joint.upper) for joint in joints]), device)
+        pivots = pivots or {}
+        of_sequence = [pivots.get(str(name), np.zeros(3)) for name in bank.sequence_object]
+        self._demos = _Demonstrations(
+            start_pos=_tensor(bank.start_pos, device),
+            start_quat=_tensor(bank.start_quat_wxyz, device),
+            goal_pos=_tensor(bank.goal_pos, device),
+            goal_quat=_tensor(bank.goal_quat_wxyz, device),
+            pivot=_tensor(np.array(of_sequence), device),
+        )
+        self._lower, self._upper = _tensor(joint_limits(robot), device)
         self._goal_shift = torch.tensor(
             [config.goal_xy, config.goal_xy, config.goal_z, config.goal_yaw], device=device
         )
@@ -157,7 +167,7 @@ class ResetDistribution:
 
     def start_pose(self, sequence: Tensor) -> tuple[Tensor, Tensor]:
         """Return the object's pose at the start of given demonstrations [M]: position [M, 3] and quaternion [M, 4]."""
-        return self._start_pos[sequence], self._start_quat[sequence]
+        return self._demos.start_pos[sequence], self._demos.start_quat[sequence]
 
     def sample(self, object_index: Tensor, generator: torch.Generator) -> Reset:
         """Draw one reset for each world.
@@ -193,15 +203,14 @@ class ResetDistribution:
         joint_pos = torch.minimum(torch.maximum(self._home + noise, self._lower), self._upper)
         shift = 2.0 * torch.rand(m, 3, generator=generator, device=device) - 1.0
         spawn_xy = c.spawn_xy if c.training_xy is None else c.training_xy
-        offset = pad(shift[:, :2] * spawn_xy, (0, 1))
-        yaw = pad(shift[:, 2:] * c.spawn_yaw, (2, 0))
-        start_pos, start_quat = self.start_pose(sequence)
-        object_quat = quat_multiply(quat_from_axis_angle(yaw), start_quat)
-        object_pos = self._turned(start_pos, start_quat, object_quat, sequence) + offset
+        demos = self._demos[sequence]
+        object_quat = quat_multiply(_about_z(shift[:, 2] * c.spawn_yaw), demos.start_quat)
+        object_pos = _turned(demos.start_pos, demos.start_quat, object_quat, demos.pivot)
+        object_pos = object_pos + pad(shift[:, :2] * spawn_xy, (0, 1))
         gravity = (
             1.0 + torch.randn(m, generator=generator, device=device) * c.home_gravity_std / GRAVITY
         )
-        goal_pos, goal_quat = self._moved_goal(sequence, generator)
+        goal_pos, goal_quat = self._moved_goal(demos, generator)
         return Reset(
             joint_pos=joint_pos,
             joint_target=joint_pos,
@@ -214,26 +223,29 @@ class ResetDistribution:
             sequence=sequence,
         )
 
-    def _turned(self, pos: Tensor, quat: Tensor, new_quat: Tensor, sequence: Tensor) -> Tensor:
-        """Return positions [M, 3] of objects that turn about their pivots, from orientations [M, 4] to new ones."""
-        if self._pivots is None:
-            return pos
-        pivot = self._pivots[sequence]
-        return pos + quat_rotate(quat, pivot) - quat_rotate(new_quat, pivot)
-
-    def _moved_goal(self, sequence: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Return goals [M, 3], [M, 4] of given demonstrations [M], perturbed as configured."""
+    def _moved_goal(
+        self, demos: _Demonstrations, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
+        """Return goals [M, 3], [M, 4] of demonstrations [M], perturbed as configured."""
         c = self.config
-        pos = self._goal_pos[sequence]
-        quat = self._goal_quat[sequence]
+        pos = demos.goal_pos
+        quat = demos.goal_quat
         if not (c.goal_xy or c.goal_z or c.goal_yaw):
             return pos, quat
         uniform = torch.rand(len(pos), 4, generator=generator, device=generator.device)
         shift = (2.0 * uniform - 1.0) * self._goal_shift
-        yaw = pad(shift[:, 3:], (2, 0))
-        new_quat = quat_multiply(quat_from_axis_angle(yaw), quat)
-        moved = self._turned(pos, quat, new_quat, sequence)
-        start_pos, start_quat = self.start_pose(sequence)
-        above_start = (self._turned(pos, quat, start_quat, sequence) - start_pos)[:, 2]
+        new_quat = quat_multiply(_about_z(shift[:, 3]), quat)
+        at_start = _turned(pos, quat, demos.start_quat, demos.pivot)
+        above_start = (at_start - demos.start_pos)[:, 2]
         shift[:, 2] = torch.maximum(shift[:, 2], -above_start.clamp_min(0.0))
-        return moved + shift[:, :3], new_quat
+        return _turned(pos, quat, new_quat, demos.pivot) + shift[:, :3], new_quat
+
+
+def _about_z(angle: Tensor) -> Tensor:
+    """[M, 4] turns about the vertical by angles [M]."""
+    return quat_from_axis_angle(pad(angle[:, None], (2, 0)))
+
+
+def _turned(pos: Tensor, quat: Tensor, new_quat: Tensor, pivot: Tensor) -> Tensor:
+    """Return positions [M, 3] of objects that turn about their pivots, from orientations [M, 4] to new ones."""
+    return pos + quat_rotate(quat, pivot) - quat_rotate(new_quat, pivot)

@@ -272,7 +272,6 @@ def readers() -> Iterator[dict[str, Reader]]:
         columns = {"object": SOUP, "side": "right", "time": times}
         write_csv(path, once.hand_keypoints, once.object_pos, turn, columns=columns)
         np.savetxt(add("camera, text", "camera.txt", read_transform, "text"), np.eye(4))
-        np.save(add("camera, npy", "camera.npy", read_transform, "bytes"), np.eye(4))
 
         import trimesh
 

@@ -56,7 +56,7 @@ def read_dexycb(root: str | Path, *, progress: Progress = unseen) -> Demos:
     parts = []
     for path in found:
         meta = _read_meta(path)
-        calibration = str(meta["extrinsics"])
+        calibration = meta["extrinsics"]
         if calibration not in calibrations:
             calibrations[calibration] = _read_extrinsics(root, calibration)
         parts.append(_read(path.parent, meta, calibrations[calibration]))
@@ -69,10 +69,9 @@ def _read(folder: Path, meta: Mapping[str, Any], extrinsics: _Poses) -> Demos:
     turn = Rotation.from_matrix(T_table_world[:3, :3])
     path = folder / "pose.npz"
     frames = meta["num_frames"]
-    objects = meta["ycb_ids"]
     grasped = meta["ycb_grasp_ind"]
     pose_object, pose_hand = _read_npz(
-        path, {"pose_y": (frames, len(objects), 7), "pose_m": (frames, 1, 51)}
+        path, {"pose_y": (frames, len(meta["ycb_ids"]), 7), "pose_m": (frames, 1, 51)}
     )
     pose_object = pose_object[:, grasped]
     pose_hand = pose_hand[:, 0]
@@ -91,7 +90,7 @@ def _read(folder: Path, meta: Mapping[str, Any], extrinsics: _Poses) -> Demos:
     return one_sequence(
         name=f"{folder.parent.name}/{folder.name}",
         subject=folder.parent.name,
-        object_name=NAME_OF_ID[objects[grasped]],
+        object_name=NAME_OF_ID[meta["ycb_ids"][grasped]],
         side=meta["mano_sides"][0],
         fps=FPS,
         keypoints=_transform(T_table_world, keypoints),
@@ -128,20 +127,14 @@ def _read_meta(path: Path) -> dict[str, Any]:
     meta = _read_yaml(path)
     try:
         meta["ycb_ids"] = [int(number) for number in meta["ycb_ids"]]
-        meta |= {name: int(meta[name]) for name in ("ycb_grasp_ind", "num_frames")}
-        known = NAME_OF_ID[meta["ycb_ids"][meta["ycb_grasp_ind"]]]
-        if (
-            meta["ycb_grasp_ind"] < 0
-            or meta["num_frames"] < 1
-            or meta["mano_sides"] not in [[side] for side in SIDES]
-        ):
+        meta["serials"] = [str(serial) for serial in meta["serials"]]
+        meta["extrinsics"] = str(meta["extrinsics"])
+        for name in ("ycb_grasp_ind", "num_frames"):
+            meta[name] = int(meta[name])
+        is_known = meta["ycb_ids"][meta["ycb_grasp_ind"]] in NAME_OF_ID
+        is_side = meta["mano_sides"] in [[side] for side in SIDES]
+        if meta["ycb_grasp_ind"] < 0 or meta["num_frames"] < 1 or not is_known or not is_side:
             raise ValueError("a number or a side is out of range")
-        if not (
-            known
-            and meta["extrinsics"]
-            and all(isinstance(serial, str) for serial in meta["serials"])
-        ):
-            raise ValueError("a text is missing")
         return meta
     except (LookupError, TypeError, ValueError) as error:
         raise DemoError(
@@ -184,20 +177,13 @@ def _read_yaml(path: Path) -> dict[str, Any]:
         if path.stat().st_size > _MAX_YAML_BYTES:
             raise ValueError("it has more than a megabyte")
         data = yaml.load(path.read_text(), Loader=yaml.BaseLoader)
-    except (
-        yaml.YAMLError,
-        ValueError,
-        TypeError,
-        KeyError,
-        AttributeError,
-        RecursionError,
-    ) as error:
+        if not isinstance(data, dict):
+            raise ValueError(f"it holds a {type(data).__name__}, expected names and values")
+        return data
+    except Exception as error:  # yaml raises any kind of error at damage
         raise DemoError(
             f"{path} is not valid YAML: {shown(str(error) or 'it is nested too deeply')}"
         ) from error
-    if not isinstance(data, dict):
-        raise DemoError(f"{path} holds a {type(data).__name__}, expected names and values.")
-    return data
 
 
 def _read_npz(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> list[np.ndarray]:

@@ -24,7 +24,7 @@ from xreset.backends.mjcf_model import OBJECT, SceneModel
 from xreset.backends.mujoco import MujocoBackend, MujocoWorld
 from xreset.backends.rigid import conjugate, rotate
 from xreset.cli import main
-from xreset.errors import BackendUnavailableError
+from xreset.errors import BackendUnavailableError, XResetError
 from xreset.physics import KnownDifference
 
 Defect = type[MujocoWorld] | type[MujocoBackend]
@@ -472,7 +472,7 @@ class Harness(unittest.TestCase):
             self.assertEqual(result.verdict, verdict)
 
     def test_unknown_check(self):
-        with self.assertRaisesRegex(ValueError, "free_fall"):
+        with self.assertRaisesRegex(XResetError, "free_fall"):
             run(MujocoBackend, only=["no_such_check"])
 
     def test_a_backend_that_cannot_be_built_is_not_a_failed_check(self):
@@ -505,9 +505,12 @@ class Harness(unittest.TestCase):
             )
             self.assertEqual([c["verdict"] for c in data["runs"][0]["checks"]], ["passed"])
             broken = Measure(what="x", measured=float("nan"), tolerance=1.0)
-            red = ("failed", "", (broken,))
+
+            def red(check, bench):
+                return CheckResult(check=check, verdict="failed", measures=(broken,))
+
             with (
-                mock.patch("xreset.backends.conformance._run_one", lambda check, bench: red),
+                mock.patch("xreset.backends.conformance._run_one", red),
                 contextlib.redirect_stdout(io.StringIO()),
                 self.assertRaises(SystemExit) as raised,
             ):

@@ -36,7 +36,7 @@ from xreset.backends.conformance.results import (
     largest,
 )
 from xreset.backends.conformance.scene import scene
-from xreset.errors import BackendUnavailableError, CapabilityError
+from xreset.errors import BackendUnavailableError, CapabilityError, XResetError
 from xreset.spec import RobotSpec
 
 __all__ = [
@@ -84,13 +84,13 @@ def run(
         report: called with each result as soon as it is known.
 
     Raises:
-        ValueError: ``only`` names a check that does not exist.
+        XResetError: ``only`` names a check that does not exist.
         BackendUnavailableError: the backend cannot be used here.
     """
     known = [check.name for check in CHECKS]
     wanted = set(known if only is None else only)
     if unknown := sorted(wanted.difference(known)):
-        raise ValueError(f"Unknown checks: {', '.join(unknown)}. Choose from: {', '.join(known)}.")
+        raise XResetError(f"Unknown check: {', '.join(unknown)}. Choose from: {', '.join(known)}.")
     bench = Bench(make, scene(robot))
     results = []
     try:

@@ -5,6 +5,7 @@ Joints move in free space here: the robot's links collide neither with one anoth
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -20,7 +21,7 @@ from xreset.backends.rigid import mechanism, object_inertia
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import robot_tree
 from xreset.physics import State
-from xreset.spec import GRAVITY, JointSpec, SceneSpec
+from xreset.spec import GRAVITY, DriveSpec, SceneSpec
 
 _WAY = 0.2  # rad, of a joint's step and of the amplitude of its sine
 _SLIDE_WAY = 0.02  # m, the same of a prismatic joint
@@ -32,22 +33,22 @@ _DRIVE_SCALES = ((1.0, 1.0, 1.0), (0.7, 1.4, 1.0), (1.3, 0.8, 0.5))
 
 def mass_properties(bench: Bench) -> Measured:
     """Read masses, centres of mass and inertias back from the engine, of every moving body and of the objects."""
-    found = bench.worlds().backend.mass_properties().to("cpu")
+    found = bench.worlds().backend.mass_properties().to("cpu").map(Tensor.double)
     bodies = mechanism(bench.scene.robot).bodies[1:]
     rows = [(0, i, body.name, body.inertia) for i, body in enumerate(bodies)]
     for world, thing in enumerate(bench.objects):
         rows.append((world, len(bodies), thing.name, object_inertia(thing)))
-    errors = {"mass": [], "centre of mass": [], "principal inertia": [], "inertia matrix": []}
+    errors = defaultdict(list)
     for world, i, name, expected in rows:
-        matrix = found.inertia[world, i].double().numpy()
-        off = (
-            float(found.mass[world, i]) / expected.mass - 1.0,
-            np.abs(found.com[world, i].double().numpy() - expected.com).max(),
-            np.abs(np.linalg.eigvalsh(matrix) / expected.moments - 1.0).max(),
-            np.abs(matrix - expected.matrix).max() / expected.moments[-1],
-        )
-        for pairs, error in zip(errors.values(), off, strict=True):
-            pairs.append((name, abs(error)))
+        matrix = found.inertia[world, i].numpy()
+        off = {
+            "mass": found.mass[world, i] / expected.mass - 1.0,
+            "centre of mass": found.com[world, i].numpy() - expected.com,
+            "principal inertia": np.linalg.eigvalsh(matrix) / expected.moments - 1.0,
+            "inertia matrix": (matrix - expected.matrix) / expected.moments[-1],
+        }
+        for what, error in off.items():
+            errors[what].append((name, float(np.abs(error).max())))
     return errors
 
 
@@ -69,12 +70,10 @@ def effort_limit(bench: Bench) -> Measured:
     _, way = _alone(bench, scene)
     weak = []
     for joint, distance in zip(scene.robot.joints, way.tolist(), strict=True):
-        effort = min(joint.drive.effort, 0.3 * joint.drive.kp * abs(distance))
-        weak.append(replace(joint, drive=replace(joint.drive, effort=effort)))
-    scene = _with_joints(scene, weak)
-    return _against_reference(
-        bench, scene, {"weak step": torch.ones(round(_DURATION / scene.control_dt))}
-    )
+        drive = joint.drive
+        weak.append(replace(drive, effort=min(drive.effort, 0.3 * drive.kp * abs(distance))))
+    step = torch.ones(round(_DURATION / scene.control_dt))
+    return _against_reference(bench, _with_drives(scene, weak), {"weak step": step})
 
 
 def _alone(bench: Bench, scene: SceneSpec) -> tuple[State, Tensor]:
@@ -109,17 +108,13 @@ def _against_reference(bench: Bench, scene: SceneSpec, signals: dict[str, Tensor
         found = paths(worlds)
     with bench.reference(scene, which) as reference:
         expected = paths(reference)
-    errors = {}
+    errors = defaultdict(list)
     for signal, path, path_there in zip(signals, found, expected, strict=True):
         off = (path - path_there) * (_WAY / way)
-        for group in ("arm", "hand"):
-            mine = [i for i, joint in enumerate(scene.robot.joints) if joint.group == group]
-            if mine:
-                names = [scene.robot.joints[i].name for i in mine]
-                errors[f"{group}, {signal}, rms"] = named(
-                    names, off.square().mean(dim=0).sqrt()[mine]
-                )
-                errors[f"{group}, {signal}, peak"] = named(names, off.abs().amax(dim=0)[mine])
+        for joint, error in zip(scene.robot.joints, off.T, strict=True):
+            case = f"{joint.group}, {signal}"
+            errors[f"{case}, rms"].append((joint.name, float(error.square().mean().sqrt())))
+            errors[f"{case}, peak"].append((joint.name, float(error.abs().max())))
     return errors
 
 
@@ -197,14 +192,13 @@ def drive_scale(bench: Bench) -> Measured:
 
     expected = []
     for i, (stiffness, damping, effort) in enumerate(_DRIVE_SCALES):
-        joints = []
+        drives = []
         for joint in scene.robot.joints:
-            drive = joint.drive
-            scaled = replace(
-                drive, kp=stiffness * drive.kp, kd=damping * drive.kd, effort=effort * drive.effort
+            d = joint.drive
+            drives.append(
+                replace(d, kp=stiffness * d.kp, kd=damping * d.kd, effort=effort * d.effort)
             )
-            joints.append(replace(joint, drive=scaled))
-        with bench.other(_with_joints(scene, joints)) as worlds:
+        with bench.other(_with_drives(scene, drives)) as worlds:
             expected.append(path(worlds, slice(i, i + 1)))
     with bench.other(scene, which) as worlds:
         # What was set before must not matter.
@@ -213,8 +207,10 @@ def drive_scale(bench: Bench) -> Measured:
         return {"path": path(worlds, slice(None)) - torch.cat(expected)}
 
 
-def _with_joints(scene: SceneSpec, joints: Sequence[JointSpec]) -> SceneSpec:
-    return replace(scene, robot=replace(scene.robot, joints=tuple(joints)))
+def _with_drives(scene: SceneSpec, drives: Sequence[DriveSpec]) -> SceneSpec:
+    pairs = zip(scene.robot.joints, drives, strict=True)
+    joints = tuple(replace(joint, drive=drive) for joint, drive in pairs)
+    return replace(scene, robot=replace(scene.robot, joints=joints))
 
 
 # Limits and weight ----------------------------------------------------------------------------------------------------
@@ -228,10 +224,8 @@ def joint_limits(bench: Bench) -> Measured:
     start, way = _alone(bench, scene)
     errors = {}
     with bench.other(scene, [0] * len(way)) as worlds:
-        for name, limit, side in (
-            ("upper", kinematics.upper.float(), 1.0),
-            ("lower", kinematics.lower.float(), -1.0),
-        ):
+        for name, side in (("upper", 1.0), ("lower", -1.0)):
+            limit = getattr(kinematics, name).float()
             limited = limit.isfinite()
             if not limited.any():
                 continue

@@ -64,9 +64,6 @@ def check(
     from xreset import description
     from xreset.backends import conformance
 
-    known = [c.name for c in conformance.CHECKS]
-    if unknown := sorted(set(only) - set(known)):
-        raise XResetError(f"Unknown check {', '.join(unknown)}. Choose from: {', '.join(known)}.")
     spec = description.load_robot(robot) if robot else conformance.scene().robot
     runs = []
     for name in dict.fromkeys(backend) or usable_engines():

@@ -143,14 +143,8 @@ class MujocoWorld(World):
         m = self._model
         found = []
         for i in (*self._at.moving_bodies, self._at.object_body):
-            found.append(
-                Inertia(
-                    mass=m.body_mass[i],
-                    com=m.body_ipos[i],
-                    quat=m.body_iquat[i],
-                    moments=m.body_inertia[i],
-                )
-            )
+            com, quat, moments = (x[i] for x in (m.body_ipos, m.body_iquat, m.body_inertia))
+            found.append(Inertia(mass=m.body_mass[i], com=com, quat=quat, moments=moments))
         return found
 
     def set_object_inertia(self, inertia: Inertia) -> None:

@@ -161,19 +161,13 @@ class PybulletWorld(World):
 
     def step(self, n: int) -> None:
         p = self._p
-        weight = np.array(
-            [
-                0.0,
-                0.0,
-                self._inertia.mass * (-GRAVITY * self.gravity_fraction - self._world_gravity),
-            ]
-        )
-        force = (weight + self.force).tolist()
+        force = np.array(self.force)
+        force[2] += self._inertia.mass * (-GRAVITY * self.gravity_fraction - self._world_gravity)
         turned = bool(self.torque.any())
         for _ in range(n * INTERNAL_STEPS):
             self._drives.apply()
             com, _ = p.getBasePositionAndOrientation(self._object)
-            p.applyExternalForce(self._object, -1, force, com, p.WORLD_FRAME)
+            p.applyExternalForce(self._object, -1, force.tolist(), com, p.WORLD_FRAME)
             if turned:
                 p.applyExternalTorque(self._object, -1, self.torque, p.WORLD_FRAME)
             p.stepSimulation()
@@ -191,21 +185,15 @@ class PybulletWorld(World):
         found = []
         # All contacts: when asked for a body, PyBullet swaps the two bodies and the normal, but not the friction.
         for contact in () if self._fresh else self._p.getContactPoints():
-            _, first, second, first_link, second_link, _, _, normal, _, press, *friction = contact
-            if self._object not in (first, second):
+            _, *bodies, first_link, second_link, _, _, normal, _, press, a, t, b, u = contact
+            if self._object not in bodies:
                 continue
-            force = (
-                press * np.array(normal)
-                + friction[0] * np.array(friction[1])
-                + friction[2] * np.array(friction[3])
-            )
-            body = second
+            force = press * np.array(normal) + a * np.array(t) + b * np.array(u)
             link = second_link
-            if first != self._object:  # the force is on the first body
+            if bodies[0] != self._object:  # the force is on the first body
                 force = -force
-                body = first
                 link = first_link
-            if body == self._table:
+            if self._table in bodies:
                 found.append((TABLE, force))
             elif press > 0:
                 found.append((self._parts[link].owner, force))
@@ -299,11 +287,8 @@ class PybulletWorld(World):
         T = np.linalg.inv(inertial_frame(self._inertia))
         shapes = []
         for group in groups:
-            shapes.append(
-                self._shape(
-                    [replace(shape, T_body_shape=T @ shape.T_body_shape) for shape in group]
-                )
-            )
+            moved = [replace(shape, T_body_shape=T @ shape.T_body_shape) for shape in group]
+            shapes.append(self._shape(moved))
         n = len(shapes) - 1
         origin = [(0.0, 0.0, 0.0)] * n
         upright = [(0.0, 0.0, 0.0, 1.0)] * n

@@ -115,9 +115,8 @@ class SapienWorld(World):
 
     def step(self, n: int) -> None:
         body = self._object
-        force = self.force - np.array(
-            [0.0, 0.0, self._inertia.mass * GRAVITY * self.gravity_fraction]
-        )
+        force = np.array(self.force)
+        force[2] -= self._inertia.mass * GRAVITY * self.gravity_fraction
         for remaining in reversed(range(n)):
             self._joints.brake()
             body.add_force_torque(force, self.torque)
@@ -151,15 +150,8 @@ class SapienWorld(World):
         found = []
         for body in (*self._bodies[1:], self._object):
             frame = body.cmass_local_pose
-            com = frame.p.astype(float)
-            found.append(
-                Inertia(
-                    mass=body.mass,
-                    com=com,
-                    quat=frame.q.astype(float),
-                    moments=body.inertia.astype(float),
-                )
-            )
+            com, quat, moments = (x.astype(float) for x in (frame.p, frame.q, body.inertia))
+            found.append(Inertia(mass=body.mass, com=com, quat=quat, moments=moments))
         return found
 
     def set_object_inertia(self, inertia: Inertia) -> None:
@@ -254,11 +246,9 @@ class SapienWorld(World):
                 vertices=geometry.vertices, scale=np.ones(3), material=material
             )
         else:
-            kind = (
-                physx.PhysxCollisionShapeCapsule
-                if geometry.kind == "capsule"
-                else physx.PhysxCollisionShapeCylinder
-            )
+            kind = physx.PhysxCollisionShapeCylinder
+            if geometry.kind == "capsule":
+                kind = physx.PhysxCollisionShapeCapsule
             made = kind(radius=size[0], half_length=size[1], material=material)
             along_x = _x_to(np.array([0.0, 0.0, 1.0]))  # as PhysX has them
             T = transform(T[:3, :3] @ along_x, T[:3, 3])
@@ -334,12 +324,13 @@ class SapienWorld(World):
         omega = angvel.astype(np.float64)
         inertia = R @ self._inertia.matrix @ R.T
         gained = self._inertia.mass * (self._object.linear_velocity - linvel) / self._dt
-        turned = inertia @ (self._object.angular_velocity - omega) / self._dt + cross(
-            omega, inertia @ omega
+        turned = inertia @ (self._object.angular_velocity - omega) / self._dt
+        turned = turned + cross(omega, inertia @ omega)
+        contact_torques = cross(arms, contact_forces)
+        return (
+            gained - force - contact_forces.sum(axis=0),
+            turned - torque - contact_torques.sum(axis=0),
         )
-        return gained - force - contact_forces.sum(axis=0), turned - torque - cross(
-            arms, contact_forces
-        ).sum(axis=0)
 
 
 _SLOPES = [(mu, degrees) for mu in (0.8, 1.2) for degrees in (0, 45)]  # noqa: XR002

@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import torch
@@ -102,13 +101,15 @@ def from_file(source: Path, place: Place, thing: str | None = None, episode: int
         return read_actions(source, place.robot, lambda name: load_object(name, place.objects))
     if schema == TRACE_SCHEMA:
         return _from_evaluation(source, place, thing, episode)
-    only = () if thing is None else (thing,)
     inputs = load_inputs(
-        source, robot=place.robot, objects=place.objects, only=only, accept=("demos", "motion")
+        source,
+        robot=place.robot,
+        objects=place.objects,
+        only=(thing,) if thing else (),
+        accept=("demos", "motion"),
     )
     motion = inputs.motion()
-    first = inputs.objects[0].name if only else motion.object_name[0]
-    grasped = next(o for o in inputs.objects if o.name == first)
+    grasped = next(o for o in inputs.objects if thing or o.name == motion.object_name[0])
     grasps = find_grasps(motion, inputs.robot, (grasped,), len(motion.valid), where="table")
     _check_episode(
         episode, len(grasps), f"{source} shows {len(grasps)} grasps of {grasped.name} on the table"
@@ -122,11 +123,11 @@ def _from_evaluation(source: Path, place: Place, wanted: str | None, episode: in
     summary = read_result(source.with_name(f"{name}.json"))
     spec = load_robot(place.robot or summary.robot)
     traces = read_traces(source.parent, name, spec.joint_names)
-    names = list(dict.fromkeys(trace.object for trace in traces))
-    chosen = wanted or names[0]
-    if chosen not in names:
-        raise DemoError(f"{source} has no {chosen}; it has {', '.join(names)}.")
+    chosen = wanted or traces[0].object
     mine = [trace for trace in traces if trace.object == chosen]
+    if not mine:
+        names = dict.fromkeys(trace.object for trace in traces)
+        raise DemoError(f"{source} has no {chosen}; it has {', '.join(names)}.")
     _check_episode(episode, len(mine), f"{source} records {len(mine)} episodes of {chosen}")
     found = mine[episode]
     thing = load_object(chosen, summary.meshes(place.objects))
@@ -166,11 +167,9 @@ def recorded_actions(robot: RobotSpec, thing: ObjectSpec, trace: Trace, *, label
         raise FileFormatError(
             f"The episode was played with control steps of {dt:.4g} s, expected a multiple of 1/240 s. Replay another."
         )
-    first = [
-        torch.as_tensor(x[:1], dtype=torch.float32)
-        for x in (trace.joint_pos, trace.object_pos, trace.object_quat)
-    ]
-    target = torch.as_tensor(trace.joint_target, dtype=torch.float32)
+    poses = (trace.joint_pos, trace.object_pos, trace.object_quat)
+    first = [torch.as_tensor(pose[:1]) for pose in poses]
+    target = torch.as_tensor(trace.joint_target).float()
     scene = nominal_scene(robot, (thing,), TaskConfig(substeps=substeps))
     return Actions(scene=scene, label=label, start=State.at_rest(*first), joint_target=target)
 
@@ -181,7 +180,7 @@ def write_actions(
     """Write an action sequence, and what engines did with it, by name: the first world of each recording."""
     scene = actions.scene
     friction = scene.friction
-    arrays: dict[str, Any] = {
+    arrays = {
         "robot": actions.robot.name,
         "robot_fingerprint": actions.robot.fingerprint,
         "joint_names": np.array(actions.robot.joint_names),
@@ -199,9 +198,8 @@ def write_actions(
         arrays["engine"] = np.array(list(replays))
         for name in ("joint_pos", "object_pos", "object_quat", "tip_force"):
             key = "object_quat_wxyz" if name == "object_quat" else name
-            arrays[key] = np.stack(
-                [getattr(recording, name)[:, 0].numpy() for recording in replays.values()]
-            )
+            rows = [getattr(recording, name)[:, 0].numpy() for recording in replays.values()]
+            arrays[key] = np.stack(rows)
     write_npz(path, SCHEMA, arrays)
 
 
@@ -237,16 +235,9 @@ def read_actions(
         timestep=float(a["timestep"]),
         substeps=int(a["substeps"]),
     )
-    start = {
-        name: torch.as_tensor(a[key], dtype=torch.float32)[None]
-        for name, key in _STATE_KEYS.items()
-    }
-    return Actions(
-        scene=scene,
-        label=str(a["label"]),
-        start=State(**start),
-        joint_target=torch.as_tensor(a["joint_target"], dtype=torch.float32),
-    )
+    start = {name: torch.as_tensor(a[key]).float()[None] for name, key in _STATE_KEYS.items()}
+    target = torch.as_tensor(a["joint_target"]).float()
+    return Actions(scene=scene, label=str(a["label"]), start=State(**start), joint_target=target)
 
 
 def _check(arrays: dict[str, np.ndarray]) -> str | None:

@@ -24,6 +24,16 @@ from xreset.task.config import TaskConfig
 
 SCHEMA = "xreset-attribution/2"
 
+_METRICS = (
+    "approach",
+    "grasp",
+    "reorient",
+    "reorientation_progress",
+    "nonfinite",
+    "overflow",
+    "out_of_bounds",
+)
+
 Kind = Literal["as it is", "towards", "all", "other"]
 
 
@@ -93,21 +103,13 @@ class Attribution:
         }
 
     def _row(self, row: Row) -> dict[str, Any]:
-        metrics = (
-            "approach",
-            "grasp",
-            "reorient",
-            "reorientation_progress",
-            "nonfinite",
-            "overflow",
-            "out_of_bounds",
-        )
-        means = {metric: round(row.mean(metric), 6) for metric in metrics}
+        means = {metric: round(row.mean(metric), 6) for metric in _METRICS}
+        share = _number(self.share(row))
         return {
             "kind": row.kind,
             "name": row.name,
             **vars(row.effect),
-            "share_of_gap": _number(self.share(row)),
+            "share_of_gap": share,
             **means,
         }
 
@@ -153,9 +155,8 @@ def attribute(
 
     def run(kind: Kind, name: str, engine: Engine, task: TaskConfig) -> None:
         label = name if kind in ("as it is", "other") else f"{a.name}, {name}"
-        player = policy.start(trial.motion)
         played = roll_out(
-            player,
+            policy.start(trial.motion),
             engine,
             replace(trial, task=task),
             repetitions=episodes,

@@ -107,7 +107,10 @@ class _Episode:
     def answer(self, message: str | bytes) -> dict[str, Any]:
         """Return the answer to a message; what is wrong with it, if it cannot be answered."""
         try:
-            data = _parsed(message)
+            try:
+                data = json.loads(message)
+            except (ValueError, RecursionError) as error:
+                raise LiveError(f"The message is not JSON ({error}).") from error
             if not isinstance(data, dict) or len(data) != 1 or not set(data) <= set(self._verbs):
                 raise LiveError(f"A message has one of the keys {', '.join(self._verbs)}.")
             (verb,) = data
@@ -122,22 +125,20 @@ class _Episode:
     def _begin(self, given: dict[str, Any]) -> dict[str, Any]:
         controller = self._controller
         contract = controller.contract
-        name = given.get("object")
-        if name is not None:
-            points = controller.points(str(name))
-            center = controller.center(str(name))
+        if given.get("object") is not None:
+            name = str(given["object"])
+            points = controller.points(name)
+            center = controller.center(name)
         else:
             points = _numbers(given, "points", contract["observation"]["cloud_points"], 3)
             center = _numbers(given, "center", 3) if "center" in given else None
         target = _numbers(given, "target", len(contract["joints"]))
-        controller.begin(
-            points, _numbers(given, "goal_pos", 3), _quaternion(given, "goal_quat"), target, center
-        )
+        controller.begin(points, *_goal(given), target, center)
         self._has_begun = True
         return {"begun": True}
 
     def _goal(self, given: dict[str, Any]) -> dict[str, Any]:
-        self._controller.set_goal(_numbers(given, "goal_pos", 3), _quaternion(given, "goal_quat"))
+        self._controller.set_goal(*_goal(given))
         return {"goal": True}
 
     def _step(self, given: dict[str, Any]) -> dict[str, Any]:
@@ -158,13 +159,6 @@ class _Episode:
         return {"target": self._controller.step(reading.batched())[0].tolist()}
 
 
-def _parsed(message: str | bytes) -> Any:
-    try:
-        return json.loads(message)
-    except (ValueError, RecursionError) as error:
-        raise LiveError(f"The message is not JSON ({error}).") from error
-
-
 def _numbers(given: dict[str, Any], name: str, *shape: int) -> np.ndarray:
     """Return an entry of a message as an array of that shape."""
     try:
@@ -178,6 +172,10 @@ def _numbers(given: dict[str, Any], name: str, *shape: int) -> np.ndarray:
             f"{name} has shape {value.shape}, or a number too large. Expected finite numbers {shape}."
         )
     return value
+
+
+def _goal(given: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    return _numbers(given, "goal_pos", 3), _quaternion(given, "goal_quat")
 
 
 def _quaternion(given: dict[str, Any], name: str) -> np.ndarray:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 import unittest
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import ClassVar
+from unittest import mock
 
 import numpy as np
 import torch
@@ -15,6 +17,7 @@ from xreset.backends.conformance.grasp_checks import grasp
 from xreset.backends.conformance.harness import Bench
 from xreset.backends.conformance.scene import gripper, objects, scene
 from xreset.backends.pool import PoolBackend
+from xreset.errors import BackendUnavailableError
 from xreset.geometry.dynamics import mass_matrix
 from xreset.geometry.kinematics import Kinematics
 from xreset.physics import State
@@ -35,6 +38,8 @@ class EngineChecks:
     """Mixed into a ``unittest.TestCase`` that names the backend."""
 
     backend_class: ClassVar[type[PoolBackend]]
+    module: ClassVar[str | None] = None
+    """What the engine is imported as; None: its backend's module imports it."""
     one_step: ClassVar[AbstractContextManager] = nullcontext()
     """Makes the engine take a single step per physics step, so that momentum can be balanced."""
 
@@ -51,6 +56,15 @@ class EngineChecks:
         state = grasp(Bench(self.backend_class, scene()))[0][[0]]
         backend.set_state(state)
         return backend, state
+
+    def test_a_missing_engine_says_how_to_get_it(self):
+        if self.module is not None:
+            engine = sys.modules[self.backend_class.__module__]._engine
+            with (
+                mock.patch.dict(sys.modules, {self.module: None}),
+                self.assertRaisesRegex(BackendUnavailableError, rf"xreset\[{self.module}\]"),
+            ):
+                getattr(engine, "__wrapped__", engine)()
 
     # Joints -----------------------------------------------------------------------------------------------------------
 

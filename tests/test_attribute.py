@@ -7,6 +7,7 @@ import unittest
 from dataclasses import fields, replace
 
 import torch
+from rich.console import Console
 
 from tests import toy_grasp
 from tests.command import xreset
@@ -18,7 +19,7 @@ from xreset.eval.engines.measure import Measured, measure
 from xreset.eval.rollout import Engine, engine
 from xreset.eval.sensitivity import COMPARED, Effect, nominal_task
 from xreset.spec import SceneSpec
-from xreset.task.config import RandomizationConfig, ResetConfig, TaskConfig, TerminationConfig
+from xreset.task.config import RandomizationConfig, TaskConfig, TerminationConfig
 from xreset.task.randomization import pair_friction
 
 SCENE = SceneSpec(
@@ -26,9 +27,7 @@ SCENE = SceneSpec(
 )
 
 TASK = TaskConfig(
-    reset=ResetConfig(
-        demo_probability=0.0, home_gravity_std=0.0, spawn_xy=0.0, spawn_yaw=0.0, home_noise=False
-    ),
+    reset=toy_grasp.AT_HOME,
     termination=TerminationConfig(episode_seconds=0.8),
     # Pair friction is the mean of two materials: 0.9 with the fingertips, and half of it is too little.
     randomization=RandomizationConfig(
@@ -184,6 +183,14 @@ class AttributeTest(unittest.TestCase):
         assert worst is not None
         self.assertEqual((worst.name, found.share(worst)), ("tip friction", 1.0))
         self.assertIn("'tip friction' alone brings about 100% of it", verdict(found))
+        data = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+        self.assertEqual(
+            (data["schema"], data["costs_most"]), ("xreset-attribution/2", "tip friction")
+        )
+        self.assertLess(data["rows"][1]["difference"], -0.1)
+        with io.StringIO() as sink:
+            Console(width=120, file=sink).print(rich_table(found, "title"))
+            self.assertRegex(sink.getvalue(), r"tip friction.* 0.\d+ -> 0.4\d+ .*100%")
 
     def test_half_the_drives_stiffness_is_told_from_torsional_friction(self):
         found = self.attribute(altered(mujoco(), stiffness=0.5, torsional=1.5))
@@ -249,36 +256,19 @@ class OutcomeTest(unittest.TestCase):
         self.assertIsNone(found.as_dict()["rows"][-1]["share_of_gap"])
         self.assertIsNone(found.costs())
 
-    def test_json_and_table(self):
-        found = self.found(A, row("towards", "arm stiffness", *[0.33] * 8), B)
-        data = json.loads(json.dumps(found.as_dict(), allow_nan=False))
-        self.assertEqual(
-            (data["schema"], data["costs_most"]), ("xreset-attribution/2", "arm stiffness")
-        )
-        self.assertAlmostEqual(data["rows"][1]["difference"], -0.33)
-        from rich.console import Console
-
-        with io.StringIO() as sink:
-            console = Console(width=120, file=sink)
-            console.print(rich_table(found, "title"))
-            for expected in ("arm stiffness", "1 -> 0.8", "-33.0", "100%"):
-                self.assertIn(expected, sink.getvalue())
-
 
 class CommandTest(unittest.TestCase):
     def test_bad_input(self):
         options = ("--demos", "none.npz", "--robot", "ur7e-sharpa", "--towards")
-        for message, policy, *more in (
-            ("does not differ from itself|Choose two engines", "zero", "mujoco"),
-            ("expected a whole number from 1", "zero", "sapien", "--episodes", "0"),
+        for message, policy, other in (
+            ("Choose two engines", "zero", "mujoco"),
             ("Unknown backend 'havok'", "zero", "havok"),
             ("there is no none.npz", "zero", "sapien"),
-            ("Unknown policy", "none", "sapien"),
         ):
             with self.subTest(message):
-                code, _, err = xreset("engines", "attribute", policy, *options, *more)
+                code, _, err = xreset("engines", "attribute", policy, *options, other)
                 self.assertEqual(code, 1)
-                self.assertRegex(err, message)
+                self.assertIn(message, err)
 
 
 if __name__ == "__main__":

@@ -14,15 +14,15 @@ import torch
 from tests.data import PYBULLET
 from tests.engine_checks import JOINT, EngineChecks
 from xreset.backends.conformance.scene import objects, scene, shape
-from xreset.backends.pybullet import PybulletBackend, _engine
+from xreset.backends.pybullet import PybulletBackend
 from xreset.backends.rigid import mechanism
-from xreset.errors import BackendUnavailableError
 from xreset.spec import Geometry, Shape
 
 
 @PYBULLET
 class PybulletTest(EngineChecks, unittest.TestCase):
     backend_class = PybulletBackend
+    module = "pybullet"
     one_step = mock.patch("xreset.backends.pybullet.INTERNAL_STEPS", 1)
 
     def test_a_hull_touches_where_it_is(self):
@@ -78,13 +78,6 @@ class PybulletTest(EngineChecks, unittest.TestCase):
         )
         self.assertEqual((done.returncode, done.stderr), (0, ""))
         self.assertRegex(done.stdout, r"^[\d.]+\n$")
-
-    def test_a_missing_engine_says_how_to_get_it(self):
-        with (
-            mock.patch.dict(sys.modules, {"pybullet": None}),
-            self.assertRaisesRegex(BackendUnavailableError, r"xreset\[pybullet\]"),
-        ):
-            _engine.__wrapped__()
 
 
 if __name__ == "__main__":

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import itertools
-import sys
 import unittest
 from dataclasses import replace
 from types import SimpleNamespace
-from unittest import mock
 
 import numpy as np
 
@@ -17,19 +15,13 @@ from xreset.backends.conformance.scene import gripper, scene
 from xreset.backends.rigid import friction_forces, mechanism
 from xreset.backends.sapien import SapienBackend
 from xreset.backends.sapien_robot import _couple, self_collision_bits
-from xreset.errors import BackendUnavailableError, RobotError
+from xreset.errors import RobotError
 from xreset.spec import MimicSpec
 
 
 class SapienTest(EngineChecks, unittest.TestCase):
     backend_class = SapienBackend
-
-    def test_a_missing_engine_says_how_to_get_it(self):
-        with (
-            mock.patch.dict(sys.modules, {"sapien": None}),
-            self.assertRaisesRegex(BackendUnavailableError, r"xreset\[sapien\]"),
-        ):
-            SapienBackend.engine_version()
+    module = "sapien"
 
     def test_the_configuration_of_the_process_stays_as_it_was(self):
         from sapien import physx

@@ -392,17 +392,9 @@ class Comparing(unittest.TestCase):
             data = json.loads((folder / "parity.json").read_text())
             self.assertEqual((data["schema"], data["ok"]), ("xreset-parity/1", not code))
         self.assertEqual(len(data["grasps"]["hold"]), len(data["reference"]["carried"]["hold 0.5"]))
-        for said, words in (
-            ("there is no ", [folder / "none.npz"]),
-            ("--grasps is 0, expected a whole number from 1", [path, "--grasps", 0]),
-            ("Unknown object 'bottle'", [path, "--only", "bottle"]),
-            ("for the robot 'ur7e-sharpa'", [path, "--robot", "openarm"]),
-        ):
-            with self.subTest(said):
-                code, _, text = xreset("engines", "compare", *words, "--backend", "mujoco")
-                self.assertEqual(code, 1)
-                self.assertIn("xreset engines", text)
-                self.assertIn(said, text)
+        code, _, text = xreset("engines", "compare", path, "--robot", "openarm")
+        self.assertEqual(code, 1)
+        self.assertIn("for the robot 'ur7e-sharpa'", text)
 
 
 class Engines(unittest.TestCase):

@@ -33,7 +33,7 @@ from xreset.eval.setting import Place
 from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.physics import State
 from xreset.spec import PairFriction, SceneSpec
-from xreset.task.config import RandomizationConfig, ResetConfig, TaskConfig, TerminationConfig
+from xreset.task.config import RandomizationConfig, TaskConfig, TerminationConfig
 
 DT = 1 / 60
 
@@ -280,13 +280,7 @@ class EvaluationTest(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
         task = TaskConfig(
-            reset=ResetConfig(
-                demo_probability=0.0,
-                home_gravity_std=0.0,
-                spawn_xy=0.0,
-                spawn_yaw=0.0,
-                home_noise=False,
-            ),
+            reset=toy_grasp.AT_HOME,
             randomization=RandomizationConfig(enabled=False),
             termination=TerminationConfig(episode_seconds=0.7),
         )
@@ -354,21 +348,12 @@ class EvaluationTest(unittest.TestCase):
 
 
 class CommandTest(unittest.TestCase):
-    def test_bad_input(self):
-        folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
-        missing = folder / "none.npz"
-        wrong = folder / "wrong.npz"
+    def test_a_file_of_another_kind(self):
+        wrong = Path(self.enterContext(tempfile.TemporaryDirectory())) / "wrong.npz"
         np.savez(wrong, schema="xreset-replays/1")
-        for message, *arguments in (
-            ("there is no", missing),
-            ("expected a whole number from 0", missing, "--episode", "-1"),
-            ("Unknown backend 'havok'", missing, "--backend", "havok"),
-            ("expected 'xreset-demos/1'", wrong),
-        ):
-            with self.subTest(message):
-                code, _, err = xreset("engines", "trace", *arguments)
-                self.assertEqual(code, 1)
-                self.assertIn(message, err)
+        code, _, err = xreset("engines", "trace", wrong)
+        self.assertEqual(code, 1)
+        self.assertIn("expected 'xreset-demos/1'", err)
 
 
 if __name__ == "__main__":

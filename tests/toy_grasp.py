@@ -19,11 +19,15 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.physics import State
 from xreset.resets.bank import ResetBank
 from xreset.spec import ObjectSpec, PairFriction, RobotSpec, SceneSpec
-from xreset.task.config import TaskConfig
+from xreset.task.config import ResetConfig, TaskConfig
 
 FRICTION = PairFriction(tip=0.9, link=0.5, table=0.6, torsional=0.002)
 OPEN, CLOSED = 0.0201, 0.0141
 """Positions and targets [m] of a jaw: each finger then presses with 2.5 N, and 0.9 of that, twice, is 1.8 times the brick's weight."""
+AT_HOME = ResetConfig(
+    demo_probability=0.0, home_gravity_std=0.0, spawn_xy=0.0, spawn_yaw=0.0, home_noise=False
+)
+"""Every episode begins at home, with nothing at random."""
 RAISED = 0.04
 """How far the lift goes [m]."""
 

@@ -148,13 +148,13 @@ def _against_built(
         thing = scene.objects[0]
         with bench.other(scene) as other:
             for motion, move in motions.items():
-                state, force = (values[i] for values in found[motion])
-                state_built, force_built = (values[0] for values in move(bench, other, [i]))
-                quats = (state.object_quat.double(), state_built.object_quat.double())
+                state, force = found[motion]
+                built, force_built = move(bench, other, [i])
+                quat = state.object_quat[i].double()
                 off = {
-                    "pos": state.object_pos - state_built.object_pos,
-                    "angle": quat_angle(*quats),
-                    "force": (force - force_built) / (GRAVITY * thing.mass),
+                    "pos": state.object_pos[i] - built.object_pos[0],
+                    "angle": quat_angle(quat, built.object_quat[0].double()),
+                    "force": (force[i] - force_built[0]) / (GRAVITY * thing.mass),
                 }
                 for what, error in off.items():
                     errors[f"{motion}, {what}"].append((thing.name, float(error.abs().max())))

@@ -107,10 +107,11 @@ class Check:
             if fnmatchcase(what, pattern):
                 return largest, unit
         words, _, name = what.rpartition(" ")
+        limits = state_limits[name]
         kind = self.states[words]
-        limits = {"exact": 0.0 if device == "cpu" else state_limits[name]["same"]}
-        limits |= state_limits[name]
-        return limits[kind], limits["unit"]
+        if kind == "exact" and device == "cpu":
+            return 0.0, limits["unit"]
+        return limits["same" if kind == "exact" else kind], limits["unit"]
 
 
 class Skipped(Exception):

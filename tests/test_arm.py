@@ -70,7 +70,7 @@ class PlaceTest(unittest.TestCase):
             [self.wrists],
             avoid,
             CONFIG,
-            lambda done, reached: seen.append((done, reached)),
+            lambda done, total: seen.append((done, total)),
         )
         self.assertEqual((own.robot, own.reached, own.followed), (self.lost, 0.0, 0.0))
         self.assertGreater(best.reached, 0.2)
@@ -80,7 +80,7 @@ class PlaceTest(unittest.TestCase):
         self.assertGreaterEqual(
             np.linalg.norm(avoid - best.robot.base_pos, axis=1).min(), CONFIG.clear
         )
-        self.assertEqual(seen, sorted(seen))  # the best yet never gets worse
+        self.assertEqual(seen, sorted(seen))
         # home held the hand three metres up
         self.assertEqual(best.home_rule, "the joints as they were")
         self.assertEqual(best.robot.joints, self.lost.joints)

@@ -19,7 +19,7 @@ from xreset.cli.retarget import retarget as command
 from xreset.demos.archive import demo_objects, read_demos, write_demos
 from xreset.demos.synth import synthesize
 from xreset.errors import DemoError, FileFormatError, RobotError
-from xreset.geometry.collision import height_above_table, table_points
+from xreset.geometry.collision import table_clearance
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_angle, quat_from_axis_angle, quat_to_matrix
 from xreset.geometry.surface import Surface
@@ -263,11 +263,7 @@ class ArmTest(unittest.TestCase):
         self.assertTrue(((joints >= self.model.lower) & (joints <= self.model.upper)).all())
 
     def test_stays_above_the_table(self):
-        support = table_points(self.robot, self.model.kinematics)
-        points = self.model.kinematics.points(
-            self.path(4), support.links, torch.as_tensor(support.points)
-        )
-        heights = height_above_table(points, torch.as_tensor(support.radii), self.model.table)
+        heights = table_clearance(self.model.kinematics, self.path(4), self.model.table)
         sunk = self.targets(4, shift=(0.0, 0.0, -heights.min().item() - 0.05))
         _, free, free_reasons = self.track(sunk, collision_weight=0.0)
         _, kept, kept_reasons = self.track(sunk)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from xreset.backends.conformance.results import Skipped
 from xreset.backends.conformance.scene import gripper
-from xreset.geometry.collision import height_above_table, table_points
+from xreset.geometry.collision import table_clearance
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_normalize
 from xreset.physics import Backend, Contacts, Links, Parameter, Parameters, State
@@ -258,12 +258,8 @@ def random_state(bench: Bench, scene: SceneSpec, num_worlds: int, seed: int) -> 
     pos = (home + reach * uniform(num_worlds, count)).clamp(
         lower + 0.1 * reach, upper - 0.1 * reach
     )
-    support = table_points(scene.robot, joints)
-    points = torch.tensor(support.points)
-    radii = torch.tensor(support.radii)
     for _ in range(_HALVINGS):
-        heights = height_above_table(joints.points(pos, support.links, points), radii, scene.table)
-        inside = (heights < 0).any(dim=1)
+        inside = table_clearance(joints, pos, scene.table) < 0
         pos = torch.where(inside[:, None], (home + pos) / 2, pos)
     return State(
         joint_pos=pos.float(),

@@ -147,12 +147,7 @@ def place(
         paths = pipeline.wrist_paths(chosen, spec, specs, progress=bar.count("hand retargeting"))
         wrists = np.concatenate([path.root_pos[path.annotated].numpy() for path in paths])
         avoid = np.concatenate((wrists, pipeline.rest_on_table(chosen, specs).object_pos))
-        move = bar.stages()
-
-        def report(done: float, reached: float) -> None:
-            move(f"placements (best yet reaches {reached:.0%})", done, 1.0)
-
-        found = places.place(spec, paths, avoid, search, report)
+        found = places.place(spec, paths, avoid, search, bar.count("placements"))
     table = [("follows", "reaches", "dexterity", "base.pos", "base.quat", "home")]
     for finalist in found:
         table.append(

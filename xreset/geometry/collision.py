@@ -73,13 +73,13 @@ class SupportPoints(NamedTuple):
     """[H] radius of the ball around each."""
 
 
-def table_points(robot: RobotSpec, kinematics: Kinematics) -> SupportPoints:
-    """Return the support points of every link that may not touch the table."""
+def table_points(kinematics: Kinematics) -> SupportPoints:
+    """Return the support points of every link of a robot that may not touch the table."""
     links: list[str] = []
     points = [np.zeros((0, 3))]
     radii: list[float] = []
     for name in kinematics.link_names:
-        if name in robot.table_exclude:
+        if name in kinematics.robot.table_exclude:
             continue
         for shape in kinematics.tree.link(name).collisions:
             own, radius = support_points(shape)
@@ -96,6 +96,13 @@ def height_above_table(points: Tensor, radii: Tensor, table: TableSpec) -> Tenso
     off_x = (x - table.center[0]).abs() > table.half_size[0]
     off_y = (y - table.center[1]).abs() > table.half_size[1]
     return (z - radii).masked_fill(off_x | off_y, float("inf"))
+
+
+def table_clearance(kinematics: Kinematics, q: Tensor, table: TableSpec) -> Tensor:
+    """[B] lowest height of the robot's moving shapes above the table [m], at joint positions [B, J]."""
+    support = table_points(kinematics)
+    points = kinematics.points(q, support.links, q.new_tensor(support.points))
+    return height_above_table(points, q.new_tensor(support.radii), table).amin(dim=-1)
 
 
 class SelfCollision:

@@ -13,17 +13,16 @@ import torch
 
 from xreset.description import DESCRIPTION, load_robot
 from xreset.errors import XResetError
-from xreset.geometry.collision import SelfCollision
+from xreset.geometry.collision import SelfCollision, table_clearance
 from xreset.geometry.dynamics import damping_ratio, drive_inertia
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import RobotTree, robot_tree
 from xreset.plugins import robot_folder
 from xreset.retarget.hand.model import HandModel, predicted_gigabytes
 from xreset.robot_tools.draft import link_places
-from xreset.robot_tools.homes import table_clearance
 from xreset.robot_tools.opposition import opposition
 from xreset.robot_tools.sources import is_solid, largest_moment, plausible
-from xreset.spec import RobotSpec, SceneSpec
+from xreset.spec import RobotSpec, SceneSpec, TableSpec
 
 Level = Literal["ok", "skipped", "warning", "error"]
 
@@ -339,7 +338,7 @@ def _around_home(spec: RobotSpec) -> torch.Tensor:
 
 
 def _above_table(spec: RobotSpec, q: torch.Tensor) -> Problems:
-    height = table_clearance(spec, q)
+    height = table_clearance(Kinematics(spec), q, TableSpec())
     share = float((height < 0).double().mean())
     level: Level = "ok"
     if height[0] < 0:

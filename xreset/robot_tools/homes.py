@@ -7,29 +7,19 @@ from itertools import product
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from xreset.geometry.collision import height_above_table, table_points
-from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.collision import table_clearance
 from xreset.geometry.rotations import matrix_to_quat
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track
 from xreset.retarget.validity import Thresholds, classify
 from xreset.robot_tools.draft import rounded
-from xreset.spec import RobotSpec, TableSpec
+from xreset.spec import RobotSpec
 
 _STEPS = (-0.15, 0.0, 0.15)
 """[m] Steps along each axis to other places that are tried."""
 _CLEAR = 0.10
 """[m] Height above the table that keeps the spread around a home clear of it."""
-
-
-def table_clearance(robot: RobotSpec, q: Tensor) -> Tensor:
-    """[B] lowest height of the robot's moving shapes above the table [m], at joint positions [B, J]."""
-    kinematics = Kinematics(robot)
-    support = table_points(robot, kinematics)
-    points = kinematics.points(q, support.links, torch.tensor(support.points))
-    return height_above_table(points, torch.tensor(support.radii), TableSpec()).amin(dim=-1)
 
 
 def hold_near(robot: RobotSpec, T_world_root: np.ndarray) -> tuple[RobotSpec, str] | None:
@@ -60,7 +50,7 @@ def hold_near(robot: RobotSpec, T_world_root: np.ndarray) -> tuple[RobotSpec, st
     reached = np.flatnonzero(classify(measures, Thresholds())[:, 0] == 0)
     if not len(reached):
         return None
-    height = table_clearance(robot, model.full(joints[reached, 0], hand))
+    height = table_clearance(model.kinematics, model.full(joints[reached, 0], hand), model.table)
     chosen = int(reached[(height > _CLEAR).numpy().argmax()])  # the first one, if all are low
     step = (100 * steps[chosen]).tolist()
     moved = f", moved by ({', '.join(f'{value:.0f}' for value in step)}) cm" if any(step) else ""

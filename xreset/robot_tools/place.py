@@ -19,14 +19,15 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from xreset.errors import RobotError
+from xreset.geometry.collision import table_clearance
 from xreset.geometry.kinematics import Kinematics
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track
 from xreset.retarget.validity import Thresholds, classify
-from xreset.robot_tools.homes import hold_near, table_clearance
+from xreset.robot_tools.homes import hold_near
 from xreset.robot_tools.placement import Finalist, PlaceConfig
-from xreset.spec import RobotSpec
+from xreset.spec import RobotSpec, TableSpec
 from xreset.tensors import one_thread
 
 _POSITION = 0.005
@@ -52,7 +53,7 @@ def place(
     paths: list[ArmTargets],
     avoid: np.ndarray,
     config: PlaceConfig | None = None,
-    progress: Callable[[float, float], None] = lambda done, reached: None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Finalist]:
     """Find the placement from which the robot follows most of the motions.
 
@@ -60,7 +61,7 @@ def place(
         robot: the robot; its own placement is the first candidate, and a finalist.
         paths: what hand retargeting asks of the arm: see :func:`xreset.retarget.pipeline.wrist_paths`.
         avoid: [., 3] points that the base keeps clear of.
-        progress: called with the share that is done and the share of frames that the best candidate yet reaches.
+        progress: called with (placements that were tried, the largest number that may be).
 
     Returns:
         The finalists, those with a home first, and of these the one that follows most.
@@ -82,8 +83,8 @@ def place(
     if not len(kept.annotated):
         kept = tried
     found = [(reach(robot, tried), robot)]
-    best = found[0][0]
     done = 0
+    total = config.rounds * config.candidates + config.elite + 1
     for number in range(config.rounds):
         elite = found[: config.elite]
         least = _rank(elite[-1][0])[0] if len(elite) == config.elite else 0
@@ -91,9 +92,8 @@ def place(
             robot, avoid, config, random, number, [candidate for _, candidate in elite]
         ):
             found.append((reach(candidate, tried, least), candidate))
-            best = max(best, found[-1][0], key=_rank)
             done += 1
-            progress(0.8 * done / (config.rounds * config.candidates), best[0])
+            progress(done, total)
         found.sort(key=lambda pair: _rank(pair[0]), reverse=True)
     chosen = [robot]
     if config.rounds:
@@ -101,7 +101,7 @@ def place(
     finalists: list[Finalist] = []
     for candidate in chosen:
         finalists.append(_finalist(candidate, robot, kept, paths))
-        progress(0.8 + 0.2 * len(finalists) / len(chosen), best[0])
+        progress(done + len(finalists), total)
     return sorted(
         finalists, key=lambda finalist: (finalist.home_rule != "", finalist.followed), reverse=True
     )
@@ -236,6 +236,6 @@ def _with_home(placed: RobotSpec, robot: RobotSpec) -> tuple[RobotSpec, str]:
     if found is not None:
         held, moved = found
         return held, "the hand where it was" + moved
-    if table_clearance(placed, home[None]) > _HOME_CLEAR:
+    if table_clearance(Kinematics(placed), home[None], TableSpec()) > _HOME_CLEAR:
         return placed, "the joints as they were"
     return placed, ""

@@ -107,7 +107,7 @@ class ArmModel:
         """Distances that the arm's joints change."""
         self._hand_collision = SelfCollision(robot, self.hand, only=robot.self_collision_links)
 
-        support = table_points(robot, self.kinematics)
+        support = table_points(self.kinematics)
         links = sorted(dict.fromkeys(support.links), key=lambda link: link not in in_hand)
         self._supported_in_hand = [link for link in links if link in in_hand]
         """Links with support points; those of the hand come first."""

@@ -24,8 +24,10 @@ from mujoco_warp._src.types import mat43
 
 _APART = wp.constant(1e6)
 """Distance [m] at which no contact is written."""
-KNOWN_FAULT = "9587990e6dd180da"
-"""Digest of the source of the engine's ``multicontact`` that has the fault."""
+KNOWN_SOURCE = "9587990e6dd180da"
+"""Digest of the source of :data:`ORIGINAL` that has the fault."""
+ORIGINAL = (multicontact.func,)
+"""The engine's function that is wrapped."""
 
 
 @wp.func

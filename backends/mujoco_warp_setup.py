@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields
 from functools import partial
+from importlib import import_module
+from types import ModuleType
 from typing import Any
 
 import mujoco_warp as mjw
@@ -30,11 +32,8 @@ _ANNOUNCE_AFTER = 3.0
 
 def correct_engine() -> None:
     """Correct the depths of contacts, before any kernel is made; warn where it is unknown whether they are wrong."""
-    try:
-        from xreset.backends import mujoco_warp_depth as depth
-    except (ImportError, AttributeError):  # the engine's private modules have changed
-        depth = None
-    if depth is not None and source_digest(depth.multicontact.func) == depth.KNOWN_FAULT:
+    depth = _replacement("mujoco_warp_depth")
+    if depth is not None:
         depth.correct_depths()
         return
     warnings.warn(
@@ -46,14 +45,19 @@ def correct_engine() -> None:
 
 def engine_step(device: Any, model: Any) -> Callable[[Any, Any], None]:
     """Return what advances a model and data, whose kinematics are there, by one step."""
-    try:
-        from xreset.backends import mujoco_warp_step as step
-    except (ImportError, AttributeError):  # the engine's private modules have changed
+    step = _replacement("mujoco_warp_step")
+    if step is None or model.opt.integrator != mjw.IntegratorType.IMPLICITFAST:
         return mjw.step
-    implicit = model.opt.integrator == mjw.IntegratorType.IMPLICITFAST
-    if implicit and source_digest(*step.ORIGINAL) == step.KNOWN_STEP:
-        return partial(step.forked_step, wp.Stream(device) if device.is_cuda else None)
-    return mjw.step
+    return partial(step.forked_step, wp.Stream(device) if device.is_cuda else None)
+
+
+def _replacement(name: str) -> ModuleType | None:
+    """Return a module that replaces parts of the engine; None if the engine's source is not what the module knows."""
+    try:
+        module = import_module(f"xreset.backends.{name}")
+    except (ImportError, AttributeError):  # the engine's private modules have changed
+        return None
+    return module if source_digest(*module.ORIGINAL) == module.KNOWN_SOURCE else None
 
 
 def source_digest(*functions: Callable) -> str:

@@ -15,7 +15,7 @@ from mujoco_warp._src.smooth import tendon_armature
 
 ORIGINAL = (forward.step, forward._forward, forward.fwd_position)
 """The engine's functions that :func:`forked_step` replaces."""
-KNOWN_STEP = "f65bf1f9a5f3ba09"
+KNOWN_SOURCE = "f65bf1f9a5f3ba09"
 """Digest of their source."""
 
 

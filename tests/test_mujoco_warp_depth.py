@@ -87,7 +87,7 @@ class Depth(unittest.TestCase):
 class OtherVersions(unittest.TestCase):
     def test_an_engine_that_finds_contacts_in_another_way_is_announced(self):
         with (
-            mock.patch.object(mujoco_warp_depth, "KNOWN_FAULT", "another"),
+            mock.patch.object(mujoco_warp_depth, "KNOWN_SOURCE", "another"),
             mock.patch.object(mujoco_warp_depth, "correct_depths") as correct,
             self.assertWarnsRegex(
                 UserWarning, r"finds contacts in another way.*Install mujoco-warp==4\.0\.0"
@@ -112,7 +112,7 @@ class OtherVersions(unittest.TestCase):
         model.opt.integrator = mjw.IntegratorType.EULER
         self.assertIs(engine_step(wp.get_device("cpu"), model), mjw.step)
         model.opt.integrator = mjw.IntegratorType.IMPLICITFAST
-        with mock.patch.object(mujoco_warp_step, "KNOWN_STEP", "another"):
+        with mock.patch.object(mujoco_warp_step, "KNOWN_SOURCE", "another"):
             self.assertIs(engine_step(wp.get_device("cpu"), model), mjw.step)
 
     def test_the_log_level_of_the_process_stays_as_it_was(self):

@@ -216,48 +216,41 @@ class OnnxPolicy:
             raise PolicyError(
                 f"{path} holds a contract that is not valid JSON ({error}). Export it again."
             ) from error
+        self._state: list[np.ndarray] | None = None
         self._try_step(path)
         self.name = path.stem if path.stem != "policy" else path.resolve().parent.name
-        self._state: list[np.ndarray] | None = None
 
     def _try_step(self, path: Path) -> None:
         """Take one step with zeros, so that a policy that cannot act is refused before work begins."""
         observed = observation_shapes(self.contract, str(path))
         self._groups = tuple(observed)
-        *flat, picture = observed.values()
         worlds = 2
+        zeros = {name: torch.zeros(worlds, *shape) for name, shape in observed.items()}
         try:
             self._lstm_dim: int = self._session.get_inputs()[2].shape[2]
-            state = (1, worlds, self._lstm_dim)
-            shapes = ((worlds, sum(width for (width,) in flat)), (worlds, *picture), state, state)
-            feed = {
-                name: np.zeros(shape, np.float32)
-                for name, shape in zip(INPUTS, shapes, strict=True)
-            }
-            outputs: Any = self._session.run(OUTPUTS, feed)
-            found = [f"{x.dtype} {x.shape}" for x in outputs]
+            actions = self.act(zeros)
+            found = [tuple(value.shape) for value in (actions, *(self._state or ()))]
         except Exception as error:
             raise PolicyError(
                 f"{path} cannot act: {shown(str(error))}. Export it again."
             ) from error
-        expected = [
-            f"float32 {shape}"
-            for shape in ((worlds, len(self.contract["joint_names"])), state, state)
-        ]
+        state = (1, worlds, self._lstm_dim)
+        expected = [(worlds, len(self.contract["joint_names"])), state, state]
         if found != expected:
             raise PolicyError(
                 f"{path} gives {found} for {worlds} worlds, expected {expected}. Export it again."
             )
-        if not all(np.isfinite(value).all() for value in outputs):
+        if not actions.isfinite().all():
             raise PolicyError(
                 f"{path} gives numbers that are not finite: its training broke down, or the file is damaged."
             )
+        self._state = None
 
     def begin(self, env: ManipulationEnv) -> None:
         """Zero the recurrent state."""
         self._state = None
 
-    def act(self, observations: TensorDict) -> Tensor:
+    def act(self, observations: TensorDict | dict[str, Tensor]) -> Tensor:
         """[N, J] mean action, on the observations' device."""
         *flat_groups, picture = self._groups
         flat = torch.cat([observations[name] for name in flat_groups], dim=-1)

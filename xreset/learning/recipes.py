@@ -6,13 +6,12 @@ import shlex
 import sys
 import tomllib
 from dataclasses import asdict, dataclass, replace
-from math import radians
 from pathlib import Path
 
 from xreset.cameras.config import VisionConfig
 from xreset.checks import from_dict, merged
 from xreset.errors import RunError
-from xreset.learning.config import ModelConfig, PpoConfig, ScheduleConfig, TrainConfig
+from xreset.learning.config import TrainConfig
 from xreset.learning.run import read_run
 from xreset.task.config import TaskConfig
 from xreset.text import plain
@@ -38,6 +37,7 @@ def _read_recipes() -> dict[str, Recipe]:
 
 
 _FILE = Path(__file__).with_name("recipes.toml")
+_STUDENT = _FILE.with_name("student.toml")
 RECIPES = _read_recipes()
 """Name -> recipe."""
 
@@ -83,35 +83,14 @@ def own_terms_flag(own: dict[str, float]) -> str:
 
 
 def student_config(teacher: TaskConfig, vision: VisionConfig) -> TrainConfig:
-    """Return the configuration of a distillation.
-
-    Ranges of the cameras: mounts and calibrations err by a centimetre and two degrees, images are up to 33 ms older
-    than the newest.
+    """Return the configuration of a distillation: ``student.toml``, with images up to 33 ms older than the newest.
 
     Args:
         teacher: the teacher's task, without cameras.
         vision: the cameras of the student.
     """
     control_dt = teacher.timestep * teacher.substeps
-    randomization = replace(
-        teacher.randomization,
-        camera_shift=(0.0, 0.01),
-        camera_turn=(0.0, radians(2.0)),
-        camera_fov=(0.97, 1.03),
-        camera_noise=(0.5, 2.0),
-        camera_latency=(0.0, round(1 / 30 / control_dt, 3)),
-    )
-    return TrainConfig(
-        task=replace(
-            teacher,
-            vision=vision,
-            randomization=randomization,
-            reward=replace(teacher.reward, own={}),
-        ),
-        model=ModelConfig(pointnet=(64, 128, 128), lstm=256, mlp=(256, 128), initial_std=0.1),
-        ppo=PpoConfig(
-            horizon=24, sequence_length=12, mini_epochs=2, minibatch_size=8192, learning_rate=5e-4
-        ),
-        schedule=ScheduleConfig(teacher=((0.0, 1.0), (0.2, 0.0))),
-        iterations=2000,
-    )
+    task = replace(teacher, vision=vision, reward=replace(teacher.reward, own={}))
+    changes = tomllib.loads(_STUDENT.read_text())
+    changes["task"]["randomization"]["camera_latency"] = [0.0, round(1 / 30 / control_dt, 3)]
+    return from_dict(TrainConfig, merged({"task": asdict(task)}, changes), str(_STUDENT))

@@ -27,6 +27,7 @@ from xreset.physics import (
     State,
     unavailable,
 )
+from xreset.plugins import existing_device
 from xreset.spec import SceneSpec
 
 try:
@@ -44,7 +45,6 @@ from xreset.backends.mujoco_warp_setup import (
     correct_engine,
     differing_fields,
     engine_step,
-    existing_device,
     fill_batched,
 )
 from xreset.torch_warp import TorchStream, quiet

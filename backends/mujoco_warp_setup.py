@@ -22,7 +22,6 @@ import warp as wp
 from torch import Tensor
 
 from xreset.backends.mjcf_model import SceneModel
-from xreset.errors import BackendUnavailableError
 
 _TESTED = "4.0.0"
 """Version of MuJoCo-Warp with which depths of contacts and the order of a step were tested."""
@@ -64,28 +63,6 @@ def source_digest(*functions: Callable) -> str:
     """Return a digest of the source of functions."""
     source = "".join(inspect.getsource(function) for function in functions)
     return hashlib.sha256(source.encode()).hexdigest()[:16]
-
-
-def existing_device(name: str) -> str:
-    """Return the device with its index; ``BackendUnavailableError`` if it does not exist."""
-    device = torch.device(name)
-    if device.type == "cpu":
-        return name
-    if device.type != "cuda":
-        raise BackendUnavailableError(
-            f"The backend 'mujoco-warp' runs on devices 'cuda' and 'cpu', found {str(device)!r}."
-        )
-    if not torch.cuda.is_available():
-        raise BackendUnavailableError(
-            "No CUDA device can be used here. Use device 'cpu', or the backend 'mujoco', which is faster on CPUs."
-        )
-    index = torch.cuda.current_device() if device.index is None else device.index
-    count = torch.cuda.device_count()
-    if index >= count:
-        raise BackendUnavailableError(
-            f"Unknown device 'cuda:{index}'. This machine has {count} CUDA devices."
-        )
-    return f"cuda:{index}"
 
 
 def contact_room(pieces: int) -> tuple[int, int, int]:

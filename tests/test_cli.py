@@ -89,7 +89,7 @@ class UsageTest(unittest.TestCase):
             ),
             (r"--minutes is not a number", ("train", "--out", "x", "--minutes", "nan")),
             (
-                r"Unknown device 'quantum'; expected cpu, cuda or",
+                r"Unknown device 'quantum'. Expected cpu, cuda or",
                 ("train", "--out", "x", "--device", "quantum"),
             ),
             (r"(File name too long|there is no)", ("demos", "info", "x" * 300)),
@@ -117,7 +117,7 @@ class UsageTest(unittest.TestCase):
                 "cuda",
             )
         self.assertEqual(code, 1)
-        self.assertIn("--device is cuda, but torch finds 0 GPUs", err)
+        self.assertIn("The device is cuda, but torch finds 0 GPUs", err)
 
     def test_what_reaches_the_terminal_is_text(self):
         code, _, err = run("eval", "\x1b[31mred\x1b]0;title\x07", "--demos", "none.npz")

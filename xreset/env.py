@@ -178,15 +178,11 @@ class ManipulationEnv:
         """Make every buffer that a step writes to."""
         from tensordict import TensorDict
 
-        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-            return torch.zeros(self.num_envs, *shape, dtype=dtype, device=self.device)
-
-        def mask() -> Tensor:
-            return zeros(dtype=torch.bool)
-
-        self._new_start = self.resets.sample(
-            self.backend.object_index, torch.Generator(device=self.device)
-        ).clone()
+        self.drawn = Drawn(self.num_envs, self.device)
+        zeros = self.drawn.zeros
+        never = zeros().bool()
+        unused = torch.Generator(device=self.device)
+        self._new_start = self.resets.sample(self.backend.object_index, unused).clone()
         episode = self._new_start.clone()
         self.goal_pos = episode.goal_pos
         self.goal_quat = episode.goal_quat
@@ -197,33 +193,31 @@ class ManipulationEnv:
         self._episode = episode
         self.nonfinite_count = torch.zeros((), dtype=torch.long, device=self.device)
         self.overflow_count = self.nonfinite_count.clone()
-        self._episode_length = zeros(dtype=torch.long)
+        self._episode_length = zeros().long()
         self._action = zeros(self.num_actions)
         self._previous_action = zeros(self.num_actions)
         self._sent_target = zeros(self.num_actions)
         self._best_reach = zeros()
         self._reward = zeros()
         self._cloud = zeros(*self.task.observation.cloud_shape)
-        self._time_out = mask()
-        self._bad_action = mask()
-        self._faulty = mask()
+        self._time_out = never.clone()
+        self._bad_action = never.clone()
+        self._faulty = never.clone()
         # Worlds to reset, and worlds whose episode is over and that wait for a reset.
-        self._reset_mask = mask()
-        self._over = mask()
+        self._reset_mask = never.clone()
+        self._over = never.clone()
+        task = self.task
         robot = self.backend.scene.robot
-        proprio = obs.layout(len(robot.joints), len(robot.fingertips), self.task.observation)[
-            "proprio"
-        ]
-        randomization = self.task.randomization
-        self.drawn = Drawn(self.num_envs, self.device)
+        layout = obs.layout(len(robot.joints), len(robot.fingertips), task.observation)
+        width = sum(layout["proprio"].values())
         self.variation = Variation(
-            self.drawn, self.backend, randomization, self.actions.is_arm, sum(proprio.values())
+            self.drawn, self.backend, task.randomization, self.actions.is_arm, width
         )
         self.vision: Vision | None = None
-        if self.task.vision.cameras:
+        if task.vision.cameras:
             from xreset.task.vision import Vision  # Warp, which other tasks do not need
 
-            self.vision = Vision(self.drawn, self.backend, self.task)
+            self.vision = Vision(self.drawn, self.backend, task)
         self._log_names: tuple[str, ...] = ()
         self._log_values = torch.zeros(0, device=self.device)
         self._observations = TensorDict({}, batch_size=[self.num_envs], device=self.device)
@@ -363,19 +357,13 @@ class ManipulationEnv:
 
         if self._renderer is None or self._renderer.size != size:
             self._renderer = Renderer(self.backend.scene, size=size)
-        state = self.backend.state()
-        values = (
-            state.joint_pos,
-            state.object_pos,
-            state.object_quat,
-            self.goal_pos,
-            self.goal_quat,
-        )
-        joints, pos, quat, goal_pos, goal_quat = (value[world].cpu().numpy() for value in values)
+        state = self.backend.state()[world].to("cpu")
         return self._renderer.draw(
-            joints,
-            pose_matrix(pos, quat),
-            goal_pose=pose_matrix(goal_pos, goal_quat),
+            state.joint_pos.numpy(),
+            pose_matrix(state.object_pos.numpy(), state.object_quat.numpy()),
+            goal_pose=pose_matrix(
+                self.goal_pos[world].cpu().numpy(), self.goal_quat[world].cpu().numpy()
+            ),
             object_index=int(self.backend.object_index[world]),
         )
 

@@ -8,6 +8,7 @@ and does not affect the others.
 from __future__ import annotations
 
 import os
+import re
 import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -138,12 +139,36 @@ def device_for(name: str, device: str) -> str:
     Raises:
         BackendUnavailableError: no backend has that name, or the device is not one.
     """
-    kind = device.partition(":")[0]
-    if kind not in ("cpu", "cuda"):
+    return device if _kind(device) in backend_class(name).devices() else "cpu"
+
+
+def existing_device(device: str) -> str:
+    """Return a device with its index.
+
+    Raises:
+        BackendUnavailableError: it is no device, or a GPU that this machine does not have.
+    """
+    kind = _kind(device)
+    if kind == "cpu":
+        return device
+    import torch
+
+    count = torch.cuda.device_count()
+    index = int(device.partition(":")[2] or (torch.cuda.current_device() if count else 0))
+    if index >= count:
+        raise BackendUnavailableError(
+            f"The device is {device}, but torch finds {count} GPUs. Check nvidia-smi, or use cpu."
+        )
+    return f"cuda:{index}"
+
+
+def _kind(device: str) -> str:
+    """Return cpu or cuda."""
+    if not re.fullmatch("cpu|cuda(:[0-9]{1,3})?", device):
         raise BackendUnavailableError(
             f"Unknown device {device!r}. Expected cpu, cuda or one of several GPUs, such as cuda:1."
         )
-    return device if kind in backend_class(name).devices() else "cpu"
+    return device.partition(":")[0]
 
 
 def make_backend(name: str, scene: SceneSpec, num_worlds: int, **options: Any) -> Backend:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial, wraps
@@ -14,6 +13,7 @@ from typing import Any
 from xreset.checks import Options
 from xreset.errors import XResetError
 from xreset.files import claim
+from xreset.plugins import existing_device
 
 _COUNTS = {
     "num_envs", "iterations", "episodes", "states", "grasps", "per_object", "max_per_object", "perturbed",
@@ -73,24 +73,8 @@ def _check(options: dict[str, Any]) -> None:
         if isinstance(value, float) and math.isnan(value):
             raise XResetError(f"{flag} is not a number.")
         if name == "device" and isinstance(value, str):
-            check_device(value)
+            existing_device(value)
     _check_overwriting(options)
-
-
-def check_device(device: str) -> None:
-    """Refuse an unknown device, and a GPU that this machine does not have."""
-    if not re.fullmatch("cpu|cuda(:[0-9]{1,3})?", device):
-        raise XResetError(
-            f"Unknown device {device!r}; expected cpu, cuda or one of several GPUs, such as cuda:1."
-        )
-    if device != "cpu":
-        import torch
-
-        count = torch.cuda.device_count()
-        if int(device.partition(":")[2] or 0) >= count:
-            raise XResetError(
-                f"--device is {device}, but torch finds {count} GPUs. Check nvidia-smi, or use --device cpu."
-            )
 
 
 def _check_overwriting(options: dict[str, Any]) -> None:

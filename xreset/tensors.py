@@ -37,17 +37,6 @@ class Tensors:
         """Write rows in place."""
         self.map(lambda x, new: x.index_put_((rows,), new), values)
 
-    def with_rows(self, rows: Sequence[int], other: Self) -> Self:
-        """Return a copy in which the given rows are those of another bundle."""
-        index = list(rows)
-
-        def replaced(own: Tensor, new: Tensor) -> Tensor:
-            own = own.clone()
-            own[index] = new[index]
-            return own
-
-        return self.map(replaced, other)
-
     def clone(self) -> Self:
         """Return a copy."""
         return self.map(torch.clone)

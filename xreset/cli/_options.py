@@ -29,9 +29,6 @@ _IN_PLACE = {"policy"}
 _LARGEST = 2**32 - 1
 """The largest seed that numpy, torch and all engines accept; also an upper limit for counts."""
 
-_LONGEST = 1000
-"""Most characters of a text or a file name; messages repeat them."""
-
 
 def checked(command: Callable[..., None]) -> Callable[..., None]:
     """Return the command with its options checked and its output files claimed while it runs."""
@@ -65,11 +62,6 @@ def _check(options: dict[str, Any]) -> None:
             raise XResetError(
                 f"{flag} is {value}, expected a whole number from {low} to {_LARGEST}."
             )
-        for text in value if isinstance(value, tuple) else (value,):
-            if isinstance(text, str | Path) and len(str(text)) > _LONGEST:
-                raise XResetError(
-                    f"{flag} has {len(str(text))} characters, expected at most {_LONGEST}."
-                )
         if isinstance(value, float) and math.isnan(value):
             raise XResetError(f"{flag} is not a number.")
         if name == "device" and isinstance(value, str):

@@ -358,11 +358,8 @@ class ExportedPolicy(nn.Module):
         self.trunk = copy.deepcopy(model.trunk)
         self.trunk.pointnet.use_bfloat16 = False
         self.mlp = copy.deepcopy(model.mlp)
-        self.output = (
-            model.distribution.as_deterministic_output_module()
-            if model.distribution is not None
-            else nn.Identity()
-        )
+        assert model.distribution is not None, "a policy is stochastic while it learns"
+        self.output = model.distribution.as_deterministic_output_module()
         self.flat_dim: int = model.obs_dim
         self.lstm_dim: int = model._latent_dim
         self.cpu().eval()

@@ -22,7 +22,7 @@ sys.path.insert(0, os.getcwd())
 
 QUICK = (
     "accounts", "docs", "engines_page", "eval", "files", "kinematics", "mirror", "render", "robots",
-    "schedule", "schedules", "task",
+    "schedule", "task",
 )  # fmt: skip
 """Modules of tests that a change of code is first tried with."""
 

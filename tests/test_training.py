@@ -223,18 +223,8 @@ class TrainingTest(unittest.TestCase):
     def test_a_configuration_starts_from_a_recipe_or_from_another_run(self):
         def parsed(*arguments: str) -> TrainConfig:
             with mock.patch("xreset.learning.train.train") as started:
-                main(
-                    [
-                        "train",
-                        "--robot",
-                        "openarm",
-                        "--resets",
-                        "bank.npz",
-                        "--out",
-                        "run",
-                        *arguments,
-                    ]
-                )
+                new = "train --robot openarm --resets bank.npz --out run"
+                main([*new.split(), *arguments])
             return started.call_args.kwargs["config"]
 
         self.assertEqual(parsed(), TrainConfig())
@@ -283,33 +273,26 @@ class TrainingTest(unittest.TestCase):
         data = json.loads((stranger / "run.json").read_text())
         data["config"]["task"]["reward"]["own"] = {"strangers_term:zero": 1.0}
         (stranger / "run.json").write_text(json.dumps(data))
-        like = [
-            "--like",
-            str(stranger),
-            "--robot",
-            "openarm",
-            "--resets",
-            str(self.bank),
-            "--backend",
-            "mujoco",
-        ]
-        like += ["--device", "cpu", "--num-envs", "4", "--iterations", "1", "--out"]
-        resume = ["--resume", "--out", str(stranger), "--iterations", "3"]
-        naming = ["--config.task.reward.own", "strangers_term:zero", "1"]
+        like = (
+            f"--like {stranger} --robot openarm --resets {self.bank} --backend mujoco --device cpu "
+            f"--num-envs 4 --iterations 1 --out {self.folder}"
+        )
+        resume = f"--resume --out {stranger} --iterations 3"
+        naming = "--config.task.reward.own strangers_term:zero 1"
 
-        def said(*arguments: str) -> str:
+        def said(arguments: str) -> str:
             with self.quickly(), redirect_stderr(io.StringIO()) as text, suppress(SystemExit):
-                main(["train", *arguments])
+                main(["train", *arguments.split()])
             return text.getvalue()
 
         without = self.folder / "without"
-        for arguments in ([*like, str(without)], resume):
-            self.assertIn("add " + " ".join(naming), said(*arguments))
+        for arguments in (f"{like}/without", resume):
+            self.assertIn(f"add {naming}", said(arguments))
         self.assertEqual(read_run(without).config.task.reward.own, {})
         self.assertEqual(len(checkpoints(stranger)), 2)
         self.assertNotIn("strangers_term", sys.modules)
-        for arguments in ([*like, str(self.folder / "with")], resume):
-            said(*arguments, *naming)
+        for arguments in (f"{like}/with", resume):
+            said(f"{arguments} {naming}")
         self.assertIn("strangers_term", sys.modules)
         self.assertEqual(
             read_run(self.folder / "with").config.task.reward.own, {"strangers_term:zero": 1.0}

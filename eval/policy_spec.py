@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from xreset.checks import from_dict
 from xreset.description import load_robot
 from xreset.env import ManipulationEnv, make_env
 from xreset.errors import PolicyError
@@ -178,9 +177,8 @@ def load_policy(
         folder = results_folder(name)
     loaded = OnnxPolicy(file)
     contract = loaded.contract
-    spec = load_robot(robot or contract["robot"])
-    task = from_dict(TaskConfig, contract["task"], f"{file}: task")
-    check_contract(str(file), contract, spec, task)
+    spec = load_robot(robot or contract.robot)
+    check_contract(str(file), contract, spec, contract.task)
 
     def start(motion: Retargeted | None) -> Policy:
         return OnnxPolicy(file)
@@ -191,10 +189,10 @@ def load_policy(
         name=name,
         start=start,
         robot=spec,
-        task=task,
+        task=contract.task,
         folder=folder / "eval",
         objects_folder=objects_folder,
-        objects=tuple(contract["objects"]),
+        objects=contract.objects,
         hash=loaded.hash,
         file=file,
         selection_seed=choice.seed if is_chosen else None,

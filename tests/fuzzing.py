@@ -13,7 +13,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -190,7 +190,7 @@ def readers() -> Iterator[dict[str, Reader]]:
             add("conformance", "conformance.json", lambda p: page(read_page([p])), "json"), stored
         )
 
-        write_policy(add("policy", "policy.onnx", OnnxPolicy, "bytes"), contract)
+        write_policy(add("policy", "policy.onnx", OnnxPolicy, "bytes"), asdict(contract))
         weights = {"weight": torch.ones(2, requires_grad=True)}
         optimizer = torch.optim.Adam(weights.values())
         weights["weight"].sum().backward()

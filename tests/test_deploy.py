@@ -8,7 +8,7 @@ import sys
 import tempfile
 import threading
 import unittest
-from dataclasses import replace
+from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -113,9 +113,8 @@ class ContractTest(unittest.TestCase):
         self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
         self.task = TaskConfig()
         robot = toy_grasp.robot()
-        file = write_policy(
-            self.folder / "toy.onnx", policy_contract(robot, self.task, ("brick",)), value=0.01
-        )
+        trained = asdict(policy_contract(robot, self.task, ("brick",)))
+        file = write_policy(self.folder / "toy.onnx", trained, value=0.01)
         self.out = self.folder / "out"
         self.contract = write_deployed(file, robot, self.task, [toy_grasp.brick()], self.out)
         self.home = [joint["home"] for joint in self.contract["joints"]]

@@ -103,7 +103,7 @@ class DistillTest(unittest.TestCase):
             (self.run_folder / TEACHER).read_bytes(), (self.teacher / "policy.onnx").read_bytes()
         )
         policy = OnnxPolicy(self.run_folder / "policy.onnx")
-        self.assertEqual(list(policy.contract["observation_layout"]), ["goal", "proprio", "view"])
+        self.assertEqual(list(policy.contract.observation_layout), ["goal", "proprio", "view"])
         env = self.env(IMAGES)
         check_contract("it", policy.contract, self.robot, env.task)
         seen = env.get_observations()

@@ -3,7 +3,7 @@
 import json
 import tempfile
 import unittest
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
@@ -295,7 +295,9 @@ class ExportTest(unittest.TestCase):
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "policy.onnx"
             export_onnx(
-                model, file, contract | {"observation_layout": layout, "joint_names": list("abcde")}
+                model,
+                file,
+                replace(contract, observation_layout=layout, joint_names=tuple("abcde")),
             )
             self.assertNotIn(
                 b".py", file.read_bytes(), "nothing of the exporting machine is in the file"

@@ -5,7 +5,7 @@ import json
 import os
 import tempfile
 import unittest
-from dataclasses import replace
+from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
 from unittest import mock
@@ -37,7 +37,7 @@ class WithPolicy(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
         cls.folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
-        cls.contract = policy_contract(robots.load("openarm"), TASK, (SOUP,))
+        cls.contract = asdict(policy_contract(robots.load("openarm"), TASK, (SOUP,)))
         cls.file = write_policy(cls.folder / "written.onnx", cls.contract)
 
 

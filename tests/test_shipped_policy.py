@@ -43,7 +43,7 @@ class ShippedPolicyTest(unittest.TestCase):
         out = subprocess.run(command, check=True, capture_output=True, text=True).stdout
         for line, file in zip(out.splitlines(), files, strict=True):
             self.assertEqual(
-                json.loads(line), [[3, len(OnnxPolicy(file).contract["joint_names"])], True]
+                json.loads(line), [[3, len(OnnxPolicy(file).contract.joint_names)], True]
             )
 
     def test_it_fits_this_version_and_has_a_card(self):
@@ -58,14 +58,14 @@ class ShippedPolicyTest(unittest.TestCase):
                 self.assertTrue(found.licence and found.data and found.recipe)
                 engines = {engine for figures in found.results.values() for engine in figures}
                 self.assertLessEqual({"mujoco", "mujoco-warp", "pybullet", "sapien"}, engines)
-                trained = set(OnnxPolicy(file).contract["objects"])
+                trained = set(OnnxPolicy(file).contract.objects)
                 self.assertEqual(set(spec.objects_of(None)), trained & set(object_names()))
 
     @unittest.skipUnless(find_spec("mujoco"), "mujoco is not installed")
     def test_it_still_grasps_and_lifts(self):
         for name, file in shipped().items():
             with self.subTest(name):
-                demos = synthesize(OnnxPolicy(file).contract["objects"][:1], 2)
+                demos = synthesize(OnnxPolicy(file).contract.objects[:1], 2)
                 with tempfile.TemporaryDirectory() as folder:
                     (result,) = evaluate(name, demos, num_envs=2, out=folder, episodes=1)
                 self.assertEqual(list(result.inputs), ["policy"])

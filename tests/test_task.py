@@ -17,7 +17,7 @@ from xreset.errors import DemoError, PolicyError, RunError
 from xreset.geometry.rotations import quat_angle, quat_from_axis_angle, quat_rotate
 from xreset.learning.recipes import RECIPES
 from xreset.physics import Links, State
-from xreset.policy import RandomPolicy, ZeroPolicy, check_contract, policy_contract
+from xreset.policy import RandomPolicy, ZeroPolicy, check_contract, policy_contract, read_contract
 from xreset.resets.distribution import Reset, ResetDistribution
 from xreset.spec import TableSpec
 from xreset.task import observations as obs
@@ -701,16 +701,17 @@ class PolicyTest(WithRobot):
     TASK = TaskConfig()
 
     def refused(self, words: str, task: TaskConfig | None = None, **changes):
-        contract = policy_contract(self.robot, self.TASK, (SOUP,)) | changes
+        contract = asdict(policy_contract(self.robot, self.TASK, (SOUP,))) | changes
         with self.subTest(words), self.assertRaisesRegex(PolicyError, f"(?s)p.onnx.*{words}"):
-            check_contract("p.onnx", contract, self.robot, task or self.TASK)
+            read = read_contract("p.onnx", contract)
+            check_contract("p.onnx", read, self.robot, task or self.TASK)
 
     def test_its_own_robot_and_task_are_accepted(self):
-        contract = policy_contract(self.robot, self.TASK, (SOUP,))
+        contract = asdict(policy_contract(self.robot, self.TASK, (SOUP,)))
         for name in ("cloud_scale", "rotation"):  # which files of earlier versions do not have
             del contract["task"]["observation"][name]
         for task in (self.TASK, evaluation_task(self.TASK)):
-            check_contract("p.onnx", contract, self.robot, task)
+            check_contract("p.onnx", read_contract("p.onnx", contract), self.robot, task)
 
     def test_refusals_name_what_differs(self):
         self.refused(
@@ -726,7 +727,7 @@ class PolicyTest(WithRobot):
         self.refused("another version of the robot", robot_fingerprint="")
         fewer = replace(self.TASK, observation=replace(self.TASK.observation, cloud_history=3))
         self.refused("observation layout .perception.cloud: 960, here 576", task=fewer)
-        extra = policy_contract(self.robot, self.TASK, ())["observation_layout"]
+        extra = policy_contract(self.robot, self.TASK, ()).observation_layout
         self.refused(
             r"policy.tactile: 4, here None",
             observation_layout=extra | {"policy": extra["policy"] | {"tactile": 4}},

@@ -117,8 +117,8 @@ class TrainingTest(unittest.TestCase):
             (info.robot, info.resets, info.resets_hash),
             ("openarm", str(self.bank), file_hash(self.bank)),
         )
-        self.assertEqual(info.contract["objects"], [SOUP, SPAM])
-        self.assertEqual(info.contract["joint_names"], list(self.robot.joint_names))
+        self.assertEqual(info.contract.objects, (SOUP, SPAM))
+        self.assertEqual(info.contract.joint_names, self.robot.joint_names)
         self.assertEqual([c.name for c in checkpoints(self.out)], ["000001.pt", "000002.pt"])
         self.assertTrue(list(self.out.glob("events.out.tfevents.*")))
         self.assertFalse([f for f in self.out.rglob("*") if f.name.endswith(".part")])
@@ -498,7 +498,7 @@ class TrainingTest(unittest.TestCase):
             (r"\(of xreset '9.9'\).*unknown: later", {"later": 1, "xreset": "9.9"}),
             ("num_envs is -5", {"num_envs": -5}),
             (
-                "contract of it.joint_names is 3",
+                "contract.joint_names is 3",
                 {"contract": good["contract"] | {"joint_names": 3}},
             ),
         ):

@@ -6,21 +6,21 @@ and control rate. Running one needs neither warp nor rsl-rl.
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.checks import Positive, parsed
+from xreset.checks import parsed
 from xreset.errors import PolicyError, needs
 from xreset.files import max_bytes, parse_json
 from xreset.spec import RobotSpec
 from xreset.task.config import TaskConfig
+from xreset.task.contract import SCHEMA, Contract
 from xreset.task.observations import layout
 from xreset.text import shown
 
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
     from xreset.env import ManipulationEnv
 
-SCHEMA = "xreset-policy/1"
 METADATA_KEY = "xreset"
 """Key of the ONNX metadata entry that holds the contract as JSON."""
 INPUTS = ("flat", "cloud", "h_in", "c_in")
@@ -53,36 +52,33 @@ class Policy(Protocol):
         ...
 
 
-def policy_contract(robot: RobotSpec, task: TaskConfig, objects: tuple[str, ...]) -> dict[str, Any]:
-    """Return everything that must agree between training and evaluation, as JSON."""
-    return {
-        "schema": SCHEMA,
-        "robot": robot.name,
-        "robot_fingerprint": robot.fingerprint,
-        "joint_names": list(robot.joint_names),
-        "fingertip_names": list(robot.fingertip_names),
-        "objects": list(objects),
-        "observation_layout": layout(
+def policy_contract(robot: RobotSpec, task: TaskConfig, objects: tuple[str, ...]) -> Contract:
+    """Return everything that must agree between training and evaluation."""
+    return Contract(
+        schema=SCHEMA,
+        robot=robot.name,
+        robot_fingerprint=robot.fingerprint,
+        joint_names=tuple(robot.joint_names),
+        fingertip_names=tuple(robot.fingertip_names),
+        objects=objects,
+        observation_layout=layout(
             len(robot.joints), len(robot.fingertips), task.observation, task.vision
         ),
-        "control_dt": task.timestep * task.substeps,
-        "task": json.loads(json.dumps(asdict(task))),  # as it will be read back: lists for tuples
-    }
+        control_dt=task.timestep * task.substeps,
+        task=task,
+    )
 
 
-def check_contract(
-    source: str, contract: dict[str, Any], robot: RobotSpec, task: TaskConfig
-) -> None:
+def check_contract(source: str, contract: Contract, robot: RobotSpec, task: TaskConfig) -> None:
     """Refuse to run a policy where its observations or actions would mean something else.
 
     Raises:
         PolicyError: names the first thing that differs.
     """
-    trained = read_contract(source, contract)
-    here = read_contract("this task", policy_contract(robot, task, ()))
-    if robot.like and trained.robot_fingerprint == robot.like:
-        here = replace(here, robot=trained.robot, robot_fingerprint=robot.like)
-    use_robot = f"Use --robot {trained.robot}."
+    here = policy_contract(robot, task, ())
+    if robot.like and contract.robot_fingerprint == robot.like:
+        here = replace(here, robot=contract.robot, robot_fingerprint=robot.like)
+    use_robot = f"Use --robot {contract.robot}."
     fixes = {
         "robot": use_robot,
         "joint order": use_robot,
@@ -90,7 +86,7 @@ def check_contract(
         "version of the robot": "Its URDF or description has changed. Train again.",
     }
     of_task = _meaning(here)
-    for part, of_policy in _meaning(trained).items():
+    for part, of_policy in _meaning(contract).items():
         names = [
             name
             for name in of_policy | of_task[part]
@@ -125,21 +121,6 @@ def _meaning(contract: Contract) -> dict[str, dict[str, Any]]:
     }
 
 
-@dataclass(frozen=True, kw_only=True)
-class Contract:
-    """What must agree between training and evaluation."""
-
-    schema: Literal["xreset-policy/1"]
-    robot: str
-    robot_fingerprint: str
-    joint_names: tuple[str, ...]
-    fingertip_names: tuple[str, ...]
-    objects: tuple[str, ...]
-    observation_layout: dict[str, dict[str, Positive[int]]]
-    control_dt: Positive[float]
-    task: TaskConfig
-
-
 def read_contract(source: str, contract: Any) -> Contract:
     """Return a contract with types; ``PolicyError`` if it lacks an entry or holds one of another type."""
     typed, problems = parsed(Contract, contract, f"The contract of {source}")
@@ -148,20 +129,19 @@ def read_contract(source: str, contract: Any) -> Contract:
     return typed
 
 
-def observation_shapes(contract: dict[str, Any], source: str) -> dict[str, tuple[int, ...]]:
+def observation_shapes(contract: Contract, source: str) -> dict[str, tuple[int, ...]]:
     """Return the shape of one world's observations, by group, in the order of ``TaskConfig.policy_groups``.
 
     Raises:
         PolicyError: the contract, which is of ``source``, does not state the width of a group.
     """
-    typed = read_contract(source, contract)
-    *flat, picture = typed.task.policy_groups
-    if missing := [name for name in flat if name not in typed.observation_layout]:
+    *flat, picture = contract.task.policy_groups
+    if missing := [name for name in flat if name not in contract.observation_layout]:
         raise PolicyError(
             f"{source} does not state what it observes of {', '.join(missing)}. Export it again."
         )
-    widths = {name: (sum(typed.observation_layout[name].values()),) for name in flat}
-    return widths | {picture: typed.task.picture_shape}
+    widths = {name: (sum(contract.observation_layout[name].values()),) for name in flat}
+    return widths | {picture: contract.task.picture_shape}
 
 
 class OnnxPolicy:
@@ -211,11 +191,12 @@ class OnnxPolicy:
                 f"{path} is an ONNX file without xreset's contract: it was not exported by xreset."
             )
         try:
-            self.contract = parse_json(metadata[METADATA_KEY])
+            contract = parse_json(metadata[METADATA_KEY])
         except ValueError as error:
             raise PolicyError(
                 f"{path} holds a contract that is not valid JSON ({error}). Export it again."
             ) from error
+        self.contract = read_contract(str(path), contract)
         self._state: list[np.ndarray] | None = None
         self._try_step(path)
         self.name = path.stem if path.stem != "policy" else path.resolve().parent.name
@@ -235,7 +216,7 @@ class OnnxPolicy:
                 f"{path} cannot act: {shown(str(error))}. Export it again."
             ) from error
         state = (1, worlds, self._lstm_dim)
-        expected = [(worlds, len(self.contract["joint_names"])), state, state]
+        expected = [(worlds, len(self.contract.joint_names)), state, state]
         if found != expected:
             raise PolicyError(
                 f"{path} gives {found} for {worlds} worlds, expected {expected}. Export it again."

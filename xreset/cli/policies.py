@@ -15,8 +15,8 @@ def list_() -> None:
         about = card(file)
         console.print(f"{name}: {about.about}")
         facts = {
-            "robot": contract["robot"],
-            "objects": ", ".join(contract["objects"]),
+            "robot": contract.robot,
+            "objects": ", ".join(contract.objects),
             "data": about.data,
             "recipe": about.recipe,
             "licence": f"{about.licence}; {file.stat().st_size / 1e6:.1f} MB",

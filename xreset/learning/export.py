@@ -9,8 +9,9 @@ import logging
 import tempfile
 import warnings
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from tensordict import TensorDict
@@ -19,7 +20,7 @@ from xreset.files import atomic_write, code_version, file_hash
 from xreset.learning.checkpoint import must_fit, read_checkpoint
 from xreset.learning.model import ExportedPolicy, PointNetLstmModel, make_actor
 from xreset.learning.run import read_run
-from xreset.policy import INPUTS, METADATA_KEY, OUTPUTS, observation_shapes
+from xreset.policy import INPUTS, METADATA_KEY, OUTPUTS, Contract, observation_shapes
 
 if TYPE_CHECKING:
     from onnx import ModelProto
@@ -33,7 +34,7 @@ _CHECKPOINT_KEY = "xreset-checkpoint"
 def export_onnx(
     actor: PointNetLstmModel,
     path: str | Path,
-    contract: dict[str, Any],
+    contract: Contract,
     *,
     checkpoint: Path | None = None,
 ) -> None:
@@ -68,7 +69,10 @@ def export_onnx(
         )
         model = onnx.load(str(file))
     _drop_exporter_notes(model)
-    entries = {METADATA_KEY: json.dumps(contract, sort_keys=True), _VERSION_KEY: code_version()}
+    entries = {
+        METADATA_KEY: json.dumps(asdict(contract), sort_keys=True),
+        _VERSION_KEY: code_version(),
+    }
     if checkpoint is not None:
         entries[_CHECKPOINT_KEY] = file_hash(checkpoint)
     onnx.helper.set_model_props(model, entries)
@@ -112,7 +116,7 @@ def export_checkpoint(out: Path, checkpoint: Path, policy: Path) -> None:
     example = TensorDict(
         {name: torch.zeros(1, *shape) for name, shape in shapes.items()}, batch_size=[1]
     )
-    actor = make_actor(example, len(info.contract["joint_names"]), info.config)
+    actor = make_actor(example, len(info.contract.joint_names), info.config)
     with must_fit(checkpoint):
         actor.load_state_dict(read_checkpoint(checkpoint).actor_state_dict)
     export_onnx(actor, policy, info.contract, checkpoint=checkpoint)

@@ -42,7 +42,7 @@ def load_teacher(path: Path) -> PointNetLstmModel:
         model = PointNetLstmModel(
             observations,
             list(shapes),
-            len(policy.contract["joint_names"]),
+            len(policy.contract.joint_names),
             ModelConfig(
                 pointnet=_widths(weights, "trunk.pointnet.mlp."),
                 lstm=weights["trunk.lstm.weight_hh_l0"].shape[1],

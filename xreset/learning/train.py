@@ -13,7 +13,6 @@ from typing import Any
 import torch
 
 from xreset.cameras.config import CAMERAS, CameraConfig, VisionConfig
-from xreset.checks import from_dict
 from xreset.env import make_env
 from xreset.errors import PolicyError, RunError, XResetError
 from xreset.files import claim_folder, file_hash, write_whole
@@ -36,7 +35,6 @@ from xreset.plugins import backend_class, device_for
 from xreset.policy import OnnxPolicy, check_contract, policy_contract
 from xreset.resets.bank import ResetBank, read_bank, write_bank
 from xreset.resets.goals import GoalSet, read_goals, with_goals, write_goals
-from xreset.task.config import TaskConfig
 
 
 def train(
@@ -201,9 +199,9 @@ def distill(
                 f"Unknown camera {', '.join(unknown)}. Choose from: {', '.join(CAMERAS)}."
             )
         chosen = tuple(CAMERAS[camera] if isinstance(camera, str) else camera for camera in cameras)
-        told = OnnxPolicy(policy_file(teacher)).contract["task"]
+        told = OnnxPolicy(policy_file(teacher)).contract.task
         vision = replace(vision or VisionConfig(), cameras=chosen)
-        config = student_config(from_dict(TaskConfig, told, f"{teacher}: task"), vision)
+        config = student_config(told, vision)
     if not config.task.vision.cameras:
         raise XResetError(
             "A student needs a camera. Give one or two of: " + ", ".join(CAMERAS) + "."
@@ -214,7 +212,7 @@ def distill(
 def _copy_teacher(teacher: Path, out: Path, inputs: Inputs, config: TrainConfig) -> None:
     """Copy the policy of a teacher into a run folder, if it fits the robot and the task."""
     contract = OnnxPolicy(teacher).contract
-    if contract["task"].get("vision", {}).get("cameras"):
+    if contract.task.vision.cameras:
         raise PolicyError(
             f"{teacher} sees through cameras itself. Give a teacher that is told pose and shape."
         )

@@ -146,6 +146,17 @@ class DistillTest(unittest.TestCase):
         ]
         self.assertEqual(20 * steps[0], 15 * steps[1], "the optimizer went on")
 
+    def test_the_lift_clock_starts_when_the_student_acts_alone(self):
+        clocked = []
+
+        def note(lift, _share, *, iteration, **_now):
+            clocked.append(iteration)
+            return lift
+
+        with self.without_export(), mock.patch("xreset.learning.clock.Lift.after", note):
+            self.distill("clock")  # the teacher acts in the first of two iterations
+        self.assertEqual(clocked, [2])
+
     def test_refusals(self):
         away = replace(IMAGES, cameras=(replace(FRONT, target=(3.0, 0.2, 0.5)),))
         two = {"teacher": self.teacher, "bank": self.bank, "out": self.folder / "refused"}

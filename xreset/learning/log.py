@@ -96,7 +96,8 @@ class TrainingLog:
             iteration: number of iterations done.
             env_steps: control steps of all worlds until now.
             elapsed: time of training until now [s].
-            scalars: the iteration's further curves, by tag; with ``speed/env_steps_per_second``.
+            scalars: the iteration's further curves, by tag; with ``speed/env_steps_per_second``, and in a distillation
+                with ``policy/teacher_share``.
         """
         assert isinstance(self._sums, Tensor), "an iteration has at least one step"
         means = dict(zip(self._names, (self._sums / self._steps).tolist(), strict=True))
@@ -111,9 +112,11 @@ class TrainingLog:
             self._online.log(curves, step=iteration)
         from_home = means["task/success_from_home"]
         before = self._lift
-        self._lift = before.after(
-            from_home, iteration=iteration, env_steps=env_steps, seconds=elapsed
-        )
+        # while a teacher acts in some worlds, their success is not the student's
+        if not scalars.get("policy/teacher_share"):
+            self._lift = before.after(
+                from_home, iteration=iteration, env_steps=env_steps, seconds=elapsed
+            )
         if self._lift.passed != before.passed:
             self.write_lift()
         if time.monotonic() - self._last_line > _LINE_SECONDS or iteration == self._total:

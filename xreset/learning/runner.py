@@ -134,6 +134,8 @@ class TrainingRunner:
                         "speed/collect_seconds": collected - start,
                         "speed/learn_seconds": now - collected,
                     }
+                    if isinstance(self.alg, SequenceDistillation):
+                        scalars["policy/teacher_share"] = self.alg.teacher_share
                     log.write(self.iteration, self.env_steps, self.elapsed, scalars)
                 if self.iteration % self.config.save_interval == 0:
                     self.save_checkpoint()

@@ -157,7 +157,7 @@ class Cameras:
         if self.config.view == "depth":
             view = torch.cat([self._nearness(image) for image in images], dim=1)
         else:
-            is_object = [self.rays.body == self.rays.pose.shape[1] - 1, images[-1] > 0]
+            is_object = [self._on_object(), images[-1] > 0]
             clouds = []
             for image, mask in zip(images, is_object, strict=False):
                 clouds.append(self._points(image, mask, generator))
@@ -180,8 +180,7 @@ class Cameras:
 
     def shows_object(self) -> Tensor:
         """[N] bool: whether the newest images show the object, if they had no errors."""
-        is_object = self.rays.body == self.rays.pose.shape[1] - 1
-        return (is_object & (self._in_range(self.rays.depth) > 0)).flatten(1).any(dim=1)
+        return (self._on_object() & (self._in_range(self.rays.depth) > 0)).flatten(1).any(dim=1)
 
     def _check_outside(self, poses: np.ndarray, bodies: dict[str, trimesh.Trimesh]) -> None:
         """Refuse cameras inside a link of the robot at home; poses [L, 4, 4] of the bodies, then of the cameras'
@@ -198,6 +197,10 @@ class Cameras:
                         f"Camera {i + 1} at {camera.pos} is inside the robot's link {name!r} and sees nothing else. "
                         "Move it out (pos)."
                     )
+
+    def _on_object(self) -> Tensor:
+        """[N, C, H, W] bool: whether a pixel's ray hits the object, which is a world's last body."""
+        return self.rays.body == self.rays.pose.shape[1] - 1
 
     def _nearness(self, depth: Tensor) -> Tensor:
         """[..., C, H, W] 1 at a camera's least depth, 0 at its largest one, and 0 where a pixel sees nothing."""

@@ -28,6 +28,8 @@ _IN_PLACE = {"policy"}
 """Options whose file a command may replace by its output."""
 _LARGEST = 2**32 - 1
 """The largest seed that numpy, torch and all engines accept; also an upper limit for counts."""
+_LONGEST = 1000
+"""Most characters of a text or a file name; messages repeat them."""
 
 
 def checked(command: Callable[..., None]) -> Callable[..., None]:
@@ -62,6 +64,11 @@ def _check(options: dict[str, Any]) -> None:
             raise XResetError(
                 f"{flag} is {value}, expected a whole number from {low} to {_LARGEST}."
             )
+        for text in value if isinstance(value, tuple) else (value,):
+            if isinstance(text, str | Path) and len(str(text)) > _LONGEST:
+                raise XResetError(
+                    f"{flag} has {len(str(text))} characters, expected at most {_LONGEST}."
+                )
         if isinstance(value, float) and math.isnan(value):
             raise XResetError(f"{flag} is not a number.")
         if name == "device" and isinstance(value, str):

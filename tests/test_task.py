@@ -253,7 +253,7 @@ class TerminationTest(unittest.TestCase):
 
 class ActionTest(WithRobot):
     def space(self, **changes) -> ActionSpace:
-        return ActionSpace.of(self.robot, ActionConfig(**changes))
+        return ActionSpace(self.robot, ActionConfig(**changes))
 
     def test_hand_is_absolute_and_arm_relative(self):
         space = self.space(arm_step=0.05)
@@ -479,7 +479,7 @@ class ResetTest(WithRobot):
 
     def test_home_joints_spread_as_the_paper_says_and_stay_within_limits(self):
         joints = self.sample().joint_pos
-        space = ActionSpace.of(self.robot, ActionConfig())
+        space = ActionSpace(self.robot, ActionConfig())
         self.assertTrue(bool(((joints >= space.lower) & (joints <= space.upper)).all()))
         spread = (joints - torch.as_tensor(self.robot.home, dtype=torch.float32)).std(dim=0)
         # an arm joint far from its limits

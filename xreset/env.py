@@ -151,7 +151,7 @@ class ManipulationEnv:
         self.generator = torch.Generator(device=self.device)
         self.generator.manual_seed(seed)
         self._graphs = GraphRunner(self.device, self.generator)
-        self.actions = ActionSpace.of(scene.robot, task.action, self.device)
+        self.actions = ActionSpace(scene.robot, task.action, self.device)
 
         def per_object(points: Callable[[ObjectSpec], np.ndarray]) -> Tensor:
             found = [torch.as_tensor(points(o), dtype=torch.float32) for o in scene.objects]

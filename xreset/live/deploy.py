@@ -96,7 +96,7 @@ def deploy_contract(
 
 def _joints(robot: RobotSpec, task: TaskConfig) -> list[dict[str, Any]]:
     """Return names, limits and the mapping of actions of every joint, in joint order."""
-    space = ActionSpace.of(robot, task.action)
+    space = ActionSpace(robot, task.action)
     tree = robot_tree(robot)
     rows = []
     for i, joint in enumerate(robot.joints):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
@@ -16,36 +14,28 @@ FINGER = 0.04
 finger's link."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class ActionSpace:
     """Maps actions [N, J] in [-1, 1] to joint targets [N, J].
 
     Arm joints are relative. Hand joints are absolute within their limits or, if so configured, relative as well. An
     absolute target is piecewise linear in its action: the lower limit at -1, :attr:`zero` at 0, the upper limit at +1.
+
+    Attributes:
+        lower: [J] joint limits.
+        upper: [J]
+        is_arm: [J] bool
+        step: [J] how far a relative target moves under action 1 [rad, m]; 0 for joints with absolute targets.
+        lead: [J] farthest that a relative target may be ahead of its joint [rad, m].
+        zero: [J] a hand joint's absolute target under action 0; 0 for arm joints.
+        below: [J] from ``zero`` down to the lower limit, reached at -1; 1 for arm joints.
+        above: [J] from ``zero`` up to the upper limit, reached at +1; 1 for arm joints.
     """
 
-    lower: Tensor
-    """[J] joint limits."""
-    upper: Tensor
-    is_arm: Tensor
-    """[J] bool"""
-    step: Tensor
-    """[J] how far a relative target moves under action 1 [rad, m]; 0 for joints with absolute targets."""
-    lead: Tensor
-    """[J] farthest that a relative target may be ahead of its joint [rad, m]."""
-    zero: Tensor
-    """[J] a hand joint's absolute target under action 0; 0 for arm joints."""
-    below: Tensor
-    """[J] from ``zero`` down to the lower limit, reached at -1; 1 for arm joints."""
-    above: Tensor
-    """[J] from ``zero`` up to the upper limit, reached at +1; 1 for arm joints."""
-    config: ActionConfig
-
-    @classmethod
-    def of(
-        cls, robot: RobotSpec, config: ActionConfig, device: torch.device | str = "cpu"
-    ) -> ActionSpace:
-        """Return the action space of a robot."""
+    def __init__(
+        self, robot: RobotSpec, config: ActionConfig, device: torch.device | str = "cpu"
+    ) -> None:
+        """Read the joints of a robot."""
+        self.config = config
         tree = robot_tree(robot)
         joints = [tree.joint(name) for name in robot.joint_names]
         lower = torch.tensor([joint.lower for joint in joints], dtype=torch.float32, device=device)
@@ -54,27 +44,23 @@ class ActionSpace:
         slides = torch.tensor([joint.type == "prismatic" for joint in joints], device=device)
         unit = torch.where(slides & ~is_arm, FINGER, 1.0)
         hand_step = config.hand_step if config.hand == "relative" else 0.0
+        zero = (lower + upper) / 2
+        below = (upper - lower) / 2
+        above = below
         if config.hand_zero == "home":
             home = torch.as_tensor(robot.home, dtype=torch.float32, device=device)
             zero = torch.minimum(torch.maximum(home, lower), upper)
             below = zero - lower
             above = upper - zero
-        else:
-            zero = (lower + upper) / 2
-            below = (upper - lower) / 2
-            above = below
-        return cls(
-            lower=lower,
-            upper=upper,
-            is_arm=is_arm,
-            step=torch.where(is_arm, config.arm_step, unit * hand_step),
-            lead=torch.where(is_arm, config.arm_lead, unit * config.hand_lead),
-            # Continuous arm joints have infinite limits; nothing may multiply their infinity by 0.
-            zero=torch.where(is_arm, 0.0, zero),
-            below=torch.where(is_arm, 1.0, below),
-            above=torch.where(is_arm, 1.0, above),
-            config=config,
-        )
+        self.lower = lower
+        self.upper = upper
+        self.is_arm = is_arm
+        self.step = torch.where(is_arm, config.arm_step, unit * hand_step)
+        self.lead = torch.where(is_arm, config.arm_lead, unit * config.hand_lead)
+        # Continuous arm joints have infinite limits; nothing may multiply their infinity by 0.
+        self.zero = torch.where(is_arm, 0.0, zero)
+        self.below = torch.where(is_arm, 1.0, below)
+        self.above = torch.where(is_arm, 1.0, above)
 
     def targets(self, action: Tensor, target: Tensor, joint_pos: Tensor) -> Tensor:
         """Return new joint targets [N, J].

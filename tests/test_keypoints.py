@@ -115,7 +115,8 @@ class Synthetic(InFolder):
         self.same(read_keypoints(self.npz(object_quat_wxyz=None, object_quat_xyzw=xyzw), PLAIN))
         self.refused("must be given once", object_quat_xyzw=xyzw)
         self.refused(
-            "object_quat_wxyz of frame 0 is not a unit quaternion", object_quat_wxyz=2 * wxyz
+            "object_quat_wxyz of frame 0 is not a position and a unit quaternion",
+            object_quat_wxyz=2 * wxyz,
         )
 
     def test_what_is_not_known_is_asked_for(self):

@@ -361,21 +361,20 @@ def _object_pose(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray, Rotation
         )
     name = given[-1]
     values = np.asarray(arrays[name], dtype=float)
-    pos = (
-        values[:, :3, 3] if name == "object_pose" else np.asarray(arrays["object_pos"], dtype=float)
-    )
-    if not np.isfinite(values).all() or not np.isfinite(pos).all():
-        raise DemoError(
-            "the object's pose is unknown in some frames. Remove such frames at the ends, interpolate the others."
-        )
     if name == "object_pose":
-        wrong = ~np.array([is_rigid(T) for T in values])
+        pos = values[:, :3, 3]
+        fits = np.array([is_rigid(T) for T in values])
         expected = "a rotation and translation with the last row 0 0 0 1"
     else:
-        wrong = np.abs(np.linalg.norm(values, axis=1) - 1) > UNIT_TOLERANCE
-        expected = "a unit quaternion"
-    if wrong.any():
-        raise DemoError(f"{name} of frame {np.argmax(wrong)} is not {expected}.")
+        pos = np.asarray(arrays["object_pos"], dtype=float)
+        fits = np.abs(np.linalg.norm(values, axis=1) - 1) <= UNIT_TOLERANCE
+        expected = "a position and a unit quaternion"
+    fits &= np.isfinite(pos).all(axis=1)
+    if not fits.all():
+        raise DemoError(
+            f"{name} of frame {np.argmin(fits)} is not {expected}. Remove frames without a pose at the ends,"
+            " interpolate the others."
+        )
     if name == "object_pose":
         return pos, Rotation.from_matrix(values[:, :3, :3])
     return pos, Rotation.from_quat(values, scalar_first=name == "object_quat_wxyz")

@@ -26,7 +26,7 @@ _SAME_TURN = np.radians(15.0)
 def doubts(demos: Demos) -> list[str]:
     """Return a sentence for each doubt."""
     found = []
-    valid = np.asarray(demos.hand_valid)
+    valid = demos.hand_valid
     hand = demos.hand_keypoints[valid].astype(float)
     if len(hand):
         length = np.median(bone_lengths(hand).sum(axis=1))
@@ -36,21 +36,27 @@ def doubts(demos: Demos) -> list[str]:
                 f"The hand's bones are {length:.2f} m long together, but {mano_length:.2f} m if the keypoints are in"
                 " MANO's order. Put them into the order of xreset.spec.KEYPOINTS."
             )
-        right = (demos.hand_side[demos.sequence_of_frame] == "right")[valid]
-        cosine = _along_fingers(hand, demos.wrist_quat_wxyz[valid].astype(float), right)
+        # a right hand's fingers point along the wrist's -x axis, a left hand's along +x
+        fingers = hand[:, [5, 9, 13, 17]].mean(axis=1) - hand[:, 0]
+        fingers /= np.linalg.norm(fingers, axis=1, keepdims=True).clip(1e-9)
+        wrist = Rotation.from_quat(demos.wrist_quat_wxyz[valid].astype(float), scalar_first=True)
+        along = (wrist.apply([1.0, 0.0, 0.0]) * fingers).sum(axis=1)
+        is_right = demos.hand_side[demos.sequence_of_frame][valid] == "right"
+        cosine = np.median(np.where(is_right, -along, along))
         if cosine < _ALONG:
             found.append(
                 f"The wrist's orientations do not point along the fingers (cosine {cosine:.2f}, expected 1). Are they"
                 " MANO's root, in the table frame, and quaternions (w, x, y, z)? Check those of the objects too."
             )
     height = demos.start_pose[0][:, 2]
-    off_table = (height < _HEIGHTS[0]) | (height > _HEIGHTS[1])
     distance, angle = start_to_goal(demos)
-    at_goal = (distance < _SAME_PLACE) & (angle < _SAME_TURN)
     for wrong, sentence in (
-        (off_table, "far from the table's top, z = 0. Are these coordinates of a camera?"),
         (
-            at_goal,
+            (height < _HEIGHTS[0]) | (height > _HEIGHTS[1]),
+            "far from the table's top, z = 0. Are these coordinates of a camera?",
+        ),
+        (
+            (distance < _SAME_PLACE) & (angle < _SAME_TURN),
             "at its goal already. A policy that leaves the object untouched solves such a demonstration.",
         ),
     ):
@@ -71,11 +77,3 @@ def start_to_goal(demos: Demos) -> tuple[np.ndarray, np.ndarray]:
         * Rotation.from_quat(start_quat, scalar_first=True).inv()
     )
     return np.linalg.norm(goal_pos - start_pos, axis=1), turn.magnitude()
-
-
-def _along_fingers(hand: np.ndarray, quat_wxyz: np.ndarray, right: np.ndarray) -> float:
-    """Return the median cosine between the fingers and the wrist's -x axis, of a left hand +x, over frames [F]."""
-    fingers = hand[:, [5, 9, 13, 17]].mean(axis=1) - hand[:, 0]
-    fingers /= np.linalg.norm(fingers, axis=1, keepdims=True).clip(1e-9)
-    axes = Rotation.from_quat(quat_wxyz, scalar_first=True).apply([1.0, 0.0, 0.0])
-    return float(np.median(np.where(right, -1.0, 1.0) * (axes * fingers).sum(axis=1)))

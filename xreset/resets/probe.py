@@ -46,7 +46,8 @@ def probe(
     """
     plan = schedule(object_index, num_envs)
     worlds = torch.as_tensor(plan.object_index)
-    verdicts = None
+    rows = []
+    verdicts = []
     done = 0
     with make_backend(
         engine, scene, len(worlds), object_index=worlds, device=device_for(engine, device)
@@ -54,14 +55,11 @@ def probe(
         for items, fresh in plan:
             start = states[torch.as_tensor(items)].to(backend.device)
             settle(backend, start, gravity=gravity, steps=steps)
-            found = judge(backend, start).cpu().numpy()
-            if verdicts is None:
-                verdicts = np.empty((len(object_index), *found.shape[1:]), dtype=found.dtype)
-            verdicts[items[fresh]] = found[fresh]
-            done += int(fresh.sum())
+            rows.append(items[fresh])
+            verdicts.append(judge(backend, start).cpu().numpy()[fresh])
+            done += len(rows[-1])
             progress(done)
-    assert verdicts is not None, "there is at least one state"
-    return verdicts
+    return np.concatenate(verdicts)[np.argsort(np.concatenate(rows))]
 
 
 def settle(backend: Backend, start: State, *, gravity: float, steps: int) -> None:

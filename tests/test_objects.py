@@ -298,10 +298,8 @@ class MeshImport(InFolder):
         content = self.write(BOX).read_bytes() + b"#" * (2 << 20)
         with zipfile.ZipFile(self.folder / "mesh.3mf", "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr("mesh.obj", content)
-        header = {
-            "asset": {"version": "2.0"},
-            "accessors": [{"componentType": 5126, "type": "VEC3", "count": 10**9}],
-        }
+        accessor = {"componentType": 5126, "type": "VEC3", "count": 10**9}
+        header = {"asset": {"version": "2.0"}, "accessors": [accessor]}
         (self.folder / "huge.gltf").write_text(json.dumps(header))
         scene = trimesh.Scene(BOX)
         for i in range(50):
@@ -463,10 +461,10 @@ class ThinWalls(unittest.TestCase):
         self.assertFalse(sheet.is_volume)
         solid = as_solid(sheet)
         self.assertAlmostEqual(solid.volume(), sheet.area * 0.001, delta=0.1 * sheet.area * 0.001)
-        pieces = decompose(sheet)
+        pieces = decompose(sheet, Settings(hull_depth=0.0, tolerance=0.004))
         # 20 mm above the bottom
         self.assertGreater(self.room(np.array([0, 0, 0.02]), pieces), 0.012)
-        self.assertLess(pieces.deviation, 0.002)
+        self.assertLess(pieces.deviation, 0.004)
 
     def test_limits_of_pieces_and_effort(self):
         few = decompose(RING, Settings(max_pieces=3))

@@ -94,7 +94,7 @@ class PadsTest(unittest.TestCase):
     def test_an_object_is_held_between_the_human_s_thumb_and_a_finger(self):
         demos = synthesize(["soup"], per_object=1, seed=1)
         objects = list(demo_objects(demos).values())
-        config = HandConfig(clearance_growth=(), iterations=0)
+        config = HandConfig(clearance_weight=0.0, iterations=0)
         hands = HandMotions(demos, self.model.robot, objects, RetargetConfig(hand=config))
         [(*_, targets, _)] = hands.batches()
         self.assertFalse(targets.held[0, 0])

@@ -250,7 +250,9 @@ def _contacts_at(
         np.isfinite(end) & (room_after > _FINGER_ROOM) & (facing_thumb > 0.75) & above_table[:, 0]
     )
     width = end - start[:, 0]
-    depth = _depth(solid, centers, approach)
+    # length of the object before each center, along the approach: how deep the hand must reach
+    into, out, *_ = solid.crossings(centers, approach)
+    depth = -np.where((into <= out) & (into < 0), into, 0.0).min(axis=0)
     with np.errstate(invalid="ignore"):
         good = thumb & finger[:, 1] & finger[:, 2] & (width < MAX_OPENING) & (width > MIN_WIDTH)
     good &= (depth > 0.004) & (depth < 0.055)
@@ -275,13 +277,6 @@ def _contacts_at(
         )
         found.append(Contacts(points=points, approach=approach, closing=closing, cost=float(cost)))
     return found
-
-
-def _depth(solid: Solid, points: np.ndarray, approach: np.ndarray) -> np.ndarray:
-    """[n] length of the object before each point, along the approach: how deep the hand must reach."""
-    enter, leave, _, _ = solid.crossings(points, approach)
-    before = (enter <= leave) & (enter < 0)
-    return -np.where(before, enter, 0.0).min(axis=0)
 
 
 def fit_hand(solid: Solid, contacts: Contacts, side: str = "right") -> Grasp:

@@ -253,8 +253,7 @@ def _sequence(arrays: Mapping[str, np.ndarray], convention: Convention) -> Demos
     side = _text(arrays, "side", convention.side)
     if side not in SIDES:
         raise DemoError(f"the side is {shown(side)}, expected right or left.")
-    for problem in _hand_problems(points[valid], convention, side):
-        raise DemoError(problem)
+    _check_hand(points[valid], convention, side)
     points[~valid] = np.nan
     points = points[:, ORDERS[convention.order]]
     T_table = np.eye(4) if convention.table_from_camera is None else convention.table_from_camera
@@ -298,13 +297,13 @@ def _text(arrays: Mapping[str, np.ndarray], field: str, option: str | None) -> s
     return text
 
 
-def _hand_problems(points: np.ndarray, convention: Convention, side: str) -> Iterator[str]:
-    """Yield what in keypoints [F, 21, 3] in metres, in the file's order, contradicts the convention; the likeliest
-    cause first."""
+def _check_hand(points: np.ndarray, convention: Convention, side: str) -> None:
+    """Refuse keypoints [F, 21, 3] in metres, in the file's order, that contradict the convention; the likeliest cause
+    comes first."""
     order = ORDERS[convention.order]
     palm = 1e3 * float(np.median(np.linalg.norm(points[:, order[9]] - points[:, 0], axis=1)))
     if not _PALM[0] <= palm <= _PALM[1]:
-        yield (
+        raise DemoError(
             f"from the wrist to the middle finger's knuckle it is {palm:.3g} mm, expected 60 to 140 mm. Is --units"
             f" {convention.units} right? Keypoints must be metric and in space, not those of an image."
         )
@@ -313,7 +312,7 @@ def _hand_problems(points: np.ndarray, convention: Convention, side: str) -> Ite
     }
     best = min(lengths, key=lambda name: lengths[name])
     if lengths[convention.order] > _ORDER_RATIO * lengths[best]:
-        yield (
+        raise DemoError(
             f"in the order {convention.order} the bones of the hand are {lengths[convention.order]:.2f} m long"
             " together, in the order"
             f" {best} {lengths[best]:.2f} m. Use --order {best}."
@@ -322,13 +321,13 @@ def _hand_problems(points: np.ndarray, convention: Convention, side: str) -> Ite
     bones = hand.bone_lengths(points)
     spread = np.median(bones.std(axis=0) / bones.mean(axis=0))
     if spread > _BONE_SPREAD:
-        yield (
+        raise DemoError(
             f"the lengths of the hand's bones change by {spread:.0%} (standard deviation) during the sequence, so"
             " the keypoints are"
             " not metric. MediaPipe's normalised landmarks, for example, are coordinates of the image."
         )
     if len(points) > 1 and np.linalg.norm(points.mean(axis=1), axis=1).max() < _CENTERED:
-        yield (
+        raise DemoError(
             "the keypoints are centred on the hand in every frame, like MediaPipe's world landmarks, so the"
             " place of the hand is"
             " unknown. Add the hand's position in the camera's or the table's frame first."
@@ -340,7 +339,7 @@ def _hand_problems(points: np.ndarray, convention: Convention, side: str) -> Ite
     fingers = points[:, [8, 12, 16, 20]] - points[:, [5, 9, 13, 17]]
     curl = np.median((fingers * palm_normal[:, None]).sum(axis=-1))
     if curl < -_CURL:
-        yield (
+        raise DemoError(
             f"as a {side} hand its fingers bend {-1e3 * curl:.0f} mm towards the back of the hand. It is the"
             " other hand (--side)"
             " or the coordinates are left-handed, as Unity's are: negate one axis of keypoints and poses."

@@ -3,18 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import inf
-from typing import Annotated, Literal
+from typing import Literal
 
-from xreset.checks import Checked, Finite, NotNegative, Positive, Rule
-
-Shares = Annotated[
-    tuple[float, ...],
-    Rule(
-        "finite numbers, 0 or more",
-        lambda x: all(0 <= share < inf for share in x),
-    ),
-]
+from xreset.checks import Checked, Finite, NotNegative, Positive
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,11 +48,6 @@ class HandConfig(Checked):
     """Change of a hand joint between neighboring frames beyond ``jump_limit``."""
     length_scale: Positive[float] = 0.10
     """Length that counts as much as one radian [m]: about a finger's length."""
-    clearance_growth: Shares = (0.01, 0.1)
-    """Shares of ``clearance_weight`` in earlier stages, each of which starts the next. A hand that may pass through the
-    object at first finds the right side of a handle or a rim. Empty: no earlier stage."""
-    growth_iterations: NotNegative[int] = 6
-    """Most Levenberg-Marquardt steps of each earlier stage."""
     iterations: NotNegative[int] = 40
     """Most Levenberg-Marquardt steps with the full weight."""
     tolerance: NotNegative[float] = 1e-3

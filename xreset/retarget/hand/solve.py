@@ -29,6 +29,12 @@ from xreset.retarget.hand.jaw import jaw_state
 from xreset.retarget.hand.model import HandModel, HandState, HandTargets
 from xreset.retarget.least_squares import free_to_move, minimize, solve_chain
 
+_CLEARANCE_GROWTH = (0.01, 0.1)
+"""Shares of the clearance's weight in earlier stages, each of which starts the next. A hand that may pass through the
+object at first finds the right side of a handle or a rim."""
+_GROWTH_STEPS = 6
+"""Most Levenberg-Marquardt steps of each earlier stage."""
+
 
 def retarget_hand(
     model: HandModel,
@@ -57,12 +63,9 @@ def retarget_hand(
     joints = model.kinematics.clamp(model.home).expand(*targets.annotated.shape, -1)
     state = HandState(joints, root_pos, root_quat)
     if config.clearance_weight:
-        for share in config.clearance_growth:
-            stage = replace(
-                config,
-                clearance_weight=share * config.clearance_weight,
-                iterations=config.growth_iterations,
-            )
+        for share in _CLEARANCE_GROWTH:
+            weight = share * config.clearance_weight
+            stage = replace(config, clearance_weight=weight, iterations=_GROWTH_STEPS)
             state = _minimize(model, targets, stage, state)
     return _minimize(model, targets, config, state).to(home)
 

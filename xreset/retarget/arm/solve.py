@@ -4,7 +4,7 @@ paper, appendix D.b).
     q_t = argmin  50 |p(q) - p_t|^2 + 10 d_R(R(q), R_t)^2 + lambda_s |q - q_{t-1}|^2 + E_coll(q),   within the joint
     limits,
 
-by Levenberg-Marquardt with projected steps (``cost``), frame after frame, batched over sequences.
+by Levenberg-Marquardt with projected steps, frame after frame, batched over sequences.
 
 The first frame starts from random restarts. The best few distinct solutions are all followed, and the one with most
 valid frames wins, because the first frame does not show which branch lasts. Where a frame fails, the same is tried
@@ -17,7 +17,7 @@ support points.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -32,6 +32,7 @@ from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.arm.model import ArmModel, ArmProblem, ArmTargets, arm_jump
 from xreset.retarget.least_squares import Quadratic, free_to_move, minimize
 from xreset.retarget.validity import REASONS, Measures, Thresholds, classify
+from xreset.tensors import Tensors
 
 _CONVERGED = 1e-5
 """Steps smaller than this end the iteration [rad or m]."""
@@ -41,6 +42,16 @@ _HOME_BIAS = 1e-3
 """Preference among solutions of the first frame for those near home [1/rad^2]."""
 _DISTINCT = 0.5
 """Solutions of the first frame differ if a joint differs by this much [rad or m]."""
+
+
+@dataclass(frozen=True)
+class Paths(Tensors):
+    """K paths of each sequence."""
+
+    joints: Tensor
+    """[S, K, T, n]"""
+    sound: Tensor
+    """[S, K, T] bool: whether a frame is valid if the joints do not jump there."""
 
 
 def track(
@@ -65,42 +76,37 @@ def track(
         config=config or ArmConfig(),
     )
     forwards = branches(problem)
-    joints, worth = best(problem, *forwards)
+    joints, worth = best(problem, forwards)
     failing = (problem.reasons(joints) > REASONS.index("hand error")).any(dim=1).nonzero()[:, 0]
     if len(failing):
-        paths, sound = forwards
         joints[failing] = _rescued(
-            problem[failing], paths[failing], sound[failing], joints[failing], worth[failing]
+            problem[failing], forwards[failing], joints[failing], worth[failing]
         )
     return joints, problem.measures(joints)
 
 
-def _rescued(
-    problem: ArmProblem, paths: Tensor, sound: Tensor, joints: Tensor, worth: Tensor
-) -> Tensor:
+def _rescued(problem: ArmProblem, paths: Paths, joints: Tensor, worth: Tensor) -> Tensor:
     """[S, T, n] better paths than ``joints`` [S, T, n], where there are any, for sequences with frames that fail.
 
     Args:
         problem: the problem of these sequences.
         paths: their paths from the first frame.
-        sound: which of the paths' frames are good.
         joints: the best of those.
         worth: [S] its worth.
     """
     if problem.annotated.shape[1] > 1:
         turned = problem.reversed()
         backwards = branches(turned)
-        back, other = best(turned, *backwards)
+        back, other = best(turned, backwards)
         joints = torch.where((other > worth)[:, None, None], back.flip(1), joints)
-        paths = torch.cat((paths, backwards[0].flip(2)), dim=1)
-        sound = torch.cat((sound, backwards[1].flip(2)), dim=1)
+        paths = Paths.cat((paths, backwards.map(lambda x: x.flip(2))), dim=1)
     if problem.config.reseeds:
         reason = problem.reasons(joints)
         missed = torch.isin(reason, torch.tensor([REASONS.index(name) for name in _WRIST_MISSED]))
         rows = missed.any(dim=1).nonzero()[:, 0]
         if len(rows):
             part = problem[rows]
-            new = repaired(part, paths[rows], sound[rows], missed[rows])
+            new = repaired(part, paths[rows], missed[rows])
             better = (part.reasons(new) == 0).sum(1) > (reason[rows] == 0).sum(1)
             joints[rows[better]] = new[better]
     return joints
@@ -115,37 +121,36 @@ def follow(problem: ArmProblem, start: Tensor) -> Tensor:
     return torch.stack(path, dim=1)
 
 
-def branches(problem: ArmProblem) -> tuple[Tensor, Tensor]:
-    """Return the paths [S, K, T, n] from distinct solutions of the first frame, and which of their frames are good."""
+def branches(problem: ArmProblem) -> Paths:
+    """Return the paths from distinct solutions of the first frame."""
     starts = _first_frames(problem)  # [S, K, n]
-    paths = follow(problem.repeated(starts.shape[1]), starts.flatten(0, 1)).unflatten(
-        0, starts.shape[:2]
-    )
-    return paths, is_sound(problem, paths)
+    paths = follow(problem.repeated(starts.shape[1]), starts.flatten(0, 1))
+    return judged(problem, paths.unflatten(0, starts.shape[:2]))
 
 
-def is_sound(problem: ArmProblem, paths: Tensor) -> Tensor:
-    """[S, K, T] bool: whether a frame of the paths [S, K, T, n] is valid if the joints do not jump there.
+def judged(problem: ArmProblem, paths: Tensor) -> Paths:
+    """Return paths [S, K, T, n] with which of their frames are good.
 
     A jump depends on the frame before, and so on the direction and on where paths are spliced; everything else depends
     on the frame alone and is measured once.
     """
     measures = problem.repeated(paths.shape[1]).measures(paths.flatten(0, 1))
     no_jumps = replace(measures, arm_jump=torch.zeros_like(measures.arm_jump))
-    return (classify(no_jumps, problem.thresholds) == 0).view(paths.shape[:3])
+    sound = classify(no_jumps, problem.thresholds) == 0
+    return Paths(paths, sound.view(paths.shape[:3]))
 
 
-def best(problem: ArmProblem, paths: Tensor, sound: Tensor) -> tuple[Tensor, Tensor]:
+def best(problem: ArmProblem, paths: Paths) -> tuple[Tensor, Tensor]:
     """Return the path [S, T, n] that is worth most, and its worth [S]: see the config."""
-    jump = arm_jump(paths, problem.annotated[:, None])
-    valid = (sound & (jump <= problem.thresholds.arm_jump)).sum(-1)
-    detour = (paths - problem.model.home).square().sum(-1).mean(-1)
+    jump = arm_jump(paths.joints, problem.annotated[:, None])
+    valid = (paths.sound & (jump <= problem.thresholds.arm_jump)).sum(-1)
+    detour = (paths.joints - problem.model.home).square().sum(-1).mean(-1)
     worth, which = (valid - problem.config.detour_cost * detour).max(dim=1)
-    return paths[torch.arange(len(which)), which], worth
+    return paths.joints[torch.arange(len(which)), which], worth
 
 
-def repaired(problem: ArmProblem, known: Tensor, sound: Tensor, missed: Tensor) -> Tensor:
-    """[S, T, n] the best path from pieces of the ``known`` paths, whose good frames are ``sound``, and of new ones.
+def repaired(problem: ArmProblem, known: Paths, missed: Tensor) -> Tensor:
+    """[S, T, n] the best path from pieces of known paths and of new ones.
 
     The new paths lead both ways from some of the frames that are ``missed`` [S, T], solved again: a path from either
     end may be stuck at a limit there, on the wrong side of the arm's null space.
@@ -155,16 +160,17 @@ def repaired(problem: ArmProblem, known: Tensor, sound: Tensor, missed: Tensor) 
     count = torch.bincount(owner, minlength=len(missed))
     column = torch.arange(len(owner)) - (count.cumsum(0) - count)[owner]
     # Sequences with fewer new paths than others repeat a known one.
-    new = known[:, :1].repeat(1, int(count.max()), 1, 1)
+    new = known.joints[:, :1].repeat(1, int(count.max()), 1, 1)
     new[owner, column] = paths
-    sound = torch.cat((sound, is_sound(problem, new)), dim=1)
-    known = torch.cat((known, new), dim=1)
+    known = Paths.cat((known, judged(problem, new)), dim=1)
+    joints = known.joints
 
     annotated = problem.annotated
-    detour = config.detour_cost * (known - problem.model.home).square().sum(-1) * annotated[:, None]
+    detour = config.detour_cost * (joints - problem.model.home).square().sum(-1)
+    detour = detour * annotated[:, None]
     return splice(
-        known,
-        worth=sound.to(known.dtype),
+        joints,
+        worth=known.sound.to(joints.dtype),
         cost=detour / annotated.sum(1)[:, None, None],
         annotated=annotated,
         jump=problem.thresholds.arm_jump,

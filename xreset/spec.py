@@ -292,6 +292,5 @@ def _lowest(shape: Shape, up: np.ndarray) -> float:
     if geometry.kind == "sphere":
         return float(z - geometry.size[0])
     radius, half = geometry.size
-    if geometry.kind == "capsule":
-        return float(z - abs(row[2]) * half - radius)
-    return float(z - abs(row[2]) * half - radius * np.hypot(row[0], row[1]))
+    tilt = 1.0 if geometry.kind == "capsule" else np.hypot(row[0], row[1])
+    return float(z - abs(row[2]) * half - radius * tilt)

@@ -23,7 +23,7 @@ from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import half_spaces, shape_mesh, transformed
 from xreset.geometry.solids import link_field
-from xreset.spec import Geometry, RobotSpec, Shape
+from xreset.spec import Geometry, Shape
 from xreset.tensors import Tensors
 
 SPACING = 4e-3
@@ -74,45 +74,31 @@ class Balls(Tensors):
     both ways."""
 
 
-def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> Balls:
-    """Fill a hand with balls.
-
-    Args:
-        robot: the robot.
-        hand: kinematics of its hand.
-        collision: decides which links must not overlap.
-    """
-    links: list[str] = []
-    centers = []
-    radii = []
-    fields = []
+def hand_balls(hand: Kinematics, collision: SelfCollision) -> Balls:
+    """Fill a hand with balls; ``collision`` decides which of its links must not overlap."""
+    solids = {}
+    for name in hand.link_names:
+        if shapes := hand.tree.link(name).collisions:
+            solids[name] = shapes
+    links = tuple(solids)
+    balls = [link_balls(shapes) for shapes in solids.values()]
+    centers = [own for own, _ in balls]
+    radii = [own for _, own in balls]
+    slices = _slices(radii)
     guards = []
     guard_radii = []
-    first = 0
-    for name in hand.link_names:
-        shapes = hand.tree.link(name).collisions
-        if not shapes:
-            continue
-        own_centers, own_radii = link_balls(shapes)
+    for own_centers, own_radii, own in zip(centers, radii, slices, strict=True):
         chosen = _apart(own_centers, own_radii, APART)
         gaps = np.linalg.norm(own_centers[chosen][:, None] - own_centers, axis=-1)
         has_neighbor = (gaps <= APART).sum(axis=1) > 1
-        links.append(name)
-        centers.append(own_centers)
-        radii.append(own_radii)
-        guards.append(chosen + first)
+        guards.append(chosen + own.start)
         guard_radii.append(own_radii[chosen] + STAND_IN * has_neighbor)
-        fields.append(link_field(shapes))
-        first += len(own_radii)
-    pairs = []
-    for pair in collision.link_pairs:
-        if set(pair) <= set(links):
-            pairs.append([links.index(name) for name in pair])
+    pairs = [(links.index(a), links.index(b)) for a, b in collision.link_pairs]
     both_ways = np.array([*pairs, *(pair[::-1] for pair in pairs)], dtype=np.int64)
     bound_centers, bound_radii = bounding_balls(centers, radii)
     return Balls(
-        links=tuple(links),
-        slices=_slices(radii),
+        links=links,
+        slices=slices,
         link=torch.as_tensor(np.repeat(np.arange(len(links)), [len(own) for own in radii])),
         centers=_joined(centers, 3),
         radii=_joined(radii),
@@ -121,7 +107,7 @@ def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> 
         guards=_joined(guards).long(),
         guard_radii=_joined(guard_radii),
         guard_slices=_slices(guard_radii),
-        fields=DistanceFields.join(fields),
+        fields=DistanceFields.join([link_field(shapes) for shapes in solids.values()]),
         link_pairs=torch.as_tensor(both_ways.reshape(-1, 2)),
     )
 

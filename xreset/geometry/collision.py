@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from xreset.errors import XResetError
+from xreset.errors import needs
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import transformed
 from xreset.geometry.urdf import RobotTree
@@ -129,12 +129,8 @@ class SelfCollision:
         Raises:
             XResetError: coal is not installed.
         """
-        try:
+        with needs("coal, which measures self-collision,", "retarget"):
             import coal
-        except ImportError as error:
-            raise XResetError(
-                f"Self-collision needs coal, which cannot be imported ({error}). Run: pip install 'xreset[retarget]'"
-            ) from error
         self._coal = coal
         self._link: list[str] = []
         self._geometry: list = []

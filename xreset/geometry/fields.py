@@ -56,11 +56,6 @@ class DistanceFields(Tensors):
     @staticmethod
     def join(parts: Sequence[DistanceFields]) -> DistanceFields:
         """Join the fields of several objects; all must have the same spacing and device."""
-        spacings = {part.spacing for part in parts}
-        if len(spacings) != 1:
-            raise ValueError(
-                f"The grids have different spacings: {sorted(spacings)}. Sample all with the same one."
-            )
         start = []
         nodes = 0
         for part in parts:

@@ -276,9 +276,6 @@ class Kinematics:
     def _forward(self, q: Tensor, base: Tensor | None, wanted: Sequence[int]):
         """Return rotations [B, n, 3, 3] and positions [B, n, 3] of the wanted links, and the axes and origins [B, 3] of
         the joints above them, by row among the moving joints."""
-        if q.shape[-1] != len(self.joint_names):
-            expected = f"{len(self.joint_names)} ({', '.join(self.joint_names)})"
-            raise ValueError(f"q has {q.shape[-1]} joints, expected {expected}")
         values = q.reshape(-1, q.shape[-1]) @ self._coupling.T + self._constant  # [B, M]
         sines = torch.sin(values)
         cosines = 1.0 - torch.cos(values)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from xreset.errors import RobotError
+from xreset.errors import RobotError, needs
 from xreset.geometry.shapes import mass_properties, surface_of
 from xreset.geometry.urdf import Link, RobotTree, load_urdf, parse_xml
 from xreset.geometry.urdf_writer import FRAME_INERTIA, FRAME_MASS, fixed
@@ -61,13 +61,8 @@ def read_source(path: str | Path, notes: list[str]) -> RobotTree:
     if root.tag == "mujocoinclude":
         raise RobotError(f"{path} is a part of an MJCF. Give the file that includes it.")
     if root.tag == "mujoco":
-        try:
+        with needs(f"mujoco, which reads {path},", "mujoco", RobotError):
             from xreset.robot_tools.mjcf import read_mjcf
-        except ImportError as error:
-            raise RobotError(
-                f"{path} is MJCF, which only MuJoCo reads, and that cannot be imported ({error}). Run: pip install "
-                "mujoco"
-            ) from error
         tree = read_mjcf(path, root, notes)
     else:
         tree = load_urdf(path)

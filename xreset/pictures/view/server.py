@@ -35,7 +35,31 @@ class WebPage:
         Raises:
             XResetError: viser is not installed, or the server does not start.
         """
-        self._server = _start_server(host, port, label)
+        with needs("viser, without which --png and --mp4 of xreset view work,", "viewer"):
+            import viser
+        try:
+            with _own_page_only(host) as guarded:
+                server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
+        except OSError as error:
+            raise XResetError(
+                f"Cannot serve the page at {host}:{port}: {error}. Choose another --host or --port."
+            ) from error
+        if not guarded:
+            server.stop()
+            raise XResetError(
+                "This version of viser cannot be restricted to its own page. Install viser 1.1."
+            )
+        camera = Camera()
+        server.initial_camera.position = camera.eye
+        server.initial_camera.look_at = camera.target
+        server.initial_camera.fov = camera.fov
+        server.scene.set_up_direction("+z")
+        table = TableSpec()
+        size = 2 * np.array(table.half_size)
+        server.scene.add_box(
+            "/table", rgb(TABLE_COLORS[0]), size, position=(*table.center, -table.half_size[2])
+        )
+        self._server = server
 
     @property
     def url(self) -> str:
@@ -48,34 +72,6 @@ class WebPage:
     def close(self) -> None:
         """Stop the server."""
         self._server.stop()
-
-
-def _start_server(host: str, port: int, label: str) -> Any:
-    with needs("viser, without which --png and --mp4 of xreset view work,", "viewer"):
-        import viser
-    try:
-        with _own_page_only(host) as guarded:
-            server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
-    except OSError as error:
-        raise XResetError(
-            f"Cannot serve the page at {host}:{port}: {error}. Choose another --host or --port."
-        ) from error
-    if not guarded:
-        server.stop()
-        raise XResetError(
-            "This version of viser cannot be restricted to its own page. Install viser 1.1."
-        )
-    camera = Camera()
-    server.initial_camera.position = camera.eye
-    server.initial_camera.look_at = camera.target
-    server.initial_camera.fov = camera.fov
-    server.scene.set_up_direction("+z")
-    table = TableSpec()
-    size = 2 * np.array(table.half_size)
-    server.scene.add_box(
-        "/table", rgb(TABLE_COLORS[0]), size, position=(*table.center, -table.half_size[2])
-    )
-    return server
 
 
 def serve_until_interrupted(server: Any) -> None:

@@ -112,7 +112,7 @@ class HandModel:
         self.table = TableSpec()
 
         collision = SelfCollision(robot, on_cpu, only=robot.self_collision_links)
-        self.balls = hand_balls(robot, on_cpu, collision).to(self.device)
+        self.balls = hand_balls(on_cpu, collision).to(self.device)
         """Balls that keep the hand out of the object, the table and itself."""
         pads = self._pads()
         self.pad_balls = torch.cat(pads)

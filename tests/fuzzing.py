@@ -35,6 +35,7 @@ from xreset.geometry import urdf
 from xreset.learning.config import TrainConfig
 from xreset.learning.run import RunInfo, read_run, write_run
 from xreset.physics import State
+from xreset.records import Field
 from xreset.resets.bank import read_bank, write_bank
 from xreset.retarget.file import read_retargeted, write_retargeted
 
@@ -238,7 +239,7 @@ def readers() -> Iterator[dict[str, Reader]]:
             add(
                 "DexYCB poses",
                 "pose.npz",
-                lambda p: {"pose_y": _read_npz(p, {"pose_y": (4, 1, 7)})},
+                lambda p: {"pose_y": _read_npz(p, {"pose_y": Field((4, 1, 7), "fi", within=None)})},
                 "npz",
                 ("pose_y",),
             ),

@@ -31,6 +31,8 @@ from xreset.text import shown
 
 FPS = 30.0
 _MAX_YAML_BYTES = 1 << 20
+_POSE = (-1e3, 1e3)
+"""Range of the numbers of a pose: metres, quaternions and MANO's angles are smaller by far."""
 _Poses = Mapping[str, np.ndarray]
 """Camera serial, or ``apriltag`` -> pose [4, 4] in the world frame."""
 
@@ -71,14 +73,14 @@ def _read(folder: Path, meta: Mapping[str, Any], extrinsics: _Poses) -> Demos:
     frames = meta["num_frames"]
     grasped = meta["ycb_grasp_ind"]
     pose_object, pose_hand = _read_npz(
-        path, {"pose_y": (frames, len(meta["ycb_ids"]), 7), "pose_m": (frames, 1, 51)}
+        path,
+        {
+            "pose_y": Field((frames, len(meta["ycb_ids"]), 7), "fi", within=_POSE),
+            "pose_m": Field((frames, 1, 51), "fi", within=_POSE),
+        },
     )
     pose_object = pose_object[:, grasped]
     pose_hand = pose_hand[:, 0]
-    if not (np.abs(pose_object) < 1e3).all() or not (np.abs(pose_hand) < 1e3).all():
-        raise DemoError(
-            f"{path} holds numbers that are not finite, or far too large. Unpack it again."
-        )
     unknown = np.linalg.norm(pose_object[:, :4], axis=1) < 0.5
     if unknown.any():
         raise DemoError(f"{path}: frame {np.argmax(unknown)} has no object pose.")
@@ -112,7 +114,7 @@ def _read_joints(folder: Path, frame: int, cameras: _Poses) -> np.ndarray:
     for serial, pose in cameras.items():
         path = folder / serial / f"labels_{frame:06d}.npz"
         if path.is_file():
-            (joints,) = _read_npz(path, {"joint_3d": (1, 21, 3)})
+            (joints,) = _read_npz(path, {"joint_3d": Field((1, 21, 3), "fi", within=None)})
             if (joints == -1).all():
                 return np.full((21, 3), np.nan)
             return _transform(pose, joints[0])
@@ -186,13 +188,12 @@ def _read_yaml(path: Path) -> dict[str, Any]:
         ) from error
 
 
-def _read_npz(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> list[np.ndarray]:
-    """Return arrays of these names and shapes, as floats."""
+def _read_npz(path: Path, schema: Mapping[str, Field]) -> list[np.ndarray]:
+    """Return the arrays of a schema, as floats."""
     if not path.is_file():
         raise DemoError(f"There is no {path}; the sequence is incomplete. Unpack it again.")
-    schema = {name: Field(shape, "fi", within=None) for name, shape in shapes.items()}
     try:
         arrays = read_npz(path, None, schema, what="a file of DexYCB with the frames of meta.yml")
     except FileFormatError as error:
         raise DemoError(f"{error} Unpack the sequence again.") from error
-    return [arrays[name].astype(float) for name in shapes]
+    return [arrays[name].astype(float) for name in schema]

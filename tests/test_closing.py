@@ -16,6 +16,7 @@ from tests.test_cli import run
 from tests.toy_bank import toy_bank, toy_retargeted
 from xreset.accounts import accounts_path
 from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.rotations import quat_rotate
 from xreset.plugins import make_backend
 from xreset.resets.bank import read_bank, write_bank
 from xreset.resets.closing import closing_states, positions_between, rotations_between
@@ -240,6 +241,14 @@ class TargetsTest(unittest.TestCase):
         torch.testing.assert_close(
             drawn.joint_target, drawn.joint_pos + 0.25 * drawn.from_bank[:, None]
         )
+        pivot = torch.tensor([0.03, -0.01, 0.02])
+        pivots = dict.fromkeys(bank.object_names, pivot.numpy())
+        turned = ResetDistribution(
+            bank, ROBOT, bank.object_names, ResetConfig(spawn_xy=0.0, spawn_yaw=1.0), pivots=pivots
+        ).home(torch.tensor([0, 1, 2]), torch.Generator().manual_seed(0))
+        still = turned.object_pos + quat_rotate(turned.object_quat, pivot.expand(3, 3))
+        torch.testing.assert_close(still, torch.as_tensor(bank.start_pos) + pivot)
+        self.assertGreater(turned.object_quat[:, 3].abs().max().item(), 0.1)
         chosen = bank_starts(bank, np.array([4, 1]))
         torch.testing.assert_close(chosen.joint_target, chosen.joint_pos + 0.25)
 

@@ -60,6 +60,8 @@ class MadeTest(unittest.TestCase):
         self.assertTrue(
             (goals.goal_pos[:, 2] > rest_height(self.banana, goals.goal_quat_wxyz)).all()
         )
+        ups = rotations(goals.start_quat_wxyz).inv().apply([0.0, 0.0, 1.0])
+        self.assertLess((ups @ ups.T).min(), 0.9, "the banana rests on one side only")
         shift = self.centers(goals, "goal") - self.centers(goals, "start")
         np.testing.assert_allclose(shift[:4], np.tile([0.0, 0.0, 0.2], (4, 1)), atol=1e-5)
         turn = rotations(goals.goal_quat_wxyz) * rotations(goals.start_quat_wxyz).inv()

@@ -119,6 +119,14 @@ class Synthetic(InFolder):
             object_quat_wxyz=2 * wxyz,
         )
 
+        pos = self.demos.object_pos.copy()
+        pos[3] = np.nan
+        path = self.folder / "a.csv"
+        columns = {"object": "soup", "side": "right"}
+        write_csv(path, self.points, pos, self.turn, columns=columns)
+        with self.assertRaisesRegex(DemoError, "of frame 3 is not a position"):
+            read_keypoints(path, PLAIN)
+
     def test_what_is_not_known_is_asked_for(self):
         self.refused("--table-from-camera FILE", replace(PLAIN, frame="camera"))
         self.refused("table must not have one", replace(PLAIN, table_from_camera=np.eye(4)))

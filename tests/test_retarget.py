@@ -202,10 +202,26 @@ class HandTest(unittest.TestCase):
         depth = []
         for weight in (0.0, 2000.0):
             motion = retarget_hand(self.model, inside, HandConfig(clearance_weight=weight))
-            distance = self.too_near(inside, motion, HandConfig()).value
-            depth.append(max((-distance).tolist(), default=0.0))
+            near = self.too_near(inside, motion, HandConfig())
+            depth.append(max((-near.value).tolist(), default=0.0))
+            if weight == 0.0:
+                self.check_distances(inside, motion, near)
         self.assertGreater(depth[0], 0.02)
         self.assertLess(depth[1], 0.005)
+
+    def check_distances(self, targets: HandTargets, motion: HandState, near: Distances) -> None:
+        """Distances from the object are those of the balls' surfaces, less what the hand keeps."""
+        balls = self.model.balls
+        number = near.number - len(balls.radii)
+        mine = (number >= 0) & (number < len(balls.radii))
+        ball = number[mine]
+        frame = near.frame[mine]
+        bodies = self.model.bodies(*(x.flatten(0, 1) for x in vars(motion).values()))
+        local = self.model.ball_centers(bodies, frame, ball)
+        local = local - targets.object_pos.flatten(0, 1)[frame]
+        distance, _ = targets.fields.signed_distance(local, torch.zeros_like(ball))
+        expected = distance - balls.radii[ball] - HandConfig().object_clearance
+        assert_close(near.value[mine], expected, atol=1e-9, rtol=0)
 
     def test_pairs_for_any_subset_of_keypoints(self):
         jaws = keypoint_pairs(
@@ -315,6 +331,7 @@ class PipelineTest(unittest.TestCase):
         demos = synthesize(["soup"], per_object=2, seed=0, fps=20)
         valid = demos.hand_valid.copy()
         valid[demos.frames(1)] = False  # a sequence in which the hand was never seen
+        valid[0] = False
         keypoints = np.where(valid[:, None, None], demos.hand_keypoints, np.nan)
         cls.demos = dataclasses.replace(demos, hand_valid=valid, hand_keypoints=keypoints)
         cls.objects = list(demo_objects(demos).values())
@@ -361,6 +378,7 @@ class PipelineTest(unittest.TestCase):
         np.testing.assert_array_equal(joints, np.tile(self.robot.home, (len(joints), 1)))
         self.assertEqual({REASONS[r] for r in self.result.reason[self.second]}, {"not annotated"})
         self.assertEqual(self.result.first_contact[1], -1)
+        np.testing.assert_array_equal(np.isinf(self.result.hand_error), ~self.result.annotated)
         np.testing.assert_array_equal(self.result.goal_pos[1], self.result.object_pos[-1])
 
     def test_a_file_comes_back_and_the_same_inputs_give_the_same_file(self):

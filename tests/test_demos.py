@@ -530,20 +530,8 @@ class Plausible(unittest.TestCase):
 class Commands(InFolder):
     def test_synth_then_info(self):
         file = self.folder / "demos.npz"
-        synth = (
-            "demos",
-            "synth",
-            "--out",
-            file,
-            "--objects",
-            "soup",
-            "--per-object",
-            1,
-            "--side",
-            "both",
-            "--fps",
-            10,
-        )
+        options = "--objects soup --per-object 1 --side both --fps 10"
+        synth = ("demos", "synth", "--out", file, *options.split())
         code, out = run(*synth)
         self.assertEqual(code, 0, out)
         first = file.read_bytes()
@@ -560,25 +548,17 @@ class Commands(InFolder):
         write_demos(file, synthesize(["soup"], 2, fps=10))
         left = self.folder / "a.npz"
         rest = self.folder / "b.npz"
+        both = self.folder / "both.npz"
         for command in (
             ("split", file, "--out", left, "--rest", rest, "--share", 0.5),
-            ("merge", left, rest, "--out", self.folder / "both.npz"),
-            (
-                "select",
-                self.folder / "both.npz",
-                "--out",
-                left,
-                "--per-object",
-                1,
-                "--pick",
-                "spread",
-            ),
+            ("merge", left, rest, "--out", both),
+            ("select", both, "--out", left, *["--per-object", "1", "--pick", "spread"]),
         ):
             code, out = run("demos", *command)
             self.assertEqual(code, 0, out)
-        both = read_demos(self.folder / "both.npz").sequence_name.tolist()
-        self.assertEqual(both, read_demos(file).sequence_name.tolist())
-        self.assertEqual(read_demos(left).sequence_name.tolist(), both[1:])
+        names = read_demos(both).sequence_name.tolist()
+        self.assertEqual(names, read_demos(file).sequence_name.tolist())
+        self.assertEqual(read_demos(left).sequence_name.tolist(), names[1:])
         code, out = run("demos", "split", file, "--out", left, "--rest", left, "--share", 0.5)
         self.assertEqual(code, 1)
         self.assertIn("Nothing was overwritten", out)

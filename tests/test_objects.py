@@ -15,8 +15,14 @@ from scipy.spatial.transform import Rotation
 
 from tests.data import InFolder, data_dir, run
 from xreset.errors import ObjectError, XResetError
-from xreset.geometry.shapes import half_spaces, hull, shape_mesh, shell_properties
-from xreset.objects.catalogue import canonical_name, load_object, load_objects, object_names
+from xreset.geometry.shapes import half_spaces, hull, shape_mesh
+from xreset.objects.catalogue import (
+    canonical_name,
+    canonical_names,
+    load_object,
+    load_objects,
+    object_names,
+)
 from xreset.objects.decompose import Settings, as_solid, decompose, limited_hull
 from xreset.objects.meshes import (
     DEFAULT_DENSITY,
@@ -46,18 +52,8 @@ def distance_to_pieces(points, obj):
 
 class Names(unittest.TestCase):
     def test_other_spellings(self):
-        papers = (
-            "cheez-its",
-            "soup",
-            "mustard",
-            "tuna",
-            "spam",
-            "banana",
-            "pitcher",
-            "powerdrill",
-            "scissors",
-        )
-        self.assertEqual(tuple(canonical_name(name) for name in papers), object_names())
+        papers = "cheez-its soup mustard tuna spam banana pitcher powerdrill scissors"
+        self.assertEqual(canonical_names(papers.split()), object_names())
         for name in ("035_power_drill", "power_drill", "Power Drill"):
             self.assertEqual(canonical_name(name), "035_power_drill")
         with self.assertRaisesRegex(
@@ -226,17 +222,14 @@ class MeshImport(InFolder):
         np.testing.assert_allclose(result.obj.com, 0, atol=5e-4)
 
     def test_a_hollow_objects_mass_is_on_its_surface(self):
-        mesh = trimesh.creation.icosphere(4, 0.1)
-        moved = trimesh.Trimesh(mesh.vertices + np.array([1, 2, 3]), mesh.faces)
-        self.assertTrue(
-            np.allclose(shell_properties(moved.vertices, moved.faces, 0.3)[0], (1, 2, 3), atol=1e-9)
-        )
+        mesh = trimesh.creation.icosphere(4, 0.1).apply_translation((0.1, 0.2, 0.3))
         for mass, moment in (
             (0.3, 0.002),
             (3.0, 0.012),
         ):  # 2/3 m r^2 of a shell: 0.3 kg in 4.2 l; 2/5 m r^2 of a solid
             found = self.load(mesh, facts=f"mass = {mass}").obj
             np.testing.assert_allclose(np.diag(found.inertia), moment, rtol=0.01)
+            np.testing.assert_allclose(found.com, (0.1, 0.2, 0.3), atol=1e-6)
 
     def test_a_mesh_in_millimetres_with_what_it_is_made_of(self):
         path = self.write(trimesh.creation.box((100, 60, 40)))
@@ -301,16 +294,9 @@ class MeshImport(InFolder):
         accessor = {"componentType": 5126, "type": "VEC3", "count": 10**9}
         header = {"asset": {"version": "2.0"}, "accessors": [accessor]}
         (self.folder / "huge.gltf").write_text(json.dumps(header))
-        scene = trimesh.Scene(BOX)
-        for i in range(50):
-            scene.add_geometry(
-                scene.geometry["geometry_0"], node_name=f"copy {i}", geom_name="geometry_0"
-            )
-        (self.folder / "copies.glb").write_bytes(scene.export(file_type="glb"))
         for name, limit, words in (
             ("mesh.3mf", 16 << 20, "is an archive. Unpack it"),
             ("huge.gltf", 1 << 30, "takes 22888 MB"),
-            ("copies.glb", 50_000, "more than XRESET_MAX_FILE_MB"),
         ):
             with (
                 self.subTest(name),
@@ -353,22 +339,18 @@ class MeshImport(InFolder):
 
     def test_bad_meshes(self):
         box = trimesh.creation.box((0.1, 0.1, 0.1))
-        nan = box.copy().export(file_type="obj").replace("v ", "v nan ", 1)
-        cases = {
-            "empty": ("", "no triangles|cannot be read"),
-            "nan": (nan, "finite|cannot be read"),
-            "tilted square": (
-                "v 0 0 0\nv 0.1 0 0.1\nv 0 0.1 0.1\nv 0.1 0.1 0.2\nf 1 2 3\nf 2 4 3\n",
-                "flat",
-            ),
-            "millimetres": (box.copy().apply_scale(1000).export(file_type="obj"), "millimetres"),
-        }
-        for name, (text, message) in cases.items():
-            with self.subTest(name):
-                path = self.folder / f"{name}.obj"
-                path.write_text(text)
-                with self.assertRaisesRegex(ObjectError, message):
-                    import_with_notes(path, name)
+        obj = box.export(file_type="obj")
+        square = "v 0 0 0\nv 0.1 0 0.1\nv 0 0.1 0.1\nv 0.1 0.1 0.2\nf 1 2 3\nf 2 4 3\n"
+        for text, message in (
+            ("", "no triangles|cannot be read"),
+            (obj.replace("v ", "v nan ", 1), "finite|cannot be read"),
+            (square, "flat"),
+            (box.apply_scale(1000).export(file_type="obj"), "millimetres"),
+        ):
+            path = self.folder / "bad.obj"
+            path.write_text(text)
+            with self.subTest(message), self.assertRaisesRegex(ObjectError, message):
+                import_with_notes(path, "bad")
 
     def test_layouts(self):
         mesh = trimesh.creation.box((0.1, 0.1, 0.1))
@@ -380,15 +362,11 @@ class MeshImport(InFolder):
         ):
             (self.folder / path).parent.mkdir(exist_ok=True)
             mesh.export(self.folder / path)
-        found = {name: path.name for name, path in mesh_files(self.folder).items()}
-        self.assertEqual(
-            found,
-            {
-                "011_banana": "011_banana.obj",
-                "024_bowl": "textured.obj",
-                "025_mug": "textured_simple.obj",
-            },
-        )
+        found = [
+            path.relative_to(self.folder).as_posix() for path in mesh_files(self.folder).values()
+        ]
+        files = ["011_banana.obj", "024_bowl/textured.obj", "025_mug/textured_simple.obj"]
+        self.assertEqual(found, files)
         with self.assertLogs("xreset.objects.meshes", "WARNING") as log:
             self.assertEqual(load_object("banana", self.folder).mass, 0.066)
         self.assertIn("hollow", log.output[0])  # 66 g in a litre

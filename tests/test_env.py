@@ -229,9 +229,11 @@ class ResetTest(WithEnv):
     def test_only_the_finished_world_begins_anew(self):
         env = self.make(QUIET)
         other = self.make(QUIET)
+        began = env.backend.state().object_quat.clone()
         for action in self.actions(8):
             env.step(action)
             other.step(action)
+        self.assertTrue(torch.equal(env.start_quat, began))
         env.episode_length_buf[1] = env.max_episode_length - 1
         action = self.actions(1, seed=5)[0]
         last_cloud = env.get_observations()["perception"].clone()
@@ -248,6 +250,8 @@ class ResetTest(WithEnv):
         torch.testing.assert_close(cloud[1], cloud[1, :1].expand_as(cloud[1]))
         self.assertEqual(float(observations["policy"][1, 15:].abs().max()), 0.0)
         self.assertEqual(float(observations["privileged"][1, -1]), 0.0)
+        self.assertTrue(torch.equal(env.start_quat[[0, 2]], began[[0, 2]]))
+        torch.testing.assert_close(env.start_quat[1], env.backend.state().object_quat[1])
         # the drives hold the new joint positions
         self.assertTrue(torch.equal(env.joint_target[1], env.backend.state().joint_pos[1]))
 

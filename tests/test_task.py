@@ -12,9 +12,16 @@ import torch
 
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_hand_arm
+from xreset.cameras.config import FRONT, VisionConfig
 from xreset.checks import from_dict
 from xreset.errors import DemoError, PolicyError, RunError
-from xreset.geometry.rotations import quat_angle, quat_from_axis_angle, quat_rotate
+from xreset.geometry.rotations import (
+    quat_angle,
+    quat_conjugate,
+    quat_from_axis_angle,
+    quat_multiply,
+    quat_rotate,
+)
 from xreset.learning.recipes import RECIPES
 from xreset.physics import Links, State
 from xreset.policy import RandomPolicy, ZeroPolicy, check_contract, policy_contract, read_contract
@@ -518,6 +525,7 @@ class ObservationTest(unittest.TestCase):
             observed_quat=quat(),
             goal_pos=rand(3),
             goal_quat=quat(),
+            start_quat=quat(),
             gravity_fraction=rand(),
             previous_action=rand(self.J),
             tip_force=10 * rand(self.E, 3),
@@ -563,9 +571,11 @@ class ObservationTest(unittest.TestCase):
             links=replace(self.x.links, quat=-self.x.links.quat),
             observed_quat=-self.x.observed_quat,
             goal_quat=-self.x.goal_quat,
+            start_quat=-self.x.start_quat,
         )
         for rotation in ("quaternion", "matrix", "to_goal"):
             c = replace(self.config, rotation=rotation)
+            torch.testing.assert_close(obs.goal_group(negated, c), obs.goal_group(self.x, c))
             for group in (obs.policy_group, obs.proprio_group):
                 torch.testing.assert_close(
                     group(negated, c, generator()), group(self.x, c, generator())
@@ -578,6 +588,22 @@ class ObservationTest(unittest.TestCase):
             torch.testing.assert_close(
                 quat_angle(quat[name], own), torch.zeros(self.N), atol=1e-3, rtol=0
             )
+
+    def test_with_cameras_a_goal_may_be_a_rotation_from_the_start(self):
+        c = replace(self.config, rotation="to_goal")
+        widths = obs.layout(self.J, self.E, c, VisionConfig(cameras=(FRONT,)))["goal"]
+        self.assertEqual([*widths], ["goal_pos", "rotation_from_start", "previous_action"])
+        drawn_otherwise = turned(100, (0.6, 0.0, 0.8)).expand(self.N, 4)
+        x = replace(
+            self.x,
+            start_quat=quat_multiply(self.x.start_quat, drawn_otherwise),
+            goal_quat=quat_multiply(self.x.goal_quat, drawn_otherwise),
+        )
+        torch.testing.assert_close(obs.goal_group(x, c), obs.goal_group(self.x, c))
+        columns = self.split(obs.goal_group(self.x, c), widths)["rotation_from_start"]
+        from_start = columns.unflatten(1, (2, 3))
+        axis = quat_rotate(quat_conjugate(self.x.start_quat), torch.tensor([1.0, 0.0, 0.0]))
+        torch.testing.assert_close(quat_rotate(self.x.goal_quat, axis), from_start[:, 0])
 
     def test_the_published_observation(self):
         c = RECIPES["published"].config.task.observation

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 _LASTING = (
     "goal_pos",
     "goal_quat",
+    "start_quat",
     "gravity_fraction",
     "sequence",
     "bank_state",
@@ -115,6 +116,7 @@ class ManipulationEnv:
         max_episode_length: control steps until the time limit.
         goal_pos: [N, 3] goal position of each world, world frame [m].
         goal_quat: [N, 4] goal orientation of each world.
+        start_quat: [N, 4] object orientation with which each world's episode began.
         sequence: [N] demonstration of each world.
         bank_state: [N] bank state that each world's episode began with, -1 for home.
         gravity_fraction: [N] share of the object's weight that acts.
@@ -186,6 +188,7 @@ class ManipulationEnv:
         episode = self._new_start.clone()
         self.goal_pos = episode.goal_pos
         self.goal_quat = episode.goal_quat
+        self.start_quat = episode.object_quat
         self.gravity_fraction = episode.gravity_fraction
         self.sequence = episode.sequence
         self.bank_state = episode.state
@@ -536,6 +539,7 @@ class ManipulationEnv:
             observed_quat=observed_quat,
             goal_pos=self.task_goal_pos,
             goal_quat=self.goal_quat,
+            start_quat=self.start_quat,
             gravity_fraction=self.gravity_fraction,
             previous_action=self._previous_action.clamp(-1.0, 1.0),
             tip_force=self.variation.scaled_forces(reading.contacts.tip_force),

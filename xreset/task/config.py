@@ -86,7 +86,8 @@ class ObservationConfig(Checked):
     """``quaternion``: a quaternion with w >= 0, which jumps where w is 0. ``matrix``: the first two columns of the
     rotation matrix, which never jump (Zhou et al. 2019, On the Continuity of Rotation Representations). ``to_goal``: in
     place of the orientations of object and goal, the columns of the rotation that leads from one to the other, along
-    the world's axes. It does not depend on the axes in which a mesh was drawn."""
+    the world's axes. It does not depend on the axes in which a mesh was drawn. A policy with cameras observes the
+    rotation from the start of the episode to the goal."""
     cloud_scale: Positive[Finite[float]] = 1.0
     """Factor on the clouds' coordinates [1/m]."""
     contact_force_scale: NotNegative[float] = 0.1

@@ -44,6 +44,8 @@ class ObservationInput:
     observed_quat: Tensor
     goal_pos: Tensor
     goal_quat: Tensor
+    start_quat: Tensor
+    """[N, 4] object orientation at the start of the episode."""
     gravity_fraction: Tensor
     """[N]"""
     previous_action: Tensor
@@ -96,8 +98,9 @@ def layout(
         }
     if vision is None or not vision.cameras:
         return groups
+    goal = "rotation_from_start" if c.rotation == "to_goal" else f"goal_{turn}"
     return {
-        "goal": {"goal_pos": 3, f"goal_{turn}": width, "previous_action": num_joints},
+        "goal": {"goal_pos": 3, goal: width, "previous_action": num_joints},
         "proprio": groups["proprio"],
         "view": {vision.view: prod(vision.view_shape)},
     }
@@ -139,8 +142,15 @@ def policy_group(
 
 
 def goal_group(x: ObservationInput, c: ObservationConfig) -> Tensor:
-    """[N, 7 + J] goal pose, previous action; 2 more as matrices."""
-    return torch.cat((x.goal_pos, _shown(x.goal_quat, c), x.previous_action), dim=-1)
+    """[N, 7 + J] goal pose, previous action; 2 more as matrices.
+
+    With ``rotation="to_goal"``, the goal's orientation is the rotation that leads to it from the start of the episode:
+    no image shows the axes in which a mesh was drawn.
+    """
+    turn = x.goal_quat
+    if c.rotation == "to_goal":
+        turn = quat_multiply(x.goal_quat, quat_conjugate(x.start_quat))
+    return torch.cat((x.goal_pos, _shown(turn, c), x.previous_action), dim=-1)
 
 
 def proprio_group(x: ObservationInput, c: ObservationConfig, generator: torch.Generator) -> Tensor:

@@ -351,7 +351,7 @@ def write_traces(
 
 
 def read_evaluation(folder: Path, run: str = "") -> Evaluation:
-    """Read the results of every engine in an ``eval`` folder, and their episodes.
+    """Read the results of every engine in an ``eval`` folder, in order of name, and their episodes.
 
     Args:
         run: what the table of episodes calls the run; default: as the results name the policy.
@@ -359,28 +359,20 @@ def read_evaluation(folder: Path, run: str = "") -> Evaluation:
     Raises:
         FileFormatError: a file is damaged, or the files are of different evaluations.
     """
-    results = read_results(folder)
-    tables = [_read_table(folder, result, run) for result in results]
+    results = []
+    tables = []
+    if os.path.isdir(folder):
+        files = [f for f in folder.glob("*.json") if not f.name.endswith(".episodes.json")]
+        results = [read_result(file) for file in sorted(files, key=lambda f: f.stem)]
+    for result in results:
+        episodes = read_episodes(folder, result.backend)
+        if len(episodes) != result.episodes:
+            raise FileFormatError(
+                f"{folder / result.backend}.json states {result.episodes} episodes, {result.backend}.episodes.json "
+                f"holds {len(episodes)}. The files are of different evaluations; evaluate again."
+            )
+        tables.append(episode_table(result, episodes, run))
     return Evaluation(results, tables)
-
-
-def _read_table(folder: Path, result: EvalResult, run: str) -> Table:
-    """Read the table of episodes of one engine."""
-    episodes = read_episodes(folder, result.backend)
-    if len(episodes) != result.episodes:
-        raise FileFormatError(
-            f"{folder / result.backend}.json states {result.episodes} episodes, {result.backend}.episodes.json holds "
-            f"{len(episodes)}. The files are of different evaluations; evaluate again."
-        )
-    return episode_table(result, episodes, run)
-
-
-def read_results(folder: Path) -> list[EvalResult]:
-    """Read the result of every engine in an ``eval`` folder, in order of name."""
-    if not os.path.isdir(folder):
-        return []
-    files = [f for f in folder.glob("*.json") if not f.name.endswith(".episodes.json")]
-    return [read_result(file) for file in sorted(files, key=lambda f: f.stem)]
 
 
 def read_result(path: Path) -> EvalResult:

@@ -124,16 +124,6 @@ class Trial:
         """Names of the objects."""
         return tuple(o.name for o in self.objects)
 
-    @property
-    def scene(self) -> SceneSpec:
-        """The scene of the task. Its friction is a placeholder, because the environment sets friction itself."""
-        return make_scene(self.robot, self.objects, self.task)
-
-    @property
-    def nominal_scene(self) -> SceneSpec:
-        """The scene with the pair friction of an evaluation, which draws none at random."""
-        return nominal_scene(self.robot, self.objects, self.task)
-
     def starts(self, device: str | torch.device = "cpu") -> ResetDistribution:
         """Return the distribution of starts. Drawn on the CPU, they are the same in every engine."""
         pivots = object_origins(self.objects, self.task)
@@ -152,7 +142,9 @@ class Trial:
         Yields:
             The environment, and the metric's points of each world's object.
         """
-        with engine.make(self.scene, len(object_index), object_index) as backend:
+        # its friction is a placeholder, because the environment sets friction itself
+        scene = make_scene(self.robot, self.objects, self.task)
+        with engine.make(scene, len(object_index), object_index) as backend:
             env = ManipulationEnv(backend, self.task, self.starts(backend.device), seed=self.seed)
             yield (
                 env,
@@ -213,7 +205,7 @@ def load_trial(
 
 
 def nominal_scene(robot: RobotSpec, objects: tuple[ObjectSpec, ...], task: TaskConfig) -> SceneSpec:
-    """Return the scene of :attr:`Trial.nominal_scene`."""
+    """Return the scene of a task with the pair friction of an evaluation, which draws none at random."""
     scene = make_scene(robot, objects, task)
     nominal = replace(task.randomization, enabled=False)
     tip, link, table = sample_friction(1, nominal, torch.Generator())[0].tolist()

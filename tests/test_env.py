@@ -724,7 +724,7 @@ class RolloutTest(WithEnv):
 
 class KinematicRetargetingTest(WithEnv):
     def test_plays_the_trajectory_at_its_own_speed_after_moving_there(self):
-        from xreset.eval.baselines import KinematicRetargeting
+        from xreset.eval.policy_spec import KinematicRetargeting
 
         task = evaluation_task(
             replace(TASK, action=ActionConfig(arm_lead=10.0), reset=ResetConfig(home_noise=False))

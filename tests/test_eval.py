@@ -19,7 +19,7 @@ from xreset.errors import FileFormatError, XResetError
 from xreset.eval.evaluate import evaluate
 from xreset.eval.metrics import EpisodeMetrics, MetricPoints
 from xreset.eval.policy_spec import PolicySpec, load_policy
-from xreset.eval.results import Episode, EvalResult, read_results, read_traces, write_results
+from xreset.eval.results import Episode, EvalResult, read_evaluation, read_traces, write_results
 from xreset.eval.rollout import engine, load_trial, roll_out
 from xreset.eval.stats import bootstrap_ci95
 from xreset.eval.table import result_rows
@@ -344,14 +344,14 @@ class ResultsTest(unittest.TestCase):
             }
             path.write_text(json.dumps(changed))
             with self.subTest(words), self.assertRaisesRegex(FileFormatError, words):
-                read_results(self.folder)
+                read_evaluation(self.folder)
 
     def test_files(self):
         rollouts = toy_rollouts()
         for name in ("sapien", "mujoco"):
             write_results(self.folder, toy_summary(name, rollouts), rollouts, self.JOINTS)
-        self.assertEqual([s.backend for s in read_results(self.folder)], ["mujoco", "sapien"])
-        self.assertEqual(read_results(self.folder)[0], toy_summary("mujoco"))
+        self.assertEqual([s.backend for s in read_evaluation(self.folder)], ["mujoco", "sapien"])
+        self.assertEqual(read_evaluation(self.folder)[0], toy_summary("mujoco"))
         traces = read_traces(self.folder, "mujoco", self.JOINTS)
         for found, made in zip(traces, rollouts.traces, strict=True):
             for name, value in vars(made).items():
@@ -370,7 +370,7 @@ class ResultsTest(unittest.TestCase):
             read_traces(self.folder, "mujoco", self.JOINTS)
         (self.folder / "sapien.json").write_text('{"schema": "xreset-eval/0"}')
         with self.assertRaisesRegex(FileFormatError, "schema version 'xreset-eval/0'"):
-            read_results(self.folder)
+            read_evaluation(self.folder)
 
     def test_two_evaluations_are_not_written_into_one_folder(self):
         policy = PolicySpec(

@@ -23,9 +23,9 @@ from xreset.eval.report.clips import (
     best_everywhere,
     draw_clips,
     encode_mp4,
+    make_film,
     worst_episodes,
 )
-from xreset.eval.report.film import make_film
 from xreset.eval.report.make import make_report
 from xreset.eval.report.page import count_failures, headline, page
 from xreset.eval.report.read import collect
@@ -300,9 +300,9 @@ class ClipTest(Reported):
         self.write(rollouts=rollouts, joints=robot.joint_names)
         out = self.folder / "film.mp4"
         with (
-            mock.patch("xreset.eval.report.film.load_robot", lambda _: robot),
+            mock.patch("xreset.eval.report.clips.load_robot", lambda _: robot),
             mock.patch(
-                "xreset.eval.report.film.encode_mp4",
+                "xreset.eval.report.clips.encode_mp4",
                 lambda frames, fps: repr((frames.shape, round(fps))).encode(),
             ),
         ):

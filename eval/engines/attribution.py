@@ -17,7 +17,7 @@ from xreset.errors import XResetError
 from xreset.eval.engines.measure import Measured, measure
 from xreset.eval.policy_spec import PolicySpec
 from xreset.eval.results import Episode
-from xreset.eval.rollout import Engine, Trial, roll_out
+from xreset.eval.rollout import Engine, Trial, nominal_scene, roll_out
 from xreset.eval.sensitivity import COMPARED, Effect, Property, nominal_task
 from xreset.plugins import backend_class
 from xreset.task.config import TaskConfig
@@ -148,9 +148,10 @@ def attribute(
             f"Unknown property {', '.join(unknown)}. Choose from: {', '.join(COMPARED)}."
         )
     progress(f"measuring {a.name}", 0, 0)
-    measured_a = measure(a, trial.nominal_scene)
+    scene = nominal_scene(trial.robot, trial.objects, trial.task)
+    measured_a = measure(a, scene)
     progress(f"measuring {b.name}", 0, 0)
-    measured_b = measure(b, trial.nominal_scene)
+    measured_b = measure(b, scene)
     rows: list[Row] = []
 
     def run(kind: Kind, name: str, engine: Engine, task: TaskConfig) -> None:

@@ -81,7 +81,6 @@ class Page(WebPage):
         self._drawn = self._written = self._due = 0.0
         self._clock = (time.monotonic(), session.time)
         self._films = ThreadPoolExecutor(1)
-        self._robot: RobotMeshes | None = None
         self._things: list[Any] = []
         self._make_controls()
         self._make_scene()
@@ -186,9 +185,11 @@ class Page(WebPage):
         obj = session.env.backend.scene.objects[0]
         radius = float(np.ptp(obj.vertices, axis=0).max()) / 2
         middle = (obj.vertices.max(axis=0) + obj.vertices.min(axis=0)) / 2
-        body = scene.add_mesh_simple("/object", obj.vertices, obj.faces, color=rgb(OBJECT_COLOR))
+        self._body = scene.add_mesh_simple(
+            "/object", obj.vertices, obj.faces, color=rgb(OBJECT_COLOR)
+        )
         # Rings turn the goal. The shape or, where a hand hides it, the ball next to it is dragged.
-        rings = scene.add_transform_controls(
+        self._rings = scene.add_transform_controls(
             "/rings",
             scale=2.4 * radius,
             disable_axes=True,
@@ -196,7 +197,7 @@ class Page(WebPage):
             depth_test=False,
             line_width=3.5,
         )
-        goal = scene.add_mesh_simple(
+        self._goal = scene.add_mesh_simple(
             "/goal",
             middle + GROWTH * (obj.vertices - middle),
             obj.faces,
@@ -204,32 +205,27 @@ class Page(WebPage):
             opacity=0.4,
             cast_shadow=False,
         )
-        handle = scene.add_icosphere("/handle", 0.018, rgb(GOAL_COLOR))
-        hint = scene.add_label(
+        self._handle = scene.add_icosphere("/handle", 0.018, rgb(GOAL_COLOR))
+        self._hint = scene.add_label(
             "/handle/hint", "drag me", position=(0.0, 0.0, 0.02), anchor="bottom-center"
         )
         self._beside = 1.8 * radius * RIGHT
-        points = scene.add_point_cloud(
+        self._points = scene.add_point_cloud(
             "/points",
             np.zeros((1, 3), np.float32),
             rgb(TOUCH_COLOR),
             point_size=0.006,
             visible=False,
         )
-        robot = RobotMeshes(scene, session.policy.robot)
-        self._robot = robot
-        self._body = body
-        self._goal = goal
-        self._rings = rings
-        self._handle = handle
-        self._hint = hint
-        self._points = points
-        self._things = [hint, handle, rings, goal, body, points, *robot.links.values()]
-        rings.on_update(self._turn)
-        for part in (goal, handle):
+        self._robot = RobotMeshes(scene, session.policy.robot)
+        links = self._robot.links
+        self._things = [self._hint, self._handle, self._rings, self._goal, self._body, self._points]
+        self._things += links.values()
+        self._rings.on_update(self._turn)
+        for part in (self._goal, self._handle):
             part.on_drag("left")(self._drag)
-        self._pull_at(body, None)
-        for name, link in robot.links.items():
+        self._pull_at(self._body, None)
+        for name, link in links.items():
             self._pull_at(link, name)
 
     def _pull_at(self, mesh: Any, link: str | None) -> None:
@@ -264,7 +260,6 @@ class Page(WebPage):
         session = self.session
         env = session.env
         state = env.backend.state()
-        assert self._robot is not None
         with self._server.atomic():
             self._robot.place(state.joint_pos[0].cpu().numpy())
             self._body.position = state.object_pos[0].cpu().numpy()

@@ -28,8 +28,7 @@ def report(
         objects: Folder of real meshes, for the clips; default: as the results name it.
         film: MP4 to write as well: every object in every engine, next to each other.
     """
-    from xreset.eval.report import film as films
-    from xreset.eval.report import make, page
+    from xreset.eval.report import clips, make, page
 
     if not run.exists() and str(run) in shipped():
         run = results_folder(str(run))
@@ -41,7 +40,7 @@ def report(
         console.print(f"note: {note}", style="yellow")
     if film is not None:
         with console.status("drawing the film"):
-            engines, shown = films.make_film(run, film, robot=robot, objects=objects)
+            engines, shown = clips.make_film(run, film, robot=robot, objects=objects)
         rows = ", ".join(engines)
         columns = ", ".join(map(short_name, shown))
         console.print(f"film: {film}\n      from the top: {rows}; from the left: {columns}")

@@ -9,6 +9,7 @@ from unittest import mock
 
 import numpy as np
 import torch
+from torch.testing import assert_close
 
 from tests.toy_bank import SOUP, toy_bank
 from tests.toy_robot import toy_hand_arm
@@ -61,7 +62,7 @@ class TestCameras(unittest.TestCase):
         body = cameras.rays.body[0, 0]
         can = body.max()
         on_table = depth[body == can - 1]
-        torch.testing.assert_close(on_table, torch.full_like(on_table, 0.5))
+        assert_close(on_table, torch.full_like(on_table, 0.5))
         top = 0.5 - (self.objects[0].vertices[:, 2].max() + float(self.state.object_pos[0, 2]))
         self.assertAlmostEqual(float(depth[12, 16]), top, places=4)
         self.assertEqual(int(body[12, 16]), int(can))
@@ -71,7 +72,7 @@ class TestCameras(unittest.TestCase):
         self.assertAlmostEqual(
             float((body == can).sum()), np.pi * (radius * pixels_per_metre) ** 2, delta=12
         )
-        torch.testing.assert_close(view[0, 0], ((2.0 - depth) / 1.9).where(depth > 0, 0.0))
+        assert_close(view[0, 0], ((2.0 - depth) / 1.9).where(depth > 0, 0.0))
 
     def test_same_state_same_pixels_in_every_engine(self):
         generator = torch.Generator().manual_seed(1)
@@ -120,7 +121,7 @@ class TestCameras(unittest.TestCase):
         self.assertAlmostEqual(float(lost.sum() / seen.sum()), 0.2, delta=0.04)
         lost = (image(edges=1.0) == 0) & seen  # around the can, and not on the table
         self.assertGreater(int(lost[0, 0].sum()), 10)
-        self.assertFalse(bool(lost[0, 0, :, :6].any()))
+        self.assertFalse(lost[0, 0, :, :6].any())
 
     def test_points_are_on_the_object(self):
         cameras = self.cameras(
@@ -128,13 +129,13 @@ class TestCameras(unittest.TestCase):
         )
         cloud = self.look(cameras)
         self.assertEqual(cloud.shape, (2, 2, 20, 4))
-        self.assertTrue(bool((cloud[..., 3] == 1).all()))
+        self.assertTrue((cloud[..., 3] == 1).all())
         points = cloud[..., :3] / 2 - self.state.object_pos[:, None, None]
         points[:, 1, :, 2] -= 0.2  # the goal is higher
         low, high = (
             torch.tensor(getattr(self.objects[0].vertices, end)(axis=0)) for end in ("min", "max")
         )
-        self.assertTrue(bool(((points > low - 1e-3) & (points < high + 1e-3)).all()))
+        self.assertTrue(((points > low - 1e-3) & (points < high + 1e-3)).all())
 
     def test_a_camera_on_a_link_moves_with_it(self):
         cameras = self.cameras(
@@ -202,9 +203,9 @@ class TestVisionInTheEnvironment(unittest.TestCase):
         )
         drawn_late = self.play(self.make(VISION, randomization=drawn), 6)
         for step in range(7):
-            torch.testing.assert_close(third[step], every[step - step % 3])
-            torch.testing.assert_close(late[step], every[max(step - 2, 0)])
-            torch.testing.assert_close(drawn_late[step], late[step])
+            assert_close(third[step], every[step - step % 3])
+            assert_close(late[step], every[max(step - 2, 0)])
+            assert_close(drawn_late[step], late[step])
 
     def test_a_reset_renews_its_world_alone(self):
         env = self.make(replace(VISION, interval=50, latency=3.0))
@@ -223,8 +224,8 @@ class TestVisionInTheEnvironment(unittest.TestCase):
             camera_shift=(0.03, 0.03), camera_turn=(0.05, 0.05), camera_fov=(0.9, 1.1)
         )
         cameras = self.make(VISION, randomization=moved).vision.cameras
-        torch.testing.assert_close(cameras.shift.norm(dim=-1), torch.full((2, 2), 0.03))
-        torch.testing.assert_close(cameras.turn.norm(dim=-1), torch.full((2, 2), 0.05))
+        assert_close(cameras.shift.norm(dim=-1), torch.full((2, 2), 0.03))
+        assert_close(cameras.turn.norm(dim=-1), torch.full((2, 2), 0.05))
         self.assertEqual(len(cameras.fov_scale.unique()), 4)
 
 

@@ -11,7 +11,9 @@ from unittest import mock
 import numpy as np
 import torch
 import trimesh
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
+from torch.testing import assert_close
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.toy_bank import SOUP, SPAM, toy_bank
@@ -148,7 +150,7 @@ class WithEnv(unittest.TestCase):
 
     def assert_finite(self, observations) -> None:
         for group, value in observations.items():
-            self.assertTrue(bool(value.isfinite().all()), group)
+            self.assertTrue(value.isfinite().all(), group)
 
 
 class StepTest(WithEnv):
@@ -163,17 +165,15 @@ class StepTest(WithEnv):
         self.assert_finite(observations)
         state = env.backend.state()
         policy = observations["policy"]
-        torch.testing.assert_close(policy[:, :3], state.object_pos)
-        torch.testing.assert_close(policy[:, 7:10], env.goal_pos)
-        torch.testing.assert_close(policy[:, 14], env.gravity_fraction)
-        torch.testing.assert_close(policy[:, 15:], self.actions(5)[-1])
-        torch.testing.assert_close(
+        assert_close(policy[:, :3], state.object_pos)
+        assert_close(policy[:, 7:10], env.goal_pos)
+        assert_close(policy[:, 14], env.gravity_fraction)
+        assert_close(policy[:, 15:], self.actions(5)[-1])
+        assert_close(
             observations["proprio"][:, 3:7], env.actions.within_limits(state.joint_pos)[:, 3:]
         )
         cloud = quat_rotate(state.object_quat[:, None], env._cloud_points)
-        torch.testing.assert_close(
-            observations["perception"][:, -1], cloud + state.object_pos[:, None]
-        )
+        assert_close(observations["perception"][:, -1], cloud + state.object_pos[:, None])
 
     def test_actions_reach_the_drives(self):
         env = self.make()
@@ -182,10 +182,10 @@ class StepTest(WithEnv):
         action[1, 1], action[2, 3] = 1.0, 2.0
         env.step(action)
         target = env.backend.state().joint_target
-        torch.testing.assert_close(target, env.joint_target)
-        torch.testing.assert_close(target[1, 1], before[1, 1] + TASK.action.arm_step)
-        torch.testing.assert_close(target[0, :3], before[0, :3])
-        torch.testing.assert_close(target[2, 3], env.actions.upper[3])
+        assert_close(target, env.joint_target)
+        assert_close(target[1, 1], before[1, 1] + TASK.action.arm_step)
+        assert_close(target[0, :3], before[0, :3])
+        assert_close(target[2, 3], env.actions.upper[3])
 
     def test_the_reach_reward_rests_on_the_best_of_the_episode(self):
         env = self.make(replace(QUIET, action=ActionConfig(arm_step=0.3, arm_lead=1.0)))
@@ -197,11 +197,9 @@ class StepTest(WithEnv):
             reach.append(reward.terms["reach"])
             distance.append(reading.tip_distance.mean(dim=-1))
         best = torch.stack(distance).cummin(dim=0).values[1:]
-        torch.testing.assert_close(
-            torch.stack(reach), 1 - torch.tanh(best / TASK.reward.reach_width)
-        )
+        assert_close(torch.stack(reach), 1 - torch.tanh(best / TASK.reward.reach_width))
         self.assertTrue(
-            bool((torch.stack(distance)[1:] > best + 1e-3).any()), "the hand moved away at times"
+            (torch.stack(distance)[1:] > best + 1e-3).any(), "the hand moved away at times"
         )
 
     def test_a_reset_of_one_world_leaves_the_others_as_they_are(self):
@@ -245,9 +243,9 @@ class ResetTest(WithEnv):
         self.assert_same(env.backend.state(), other.backend.state(), [0, 2])
         self.assert_same(observations, expected, [0, 2])
         cloud = observations["perception"]
-        torch.testing.assert_close(cloud[[0, 2], :-1], last_cloud[[0, 2], 1:])
+        assert_close(cloud[[0, 2], :-1], last_cloud[[0, 2], 1:])
         # the new episode's history is its first frame, without previous action and reward
-        torch.testing.assert_close(cloud[1], cloud[1, :1].expand_as(cloud[1]))
+        assert_close(cloud[1], cloud[1, :1].expand_as(cloud[1]))
         self.assertEqual(float(observations["policy"][1, 15:].abs().max()), 0.0)
         self.assertEqual(float(observations["privileged"][1, -1]), 0.0)
         self.assertTrue(torch.equal(env.start_quat[[0, 2]], began[[0, 2]]))
@@ -261,12 +259,12 @@ class ResetTest(WithEnv):
         self.bank = replace(self.bank, joint_target=self.bank.joint_pos + 0.01)
         env = self.make(task)
         state = env.backend.state()
-        self.assertTrue(bool(env.from_bank.all()))
+        self.assertTrue(env.from_bank.all())
         numbers = ((state.object_pos[:, 0] - 0.6) * 100).round().int().tolist()
-        torch.testing.assert_close(state.joint_pos, torch.as_tensor(self.bank.joint_pos)[numbers])
-        torch.testing.assert_close(env.goal_pos, torch.as_tensor(self.bank.goal_pos)[env.sequence])
-        torch.testing.assert_close(state.joint_target, state.joint_pos + 0.01)
-        torch.testing.assert_close(env.joint_target, state.joint_target)
+        assert_close(state.joint_pos, torch.as_tensor(self.bank.joint_pos)[numbers])
+        assert_close(env.goal_pos, torch.as_tensor(self.bank.goal_pos)[env.sequence])
+        assert_close(state.joint_target, state.joint_pos + 0.01)
+        assert_close(env.joint_target, state.joint_target)
         state = self.make(replace(task, reset=ResetConfig(demo_probability=0.0))).backend.state()
         self.assertTrue(torch.equal(state.joint_target, state.joint_pos))
 
@@ -284,8 +282,8 @@ class RobustnessTest(WithEnv):
             late.append(env.step(action)[0])
             present.append(same.step(action)[0])
         for now, before in zip(late[2:], present, strict=False):
-            torch.testing.assert_close(now["policy"][:, :3], before["policy"][:, :3])
-            torch.testing.assert_close(now["proprio"], before["proprio"])
+            assert_close(now["policy"][:, :3], before["policy"][:, :3])
+            assert_close(now["proprio"], before["proprio"])
 
     def test_arm_and_hand_may_be_late_apart(self):
         env = self.make(self.task(action_latency=(0.0, 0.0), hand_latency=(1.0, 1.0)))
@@ -294,8 +292,8 @@ class RobustnessTest(WithEnv):
             for action in self.actions(3):
                 env.step(action)
                 arm, hand = sent.call_args.args[0].split((3, 4), dim=-1)
-                torch.testing.assert_close(arm, env.joint_target[:, :3])
-                torch.testing.assert_close(hand, last[:, 3:])
+                assert_close(arm, env.joint_target[:, :3])
+                assert_close(hand, last[:, 3:])
                 last = env.joint_target.clone()
 
     def test_a_lost_action_leaves_the_targets_where_they_are(self):
@@ -329,9 +327,9 @@ class RobustnessTest(WithEnv):
 
     def test_a_tracker_errs_by_the_same_in_an_episode_and_anew_in_every_pose(self):
         bias, cloud_bias = self.observed(TrackerConfig(position_bias=0.01))
-        self.assertTrue(bool(((bias.abs() <= 0.01001) & (bias.abs() > 0)).all()))
-        torch.testing.assert_close(bias, bias[:1].expand_as(bias))
-        torch.testing.assert_close(bias, cloud_bias)
+        self.assertTrue(((bias.abs() <= 0.01001) & (bias.abs() > 0)).all())
+        assert_close(bias, bias[:1].expand_as(bias))
+        assert_close(bias, cloud_bias)
         noise, _ = self.observed(TrackerConfig(position_noise=0.01))
         self.assertTrue(
             bool((noise.abs() <= 0.01001).all()) and bool((noise[1:] != noise[:-1]).all())
@@ -408,9 +406,9 @@ class RobustnessTest(WithEnv):
         pushes, pushed, free = env.variation.pushes, env.backend.state(), same.backend.state()
         mass = env.variation.parameters["object_mass"][:, None]
         expected = pushes.force / mass * env.backend.scene.control_dt
-        self.assertTrue(bool(((expected.norm(dim=-1) > 0) & (expected.norm(dim=-1) <= 0.5)).all()))
+        self.assertTrue(((expected.norm(dim=-1) > 0) & (expected.norm(dim=-1) <= 0.5)).all())
         spin = pushed.object_angvel - free.object_angvel
-        self.assertTrue(bool(((spin.norm(dim=-1) > 0) & (spin.norm(dim=-1) <= 4.2)).all()))
+        self.assertTrue(((spin.norm(dim=-1) > 0) & (spin.norm(dim=-1) <= 4.2)).all())
         com = torch.as_tensor(np.stack([o.com for o in self.objects]), dtype=torch.float32)[
             env.backend.object_index
         ]
@@ -420,7 +418,7 @@ class RobustnessTest(WithEnv):
             + torch.linalg.cross(pushed.object_angvel, arm)
             - free.object_linvel
         )
-        torch.testing.assert_close(velocity, expected, atol=0.01, rtol=0.02)
+        assert_close(velocity, expected, atol=0.01, rtol=0.02)
 
     def test_pushes_wait_for_the_gate_and_move_the_arms_targets(self):
         push = PushConfig(probability=(1.0, 1.0), object_velocity=0.5, arm_torque=0.5, when="gated")
@@ -435,7 +433,7 @@ class RobustnessTest(WithEnv):
             * torch.tensor([drive.kp for drive in drives])
             / torch.tensor([d.effort for d in drives])
         )
-        self.assertTrue(bool((torque[:, :3].abs() <= 0.5001).all() and (torque[:, :3] != 0).all()))
+        self.assertTrue((torque[:, :3].abs() <= 0.5001).all() and (torque[:, :3] != 0).all())
         self.assertEqual(float(torque[:, 3:].abs().max()), 0.0)
         env.variation.pushes.gate.fill_(True)
         env.step(torch.zeros(N, 7))
@@ -469,7 +467,7 @@ class RobustnessTest(WithEnv):
             (found.drives[:, 2], 1.0, 1.0),
             (found.object_com.norm(dim=-1), 0.01, 0.01),
         ):
-            self.assertTrue(bool(((factor >= low - 1e-4) & (factor <= high + 1e-4)).all()), factor)
+            self.assertTrue(((factor >= low - 1e-4) & (factor <= high + 1e-4)).all(), factor)
         self.assertNotIn("drives", self.make().variation.parameters)
 
     def test_an_engine_that_cannot_do_it_is_named(self):
@@ -499,8 +497,8 @@ class RobustnessTest(WithEnv):
         for action in self.actions(5, seed=1):
             one, *_ = env.step(action)
             two, *_ = other.step(action)
-        torch.testing.assert_close(one["policy"], two["policy"], atol=1e-4, rtol=0)
-        torch.testing.assert_close(env.variation.parameters, other.variation.parameters)
+        assert_close(one["policy"], two["policy"], atol=1e-4, rtol=0)
+        assert_close(env.variation.parameters, other.variation.parameters)
 
     def test_a_step_with_all_of_it_never_waits_for_the_device(self):
         """As on a GPU, where any of these operations would stop the host until the device is done, and could not be captured."""
@@ -595,9 +593,7 @@ class ObjectFrameTest(WithEnv):
         one = self.played(self.specs[0], toy_bank(self.robot), task)
         other = self.played(self.specs[1], self.moved_bank(), task)
         for step, (a, b) in enumerate(zip(one, other, strict=True)):
-            torch.testing.assert_close(
-                a, b, atol=1e-4, rtol=1e-4, msg=lambda text, step=step: f"{step}: {text}"
-            )
+            assert_close(a, b, atol=1e-4, rtol=1e-4, msg=lambda text, step=step: f"{step}: {text}")
         away = self.played(self.specs[0], toy_bank(self.robot), replace(task, object_frame="mesh"))[
             0
         ]
@@ -635,7 +631,7 @@ class FailureTest(WithEnv):
             )
             self.assertEqual(extras["time_outs"].tolist(), [0.0, 1.0, 0.0])
             self.assertEqual(float(reward[1]), 0.0)
-            self.assertTrue(bool(reward.isfinite().all()))
+            self.assertTrue(reward.isfinite().all())
             self.assert_finite(observations)
             self.assert_finite(extras["log"])
             self.assertEqual(float(extras["log"]["health/nonfinite_total"]), i + 1)
@@ -677,13 +673,13 @@ class RolloutTest(WithEnv):
         )
         trace = found.traces[0]
         self.assertEqual((trace.joint_pos.shape, trace.object_pos.shape), ((11, 7), (11, 3)))
-        np.testing.assert_allclose(np.diff(trace.time), 0.05)
-        np.testing.assert_allclose(trace.goal_pos, self.bank.goal_pos[0])
+        assert_allclose(np.diff(trace.time), 0.05)
+        assert_allclose(trace.goal_pos, self.bank.goal_pos[0])
         self.assertGreater(found.control_steps_per_second, 0)
         self.assertEqual(one.episodes, found.episodes)
         for a, b in zip(one.traces, found.traces, strict=True):
-            np.testing.assert_array_equal(a.object_pos, b.object_pos)
-            np.testing.assert_array_equal(a.joint_pos, b.joint_pos)
+            assert_array_equal(a.object_pos, b.object_pos)
+            assert_array_equal(a.joint_pos, b.joint_pos)
 
     def test_each_repetition_has_a_start_of_its_own_and_the_seed_decides(self):
         class Watching(ZeroPolicy):
@@ -697,7 +693,7 @@ class RolloutTest(WithEnv):
             return policy.seen
 
         found = starts()
-        np.testing.assert_array_equal(found, starts())
+        assert_array_equal(found, starts())
         self.assertGreater(np.abs(found - starts(seed=1)).max(axis=1).min(), 1e-4)
         self.assertGreater(
             np.abs(found[0::2] - found[1::2]).max(axis=1).min(),
@@ -753,11 +749,9 @@ class KinematicRetargetingTest(WithEnv):
             path = paths[int(env.sequence[world])]
             found = np.stack(targets)[:, world]
             played = found[6 : 6 + 2 * len(path) : 2]  # 30 Hz frames at 60 Hz control
-            np.testing.assert_allclose(played, path, atol=1e-4)
-            np.testing.assert_allclose(
-                found[-1], path[-1], atol=1e-4, err_msg="it holds the last frame"
-            )
-            np.testing.assert_allclose(
+            assert_allclose(played, path, atol=1e-4)
+            assert_allclose(found[-1], path[-1], atol=1e-4, err_msg="it holds the last frame")
+            assert_allclose(
                 found[2], 0.5 * (0.01 + path[0]), atol=1e-4, err_msg="half of the lead-in"
             )
 

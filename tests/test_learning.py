@@ -10,6 +10,7 @@ from unittest import mock
 
 import torch
 from tensordict import TensorDict
+from torch.testing import assert_close
 
 from xreset import robots
 from xreset.checks import from_dict
@@ -76,7 +77,7 @@ class ModelTest(unittest.TestCase):
         cloud = with_real_history(observations(T, N), first)["perception"]
         for begin in (0, 3):
             piece, starts = cloud[begin : begin + L], first[begin : begin + L]
-            torch.testing.assert_close(
+            assert_close(
                 embed_sequences(model.trunk.pointnet, piece, starts), model.trunk.pointnet(piece)
             )
 
@@ -98,17 +99,17 @@ class ModelTest(unittest.TestCase):
             model.reset(dones[t])
         obs["policy"].requires_grad_(True)
         together = model(obs, masks=first, hidden_state=(zero, zero))
-        torch.testing.assert_close(together, torch.stack(stepwise))
+        assert_close(together, torch.stack(stepwise))
         together[3:, 0].sum().backward()
         self.assertEqual(float(obs["policy"].grad[:3].abs().max()), 0.0)
         self.assertGreater(float(obs["policy"].grad[3:, 0].abs().max()), 0.0)
         carried = model(obs, masks=first, hidden_state=(zero + 1, zero + 1))
         self.assertGreater(float((carried - together).detach()[:3, 0].abs().max()), 1e-4)
-        torch.testing.assert_close(carried[3:, 0], together[3:, 0])
+        assert_close(carried[3:, 0], together[3:, 0])
         obs["policy"].grad = None
         h, c = torch.cat(states, dim=2)
         pieces = model(obs, masks=first, hidden_state=(h.detach(), c.detach()))
-        torch.testing.assert_close(pieces, torch.stack(stepwise))
+        assert_close(pieces, torch.stack(stepwise))
         pieces[L:].sum().backward()
         self.assertEqual(float(obs["policy"].grad[:L].abs().max()), 0.0)
 
@@ -140,7 +141,7 @@ class ModelTest(unittest.TestCase):
                 output.square().sum().backward()
             found.append((output.detach(), model.trunk.lstm.weight_ih_l0.grad))
         library, full, low = found
-        torch.testing.assert_close(full, library)
+        assert_close(full, library)
         for value, expected in zip(low, library, strict=True):
             self.assertTrue(0.0 < float((value - expected).norm()) < 0.01 * float(expected.norm()))
 
@@ -170,7 +171,7 @@ class StorageTest(unittest.TestCase):
         dones[3, 1] = 1
         worlds = torch.tensor([2, 0])
         h, _ = piece_states([code[:, None, :, None]] * 2, worlds, L)
-        torch.testing.assert_close(h[0, :, 0], code[::L, worlds].flatten())
+        assert_close(h[0, :, 0], code[::L, worlds].flatten())
         # a step is the first of an episode where the step before it was the last
         first = first_steps(SimpleNamespace(dones=dones), worlds)
         self.assertTrue(torch.equal(first, firsts((3, 0), (4, 1))[:, worlds]))
@@ -247,7 +248,7 @@ class StorageTest(unittest.TestCase):
             self.assertFalse(one._graphs._graphs)
             self.assertTrue(two._graphs._graphs)
             self.assertGreater(float((plain - before).abs().mean()), 0.05)
-            torch.testing.assert_close(captured, plain, rtol=0.0, atol=tolerance)
+            assert_close(captured, plain, rtol=0.0, atol=tolerance)
 
     def test_a_bounds_loss_pulls_means_back_from_beyond_the_limits(self):
         _, _, free = self.bandit(iterations=5, bias=3.0, target=3.0)
@@ -269,10 +270,10 @@ class ReturnCriticTest(unittest.TestCase):
             )
             critic.take_returns(seen[-1])
             critic.reset()
-            torch.testing.assert_close(critic(obs), before, atol=1e-4, rtol=1e-4)
+            assert_close(critic(obs), before, atol=1e-4, rtol=1e-4)
             everything = torch.cat(seen)
             moments = (everything.mean(), everything.std(unbiased=False))
-            torch.testing.assert_close((critic.return_mean, critic.return_std), moments)
+            assert_close((critic.return_mean, critic.return_std), moments)
 
 
 class ExportTest(unittest.TestCase):
@@ -305,9 +306,7 @@ class ExportTest(unittest.TestCase):
             policy = OnnxPolicy(file)
         with torch.no_grad():
             for t in range(50):
-                torch.testing.assert_close(
-                    policy.act(seen(t)), model(seen(t)).clamp(-1, 1), atol=1e-5, rtol=0
-                )
+                assert_close(policy.act(seen(t)), model(seen(t)).clamp(-1, 1), atol=1e-5, rtol=0)
 
 
 class ConfigTest(unittest.TestCase):

@@ -3,6 +3,7 @@
 import unittest
 
 import numpy as np
+from numpy.testing import assert_array_equal
 
 from xreset.schedule import schedule
 
@@ -26,7 +27,7 @@ class ScheduleTest(unittest.TestCase):
                 done = [row[fresh] for row, fresh in plan]
                 self.assertEqual(sorted(np.concatenate(done)), list(range(len(items))))
                 for row, fresh in plan:
-                    np.testing.assert_array_equal(items[row], plan.object_index)
+                    assert_array_equal(items[row], plan.object_index)
                     self.assertTrue(fresh.any())
                 kinds = len(set(items))  # each object needs a world of its own
                 self.assertEqual(len(plan.object_index), min(max(worlds, kinds), len(items)))
@@ -39,8 +40,8 @@ class ScheduleTest(unittest.TestCase):
 
     def test_a_world_without_work_repeats_an_item_of_its_object(self):
         plan = schedule(np.array([0, 0, 0]), 2)
-        np.testing.assert_array_equal(plan.rounds, [[0, 1], [2, 2]])
-        np.testing.assert_array_equal(plan.fresh, [[True, True], [True, False]])
+        assert_array_equal(plan.rounds, [[0, 1], [2, 2]])
+        assert_array_equal(plan.fresh, [[True, True], [True, False]])
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch.testing import assert_close
 
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_hand_arm
@@ -254,8 +255,8 @@ class TerminationTest(unittest.TestCase):
             ]
         )
         away = (limits - torch.tensor([0.5, 0.3, 0.1])).sign() * 0.01
-        self.assertFalse(bool(out_of_bounds(limits - away, table, c).any()))
-        self.assertTrue(bool(out_of_bounds(limits + away, table, c).all()))
+        self.assertFalse(out_of_bounds(limits - away, table, c).any())
+        self.assertTrue(out_of_bounds(limits + away, table, c).all())
 
 
 class ActionTest(WithRobot):
@@ -267,11 +268,11 @@ class ActionTest(WithRobot):
         target = torch.tensor([[0.1, 0.5, -0.5, 0.0, 0.0, 0.3, 0.01]])
         still = space.targets(torch.zeros(1, 7), target, target - 0.02)
         # a loaded arm that sags would otherwise sink a little further at every step of zero action
-        torch.testing.assert_close(still[:, :3], target[:, :3])
-        torch.testing.assert_close(still[:, 3:], torch.tensor([[-0.55, 0.55, 0.8, 0.02]]))
+        assert_close(still[:, :3], target[:, :3])
+        assert_close(still[:, 3:], torch.tensor([[-0.55, 0.55, 0.8, 0.02]]))
         # actions are limited to [-1, 1]
         full = space.targets(torch.full((1, 7), 5.0), target, target)
-        torch.testing.assert_close(full, torch.tensor([[0.15, 0.55, -0.45, 0.5, 1.6, 1.6, 0.04]]))
+        assert_close(full, torch.tensor([[0.15, 0.55, -0.45, 0.5, 1.6, 1.6, 0.04]]))
 
     def test_arm_targets_stay_near_the_joint_and_within_its_limits(self):
         space = self.space(arm_step=0.05, arm_lead=0.15)
@@ -279,10 +280,10 @@ class ActionTest(WithRobot):
         target = blocked.clone()
         for _ in range(10):
             target = space.targets(torch.tensor([[0.0, 1, -1, 0, 0, 0, 0]]), target, blocked)
-        torch.testing.assert_close(target[:, 1:3], torch.tensor([[0.15, -0.15]]))
+        assert_close(target[:, 1:3], torch.tensor([[0.15, -0.15]]))
         near = torch.tensor([[0.29, 2.99, -1.99, 0, 0, 0, 0]])
         moved = space.targets(torch.tensor([[1.0, 1, -1, 0, 0, 0, 0]]), near, near)
-        torch.testing.assert_close(moved[:, :3], torch.tensor([[0.3, 3.0, -2.0]]))
+        assert_close(moved[:, :3], torch.tensor([[0.3, 3.0, -2.0]]))
 
     def test_action_zero_may_be_home(self):
         space = self.space(hand_zero="home")
@@ -295,7 +296,7 @@ class ActionTest(WithRobot):
             (0.5, (home + space.upper) / 2),
         ):
             found = space.targets(torch.full((1, 7), action), target, target)
-            torch.testing.assert_close(found[0, 3:], expected[3:], msg=f"action {action}")
+            assert_close(found[0, 3:], expected[3:], msg=f"action {action}")
 
     def test_a_relative_hand_that_does_nothing_holds_its_targets(self):
         space = self.space(hand="relative", hand_step=0.05, hand_lead=0.4)
@@ -303,19 +304,15 @@ class ActionTest(WithRobot):
         target = torch.tensor([[0.1, 0.5, -0.5, -0.2, 0.4, 0.3, 0.01]])
         # joints that an object keeps from following
         pressed = target - torch.tensor([0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.004])
-        torch.testing.assert_close(
-            space.targets(torch.zeros(1, 7), target, pressed)[:, 3:], target[:, 3:]
-        )
+        assert_close(space.targets(torch.zeros(1, 7), target, pressed)[:, 3:], target[:, 3:])
         moved = space.targets(torch.tensor([[0.0, 0, 0, 1, -1, 0.5, 1]]), target, pressed)
-        torch.testing.assert_close(moved[:, 3:], torch.tensor([[-0.15, 0.35, 0.325, 0.012]]))
+        assert_close(moved[:, 3:], torch.tensor([[-0.15, 0.35, 0.325, 0.012]]))
         for _ in range(20):
             moved = space.targets(torch.ones(1, 7), moved, pressed)
         held = pressed[:, 3:] + torch.tensor([0.4, 0.4, 0.4, 0.016])
-        torch.testing.assert_close(
-            moved[:, 3:], held, msg="it presses no harder than its lead allows"
-        )
+        assert_close(moved[:, 3:], held, msg="it presses no harder than its lead allows")
         action = space.action_for(target + torch.tensor([0.02] * 6 + [0.0008]), target)
-        torch.testing.assert_close(action[:, 3:], torch.full((1, 4), 0.4))
+        assert_close(action[:, 3:], torch.full((1, 4), 0.4))
 
     def test_action_for_undoes_targets(self):
         for options in ({}, {"hand_zero": "home"}):
@@ -324,7 +321,7 @@ class ActionTest(WithRobot):
             target = space.lower + (space.upper - space.lower) * torch.rand(50, 7, generator=g)
             wanted = space.targets(2 * torch.rand(50, 7, generator=g) - 1, target, target)
             again = space.targets(space.action_for(wanted, target), target, target)
-            torch.testing.assert_close(again, wanted, atol=1e-5, rtol=0)
+            assert_close(again, wanted, atol=1e-5, rtol=0)
 
 
 class LatencyTest(unittest.TestCase):
@@ -344,12 +341,12 @@ class LatencyTest(unittest.TestCase):
 class RandomizationTest(unittest.TestCase):
     def test_a_pairs_friction_is_the_mean_of_its_materials(self):
         c = RandomizationConfig(elastomer=0.8, metal=0.1, table=0.5)
-        torch.testing.assert_close(
+        assert_close(
             pair_friction(torch.tensor([0.5, 1.0]), c),
             torch.tensor([[0.65, 0.3, 0.5], [0.9, 0.55, 0.75]]),
         )
         nominal = sample_friction(3, RandomizationConfig(enabled=False), generator())
-        torch.testing.assert_close(nominal, pair_friction(torch.full((3,), 0.75), c))
+        assert_close(nominal, pair_friction(torch.full((3,), 0.75), c))
 
     def test_friction_comes_from_the_buckets(self):
         c = RandomizationConfig(friction=(0.5, 1.0), friction_buckets=250, hand_friction=(0.5, 1.0))
@@ -357,9 +354,7 @@ class RandomizationTest(unittest.TestCase):
         material = 2 * table - c.table
         drawn = 2 * link - (2 * tip - c.elastomer)
         for values in (material, drawn):
-            torch.testing.assert_close(
-                torch.stack(values.aminmax()), torch.tensor([0.5, 1.0]), atol=2e-3, rtol=0
-            )
+            assert_close(torch.stack(values.aminmax()), torch.tensor([0.5, 1.0]), atol=2e-3, rtol=0)
             self.assertAlmostEqual(float(values.mean()), 0.75, delta=0.005)
         self.assertEqual(len(material.mul(1e5).round().unique()), 250)
 
@@ -383,13 +378,11 @@ class ResetTest(WithRobot):
         reset = self.sample(torch.tensor([0, 1] * 500), demo_probability=1.0)
         # the toy bank numbers its states
         state = ((reset.object_pos[:, 0] - 0.6) * 100).round().long()
-        torch.testing.assert_close(reset.joint_pos, torch.as_tensor(bank.joint_pos)[state])
-        torch.testing.assert_close(reset.object_quat, torch.as_tensor(bank.object_quat_wxyz)[state])
+        assert_close(reset.joint_pos, torch.as_tensor(bank.joint_pos)[state])
+        assert_close(reset.object_quat, torch.as_tensor(bank.object_quat_wxyz)[state])
         self.assertEqual(reset.sequence.tolist(), bank.sequence_index[state].tolist())
-        torch.testing.assert_close(reset.goal_pos, torch.as_tensor(bank.goal_pos)[reset.sequence])
-        torch.testing.assert_close(
-            reset.goal_quat, torch.as_tensor(bank.goal_quat_wxyz)[reset.sequence]
-        )
+        assert_close(reset.goal_pos, torch.as_tensor(bank.goal_pos)[reset.sequence])
+        assert_close(reset.goal_quat, torch.as_tensor(bank.goal_quat_wxyz)[reset.sequence])
 
     def test_which_states_are_drawn(self):
         """Every state of the object, and of no other; home where there is none."""
@@ -420,27 +413,25 @@ class ResetTest(WithRobot):
     def test_gravity(self):
         """Of bank resets uniform, of home resets alpha = 1 + eta / 9.81 with eta ~ N(0, 1), clipped."""
         gravity = self.sample(demo_probability=1.0).gravity_fraction
-        torch.testing.assert_close(
-            torch.stack(gravity.aminmax()), torch.tensor([0.0, 1.0]), atol=0.01, rtol=0
-        )
+        assert_close(torch.stack(gravity.aminmax()), torch.tensor([0.0, 1.0]), atol=0.01, rtol=0)
         self.assertAlmostEqual(float(gravity.mean()), 0.5, delta=0.02)
         gravity = self.sample().gravity_fraction
         self.assertAlmostEqual(float(gravity.mean()), 1.0, delta=0.01)
         self.assertAlmostEqual(float(gravity.std()), 1 / 9.81, delta=0.005)
         clipped = self.sample(home_gravity_clip=0.1).gravity_fraction
-        torch.testing.assert_close(torch.stack(clipped.aminmax()), torch.tensor([0.9, 1.1]))
+        assert_close(torch.stack(clipped.aminmax()), torch.tensor([0.9, 1.1]))
         for options in (
             {"demo_probability": 1.0, "random_gravity": False},
             {"home_gravity_std": 0.0},
         ):
-            self.assertTrue(bool((self.sample(**options).gravity_fraction == 1).all()))
+            self.assertTrue((self.sample(**options).gravity_fraction == 1).all())
 
     def test_home_spawns_are_uniform_around_the_demonstrations_start(self):
         start = torch.as_tensor(toy_bank(self.robot).start_pos)
         reset = self.sample()
         offset = reset.object_pos - start[reset.sequence]
         extremes = torch.stack(torch.aminmax(offset, dim=0))
-        torch.testing.assert_close(
+        assert_close(
             extremes, torch.tensor([[-0.02, -0.02, 0], [0.02, 0.02, 0]]), atol=2e-4, rtol=0
         )
         yaw = quat_angle(
@@ -449,7 +440,7 @@ class ResetTest(WithRobot):
         self.assertAlmostEqual(float(yaw.rad2deg().max()), 25.0, delta=0.1)
         self.assertAlmostEqual(float(yaw.rad2deg().mean()), 12.5, delta=0.5)
         unmoved = self.sample(spawn_xy=0.0, spawn_yaw=0.0)
-        torch.testing.assert_close(unmoved.object_pos, start[unmoved.sequence])
+        assert_close(unmoved.object_pos, start[unmoved.sequence])
         wide = self.sample(training_xy=0.1)
         self.assertAlmostEqual(
             float((wide.object_pos - start[wide.sequence]).max()), 0.1, delta=1e-3
@@ -459,9 +450,7 @@ class ResetTest(WithRobot):
         )
         # y of the object stands up
         axis = quat_rotate(self.sample(bank=lying).object_quat, torch.tensor([0.0, 1, 0]))
-        torch.testing.assert_close(
-            axis, torch.tensor([0.0, 0, 1]).expand_as(axis), atol=1e-6, rtol=0
-        )
+        assert_close(axis, torch.tensor([0.0, 0, 1]).expand_as(axis), atol=1e-6, rtol=0)
 
     def test_goals_move_around_the_demonstrated_ones_and_never_below_the_start(self):
         bank = toy_bank(self.robot)
@@ -473,11 +462,9 @@ class ResetTest(WithRobot):
             reset.goal_quat,
             torch.as_tensor(bank.goal_quat_wxyz, dtype=torch.float32)[reset.sequence],
         )
-        torch.testing.assert_close(reset.goal_pos[reset.from_bank], goal[reset.from_bank])
+        assert_close(reset.goal_pos[reset.from_bank], goal[reset.from_bank])
         largest = torch.cat((offset.abs().amax(dim=0), angle[~reset.from_bank].max()[None]))
-        torch.testing.assert_close(
-            largest, torch.tensor([0.03, 0.03, 0.05, 0.5]), atol=2e-3, rtol=0
-        )
+        assert_close(largest, torch.tensor([0.03, 0.03, 0.05, 0.5]), atol=2e-3, rtol=0)
         reset = self.sample(bank=toy_bank(self.robot, goal_pos=bank.start_pos), **options)
         start = torch.as_tensor(bank.start_pos, dtype=torch.float32)[reset.sequence]
         self.assertGreaterEqual(float((reset.goal_pos - start)[:, 2].min()), 0.0)
@@ -487,13 +474,13 @@ class ResetTest(WithRobot):
     def test_home_joints_spread_as_the_paper_says_and_stay_within_limits(self):
         joints = self.sample().joint_pos
         space = ActionSpace(self.robot, ActionConfig())
-        self.assertTrue(bool(((joints >= space.lower) & (joints <= space.upper)).all()))
+        self.assertTrue(((joints >= space.lower) & (joints <= space.upper)).all())
         spread = (joints - torch.as_tensor(self.robot.home, dtype=torch.float32)).std(dim=0)
         # an arm joint far from its limits
         self.assertAlmostEqual(float(spread[1]), 0.075, delta=0.004)
         self.assertAlmostEqual(float(spread[4]), 0.10, delta=0.005)  # a finger joint
         quiet = self.sample(self.SOUPS[:5], home_noise=False)
-        torch.testing.assert_close(quiet.joint_pos, torch.full((5, 7), 0.01))
+        assert_close(quiet.joint_pos, torch.full((5, 7), 0.01))
 
 
 QUIET = NoiseConfig(joint_pos=0.0, joint_vel=0.0, object_pos=0.0, object_rot=0.0, cloud=0.0)
@@ -547,22 +534,16 @@ class ObservationTest(unittest.TestCase):
 
     def test_without_noise_the_proprio_group_is_exact(self):
         for name in ("pos", "linvel", "angvel"):
-            torch.testing.assert_close(
-                self.proprio[f"palm_{name}"], getattr(self.x.links, name)[:, 0]
-            )
-        torch.testing.assert_close(
-            self.proprio["tip_pos"], self.x.links.pos[:, 1:].reshape(self.N, -1)
-        )
-        torch.testing.assert_close(self.proprio["joint_vel"], 0.2 * self.x.state.joint_vel)
-        torch.testing.assert_close(
+            assert_close(self.proprio[f"palm_{name}"], getattr(self.x.links, name)[:, 0])
+        assert_close(self.proprio["tip_pos"], self.x.links.pos[:, 1:].reshape(self.N, -1))
+        assert_close(self.proprio["joint_vel"], 0.2 * self.x.state.joint_vel)
+        assert_close(
             self.proprio["joint_pos"], (self.x.state.joint_pos - 0.5) / 2.5
         )  # limits -2, 3 become -1, 1
         force = self.proprio["tip_force"]
         self.assertEqual(float(force.abs().max()), 1.0)
         small = self.x.tip_force.abs() < 10
-        torch.testing.assert_close(
-            force.view(self.N, self.E, 3)[small], 0.1 * self.x.tip_force[small]
-        )
+        assert_close(force.view(self.N, self.E, 3)[small], 0.1 * self.x.tip_force[small])
 
     def test_one_rotation_is_one_observation(self):
         negated = replace(
@@ -577,17 +558,13 @@ class ObservationTest(unittest.TestCase):
             c = replace(self.config, rotation=rotation)
             torch.testing.assert_close(obs.goal_group(negated, c), obs.goal_group(self.x, c))
             for group in (obs.policy_group, obs.proprio_group):
-                torch.testing.assert_close(
-                    group(negated, c, generator()), group(self.x, c, generator())
-                )
+                assert_close(group(negated, c, generator()), group(self.x, c, generator()))
         for name, quat, own in (
             ("object_quat", self.policy, self.x.observed_quat),
             ("palm_quat", self.proprio, self.x.links.quat[:, 0]),
         ):
-            self.assertTrue(bool((quat[name][:, 0] >= 0).all()), name)
-            torch.testing.assert_close(
-                quat_angle(quat[name], own), torch.zeros(self.N), atol=1e-3, rtol=0
-            )
+            self.assertTrue((quat[name][:, 0] >= 0).all(), name)
+            assert_close(quat_angle(quat[name], own), torch.zeros(self.N), atol=1e-3, rtol=0)
 
     def test_with_cameras_a_goal_may_be_a_rotation_from_the_start(self):
         c = replace(self.config, rotation="to_goal")
@@ -616,8 +593,8 @@ class ObservationTest(unittest.TestCase):
         cloud = quat_rotate(self.x.observed_quat[:, None], points) + self.x.observed_pos[:, None]
         distance = (self.x.links.pos[:, :, None] - cloud[:, None]).norm(dim=-1).amin(dim=-1)
         vectors = found[:, :-1].unflatten(1, (-1, 3))
-        torch.testing.assert_close(vectors.norm(dim=-1), distance[:, 1:])
-        torch.testing.assert_close(found[:, -1], distance[:, 0])
+        assert_close(vectors.norm(dim=-1), distance[:, 1:])
+        assert_close(found[:, -1], distance[:, 0])
         ends = self.x.links.pos[:, 1:] + vectors
         gaps = (ends[:, :, None] - cloud[:, None]).norm(dim=-1).amin(dim=-1)
         self.assertLess(float(gaps.max()), 1e-5)
@@ -628,15 +605,13 @@ class ObservationTest(unittest.TestCase):
         state = self.x.state
         to_goal = self.x.goal_pos - state.object_pos
         expected = torch.cat((state.object_linvel, state.object_angvel, to_goal), 1)
-        torch.testing.assert_close(found[:, :9], expected)
+        assert_close(found[:, :9], expected)
         axis = torch.tensor([1.0, 0, 0]).expand(self.N, 3)
         corrected = quat_rotate(
             quat_from_axis_angle(found[:, 9:12]), quat_rotate(self.x.state.object_quat, axis)
         )
-        torch.testing.assert_close(
-            corrected, quat_rotate(self.x.goal_quat, axis), atol=1e-5, rtol=0
-        )
-        torch.testing.assert_close(
+        assert_close(corrected, quat_rotate(self.x.goal_quat, axis), atol=1e-5, rtol=0)
+        assert_close(
             found[:, 12:],
             torch.stack((self.x.tip_distance.amin(1), self.x.gravity_fraction, self.x.reward), 1),
         )
@@ -653,7 +628,7 @@ class ObservationTest(unittest.TestCase):
         ):
             cloud = obs.cloud_frame(points, self.x, config, generator())
             self.assertEqual(tuple(cloud.shape), (self.N, 10, config.cloud_shape[2]))
-            torch.testing.assert_close(cloud[2, 7], expected)
+            assert_close(cloud[2, 7], expected)
 
     def test_rotations_as_columns_of_the_matrix(self):
         c = replace(self.config, rotation="matrix", joint_target=True)
@@ -661,17 +636,15 @@ class ObservationTest(unittest.TestCase):
         x = replace(self.x, observed_quat=turned(90)[None].expand(self.N, 4))
         shown = self.split(obs.policy_group(x, c, generator()), widths["policy"])
         shown |= self.split(obs.proprio_group(x, c, generator()), widths["proprio"])
-        torch.testing.assert_close(
+        assert_close(
             shown["object_rotation"], torch.tensor([0.0, 1, 0, -1, 0, 0]).expand(self.N, 6)
         )
         for axis, column in zip(
             torch.eye(3), shown["palm_rotation"].split(3, dim=-1), strict=False
         ):
-            torch.testing.assert_close(
-                column, quat_rotate(x.links.quat[:, 0], axis.expand(self.N, 3))
-            )
-        torch.testing.assert_close(shown["joint_target"], x.joint_target - x.state.joint_pos)
-        torch.testing.assert_close(shown["tip_force"], self.proprio["tip_force"])
+            assert_close(column, quat_rotate(x.links.quat[:, 0], axis.expand(self.N, 3)))
+        assert_close(shown["joint_target"], x.joint_target - x.state.joint_pos)
+        assert_close(shown["tip_force"], self.proprio["tip_force"])
 
     def test_noise_has_the_configured_spread_and_touches_only_what_is_measured(self):
         many = torch.zeros(4000, dtype=torch.long)
@@ -692,7 +665,7 @@ class ObservationTest(unittest.TestCase):
         expected[joints + self.J : joints + 2 * self.J] = 0.1 * 0.2
         rotation = policy[:, 3:7]
         spread[3:7] = 0.0
-        torch.testing.assert_close(spread, expected, rtol=0.1, atol=1e-6)
+        assert_close(spread, expected, rtol=0.1, atol=1e-6)
         angle = quat_angle(rotation, x.observed_quat).square().mean().sqrt()
         self.assertAlmostEqual(float(angle), 0.05 * math.sqrt(3), delta=0.005)
         cloud = obs.cloud_frame(torch.zeros(self.N, 1000, 3), self.x, c, generator())

@@ -185,7 +185,7 @@ class TrainingTest(unittest.TestCase):
                     (content.iteration, content.env_steps), (1, 4 * config.ppo.horizon)
                 )
                 for value in content.actor_state_dict.values():
-                    self.assertTrue(bool(value.isfinite().all()))
+                    self.assertTrue(value.isfinite().all())
 
     def test_the_same_ctrl_c_told_twice_is_one(self):
         with _stop_on_interrupt() as stop:

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.testing import assert_array_equal
 
 from tests.test_env import TASK, BreakableBackend, N, WithEnv
 from xreset.errors import XResetError
@@ -40,8 +41,8 @@ class VectorEnvTest(WithEnv):
             self.assertFalse(terminated.any())
             self.assertEqual(truncated.all(), step in (length, 2 * length + 1))
             if step == length + 1:
-                np.testing.assert_array_equal(reward, 0.0)
-                np.testing.assert_array_equal(env.env.episode_length_buf.numpy(), 0)
+                assert_array_equal(reward, 0.0)
+                assert_array_equal(env.env.episode_length_buf.numpy(), 0)
 
     def test_an_episode_counts_once(self):
         """A broken world is counted in the step that ends it, and not again in the one that resets it."""
@@ -62,7 +63,7 @@ class VectorEnvTest(WithEnv):
         self.assertEqual(reward[0], 0.0)
         for name, value in seen.items():
             self.assertTrue(np.isfinite(value).all(), name)
-            np.testing.assert_array_equal(value[0], before[name][0])
+            assert_array_equal(value[0], before[name][0])
         _, _, terminated, truncated, infos = env.step(still)
         self.assertFalse(terminated.any() or truncated.any() or infos["faulty"].any())
         self.assertEqual(int(inner.nonfinite_count), 1)

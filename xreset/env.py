@@ -548,7 +548,7 @@ class ManipulationEnv:
         )
         frame = obs.cloud_frame(self._cloud_points, x, c, self.generator)[:, None]
         history = torch.cat((self._cloud[:, 1:], frame), dim=1)
-        self._cloud.copy_(torch.where(self._reset_mask.view(-1, 1, 1, 1), frame, history))
+        self._cloud.copy_(where(self._reset_mask, frame, history))
         groups = {
             "policy": obs.policy_group(x, c, self.generator, self._cloud_points),
             "proprio": self.variation.observed_proprio(

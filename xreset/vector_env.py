@@ -9,6 +9,7 @@ import torch
 
 from xreset.env import ManipulationEnv
 from xreset.errors import XResetError, needs
+from xreset.tensors import where
 
 with needs("gymnasium", "gymnasium"):
     import gymnasium
@@ -132,9 +133,7 @@ def with_sound_rows(observations: TensorDict, before: TensorDict) -> TensorDict:
     """Replace the observations of every world that shows a number that is not finite with its observations before."""
     finite = [value.flatten(1).isfinite().all(dim=1) for value in observations.values()]
     sound = torch.stack(finite).all(dim=0)
-    return observations.apply(
-        lambda new, old: torch.where(sound.view(-1, *[1] * (new.ndim - 1)), new, old), before
-    )
+    return observations.apply(lambda new, old: where(sound, new, old), before)
 
 
 def arrays(observations: TensorDict) -> dict[str, np.ndarray]:

@@ -24,6 +24,7 @@ from xreset.geometry.urdf import link_meshes
 from xreset.objects.sampling import winding_number
 from xreset.physics import State
 from xreset.spec import SceneSpec, TableSpec
+from xreset.tensors import where
 
 
 class Cameras:
@@ -147,10 +148,8 @@ class Cameras:
 
         Depths are 1 at the camera's least depth, 0 at its largest one, and 0 where a pixel sees nothing.
         """
-        due = self._due.view(-1, 1, 1, 1)
-        self.image.copy_(
-            torch.where(due, self._with_errors(self.rays.depth, generator), self.image)
-        )
+        measured = self._with_errors(self.rays.depth, generator)
+        self.image.copy_(where(self._due, measured, self.image))
         images = [self.image]
         if self._goal_rays is not None:
             images.append(self._in_range(self._goal_rays.depth))
@@ -162,7 +161,7 @@ class Cameras:
             for image, mask in zip(images, is_object, strict=False):
                 clouds.append(self._points(image, mask, generator))
             view = torch.stack(clouds, dim=1)
-        self.view.copy_(torch.where(due, view, self.view))
+        self.view.copy_(where(self._due, view, self.view))
         return self.view
 
     def picture(self, world: int, width: int) -> np.ndarray:

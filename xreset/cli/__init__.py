@@ -115,13 +115,5 @@ def _run(argv: list[str]) -> None:
 
 def _usage() -> str:
     width = max(map(len, COMMANDS))
-    lines = [f"  {name:<{width}}  {text}" for name, text in COMMANDS.items()]
-    return "\n".join(
-        [
-            "usage: xreset COMMAND ...",
-            "",
-            *lines,
-            "",
-            "xreset COMMAND --help shows the options of one command.",
-        ]
-    )
+    lines = "\n".join(f"  {name:<{width}}  {text}" for name, text in COMMANDS.items())
+    return f"usage: xreset COMMAND ...\n\n{lines}\n\nxreset COMMAND --help shows the options of one command."

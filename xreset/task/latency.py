@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from xreset.task.randomization import Drawn, Sample
+from xreset.tensors import where
 
 
 class DelayLine:
@@ -50,7 +51,7 @@ class DelayLine:
     def fill(self, fresh: Tensor, value: Tensor) -> None:
         """Make a value [N, D] the whole past of the worlds of a mask [N]."""
         if self.longest:
-            self.values.copy_(torch.where(fresh[:, None, None], value[:, None], self.values))
+            self.values.copy_(where(fresh, value[:, None], self.values))
 
     def push(self, value: Tensor, delay: Tensor | None = None) -> Tensor:
         """Add the newest value [N, D] and return the delayed one [N, D], interpolated between whole steps.

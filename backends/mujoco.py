@@ -11,7 +11,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from xreset.backends.pool import PoolBackend, World
-from xreset.backends.rigid import Inertia, conjugate, object_inertia
+from xreset.backends.rigid import ContactArrays, Inertia, LinkArrays, conjugate, object_inertia
 from xreset.physics import Capability, KnownDifference, unavailable
 from xreset.spec import SceneSpec
 
@@ -122,13 +122,13 @@ class MujocoWorld(World):
         self._overflows = sum(warning.number for warning in self._full)
         self._overflowed = self._overflows > before
 
-    def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def contacts(self) -> ContactArrays:
         self._with_sensors(mujoco.mj_sensorAcc)
         tip_force = self._sum_by_tip @ self._geom_forces
         # A contact in which no force acts is no touch.
         return tip_force, tip_force.any(axis=1), -self._table_force
 
-    def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def links(self) -> LinkArrays:
         self._with_sensors(mujoco.mj_step1)
         self._ahead = True
         return self._links

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.backends.rigid import Inertia
+from xreset.backends.rigid import ContactArrays, Inertia, LinkArrays
 from xreset.backends.workers import (
     CONTACT_FIELDS,
     STATE_FIELDS,
@@ -72,14 +72,14 @@ class World(ABC):
         """Advance by n physics steps."""
 
     @abstractmethod
-    def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def links(self) -> LinkArrays:
         """Return position [K, 3], orientation [K, 4], velocity of the origin [K, 3], angular velocity [K, 3] of links.
 
         The arrays may be views of the engine's memory, which the next call that changes the world overwrites.
         """
 
     @abstractmethod
-    def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def contacts(self) -> ContactArrays:
         """Return tip force [E, 3], tip touch [E] bool and table force [3] on the object in the last physics step.
 
         All are zero right after :meth:`set_state`.

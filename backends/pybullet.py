@@ -39,7 +39,9 @@ from xreset.backends.pool import PoolBackend, World, is_finite
 from xreset.backends.rigid import (
     OTHER_LINK,
     TABLE,
+    ContactArrays,
     Inertia,
+    LinkArrays,
     TrackedFrames,
     conjugate,
     cross,
@@ -173,14 +175,14 @@ class PybulletWorld(World):
             p.stepSimulation()
         self._fresh = False
 
-    def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def links(self) -> LinkArrays:
         states = self._p.getLinkStates(
             self._robot, self._frames.bodies, computeLinkVelocity=1, computeForwardKinematics=1
         )
         rows = np.array([state[4] + state[5] + state[6] + state[7] for state in states])
         return self._frames.locate(rows[:, :3], rows[:, [6, 3, 4, 5]], rows[:, 7:10], rows[:, 10:])
 
-    def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def contacts(self) -> ContactArrays:
         """See :meth:`World.contacts`. The forces are those of the last internal step."""
         found = []
         # All contacts: when asked for a body, PyBullet swaps the two bodies and the normal, but not the friction.

@@ -20,6 +20,11 @@ from xreset.geometry.dynamics import drive_shares
 from xreset.geometry.urdf import Joint, Link, RobotTree, robot_tree
 from xreset.spec import ObjectSpec, RobotSpec, Shape
 
+LinkArrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""Of the tracked links: position [K, 3], orientation [K, 4], velocity of the origin [K, 3], angular velocity [K, 3]."""
+ContactArrays = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Tip force [E, 3], tip touch [E] bool and table force [3], on the object."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Inertia:
@@ -187,7 +192,7 @@ class TrackedFrames:
 
     def locate(
         self, pos: np.ndarray, quat: np.ndarray, com_velocity: np.ndarray, angvel: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    ) -> LinkArrays:
         """Return position, orientation, velocity and angular velocity of the tracked links.
 
         Args:
@@ -328,9 +333,7 @@ OTHER_LINK = -2
 """What touches the object: these, or the index of a fingertip."""
 
 
-def sum_contacts(
-    tips: int, contacts: Iterable[tuple[int, np.ndarray]]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def sum_contacts(tips: int, contacts: Iterable[tuple[int, np.ndarray]]) -> ContactArrays:
     """Return tip force [E, 3], tip touch [E] and table force [3], given what touches the object and with which
     force."""
     tip_force = np.zeros((tips, 3))

@@ -28,7 +28,9 @@ from xreset.backends.pool import PoolBackend, World
 from xreset.backends.rigid import (
     OTHER_LINK,
     TABLE,
+    ContactArrays,
     Inertia,
+    LinkArrays,
     TrackedFrames,
     cross,
     friction_forces,
@@ -125,7 +127,7 @@ class SapienWorld(World):
                 self._last_step = (*motion, force, self.torque)
             self._system.step()
 
-    def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def links(self) -> LinkArrays:
         parts = []
         for body in self._tracked:
             pose = body.entity_pose
@@ -133,7 +135,7 @@ class SapienWorld(World):
         rows = np.concatenate(parts, dtype=np.float64).reshape(-1, 13)
         return self._frames.locate(rows[:, :3], rows[:, 3:7], rows[:, 7:10], rows[:, 10:])
 
-    def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def contacts(self) -> ContactArrays:
         tips = len(self._mechanism.robot.fingertips)
         if self._last_step is None:
             return sum_contacts(tips, ())

@@ -19,7 +19,7 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_normalize
 from xreset.physics import Backend, Contacts, Links, Parameter, Parameters, State
 from xreset.plugins import backend_status, make_backend
-from xreset.spec import ObjectSpec, SceneSpec
+from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 
 MakeBackend = Callable[..., Backend]
 """Builds the backend under test: ``make(scene, num_worlds, object_index=...)``."""
@@ -204,9 +204,41 @@ class Bench:
         """Return [N] initial states with the object high above everything."""
         return replace_fields(self.start(), object_pos=torch.tensor([*self.place, 1.5]))
 
-    def random_state(self, seed: int) -> State:
-        """Return [N] random states of the shared worlds."""
-        return random_state(self, self.scene, self.NUM_WORLDS, seed)
+    def random_state(
+        self, seed: int, robot: RobotSpec | None = None, num_worlds: int = NUM_WORLDS
+    ) -> State:
+        """Return random states [N] of the shared worlds, or of worlds with another robot.
+
+        Every field is away from its default: joints are within their limits, the object spinning in the air.
+
+        A robot that would reach into the table is moved towards home until it does not: an arm deep inside the table is
+        thrown out, and no two engines need do that alike.
+        """
+        random = torch.Generator().manual_seed(seed)
+
+        def uniform(*shape: int) -> Tensor:
+            return 2.0 * torch.rand(*shape, generator=random) - 1.0
+
+        joints = Kinematics(robot or self.scene.robot)
+        home = torch.as_tensor(joints.robot.home, dtype=torch.float64)
+        lower, upper = finite_limits(joints)
+        reach = 0.3 * (upper - lower)
+        count = len(home)
+        pos = (home + reach * uniform(num_worlds, count)).clamp(
+            lower + 0.1 * reach, upper - 0.1 * reach
+        )
+        for _ in range(_HALVINGS):
+            inside = table_clearance(joints, pos, self.scene.table) < 0
+            pos = torch.where(inside[:, None], (home + pos) / 2, pos)
+        return State(
+            joint_pos=pos.float(),
+            joint_vel=0.5 * uniform(num_worlds, count),
+            joint_target=(pos + 0.2 * reach * uniform(num_worlds, count)).float(),
+            object_pos=torch.tensor([*self.place, 1.5]) + 0.05 * uniform(num_worlds, 3),
+            object_quat=quat_normalize(uniform(num_worlds, 4)),
+            object_linvel=uniform(num_worlds, 3),
+            object_angvel=4.0 * uniform(num_worlds, 3),
+        )
 
     @cached_property
     def place(self) -> tuple[float, float]:
@@ -237,39 +269,6 @@ def replace_fields(state: State, **changes: Tensor) -> State:
     for name, value in changes.items():
         new[name] = value.float().expand_as(getattr(state, name))
     return replace(state, **new).clone()
-
-
-def random_state(bench: Bench, scene: SceneSpec, num_worlds: int, seed: int) -> State:
-    """[N] states with every field away from its default: joints within their limits, the object spinning in the air.
-
-    A robot that would reach into the table is moved towards home until it does not: an arm deep inside the table is
-    thrown out, and no two engines need do that alike.
-    """
-    random = torch.Generator().manual_seed(seed)
-
-    def uniform(*shape: int) -> Tensor:
-        return 2.0 * torch.rand(*shape, generator=random) - 1.0
-
-    joints = Kinematics(scene.robot)
-    home = torch.as_tensor(scene.robot.home, dtype=torch.float64)
-    lower, upper = finite_limits(joints)
-    reach = 0.3 * (upper - lower)
-    count = len(home)
-    pos = (home + reach * uniform(num_worlds, count)).clamp(
-        lower + 0.1 * reach, upper - 0.1 * reach
-    )
-    for _ in range(_HALVINGS):
-        inside = table_clearance(joints, pos, scene.table) < 0
-        pos = torch.where(inside[:, None], (home + pos) / 2, pos)
-    return State(
-        joint_pos=pos.float(),
-        joint_vel=0.5 * uniform(num_worlds, count),
-        joint_target=(pos + 0.2 * reach * uniform(num_worlds, count)).float(),
-        object_pos=torch.tensor([*bench.place, 1.5]) + 0.05 * uniform(num_worlds, 3),
-        object_quat=quat_normalize(uniform(num_worlds, 4)),
-        object_linvel=uniform(num_worlds, 3),
-        object_angvel=4.0 * uniform(num_worlds, 3),
-    )
 
 
 def finite_limits(kinematics: Kinematics, most: float = 3.0) -> tuple[Tensor, Tensor]:

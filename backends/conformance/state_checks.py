@@ -9,7 +9,6 @@ from torch import Tensor
 
 from xreset.backends.conformance.harness import (
     Bench,
-    random_state,
     small_motion,
     state_errors,
 )
@@ -62,7 +61,7 @@ def joint_order(bench: Bench) -> Measured:
     count = len(scene.robot.joints)
     which = [0] * count
     with bench.other(scene, which) as worlds:
-        state = random_state(bench, scene, count, seed=3)
+        state = bench.random_state(3, scene.robot, count)
         worlds.set(state)
         links = _link_errors(kinematics, state, worlds.links())
         found = state_errors(worlds.state(), state)

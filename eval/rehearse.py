@@ -7,7 +7,7 @@ two (:mod:`xreset.live.faults`). The results are curves as in :mod:`xreset.eval.
 from __future__ import annotations
 
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
@@ -35,7 +35,7 @@ from xreset.eval.sensitivity import FAULTS, SWEEPS, Property, amount, chosen, no
 from xreset.eval.stress import COSTLY, Stress, by_property, draw_curves, plot_size, sweep
 from xreset.files import claim_folder, write_json, write_whole
 from xreset.inputs import Data
-from xreset.live.engine import begin, make_controller
+from xreset.live.engine import make_controller
 from xreset.live.faults import Faults, FaultyDriver
 from xreset.runtime import OnnxActor, Runner
 from xreset.task.terminations import out_of_bounds
@@ -130,21 +130,16 @@ def rehearse(
     opened = chosen_engines(engines, device)
     folder = Path(out) if out else spec.folder.parent / "rehearsal"
     found: list[Rehearsal] = []
+    stopped: dict[str, Counter[str]] = defaultdict(Counter)
+
+    def play(place: Engine, prop: Property | None, value: float) -> tuple[Episode, ...]:
+        changed, fault = _setting(trial, prop, value)
+        return _play(actor, place, changed, fault, episodes, real_time, stopped[place.name])
+
     with claim_folder(folder):
         for place in opened:
-            stopped: Counter[str] = Counter()
-
-            def play(
-                prop: Property | None,
-                value: float,
-                place: Engine = place,
-                stopped: Counter[str] = stopped,
-            ) -> tuple[Episode, ...]:
-                changed, fault = _setting(trial, prop, value)
-                return _play(actor, place, changed, fault, episodes, real_time, stopped)
-
             card = sweep(Rehearsal, spec, trial, place, properties, play, folder, progress)
-            card = replace(card, stopped=dict(stopped))
+            card = replace(card, stopped=dict(stopped[place.name]))
             write_json(folder / f"{place.name}.json", asdict(card))
             found.append(card)
             write_whole(folder / "index.html", page(found))
@@ -186,7 +181,6 @@ def _play(
         for r in rounds:
             env = r.env
             controller = make_controller(env, actor)
-            begin(controller, env)
             metrics = EpisodeMetrics(env.reading(), env.goal_pos, env.goal_quat, r.points)
 
             def look(

@@ -136,19 +136,12 @@ def stress(
         for value in prop.values:
             prop.set_in(task, value)
 
-    found = []
-    for engine in engines:
+    def play(engine: Engine, prop: Property | None, value: float) -> tuple[Episode, ...]:
+        changed = replace(trial, task=prop.set_in(task, value) if prop else task)
+        player = policy.start(trial.motion)
+        return roll_out(player, engine, changed, repetitions=repetitions).episodes
 
-        def play(
-            prop: Property | None, value: float, engine: Engine = engine
-        ) -> tuple[Episode, ...]:
-            changed = replace(trial, task=task if prop is None else prop.set_in(task, value))
-            return roll_out(
-                policy.start(trial.motion), engine, changed, repetitions=repetitions
-            ).episodes
-
-        found.append(sweep(Stress, policy, trial, engine, sweeps, play, out, progress))
-    return found
+    return [sweep(Stress, policy, trial, each, sweeps, play, out, progress) for each in engines]
 
 
 def sweep(
@@ -157,7 +150,7 @@ def sweep(
     trial: Trial,
     engine: Engine,
     properties: Sequence[Property],
-    play: Callable[[Property | None, float], Sequence[Episode]],
+    play: Callable[[Engine, Property | None, float], Sequence[Episode]],
     out: Path,
     progress: Callable[[str, int, int], None],
 ) -> Card:
@@ -169,7 +162,7 @@ def sweep(
         trial: named in the card.
         engine: where episodes are played.
         properties: properties and values.
-        play: plays the episodes with one property at a value; with None: with nothing changed.
+        play: plays the episodes in an engine with one property at a value; with None: with nothing changed.
         out: folder of the card.
         progress: called with (engine, runs done, runs in all).
     """
@@ -177,7 +170,7 @@ def sweep(
     usable = [prop for prop in properties if prop.needs is None or prop.needs in able]
     total = 1 + sum(len(prop.values) for prop in usable)
     done = 1
-    nominal = play(None, 1.0)
+    nominal = play(engine, None, 1.0)
     progress(engine.name, done, total)
     as_is = Effect.of(nominal, nominal)
     card = card_type(
@@ -197,7 +190,7 @@ def sweep(
     for prop in usable:
         swept = {}
         for value in prop.values:
-            swept[value] = play(prop, value)
+            swept[value] = play(engine, prop, value)
             done += 1
             progress(engine.name, done, total)
         card = replace(card, curves=(*card.curves, curve(prop, nominal, swept)))

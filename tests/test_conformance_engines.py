@@ -94,14 +94,9 @@ class EveryBackend(unittest.TestCase):
         for backend in BACKENDS:
             with self.subTest(backend=backend):
                 self.passes(backend, robot=panda(), only=robot_dependent)
-
-    @PYBULLET
-    def test_checks_that_need_the_suites_robot_are_skipped_with_another(self):
-        own = [c.name for c in CHECKS if c.own_robot_only]
+        own = [check.name for check in CHECKS if check.own_robot_only]
         results = run(make_local("mujoco"), robot=panda(), only=own)
-        self.assertEqual(
-            [(r.name, r.verdict) for r in results], [(name, "skipped") for name in own]
-        )
+        self.assertEqual({result.verdict for result in results}, {"skipped"})
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ import torch
 
 from tests import toy_grasp
 from tests.command import xreset
+from tests.engine_checks import JOINT, with_drive
 from tests.toy_bank import SOUP, SPAM
 from tests.toy_grasp import recording
 from xreset.errors import DemoError, FileFormatError, XResetError
@@ -172,8 +173,11 @@ class TraceTest(unittest.TestCase):
         self.assertAlmostEqual(self.result.reference.lifted or 0.0, toy_grasp.RAISED, delta=0.01)
 
     def test_half_a_drives_gain_is_found_in_its_joint_at_once(self):
+        kp = 0.5 * toy_grasp.robot().joints[JOINT["turn"]].drive.kp
         weak = toy_grasp.with_scene(
-            self.mujoco, "weak", lambda scene: toy_grasp.with_drive(scene, "turn", kp=0.5)
+            self.mujoco,
+            "weak",
+            lambda scene: replace(scene, robot=with_drive(scene.robot, "turn", kp=kp)),
         )
         result = trace(wave_actions(), self.mujoco, [weak])
         found = {d.quantity: d for d in result.engines[0].divergences}

@@ -151,21 +151,5 @@ def with_scene(base: Engine, name: str, change) -> Engine:
     return replace(base, name=name, make=make)
 
 
-def with_drive(scene: SceneSpec, joint: str, **factors: float) -> SceneSpec:
-    """The scene with a joint's drive changed by factors."""
-    joints = tuple(
-        replace(
-            j,
-            drive=replace(
-                j.drive, **{name: getattr(j.drive, name) * x for name, x in factors.items()}
-            ),
-        )
-        if j.name == joint
-        else j
-        for j in scene.robot.joints
-    )
-    return replace(scene, robot=replace(scene.robot, joints=joints))
-
-
 def with_tip_friction(scene: SceneSpec, factor: float) -> SceneSpec:
     return replace(scene, friction=replace(scene.friction, tip=scene.friction.tip * factor))

@@ -418,8 +418,7 @@ def _joint(joint: yourdfpy.Joint) -> Joint:
     if kind != "fixed" and not length > _SHORTEST_AXIS:
         raise RobotError(f"joint {name!r} has the axis {axis}, expected a direction.")
     limits = {}
-    limit = joint.limit
-    if limit is not None:
+    if limit := joint.limit:
         if limit.effort is not None and 0 < limit.effort < math.inf:
             limits["effort"] = float(limit.effort)
         if limit.velocity is not None:

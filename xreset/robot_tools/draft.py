@@ -85,11 +85,7 @@ def description_text(spec: RobotSpec, notes: Sequence[str]) -> str:
     """The robot's ``robot.toml``, every part explained; ``notes`` say what was guessed."""
     loader = jinja2.FileSystemLoader(Path(__file__).with_name("templates"))
     pages = jinja2.Environment(
-        loader=loader,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-        autoescape=False,
+        loader=loader, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
     )
     pages.filters["toml"] = lambda value: json.dumps(value, ensure_ascii=False)
     return pages.get_template("robot.toml").render(spec=spec, notes=notes, schema=SCHEMA)

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import mujoco
@@ -178,12 +179,14 @@ def _tree(path: Path, model: mujoco.MjModel, couplings: Couplings) -> RobotTree:
             T = transform(T[:3, :3], data.xanchor[joint])
             poses[child] = T
             links[child] = frame(child)
-            between = np.linalg.inv(poses[above]) @ T
-            joints.append(
-                _joint(
-                    model, couplings, joint, above, child, between, T[:3, :3].T @ data.xaxis[joint]
-                )
+            placed = Joint(
+                parent=above,
+                child=child,
+                T_parent_joint=np.linalg.inv(poses[above]) @ T,
+                axis=T[:3, :3].T @ data.xaxis[joint],
+                **_motion(model, couplings, joint),
             )
+            joints.append(placed)
             above = child
         poses[names[number]] = T
         if not moving and number > 1:
@@ -205,37 +208,22 @@ def _tree(path: Path, model: mujoco.MjModel, couplings: Couplings) -> RobotTree:
     )
 
 
-def _joint(
-    model: mujoco.MjModel,
-    couplings: Couplings,
-    number: int,
-    parent: str,
-    child: str,
-    T_parent_child: np.ndarray,
-    axis: np.ndarray,
-) -> Joint:
-    limits = {}
-    if model.jnt_limited[number]:
-        limits = dict(zip(("lower", "upper"), model.jnt_range[number].tolist(), strict=True))
+def _motion(model: mujoco.MjModel, couplings: Couplings, number: int) -> dict[str, Any]:
+    """Return a joint's name, type, limits and what it follows."""
     name = joint_name(model, number)
-    kind = "prismatic" if model.jnt_type[number] == SLIDE else "revolute"
-    mimic = None
+    is_slide = model.jnt_type[number] == SLIDE
+    motion: dict[str, Any] = {"name": name, "type": "prismatic" if is_slide else "revolute"}
+    if model.jnt_limited[number]:
+        motion["lower"], motion["upper"] = model.jnt_range[number].tolist()
     line = couplings.lines.get(number)
     if line and line.multiplier:
         source = joint_name(model, line.source)
-        mimic = MimicSpec(joint=name, source=source, multiplier=line.multiplier, offset=line.offset)
+        motion["mimic"] = MimicSpec(
+            joint=name, source=source, multiplier=line.multiplier, offset=line.offset
+        )
     elif line:
-        kind = "fixed"
-    return Joint(
-        name=name,
-        type=kind,
-        parent=parent,
-        child=child,
-        T_parent_joint=T_parent_child,
-        axis=axis,
-        mimic=mimic,
-        **limits,
-    )
+        motion["type"] = "fixed"
+    return motion
 
 
 def _shapes(

@@ -104,14 +104,13 @@ def _object_index(names: np.ndarray, objects: Sequence[ObjectSpec]) -> np.ndarra
 
 
 def _retargeted_view(data: Retargeted, inputs: Inputs) -> View:
+    names = ("", *data.reason_names[1:])
     return View(
         kind="robot trajectories",
         robot=inputs.robot,
         **_motion(data, inputs.objects),
         post_contact=data.post_contact,
-        reason=tuple(
-            "" if reason == 0 else data.reason_names[reason] for reason in data.reason.tolist()
-        ),
+        reason=tuple(names[reason] for reason in data.reason.tolist()),
         joint_pos=data.joint_pos,
         fingertips=data.fingertip_pos,
         hand_error=data.hand_error,

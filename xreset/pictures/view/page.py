@@ -179,18 +179,15 @@ class _Scene:
             self._robot.place(view.joint_pos[row], reason_color(view.reason[row]))
 
     def _show_human(self, row: int) -> None:
-        view = self._view
-        keypoints = np.full((21, 3), np.nan, np.float32)
-        touching = np.zeros(21, dtype=bool)
-        if view.human_keypoints is not None and view.human_touching is not None:
-            keypoints = view.human_keypoints[row].astype(np.float32)
-            touching = view.human_touching[row]
-        visible = np.isfinite(keypoints).all()
+        keypoints = self._view.human_keypoints
+        touching = self._view.human_touching
+        visible = keypoints is not None and np.isfinite(keypoints[row]).all()
         self._keypoints.visible = visible
         self._bones.visible = visible
-        if not visible:
+        if keypoints is None or touching is None or not visible:
             return
-        colors = np.where(touching[:, None], rgb(TOUCH_COLOR), rgb(HUMAN_COLOR))
-        self._keypoints.points = keypoints
+        points = keypoints[row].astype(np.float32)
+        colors = np.where(touching[row, :, None], rgb(TOUCH_COLOR), rgb(HUMAN_COLOR))
+        self._keypoints.points = points
         self._keypoints.colors = colors.astype(np.uint8)
-        self._bones.points = keypoints[BONES]
+        self._bones.points = points[BONES]

@@ -183,16 +183,14 @@ class MeshImport(InFolder):
         # the hole stays open
         self.assertGreater(distance_to_pieces(np.zeros((1, 3)), first)[0], 0.03)
         (file,) = (self.folder / "cache" / "objects").glob("*.npz")
-        for content, cuts in (
-            (file.read_bytes(), 0),
-            (file.read_bytes()[:100], 1),
-        ):  # a damaged cache is made again
-            file.write_bytes(content)
-            with mock.patch("xreset.objects.cache.decompose", wraps=decompose) as cut:
-                again = self.load(RING).obj
-            self.assertEqual(cut.call_count, cuts)
-            for a, b in zip(first.pieces, again.pieces, strict=True):
-                np.testing.assert_allclose(shape_mesh(a).bounds, shape_mesh(b).bounds, atol=1e-12)
+        with mock.patch("xreset.objects.cache.decompose", side_effect=AssertionError):
+            again = self.load(RING).obj
+        for a, b in zip(first.pieces, again.pieces, strict=True):
+            np.testing.assert_allclose(shape_mesh(a).bounds, shape_mesh(b).bounds, atol=1e-12)
+        file.write_bytes(file.read_bytes()[:100])  # a damaged cache is made again
+        with mock.patch("xreset.objects.cache.decompose", return_value=decompose(BOX)) as cut:
+            self.load(RING)
+        self.assertEqual(cut.call_count, 1)
         with mock.patch(
             "xreset.objects.cache.distributions", return_value=[mock.Mock(version="99")]
         ):

@@ -9,7 +9,7 @@ import trimesh
 from tests.toy_retarget import FLOAT, UPRIGHT, box_object
 from xreset import robots
 from xreset.geometry.balls import BARE, SPACING, inscribed_balls, link_balls, sharp_points
-from xreset.geometry.collision import SelfCollision, height_above_table
+from xreset.geometry.collision import SelfCollision, bounding_ball, height_above_table
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_to_matrix
@@ -147,6 +147,10 @@ class ShapesTest(unittest.TestCase):
                 expected = -trimesh.proximity.signed_distance(shape_mesh(shape), points)
                 np.testing.assert_allclose(signed_distance(shape, points), expected, atol=5e-4)
 
+    def test_a_ball_around_balls(self):
+        center, radius = bounding_ball(np.diag((2.0, 0.0, 0.0)), np.array((1.0, 0.5, 0.5)))
+        self.assertEqual((center.tolist(), radius), ([1, 0, 0], 2))
+
     def test_height_counts_only_above_the_table(self):
         table = TableSpec(center=(0.0, 0.0), half_size=(0.5, 0.5, 0.02))
         points = torch.tensor([[0.0, 0.0, 0.03], [0.0, 0.6, -1.0]], dtype=FLOAT)
@@ -185,6 +189,11 @@ class SelfCollisionTest(unittest.TestCase):
         for configuration, a, b in near:
             self.assertEqual(configuration, 1)
             self.assertIn("right_index", a + b)
+
+    def test_pairs_that_the_arm_moves_join_hand_and_arm(self):
+        collision = SelfCollision(self.robot, Kinematics(self.robot), moved_by_arm=True)
+        self.assertIn(("forearm_link", "right_index_DP"), collision.link_pairs)
+        self.assertNotIn(("right_index_DP", "right_middle_DP"), collision.link_pairs)
 
     def test_one_link_is_kept_out_of_another(self):
         model = HandModel(self.robot)

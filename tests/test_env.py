@@ -235,7 +235,10 @@ class ResetTest(WithEnv):
         env.episode_length_buf[1] = env.max_episode_length - 1
         action = self.actions(1, seed=5)[0]
         last_cloud = env.get_observations()["perception"].clone()
+        mass = env.variation.parameters["object_mass"].clone()
         observations, _, done, extras = env.step(action)
+        drawn_again = env.variation.parameters["object_mass"] != mass
+        self.assertEqual(drawn_again.tolist(), [False, True, False])
         expected, *_ = other.step(action)
         self.assertEqual(done.tolist(), [0, 1, 0])
         self.assertEqual(extras["time_outs"].tolist(), [0.0, 1.0, 0.0])

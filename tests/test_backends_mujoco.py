@@ -89,9 +89,9 @@ class Model(unittest.TestCase):
         return {pair for pair in pairs if "robot/" in min(pair) and "robot/" in max(pair)}
 
     def test_what_may_collide(self):
-        base, column, wrist, jaw_a, pad_b = (
-            f"robot/{body}/0" for body in ("base", "column", "wrist", "jaw_a", "finger_b")
-        )  # the pad is fixed to finger_b
+        # the pad is fixed to finger_b
+        bodies = ("base", "column", "wrist", "jaw_a", "finger_b")
+        base, column, wrist, jaw_a, pad_b = (f"robot/{body}/0" for body in bodies)
         # jaw_a and column are excluded
         expected = {frozenset((jaw_a, pad_b)), frozenset((column, pad_b))}
         for link in (column, wrist, jaw_a, pad_b):

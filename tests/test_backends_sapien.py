@@ -55,9 +55,8 @@ class SapienTest(EngineChecks, unittest.TestCase):
             ),
         )
         (result,) = run(SapienBackend, robot=far, only=["mimic_joints"])
-        self.assertLess(
-            max(measure.measured for measure in result.measures), 4e-3
-        )  # 0.002 rad through three links; alone it would stay
+        # 0.002 rad through three links; alone it would stay
+        self.assertLess(max(measure.measured for measure in result.measures), 4e-3)
 
     def test_a_mimic_joint_on_another_branch_than_its_source_is_refused(self):
         def joint(parent, child):

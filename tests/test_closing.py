@@ -182,9 +182,9 @@ class FingersTest(unittest.TestCase):
         fingers, joints = self.fingers(0.0201, 0.0501)
         for force in (1.0, 2.5):
             target = squeeze_targets(ROBOT, fingers, joints, SqueezeConfig(force=force))
-            self.assertAlmostEqual(
-                target[0, JAW] - joints[0, JAW], -(force + 1.1 * force) / 800, delta=2e-5
-            )  # jaw_b mimics jaw_a
+            # jaw_b mimics jaw_a
+            pressed = -(force + 1.1 * force) / 800
+            self.assertAlmostEqual(target[0, JAW] - joints[0, JAW], pressed, delta=2e-5)
             np.testing.assert_array_equal(target[1], joints[1], "30 mm away nothing is pressed on")
             arm = ROBOT.arm_indices
             np.testing.assert_array_equal(target[:, arm], joints[:, arm])

@@ -442,9 +442,8 @@ class Toy(Robots):
             'ixx="1e-5" iyy="1e-5" izz="1e-5"', 'ixx="0.1" iyy="0.1" izz="0.1"', 1
         ).replace('<mass value="0.4"/>', '<mass value="0"/>')
         tree, notes = self.read("heavy.urdf", heavy)
-        self.assertRegex(
-            notes, r"have no mass.*base \(0.128 kg\).*their mass and size do not allow.*f1_a"
-        )  # its box of water
+        words = r"have no mass.*base \(0.128 kg\).*their mass and size do not allow.*f1_a"
+        self.assertRegex(notes, words)  # its box of water
         self.assertLess(np.linalg.eigvalsh(tree.link("f1_a").inertia).max(), 1e-4)
 
     def test_errors_leave_nothing(self):

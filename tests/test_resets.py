@@ -110,9 +110,8 @@ class FilterTest(unittest.TestCase):
         self.assertEqual(
             (bank.rejected_sequence_index.tolist(), bank.rejected_frame_index.tolist()), ([0], [1])
         )
-        np.testing.assert_allclose(
-            bank.start_pos[1], self.retargeted().object_pos[3], atol=1e-6
-        )  # frame 0 counts although it is not valid
+        # frame 0 counts although it is not valid
+        np.testing.assert_allclose(bank.start_pos[1], self.retargeted().object_pos[3], atol=1e-6)
         np.testing.assert_allclose(bank.goal_pos, self.retargeted().goal_pos, atol=1e-6)
         self.assertEqual(calls[-1], (5, 5))
 

@@ -31,11 +31,8 @@ class AgainstScipy(unittest.TestCase):
     def test_single_functions(self):
         a, b = (r.as_quat(scalar_first=True) for r in (self.a, self.b))
         product = (self.a * self.b).as_quat(scalar_first=True)
-        product *= np.sign(
-            (product * quat_multiply(*map(torch.as_tensor, (a, b))).numpy()).sum(
-                axis=1, keepdims=True
-            )
-        )  # q is -q
+        found = quat_multiply(*map(torch.as_tensor, (a, b))).numpy()
+        product *= np.sign((product * found).sum(axis=1, keepdims=True))  # q is -q
         self.assert_near(quat_multiply, product, a, b)
         self.assert_near(quat_to_matrix, self.a.as_matrix(), a)
         self.assert_near(quat_rotate, self.a.apply(self.points), a, self.points)

@@ -537,9 +537,8 @@ class ObservationTest(unittest.TestCase):
             assert_close(self.proprio[f"palm_{name}"], getattr(self.x.links, name)[:, 0])
         assert_close(self.proprio["tip_pos"], self.x.links.pos[:, 1:].reshape(self.N, -1))
         assert_close(self.proprio["joint_vel"], 0.2 * self.x.state.joint_vel)
-        assert_close(
-            self.proprio["joint_pos"], (self.x.state.joint_pos - 0.5) / 2.5
-        )  # limits -2, 3 become -1, 1
+        # limits -2, 3 become -1, 1
+        assert_close(self.proprio["joint_pos"], (self.x.state.joint_pos - 0.5) / 2.5)
         force = self.proprio["tip_force"]
         self.assertEqual(float(force.abs().max()), 1.0)
         small = self.x.tip_force.abs() < 10

@@ -282,9 +282,8 @@ def lowest_point(shapes: Sequence[Shape], turn: np.ndarray | None = None) -> flo
 def _lowest(shape: Shape, up: np.ndarray) -> float:
     geometry = shape.geometry
     z = up @ shape.T_body_shape[:3, 3]
-    row = (
-        up @ shape.T_body_shape[:3, :3]
-    )  # height of a point p of the shape's own frame: z + row . p
+    # height of a point p of the shape's own frame: z + row . p
+    row = up @ shape.T_body_shape[:3, :3]
     if geometry.kind == "hull":
         return float(z + (geometry.vertices @ row).min())
     if geometry.kind == "box":

@@ -99,9 +99,8 @@ class Cameras:
         y, x = torch.meshgrid(
             *(torch.arange(n, device=device) + 0.5 - n / 2 for n in size), indexing="ij"
         )
-        self._pixels = (
-            torch.stack((x, y), dim=-1).flatten(0, 1) * 2 / config.height
-        )  # at half a field of view of 45 deg
+        # at half a field of view of 45 deg
+        self._pixels = torch.stack((x, y), dim=-1).flatten(0, 1) * 2 / config.height
         self.shift = torch.zeros(worlds, count, 3, device=device)
         self.turn = torch.zeros_like(self.shift)
         self.fov_scale = torch.ones(worlds, count, device=device)

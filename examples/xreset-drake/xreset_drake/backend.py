@@ -191,10 +191,9 @@ class DrakeWorld(World):
         for contact in map(
             results.hydroelastic_contact_info, range(results.num_hydroelastic_contacts())
         ):
-            patch, force = (
-                contact.contact_surface(),
-                contact.F_Ac_W().translational(),
-            )  # on the first of the two geometries
+            patch = contact.contact_surface()
+            # on the first of the two geometries
+            force = contact.F_Ac_W().translational()
             first, second = self._at.surfaces[patch.id_M()], self._at.surfaces[patch.id_N()]
             if second.role == "object":
                 first, second, force = second, first, -force

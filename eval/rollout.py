@@ -24,6 +24,7 @@ from xreset.inputs import Data, load_inputs
 from xreset.physics import Backend
 from xreset.plugins import backend_class, device_for, make_backend
 from xreset.policy import Policy
+from xreset.progress import Progress, unseen
 from xreset.resets.bank import ResetBank
 from xreset.resets.distribution import Reset, ResetDistribution
 from xreset.resets.goals import GoalSet
@@ -38,9 +39,6 @@ from xreset.task.terminations import out_of_bounds
 
 TRACE_INTERVAL = 0.05
 """Time between the states of a trace [s]."""
-
-Progress = Callable[[int, int], None]
-"""Called with (control steps done, control steps in all)."""
 
 MakeBackend = Callable[[SceneSpec, int, Tensor], Backend]
 """Makes the worlds of a scene, given their number and the index of the object in each world [N]."""
@@ -218,7 +216,7 @@ def roll_out(
     trial: Trial,
     *,
     repetitions: int,
-    progress: Progress = lambda done, total: None,
+    progress: Progress = unseen,
 ) -> Rollouts:
     """Play demonstrations ``repetitions`` times each.
 

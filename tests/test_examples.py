@@ -54,6 +54,7 @@ class FaceTest(unittest.TestCase):
             "Any",
             "Self",
             "Data",
+            "Progress",
         }
         for name in xreset.__all__:
             value = name != "VectorEnv" and getattr(xreset, name)

@@ -26,7 +26,7 @@ def evaluate(
     device: str = "cpu",
     settle: bool = False,
     out: str | Path | None = None,
-    progress: Callable[[str, int, int], None] = lambda name, done, total: None,
+    progress: Callable[[str, float, int], None] = lambda name, done, total: None,
 ) -> Evaluation:
     """Play every demonstration in every engine, from the same starts, and write the results.
 

@@ -89,7 +89,7 @@ def rehearse(
     device: str = "cpu",
     real_time: bool = False,
     out: str | Path | None = None,
-    progress: Callable[[str, int, int], None] = lambda name, done, total: None,
+    progress: Callable[[str, float, int], None] = lambda name, done, total: None,
 ) -> list[Rehearsal]:
     """Rehearse a policy for a robot: play the same episodes with each fault in each engine, and write the results.
 

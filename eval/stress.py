@@ -103,7 +103,7 @@ def stress(
     *,
     sweeps: Sequence[Property] = SWEEPS,
     repetitions: int = 2,
-    progress: Callable[[str, int, int], None] = lambda name, done, total: None,
+    progress: Callable[[str, float, int], None] = lambda name, done, total: None,
 ) -> list[Stress]:
     """Sweep properties in each engine and write ``OUT/BACKEND.json`` after each property, so that a stopped command
     keeps its results.
@@ -152,7 +152,7 @@ def sweep(
     properties: Sequence[Property],
     play: Callable[[Engine, Property | None, float], Sequence[Episode]],
     out: Path,
-    progress: Callable[[str, int, int], None],
+    progress: Callable[[str, float, int], None],
 ) -> Card:
     """Play episodes with each value of the properties that an engine can set, and write the card after each property.
 

@@ -252,7 +252,7 @@ def compare(
     grasps: int = 48,
     tries: GraspMotion = STANDARD,
     reference: Engine | None = None,
-    progress: Callable[[str, int, int], None] = lambda doing, done, total: None,
+    progress: Callable[[str, float, int], None] = lambda doing, done, total: None,
 ) -> Parity:
     """Measure engines against the reference.
 

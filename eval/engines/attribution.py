@@ -126,7 +126,7 @@ def attribute(
     *,
     episodes: int,
     only: Sequence[str] = (),
-    progress: Callable[[str, int, int], None] = lambda run, done, total: None,
+    progress: Callable[[str, float, int], None] = lambda run, done, total: None,
 ) -> Attribution:
     """Measure both engines, and play the policy in A, in A changed towards B, and in B.
 

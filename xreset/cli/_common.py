@@ -80,7 +80,7 @@ Port = Annotated[int, tyro.conf.arg(help="Port to serve at; if it is taken, the 
 
 
 @contextmanager
-def engine_bars(names: Sequence[str]) -> Iterator[Callable[[str, int, int], None]]:
+def engine_bars(names: Sequence[str]) -> Iterator[Callable[[str, float, int], None]]:
     """Show a progress bar for each engine; yields the function that moves them: (engine, steps done, steps in all)."""
     with Progress() as bar:
         counts = {name: bar.count(name) for name in names}

@@ -11,7 +11,6 @@ Shape letters: F frames, n arm joints.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from xreset.errors import RobotError
 from xreset.geometry.collision import table_clearance
 from xreset.geometry.kinematics import Kinematics
+from xreset.progress import Progress, unseen
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track
@@ -53,7 +53,7 @@ def place(
     paths: list[ArmTargets],
     avoid: np.ndarray,
     config: PlaceConfig | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = unseen,
 ) -> list[Finalist]:
     """Find the placement from which the robot follows most of the motions.
 

@@ -54,6 +54,13 @@ class UrdfTest(unittest.TestCase):
         path.write_text(f'<robot name="toy"><link name="base"/>{"".join(parts)}</robot>')
         return path
 
+    def test_what_is_not_a_file_is_refused_at_once(self):
+        pipe = self.folder / "pipe.urdf"
+        os.mkfifo(pipe)
+        for path in (pipe, self.folder, self.folder / "none.urdf", "x" * 5000):
+            with self.assertRaisesRegex(RobotError, "is not a file. Expected a robot's URDF"):
+                load_urdf(path)
+
     def test_a_changed_mesh_is_read_again(self):
         mesh = self.folder / "box.stl"
         trimesh.creation.box((0.1, 0.1, 0.1)).export(mesh)

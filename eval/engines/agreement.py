@@ -276,17 +276,17 @@ def compare(
     scene = SceneSpec(robot=robot, objects=tuple(objects))
 
     table = find_grasps(motion, robot, objects, grasps, where="table")
-    closings: dict[str, tuple[Recording, Recording]] = {}
+    closings: dict[Engine, tuple[Recording, Recording]] = {}
     for done, e in enumerate(everyone):
         progress(f"{e.name}: closing {len(table)} hands", done, total)
-        closings[e.name] = try_closings(e, scene, table, tries)
+        closings[e] = try_closings(e, scene, table, tries)
     air = find_grasps(motion, robot, objects, grasps, where="air")
-    closed = {name: whole for name, (_, whole) in closings.items() if name != floor.name}
+    closed = {e.name: whole for e, (_, whole) in closings.items() if e is not floor}
     common = common_states(robot, table, air, closed, grasps, scene.control_dt, tries)
-    holds: dict[str, tuple[Recording, ...]] = {}
+    holds: dict[Engine, tuple[Recording, ...]] = {}
     for done, e in enumerate(everyone, len(everyone)):
         progress(f"{e.name}: holding {len(common.label)} objects", done, total)
-        holds[e.name] = try_holds(e, scene, common, tries)
+        holds[e] = try_holds(e, scene, common, tries)
     progress("", total, total)
 
     surfaces = [
@@ -296,15 +296,15 @@ def compare(
     window = round(PRESS_TIME / scene.control_dt)
 
     def judged(e: Engine) -> EngineParity:
-        press, closing = closings[e.name]
-        press_there, closing_there = closings[reference.name]
+        press, closing = closings[e]
+        press_there, closing_there = closings[reference]
         metrics = (
             *press_metrics(press, press_there, window),
-            *hold_metrics(holds[e.name], holds[reference.name], points),
+            *hold_metrics(holds[e], holds[reference], points),
             outcome_metric("closing, outcome", [closing], [closing_there]),
         )
         outcomes = {"closing": closing}
-        for mu, recording in zip(FRICTIONS, holds[e.name], strict=True):
+        for mu, recording in zip(FRICTIONS, holds[e], strict=True):
             outcomes[f"hold {mu:g}"] = recording
         return EngineParity(
             engine=e,

@@ -39,8 +39,9 @@ def film(
     """
     if not 0 <= world < env.num_envs:
         raise XResetError(f"World {world} does not exist. Choose one from 0 to {env.num_envs - 1}.")
+    policy = load_policy(policy)
     env.reset()
-    player = load_policy(policy).begin(env)
+    player = policy.begin(env)
     every = max(1, int(1.0 / (fps * env.backend.scene.control_dt) + 1e-6))
     frames = [_frame(env, world, size)]
     for step in range(1, env.max_episode_length + 1):

@@ -91,7 +91,7 @@ def chosen_engines(engines: str | Iterable[str | Engine], device: str) -> list[E
     """Return engines, given by name or already loaded, each once."""
     names = (engines,) if isinstance(engines, str) else engines
     return [
-        engine(each, device=device) if isinstance(each, str) else each
+        each if isinstance(each, Engine) else engine(each, device=device)
         for each in dict.fromkeys(names)
     ]
 
@@ -140,7 +140,7 @@ class Trial:
         Yields:
             The environment, and the metric's points of each world's object.
         """
-        # its friction is a placeholder, because the environment sets friction itself
+        # The scene's friction is a placeholder, because the environment sets friction itself.
         scene = make_scene(self.robot, self.objects, self.task)
         with engine.make(scene, len(object_index), object_index) as backend:
             env = ManipulationEnv(backend, self.task, self.starts(backend.device), seed=self.seed)

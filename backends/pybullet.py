@@ -187,15 +187,19 @@ class PybulletWorld(World):
         found = []
         # All contacts: when asked for a body, PyBullet swaps the two bodies and the normal, but not the friction.
         for contact in () if self._fresh else self._p.getContactPoints():
-            _, *bodies, first_link, second_link, _, _, normal, _, press, a, t, b, u = contact
-            if self._object not in bodies:
+            _, first, second, first_link, second_link, _, _, normal, _, press, *friction = contact
+            if self._object not in (first, second):
                 continue
-            force = press * np.array(normal) + a * np.array(t) + b * np.array(u)
+            force = (
+                press * np.array(normal)
+                + friction[0] * np.array(friction[1])
+                + friction[2] * np.array(friction[3])
+            )
             link = second_link
-            if bodies[0] != self._object:  # the force is on the first body
+            if first != self._object:  # the force is on the first body
                 force = -force
                 link = first_link
-            if self._table in bodies:
+            if self._table in (first, second):
                 found.append((TABLE, force))
             elif press > 0:
                 found.append((self._parts[link].owner, force))

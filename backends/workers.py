@@ -94,7 +94,7 @@ class Job:
     object_index: tuple[int, ...]
 
 
-@dataclass
+@dataclass(eq=False)  # exceptions are hashable
 class WorldFailure(Exception):
     """A world raised. The failure crosses process boundaries, so it holds text."""
 

@@ -111,17 +111,15 @@ def collect(folder: Path) -> ReportData:
     if choice is not None and choice.policy_hash not in policies:
         choice = None
     stress = read_stress(place / "stress", training.first.inputs.get("policy"))
-    taught = None
-    if run is not None and run.teacher is not None:
-        taught = read_evaluation(folder / "teacher")
     notes = uneven([training]) + not_described
-    if taught:
-        notes.append(missed_by_student(training.episodes, taught.to_frame()))
-    elif taught is not None:
-        notes.append(
-            "The teacher was not evaluated from the same starts. Make its results first: "
-            f"xreset eval {folder / TEACHER} --out {folder / 'teacher'} --demos DEMOS"
-        )
+    if run is not None and run.teacher is not None:
+        if taught := read_evaluation(folder / "teacher"):
+            notes.append(missed_by_student(training.episodes, taught.to_frame()))
+        else:
+            notes.append(
+                "The teacher was not evaluated from the same starts. Make its results first: "
+                f"xreset eval {folder / TEACHER} --out {folder / 'teacher'} --demos DEMOS"
+            )
     return ReportData(training=training, run=run, choice=choice, stress=stress, notes=tuple(notes))
 
 

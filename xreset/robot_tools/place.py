@@ -61,7 +61,7 @@ def place(
         robot: the robot; its own placement is the first candidate, and a finalist.
         paths: what hand retargeting asks of the arm: see :func:`xreset.retarget.pipeline.wrist_paths`.
         avoid: [., 3] points that the base keeps clear of.
-        progress: called with (placements that were tried, the largest number that may be).
+        progress: called with (placements tried, most placements to try).
 
     Returns:
         The finalists, those with a home first, and of these the one that follows most.

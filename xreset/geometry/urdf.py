@@ -189,7 +189,9 @@ def load_urdf(path: str | Path) -> RobotTree:
 def parse_xml(path: Path) -> Element:
     """Return the root element of a file, or raise ``RobotError``; expat refuses entities that grow to any size."""
     if not os.path.isfile(path):  # Path.is_file() raises OSError for a name that is too long
-        raise RobotError(f"{shown(str(path))} is not a file. Expected a robot's URDF or MJCF there.")
+        raise RobotError(
+            f"{shown(str(path))} is not a file. Expected a robot's URDF or MJCF there."
+        )
     try:
         if path.stat().st_size > max_bytes() // 16:
             raise ValueError("it is too large to describe a robot")

@@ -50,7 +50,8 @@ class OnnxPolicyTest(WithPolicy):
         partial = {name: value for name, value in self.contract.items() if name != "robot"}
         for words, changes in (
             ("numbers that are not finite", {"value": np.nan}),
-            (r"gives \[\(2, 3\), ", {"actions": 3}),
+            ("numbers that are not finite", {"state": "Log"}),
+            (r"gives \['float32 \(2, 3\)', ", {"actions": 3}),
             ("cannot act", {"lstm": "width"}),
             ("cannot act", {"lstm": 10**11}),
             ("cannot act", {"outputs": 2}),

@@ -21,6 +21,7 @@ def write_policy(
     actions: int | None = None,
     outputs: int = 3,
     value: float = 0.5,
+    state: str = "Identity",
     metadata: str | None = None,
 ) -> Path:
     """Write it; without options it is sound.
@@ -32,6 +33,7 @@ def write_policy(
         actions: how many it gives, if not those of the contract.
         outputs: how many of the three it has.
         value: of every weight.
+        state: ONNX operator that makes the LSTM's new state from the old one.
         metadata: in place of the contract.
     """
     layout, cloud = (
@@ -57,8 +59,8 @@ def write_policy(
     weights = numpy_helper.from_array(np.full((flat, width), value, dtype=np.float32), "w")
     nodes = [
         helper.make_node("MatMul", ["flat", "w"], ["actions"]),
-        helper.make_node("Identity", ["h_in"], ["h_out"]),
-        helper.make_node("Identity", ["c_in"], ["c_out"]),
+        helper.make_node(state, ["h_in"], ["h_out"]),
+        helper.make_node(state, ["c_in"], ["c_out"]),
     ]
     graph = helper.make_graph(nodes, "policy", inputs, given, [weights])
     model = helper.make_model(graph, ir_version=9, opset_imports=[helper.make_opsetid("", 18)])

@@ -209,39 +209,45 @@ class OnnxPolicy:
         zeros = {name: torch.zeros(worlds, *shape) for name, shape in observed.items()}
         try:
             self._lstm_dim: int = self._session.get_inputs()[2].shape[2]
-            actions = self.act(zeros)
-            found = [tuple(value.shape) for value in (actions, *(self._state or ()))]
+            outputs = self._outputs(zeros)
+            found = [f"{value.dtype} {value.shape}" for value in outputs]
         except Exception as error:
             raise PolicyError(
                 f"{path} cannot act: {shown(str(error))}. Export it again."
             ) from error
         state = (1, worlds, self._lstm_dim)
-        expected = [(worlds, len(self.contract.joint_names)), state, state]
+        shapes = ((worlds, len(self.contract.joint_names)), state, state)
+        expected = [f"float32 {shape}" for shape in shapes]
         if found != expected:
             raise PolicyError(
                 f"{path} gives {found} for {worlds} worlds, expected {expected}. Export it again."
             )
-        if not actions.isfinite().all():
+        if not all(np.isfinite(value).all() for value in outputs):
             raise PolicyError(
                 f"{path} gives numbers that are not finite: its training broke down, or the file is damaged."
             )
-        self._state = None
 
     def begin(self, env: ManipulationEnv) -> None:
         """Zero the recurrent state."""
         self._state = None
 
-    def act(self, observations: TensorDict | dict[str, Tensor]) -> Tensor:
+    def act(self, observations: TensorDict) -> Tensor:
         """[N, J] mean action, on the observations' device."""
+        actions, *state = self._outputs(observations)
+        self._state = [np.array(value) for value in state]
+        device = observations[self._groups[0]].device
+        return torch.as_tensor(actions, device=device).clamp(-1.0, 1.0)
+
+    def _outputs(self, observations: TensorDict | dict[str, Tensor]) -> list[np.ndarray]:
+        """Return the graph's outputs: actions [N, J] without limits, and the LSTM's next state."""
         *flat_groups, picture = self._groups
         flat = torch.cat([observations[name] for name in flat_groups], dim=-1)
         shape = (1, len(flat), self._lstm_dim)
         if self._state is None or self._state[0].shape != shape:
             self._state = [np.zeros(shape, dtype=np.float32) for _ in range(2)]
         values = (flat.cpu().numpy(), observations[picture].cpu().numpy(), *self._state)
-        actions, h, c = self._session.run(OUTPUTS, dict(zip(INPUTS, values, strict=True)))
-        self._state = [np.array(h), np.array(c)]
-        return torch.as_tensor(actions, device=flat.device).clamp(-1.0, 1.0)
+        outputs: Any = self._session.run(OUTPUTS, dict(zip(INPUTS, values, strict=True)))
+        return outputs
 
 
 class ZeroPolicy:

@@ -131,6 +131,9 @@ class Pickles(InFolder):
                 with self.subTest(name, protocol=protocol):
                     np.testing.assert_array_equal(array_of(found[name]), value)
 
+    def test_protocol_5_is_refused(self):
+        self.refused("protocol 5; save it with", pickle.dumps({"a": np.zeros(3)}, protocol=5))
+
     def test_a_pickle_of_python_2(self):
         kind = b"cnumpy\ndtype\n(S'f8'\nI0\nI1\ntR(I3\nS'<'\nNNNI-1\nI-1\nI0\ntb"
         data = (
@@ -164,7 +167,7 @@ class Pickles(InFolder):
         self.addCleanup(tracemalloc.stop)
         self.load(b"\x80\x02}r\x00\x00\x00\x10.")  # a value that is stored under the number 2^28
         # a bytearray of 1 TiB
-        self.refused("cannot be read", b"\x80\x05\x96" + (1 << 40).to_bytes(8, "little") + b".")
+        self.refused("cannot be read", b"\x80\x04\x96" + (1 << 40).to_bytes(8, "little") + b".")
         self.refused("more than a megabyte", pickle.dumps({"a": np.zeros(200_000)}))
         self.assertLess(tracemalloc.get_traced_memory()[1], 8 << 20)
 

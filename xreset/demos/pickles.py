@@ -37,11 +37,11 @@ class _Call:
         self.state = state
 
 
-class _Unpickler(
-    pickle._Unpickler
-):  # the one in C reserves memory for any index that a file states
+# The unpickler in C reserves memory for any index that a file states.
+class _Unpickler(pickle._Unpickler):
     dispatch: dict[int, Any] = pickle._Unpickler.dispatch.copy()
-    dispatch.pop(pickle.BYTEARRAY8[0])  # makes an array of any length that a file states
+    # This operation makes an array of any length that a file states.
+    dispatch.pop(pickle.BYTEARRAY8[0])
 
     def find_class(self, module: str, name: str) -> Any:
         if module.partition(".")[0] not in ("numpy", "_codecs"):
@@ -60,6 +60,8 @@ def read_pickle(path: Path) -> dict[Any, Any]:
             content = file.read(_MAX_BYTES + 1)
         if len(content) > _MAX_BYTES:
             raise ValueError("it has more than a megabyte")
+        if content[:2] == pickle.PROTO + b"\x05":
+            raise ValueError("it is of protocol 5; save it with pickle.dump(..., protocol=4)")
         data = _Unpickler(io.BytesIO(content), encoding="latin-1").load()
         if not isinstance(data, dict):
             raise ValueError(f"it holds {shown(type(data).__name__)}, expected a dictionary")

@@ -57,7 +57,7 @@ class PpoConfig(Checked):
     REMOVED: ClassVar[dict[str, Any]] = {"critic_learning_rate": None, "clip_values": True}
 
     horizon: Annotated[int, Rule("a number above 1", lambda steps: steps > 1)] = 16
-    """Control steps per world and iteration."""
+    """Control steps per world and iteration. Not 1: rsl-rl stores LSTM states from a run's second step on."""
     sequence_length: Positive[int] = 4
     """Length of truncated back-propagation through time; divides the horizon."""
     mini_epochs: Positive[int] = 5

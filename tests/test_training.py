@@ -24,7 +24,7 @@ from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_goals import toy_goals
 from xreset import robots
 from xreset.cli import main
-from xreset.errors import FileFormatError, RunError, XResetError
+from xreset.errors import FileFormatError, PolicyError, RunError, XResetError
 from xreset.files import claim, file_hash
 from xreset.learning.checkpoint import Checkpoint, load_moments, read_checkpoint
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
@@ -399,6 +399,15 @@ class TrainingTest(unittest.TestCase):
         write_bank(bank, empty, config={}, inputs={})
         with self.assertRaisesRegex(RunError, "not the file that this run was started with"):
             self.resume(out)
+
+    def test_a_run_whose_observations_meant_something_else_is_not_resumed(self):
+        out = self.train("older", config=replace(CONFIG, iterations=1))
+        run = json.loads((out / "run.json").read_text())
+        terms = run["contract"]["observation_layout"]["policy"]
+        _, terms["older"] = terms.popitem()
+        (out / "run.json").write_text(json.dumps(run))
+        with self.assertRaisesRegex(PolicyError, "another observation layout .policy.older"):
+            self.resume(out, iterations=2)
 
     def test_a_training_leaves_global_settings_as_they_were(self):
         self.addCleanup(torch.set_float32_matmul_precision, torch.get_float32_matmul_precision())

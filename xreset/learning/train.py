@@ -255,6 +255,7 @@ def resume(
     Raises:
         RunError: the run has other reward terms of the user's own, the bank is not the run's, the newest checkpoint
             does not fit, another process is training here, or there is too little memory.
+        PolicyError: the robot has changed, or the policy observed something else in an earlier version of xreset.
     """
     out = Path(out)
     info = read_run(out)
@@ -274,6 +275,7 @@ def resume(
         raise RunError(
             f"{info.resets} is not the file that this run was started with. Put it back, or start a new run."
         )
+    check_contract(str(out), info.contract, inputs.robot, info.config.task)
     _run(out, info, inputs, minutes=minutes, resumed=True, wandb=wandb)
     return out
 

@@ -298,3 +298,4 @@ def _draw(ax: Axes, card: Stress, curve: Curve, color: str) -> None:
     ax.plot(x, mean, color=color, marker="o", markersize=3, label=card.backend)
     ax.axvline(curve.nominal, color="grey", linewidth=0.7, linestyle=":")
     ax.set_xlabel("factor" if curve.unit == "x" else curve.unit)
+    ax.locator_params(axis="x", nbins=5)

@@ -36,9 +36,8 @@ class MujocoWorld(World):
     """
 
     def __init__(self, scene: SceneSpec, object_index: int) -> None:
-        if (
-            mujoco.get_mju_user_warning() is None
-        ):  # the default writes a log file into the current folder
+        # the default writes a log file into the current folder
+        if mujoco.get_mju_user_warning() is None:
             mujoco.set_mju_user_warning(lambda _: None)
         self._at = at = _compiled(scene, object_index)
         self._model = model = copy(at.model)  # each world has parameters of its own

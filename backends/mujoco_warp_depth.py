@@ -58,9 +58,8 @@ def multicontact_with_depth(
         polygon, clipped, plane_normal, plane_dist, idx1, idx2, n1, n2, endvert, face1, face2, epa_vert, epa_vert_index,
         epa_face, x1, x2, geom1, geom2, geomtype1, geomtype2,
     )  # fmt: skip
-    if (
-        count == 1 and depth[0] != 0.0
-    ):  # zero: nothing was clipped, and the depth of the pair is right
+    # zero: nothing was clipped, and the depth of the pair is right
+    if count == 1 and depth[0] != 0.0:
         depth[1] = _APART
         return 2, witness1, witness2, depth
     return count, witness1, witness2, depth

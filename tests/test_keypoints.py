@@ -115,7 +115,7 @@ class Synthetic(InFolder):
         self.same(read_keypoints(self.npz(object_quat_wxyz=None, object_quat_xyzw=xyzw), PLAIN))
         self.refused("must be given once", object_quat_xyzw=xyzw)
         self.refused(
-            "object_quat_wxyz of frame 0 is not a position and a unit quaternion",
+            "object_pos and object_quat_wxyz of frame 0 should be a position and a unit quaternion",
             object_quat_wxyz=2 * wxyz,
         )
 
@@ -124,7 +124,7 @@ class Synthetic(InFolder):
         path = self.folder / "a.csv"
         columns = {"object": "soup", "side": "right"}
         write_csv(path, self.points, pos, self.turn, columns=columns)
-        with self.assertRaisesRegex(DemoError, "of frame 3 is not a position"):
+        with self.assertRaisesRegex(DemoError, "object_pos and .* of frame 3 should be a position"):
             read_keypoints(path, PLAIN)
 
     def test_what_is_not_known_is_asked_for(self):

@@ -49,9 +49,8 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
     """
     path = Path(path)
     try:
-        if (
-            path.exists() and not path.is_file() and not path.is_dir()
-        ):  # root could replace /dev/null by a file
+        # root could replace /dev/null by a file
+        if path.exists() and not path.is_file() and not path.is_dir():
             raise XResetError(f"cannot write {path}: it is a device. Choose another place.")
         with _temporary(path.parent, Path.touch) as temporary, open(temporary, mode) as file:
             yield file
@@ -94,9 +93,8 @@ def _temporary(folder: Path, make: Callable[[Path], None]) -> Iterator[Path]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     descriptor = None
-    while (
-        descriptor is None
-    ):  # again if another process took it for a leftover before it was locked
+    # again if another process took it for a leftover before it was locked
+    while descriptor is None:
         temporary = folder / f".xreset-{secrets.token_hex(4)}.part"
         make(temporary)
         with suppress(FileNotFoundError):
@@ -197,9 +195,8 @@ def _patient_lock(path: Path) -> int | None:
         path.parent.mkdir(parents=True, exist_ok=True)
         if not path.is_dir():
             path.touch()
-        with suppress(
-            FileNotFoundError
-        ):  # the process that held the lock has just removed the file
+        # The process that held the lock may just have removed the file.
+        with suppress(FileNotFoundError):
             descriptor = _lock(path)
             if descriptor is not None:
                 return descriptor
@@ -264,9 +261,8 @@ def code_version() -> str:
             )
             commit = found.stdout.strip()
     else:
-        with suppress(
-            PackageNotFoundError, ValueError, AttributeError
-        ):  # no package, or one of another origin
+        # There may be no package, or one of another origin.
+        with suppress(PackageNotFoundError, ValueError, AttributeError):
             origin = json.loads(distribution("xreset").read_text("direct_url.json") or "{}")
             commit = str(origin.get("vcs_info", {}).get("commit_id", ""))[:12]
     return f"{__version__}+g{commit}" if commit else __version__
@@ -287,9 +283,8 @@ def read_json(
     xreset that wrote it unless ``keep_version``."""
     path = Path(path)
     must_exist(path, "JSON file")
-    if (
-        path.stat().st_size > max_bytes() // 16
-    ):  # objects in memory are about that many times larger
+    # objects in memory are about 16 times larger
+    if path.stat().st_size > max_bytes() // 16:
         raise FileFormatError(
             f"{path} has {path.stat().st_size >> 20} MB, too many for JSON. {RAISE_LIMIT}"
         )
@@ -333,10 +328,8 @@ def read_toml(
         data = tomllib.loads(path.read_bytes().decode())
     except OSError as problem:
         raise error(f"{path} cannot be read ({problem.strerror}).{hint}") from problem
-    except (
-        ValueError,
-        RecursionError,
-    ) as problem:  # of TOML, of decoding, of numbers of thousands of digits
+    # of TOML, of decoding, of numbers of thousands of digits
+    except (ValueError, RecursionError) as problem:
         raise error(f"{path} is not valid TOML: {problem}.") from problem
     if schema is not None and data.get("schema") != schema:
         raise error(f"{path} states schema {shown(data.get('schema'))}, expected {schema!r}.")
@@ -395,10 +388,8 @@ def must_exist(path: Path, what: str) -> None:
         raise FileFormatError(
             f"there is no {path} ({what}). Check the path, or make the file first."
         ) from None
-    except (
-        OSError,
-        ValueError,
-    ) as error:  # a name too long, a folder that may not be entered, a zero in the name
+    # a name too long, a folder that may not be entered, a zero in the name
+    except (OSError, ValueError) as error:
         raise FileFormatError(f"there is no {shown(str(path))} ({what}): {error}.") from error
     if not stat.S_ISREG(mode):
         raise FileFormatError(f"{path} is a folder or a device, expected a file ({what}).")

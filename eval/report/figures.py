@@ -153,9 +153,8 @@ def write_picture(path: Path, groups: Groups, tags: Sequence[str], found: Table,
         if not found.empty:
             draw_scores(parts[-1].subplots(), found, order)
         handles = []
-        for i, label in enumerate(
-            order
-        ):  # matplotlib leaves out labels that begin with an underscore
+        # matplotlib leaves out labels that begin with an underscore
+        for i, label in enumerate(order):
             handles.append(
                 Line2D(
                     [], [], color=color(i), linestyle=_style(i), linewidth=2.5, label=f" {label}"

@@ -51,9 +51,8 @@ def main(argv: list[str] | None = None) -> None:
 
     argv = sys.argv[1:] if argv is None else argv
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(
-            stream, TextIOWrapper
-        ):  # write an escape for a character that the terminal lacks
+        if isinstance(stream, TextIOWrapper):
+            # write an escape for a character that the terminal lacks
             stream.reconfigure(errors="backslashreplace")
     if argv[:1] == ["--version"]:
         from xreset.files import code_version

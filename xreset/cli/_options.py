@@ -94,8 +94,7 @@ def _claimed(options: dict[str, Any]) -> Iterator[None]:
     with ExitStack() as claims:
         for name in _WRITTEN:
             path = options.get(name)
-            if (
-                isinstance(path, Path) and path.suffix and path.parent.is_dir()
-            ):  # a folder is claimed by what writes into it
+            # a folder is claimed by what writes into it
+            if isinstance(path, Path) and path.suffix and path.parent.is_dir():
                 claims.enter_context(claim(path))
         yield

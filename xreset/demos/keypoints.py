@@ -216,7 +216,7 @@ def _read_csv(path: Path, name: str) -> Iterator[dict[str, np.ndarray]]:
         found = {"sequence": np.array(sequence)} | {
             field: values[own] for field, values in arrays.items()
         }
-        for text in _TEXTS[1:]:
+        for text in ("object", "side", "subject"):
             if text not in table:
                 continue
             values = {table[text][frame].strip() for frame in own}
@@ -359,6 +359,7 @@ def _object_pose(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray, Rotation
             f" object_quat_wxyz or _xyzw; found {', '.join(given) or 'none'}."
         )
     name = given[-1]
+    what = " and ".join(given)
     values = np.asarray(arrays[name], dtype=float)
     if name == "object_pose":
         pos = values[:, :3, 3]
@@ -371,7 +372,7 @@ def _object_pose(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray, Rotation
     fits &= np.isfinite(pos).all(axis=1)
     if not fits.all():
         raise DemoError(
-            f"{name} of frame {np.argmin(fits)} is not {expected}. Remove frames without a pose at the ends,"
+            f"{what} of frame {np.argmin(fits)} should be {expected}. Remove frames without a pose at the ends,"
             " interpolate the others."
         )
     if name == "object_pose":

@@ -85,9 +85,8 @@ def hull(points: np.ndarray, tolerance: float = 0.0) -> Shape:
     index = np.full(len(points), -1)
     index[convex.vertices] = np.arange(len(convex.vertices))
     normals = _triangle_normals(points[convex.simplices])
-    inward = (normals * convex.equations[:, :3]).sum(
-        axis=1
-    ) < 0  # qhull's triangles have no consistent winding
+    # qhull's triangles have no consistent winding
+    inward = (normals * convex.equations[:, :3]).sum(axis=1) < 0
     faces = convex.simplices.copy()
     faces[inward] = faces[inward][:, ::-1]
     return Shape(

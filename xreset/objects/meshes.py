@@ -258,9 +258,8 @@ def _checked(mesh: trimesh.Trimesh, path: Path) -> trimesh.Trimesh:
         raise ObjectError(f"{path} has a vertex that is not finite; it is damaged.")
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
         raise ObjectError(f"{path} has a triangle of an unknown vertex; it is damaged.")
-    if (
-        mesh.extents is not None and mesh.extents.max() > _LARGEST
-    ):  # before merging, which rounds by the size
+    # before merging, which rounds by the size
+    if mesh.extents is not None and mesh.extents.max() > _LARGEST:
         raise ObjectError(
             f"{path} measures {_size(mesh)}; meshes must be in metres. Is it in millimetres (--scale 0.001)?"
         )

@@ -230,8 +230,9 @@ class HandMotions:
     ) -> Iterator[tuple[np.ndarray, np.ndarray, HandTargets, HandState]]:
         """Retarget the hand alone, in batches of those sequences that have a hand.
 
-        Returns of each batch of S sequences, padded to T frames: the frames [B] of all, where they are in the batch
-        [S, T], the hand's targets, and its motion.
+        Yields:
+            Of each batch of S sequences, padded to T frames: the B rows of its frames in all frames, which places of
+            the batch [S, T] they fill (bool), the hand's targets, and the hand's motion.
         """
         owner = self.demos.sequence_of_frame
         lengths = np.diff(self.demos.frame_offsets)

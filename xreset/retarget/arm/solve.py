@@ -308,7 +308,7 @@ def spread_over(flags: Tensor, count: int) -> tuple[Tensor, Tensor]:
     return torch.cat(rows), torch.cat(frames)
 
 
-# One frame
+# One frame ------------------------------------------------------------------------------------------------------------
 
 
 def solve(frame: ArmProblem, q: Tensor, iterations: int, previous: Tensor | None = None) -> Tensor:
@@ -337,9 +337,8 @@ def solve(frame: ArmProblem, q: Tensor, iterations: int, previous: Tensor | None
         moved = q + torch.linalg.solve(H, -here.gradient * free)
         return torch.minimum(torch.maximum(moved, model.lower), model.upper)
 
-    def done(
-        before: Tensor, after: Tensor, *_: Tensor
-    ) -> Tensor:  # all together: the batch keeps its size
+    def done(before: Tensor, after: Tensor, *_: Tensor) -> Tensor:
+        # all together: the batch keeps its size
         return ((after - before).abs() < _CONVERGED).all().expand(len(before))
 
     return minimize(q, evaluate, step, done, iterations, damping_range=(1e-9, 1e9))

@@ -115,7 +115,11 @@ class FileTest(InFolder):
             ("retarget", "-h", False),
             ("resets", "--settle --out /tmp/victim.npz", False),
             ("resets", "--robot /tmp", False),
-            ("retarget", "--hand.clearance -0.001 --arm.restarts=8 --hand.jump_limit 0.2", True),
+            (
+                "retarget",
+                "--hand.object-clearance -0.001 --arm.restarts=8 --hand.jump_limit 1",
+                True,
+            ),
             ("resets", "--closing.spacing 0.005 --num-envs 8 --backend mujoco", True),
         ):
             options = text.split()

@@ -132,7 +132,8 @@ class Runner:
         try:
             newest = self.driver.read()
             self._one_robot = np.ndim(newest.joint_pos) == 1
-            reading = self._reading = self._merged(newest.batched(), now)
+            reading = self._merged(newest.batched(), now)
+            self._reading = reading
         except Exception as error:
             self._stop_all(f"The driver could not read: {error}.")
             return self._sent

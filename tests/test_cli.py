@@ -91,11 +91,16 @@ class UsageTest(unittest.TestCase):
                 self.assertNotIn("Traceback", err)
 
     def test_a_gpu_that_is_not_there(self):
-        with mock.patch("torch.cuda.device_count", return_value=0):
-            arguments = "resets none.npz --out x.npz --backend mujoco-warp --device cuda"
-            code, _, err = run(*arguments.split())
-        self.assertEqual(code, 1)
-        self.assertIn("The device is cuda, but torch finds 0 GPUs", err)
+        """It is also not there if only its driver knows it."""
+        arguments = "resets none.npz --out x.npz --backend mujoco-warp --device cuda"
+        for can_be_used, count in ((True, 0), (False, 1)):
+            with (
+                mock.patch("torch.cuda.device_count", return_value=count),
+                mock.patch("torch.cuda.is_available", return_value=can_be_used),
+            ):
+                code, _, err = run(*arguments.split())
+            self.assertEqual(code, 1)
+            self.assertIn("The device is cuda, but torch can use 0 GPUs", err)
 
     def test_what_reaches_the_terminal_is_text(self):
         code, _, err = run("eval", "\x1b[31mred\x1b]0;title\x07", "--demos", "none.npz")

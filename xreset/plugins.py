@@ -153,11 +153,12 @@ def existing_device(device: str) -> str:
         return device
     import torch
 
-    count = torch.cuda.device_count()
+    # device_count alone counts GPUs whose driver torch cannot use
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     index = int(device.partition(":")[2] or (torch.cuda.current_device() if count else 0))
     if index >= count:
         raise BackendUnavailableError(
-            f"The device is {device}, but torch finds {count} GPUs. Check nvidia-smi, or use cpu."
+            f"The device is {device}, but torch can use {count} GPUs. Check nvidia-smi, or use cpu."
         )
     return f"cuda:{index}"
 

@@ -84,6 +84,7 @@ def check_contract(source: str, contract: Contract, robot: RobotSpec, task: Task
         "joint order": use_robot,
         "fingertips": use_robot,
         "version of the robot": "Its URDF or description has changed. Train again.",
+        "observation layout": "Use the run's own configuration, or train again if it is of an earlier xreset.",
     }
     of_task = _meaning(here)
     for part, of_policy in _meaning(contract).items():

@@ -122,7 +122,7 @@ def export_checkpoint(out: Path, checkpoint: Path, policy: Path) -> None:
     export_onnx(actor, policy, info.contract, checkpoint=checkpoint)
 
 
-def is_of(policy: Path, checkpoint: Path) -> bool:
+def is_exported_from(policy: Path, checkpoint: Path) -> bool:
     """Return whether a policy was exported from a checkpoint."""
     import onnx
     from google.protobuf.message import DecodeError

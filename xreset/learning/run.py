@@ -135,9 +135,9 @@ def _exported_policy(folder: Path) -> Path:
         chosen = checkpoint.with_name(choice.chosen)
         checkpoint = chosen if chosen.exists() else checkpoint
     # rsl-rl, which playing a file does not need
-    from xreset.learning.export import export_checkpoint, is_of
+    from xreset.learning.export import export_checkpoint, is_exported_from
 
-    if not policy.exists() or not is_of(policy, checkpoint):
+    if not policy.exists() or not is_exported_from(policy, checkpoint):
         export_checkpoint(folder, checkpoint, policy)
     return policy
 

@@ -161,6 +161,7 @@ def load_policy(
 
     Raises:
         PolicyError: the policy is unknown, or does not fit the robot.
+        FileFormatError: ``run.json`` or ``choice.json`` next to it is damaged.
     """
     if isinstance(policy, PolicySpec):
         return policy

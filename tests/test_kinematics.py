@@ -172,6 +172,20 @@ class KinematicsTest(unittest.TestCase):
             *shape, len(low), dtype=FLOAT, generator=generator
         )
 
+    def test_every_moving_joint_is_actuated_or_follows_one_that_is(self):
+        lead = self.robot.mimics[0]
+        without = dataclasses.replace(self.robot, mimics=())
+        passive = dataclasses.replace(lead, source=lead.joint)
+        for robot, words in (
+            (without, f"{lead.joint!r} moves, but the description neither"),
+            (
+                dataclasses.replace(self.robot, mimics=(passive,)),
+                f"follow {lead.joint}, which the description does not actuate",
+            ),
+        ):
+            with self.assertRaisesRegex(RobotError, words):
+                Kinematics(robot)
+
     def test_link_poses_agree_with_mujoco(self):
         import mujoco
 

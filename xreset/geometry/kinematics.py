@@ -74,8 +74,8 @@ class Kinematics:
             device: device of all results.
 
         Raises:
-            RobotError: the description names a joint or link that is not in the URDF, or a moving joint is neither
-                actuated nor a mimic.
+            RobotError: the description names a joint or link that is not in the URDF, a moving joint is neither
+                actuated nor a mimic, or a mimic follows a joint that is not actuated.
         """
         tree = robot_tree(robot)
         self.robot = robot
@@ -100,6 +100,11 @@ class Kinematics:
                     "actuates it nor makes it a mimic joint. Add it to either, or make it fixed in the URDF."
                 )
             driven.add(mimics[joint.name].source if joint.name in mimics else joint.name)
+        if passive := driven.difference(robot.joint_names):
+            raise RobotError(
+                f"robot {robot.name!r}: mimic joints follow {', '.join(sorted(passive))}, which the description does "
+                "not actuate. Let them follow an actuated joint."
+            )
         indices = [i for i, name in enumerate(robot.joint_names) if name in driven]
         self.joint_indices = np.array(indices, dtype=np.int64)
         """[J] indices of this kinematics' joints in the robot's joint order; all of them when the root is the

@@ -55,12 +55,10 @@ def main(bank: Path, iterations: int = 3, num_envs: int = 8) -> None:
         gain = (gain - gain.mean()) / (gain.std() + 1e-8)
         for _ in range(EPOCHS):
             ratio = (Normal(actor(obs), log_std.exp()).log_prob(act).sum(1) - logp).exp()
-            loss = (
-                -torch.min(ratio * gain, ratio.clamp(1 - CLIP, 1 + CLIP) * gain).mean()
-                + (critic(obs)[:, 0] - aim).square().mean()
-            )
+            policy_loss = -torch.min(ratio * gain, ratio.clamp(1 - CLIP, 1 + CLIP) * gain).mean()
+            value_loss = (critic(obs)[:, 0] - aim).square().mean()
             optimizer.zero_grad()
-            loss.backward()
+            (policy_loss + value_loss).backward()
             optimizer.step()
         mean = reward[real].mean()
         print(f"iteration {iteration + 1}: reward per step {mean:.4f}, {int(end.sum())} ended")

@@ -28,7 +28,7 @@ from xreset.description import load_robot
 from xreset.errors import FileFormatError, GoalError
 from xreset.objects.catalogue import load_objects, object_names
 from xreset.objects.rest import rest_height, resting_orientation
-from xreset.progress import Progress, unseen
+from xreset.progress import unseen
 from xreset.records import Field, read_record, schema_of, write_record
 from xreset.resets.bank import ResetBank, bank_problem, check_objects, no_states
 from xreset.resets.config import GoalConfig
@@ -89,7 +89,7 @@ def make_goals(
     families: Sequence[str] | None = None,
     poses: Sequence[Sequence[float]] = (),
     config: GoalConfig | None = None,
-    progress: Progress = unseen,
+    progress: Callable[[float, int], None] = unseen,
 ) -> GoalSet:
     """Draw starts and goals of objects, without demonstrations.
 

@@ -9,7 +9,7 @@ Shape letters: M states, N worlds, J joints, n arm joints, P phases.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
@@ -32,7 +32,7 @@ from xreset.geometry.rotations import (
 )
 from xreset.physics import Backend, State
 from xreset.pictures.render import Camera, Renderer, add_caption, pose_matrix
-from xreset.progress import Progress, unseen
+from xreset.progress import unseen
 from xreset.resets.bank import ResetBank
 from xreset.resets.config import SqueezeConfig
 from xreset.resets.fingers import Fingers, fingers_of, squeeze_targets
@@ -121,7 +121,7 @@ def judge(
     squeeze: SqueezeConfig | None = None,
     num_envs: int = 32,
     device: str = "cpu",
-    progress: Progress = unseen,
+    progress: Callable[[float, int], None] = unseen,
 ) -> Judgement:
     """Judge which objects a robot holds, lifts and turns.
 

@@ -297,18 +297,20 @@ def compare(
 
     def judged(e: Engine) -> EngineParity:
         press, closing = closings[e]
-        press_there, closing_there = closings[reference]
-        metrics = (
-            *press_metrics(press, press_there, window),
-            *hold_metrics(holds[e], holds[reference], points),
-            outcome_metric("closing, outcome", [closing], [closing_there]),
-        )
+        metrics: tuple[Metric, ...] = ()
+        if e is not reference:
+            press_there, closing_there = closings[reference]
+            metrics = (
+                *press_metrics(press, press_there, window),
+                *hold_metrics(holds[e], holds[reference], points),
+                outcome_metric("closing, outcome", [closing], [closing_there]),
+            )
         outcomes = {"closing": closing}
         for mu, recording in zip(FRICTIONS, holds[e], strict=True):
             outcomes[f"hold {mu:g}"] = recording
         return EngineParity(
             engine=e,
-            metrics=() if e is reference else metrics,
+            metrics=metrics,
             carried={name: tuple(carried(r).tolist()) for name, r in outcomes.items()},
             broken=sum(int(r.broken.sum()) for r in (*outcomes.values(), press)),
         )

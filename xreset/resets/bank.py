@@ -226,9 +226,8 @@ def check_retargeted(path: str | Path, data: Retargeted, robot: RobotSpec) -> No
     """Refuse trajectories of another robot, or with joints outside this robot's limits; ``FileFormatError``."""
     check_robot(path, "retargeted file", data, robot)
     lower, upper = joint_limits(robot)
-    beyond = np.where(
-        data.valid[:, None], np.maximum(lower - data.joint_pos, data.joint_pos - upper), -np.inf
-    )
+    outside = np.maximum(lower - data.joint_pos, data.joint_pos - upper)
+    beyond = np.where(data.valid[:, None], outside, -np.inf)
     frame, joint = np.unravel_index(int(beyond.argmax()), beyond.shape)
     if beyond[frame, joint] > _TOLERANCE:
         raise FileFormatError(

@@ -330,9 +330,9 @@ def solve(frame: ArmProblem, q: Tensor, iterations: int, previous: Tensor | None
 
     def step(q: Tensor, here: Quadratic, damping: Tensor) -> Tensor:
         free = free_to_move(q, here.gradient, model.lower, model.upper)
-        ridge = damping[:, None] * here.curvature.diagonal(dim1=-2, dim2=-1).clamp_min(
-            1e-3
-        ) * free + (1.0 - free)
+        diagonal = here.curvature.diagonal(dim1=-2, dim2=-1).clamp_min(1e-3)
+        # a joint that may not move has a row of the identity
+        ridge = damping[:, None] * diagonal * free + (1.0 - free)
         H = here.curvature * free[:, :, None] * free[:, None, :] + torch.diag_embed(ridge)
         moved = q + torch.linalg.solve(H, -here.gradient * free)
         return torch.minimum(torch.maximum(moved, model.lower), model.upper)

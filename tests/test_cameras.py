@@ -137,6 +137,18 @@ class TestCameras(unittest.TestCase):
         )
         self.assertTrue(((points > low - 1e-3) & (points < high + 1e-3)).all())
 
+    def test_a_picture_shows_the_goal_in_green_if_the_policy_sees_it(self):
+        without, with_goal = (
+            self.cameras(replace(VISION, goal_image=goal_image)) for goal_image in (False, True)
+        )
+        for cameras in (without, with_goal):
+            self.look(cameras)
+        gray, colored = (cameras.picture(0, 128).astype(int) for cameras in (without, with_goal))
+        self.assertTrue((gray == gray[..., :1]).all())
+        green = colored[..., 1] > colored[..., 0]
+        self.assertTrue(green[:, :64].any() and green[:, 64:].any())
+        np.testing.assert_array_equal(colored[~green], gray[~green])
+
     def test_a_camera_on_a_link_moves_with_it(self):
         cameras = self.cameras(
             replace(

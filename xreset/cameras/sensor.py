@@ -26,6 +26,8 @@ from xreset.physics import State
 from xreset.spec import SceneSpec, TableSpec
 from xreset.tensors import where
 
+_GOAL_COLOR = (0.3, 1.0, 0.3)
+
 
 class Cameras:
     """Fixed buffers of N worlds. Apart from the rays, a step is torch operations that can be captured in a graph.
@@ -164,7 +166,8 @@ class Cameras:
         return self.view
 
     def picture(self, world: int, width: int) -> np.ndarray:
-        """Return the newest images of a world side by side, [h, width, 3] uint8: near is bright, nothing is black.
+        """Return the newest images of a world side by side, [h, width, 3] uint8: near is bright, nothing is black. Green
+        is the object at its goal, if the policy sees it.
 
         Args:
             world: index of the world.
@@ -172,9 +175,13 @@ class Cameras:
         """
         images = self.image[world]
         near = torch.where(images > 0, 0.2 + 0.8 * self._nearness(images), 0.0)
-        pixels = Image.fromarray((255 * torch.cat(tuple(near), dim=1)).byte().cpu().numpy())
+        colors = near[..., None].repeat(1, 1, 1, 3)
+        if self._goal_rays is not None:
+            at_goal = self._in_range(self._goal_rays.depth)[world] > 0
+            colors[at_goal] = 0.5 * (colors[at_goal] + colors.new_tensor(_GOAL_COLOR))
+        pixels = Image.fromarray((255 * torch.cat(tuple(colors), dim=1)).byte().cpu().numpy())
         height = 2 * round(width * pixels.height / pixels.width / 2)
-        return np.asarray(pixels.resize((width, height), Image.Resampling.NEAREST).convert("RGB"))
+        return np.asarray(pixels.resize((width, height), Image.Resampling.NEAREST))
 
     def shows_object(self) -> Tensor:
         """[N] bool: whether the newest images show the object, if they had no errors."""

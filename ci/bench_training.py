@@ -6,8 +6,8 @@ raw       the captured graph of the engine's own step, as many times as a contro
 env       ManipulationEnv.step with random actions, resets from home and bank included; beside it the share of raw
 rollout   env and the policy, the value and the storage
 update    the rest of a PPO iteration: all epochs over the rollout
-train     whole iterations
-The worlds start from a bank of retargeted synthetic demonstrations, or from --resets. --precision as in training.
+train     whole iterations; beside it how many seconds of physics they simulate in a second
+The worlds start from a bank of retargeted synthetic demonstrations, or from --resets. --recipe and --precision as in training.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,12 +26,12 @@ from benchlib import OBJECT, Options, rate, run_time, seconds_of
 from rich.console import Console
 from rich.table import Table
 
-from xreset.env import ManipulationEnv, make_scene
+from xreset.env import ManipulationEnv, make_env
 from xreset.inputs import load_inputs
-from xreset.learning.config import PpoConfig, TrainConfig
+from xreset.learning.config import TrainConfig
+from xreset.learning.recipes import starting_config
 from xreset.learning.runner import TrainingRunner
-from xreset.plugins import backend_status, make_backend
-from xreset.resets.distribution import ResetDistribution
+from xreset.plugins import backend_status
 
 
 def add_arguments(group: argparse._ArgumentGroup) -> None:
@@ -40,6 +41,7 @@ def add_arguments(group: argparse._ArgumentGroup) -> None:
         help="reset bank (default: one of a synthetic soup-can demonstration)",
     )
     group.add_argument("--objects", type=Path, help="folder of real meshes")
+    group.add_argument("--recipe", default="paper", help="as in training")
     group.add_argument("--precision", default="bfloat16", choices=["float32", "tf32", "bfloat16"])
     group.add_argument("--iterations", type=int, default=5, help="PPO iterations to time")
 
@@ -52,17 +54,17 @@ def run(options: Options, console: Console) -> None:
     with tempfile.TemporaryDirectory() as folder:
         resets = options.extra["resets"] or _synthetic_bank(options.robot, Path(folder))
         inputs = load_inputs(resets, robot=options.robot, objects=options.extra["objects"])
-        config = TrainConfig(ppo=PpoConfig(precision=options.extra["precision"]))
-        scene = make_scene(inputs.robot, inputs.objects, config.task)
-        names = tuple(o.name for o in inputs.objects)
-        with make_backend("mujoco-warp", scene, options.num_envs, device=options.device) as backend:
-            env = ManipulationEnv(
-                backend,
-                config.task,
-                ResetDistribution(
-                    inputs.bank, inputs.robot, names, config.task.reset, backend.device
-                ),
-            )
+        config = starting_config(options.extra["recipe"])
+        config = replace(config, ppo=replace(config.ppo, precision=options.extra["precision"]))
+        with make_env(
+            inputs.robot,
+            inputs.objects,
+            inputs.bank,
+            config.task,
+            engine="mujoco-warp",
+            num_envs=options.num_envs,
+            device=options.device,
+        ) as env:
             console.print(_measure(env, config, options, Path(folder)))
 
 
@@ -112,12 +114,14 @@ def _measure(env: ManipulationEnv, config: TrainConfig, options: Options, folder
         "env steps/s",
         "ms per control step",
         "",
-        title=f"training: {n} worlds, {options.robot}, {config.ppo.precision}",
+        title=f"training: {n} worlds, {options.robot}, {options.extra['recipe']}, {config.ppo.precision}",
     )
+    simulated = trained * config.task.timestep * config.task.substeps
+    faults = f"{int(env.nonfinite_count)} not finite, {int(env.overflow_count)} overflows"
     note = {
         "raw": f"{still * n:,.0f} with constant targets",
         "env": f"{stepped / raw:.2f} of raw",
-        "train": f"{int(env.nonfinite_count)} not finite, {int(env.overflow_count)} overflows",
+        "train": f"{simulated:,.0f} simulated seconds per second; {faults}",
     }
     steps = {"raw": raw, "env": stepped, "rollout": rolled, "update": updated, "train": trained / n}
     for name, per_second in steps.items():

@@ -166,8 +166,9 @@ class Cameras:
         return self.view
 
     def picture(self, world: int, width: int) -> np.ndarray:
-        """Return the newest images of a world side by side, [h, width, 3] uint8: near is bright, nothing is black. Green
-        is the object at its goal, if the policy sees it.
+        """Return the newest images of a world side by side, [h, width, 3] uint8: near is bright, nothing is black.
+
+        The object at its goal is green, if the policy sees it.
 
         Args:
             world: index of the world.

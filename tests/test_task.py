@@ -188,7 +188,7 @@ class RewardTest(unittest.TestCase):
         ):
             with self.subTest(name), self.assertRaisesRegex(RunError, problem):
                 self.reward(RewardConfig(own={name: 1.0}))
-        for own in ({"height": 1.0}, {"module:": 1.0}, {"a:b": math.nan}):
+        for own in ({"height": 1.0}, {"module:": 1.0}, {"a:b": math.nan}, {math.sin: 1.0}, ["a:b"]):
             with (
                 self.subTest(own),
                 self.assertRaisesRegex(ValueError, "expected module:function and a finite number"),

@@ -64,6 +64,10 @@ def newest(out: Path) -> Checkpoint:
     return read_checkpoint(latest_checkpoint(out))
 
 
+def not_a_number(x):
+    return x.tip_distance[:, 0] * float("nan")
+
+
 class TrainingTest(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
@@ -258,6 +262,12 @@ class TrainingTest(unittest.TestCase):
             ):
                 parsed(*arguments)
             self.assertRegex(said.getvalue(), problem)
+
+    def test_an_own_term_that_is_not_finite_is_named(self):
+        name = f"{__name__}:not_a_number"
+        task = replace(CONFIG.task, reward=replace(CONFIG.task.reward, own={name: 1.0}))
+        with self.assertRaisesRegex(RunError, f"finite numbers \\({name}\\)"):
+            self.train("not_a_number", config=replace(CONFIG, task=task))
 
     def test_a_run_folder_does_not_decide_which_code_is_imported(self):
         """Reward terms of one's own are taken from the command line only."""

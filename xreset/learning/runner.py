@@ -235,11 +235,16 @@ class TrainingRunner:
 
     def _check_finite(self, obs: TensorDict) -> None:
         """Refuse observations that are not finite, once per iteration: they come from worlds whose health was sound."""
+        own = ", ".join(self.env.task.reward.own)
+        remedy = f"Continue from the last checkpoint: xreset train --out {self.folder} --resume"
+        if own:
+            remedy = (
+                f"The critic observes the reward: do your own terms return finite numbers ({own})?"
+            )
         for group, value in obs.items():
             if not bool(value.isfinite().all()):
                 raise RunError(
-                    f"The observation group {group!r} is not finite at iteration {self.iteration}. Continue from the "
-                    f"last checkpoint: xreset train --out {self.folder} --resume"
+                    f"The observation group {group!r} is not finite at iteration {self.iteration}. {remedy}"
                 )
 
 

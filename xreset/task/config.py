@@ -16,7 +16,10 @@ PositiveRange = Annotated[Range, Rule("factors above 0", lambda x: x[0] > 0)]
 
 
 def _are_own_terms(own: dict[str, float]) -> bool:
-    return all(all(name.partition(":")[::2]) and isfinite(weight) for name, weight in own.items())
+    return isinstance(own, dict) and all(
+        isinstance(name, str) and all(name.partition(":")[::2]) and isfinite(weight)
+        for name, weight in own.items()
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
-from trimesh.triangles import points_to_barycentric
 
 from xreset.spec import ObjectSpec
 
@@ -33,6 +32,8 @@ def resting_orientation(obj: ObjectSpec, up: np.ndarray) -> np.ndarray:
 
     An object rests on a face of its convex hull if its center of mass projects into that face.
     """
+    from trimesh.triangles import points_to_barycentric  # slow to import
+
     convex = ConvexHull(obj.vertices)
     corners = obj.vertices[convex.simplices]
     normals = convex.equations[:, :3]

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
+from xreset.errors import XResetError
 from xreset.eval.policy_spec import PolicySpec, load_policy
 from xreset.eval.results import Evaluation, episode_table, summarize, write_results
 from xreset.eval.rollout import Engine, chosen_engines, load_trial, roll_out
@@ -52,6 +53,10 @@ def evaluate(
         PolicyError: the policy is unknown, or the seed chose this checkpoint.
         XResetError: another process is writing the folder.
     """
+    if episodes < 1 or num_envs < 1:
+        raise XResetError(
+            f"episodes is {episodes} and num_envs is {num_envs}, expected at least 1 of each."
+        )
     policy = load_policy(policy, robot=robot, seed=seed)
     policy.check_seed(seed)
     chosen = chosen_engines(engines, device)

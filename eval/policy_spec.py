@@ -22,6 +22,7 @@ from xreset.resets.bank import ResetBank
 from xreset.retarget.file import Retargeted
 from xreset.spec import ObjectSpec, RobotSpec
 from xreset.task.config import TaskConfig, evaluation_task
+from xreset.text import Brief, shown
 
 if TYPE_CHECKING:
     from tensordict import TensorDict
@@ -30,8 +31,8 @@ BASELINES = ("zero", "random", "ik")
 """Names of the policies that need no training."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class PolicySpec:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class PolicySpec(Brief):
     """A policy, the robot and the task that it was trained for, and where its results go."""
 
     name: str
@@ -165,6 +166,11 @@ def load_policy(
     """
     if isinstance(policy, PolicySpec):
         return policy
+    if not isinstance(policy, str | Path):
+        raise PolicyError(
+            f"policy is {shown(policy)}, expected a name, a path or a PolicySpec. docs/gymnasium.md shows how to make "
+            "one of a network of your own."
+        )
     name = str(policy)
     if name in BASELINES:
         return _baseline(name, robot, seed)
@@ -208,7 +214,7 @@ def load_policy(
 
 def _baseline(name: str, robot: str | Path | None, seed: int) -> PolicySpec:
     if robot is None:
-        raise PolicyError(f"The baseline {name!r} needs a robot. Add --robot.")
+        raise PolicyError(f"The baseline {name!r} needs a robot. Add --robot (in Python: robot).")
     spec = load_robot(robot)
 
     def start(motion: Retargeted | None) -> Policy:

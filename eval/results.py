@@ -215,7 +215,7 @@ class Evaluation(list[EvalResult]):
         """Return the table of episodes; see :func:`episode_table`."""
         return self._episodes
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         return table_text(self)
 
 

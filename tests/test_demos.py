@@ -440,6 +440,9 @@ class Synthetic(InFolder):
             demos.object_pos, demos.object_quat_wxyz, demos.hand_keypoints.astype(float)
         )
 
+    def test_one_object_may_be_a_name(self):
+        self.assertEqual(synthesize("soup", 1).object_name.tolist(), ["005_tomato_soup_can"])
+
     def test_the_same_seed_gives_the_same_bits(self):
         again = synthesize(["banana", "soup"], per_object=1, seed=0)  # another order, fewer objects
         for name in ("banana", "soup"):

@@ -16,10 +16,10 @@ from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from tests.toy_bank import SOUP, SPAM, toy_bank
+from tests.toy_bank import SOUP, SPAM, toy_bank, toy_retargeted
 from tests.toy_robot import toy_hand_arm
-from xreset.env import ManipulationEnv, make_scene, object_origins
-from xreset.errors import CapabilityError
+from xreset.env import ManipulationEnv, make_env, make_scene, object_origins
+from xreset.errors import CapabilityError, XResetError
 from xreset.eval.metrics import EpisodeMetrics, MetricPoints
 from xreset.eval.rollout import Engine, Trial, roll_out
 from xreset.geometry.rotations import quat_rotate
@@ -28,6 +28,7 @@ from xreset.objects.catalogue import load_object, load_objects
 from xreset.physics import State
 from xreset.policy import ZeroPolicy
 from xreset.resets.distribution import ResetDistribution
+from xreset.resets.filter import make_bank
 from xreset.task.config import (
     ActionConfig,
     ObservationConfig,
@@ -151,6 +152,36 @@ class WithEnv(unittest.TestCase):
     def assert_finite(self, observations) -> None:
         for group, value in observations.items():
             self.assertTrue(value.isfinite().all(), group)
+
+
+class RefusalTest(WithEnv):
+    def test_what_does_not_belong_together_is_refused(self):
+        names = tuple(f"other_{name}" for name in self.robot.joint_names)
+        meshes = tuple(replace(obj, source="0" * 64) for obj in self.objects)
+        for words, given in {
+            "joints are not those of": {"bank": replace(self.bank, joint_names=names)},
+            "was made with": {"objects": meshes},
+            "load_robot": {"robot": self.robot.name},
+            "'soup'.*load_object": {"objects": ["soup"]},
+            "read_bank": {"bank": "bank.npz"},
+        }.items():
+            parts = {"robot": self.robot, "objects": self.objects, "bank": self.bank} | given
+            with self.subTest(words), self.assertRaisesRegex(XResetError, words):
+                make_env(**parts, num_envs=1)
+        motion = toy_retargeted(self.robot, [SOUP], [0, 2], joint_names=names)
+        with self.assertRaisesRegex(XResetError, "The motion is .* joints are not those of"):
+            make_bank(motion, self.robot, self.objects)
+
+    def test_starts_and_goals_do_not_depend_on_the_robot(self):
+        rows = np.zeros(self.bank.num_states, dtype=bool)
+        bank = replace(self.bank.with_states(rows), joint_names=("other",))
+        make_env(self.robot, self.objects, bank, num_envs=1).close()
+
+    def test_an_action_is_not_broadcast(self):
+        env = self.make()
+        for shape in ((7,), (1, 7), (N, 1), ()):
+            with self.subTest(shape), self.assertRaisesRegex(XResetError, r"expected \(3, 7\)"):
+                env.step(torch.zeros(shape))
 
 
 class StepTest(WithEnv):

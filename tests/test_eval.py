@@ -15,11 +15,18 @@ from scipy.spatial.transform import Rotation
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_results import OBJECTS, toy_rollouts, toy_summary
 from xreset.checks import from_dict
-from xreset.errors import FileFormatError, XResetError
+from xreset.errors import FileFormatError, PolicyError, XResetError
 from xreset.eval.evaluate import evaluate
 from xreset.eval.metrics import EpisodeMetrics, MetricPoints
 from xreset.eval.policy_spec import PolicySpec, load_policy
-from xreset.eval.results import Episode, EvalResult, read_evaluation, read_traces, write_results
+from xreset.eval.results import (
+    Episode,
+    EvalResult,
+    Evaluation,
+    read_evaluation,
+    read_traces,
+    write_results,
+)
 from xreset.eval.rollout import engine, load_trial, roll_out
 from xreset.eval.stats import bootstrap_ci95
 from xreset.eval.table import result_rows
@@ -300,6 +307,11 @@ class ResultsTest(unittest.TestCase):
     def setUp(self):
         self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
 
+    def test_an_evaluation_shows_its_table(self):
+        evaluation = Evaluation([toy_summary()], [])
+        self.assertEqual(repr(evaluation), str(evaluation))
+        self.assertIn("task progress", repr(evaluation))
+
     def test_summary(self):
         s = toy_summary()
         self.assertEqual((s.objects, s.episodes, s.task_progress.mean), ((SOUP, SPAM), 4, 0.4975))
@@ -371,6 +383,14 @@ class ResultsTest(unittest.TestCase):
         (self.folder / "sapien.json").write_text('{"schema": "xreset-eval/0"}')
         with self.assertRaisesRegex(FileFormatError, "schema version 'xreset-eval/0'"):
             read_evaluation(self.folder)
+
+    def test_what_cannot_be_played_is_refused(self):
+        with self.assertRaisesRegex(PolicyError, "Linear.*expected a name, a path or a PolicySpec"):
+            evaluate(torch.nn.Linear(2, 2), "demos.npz")
+        with self.assertRaisesRegex(XResetError, r"Found \['soup'\], expected Demos"):
+            evaluate("zero", ["soup"], robot="openarm")
+        with self.assertRaisesRegex(XResetError, "episodes is 0"):
+            evaluate("zero", "demos.npz", robot="openarm", episodes=0)
 
     def test_two_evaluations_are_not_written_into_one_folder(self):
         policy = PolicySpec(

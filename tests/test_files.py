@@ -525,6 +525,15 @@ class BankTest(InFolder):
             inputs={"retargeted": "ab"},
         )
 
+    def test_a_bank_prints_shapes(self):
+        text = repr(toy_bank(self.robot))
+        self.assertIn("joint_pos=array[6, 7], object_pos=array[6, 3]", text)
+        self.assertLess(len(text), 1500)
+
+    def test_provenance_may_be_left_out(self):
+        write_bank(self.file, toy_bank(self.robot))
+        self.assertEqual(read_bank(self.file).num_states, 6)
+
     def test_round_trip(self):
         for changes in ({}, {"rejected_reason": np.zeros(3, dtype=np.int32)}):
             self.write(**changes)

@@ -15,13 +15,14 @@ import torch
 from torch import Tensor
 
 from xreset.capture import GraphRunner
+from xreset.errors import XResetError
 from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
 from xreset.objects.sampling import center, metric_points, surface_points
 from xreset.physics import Backend, Parameters, State
 from xreset.plugins import make_backend
-from xreset.resets.bank import ResetBank
+from xreset.resets.bank import ResetBank, check_states
 from xreset.resets.distribution import Reset, ResetDistribution
-from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
+from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, checked_objects
 from xreset.task import observations as obs
 from xreset.task.actions import ActionSpace
 from xreset.task.config import TaskConfig
@@ -83,9 +84,15 @@ def make_env(
         num_envs: N.
         device: where the engine and all tensors live.
         seed: seed of every random number that the environment draws.
+
+    Raises:
+        FileFormatError: the bank's states are for another robot or other meshes.
+        DemoError: the bank has no demonstration of an object.
+        CapabilityError: the engine cannot do what the task asks for.
     """
     task = task or TaskConfig()
-    objects = tuple(objects)
+    objects = checked_objects(robot, objects)
+    check_states(bank, robot, objects)
     backend = make_backend(engine, make_scene(robot, objects, task), num_envs, device=device)
     try:
         names = tuple(o.name for o in objects)
@@ -397,6 +404,11 @@ class ManipulationEnv:
     # Parts
 
     def _apply_action(self, action: Tensor, push: Tensor | None = None) -> None:
+        if action.shape != self._action.shape:
+            raise XResetError(
+                f"The actions have the shape {tuple(action.shape)}, expected {tuple(self._action.shape)}: one row for "
+                "each world, one column for each joint."
+            )
         self._action.copy_(action)
         self._graphs.run(self._process_action)
         self.backend.set_joint_targets(

@@ -14,7 +14,7 @@ import numpy as np
 from xreset.demos.archive import SCHEMA_NAME as DEMOS
 from xreset.demos.archive import Demos, demo_objects, read_demos
 from xreset.description import load_robot
-from xreset.errors import DemoError, FileFormatError
+from xreset.errors import DemoError, FileFormatError, XResetError
 from xreset.files import file_hash
 from xreset.objects.catalogue import canonical_names, load_objects
 from xreset.progress import Progress, unseen
@@ -140,6 +140,10 @@ def load_inputs(
     if isinstance(data, str | Path):
         path = Path(data)
         data = _read(path, accept)
+    if not isinstance(data, Data):
+        raise XResetError(
+            f"Found {shown(data)}, expected Demos, Retargeted, a ResetBank, or a file of one of them."
+        )
     folder = Path(objects) if objects else None
     names = _object_names(data)
     if only:

@@ -7,14 +7,16 @@ up and the table's top at z = 0. Shape letters: J actuated joints, E fingertips.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from xreset.checks import NotNegative, Number, Positive, Rule, Text
+from xreset.errors import XResetError
+from xreset.text import Brief, shown
 
 GRAVITY = 9.81
 """Magnitude of gravity in m/s^2; it points along -z."""
@@ -204,8 +206,8 @@ class RobotSpec:
         return fingerprint in (self.fingerprint, replace(self, meshes=()).fingerprint)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ObjectSpec:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class ObjectSpec(Brief):
     """A rigid object in the frame of its mesh, which is the frame of the demonstrations' object poses."""
 
     name: str
@@ -271,6 +273,21 @@ class SceneSpec:
     def control_dt(self) -> float:
         """Duration of a control step [s]."""
         return self.timestep * self.substeps
+
+
+def checked_objects(robot: Any, objects: Iterable[Any]) -> tuple[ObjectSpec, ...]:
+    """Return the objects. Names in place of robot and objects are refused; ``XResetError``."""
+    if not isinstance(robot, RobotSpec):
+        raise XResetError(
+            f"robot is {shown(robot)}, expected a RobotSpec: xreset.load_robot(NAME)."
+        )
+    objects = (objects,) if isinstance(objects, ObjectSpec | str) else tuple(objects)
+    for obj in objects:
+        if not isinstance(obj, ObjectSpec):
+            raise XResetError(
+                f"objects has {shown(obj)}, expected an ObjectSpec: xreset.load_object(NAME)."
+            )
+    return objects
 
 
 def lowest_point(shapes: Sequence[Shape], turn: np.ndarray | None = None) -> float:

@@ -22,6 +22,17 @@ def shown(value: Any) -> str:
     return text if len(text) <= 200 else f"{text[:160]}...{text[-30:]}"
 
 
+class Brief:
+    """Base of dataclasses made with ``repr=False``, which print arrays as their shapes and other values shortened."""
+
+    def __repr__(self) -> str:
+        parts = []
+        for name, value in vars(self).items():
+            shape = getattr(value, "shape", None)
+            parts.append(f"{name}={shown(value) if shape is None else f'array{list(shape)}'}")
+        return f"{type(self).__name__}({', '.join(parts)})"
+
+
 def is_plain(text: str) -> bool:
     """Return whether a text has only printable characters and line ends, none that controls a terminal."""
     return text.isprintable() or all(c.isprintable() or c in "\n\t" for c in text)

@@ -32,7 +32,7 @@ from xreset.records import (
     wrong_value,
 )
 from xreset.spec import ObjectSpec
-from xreset.text import shown
+from xreset.text import Brief, shown
 
 SCHEMA_NAME = "xreset-demos/1"
 SIDES = ("right", "left")
@@ -54,7 +54,7 @@ _PER_SEQUENCE = ("sequence_name", "subject", "object_name", "hand_side")
 _PER_FRAME = ("hand_keypoints", "hand_valid", "wrist_quat_wxyz", "object_pos", "object_quat_wxyz")
 
 
-class ObjectMotions:
+class ObjectMotions(Brief):
     """Motions of objects one after another: S sequences, F frames of all of them. Base of records of frames."""
 
     fps: float
@@ -86,7 +86,7 @@ class ObjectMotions:
         return self.object_pos[last], self.object_quat_wxyz[last]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Demos(ObjectMotions):
     """Demonstrations of one or several objects; the attributes are the arrays of the file."""
 

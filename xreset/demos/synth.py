@@ -29,7 +29,7 @@ from xreset.demos.grasp import (
     plan_contacts,
 )
 from xreset.errors import DemoError
-from xreset.objects.catalogue import load_object, object_names
+from xreset.objects.catalogue import load_objects, object_names
 from xreset.objects.rest import rest_height, resting_orientation
 from xreset.progress import unseen
 from xreset.spec import ObjectSpec
@@ -97,7 +97,7 @@ def synthesize(
             " frames per second."
         )
     folder = Path(meshes) if meshes else None
-    specs = [load_object(name, folder) for name in objects or object_names(folder)]
+    specs = load_objects(objects or object_names(folder), folder)
     parts = []
     for spec in specs:
         starts = [_start(spec, np.array(up), side) for up in _REST_UP.get(spec.name, (_Z,))]

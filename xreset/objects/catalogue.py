@@ -100,7 +100,8 @@ def load_object(name: str, folder: str | Path | None = None) -> ObjectSpec:
 
 
 def load_objects(names: Iterable[str], folder: str | Path | None = None) -> tuple[ObjectSpec, ...]:
-    """Load several objects, in that order; see :func:`load_object`."""
+    """Load several objects, in that order, or the one of a single name; see :func:`load_object`."""
+    names = (names,) if isinstance(names, str) else names
     return tuple(load_object(name, folder) for name in names)
 
 

@@ -23,7 +23,7 @@ from xreset.demos.archive import (
     SequenceTexts,
     Text,
 )
-from xreset.errors import FileFormatError
+from xreset.errors import FileFormatError, XResetError
 from xreset.geometry.urdf import joint_limits
 from xreset.records import (
     JOINT,
@@ -36,6 +36,7 @@ from xreset.records import (
 )
 from xreset.retarget.file import Retargeted
 from xreset.spec import ObjectSpec, RobotSpec
+from xreset.text import Brief, shown
 
 SCHEMA = "xreset-resets/1"
 
@@ -47,8 +48,8 @@ StateIndices = Annotated[np.ndarray, Field(("L",), "i", within=(0, inf))]
 RejectedIndices = Annotated[np.ndarray, Field(("C",), "i", within=(0, inf))]
 
 
-@dataclass(frozen=True, kw_only=True)
-class ResetBank:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class ResetBank(Brief):
     """Contents of a reset bank: starts and goals of demonstrations [S], stable states [L] and rejected candidates
     [C]."""
 
@@ -177,9 +178,20 @@ def starts_and_goals(
 
 
 def write_bank(
-    path: str | Path, bank: ResetBank, *, config: Mapping[str, Any], inputs: Mapping[str, str]
+    path: str | Path,
+    bank: ResetBank,
+    *,
+    config: Mapping[str, Any] | None = None,
+    inputs: Mapping[str, str] | None = None,
 ) -> None:
-    """Write a bank; see :func:`xreset.records.write_record`."""
+    """Write a bank.
+
+    Args:
+        path: npz file; appears whole or not at all.
+        bank: the bank.
+        config: configuration that made it, for the file to state.
+        inputs: name -> SHA-256 of each file that it was made from, for the file to state.
+    """
     write_record(path, SCHEMA, bank, config=config, inputs=inputs)
 
 
@@ -216,6 +228,24 @@ def check_robot(path: str | Path, what: str, data: Any, robot: RobotSpec) -> Non
             f"{path} is a {what} for another version of {data.robot!r}: its URDF or robot.toml has changed. Make it "
             "again."
         )
+
+
+def check_joints(what: str, data: Any, robot: RobotSpec) -> None:
+    """Refuse data with other joints than the robot's; ``FileFormatError``."""
+    if data.joint_names != robot.joint_names:
+        raise FileFormatError(
+            f"{what} for the robot {data.robot!r}, whose joints are not those of {robot.name!r}. Make it with the "
+            "same robot."
+        )
+
+
+def check_states(bank: ResetBank, robot: RobotSpec, objects: tuple[ObjectSpec, ...]) -> None:
+    """Refuse a bank whose states have other joints or other object geometry; ``FileFormatError``."""
+    if not isinstance(bank, ResetBank):
+        raise XResetError(f"bank is {shown(bank)}, expected a ResetBank: xreset.read_bank(FILE).")
+    if bank.num_states:
+        check_joints("The reset bank is", bank, robot)
+        check_objects("The reset bank", bank, objects)
 
 
 _TOLERANCE = 1e-4

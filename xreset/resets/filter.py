@@ -17,13 +17,13 @@ from torch import Tensor
 from xreset.errors import DemoError
 from xreset.physics import Backend, State
 from xreset.progress import unseen
-from xreset.resets.bank import ResetBank, starts_and_goals
+from xreset.resets.bank import ResetBank, check_joints, starts_and_goals
 from xreset.resets.closing import closing_states, positions_between, rotations_between
 from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
 from xreset.resets.fingers import fingers_of, squeeze_targets
 from xreset.resets.probe import probe
 from xreset.retarget.file import Retargeted
-from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
+from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, checked_objects
 from xreset.task.config import TerminationConfig
 from xreset.task.terminations import out_of_bounds
 
@@ -89,7 +89,10 @@ def make_bank(
 
     Raises:
         DemoError: no frame is valid.
+        FileFormatError: the trajectories are for another robot.
     """
+    objects = checked_objects(robot, objects)
+    check_joints("The motion is", retargeted, robot)
     engines = (engine,) if isinstance(engine, str) else tuple(engine)
     limits = limits or FilterConfig()
     squeeze = squeeze or SqueezeConfig()

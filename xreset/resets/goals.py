@@ -58,7 +58,7 @@ _INSIDE = 0.005
 """A goal is inside the table if its lowest point is deeper than this [m]."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class GoalSet(ResetBank):
     """Contents of a goal set: starts and goals [S]. It has no states."""
 

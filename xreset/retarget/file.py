@@ -39,7 +39,7 @@ SCHEMA = "xreset-retargeted/1"
 FrameDistances = Annotated[np.ndarray, Field(("F",), "f", within=None)]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Retargeted(ObjectMotions):
     """Robot trajectories of demonstrations, in the table frame."""
 

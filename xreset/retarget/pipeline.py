@@ -27,7 +27,7 @@ from xreset.retarget.hand.jaw import jaw_keypoints
 from xreset.retarget.hand.model import HandModel, HandState, HandTargets
 from xreset.retarget.hand.solve import retarget_hand
 from xreset.retarget.validity import REASONS, Thresholds, classify
-from xreset.spec import ObjectSpec, RobotSpec
+from xreset.spec import ObjectSpec, RobotSpec, checked_objects
 from xreset.tensors import one_thread
 
 _SEQUENCES_PER_BATCH = 24
@@ -116,6 +116,7 @@ def retarget_demos(
         RobotError: the robot's description does not allow retargeting.
     """
     config = config or RetargetConfig()
+    objects = checked_objects(robot, objects)
     hands = HandMotions(demos, robot, objects, config, device=device)
     demos = hands.demos
     arm = ArmModel(robot)

@@ -33,11 +33,11 @@ from xreset.geometry.rotations import (
 from xreset.physics import Backend, State
 from xreset.pictures.render import Camera, Renderer, add_caption, pose_matrix
 from xreset.progress import unseen
-from xreset.resets.bank import ResetBank
+from xreset.resets.bank import ResetBank, check_states
 from xreset.resets.config import SqueezeConfig
 from xreset.resets.fingers import Fingers, fingers_of, squeeze_targets
 from xreset.resets.probe import probe
-from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
+from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, checked_objects
 
 SCHEMA = "xreset-judge/1"
 PHASES = ("hold", "lift", "turn")
@@ -140,6 +140,8 @@ def judge(
     Raises:
         RobotError: the bank has no lifted grasp of any object.
     """
+    objects = checked_objects(robot, objects)
+    check_states(bank, robot, objects)
     squeeze = squeeze or SqueezeConfig(force=5.0, reach=0.01)
     height = bank.object_pos[:, 2] - bank.start_pos[bank.sequence_index, 2]
     lifted = bank.with_states(np.flatnonzero(bank.post_contact & (height > LIFT)))

@@ -7,7 +7,7 @@ up and the table's top at z = 0. Shape letters: J actuated joints, E fingertips.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -275,19 +275,21 @@ class SceneSpec:
         return self.timestep * self.substeps
 
 
-def checked_objects(robot: Any, objects: Iterable[Any]) -> tuple[ObjectSpec, ...]:
+def checked_objects(robot: Any, objects: Any) -> tuple[ObjectSpec, ...]:
     """Return the objects. Names in place of robot and objects are refused; ``XResetError``."""
     if not isinstance(robot, RobotSpec):
         raise XResetError(
             f"robot is {shown(robot)}, expected a RobotSpec: xreset.load_robot(NAME)."
         )
-    objects = (objects,) if isinstance(objects, ObjectSpec | str) else tuple(objects)
-    for obj in objects:
+    found: tuple[Any, ...] = (objects,)
+    if not isinstance(objects, ObjectSpec | str):
+        found = tuple(objects)
+    for obj in found:
         if not isinstance(obj, ObjectSpec):
             raise XResetError(
                 f"objects has {shown(obj)}, expected an ObjectSpec: xreset.load_object(NAME)."
             )
-    return objects
+    return found
 
 
 def lowest_point(shapes: Sequence[Shape], turn: np.ndarray | None = None) -> float:

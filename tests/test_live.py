@@ -114,6 +114,7 @@ class FaultTest(unittest.TestCase):
             ("NaN joint", after(1, joint_pos=np.array([0, np.nan])), "joint positions are 0.1. s old, or not finite"),
             ("old joints", after(1, joint_time=0.99), "joint positions are 0.1. s old"),
             ("limit", after(1, joint_pos=np.array([0, 9.5])), "Joint finger is at 9.50, beyond its limit 9.00"),
+            ("no pose", after(1, object_pos=None), "object_pos is None. Without a new value, give the last one"),
             ("no cable", lambda t, r: refuse() if t > 1 else r, "The driver could not read: the cable is out"),
         ):  # fmt: skip
             with self.subTest(name), self.assertLogs("xreset", "WARNING") as logs:
@@ -171,6 +172,18 @@ class FaultTest(unittest.TestCase):
         driver = Scripted()
         with self.assertLogs("xreset"):
             self.assertEqual(self.stopped(driver, Steady(interrupted)), "Ctrl-C was pressed.")
+
+    def test_a_clock_that_nobody_moves(self):
+        driver = Scripted()
+        driver.wait_until = lambda moment: None  # type: ignore[method-assign]
+        with self.assertLogs("xreset"):
+            outcome = Runner(Steady(), driver).run(30)
+        self.assertRegex(outcome.reason or "", "clock stands still. Override now.. and wait_until")
+        self.assertEqual(driver.stops, 1)
+        self.assertLess(len(driver.sent), 10)
+
+        driver.wait_until = lambda moment: setattr(driver, "time", moment // 0.05 * 0.05)  # type: ignore[method-assign]
+        self.assertIsNone(Runner(Steady(), driver).run(3).reason, "a coarse clock is no fault")
 
     def test_late_data_are_used_and_single_faults_are_ignored(self):
         def fault(time, reading):

@@ -54,11 +54,17 @@ class Reading:
     """Only of an engine; None: they follow from the joints."""
 
     def batched(self) -> Reading:
-        """Return the reading with the axis N, in float32 (times: float64)."""
+        """Return the reading with the axis N, in float32 (times: float64).
+
+        Raises:
+            ValueError: data that no robot may leave out are None.
+        """
         if np.ndim(self.joint_pos) == 2:
             return self
         rows = {}
         for name, value in vars(self).items():
+            if value is None and name not in ("tip_force", "links"):
+                raise ValueError(f"{name} is None. Without a new value, give the last one and its time")
             if value is not None:
                 rows[name] = np.asarray(
                     value, dtype=np.float64 if name.endswith("_time") else np.float32
@@ -82,7 +88,7 @@ class Driver(ABC):
         """Hold still. The runner calls it once, after it has slowed down, and also when a method has failed."""
 
     def now(self) -> float:
-        """Return the time on the clock of the readings [s]."""
+        """Return the time on the clock of the readings [s]. Override it together with :meth:`wait_until`."""
         return time.monotonic()
 
     def wait_until(self, moment: float) -> None:

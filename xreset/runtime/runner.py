@@ -23,7 +23,7 @@ class Limits:
     joint_margin: float = 0.1
     """How far a joint may be beyond its limit [rad, m]."""
     late: float = 0.5
-    """Longest time that one control step may take [s]."""
+    """Longest time that one control step may take, and that the clock may stand still [s]."""
     slow_down: float = 0.25
     """Time in which targets come to rest [s]."""
 
@@ -94,6 +94,7 @@ class Runner:
 
     def _loop(self, end: float) -> None:
         due = self.driver.now()
+        still = 0.0  # time for which the clock has stood still
         while self.driver.now() < min(end, self._stopped_at.max() + self.limits.slow_down):
             if not self._tick():
                 return
@@ -104,7 +105,12 @@ class Runner:
                 due += late  # the rate is kept from here on; no step is made up for
             if late > self.limits.late:
                 self._stop_all(f"A control step took {late:.2f} s too long.")
+            before = self.driver.now()
             self.driver.wait_until(due)
+            still = still + due - before if self.driver.now() <= before else 0.0
+            if still > self.limits.late:
+                self._stop_all("The driver's clock stands still. Override now() and wait_until() together.")
+                return
 
     def _tick(self) -> bool:
         """Read, act and send once; return whether the driver still takes targets."""

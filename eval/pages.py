@@ -7,8 +7,8 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from xreset import __version__
 from xreset.eval.table import escape, markdown
+from xreset.files import code_version
 from xreset.text import short_name
 
 
@@ -28,7 +28,7 @@ def _environment() -> Environment:
         keep_trailing_newline=True,
     )
     made.filters |= {"percent": percent, "short_name": short_name, "md": escape, "table": markdown}
-    made.globals["version"] = __version__
+    made.globals["version"] = code_version()
     return made
 
 

@@ -231,7 +231,7 @@ def judge(found: Sequence[Rehearsal]) -> tuple[str, list[str]]:
                 low, high = (-100 * bound for bound in reversed(point.difference_ci95))
                 text = (
                     f"{card.backend}: {option.replace('-', ' ')} {amount(curves[option].unit, value)} costs "
-                    f"{-100 * point.difference:.1f} points (95 %: {low:.0f} to {high:.0f}). "
+                    f"{-100 * point.difference:.1f} points (95 %: {round(low)} to {round(high)}). "
                     f"At most {100 * most:.0f} are wanted."
                 )
                 reasons = against if low > 100 * most else unsure

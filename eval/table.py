@@ -73,9 +73,13 @@ def distance_text(distance: float | None) -> str:
     return "missing" if distance is None else f"{100 * distance:.1f} cm"
 
 
-def estimate_text(mean: float, low: float, high: float) -> str:
-    """Return an estimate and its interval as percent, or cm, such as ``93.2 (88-98)``; ``-`` if it is not known."""
-    return "-" if isnan(mean) else f"{100 * mean:.1f} ({100 * low:.0f}-{100 * high:.0f})"
+def estimate_text(metric: str, mean: float, low: float, high: float) -> str:
+    """Return an estimate and its interval as percent, such as ``93.2 (88-98)``, or cm, such as ``0.6 (0.5-0.8)``; ``-``
+    if it is not known."""
+    digits = 1 if metric == "least_distance" else 0
+    return (
+        "-" if isnan(mean) else f"{100 * mean:.1f} ({100 * low:.{digits}f}-{100 * high:.{digits}f})"
+    )
 
 
 @dataclass(frozen=True)

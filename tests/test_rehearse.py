@@ -140,6 +140,12 @@ class VerdictTest(unittest.TestCase):
         self.assertRegex(
             reasons[0], "sapien: action delay 67 ms costs 20.0 points .95 %: 20 to 20.. At most 4"
         )
+        card = self.card(action_delay_67=0.2)
+        curves = []
+        for each in card.curves:
+            points = tuple(replace(point, difference_ci95=(-0.2, 1e-6)) for point in each.points)
+            curves.append(replace(each, points=points))
+        self.assertRegex(judge([replace(card, curves=tuple(curves))])[1][0], "95 %: 0 to 20.")
         _, reasons = judge([replace(self.card(), task_progress=0.3)])
         self.assertIn("only 30 % without any fault", reasons[0])
         self.assertIn("No verdict", judge([replace(self.card(), curves=self.card().curves[:3])])[0])

@@ -67,6 +67,7 @@ class FileTest(InFolder):
                 head + "[runs.a]\nminuets = 3\n",
                 r"runs\.a does not fit Runs \(unknown: minuets \(minutes\?\)\)",
             ),
+            (head + "[runs.a]\nworlds = 3\n", r"\(unknown: worlds; known: data, .*, num_envs, "),
             (
                 head + "[runs.a]\nseeds = [0, 0]\n",
                 r"runs\.a\.seeds is \[0, 0\], expected one or more",
@@ -384,7 +385,9 @@ class TablesTest(InFolder):
         text = page.read_text()
         self.assertIn("![Table I", text)
         self.assertRegex(text, r"\| published success \| 25.0 \(0-50\) \| - \| 25.0 \(0-50\) \|")
-        self.assertRegex(text, r"\| published distance \\\[cm\\\] \| 7.8 \(6-10\) \|")
+        self.assertRegex(text, r"\| published distance \\\[cm\\\] \| 7.8 \(5.5-10.0\) \|")
+        self.assertIn("Episodes / demonstrations / seeds: ik 4 / 2 / 1, ours 8 / 2 / 2.", text)
+        self.assertIn("The paper's figures follow", text)
         for note in (
             "The training ours-seed0 is not finished: not begun",
             "Not evaluated yet: eval x-sim-seed0, eval x-sim-seed1",

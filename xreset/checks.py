@@ -157,7 +157,10 @@ def _record(cls: type, data: Any, where: str, problems: list[str]) -> Any:
     unknown = sorted(set(data) - set(names))
     found = []
     if unknown:
-        found.append(f"unknown: {', '.join(_with_guess(name, names) for name in _first(unknown))}")
+        guesses = [_with_guess(name, names) for name in _first(unknown)]
+        found.append(f"unknown: {', '.join(guesses)}")
+        if not any(guess.endswith("?)") for guess in guesses):
+            found.append(f"known: {', '.join(names)}")
     if missing:
         found.append(f"missing: {', '.join(missing)}")
     if found:

@@ -87,6 +87,15 @@ def by_engine(members: Iterable[Training]) -> Sequence[tuple[Any, Table]]:
     return list(pd.concat(evaluated).groupby("engine")) if evaluated else []
 
 
+COUNTED = "episodes / demonstrations / seeds"
+"""What :func:`counted` gives."""
+
+
+def counted(episodes: Table) -> str:
+    """Return the numbers of :data:`COUNTED` in the episodes of one engine, such as ``24 / 6 / 2``."""
+    return f"{len(episodes)} / {episodes['sequence'].nunique()} / {episodes['run'].nunique()}"
+
+
 def estimate(episodes: Table, metric: str) -> tuple[float, tuple[float, float]]:
     """Return the mean of a metric over all episodes of several trainings on the same demonstrations, and its 95 %
     interval.

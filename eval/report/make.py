@@ -87,7 +87,7 @@ def compare(
         groups=groups,
         notes=notes,
         versions=caption(policies),
-        results=tables.results(trainings, found),
+        results=tables.results(groups, found),
         x=AXES[x][0],
         lifted=tables.lifted(groups, x),
         different=tables.different(groups),

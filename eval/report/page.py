@@ -17,7 +17,6 @@ from xreset.eval.report.read import ReportData
 from xreset.eval.results import Table
 from xreset.eval.stress import by_property
 from xreset.eval.table import FIGURES, caption
-from xreset.files import code_version
 from xreset.pictures.render import encode_png
 
 
@@ -40,7 +39,6 @@ def page(data: ReportData, clips: Sequence[Clip], strips: Sequence[Clip] = ()) -
         figures=FIGURES,
         versions=caption(result.policy for result in results),
         headline=headline(data),
-        code_version=code_version(),
         colors=COLORS,
         script=script,
         script_hash=_base64(hashlib.sha256(script.encode()).digest()),

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 
 from scipy.stats import binomtest
 
 from xreset.errors import RunError
 from xreset.eval.report.curves import AXES, X, amounts
-from xreset.eval.report.groups import Groups
+from xreset.eval.report.groups import COUNTED, Groups, by_engine, counted
 from xreset.eval.report.read import Training
 from xreset.eval.results import Table
 from xreset.eval.table import METRICS, Rows, estimate_text
@@ -17,24 +18,31 @@ from xreset.learning.clock import SHARES, Lift
 _LIFT_FIELDS: dict[X, str] = {"minutes": "minutes", "steps": "env_steps", "iterations": "iteration"}
 
 
-def results(trainings: Sequence[Training], found: Table) -> Rows:
-    """Return a row for each group and metric, and a column for each engine; ``-`` where it was not evaluated or
-    measured.
+def results(groups: Groups, found: Table) -> Rows:
+    """Return a row for each group and metric, a row with each group's number of episodes, and a column for each engine;
+    ``-`` where it was not evaluated or measured.
 
     Args:
         found: :func:`xreset.eval.report.groups.scores`.
     """
+    trainings = list(chain(*groups.values()))
     head = ["", ""]
-    for engine in sorted(found["engine"].unique()):
+    engines = sorted(found["engine"].unique())
+    for engine in engines:
         versions = {m.results[engine].backend_version for m in trainings if engine in m.results}
         head.append(f"{engine} {', '.join(sorted(versions))}")
-    texts = [estimate_text(*values) for values in found[["mean", "low", "high"]].to_numpy()]
+    texts = [
+        estimate_text(*values) for values in found[["metric", "mean", "low", "high"]].to_numpy()
+    ]
     cells = found.assign(text=texts).pivot_table(
         "text", ["group", "metric"], "engine", "first", "-", sort=False
     )
     rows = [head]
-    for (label, metric), row in cells[sorted(cells)].iterrows():
-        rows.append([label if metric == next(iter(METRICS)) else "", METRICS[metric], *row])
+    for (label, metric), row in cells[engines].iterrows():
+        if metric == next(iter(METRICS)):
+            counts = {engine: counted(own) for engine, own in by_engine(groups[label])}
+            rows.append([label, COUNTED, *(counts.get(engine, "-") for engine in engines)])
+        rows.append(["", METRICS[metric], *row])
     return rows
 
 

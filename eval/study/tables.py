@@ -13,7 +13,7 @@ import pandas as pd
 
 from xreset.eval.plots import picture
 from xreset.eval.report.figures import draw_bars
-from xreset.eval.report.groups import estimate
+from xreset.eval.report.groups import COUNTED, counted, estimate
 from xreset.eval.report.read import Training, read_training
 from xreset.eval.results import Table
 from xreset.eval.study.file import TableSpec
@@ -59,6 +59,15 @@ class FilledTable:
         text = self.wide(engine)["text"]
         return [(self.unit, *text.columns), *text.itertuples(name=None)]
 
+    def counts(self, engine: str) -> str:
+        """Return how much of each run was evaluated in an engine."""
+        texts = []
+        for name, every in self.episodes.items():
+            own = every[every["engine"] == engine] if len(every) else every
+            if len(own):
+                texts.append(f"{name} {counted(own)}")
+        return f"{COUNTED.capitalize()}: {', '.join(texts)}."
+
     def versions(self, engine: str) -> str:
         """Return the engine's versions in which the runs were evaluated."""
         evaluated = [
@@ -95,7 +104,7 @@ def fill(plan: Plan, table: TableSpec) -> FilledTable:
         }
         mean, (low, high) = estimate(own, key["metric"]) if len(own) else (nan, (nan, nan))
         figure = stated.get((key["method"], key["object"], key["metric"]))
-        text = estimate_text(mean, low, high)
+        text = estimate_text(key["metric"], mean, low, high)
         if figure is not None:
             text += f", paper {figure[0]:.1f}"
             if figure[1] is not None:
@@ -208,6 +217,8 @@ def draw(path: Path, table: FilledTable) -> None:
                     value, bar.get_x(), bar.get_x() + bar.get_width(), color="black", linewidth=2
                 )
             ax.set_ylabel(table.unit)
+            if table.unit == "%":
+                ax.set_ylim(0, 104)
             ax.set_title(engine, fontsize="medium", loc="left")
         if table.paper:
             panels[-1].plot([], [], color="black", linewidth=2, label=" the paper")

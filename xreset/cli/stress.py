@@ -67,7 +67,9 @@ def stress(
                     cells.append("cannot be set")
             table.append((prop.option, f"{value:g} {prop.unit}", *cells))
     show_table(
-        table, title=f"{spec.name}: task progress, and its difference to the same episodes (95 %)"
+        table,
+        title=f"{spec.name}: task progress, and its difference to the same episodes in points (95 %)\n"
+        f"{found[0].episodes} episodes, seed {setting.seed}",
     )
     for result in found:
         if result.left_out:

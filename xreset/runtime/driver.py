@@ -64,7 +64,9 @@ class Reading:
         rows = {}
         for name, value in vars(self).items():
             if value is None and name not in ("tip_force", "links"):
-                raise ValueError(f"{name} is None. Without a new value, give the last one and its time")
+                raise ValueError(
+                    f"{name} is None. Without a new value, give the last one and its time"
+                )
             if value is not None:
                 rows[name] = np.asarray(
                     value, dtype=np.float64 if name.endswith("_time") else np.float32

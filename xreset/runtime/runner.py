@@ -109,7 +109,9 @@ class Runner:
             self.driver.wait_until(due)
             still = still + due - before if self.driver.now() <= before else 0.0
             if still > self.limits.late:
-                self._stop_all("The driver's clock stands still. Override now() and wait_until() together.")
+                self._stop_all(
+                    "The driver's clock stands still. Override now() and wait_until() together."
+                )
                 return
 
     def _tick(self) -> bool:

@@ -261,6 +261,8 @@ class KinematicsTest(unittest.TestCase):
     def test_errors_name_the_cause(self):
         with self.assertRaisesRegex(RobotError, "no link 'nose' below"):
             self.kinematics.points(self.q, ["nose"])
+        with self.assertRaisesRegex(ValueError, "q has 2 joint positions, expected "):
+            self.kinematics.link_poses(torch.zeros(2))
         renamed = write_urdf(self.folder / "other.urdf", rename={"arm_2": "arm_two"})
         for changes, cause in (({"mimics": ()}, "jaw_b"), ({"urdf": renamed}, "arm_two")):
             with self.assertRaisesRegex(RobotError, cause):

@@ -40,15 +40,14 @@ def make_report(
     """
     out = folder / "report" if out is None else out
     data = collect(folder)
-    clips = []
-    strips = []
-    try:
-        clips, strips = draw_report(data, robot, objects)
-    except XResetError as error:  # numbers are worth a page without films; the page says why
-        data = replace(data, notes=(*data.notes, f"There are no clips: {error}"))
-    content = page(data, clips, strips)
     with claim_folder(out):
-        write_whole(out / "index.html", content)
+        clips = []
+        strips = []
+        try:
+            clips, strips = draw_report(data, robot, objects)
+        except XResetError as error:  # numbers are worth a page without films; the page says why
+            data = replace(data, notes=(*data.notes, f"There are no clips: {error}"))
+        write_whole(out / "index.html", page(data, clips, strips))
     return out / "index.html", data
 
 

@@ -204,6 +204,10 @@ class Kinematics:
 
         Returns:
             [..., L, 4, 4] pose of each link in the frame of ``base`` (the world).
+
+        Raises:
+            RobotError: there is no such link.
+            ValueError: ``q`` has another number of joints.
         """
         indices = [self.link_index(name) for name in (self.link_names if links is None else links)]
         rot, pos, _, _ = self._forward(q, base, indices)
@@ -281,6 +285,10 @@ class Kinematics:
     def _forward(self, q: Tensor, base: Tensor | None, wanted: Sequence[int]):
         """Return rotations [B, n, 3, 3] and positions [B, n, 3] of the wanted links, and the axes and origins [B, 3] of
         the joints above them, by row among the moving joints."""
+        if q.shape[-1] != len(self.joint_names):
+            raise ValueError(
+                f"q has {q.shape[-1]} joint positions, expected {len(self.joint_names)}: {self.joint_names}"
+            )
         values = q.reshape(-1, q.shape[-1]) @ self._coupling.T + self._constant  # [B, M]
         sines = torch.sin(values)
         cosines = 1.0 - torch.cos(values)

@@ -110,7 +110,7 @@ def rehearse(
         progress: called with (engine, runs done, runs in all).
 
     Returns:
-        The results that were written, in the order of the engines. :func:`judge` has the verdict.
+        The results that were written, in the order of the engines.
 
     Raises:
         PolicyError: the policy is a baseline, or the seed chose this checkpoint.

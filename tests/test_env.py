@@ -183,6 +183,11 @@ class RefusalTest(WithEnv):
             with self.subTest(shape), self.assertRaisesRegex(XResetError, r"expected \(3, 7\)"):
                 env.step(torch.zeros(shape))
 
+    def test_observations_do_not_hold_the_graph_of_an_action(self):
+        observations, reward, *_ = self.make().step(torch.zeros(N, 7, requires_grad=True) * 1.0)
+        for value in (*observations.values(), reward):
+            self.assertFalse(value.requires_grad)
+
 
 class StepTest(WithEnv):
     def test_observations_state_the_world(self):

@@ -409,7 +409,7 @@ class ManipulationEnv:
                 f"The actions have the shape {tuple(action.shape)}, expected {tuple(self._action.shape)}: one row for "
                 "each world, one column for each joint."
             )
-        self._action.copy_(action)
+        self._action.copy_(action.detach())
         self._graphs.run(self._process_action)
         self.backend.set_joint_targets(
             self._sent_target if push is None else self._sent_target + push

@@ -76,8 +76,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             actions: [N, J] real numbers, limited to [-1, 1]. A world whose numbers are not finite fails.
 
         Returns:
-            Observations, reward [N], terminated [N], truncated [N], and a dictionary with ``faulty`` [N]: whether the
-            simulation failed.
+            Observations, reward [N], terminated [N], truncated [N], and a dictionary with ``faulty`` [N] (the
+            simulation failed).
 
         Raises:
             XResetError: the actions have another shape, or are not real numbers.

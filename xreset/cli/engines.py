@@ -69,10 +69,11 @@ def check(
     for name in dict.fromkeys(backend) or usable_engines():
         status = backend_status(name)
         used = device if device.split(":")[0] in status.device else "cpu"
+        make = _maker(name, used)  # before the headline: it refuses an unknown engine
         what = f" {status.version}, {spec.name}, {used}: verdict, check, and what came nearest to its tolerance"
         console.print(Text.assemble((name, "bold"), what))
         results = conformance.run(
-            _maker(name, used),
+            make,
             robot=spec,
             only=only or None,
             report=lambda result: _print_check(result, verbose),

@@ -67,7 +67,7 @@ class Variation:
         if missing:
             raise CapabilityError(
                 f"The backend {backend.name!r} cannot set {', '.join(missing)} in each world, which this task draws. "
-                "Leave these ranges of task.randomization at their defaults, or use another backend."
+                "Use another backend, or in a training leave these ranges of task.randomization at their defaults."
             )
         self.force_gain: Tensor | None = None
         if c.draws("force_gain"):

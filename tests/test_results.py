@@ -63,7 +63,7 @@ class ResultsTest(unittest.TestCase):
             table.groupby("engine")["least_distance"].count().to_dict(), {"mujoco": 0, "sapien": 4}
         )
         for engine, expected in (("mujoco", np.nan), ("sapien", 0.0775)):
-            found, (low, _) = estimate(table[table["engine"] == engine], "least_distance")
+            found, low, _ = estimate(table[table["engine"] == engine], "least_distance")
             np.testing.assert_allclose(found, expected)
             self.assertEqual(np.isnan(low), np.isnan(expected))
 

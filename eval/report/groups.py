@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from math import nan
 from os.path import commonprefix
 from typing import Any
 
@@ -76,8 +77,7 @@ def scores(groups: Groups) -> Table:
     for label, members in groups.items():
         for engine, own in by_engine(members):
             for metric in METRICS:
-                value, (low, high) = estimate(own, metric)
-                rows.append((label, engine, metric, value, low, high))
+                rows.append((label, engine, metric, *estimate(own, metric)))
     return pd.DataFrame(rows, columns=["group", "engine", "metric", "mean", "low", "high"])
 
 
@@ -96,15 +96,16 @@ def counted(episodes: Table) -> str:
     return f"{len(episodes)} / {episodes['sequence'].nunique()} / {episodes['run'].nunique()}"
 
 
-def estimate(episodes: Table, metric: str) -> tuple[float, tuple[float, float]]:
+def estimate(episodes: Table, metric: str) -> tuple[float, float, float]:
     """Return the mean of a metric over all episodes of several trainings on the same demonstrations, and its 95 %
-    interval.
+    interval; NaN without episodes.
 
     The interval is a bootstrap over demonstrations, as in ``xreset eval``, and for several trainings over trainings,
     too (:func:`xreset.eval.stats.crossed_bootstrap_ci95`).
     """
+    if episodes.empty:
+        return nan, nan, nan
     values = episodes[metric].to_numpy(float)
     runs = pd.factorize(episodes["run"])[0]
-    return mean(episodes, metric), crossed_bootstrap_ci95(
-        values, runs, episodes["sequence"].to_numpy()
-    )
+    interval = crossed_bootstrap_ci95(values, runs, episodes["sequence"].to_numpy())
+    return mean(episodes, metric), *interval

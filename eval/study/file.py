@@ -31,7 +31,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -41,7 +41,6 @@ from xreset.errors import FileFormatError, RunError
 from xreset.eval.study.paper import paper_tables
 from xreset.eval.table import METRICS
 from xreset.files import read_toml
-from xreset.text import shown
 
 SCHEMA = "xreset-study/1"
 SHIPPED = Path(__file__).parent.parent / "studies"
@@ -53,17 +52,24 @@ _LARGEST_SEED = 2**32 - 1
 Seed = Annotated[
     int, Rule(f"a whole number from 0 to {_LARGEST_SEED}", lambda x: 0 <= x <= _LARGEST_SEED)
 ]
+Robot = Annotated[
+    str,
+    Rule(
+        "the name of a robot or the folder of one",
+        lambda name: bool(_NAME.fullmatch(Path(name).name)),
+    ),
+]
 
 
-Axis = Literal["run", "object", "metric"]
+def _options(*allowed: str) -> Rule:
+    """Return the rule for options of a command that a study may give. None names a file: a study writes only into
+    ``--out``."""
 
+    def holds(texts: tuple[str, ...]) -> bool:
+        given = [text.replace("_", "-") for text in texts if re.match(r"-\D", text)]
+        return all(option.startswith(allowed) for option in given)
 
-COMMAND_FLAGS = {
-    "retarget": ("--hand.", "--arm.", "--device"),
-    "resets": ("--closing.", "--filter.", "--squeeze.", "--backend", "--device", "--num-envs"),
-}
-"""Flags, and beginnings of flags, that a study file may give to a command. None names a file: a study writes only into
-``--out``."""
+    return Rule(f"options that begin with {', '.join(allowed)}", holds)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,22 +82,13 @@ class Data(Checked):
     synthetic_seed: Seed = 0
     meshes: str | None = None
     """Folder of meshes, relative to ``--data``; None: the stand-ins."""
-    retarget: tuple[str, ...] = ()
-    """Further options of ``xreset retarget``: those of :data:`COMMAND_FLAGS`."""
-    resets: tuple[str, ...] = ()
-    """Further options of ``xreset resets``: those of :data:`COMMAND_FLAGS`."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for command, allowed in COMMAND_FLAGS.items():
-            for text in getattr(self, command):
-                flag = text.partition("=")[0].replace("_", "-")
-                group = flag[: flag.find(".") + 1]
-                if re.match(r"-\D", text) and (group or flag) not in allowed:
-                    raise ValueError(
-                        f"{command} holds the option {shown(text)}, which a study file may not give. "
-                        f"Choose from: {', '.join(allowed)}"
-                    )
+    retarget: Annotated[tuple[str, ...], _options("--hand.", "--arm.", "--device")] = ()
+    """Further options of ``xreset retarget``."""
+    resets: Annotated[
+        tuple[str, ...],
+        _options("--closing.", "--filter.", "--squeeze.", "--backend", "--device", "--num-envs"),
+    ] = ()
+    """Further options of ``xreset resets``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +100,7 @@ class Evaluation(Checked):
     objects: tuple[str, ...] = ()
     """Only these objects, where a run has them; empty: all objects of the run."""
     unseen: bool = False
-    """Whether ``objects`` are played by every run, also by those that have not trained with them."""
+    """Whether the objects are played by every run, also by those that have not trained with them."""
     per_object: Positive[int] | None = None
     """Largest number of demonstrations of each object; None: all (of the run's own data: as many as in training)."""
     episodes: Positive[int] = 5
@@ -113,11 +110,6 @@ class Evaluation(Checked):
     """Engines that are not installed are left out, with a note."""
     num_envs: Positive[int] = 64
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.unseen and not self.objects:
-            raise ValueError("unseen is true without objects. Name the objects that were left out")
-
 
 @dataclass(frozen=True, kw_only=True)
 class Runs(Checked):
@@ -125,7 +117,7 @@ class Runs(Checked):
 
     REMOVED: ClassVar[dict[str, Any]] = {"gpus": 1}
     data: str
-    robot: str = "ur7e-sharpa"
+    robot: Robot = "ur7e-sharpa"
     objects: tuple[str, ...] = ()
     """Empty: all objects of the data."""
     alone: bool = False
@@ -154,13 +146,6 @@ class Runs(Checked):
     evaluations: tuple[str, ...] = ()
     """Names of the evaluations; empty: all."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not _NAME.fullmatch(Path(self.robot).name):
-            raise ValueError(
-                f"robot is {shown(self.robot)}, expected the name of a robot or the folder of one"
-            )
-
 
 @dataclass(frozen=True, kw_only=True)
 class TableSpec:
@@ -172,7 +157,7 @@ class TableSpec:
     """Table of the paper: its figures are shown next to ours, and its rows and columns are used."""
     title: str | None = None
     evaluation: str = "eval"
-    rows: Axis = "object"
+    rows: Literal["run", "object", "metric"] = "object"
     """Rows of a table without ``paper``. The columns are runs, or objects if the rows are runs. ``metric``: the metrics
     of both versions of the paper, over all objects or ``object``."""
     object: str | None = None
@@ -222,41 +207,48 @@ def read_study(path: Path) -> Study:
         raise FileFormatError(f"{path}: defaults, runs and each of the runs must be tables.")
     raw["runs"] = {name: merged(defaults, run) for name, run in runs.items()}
     study = from_dict(Study, raw, str(path))
-    for problem in _problems(study):
-        raise FileFormatError(f"{path}: {problem}")
+    try:
+        _check_names(study)
+    except ValueError as error:
+        raise FileFormatError(f"{path}: {error}") from None
     return study
 
 
-def _problems(study: Study) -> Iterator[str]:
-    """Yield what is wrong with the names in a study."""
+def _check_names(study: Study) -> None:
+    """Raise ``ValueError`` if something is named that a study does not define, or cannot be the name of a folder."""
     for name in (*study.data, *study.runs, *study.evaluations):
         if not _NAME.fullmatch(name):
-            yield f"{name!r} cannot be the name of a folder. Use letters, digits, dots, dashes and underscores."
+            raise ValueError(
+                f"{name!r} cannot be the name of a folder. Use letters, digits, dots, dashes and underscores."
+            )
     for name, evaluation in study.evaluations.items():
         if name != "eval" and not name.startswith("eval-"):
-            yield f"the evaluation {name!r} is a folder in every run: call it 'eval', or begin its name with 'eval-'."
-        yield from _unknown(f"evaluations.{name}.data", evaluation.data, study.data)
+            raise ValueError(
+                f"the evaluation {name!r} is a folder in every run: call it 'eval', or begin its name with 'eval-'."
+            )
+        _expect(f"evaluations.{name}.data", study.data, evaluation.data)
     trained: list[str] = []
     for name, run in study.runs.items():
-        yield from _unknown(f"runs.{name}.data", run.data, study.data)
-        yield from _unknown(f"runs.{name}.weights", run.weights, trained)
-        for evaluation in run.evaluations:
-            yield from _unknown(f"runs.{name}.evaluations", evaluation, study.evaluations)
+        _expect(f"runs.{name}.data", study.data, run.data)
+        _expect(f"runs.{name}.weights", trained, run.weights)
+        _expect(f"runs.{name}.evaluations", study.evaluations, *run.evaluations)
         if run.policy is None:
             trained.append(name)
     papers = paper_tables()
     for i, table in enumerate(study.tables):
         where = f"tables[{i}]"
-        yield from _unknown(f"{where}.paper", table.paper, papers)
-        yield from _unknown(f"{where}.evaluation", table.evaluation, study.evaluations)
-        yield from _unknown(f"{where}.metric", table.metric, METRICS)
-        for run, method in table.runs.items():
-            yield from _unknown(f"{where}.runs", run, study.runs)
-            if table.paper:
-                yield from _unknown(f"{where}.runs", method, papers[table.paper].methods)
+        _expect(f"{where}.paper", papers, table.paper)
+        _expect(f"{where}.evaluation", study.evaluations, table.evaluation)
+        _expect(f"{where}.metric", METRICS, table.metric)
+        _expect(f"{where}.runs", study.runs, *table.runs)
+        if table.paper:
+            methods = dict.fromkeys(method for method, _, _ in papers[table.paper].figures())
+            _expect(f"{where}.runs", methods, *table.runs.values())
 
 
-def _unknown(where: str, name: str | None, known: Collection[str]) -> Iterator[str]:
-    """Yield a sentence if a name is given and not known."""
-    if name is not None and name not in known:
-        yield f"{where} is {name!r}, expected one of {', '.join(map(repr, known)) or 'none'}."
+def _expect(where: str, known: Collection[str], *names: str | None) -> None:
+    """Refuse names that are given and not known."""
+    for name in names:
+        if name is not None and name not in known:
+            listing = ", ".join(map(repr, known)) or "none"
+            raise ValueError(f"{where} is {name!r}, expected one of {listing}.")

@@ -14,6 +14,12 @@ FILE = Path(__file__).parent / "paper.toml"
 ALL = "all"
 """In place of an object: the mean over all of them."""
 
+TRAINING = (
+    "10,000 iterations of 16 steps in 4,096 worlds"
+    " on four GPUs (Table VIII), an unstated number of seeds"
+)
+"""How long the paper's policies were trained, in the paper's words."""
+
 Axis = Literal["object", "method", "metric"]
 
 
@@ -35,24 +41,18 @@ class PaperTable:
     metric: str = "task_progress"
     """The metric of all figures, where metrics are not an axis."""
 
-    @property
-    def methods(self) -> tuple[str, ...]:
-        """The methods that the paper compares, in its order."""
-        return tuple(self.values) if self.rows == "method" else self.names
-
-    def figures(self) -> dict[tuple[str, str, str], tuple[float, float | None]]:
-        """Return method, object and metric -> figure and its standard error, percent; None where none is stated."""
+    def figures(self) -> dict[tuple[str, str, str], tuple[float, str]]:
+        """Return method, object and metric -> figure, percent, and its text with the standard error if it is stated."""
         found = {}
+        fixed = {"object": self.object, "metric": self.metric}
         for row, values in self.values.items():
             errors = self.standard_error.get(row, (None,) * len(values))
             for column, value, error in zip(self.names, values, errors, strict=True):
-                key = {
-                    "object": self.object,
-                    "metric": self.metric,
-                    self.rows: row,
-                    self.columns: column,
-                }
-                found[key["method"], key["object"], key["metric"]] = (value, error)
+                key = fixed | {self.rows: row, self.columns: column}
+                text = f", paper {value:.1f}"
+                if error is not None:
+                    text += f" \N{PLUS-MINUS SIGN} {error:.1f}"
+                found[key["method"], key["object"], key["metric"]] = (value, text)
         return found
 
 
@@ -64,8 +64,3 @@ def paper_tables() -> dict[str, PaperTable]:
         number: from_dict(PaperTable, content, f"{FILE}: {number}")
         for number, content in tables.items()
     }
-
-
-def paper_training() -> str:
-    """Return how long the paper's policies were trained, in the paper's words."""
-    return tomllib.loads(FILE.read_text())["training"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
@@ -9,14 +10,12 @@ from pathlib import Path
 from xreset.eval.pages import render
 from xreset.eval.report import fairness
 from xreset.eval.report.make import compare
-from xreset.eval.report.read import Training
 from xreset.eval.study.file import TableSpec
-from xreset.eval.study.paper import paper_training
+from xreset.eval.study.paper import TRAINING
 from xreset.eval.study.plan import Plan
 from xreset.eval.study.tables import FilledTable, draw, fill
 from xreset.eval.table import caption
 from xreset.files import write_whole
-from xreset.learning.clock import Lift
 from xreset.text import short_name
 
 _ALIKE = 0.05
@@ -29,31 +28,29 @@ def write_page(plan: Plan, out: Path) -> tuple[Path, list[str]]:
     Returns:
         The page, and what makes its figures incomparable, doubtful or incomplete.
     """
-    trained = {run.name: run.trained() for run in plan.runs if run.config is not None}
     tables = [fill(plan, table) for table in plan.study.tables]
-    every_metric: list[TableSpec] = []
+    metrics: list[TableSpec] = []
     for table in plan.study.tables:
         title = f"Every metric, {table.evaluation}"
         spec = TableSpec(runs=table.runs, title=title, evaluation=table.evaluation, rows="metric")
-        if spec not in every_metric:
-            every_metric.append(spec)
-    found = [*_incomplete(plan)]
+        if spec not in metrics:
+            metrics.append(spec)
+    notes = dict.fromkeys(_incomplete(plan))
     for i, table in enumerate(tables, 1):
-        found += [f"{table.title}: {note}" for note in _unfair(plan, table, trained)]
         if table.engines:
+            notes |= dict.fromkeys(f"{table.title}: {note}" for note in _unfair(plan, table))
             draw(out / f"table-{i}.png", table)
-    notes = list(dict.fromkeys(found))
     content = render(
         "study.md.j2",
         plan=plan,
         tables=tables,
-        metrics=[fill(plan, table) for table in every_metric],
+        metrics=[fill(plan, spec) for spec in metrics],
         notes=notes,
         compared=_compare(plan, out),
-        versions=caption(run.runs.policy or "" for run in plan.runs),
+        versions=caption(run.spec.policy or "" for run in plan.runs),
     )
     write_whole(out / "study.md", content)
-    return out / "study.md", notes
+    return out / "study.md", list(notes)
 
 
 def _incomplete(plan: Plan) -> Iterator[str]:
@@ -61,8 +58,8 @@ def _incomplete(plan: Plan) -> Iterator[str]:
     unevaluated = []
     for step in plan.steps.values():
         left = "" if step.kind == "data" else step.left()
-        if left and step.kind == "train" and step.run:
-            yield f"The training {step.run.name} is not finished: {left}."
+        if left and step.kind == "train":
+            yield f"The training {step.folder.name} is not finished: {left}."
         elif left:
             unevaluated.append(step.name)
     if unevaluated:
@@ -71,15 +68,11 @@ def _incomplete(plan: Plan) -> Iterator[str]:
         yield f"Not evaluated in {engine} on this machine: {reason.splitlines()[0]}"
 
 
-def _unfair(plan: Plan, table: FilledTable, trained: dict[str, Lift]) -> Iterator[str]:
+def _unfair(plan: Plan, table: FilledTable) -> Iterator[str]:
     """Yield what makes a table's figures incomparable, with one another and with the paper's."""
-    if not table.engines:
-        return
-    by_objects: dict[tuple[str, ...], list[Training]] = {}
+    by_objects = defaultdict(list)
     for training in chain(*table.trainings.values()):
-        by_objects.setdefault(tuple(sorted(training.episodes["object"].unique())), []).append(
-            training
-        )
+        by_objects[frozenset(training.episodes["object"])].append(training)
     for trainings in by_objects.values():
         yield from fairness.uneven(trainings)
         yield from fairness.begun(trainings)
@@ -96,24 +89,23 @@ def _unfair(plan: Plan, table: FilledTable, trained: dict[str, Lift]) -> Iterato
         )
     lengths = {}
     for run in plan.runs:
-        if run.group in table.trainings and run.name in trained and trained[run.name].env_steps:
-            lengths[run.name] = trained[run.name].env_steps * 1e-6
+        steps = run.trained().env_steps
+        if run.group in table.trainings and steps:
+            lengths[run.folder.name] = steps * 1e-6
     if lengths and max(lengths.values()) > (1 + _ALIKE) * min(lengths.values()):
         listing = ", ".join(f"{name} {steps:.3g}" for name, steps in lengths.items())
         yield f"not of equal length (million environment steps: {listing})."
     if table.paper:
-        yield f"the paper's policies took {paper_training()}; ours as in the comparisons below."
+        yield f"the paper's policies took {TRAINING}; ours as in the comparisons below."
 
 
 def _compare(plan: Plan, out: Path) -> list[str]:
     """Compare the trainings that have the same objects, in a folder for each, and return the names of the folders."""
-    by_objects: dict[tuple[str, ...], list[str]] = {}
+    by_objects = defaultdict(list)
     for run in plan.runs:
         has_curves = any(run.folder.glob("events.out.tfevents.*"))
         if run.config is not None and (has_curves or any(run.folder.glob("eval/*.episodes.json"))):
-            by_objects.setdefault(run.objects, []).append(
-                f"{run.group}-seed{run.seed}={run.folder}"
-            )
+            by_objects[run.objects].append(f"{run.label}={run.folder}")
     names = []
     for objects, runs in by_objects.items():
         what = short_name(objects[0], "_") if len(objects) == 1 else f"{len(objects)}-objects"

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from itertools import chain, product
 from math import nan
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
@@ -17,14 +16,13 @@ from xreset.eval.report.groups import COUNTED, counted, estimate
 from xreset.eval.report.read import Training, read_training
 from xreset.eval.results import Table
 from xreset.eval.study.file import TableSpec
-from xreset.eval.study.paper import ALL, PaperTable, paper_tables
+from xreset.eval.study.paper import ALL, paper_tables
 from xreset.eval.study.plan import Plan
 from xreset.eval.table import METRICS, Rows, estimate_text
 from xreset.objects.catalogue import canonical_name
 from xreset.text import short_name
 
-Axis = tuple[str, list[str]]
-"""What the rows or columns are (method, object or metric), and their names."""
+_CELL = ["row", "column", "mean", "low", "high", "paper", "text"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,31 +30,21 @@ class FilledTable:
     """A table of the study with its figures."""
 
     title: str
-    cells: Table
-    """One row for each figure: engine, row and column (names as they are shown), mean, low and high (95 % interval;
-    shares, or m; NaN if it was not evaluated or measured), the paper's figure (percent), text."""
+    unit: str
+    """Unit of the figures, where their column does not state one."""
+    engines: dict[str, Table]
+    """Engine -> rows by columns, for each of mean, low and high (95 % interval; shares, or m; NaN if it was not
+    evaluated or measured), paper (the paper's figure, percent) and text."""
     trainings: dict[str, list[Training]]
     """Run of the study -> its evaluated trainings."""
     episodes: dict[str, Table]
     """Run of the study -> all episodes; a seed has one name, also where it trained each object alone."""
     paper: bool
     """Whether it has figures of the paper."""
-    unit: str
-    """Unit of the cells, where their column does not state one."""
-
-    @property
-    def engines(self) -> list[str]:
-        """Engines in which anything was evaluated."""
-        return list(self.cells["engine"].unique())
-
-    def wide(self, engine: str) -> Table:
-        """Return the cells of one engine: rows by columns, for each kind of value."""
-        own = self.cells[self.cells["engine"] == engine].drop(columns="engine")
-        return own.set_index(["row", "column"]).unstack(sort=False)
 
     def as_rows(self, engine: str) -> Rows:
         """Return the table of one engine."""
-        text = self.wide(engine)["text"]
+        text = self.engines[engine]["text"]
         return [(self.unit, *text.columns), *text.itertuples(name=None)]
 
     def counts(self, engine: str) -> str:
@@ -82,61 +70,65 @@ def fill(plan: Plan, table: TableSpec) -> FilledTable:
     Raises:
         FileFormatError: a result is damaged.
     """
+    paper = paper_tables()[table.paper] if table.paper else None
+    objects = {name: plan.played.get((name, table.evaluation), set()) for name in table.runs}
+    known = sorted(set().union(*objects.values()))
+    one = canonical_name(table.object, known) if table.object else None
+    names = {
+        "method": list(table.runs.values()),
+        "metric": list(METRICS),
+        "object": [*known, ALL] if paper or len(known) > 1 else known,
+    }
+    fixed = {"object": one or ALL, "metric": table.metric}
+    if paper is not None:
+        row_axis = paper.rows
+        column_axis = paper.columns
+        rows = [name for name in paper.values if name in names[row_axis]]
+        columns = [name for name in paper.names if name in names[column_axis]]
+        fixed = {"object": paper.object, "metric": paper.metric}
+    else:
+        row_axis = "method" if table.rows == "run" else table.rows
+        column_axis = "object" if table.rows == "run" else "method"
+        names["object"] = [one] if one else names["object"]
+        rows = names[row_axis]
+        columns = names[column_axis]
+    stated = paper.figures() if paper else {}
+    run_of = {shown: name for name, shown in table.runs.items()}
     trainings = {name: trainings_of(plan, name, table.evaluation) for name in table.runs}
     episodes = {
         name: _episodes(found, plan.study.runs[name].alone) for name, found in trainings.items()
     }
-    paper = paper_tables()[table.paper] if table.paper else None
-    stated = paper.figures() if paper else {}
-    (row_axis, rows), (column_axis, columns), fixed = _axes(plan, table, paper)
-    run_of = {shown: name for name, shown in table.runs.items()}
-    engines = sorted(set().union(*(t.results for t in chain(*trainings.values()))))
-    cells = []
-    for engine, row, column in product(engines, rows, columns):
-        key = fixed | {row_axis: row, column_axis: column}
-        run = run_of[key["method"]]
-        objects = {key["object"]} if key["object"] != ALL else set(objects_of(plan, run, table))
-        own = _episodes_with(episodes[run], engine, objects)
-        cell: dict[str, Any] = {
-            "engine": engine,
-            "row": _shown(row_axis, row),
-            "column": _shown(column_axis, column),
-        }
-        mean, (low, high) = estimate(own, key["metric"]) if len(own) else (nan, (nan, nan))
-        figure = stated.get((key["method"], key["object"], key["metric"]))
-        text = estimate_text(key["metric"], mean, low, high)
-        if figure is not None:
-            text += f", paper {figure[0]:.1f}"
-            if figure[1] is not None:
-                text += f" \N{PLUS-MINUS SIGN} {figure[1]:.1f}"
-        cell |= {
-            "mean": mean,
-            "low": low,
-            "high": high,
-            "paper": figure[0] if figure else nan,
-            "text": text,
-        }
-        cells.append(cell)
-    names = ["engine", "row", "column", "mean", "low", "high", "paper", "text"]
+    engines = {}
+    for engine in sorted(set().union(*(t.results for t in chain(*trainings.values())))):
+        cells = []
+        for row, column in product(rows, columns):
+            key = fixed | {row_axis: row, column_axis: column}
+            run = run_of[key["method"]]
+            wanted = objects[run] if key["object"] == ALL else {key["object"]}
+            values = estimate(_episodes_with(episodes[run], engine, wanted), key["metric"])
+            figure, text = stated.get((key["method"], key["object"], key["metric"]), (nan, ""))
+            shown = (_shown(row_axis, row), _shown(column_axis, column))
+            mean = estimate_text(key["metric"], *values)
+            cells.append((*shown, *values, figure, mean + text))
+        found = pd.DataFrame(cells, columns=_CELL)
+        engines[engine] = found.set_index(["row", "column"]).unstack(sort=False)
     return FilledTable(
         title=table.title or (paper.title if paper else METRICS[table.metric]),
-        cells=pd.DataFrame(cells, columns=names),
+        unit="cm" if fixed["metric"] == "least_distance" else "%",
+        engines=engines,
         trainings=trainings,
         episodes=episodes,
         paper=paper is not None,
-        unit="cm" if fixed.get("metric") == "least_distance" else "%",
     )
 
 
 def trainings_of(plan: Plan, group: str, evaluation: str) -> list[Training]:
-    """Return the evaluated trainings of a run of the study. Those of one seed, one for each object alone, have one
-    label."""
+    """Return the evaluated trainings of a run of the study."""
     found = []
     for run in plan.runs:
         folder = run.folder / evaluation
         if run.group == group and any(folder.glob("*.episodes.json")):
-            label = f"{group}-seed{run.seed}" if run.runs.alone else run.name
-            found.append(read_training(label, run.folder, folder))
+            found.append(read_training(run.label, run.folder, folder))
     return found
 
 
@@ -160,59 +152,22 @@ def _episodes_with(episodes: Table, engine: str, objects: set[str]) -> Table:
     return own.groupby("run", sort=False).filter(lambda seed: set(seed["object"]) == objects)
 
 
-def objects_of(plan: Plan, group: str, table: TableSpec) -> tuple[str, ...]:
-    """Return the objects with which a run of the study is evaluated."""
-    objects = set()
-    for step in plan.steps.values():
-        if (
-            step.run is not None
-            and step.run.group == group
-            and step.name.startswith(f"{table.evaluation} ")
-        ):
-            objects.update(step.objects)
-    return tuple(sorted(objects))
-
-
-def _axes(
-    plan: Plan, table: TableSpec, paper: PaperTable | None
-) -> tuple[Axis, Axis, dict[str, str]]:
-    """Return rows, columns, and what is the same in all cells."""
-    known = sorted(set().union(*(objects_of(plan, run, table) for run in table.runs)))
-    methods = list(table.runs.values())
-    if paper is not None:
-        names = {"method": methods, "metric": list(METRICS), "object": [*known, ALL]}
-        rows = [name for name in paper.values if name in names[paper.rows]]
-        columns = [name for name in paper.names if name in names[paper.columns]]
-        fixed = {"object": paper.object, "metric": paper.metric}
-        return (paper.rows, rows), (paper.columns, columns), fixed
-    one = canonical_name(table.object, known) if table.object else None
-    if table.rows == "metric":
-        return ("metric", list(METRICS)), ("method", methods), {"object": one or ALL}
-    objects = [one] if one else [*known, ALL] if len(known) > 1 else known
-    fixed = {"metric": table.metric}
-    if table.rows == "run":
-        return ("method", methods), ("object", objects), fixed
-    return ("object", objects), ("method", methods), fixed
-
-
 def _shown(axis: str, name: str) -> str:
-    if axis == "metric":
-        return METRICS[name]
-    if axis == "method":
-        return name
-    return "all of them" if name == ALL else short_name(name)
+    if axis == "object":
+        return "all of them" if name == ALL else short_name(name)
+    return METRICS[name] if axis == "metric" else name
 
 
 def draw(path: Path, table: FilledTable) -> None:
     """Draw bars with intervals, a panel for each engine; the paper's figures are black lines across them."""
-    engines = table.engines
-    size = (max(7.0, 1.1 * table.cells["row"].nunique() + 2), 2.6 * len(engines) + 0.4)
+    count = len(table.engines)
+    rows = max(len(own) for own in table.engines.values())
+    size = (max(7.0, 1.1 * rows + 2), 2.6 * count + 0.4)
     with picture(path, size, text_parse_math=False) as figure:
-        panels = figure.subplots(len(engines), 1, squeeze=False)[:, 0]
-        for ax, engine in zip(panels, engines, strict=True):
-            wide = table.wide(engine)
-            draw_bars(ax, wide["mean"], wide["low"], wide["high"])
-            for bar, value in zip(ax.patches, wide["paper"].to_numpy().T.ravel(), strict=True):
+        panels = figure.subplots(count, 1, squeeze=False)[:, 0]
+        for ax, (engine, own) in zip(panels, table.engines.items(), strict=True):
+            draw_bars(ax, own["mean"], own["low"], own["high"])
+            for bar, value in zip(ax.patches, own["paper"].to_numpy().T.ravel(), strict=True):
                 ax.hlines(
                     value, bar.get_x(), bar.get_x() + bar.get_width(), color="black", linewidth=2
                 )

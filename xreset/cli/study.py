@@ -49,21 +49,19 @@ def study(
     wanted = [step for step in todo.steps.values() if only in ("all", step.kind)]
     if dry_run:
         for step in wanted:
-            after = [need for need in step.needs if not todo.steps[need].done()]
+            left, commands = step.todo()
+            after = [need for need in step.needs if todo.steps[need].left()]
             waits = f", after {', '.join(after)}" if after else ""
-            console.print(
-                f"{step.name}: {step.left() or 'done'} ({'a' if step.gpu else 'no'} GPU{waits})"
-            )
-            for command in [] if step.done() else step.commands():
+            console.print(f"{step.name}: {left or 'done'} ({'a' if step.gpu else 'no'} GPU{waits})")
+            for command in commands:
                 console.print(f"    {launch.shown_command(command)}")
         return
     problems = []
     if only != "tables":
-        for subset in todo.subsets:
+        for subset in todo.subsets():
             subset.make()
-        problems = launch.launch(
-            todo, [step for step in wanted if not step.done()], per_gpu=per_gpu, say=console.print
-        )
+        undone = [step for step in wanted if step.left()]
+        problems = launch.launch(todo, undone, per_gpu=per_gpu, say=console.print)
     if only in ("all", "tables"):
         page, notes = report.write_page(planned(), out / "reports" / todo.name)
         for note in notes:

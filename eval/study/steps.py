@@ -1,0 +1,301 @@
+"""What is left to do of a study, and the commands of ``xreset`` that do it.
+
+    OUT/data/SUBSET/demos.npz               demonstrations of a subset of the data, and its definition (subset.json)
+    OUT/data/SUBSET/ROBOT/resets.npz        reset bank, made by xreset retarget and xreset resets
+    OUT/RUN/                                run folder of xreset train
+    OUT/RUN/EVALUATION/                     results of xreset eval
+
+Studies with the same OUT share its content: a run of the same name and configuration is trained once.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+from xreset.demos.archive import read_demos, write_demos
+from xreset.demos.synth import synthesize
+from xreset.errors import RunError
+from xreset.eval.report.read import flat
+from xreset.eval.results import read_result
+from xreset.eval.study.file import Data, Evaluation, Runs
+from xreset.files import file_hash, is_claimed, read_json, write_json
+from xreset.learning.clock import Lift, read_lift
+from xreset.learning.config import TrainConfig
+from xreset.learning.run import checkpoints, read_run
+from xreset.text import shown
+
+SUBSET_SCHEMA = "xreset-subset/1"
+_ENOUGH = 0.97
+"""Share of the minutes from which a training counts as done: to start again would cost more than what is left."""
+
+Todo = tuple[str, list[list[str]]]
+"""What is left to do, in words, and the commands to run next, in order; both are empty if nothing is left."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """A part of a study that commands of ``xreset`` do."""
+
+    name: str
+    kind: Literal["data", "train", "eval"]
+    folder: Path
+    """Folder that the commands write."""
+    todo: Callable[[], Todo]
+    needs: Sequence[str] = ()
+    """Names of the steps before it."""
+    gpu: bool = False
+
+    def left(self) -> str:
+        """Return what is left to do, in words; empty if the step is done."""
+        return self.todo()[0]
+
+    def busy(self) -> bool:
+        """Return whether another process is writing this step's folder."""
+        return is_claimed(self.folder)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Subset:
+    """Demonstrations of some objects of a study's data."""
+
+    folder: Path
+    data: Data
+    given: Path
+    """Folder that the data's files are relative to."""
+    objects: tuple[str, ...]
+    """Empty: all objects."""
+    per_object: int | None
+
+    @property
+    def demos(self) -> Path:
+        """The archive."""
+        return self.folder / "demos.npz"
+
+    @property
+    def meshes(self) -> Path | None:
+        """Folder of meshes; None: the stand-ins."""
+        return self.given / self.data.meshes if self.data.meshes else None
+
+    def robot(self, name: str) -> Path:
+        """Return the folder with the motion and the reset bank of a robot, given by name or folder."""
+        return self.folder / Path(name).name
+
+    @cached_property
+    def definition(self) -> dict[str, Any]:
+        """Everything that the subset's files depend on."""
+        data = self.data
+        if data.demos:
+            source: dict[str, Any] = {"demos": file_hash(self.given / data.demos)}
+        else:
+            source = {
+                "synthetic_per_object": data.synthetic_per_object,
+                "synthetic_seed": data.synthetic_seed,
+            }
+        return source | {
+            "retarget": list(data.retarget),
+            "resets": list(data.resets),
+            "objects": list(self.objects),
+            "per_object": self.per_object,
+            "meshes": data.meshes,
+        }
+
+    def is_made(self) -> bool:
+        """Return whether the archive exists; refuse one of another definition."""
+        file = self.folder / "subset.json"
+        if file.is_file():
+            made = read_json(file, SUBSET_SCHEMA)
+            _refuse_other(f"{self.folder} was made otherwise", "data", made, self.definition)
+        return file.is_file() and self.demos.is_file()
+
+    def make(self) -> None:
+        """Write the archive, unless it exists."""
+        if self.is_made():
+            return
+        data = self.data
+        objects = self.objects or None
+        if data.demos:
+            demos = read_demos(self.given / data.demos)
+        else:
+            demos = synthesize(objects, data.synthetic_per_object, data.synthetic_seed)
+        chosen = demos.select(objects=objects, max_per_object=self.per_object)
+        write_demos(self.demos, chosen, config=self.definition)
+        write_json(self.folder / "subset.json", {"schema": SUBSET_SCHEMA} | self.definition)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """One training, or one baseline."""
+
+    group: str
+    """Name of the run in the study; trainings with other seeds and objects share it."""
+    spec: Runs
+    objects: tuple[str, ...]
+    subset: Subset
+    folder: Path
+    seed: int = 0
+    config: TrainConfig | None = None
+    """None: a baseline."""
+    weights: Path | None = None
+
+    @property
+    def label(self) -> str:
+        """Name in tables; trainings of one seed, each with an object alone, share it."""
+        return self.group if self.config is None else f"{self.group}-seed{self.seed}"
+
+    @property
+    def bank(self) -> Path:
+        """The run's reset bank."""
+        return self.subset.robot(self.spec.robot) / "resets.npz"
+
+    def trained(self) -> Lift:
+        """Return how far the training has come, which it notes with every checkpoint."""
+        return read_lift(self.folder)
+
+    def check(self) -> None:
+        """Refuse a folder with a run of another configuration. The length may differ: a run can be continued."""
+        if self.config is None or not (self.folder / "run.json").is_file():
+            return
+        info = read_run(self.folder)
+        found: dict[str, Any] = {"seed": info.seed, "config": _without_length(info.config)}
+        wanted: dict[str, Any] = {"seed": self.seed, "config": _without_length(self.config)}
+        for name in ("robot", "backend", "num_envs"):
+            found[name] = getattr(info, name)
+            wanted[name] = getattr(self.spec, name)
+        found["other networks to begin with"] = info.weights is not None
+        wanted["other networks to begin with"] = self.weights is not None
+        if self.bank.is_file():
+            found["reset bank"] = info.resets_hash[:12]
+            wanted["reset bank"] = file_hash(self.bank)[:12]
+        _refuse_other(f"{self.folder} holds a run of another configuration", "runs", found, wanted)
+
+
+def _without_length(config: TrainConfig) -> dict[str, Any]:
+    return asdict(replace(config, iterations=1, save_interval=1))
+
+
+def _refuse_other(problem: str, what: str, found: dict[str, Any], wanted: dict[str, Any]) -> None:
+    """Refuse what has the study's name if it is not what the study describes.
+
+    Raises:
+        RunError: an entry differs; the message names it.
+    """
+    old = dict(flat(found))
+    new = dict(flat(wanted))
+    for name in sorted({*old, *new}):
+        if old.get(name) != new.get(name):
+            raise RunError(
+                f"{problem}: {name} is {shown(old.get(name))} there and {shown(new.get(name))} in the study. "
+                f"Nothing was changed; give the {what} another name, or choose another --out."
+            )
+
+
+# What is left to do ---------------------------------------------------------------------------------------------------
+
+
+def bank_todo(subset: Subset, robot: str) -> Todo:
+    """Return what is left to do from demonstrations to the reset bank of a robot."""
+    folder = subset.robot(robot)
+    motion = folder / "retargeted.npz"
+    bank = folder / "resets.npz"
+    if bank.is_file():
+        return "", []
+    commands = []
+    if not motion.is_file():
+        retarget = _xreset("retarget", subset.demos, robot=robot, out=motion, objects=subset.meshes)
+        commands.append([*retarget, *subset.data.retarget])
+    own_robot = robot if Path(robot).is_dir() else None
+    resets = _xreset("resets", motion, out=bank, robot=own_robot, objects=subset.meshes)
+    return "to do", [*commands, [*resets, *subset.data.resets]]
+
+
+def train_todo(run: Run) -> Todo:
+    """Return what is left to do of a training, from the beginning or from its newest checkpoint."""
+    spec = run.spec
+    now = run.trained()
+    assert run.config is not None
+    iterations = run.config.iterations
+    left = f"{now.iteration} of {iterations} iterations" if now.iteration else "not begun"
+    length = {"out": run.folder, "iterations": iterations}
+    is_enough = now.iteration >= iterations
+    if spec.minutes is not None:
+        is_enough = is_enough or now.minutes >= _ENOUGH * spec.minutes
+        length["minutes"] = f"{spec.minutes - now.minutes:.4g}"
+        if now.iteration:
+            left += f", {now.minutes:.1f} of {spec.minutes:g} minutes"
+    if is_enough:
+        return "", []
+    if checkpoints(run.folder):
+        return left, [_xreset("train", **length, resume=True)]
+    command = _xreset(
+        "train",
+        **length,
+        robot=spec.robot,
+        resets=run.bank,
+        backend=spec.backend,
+        device=spec.device,
+        num_envs=spec.num_envs,
+        seed=run.seed,
+        like=spec.recipe,
+        weights=run.weights,
+        objects=run.subset.meshes,
+        config=spec.config,
+    )
+    return left, [command]
+
+
+def eval_todo(run: Run, folder: Path, spec: Evaluation, subset: Subset, engines: list[str]) -> Todo:
+    """Return in which engines an evaluation is missing: there is no result, or one of other episodes or files."""
+    policy = run.spec.policy
+    demos = subset.demos
+    if policy == "ik":
+        demos = subset.robot(run.spec.robot) / "retargeted.npz"
+    command = _xreset(
+        "eval",
+        policy or run.folder,
+        robot=run.spec.robot if policy else None,
+        demos=demos,
+        episodes=spec.episodes,
+        seed=spec.seed,
+        num_envs=spec.num_envs,
+        out=folder,
+        objects=subset.meshes,
+    )
+    files = {"demos": demos}
+    if policy is None:
+        files["policy"] = run.folder / "policy.onnx"
+    hashes = {name: file_hash(file) for name, file in files.items() if file.is_file()}
+    missing = []
+    for engine in engines:
+        file = folder / f"{engine}.json"
+        result = read_result(file) if file.is_file() else None
+        if (
+            result is None
+            or (result.seed, result.episodes_per_demo) != (spec.seed, spec.episodes)
+            or not hashes.items() <= result.inputs.items()
+        ):
+            missing.append(engine)
+            command += ["--backend", engine]
+    return (f"in {', '.join(missing)}", [command]) if missing else ("", [])
+
+
+def _xreset(verb: str, *words: object, **options: Any) -> list[str]:
+    """Return a command of ``xreset``; see :func:`flags`."""
+    return [sys.executable, "-m", "xreset", verb, *map(str, words), *flags(options)]
+
+
+def flags(values: dict[str, Any], prefix: str = "--") -> Iterator[str]:
+    """Yield values, which may be nested, as options of a command; None gives no option."""
+    for name, value in values.items():
+        flag = name.replace("_", "-")
+        if isinstance(value, dict):
+            yield from flags(value, f"{prefix}{flag}.")
+        elif isinstance(value, bool):
+            yield f"{prefix}{flag}" if value else f"{prefix}no-{flag}"
+        elif value is not None:
+            yield prefix + flag
+            yield from map(str, value if isinstance(value, list | tuple) else [value])

@@ -153,11 +153,13 @@ def _unseen_rows(
 def results_table(summaries: Sequence[EvalResult]) -> Table:
     """Return the table of an evaluation: one column for each engine; four engines fit into 80 characters."""
     first = summaries[0]
-    title = f"{first.policy} on {first.robot}\n"
-    title += f"{first.episodes} episodes of {len(first.per_demo)} demonstrations, seed {first.seed}"
+    counts = (
+        f"episodes: {first.episodes}, demonstrations: {len(first.per_demo)}, seed: {first.seed}"
+    )
     table = Table(
         "",
-        title=title,
+        title=f"{first.policy} on {first.robot}\n{counts}",
+        min_width=len(counts) + 1,
         title_justify="left",
         caption=caption([first.policy]),
         caption_justify="left",

@@ -34,7 +34,7 @@ class ResultsTest(unittest.TestCase):
             (first["policy"], first["robot"], first["seed"], first["sequence_name"]),
             ("zero", "toy", 3, "demo_0"),
         )
-        for expected in ("mujoco", "sapien", "49.8%", "4 episodes of 2 demonstrations, seed 3"):
+        for expected in ("mujoco", "sapien", "49.8%", "episodes: 4, demonstrations: 2, seed: 3"):
             self.assertIn(expected, str(evaluation))
 
     def test_an_earlier_version_did_not_measure_the_published_success(self):

@@ -183,6 +183,10 @@ class ManipulationEnv:
         self._allocate()
         self.reset()
 
+    def __repr__(self) -> str:
+        robot = self.backend.scene.robot.name
+        return f"ManipulationEnv(num_envs={self.num_envs}, robot={robot!r}, engine={self.backend.name!r})"
+
     def _allocate(self) -> None:
         """Make every buffer that a step writes to."""
         from tensordict import TensorDict

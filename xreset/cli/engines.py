@@ -329,8 +329,8 @@ def attribute(
             spec, a, b, played, episodes=episodes, only=only, progress=bar.stages()
         )
     demonstrations = len(played.bank.sequence_name)
-    count = f"{len(found.rows[0].episodes)} episodes of {demonstrations} demonstrations, seed {setting.seed}"
-    title = f"{spec.name} on {spec.robot.name}: what costs the skill between {backend} and {towards}\n{count}"
+    counts = f"episodes: {len(found.rows[0].episodes)}, demonstrations: {demonstrations}, seed: {setting.seed}"
+    title = f"{spec.name} on {spec.robot.name}: what costs the skill between {backend} and {towards}\n{counts}"
     content = found.as_dict() | {
         "policy": spec.name,
         "robot": spec.robot.name,

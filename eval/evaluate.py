@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -12,6 +12,7 @@ from xreset.eval.results import Evaluation, episode_table, summarize, write_resu
 from xreset.eval.rollout import Engine, chosen_engines, load_trial, roll_out
 from xreset.files import claim_folder
 from xreset.inputs import Data
+from xreset.progress import NamedProgress, unseen
 
 
 def evaluate(
@@ -27,7 +28,7 @@ def evaluate(
     device: str = "cpu",
     settle: bool = False,
     out: str | Path | None = None,
-    progress: Callable[[str, float, int], None] = lambda name, done, total: None,
+    progress: NamedProgress = unseen,
 ) -> Evaluation:
     """Play every demonstration in every engine, from the same starts, and write the results.
 

@@ -21,6 +21,7 @@ from xreset.eval.rollout import Engine, Trial, roll_out
 from xreset.eval.sensitivity import SWEEPS, Effect, Interval, Property, amount, nominal_task
 from xreset.files import read_typed, write_json
 from xreset.plugins import backend_class
+from xreset.progress import NamedProgress, unseen
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -103,7 +104,7 @@ def stress(
     *,
     sweeps: Sequence[Property] = SWEEPS,
     repetitions: int = 2,
-    progress: Callable[[str, float, int], None] = lambda name, done, total: None,
+    progress: NamedProgress = unseen,
 ) -> list[Stress]:
     """Sweep properties in each engine and write ``OUT/BACKEND.json`` after each property, so that a stopped command
     keeps its results.
@@ -152,7 +153,7 @@ def sweep(
     properties: Sequence[Property],
     play: Callable[[Engine, Property | None, float], Sequence[Episode]],
     out: Path,
-    progress: Callable[[str, float, int], None],
+    progress: NamedProgress,
 ) -> Card:
     """Play episodes with each value of the properties that an engine can set, and write the card after each property.
 

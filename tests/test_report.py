@@ -120,7 +120,7 @@ class CollectTest(Reported):
         ):
             collect(self.folder)
         self.write_soup()
-        (self.folder / "lift.json").write_text('{"schema": "xreset-lift/1"}')
+        (self.folder / "lift.json").write_text('{"schema": "xreset-lift/1", "iteration": 1}')
         with self.assertRaisesRegex(
             RunError, f"no evaluation results.*xreset eval {self.folder} --demos"
         ):

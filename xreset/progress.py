@@ -6,7 +6,9 @@ from collections.abc import Callable
 
 Progress = Callable[[float, int], None]
 """Called with what is done and what is to be done in all."""
+NamedProgress = Callable[[str, float, int], None]
+"""Called with the name of what runs, what is done of it and what is to be done in all."""
 
 
-def unseen(done: float, total: int) -> None:
+def unseen(*done: object) -> None:
     """Show nothing."""

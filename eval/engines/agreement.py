@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from xreset.eval.rollout import Engine, engine
 from xreset.geometry.kinematics import Kinematics
 from xreset.objects.sampling import surface_points
 from xreset.physics import Backend, State
+from xreset.progress import NamedProgress, unseen
 from xreset.retarget.file import Retargeted
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 
@@ -252,7 +253,7 @@ def compare(
     grasps: int = 48,
     tries: GraspMotion = STANDARD,
     reference: Engine | None = None,
-    progress: Callable[[str, float, int], None] = lambda doing, done, total: None,
+    progress: NamedProgress = unseen,
 ) -> Parity:
     """Measure engines against the reference.
 

@@ -6,7 +6,7 @@ Every run plays the same episodes from the same starts, so runs are compared epi
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
@@ -20,6 +20,7 @@ from xreset.eval.results import Episode
 from xreset.eval.rollout import Engine, Trial, nominal_scene, roll_out
 from xreset.eval.sensitivity import COMPARED, Effect, Property, nominal_task
 from xreset.plugins import backend_class
+from xreset.progress import NamedProgress, unseen
 from xreset.task.config import TaskConfig
 
 SCHEMA = "xreset-attribution/2"
@@ -126,7 +127,7 @@ def attribute(
     *,
     episodes: int,
     only: Sequence[str] = (),
-    progress: Callable[[str, float, int], None] = lambda run, done, total: None,
+    progress: NamedProgress = unseen,
 ) -> Attribution:
     """Measure both engines, and play the policy in A, in A changed towards B, and in B.
 

@@ -14,10 +14,8 @@ from xreset.errors import FileFormatError, RunError, needs
 from xreset.eval.report.fairness import missed_by_student, uneven
 from xreset.eval.results import EvalResult, Table, read_evaluation, read_traces, recorded
 from xreset.eval.stress import Stress, read_stress
-from xreset.files import read_json, read_typed
-from xreset.learning.clock import FILE as LIFT_FILE
-from xreset.learning.clock import SCHEMA as LIFT_SCHEMA
-from xreset.learning.clock import Lift
+from xreset.files import read_json
+from xreset.learning.clock import Lift, read_lift
 from xreset.learning.run import SCHEMA as RUN_SCHEMA
 from xreset.learning.run import TEACHER, Choice, RunInfo, read_choice, read_run
 from xreset.policies import results_folder, shipped
@@ -41,8 +39,8 @@ class Training:
     """Engine -> result."""
     episodes: Table
     """Episodes in all engines (:func:`xreset.eval.results.episode_table`), where ``run`` is the label."""
-    lift: Lift | None = None
-    """When the training first succeeded from home; None without ``lift.json``."""
+    lift: Lift
+    """When the training first succeeded from home; empty without ``lift.json``."""
 
     @property
     def first(self) -> EvalResult:
@@ -243,14 +241,12 @@ def read_training(label: str, folder: Path, results: Path | None = None) -> Trai
     results = results or results_in(folder)
     evaluation = read_evaluation(results, label)
     curves = read_curves(folder)
-    lift = None
-    if (folder / LIFT_FILE).is_file():
-        lift = read_typed(Lift, folder / LIFT_FILE, LIFT_SCHEMA)
+    lift = read_lift(folder)
     run = None
     file = folder / "run.json"
     if file.is_file():
         run = read_json(file, RUN_SCHEMA, keep_version=True)
-    if not evaluation and curves.empty and lift is None:
+    if not evaluation and curves.empty and not lift.iteration:
         raise RunError(
             f"{folder} holds neither learning curves (events.out.tfevents.*) nor evaluation results. "
             + _evaluate(folder)

@@ -51,7 +51,7 @@ def lifted(groups: Groups, x: X) -> Rows:
     when each did."""
     rows = [["", "runs", *(f"{100 * share:g} %" for share in SHARES)]]
     for label, members in groups.items():
-        clocks = [m.lift for m in members if m.lift is not None and m.lift.iteration]
+        clocks = [m.lift for m in members if m.lift.iteration]
         if clocks:
             cells = [_lifted(clocks, share, x) for share in SHARES]
             rows.append([label, str(len(members)), *cells])

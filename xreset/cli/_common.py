@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
@@ -15,6 +15,7 @@ from xreset.cli import INVOCATION
 from xreset.cli._terminal import Progress, console, show_table
 from xreset.files import code_version, write_json
 from xreset.plugins import backend_names, backend_status
+from xreset.progress import NamedProgress
 
 if TYPE_CHECKING:
     from xreset.eval import rollout
@@ -80,7 +81,7 @@ Port = Annotated[int, tyro.conf.arg(help="Port to serve at; if it is taken, the 
 
 
 @contextmanager
-def engine_bars(names: Sequence[str]) -> Iterator[Callable[[str, float, int], None]]:
+def engine_bars(names: Sequence[str]) -> Iterator[NamedProgress]:
     """Show a progress bar for each engine; yields the function that moves them: (engine, steps done, steps in all)."""
     with Progress() as bar:
         counts = {name: bar.count(name) for name in names}

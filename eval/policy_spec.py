@@ -188,6 +188,7 @@ def load_policy(
         name = path.stem
     else:
         folder = results_folder(name)
+    choice = read_choice(folder)
     loaded = OnnxPolicy(file)
     contract = loaded.contract
     spec = load_robot(robot or contract.robot)
@@ -196,7 +197,6 @@ def load_policy(
     def start(motion: Retargeted | None) -> Policy:
         return OnnxPolicy(file)
 
-    choice = read_choice(folder)
     is_chosen = choice is not None and choice.policy_hash == loaded.hash
     return PolicySpec(
         name=name,

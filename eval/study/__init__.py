@@ -1,1 +1,12 @@
-"""Studies: a file names trainings, evaluations and tables; ``xreset study FILE`` does what is missing of them."""
+"""Studies: a file names trainings, evaluations and tables; ``xreset study FILE`` does what is missing of them.
+
+    file.py      what a study file may hold
+    plan.py      the runs of a study, and its steps: reset banks, trainings, evaluations
+    steps.py     what is left to do of a step, and the commands of xreset that do it
+    launch.py    runs these commands, spread over the GPUs
+    tables.py    tables of what the runs reach, next to the paper's figures (paper.py, paper.toml)
+    report.py    the page: tables, and what makes them unfair or incomplete
+
+A run is a folder that a command of ``xreset`` writes. Its files say what is done, so the same
+command continues a study.
+"""

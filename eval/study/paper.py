@@ -25,7 +25,10 @@ Axis = Literal["object", "method", "metric"]
 
 @dataclass(frozen=True, kw_only=True)
 class PaperTable:
-    """A table of the paper. Objects have their official names, metrics those of :data:`xreset.eval.table.METRICS`."""
+    """A table of the paper; or, without figures, one of a study.
+
+    Objects have their official names, metrics those of :data:`xreset.eval.table.METRICS`.
+    """
 
     title: str
     rows: Axis

@@ -16,6 +16,7 @@ from xreset.eval.study.plan import Plan
 from xreset.eval.study.tables import FilledTable, draw, fill
 from xreset.eval.table import caption
 from xreset.files import write_whole
+from xreset.learning.clock import read_lift
 from xreset.text import short_name
 
 _ALIKE = 0.05
@@ -89,7 +90,7 @@ def _unfair(plan: Plan, table: FilledTable) -> Iterator[str]:
         )
     lengths = {}
     for run in plan.runs:
-        steps = run.trained().env_steps
+        steps = read_lift(run.folder).env_steps
         if run.group in table.trainings and steps:
             lengths[run.folder.name] = steps * 1e-6
     if lengths and max(lengths.values()) > (1 + _ALIKE) * min(lengths.values()):

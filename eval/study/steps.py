@@ -24,7 +24,7 @@ from xreset.eval.report.read import flat
 from xreset.eval.results import read_result
 from xreset.eval.study.file import Data, Evaluation, Runs
 from xreset.files import file_hash, is_claimed, read_json, write_json
-from xreset.learning.clock import Lift, read_lift
+from xreset.learning.clock import read_lift
 from xreset.learning.config import TrainConfig
 from xreset.learning.run import checkpoints, read_run
 from xreset.text import shown
@@ -152,10 +152,6 @@ class Run:
         """The run's reset bank."""
         return self.subset.robot(self.spec.robot) / "resets.npz"
 
-    def trained(self) -> Lift:
-        """Return how far the training has come, which it notes with every checkpoint."""
-        return read_lift(self.folder)
-
     def check(self) -> None:
         """Refuse a folder with a run of another configuration. The length may differ: a run can be continued."""
         if self.config is None or not (self.folder / "run.json").is_file():
@@ -216,7 +212,7 @@ def bank_todo(subset: Subset, robot: str) -> Todo:
 def train_todo(run: Run) -> Todo:
     """Return what is left to do of a training, from the beginning or from its newest checkpoint."""
     spec = run.spec
-    now = run.trained()
+    now = read_lift(run.folder)
     assert run.config is not None
     iterations = run.config.iterations
     left = f"{now.iteration} of {iterations} iterations" if now.iteration else "not begun"

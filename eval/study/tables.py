@@ -16,7 +16,7 @@ from xreset.eval.report.groups import COUNTED, counted, estimate
 from xreset.eval.report.read import Training, read_training
 from xreset.eval.results import Table
 from xreset.eval.study.file import TableSpec
-from xreset.eval.study.paper import ALL, paper_tables
+from xreset.eval.study.paper import ALL, PaperTable, paper_tables
 from xreset.eval.study.plan import Plan
 from xreset.eval.table import METRICS, Rows, estimate_text
 from xreset.objects.catalogue import canonical_name
@@ -70,29 +70,12 @@ def fill(plan: Plan, table: TableSpec) -> FilledTable:
     Raises:
         FileFormatError: a result is damaged.
     """
-    paper = paper_tables()[table.paper] if table.paper else None
     objects = {name: plan.played.get((name, table.evaluation), set()) for name in table.runs}
-    known = sorted(set().union(*objects.values()))
-    one = canonical_name(table.object, known) if table.object else None
-    names = {
-        "method": list(table.runs.values()),
-        "metric": list(METRICS),
-        "object": [*known, ALL] if paper or len(known) > 1 else known,
-    }
-    fixed = {"object": one or ALL, "metric": table.metric}
-    if paper is not None:
-        row_axis = paper.rows
-        column_axis = paper.columns
-        rows = [name for name in paper.values if name in names[row_axis]]
-        columns = [name for name in paper.names if name in names[column_axis]]
-        fixed = {"object": paper.object, "metric": paper.metric}
-    else:
-        row_axis = "method" if table.rows == "run" else table.rows
-        column_axis = "object" if table.rows == "run" else "method"
-        names["object"] = [one] if one else names["object"]
-        rows = names[row_axis]
-        columns = names[column_axis]
-    stated = paper.figures() if paper else {}
+    layout, names = _layout(table, sorted(set().union(*objects.values())))
+    rows = [name for name in layout.values if name in names[layout.rows]]
+    columns = [name for name in layout.names if name in names[layout.columns]]
+    fixed = {"object": layout.object, "metric": layout.metric}
+    stated = layout.figures() if table.paper else {}
     run_of = {shown: name for name, shown in table.runs.items()}
     trainings = {name: trainings_of(plan, name, table.evaluation) for name in table.runs}
     episodes = {
@@ -102,24 +85,53 @@ def fill(plan: Plan, table: TableSpec) -> FilledTable:
     for engine in sorted(set().union(*(t.results for t in chain(*trainings.values())))):
         cells = []
         for row, column in product(rows, columns):
-            key = fixed | {row_axis: row, column_axis: column}
+            key = fixed | {layout.rows: row, layout.columns: column}
             run = run_of[key["method"]]
             wanted = objects[run] if key["object"] == ALL else {key["object"]}
             values = estimate(_episodes_with(episodes[run], engine, wanted), key["metric"])
             figure, text = stated.get((key["method"], key["object"], key["metric"]), (nan, ""))
-            shown = (_shown(row_axis, row), _shown(column_axis, column))
+            shown = (_shown(layout.rows, row), _shown(layout.columns, column))
             mean = estimate_text(key["metric"], *values)
             cells.append((*shown, *values, figure, mean + text))
         found = pd.DataFrame(cells, columns=_CELL)
         engines[engine] = found.set_index(["row", "column"]).unstack(sort=False)
     return FilledTable(
-        title=table.title or (paper.title if paper else METRICS[table.metric]),
+        title=table.title or layout.title,
         unit="cm" if fixed["metric"] == "least_distance" else "%",
         engines=engines,
         trainings=trainings,
         episodes=episodes,
-        paper=paper is not None,
+        paper=table.paper is not None,
     )
+
+
+def _layout(table: TableSpec, known: list[str]) -> tuple[PaperTable, dict[str, list[str]]]:
+    """Return rows and columns of a table, those of the paper or its own; and for each axis what the study has.
+
+    Args:
+        known: objects that are played.
+    """
+    names = {
+        "method": list(table.runs.values()),
+        "metric": list(METRICS),
+        "object": [*known, ALL] if table.paper or len(known) > 1 else known,
+    }
+    if table.paper:
+        return paper_tables()[table.paper], names
+    one = canonical_name(table.object, known) if table.object else None
+    names["object"] = [one] if one else names["object"]
+    rows = "method" if table.rows == "run" else table.rows
+    columns = "object" if table.rows == "run" else "method"
+    layout = PaperTable(
+        title=METRICS[table.metric],
+        rows=rows,
+        columns=columns,
+        names=tuple(names[columns]),
+        values=dict.fromkeys(names[rows], ()),
+        object=one or ALL,
+        metric=table.metric,
+    )
+    return layout, names
 
 
 def trainings_of(plan: Plan, group: str, evaluation: str) -> list[Training]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import rich.console
@@ -68,6 +68,12 @@ class Progress(rich.progress.Progress):
             self.update(task, description=stage, completed=done, total=total or None)
 
         return move
+
+
+def show_notes(notes: Iterable[str]) -> None:
+    """Print what a user should know, a line for each note."""
+    for note in notes:
+        console.print(f"note: {note}", style="yellow")
 
 
 def show_table(rows: Sequence[Sequence[str | Text]], **options: Any) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from xreset.checks import Options
 from xreset.cli._common import Flat, Source, Sources
-from xreset.cli._terminal import Progress, console, show_table
+from xreset.cli._terminal import Progress, console, show_notes, show_table
 from xreset.errors import DemoError
 from xreset.files import file_hash
 
@@ -338,8 +338,7 @@ def _print_summary(demos: Demos, path: Path) -> None:
     console.print(
         f"{path}: {demos.num_sequences} sequences, {demos.num_frames} frames at {demos.fps:g} per second"
     )
-    for doubt in doubts(demos):
-        console.print(f"note: {doubt}", style="yellow")
+    show_notes(doubts(demos))
 
 
 COMMAND = {

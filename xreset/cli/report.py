@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from xreset.cli._common import Robot, Source
-from xreset.cli._terminal import console
+from xreset.cli._terminal import console, show_notes
 from xreset.eval import table
 from xreset.policies import results_folder, shipped
 from xreset.text import short_name
@@ -36,8 +36,7 @@ def report(
         html, data = make.make_report(run, out, robot=robot, objects=objects)
     console.print(table.results_table(list(data.training.results.values())))
     console.print(page.headline(data))
-    for note in data.notes:
-        console.print(f"note: {note}", style="yellow")
+    show_notes(data.notes)
     if film is not None:
         with console.status("drawing the film"):
             engines, shown = clips.make_film(run, film, robot=robot, objects=objects)

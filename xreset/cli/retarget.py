@@ -9,7 +9,7 @@ import numpy as np
 
 from xreset.accounts import accounts_path, write_accounts
 from xreset.cli._common import Objects, Source, show_accounts
-from xreset.cli._terminal import Progress, console
+from xreset.cli._terminal import Progress, console, show_notes
 from xreset.files import file_hash
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.hand.config import HandConfig
@@ -47,8 +47,7 @@ def retarget(
     chosen = read_demos(demos)
     if max_per_object is not None:
         chosen = chosen.select(max_per_object=max_per_object)
-    for doubt in doubts(chosen):
-        console.print(f"note: {doubt}", style="yellow")
+    show_notes(doubts(chosen))
     specs = demo_objects(chosen, objects)
     config = RetargetConfig(hand=hand, arm=arm)
     with Progress() as bar:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from xreset.cli._common import Name, Several
-from xreset.cli._terminal import console
+from xreset.cli._terminal import console, show_notes
 from xreset.errors import RunError
 from xreset.eval.study import file as files
 
@@ -64,8 +64,7 @@ def study(
         problems = launch.launch(todo, undone, per_gpu=per_gpu, say=console.print)
     if only in ("all", "tables"):
         page, notes = report.write_page(planned(), out / "reports" / todo.name)
-        for note in notes:
-            console.print(f"note: {note}", style="yellow")
+        show_notes(notes)
         console.print(f"page: {page}")
     if problems:
         raise RunError(

@@ -12,8 +12,11 @@ from unittest import mock
 import numpy as np
 import torch
 
+from tests.command import xreset as run
 from tests.toy_retarget import FLOAT, arm_targets
 from xreset import robots
+from xreset.demos.archive import write_demos
+from xreset.demos.synth import synthesize
 from xreset.description import DESCRIPTION
 from xreset.description import load_robot as load
 from xreset.errors import RobotError
@@ -118,10 +121,24 @@ class PlaceTest(unittest.TestCase):
         )
         assert_close(after, before, atol=5e-3, rtol=0)
 
+    def test_the_base_keeps_clear_of_demonstrations_that_are_not_tried(self):
+        demos = synthesize(["soup"], 3, seed=0)
+        file = Path(self.enterContext(tempfile.TemporaryDirectory())) / "demos.npz"
+        write_demos(file, demos)
+        self.enterContext(mock.patch("xreset.retarget.pipeline.wrist_paths", return_value=[]))
+        with mock.patch.object(placing, "place", side_effect=RobotError("found")) as place:
+            run("robots", "place", "openarm", "--demos", file, "--max-per-object", "1")
+        frames = demos.hand_valid.sum() + len(demos.object_pos)
+        self.assertEqual(place.call_args.args[2].shape, (frames, 3))
+
     def test_a_search_without_wrists_or_without_room_ends(self):
         none = self.wrists[torch.arange(0)]
         with self.assertRaisesRegex(RobotError, "no frame to reach"):
             placing.place(self.robot, [none], NOWHERE, CONFIG)
+        below = np.array([[0.45, 0.6, 0.0]])
+        narrow = dataclasses.replace(CONFIG, clear=0.35, tilt=(0.0, 0.0))
+        with self.assertRaisesRegex(RobotError, "no place .* 0.35 m away"):
+            placing.place(self.robot, [self.wrists], below, narrow)
         avoid = self.wrists.root_pos.numpy().reshape(-1, 3)
         with self.assertRaisesRegex(
             RobotError, "no place in the searched ranges is 9 m away.*Lower --search.clear"

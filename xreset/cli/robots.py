@@ -141,12 +141,14 @@ def place(
     from xreset.robot_tools import place as places
 
     spec = description.load_robot(robot)
-    chosen = archive.read_demos(demos).select(max_per_object=max_per_object, spread=True)
+    every = archive.read_demos(demos)
+    chosen = every.select(max_per_object=max_per_object, spread=True)
     specs = list(archive.demo_objects(chosen, objects).values())
     with Progress() as bar:
         paths = pipeline.wrist_paths(chosen, spec, specs, progress=bar.count("hand retargeting"))
-        wrists = np.concatenate([path.root_pos[path.annotated].numpy() for path in paths])
-        avoid = np.concatenate((wrists, pipeline.rest_on_table(chosen, specs).object_pos))
+        grounded = pipeline.rest_on_table(every, specs)
+        wrists = grounded.hand_keypoints[grounded.hand_valid, 0]
+        avoid = np.concatenate((wrists, grounded.object_pos))
         found = places.place(spec, paths, avoid, search, bar.count("placements"))
     table = [("follows", "reaches", "dexterity", "base.pos", "base.quat", "home")]
     for finalist in found:

@@ -41,6 +41,8 @@ _FIRST = 12
 """Frames that a candidate is tried on before all others: most fail on enough of them."""
 _DRAWS = 1000
 """Times that a candidate is drawn until it is clear of wrists and objects; then the round goes without it."""
+_UPRIGHT = 45.0
+"""[degrees] A base that is tilted less stands on something."""
 _SHRINK = 0.6
 """Factor by which the spread of candidates about the best shrinks from round to round."""
 _HOME_CLEAR = 0.02
@@ -195,7 +197,10 @@ def _candidates(
             else:
                 drawn = centers[random.integers(len(centers))] + spread * random.standard_normal(6)
             drawn[bounded] = np.clip(drawn[bounded], low[bounded], high[bounded])
-            if not len(avoid) or np.linalg.norm(avoid - drawn[:3], axis=1).min() >= config.clear:
+            away = avoid - drawn[:3]
+            if drawn[4] < _UPRIGHT:
+                away[:, 2] = away[:, 2].clip(min=0)  # what carries the base is below it
+            if not len(avoid) or np.linalg.norm(away, axis=1).min() >= config.clear:
                 candidates.append(_placed(robot, drawn))
                 break
     if number == 0 and not candidates:

@@ -23,8 +23,9 @@ class PlaceConfig:
     z: tuple[float, float] = (0.0, 0.8)
     tilt: tuple[float, float] | None = None
     """Range of the angle between the base's z axis and the vertical [degrees]; None: as the description has it."""
-    clear: float = 0.20
-    """Distance that the base's origin keeps from every wrist and object of the demonstrations [m]."""
+    clear: float = 0.30
+    """Distance that the base's origin, and what an upright base stands on, keep from every wrist and object of the
+    demonstrations [m]."""
     frames: int = 100
     """Frames that each candidate is tried on, each on its own."""
     candidates: int = 40

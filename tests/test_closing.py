@@ -304,6 +304,17 @@ class CommandTest(unittest.TestCase):
         self.assertEqual(config["closing"], {"spacing": 0.0056, "within": 0.1})
         self.assertEqual(config["squeeze"]["force"], 2.5)
 
+    def test_other_meshes_than_those_of_the_motion_are_told(self):
+        for source, told in ((toy_grasp.brick().source, 0), ("another mesh", 1)):
+            write_retargeted(
+                self.folder / "r.npz",
+                grasp_and_lift(),
+                config={},
+                inputs={"object brick": source},
+            )
+            words = "made with other meshes of brick. Give the same --objects folder"
+            self.assertEqual(self.resets()[2].count(words), told)
+
     def test_a_squeeze_that_an_engine_does_not_accept_is_left_out(self):
         still = lambda robot, fingers, joints, config: joints - (np.arange(2) == 1)[:, None]  # noqa: E731
         with mock.patch(

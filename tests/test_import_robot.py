@@ -239,6 +239,7 @@ class Toy(Robots):
         )
         joint = load_urdf(folder / "robot.urdf").joint("f1_2")
         np.testing.assert_allclose((joint.lower, joint.upper), (0.1, 1.3))
+        self.assertIn("'f1_2' has the limits 0.1..1.3", (folder / "robot.toml").read_text())
         text = (folder / "robot.urdf").read_text()
         (folder / "robot.urdf").write_text(text.replace('upper="1.3"', 'upper="1"'))
         found = errors(folder)
@@ -282,7 +283,8 @@ class Toy(Robots):
         )
 
     def test_mjcf_is_the_same_hand(self):
-        mjcf, _ = self.read("hand.xml", MJCF)
+        mjcf, notes = self.read("hand.xml", MJCF)
+        self.assertNotIn("closed loops", notes)
         urdf = read_source(self.hand, [])
         self.assertEqual((mjcf.link_names, mjcf.mimics), (urdf.link_names, urdf.mimics))
         for a, b in zip((*mjcf.joints, *mjcf.links), (*urdf.joints, *urdf.links), strict=True):
@@ -459,6 +461,9 @@ class Toy(Robots):
                 "limit on input amplification",
             ),
             (HAND, {"thumb": "f9"}, "--thumb 'f9' is in 0 fingers"),
+            (HAND, {"offset": (0, 0, 60)}, "--offset is 0.00, 0.00, 60.00, expected metres"),
+            (HAND, {"rpy": (0, 0, 90)}, "--rpy is 0.00, 0.00, 90.00, expected radians"),
+            (HAND, {"rpy": (0, 0, np.nan)}, "expected radians"),
         ):
             with self.assertRaisesRegex(RobotError, words):
                 self.imported(hand, **options)

@@ -5,6 +5,7 @@ import json
 import os
 import unittest
 import zipfile
+from dataclasses import replace
 from unittest import mock
 
 import numpy as np
@@ -243,6 +244,7 @@ class MeshImport(InFolder):
         for name, scale, words in (
             ("brick", 0.001, "there already"),
             ("other", 1.0, "millimetres"),
+            ("other", 1e-6, r"0\.0001 x .* m, expected 0\.005 to 2 m.*--scale"),
             ("../other", 0.001, "cannot be an object's name"),
         ):
             with self.assertRaisesRegex(ObjectError, words):
@@ -281,6 +283,8 @@ class MeshImport(InFolder):
         self.assertGreater(len(found.obj.pieces), 1)
         self.assertLessEqual(found.deviation, 0.002)
         self.assertEqual(found.hollows(), "")
+        cut_short = replace(found, deviation=0.01)  # its tolerance is stated: that is no advice
+        self.assertEqual(cut_short.hollows(), "")
         neck = np.array([[0.0205, 0, 0.157]])
         self.assertGreater(distance_to_pieces(neck, found.obj)[0], 0.001)
         self.assertLess(distance_to_pieces(neck, plain.obj)[0], -0.003)

@@ -121,6 +121,14 @@ class Registry(Copied):
         with self.assertRaisesRegex(RobotError, "ur7e-sharpa"):
             load("no-such-robot")
 
+    def test_a_plugin_has_the_name_that_files_give_its_robot(self):
+        entry = EntryPoint("mine", "xreset.robots.openarm", plugins.ROBOTS)
+        with (
+            mock.patch.object(plugins, "entry_points", lambda group: [entry]),
+            self.assertRaisesRegex(RobotError, "'mine' calls it 'openarm' in robot.toml"),
+        ):
+            load("mine")
+
     def test_a_broken_plugin_harms_nobody(self):
         entries = [
             EntryPoint("broken", "xreset_no_such_package.robot", plugins.ROBOTS),

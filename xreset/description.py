@@ -19,7 +19,7 @@ from xreset.checks import parsed
 from xreset.errors import RobotError
 from xreset.files import read_toml
 from xreset.geometry.urdf import mesh_files
-from xreset.plugins import robot_folder
+from xreset.plugins import robot_folder, robot_names
 from xreset.spec import RobotSpec
 
 DESCRIPTION = "robot.toml"
@@ -38,13 +38,22 @@ def load_robot(name_or_folder: str | Path) -> RobotSpec:
         RobotError: the robot is unknown, or its description is wrong; the message lists everything that is wrong.
             Whether the URDF has the named links and joints is found by :func:`xreset.robot_tools.check.check`.
     """
-    return read_description(robot_folder(name_or_folder) / DESCRIPTION)
+    spec = read_description(robot_folder(name_or_folder) / DESCRIPTION)
+    name = str(name_or_folder)
+    if name in robot_names() and spec.name != name:  # files name the robot as robot.toml does
+        raise RobotError(
+            f"The package of the robot {name!r} calls it {spec.name!r} in robot.toml. Use one name in both."
+        )
+    return spec
 
 
 def read_description(path: Path) -> RobotSpec:
     """Read a ``robot.toml``; see :func:`load_robot`."""
     data = read_toml(
-        path, SCHEMA, error=RobotError, hint=" A robot's folder holds one beside its URDF."
+        path,
+        SCHEMA,
+        error=RobotError,
+        hint=" A robot's folder has one next to its URDF; a package ships it as data.",
     )
     spec, problems = parsed(RobotSpec, _fields(data, path.parent), "the file")
     if spec is not None:

@@ -86,7 +86,8 @@ def robot_folder(name_or_folder: str | Path) -> Path:
             return folder.resolve()
         known = known_plugins(ROBOTS)
         raise RobotError(
-            f"Unknown robot {shown(name)}, and no folder has that name. Choose from: {known}."
+            f"Unknown robot {shown(name)}, and no folder has that name. Choose from: {known}; or give the robot's "
+            "folder with --robot."
         )
     module = load_plugin(ROBOTS, name)
     if not isinstance(module, ModuleType) or not module.__file__:

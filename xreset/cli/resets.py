@@ -49,13 +49,19 @@ def resets(
     from xreset.resets.bank import check_retargeted, write_bank
     from xreset.resets.filter import make_bank
     from xreset.resets.settle import settle_starts
-    from xreset.retarget.file import read_retargeted
+    from xreset.retarget.file import object_sources, read_retargeted
 
     backends = list(dict.fromkeys(backend)) or ["mujoco"]
     data = read_retargeted(retargeted)
     spec = load_robot(robot or data.robot)
     check_retargeted(retargeted, data, spec)
     loaded = load_objects(sorted({*map(str, data.object_name)}), objects)
+    stated = object_sources(retargeted)
+    if changed := [o.name for o in loaded if stated.get(o.name, o.source) != o.source]:
+        console.print(
+            f"note: {retargeted} was made with other meshes of {', '.join(changed)}. Give the same --objects folder.",
+            style="yellow",
+        )
     where = {"num_envs": num_envs, "device": device}
     options = {"limits": limits, "closing": closing, "squeeze": squeeze}
     title = f"states stable in {', '.join(backends)}"

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 DEFAULT_DENSITY = 500.0
 """Density of an object of unknown mass [kg/m^3]: a packed household object."""
 
-_LARGEST = 2.0
-"""A larger mesh is in other units [m]."""
+_SIZES = (0.005, 2.0)
+"""Lengths of meshes in metres [m]; a smaller or larger one is in other units."""
 _FLAT = 1e-5
 """A thinner mesh is flat [m]."""
 _HOLLOW = 120.0
@@ -52,10 +52,12 @@ class Import:
     """Largest distance between the pieces' surface and the mesh's [m]."""
     mass_source: str
     """Where the mass comes from, in words."""
+    tolerance: float | None
+    """Stated tolerance of the pieces [m]."""
 
     def hollows(self) -> str:
         """Return a sentence about what the pieces fill or leave out; empty if they keep to the surface."""
-        if self.deviation <= _FEW_MM:
+        if self.deviation <= _FEW_MM or self.tolerance is not None:
             return ""
         count = len(self.obj.pieces)
         pieces = f"its {count} pieces fill" if count > 1 else "its convex hull fills"
@@ -178,7 +180,13 @@ def import_with_notes(path: str | Path, name: str) -> Import:
         source=source,
         friction=own.friction,
     )
-    return Import(obj=obj, notes=tuple(notes), deviation=pieces.deviation, mass_source=mass_source)
+    return Import(
+        obj=obj,
+        notes=tuple(notes),
+        deviation=pieces.deviation,
+        mass_source=mass_source,
+        tolerance=own.tolerance,
+    )
 
 
 def add_mesh(
@@ -259,9 +267,10 @@ def _checked(mesh: trimesh.Trimesh, path: Path) -> trimesh.Trimesh:
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
         raise ObjectError(f"{path} has a triangle of an unknown vertex; it is damaged.")
     # before merging, which rounds by the size
-    if mesh.extents is not None and mesh.extents.max() > _LARGEST:
+    if mesh.extents is not None and not _SIZES[0] <= mesh.extents.max() <= _SIZES[1]:
         raise ObjectError(
-            f"{path} measures {_size(mesh)}; meshes must be in metres. Is it in millimetres (--scale 0.001)?"
+            f"{path} measures {_size(mesh)}, expected {_SIZES[0]:g} to {_SIZES[1]:g} m. State the file's unit with "
+            "--scale: 1 for metres, 0.001 for millimetres."
         )
     mesh.merge_vertices(merge_tex=True, merge_norm=True)  # texture seams are no holes
     mesh.update_faces(mesh.nondegenerate_faces())

@@ -5,6 +5,7 @@ Shape letters: S sequences, F frames of all sequences, J joints, E fingertips, R
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,7 @@ from xreset.records import (
     RATE,
     Field,
     offsets_problem,
+    read_npz,
     read_record,
     write_record,
 )
@@ -118,6 +120,16 @@ def read_retargeted(path: str | Path) -> Retargeted:
         FileFormatError: the file is missing, damaged, of another kind, or inconsistent.
     """
     return read_record(Retargeted, path, SCHEMA, what="retargeted trajectories", check=_check)
+
+
+def object_sources(path: str | Path) -> dict[str, str]:
+    """Return object name -> :attr:`~xreset.spec.ObjectSpec.source` when the file was made, where it states them."""
+    meta = read_npz(path, SCHEMA, {}, what="retargeted trajectories").get("meta")
+    try:
+        inputs = json.loads(str(meta))["inputs"]
+        return {name.removeprefix("object "): source for name, source in inputs.items()}
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        return {}
 
 
 def _check(arrays: dict[str, np.ndarray]) -> str | None:

@@ -166,9 +166,8 @@ class Couplings:
             return
         self.lines |= lines
         names = ", ".join(self.names[i] for i in followers)
-        self.notes.append(
-            f"coupled joints: {names} with {self.names[source]}; closed loops stay closed within {1e3 * opened:.2f} mm"
-        )
+        loops = f"; closed loops stay closed within {1e3 * opened:.2f} mm" if opened else ""
+        self.notes.append(f"coupled joints: {names} with {self.names[source]}{loops}")
 
     def _misfit(self, positions: np.ndarray, rows: np.ndarray) -> tuple[float, float]:
         """Return the widest gap of a closed loop [m], and the most that another equality is off [rad or m].

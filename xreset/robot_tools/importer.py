@@ -86,6 +86,14 @@ def import_robot(
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise RobotError(f"{out} is there already; give another folder, or remove it.")
+    for option, values, most, unit in (
+        ("--offset", offset, 1.0, "metres"),
+        ("--rpy", rpy, 2 * np.pi, "radians"),
+    ):
+        if values is not None and not np.abs(values).max() <= most:
+            raise RobotError(
+                f"{option} is {_vector(np.array(values))}, expected {unit} from {-most:.3g} to {most:.3g}."
+            )
     notes: list[str] = []
     arm_tree = read_source(arm, notes)
     if flange is None:

@@ -184,10 +184,12 @@ def _with_limits(tree: RobotTree, path: Path, notes: list[str]) -> RobotTree:
         ends = mimic.multiplier * np.array((driver.lower, driver.upper)) + mimic.offset
         low, high = sorted(ends.tolist())
         if low < joint.lower or high > joint.upper:
-            notes.append(
-                f"{name!r} has the limits {low:.4g}..{high:.4g} that {mimic.source!r} gives it, "
-                f"in place of {joint.lower:.4g}..{joint.upper:.4g}"
-            )
+            limits = f"{low:.3g}..{high:.3g}"
+            stated = f"{joint.lower:.3g}..{joint.upper:.3g}"
+            if limits != stated:
+                notes.append(
+                    f"{name!r} has the limits {limits} that {mimic.source!r} gives it, in place of {stated}"
+                )
             joint = replace(joint, lower=low, upper=high)
         joints[name] = replace(joint, mimic=mimic)
     return replace(tree, joints=tuple(joints.values()))

@@ -56,6 +56,7 @@ class StableBaselinesTest(WithEnv):
         self.assertEqual(done.tolist(), [True] + [False] * (N - 1))
         self.assertEqual((infos[0]["TimeLimit.truncated"], infos[0]["faulty"]), (False, True))
         self.assertEqual(reward[0], 0.0)
+        self.assertEqual(env.log["health/nonfinite_total"], 1)
         for name, value in observations.items():
             self.assertTrue(np.isfinite(value).all(), name)
             np.testing.assert_array_equal(infos[0]["terminal_observation"][name], before[name][0])

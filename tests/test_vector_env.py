@@ -59,6 +59,7 @@ class VectorEnvTest(WithEnv):
         self.assertEqual(
             (terminated.tolist(), infos["faulty"].tolist()), ([True, False, False],) * 2
         )
+        self.assertEqual(env.log["health/nonfinite_total"], 1)
         self.assertFalse(truncated.any(), "a fault is no truncation: nobody may bootstrap from it")
         self.assertEqual(reward[0], 0.0)
         for name, value in seen.items():

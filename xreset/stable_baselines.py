@@ -28,11 +28,15 @@ class StableBaselinesEnv(VecEnv):
     A world is reset in the step that ends its episode, as Stable-Baselines3 expects. The last observation of the
     episode is ``infos[world]["terminal_observation"]``; ``infos[world]["TimeLimit.truncated"]`` says whether its value
     is to be bootstrapped. An episode whose simulation fails is terminated, and ``infos[world]["faulty"]`` is True.
+
+    Attributes:
+        log: as of :class:`~xreset.vector_env.VectorEnv`.
     """
 
     def __init__(self, env: ManipulationEnv) -> None:
         """Wrap an environment, which belongs to this object from then on."""
         self.env = env
+        self.log: dict[str, torch.Tensor] = {}
         self._action = torch.zeros(env.num_envs, env.num_actions, device=env.device)
         super().__init__(env.num_envs, observation_space(env), action_space(env))
 
@@ -61,6 +65,7 @@ class StableBaselinesEnv(VecEnv):
         observations, reward, done, extras = self.env.step(self._action, begin=nothing)
         observations = with_sound_rows(observations, before)
         faulty = extras["faulty"]
+        self.log = extras["log"]
         truncated = extras["time_outs"].bool() & ~faulty
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         ended = done.nonzero().squeeze(-1)

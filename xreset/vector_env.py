@@ -33,6 +33,9 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     The step after an end ignores the world's action, gives no reward, and returns the first observation of the next
     episode (Gymnasium's ``AutoresetMode.NEXT_STEP``).
+
+    Attributes:
+        log: means over the worlds in the last step, by name: reward terms, grasps, successes.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": []}  # noqa: RUF012
@@ -48,6 +51,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._ended = torch.zeros(self.num_envs, dtype=torch.bool, device=env.device)
         self._observations = env.get_observations()
+        self.log: dict[str, torch.Tensor] = {}
 
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
@@ -88,6 +92,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         observations, reward, done, extras = self.env.step(action, begin=self._ended)
         reward = torch.where(self._ended, 0.0, reward)
         faulty = extras["faulty"]
+        self.log = extras["log"]
         self._observations = with_sound_rows(observations, self._observations)
         self._ended = done.bool()
         truncated = self._ended & extras["time_outs"].bool() & ~faulty

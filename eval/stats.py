@@ -30,15 +30,12 @@ def bootstrap_ci95(
         return float(values.mean()), float(values.mean())
     rng = np.random.default_rng(seed)
     if groups is None or len(np.unique(groups)) < 2:
-        means = values[rng.integers(len(values), size=(draws, len(values)))].mean(axis=1)
-    else:
-        _, number = np.unique(groups, return_inverse=True)
-        sums = np.bincount(number, values)
-        counts = np.bincount(number)
-        picks = rng.integers(len(sums), size=(draws, len(sums)))
-        means = sums[picks].sum(axis=1) / counts[picks].sum(axis=1)
-    low, high = np.percentile(means, [2.5, 97.5])
-    return float(low), float(high)
+        groups = np.arange(len(values))
+    _, number = np.unique(groups, return_inverse=True)
+    sums = np.bincount(number, values)
+    counts = np.bincount(number)
+    picks = rng.integers(len(sums), size=(draws, len(sums)))
+    return _interval(sums[picks].sum(axis=1) / counts[picks].sum(axis=1))
 
 
 def crossed_bootstrap_ci95(
@@ -61,21 +58,48 @@ def crossed_bootstrap_ci95(
     Raises:
         ValueError: a training has no episode of some demonstration.
     """
+    if len(np.unique(runs)) == 1:
+        return bootstrap_ci95(values, groups, draws=draws, seed=seed)
+    rng = np.random.default_rng(seed)
+    return _interval(_means((values, runs, groups), rng, rng, draws))
+
+
+def difference_ci95(one: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Return the 95 % interval of the mean of ``other`` minus that of ``one``: crossed bootstraps with the same
+    draws of demonstrations, and each with its own draws of trainings.
+
+    Args:
+        one: values, runs and groups, as of :func:`crossed_bootstrap_ci95`.
+        other: the same of trainings that were evaluated on the same demonstrations.
+    """
+    rng = np.random.default_rng(0)
+    first, second = (_means(each, rng, np.random.default_rng(1)) for each in (one, other))
+    return _interval(second - first)
+
+
+def _means(
+    crossed: Sequence[np.ndarray],
+    run_rng: np.random.Generator,
+    group_rng: np.random.Generator,
+    draws: int = 2000,
+) -> np.ndarray:
+    """Return the mean of values, by runs and groups, in each draw [draws]."""
+    values, runs, groups = crossed
     run_names, run = np.unique(runs, return_inverse=True)
     group_names, group = np.unique(groups, return_inverse=True)
-    if len(run_names) == 1:
-        return bootstrap_ci95(values, groups, draws=draws, seed=seed)
     sums, counts = np.zeros((2, len(run_names), len(group_names)))
     np.add.at(sums, (run, group), values)
     np.add.at(counts, (run, group), 1)
     if (counts == 0).any():
         raise ValueError("every training needs episodes of every demonstration")
-    rng = np.random.default_rng(seed)
     run_times, group_times = (
-        rng.multinomial(n, np.full(n, 1 / n), size=draws) for n in counts.shape
+        rng.multinomial(n, np.full(n, 1 / n), size=draws)
+        for rng, n in zip((run_rng, group_rng), counts.shape, strict=True)
     )
-    means = ((run_times @ sums) * group_times).sum(axis=1) / (
-        (run_times @ counts) * group_times
-    ).sum(axis=1)
+    means = ((run_times @ sums) * group_times).sum(axis=1)
+    return means / ((run_times @ counts) * group_times).sum(axis=1)
+
+
+def _interval(means: np.ndarray) -> tuple[float, float]:
     low, high = np.percentile(means, [2.5, 97.5])
     return float(low), float(high)

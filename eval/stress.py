@@ -13,6 +13,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
+import numpy as np
+
 from xreset.errors import XResetError
 from xreset.eval.plots import COLORS, picture
 from xreset.eval.policy_spec import PolicySpec
@@ -221,14 +223,12 @@ def curve(
 ) -> Curve:
     """Compare the episodes of each value with the nominal ones."""
     every = {prop.nominal: nominal} | swept
-    points = []
-    for value in sorted(every):
-        points.append(Point(value=value, **vars(Effect.of(every[value], nominal))))
+    points = tuple(Point(value=v, **vars(Effect.of(every[v], nominal))) for v in sorted(every))
     return Curve(
         property=prop.option,
         unit=prop.unit,
         nominal=prop.nominal,
-        points=tuple(points),
+        points=points,
         lower=_limit([p for p in reversed(points) if p.value <= prop.nominal]),
         upper=_limit([p for p in points if p.value >= prop.nominal]),
     )
@@ -292,10 +292,9 @@ def draw_curves(figure: Figure, found: Sequence[Stress]) -> None:
 
 def _draw(ax: Axes, card: Stress, curve: Curve, color: str) -> None:
     x = [p.value for p in curve.points]
-    low = [100 * (card.task_progress + p.difference_ci95[0]) for p in curve.points]
-    high = [100 * (card.task_progress + p.difference_ci95[1]) for p in curve.points]
+    ends = np.array([p.difference_ci95 for p in curve.points]).T
     mean = [100 * p.task_progress for p in curve.points]
-    ax.fill_between(x, low, high, color=color, alpha=0.15, linewidth=0)
+    ax.fill_between(x, *(100 * (card.task_progress + ends)), color=color, alpha=0.15, linewidth=0)
     ax.plot(x, mean, color=color, marker="o", markersize=3, label=card.backend)
     ax.axvline(curve.nominal, color="grey", linewidth=0.7, linestyle=":")
     ax.set_xlabel("factor" if curve.unit == "x" else curve.unit)

@@ -19,7 +19,7 @@ from xreset.eval.report.figures import draw_lines, draw_scores
 from xreset.eval.report.groups import grouped, scores
 from xreset.eval.report.make import compare
 from xreset.eval.report.read import read_curves, read_training, read_trainings
-from xreset.eval.stats import bootstrap_ci95, crossed_bootstrap_ci95
+from xreset.eval.stats import bootstrap_ci95, crossed_bootstrap_ci95, difference_ci95
 from xreset.learning.clock import Lift, Passing, write_lift
 from xreset.learning.config import TrainConfig
 from xreset.task.config import ResetConfig, TaskConfig, TerminationConfig
@@ -327,6 +327,23 @@ class ScoreTest(Compared):
         with self.assertRaisesRegex(ValueError, "every demonstration"):
             crossed_bootstrap_ci95(values[:4], np.array([0, 0, 0, 1]), np.array([0, 0, 1, 1]))
 
+    def test_a_difference_is_of_the_same_demonstrations(self):
+        rng = np.random.default_rng(0)
+        hard = rng.normal(size=40)  # what is hard for one is hard for the other
+        demos = np.tile(np.arange(40), 6)
+        runs = np.arange(240) // 40
+        both = [hard[demos] + rng.normal(scale=0.1, size=240) for _ in range(2)]
+        low, high = difference_ci95([both[0], runs, demos], [both[1] + 1.0, runs, demos])
+        self.assertTrue(0.95 < low < 1.0 < high < 1.05, (low, high))
+        each = rng.normal(size=2)[np.arange(80) // 40]  # two seeds that differ much
+        few = [hard[demos[:80]] + each, runs[:80], demos[:80]]
+        low, high = difference_ci95(few, [both[1], runs, demos])
+        self.assertGreater(high - low, 0.3 * abs(each[0] - each[-1]), "the seeds are drawn, too")
+        with self.assertRaisesRegex(ValueError, "every training needs"):
+            difference_ci95(
+                [both[0][:3], runs[:3], demos[:3]], [both[1][:41], runs[:41], demos[:41]]
+            )
+
 
 class FairnessTest(Compared):
     def test_alike(self):
@@ -444,6 +461,7 @@ class WrittenTest(Compared):
             r"|  | reorient | 25\.0 \(.*\) | - |",
             r"|  | published success | 25\.0 \(.*\) | 25\.0 \(.*\) |",
             r"|  | published distance \[cm\] | 7\.8 \(5\.5-10\.0\) | - |",
+            r"|  | task progress minus x | -5\.0 \([-+.\d]+ to [-+.\d]+\) | -5\.0 \(.*\) |",
             "| seed | 0; 1 | 0 |",
             "| task.reset.random_gravity | True | False |",
             "| minutes of training | 2.0 | 2.0 |",

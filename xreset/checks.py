@@ -159,7 +159,7 @@ def _record(cls: type, data: Any, where: str, problems: list[str]) -> Any:
     if unknown:
         guesses = [_with_guess(name, names) for name in _first(unknown)]
         found.append(f"unknown: {', '.join(guesses)}")
-        if not missing and not any(guess.endswith("?)") for guess in guesses):
+        if not missing and guesses == unknown:
             found.append(f"known: {', '.join(names)}")
     if missing:
         found.append(f"missing: {', '.join(missing)}")

@@ -8,12 +8,13 @@ from math import nan
 from os.path import commonprefix
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from xreset.eval.report.fairness import uneven
 from xreset.eval.report.read import Training
 from xreset.eval.results import Table, mean
-from xreset.eval.stats import crossed_bootstrap_ci95
+from xreset.eval.stats import crossed_bootstrap_ci95, difference_ci95
 from xreset.eval.table import METRICS
 
 Groups = dict[str, Sequence[Training]]
@@ -105,7 +106,18 @@ def estimate(episodes: Table, metric: str) -> tuple[float, float, float]:
     """
     if episodes.empty:
         return nan, nan, nan
-    values = episodes[metric].to_numpy(float)
+    return mean(episodes, metric), *crossed_bootstrap_ci95(*_crossed(episodes, metric))
+
+
+def difference(one: Table, other: Table) -> str:
+    """Return task progress of ``other`` minus that of ``one``, episodes on the same demonstrations, in points with its
+    95 % interval (:func:`xreset.eval.stats.difference_ci95`)."""
+    low, high = difference_ci95(_crossed(one, "task_progress"), _crossed(other, "task_progress"))
+    value = mean(other, "task_progress") - mean(one, "task_progress")
+    return f"{100 * value:+.1f} ({100 * low:+.1f} to {100 * high:+.1f})"
+
+
+def _crossed(episodes: Table, metric: str) -> list[np.ndarray]:
+    """Return a metric, the training and the demonstration of each episode."""
     runs = pd.factorize(episodes["run"])[0]
-    interval = crossed_bootstrap_ci95(values, runs, episodes["sequence"].to_numpy())
-    return mean(episodes, metric), *interval
+    return [episodes[metric].to_numpy(float), runs, episodes["sequence"].to_numpy()]

@@ -3,7 +3,7 @@ results."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,6 +55,12 @@ class Training:
             for engine in self.results
         ]
         return pd.concat(parts, ignore_index=True)
+
+
+def versions(trainings: Iterable[Training], engine: str) -> str:
+    """Return the engine's versions in which trainings were evaluated."""
+    found = {t.results[engine].backend_version for t in trainings if engine in t.results}
+    return ", ".join(sorted(found))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,7 +135,8 @@ def results_in(folder: Path) -> Path:
     """
     if not folder.is_dir():
         raise RunError(
-            f"there is no folder {folder}. Give a run folder, or a folder that xreset eval wrote results into."
+            f"there is no folder {folder}. Give a run folder, or a folder that xreset eval wrote results into. "
+            "Of a policy that ships, make results first: xreset eval NAME --demos DEMOS"
         )
     if (folder / "eval").is_dir() or (folder / "run.json").is_file():
         return folder / "eval"

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import chain
 
+import pandas as pd
 from scipy.stats import binomtest
 
 from xreset.errors import RunError
 from xreset.eval.report.curves import AXES, X, amounts
-from xreset.eval.report.groups import COUNTED, Groups, by_engine, counted
-from xreset.eval.report.read import Training
+from xreset.eval.report.fairness import uneven
+from xreset.eval.report.groups import COUNTED, Groups, by_engine, counted, difference
+from xreset.eval.report.read import Training, versions
 from xreset.eval.results import Table
 from xreset.eval.table import METRICS, Rows, estimate_text
 from xreset.learning.clock import SHARES, Lift
@@ -19,30 +21,30 @@ _LIFT_FIELDS: dict[X, str] = {"minutes": "minutes", "steps": "env_steps", "itera
 
 
 def results(groups: Groups, found: Table) -> Rows:
-    """Return a row for each group and metric, a row with each group's number of episodes, and a column for each engine;
-    ``-`` where it was not evaluated or measured.
+    """Return rows of each group: how much was evaluated, every metric, and the difference to the first group where both
+    were evaluated alike. The columns are engines; ``-`` where it was not evaluated or measured.
 
     Args:
         found: :func:`xreset.eval.report.groups.scores`.
     """
-    trainings = list(chain(*groups.values()))
-    head = ["", ""]
     engines = sorted(found["engine"].unique())
-    for engine in engines:
-        versions = {m.results[engine].backend_version for m in trainings if engine in m.results}
-        head.append(f"{engine} {', '.join(sorted(versions))}")
-    texts = [
-        estimate_text(*values) for values in found[["metric", "mean", "low", "high"]].to_numpy()
-    ]
-    cells = found.assign(text=texts).pivot_table(
-        "text", ["group", "metric"], "engine", "first", "-", sort=False
-    )
-    rows = [head]
-    for (label, metric), row in cells[engines].iterrows():
-        if metric == next(iter(METRICS)):
-            counts = {engine: counted(own) for engine, own in by_engine(groups[label])}
-            rows.append([label, COUNTED, *(counts.get(engine, "-") for engine in engines)])
-        rows.append(["", METRICS[metric], *row])
+    every = list(chain(*groups.values()))
+    rows = [["", "", *(f"{engine} {versions(every, engine)}" for engine in engines)]]
+    first, *_ = groups
+    reference = dict(by_engine(groups[first]))
+    for label, members in groups.items():
+        alike = label != first and not uneven([*groups[first], *members])
+        columns = {}
+        for engine, episodes in by_engine(members):
+            column = {COUNTED: counted(episodes)}
+            own = found[(found["group"] == label) & (found["engine"] == engine)]
+            for _, _, metric, *values in own.itertuples(index=False):
+                column[METRICS[metric]] = estimate_text(metric, *values)
+            if alike and engine in reference:
+                column[f"task progress minus {first}"] = difference(reference[engine], episodes)
+            columns[engine] = column
+        for name, *texts in pd.DataFrame(columns, columns=engines).fillna("-").itertuples():
+            rows.append([label if name == COUNTED else "", name, *texts])
     return rows
 
 
@@ -89,11 +91,10 @@ def different(groups: Groups) -> Rows:
         cells = []
         described = set()
         for columns in facts.values():
-            texts = [known.get(name, "-") for known in columns]
-            cells.append("; ".join(dict.fromkeys(texts)))
-            described.update(
-                text for text, known in zip(texts, columns, strict=True) if "seed" in known
-            )
+            texts = dict.fromkeys(known.get(name, "-") for known in columns)
+            cells.append("; ".join(texts))
+            if "seed" in columns[0]:
+                described.update(texts)
         if len(described) > 1 or name in lengths:
             rows.append([name, *cells])
     return rows

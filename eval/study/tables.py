@@ -13,7 +13,7 @@ import pandas as pd
 from xreset.eval.plots import picture
 from xreset.eval.report.figures import draw_bars
 from xreset.eval.report.groups import COUNTED, counted, estimate
-from xreset.eval.report.read import Training, read_training
+from xreset.eval.report.read import Training, read_training, versions
 from xreset.eval.results import Table
 from xreset.eval.study.file import TableSpec
 from xreset.eval.study.paper import ALL, PaperTable, paper_tables
@@ -58,10 +58,7 @@ class FilledTable:
 
     def versions(self, engine: str) -> str:
         """Return the engine's versions in which the runs were evaluated."""
-        evaluated = [
-            t.results[engine] for t in chain(*self.trainings.values()) if engine in t.results
-        ]
-        return ", ".join(sorted({result.backend_version for result in evaluated}))
+        return versions(chain(*self.trainings.values()), engine)
 
 
 def fill(plan: Plan, table: TableSpec) -> FilledTable:

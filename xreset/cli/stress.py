@@ -55,16 +55,13 @@ def stress(
         )
     sweeps.write_plot(folder / "stress.png", found, f"{spec.name}: robustness")
     table = [("property", "value", *(result.backend for result in found))]
-    by_option = [{curve.property: curve for curve in result.curves} for result in found]  # noqa: XR002
+    swept = sweeps.by_property(found)
     for prop in properties:
-        values = sorted({*prop.values, prop.nominal})
-        for i, value in enumerate(values):
+        for i, value in enumerate(sorted({*prop.values, prop.nominal})):
             cells = []
-            for curves in by_option:
-                if prop.option in curves:
-                    cells.append(_cell(curves[prop.option].points[i], value == prop.nominal))
-                else:
-                    cells.append("cannot be set")
+            for curve in swept.get(prop.option, [None] * len(found)):
+                text = _cell(curve.points[i], value == prop.nominal) if curve else "cannot be set"
+                cells.append(text)
             table.append((prop.option, f"{value:g} {prop.unit}", *cells))
     show_table(
         table,

@@ -99,15 +99,15 @@ class Runner:
             if not self._tick():
                 return
             due += self.controller.dt
-            late = self.driver.now() - due
+            now = self.driver.now()
+            late = now - due
             if late > 0:
                 self.outcome.missed += 1
                 due += late  # the rate is kept from here on; no step is made up for
             if late > self.limits.late:
                 self._stop_all(f"A control step took {late:.2f} s too long.")
-            before = self.driver.now()
             self.driver.wait_until(due)
-            still = still + due - before if self.driver.now() <= before else 0.0
+            still = still + due - now if self.driver.now() <= now else 0.0
             if still > self.limits.late:
                 self._stop_all(
                     "The driver's clock stands still. Override now() and wait_until() together."

@@ -55,8 +55,8 @@ class Step:
         return self.todo()[0]
 
     def busy(self) -> bool:
-        """Return whether another process is writing this step's folder."""
-        return is_claimed(self.folder)
+        """Return whether another process is writing this step's folder, or a file in it."""
+        return any(map(is_claimed, (self.folder, *self.folder.glob(".*.lock"))))
 
 
 @dataclass(frozen=True, kw_only=True)

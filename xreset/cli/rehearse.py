@@ -27,7 +27,8 @@ def rehearse(
             objects.
         backend: Physics engine; give it again for more engines. Default: all that can be used here, but not
             MuJoCo-Warp on a CPU, where it is slow.
-        fault: Fault to try, or NAME=VALUE,VALUE... for values of your own; give it again for more. Default: all.
+        fault: Fault to try, or NAME=VALUE,VALUE... for values of your own (delays in ms, errors in mm or degrees,
+            pushes of the object in m/s); give it again for more. Default: all.
         episodes: Episodes of each demonstration, the same for every fault.
         real_time: Let the simulation wait for the wall clock.
         setting: Robot, meshes, seed, device and worlds.

@@ -27,8 +27,8 @@ def stress(
 
     Args:
         demos: Demonstrations whose starts and goals are played.
-        property: Property to change, or NAME=VALUE,VALUE... for values of your own; give it again for more. Default:
-            all.
+        property: Property to change, or NAME=VALUE,VALUE... for values of your own (factors, latencies in control
+            steps; the table shows each unit); give it again for more. Default: all.
         episodes: Episodes of each demonstration, the same for every value.
         setting: Robot, meshes, seed, device and worlds.
         out: Folder for the results; default: stress/ in the run folder or next to the policy.

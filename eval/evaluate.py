@@ -54,10 +54,8 @@ def evaluate(
         PolicyError: the policy is unknown, or the seed chose this checkpoint.
         XResetError: another process is writing the folder.
     """
-    if episodes < 1 or num_envs < 1:
-        raise XResetError(
-            f"episodes is {episodes} and num_envs is {num_envs}, expected at least 1 of each."
-        )
+    if episodes < 1:
+        raise XResetError(f"episodes is {episodes}, expected at least 1.")
     policy = load_policy(policy, robot=robot, seed=seed)
     policy.check_seed(seed)
     chosen = chosen_engines(engines, device)

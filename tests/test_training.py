@@ -263,6 +263,10 @@ class TrainingTest(unittest.TestCase):
                 parsed(*arguments)
             self.assertRegex(said.getvalue(), problem)
 
+    def test_a_recipe_is_not_ignored(self):
+        with self.assertRaisesRegex(XResetError, "Both recipe and config"):
+            self.train("both", recipe="minutes")
+
     def test_an_own_term_that_is_not_finite_is_named(self):
         name = f"{__name__}:not_a_number"
         task = replace(CONFIG.task, reward=replace(CONFIG.task.reward, own={name: 1.0}))

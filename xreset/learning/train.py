@@ -92,6 +92,8 @@ def train(
         XResetError: bank, robot, objects and configuration do not fit together.
     """
     out = Path(out)
+    if config is not None and recipe is not None:
+        raise XResetError("Both recipe and config are given. Give one of them.")
     if config is None:
         config = starting_config(recipe or default_recipe(weights if goals is not None else None))
     if iterations is not None:

@@ -184,14 +184,7 @@ def write_bank(
     config: Mapping[str, Any] | None = None,
     inputs: Mapping[str, str] | None = None,
 ) -> None:
-    """Write a bank.
-
-    Args:
-        path: npz file; appears whole or not at all.
-        bank: the bank.
-        config: configuration that made it, for the file to state.
-        inputs: name -> SHA-256 of each file that it was made from, for the file to state.
-    """
+    """Write a bank. The file states the configuration that made it, and name -> SHA-256 of the input files."""
     write_record(path, SCHEMA, bank, config=config, inputs=inputs)
 
 
@@ -234,8 +227,7 @@ def check_joints(what: str, data: Any, robot: RobotSpec) -> None:
     """Refuse data with other joints than the robot's; ``FileFormatError``."""
     if data.joint_names != robot.joint_names:
         raise FileFormatError(
-            f"{what} for the robot {data.robot!r}, whose joints are not those of {robot.name!r}. Make it with the "
-            "same robot."
+            f"{what} for the robot {data.robot!r}, whose joints are not those of {robot.name!r}. Use one robot."
         )
 
 

@@ -168,8 +168,7 @@ def load_policy(
         return policy
     if not isinstance(policy, str | Path):
         raise PolicyError(
-            f"policy is {shown(policy)}, expected a name, a path or a PolicySpec. docs/gymnasium.md shows how to make "
-            "one of a network of your own."
+            f"policy is {shown(policy)}, expected a name, a path or a PolicySpec (docs/gymnasium.md)."
         )
     name = str(policy)
     if name in BASELINES:
@@ -214,7 +213,7 @@ def load_policy(
 
 def _baseline(name: str, robot: str | Path | None, seed: int) -> PolicySpec:
     if robot is None:
-        raise PolicyError(f"The baseline {name!r} needs a robot. Add --robot (in Python: robot).")
+        raise PolicyError(f"The baseline {name!r} needs a robot. Add --robot.")
     spec = load_robot(robot)
 
     def start(motion: Retargeted | None) -> Policy:

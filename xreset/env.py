@@ -88,7 +88,6 @@ def make_env(
     Raises:
         FileFormatError: the bank's states are for another robot or other meshes.
         DemoError: the bank has no demonstration of an object.
-        CapabilityError: the engine cannot do what the task asks for.
     """
     task = task or TaskConfig()
     objects = checked_objects(robot, objects)
@@ -410,8 +409,7 @@ class ManipulationEnv:
     def _apply_action(self, action: Tensor, push: Tensor | None = None) -> None:
         if action.shape != self._action.shape:
             raise XResetError(
-                f"The actions have the shape {tuple(action.shape)}, expected {tuple(self._action.shape)}: one row for "
-                "each world, one column for each joint."
+                f"The actions have the shape {tuple(action.shape)}, expected {tuple(self._action.shape)}."
             )
         self._action.copy_(action.detach())
         self._graphs.run(self._process_action)

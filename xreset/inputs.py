@@ -142,7 +142,7 @@ def load_inputs(
         data = _read(path, accept)
     if not isinstance(data, Data):
         raise XResetError(
-            f"Found {shown(data)}, expected Demos, Retargeted, a ResetBank, or a file of one of them."
+            f"Found {shown(data)}, expected Demos, Retargeted, a ResetBank or their file."
         )
     folder = Path(objects) if objects else None
     names = _object_names(data)

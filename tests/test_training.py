@@ -470,6 +470,14 @@ class TrainingTest(unittest.TestCase):
             with self.subTest(error), broken, self.assertRaisesRegex(wanted, said):
                 self.train("memory")
 
+    def test_many_worlds_on_a_cpu_are_warned_of(self):
+        stopped = mock.patch("xreset.learning.train._runner", side_effect=RunError("stopped"))
+        for worlds, warned in ((300, True), (4, False)):
+            said = io.StringIO()
+            with stopped, redirect_stderr(said), self.assertRaisesRegex(RunError, "stopped"):
+                self.train(f"worlds{worlds}", num_envs=worlds)
+            self.assertEqual("--num-envs 8" in said.getvalue(), warned)
+
     def test_a_damaged_checkpoint_is_named(self):
         file = self.folder / "000009.pt"
         file.write_bytes(latest_checkpoint(self.out).read_bytes()[:1000])

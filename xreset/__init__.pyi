@@ -41,6 +41,8 @@ from xreset.resets.goals import make_goals as make_goals
 from xreset.resets.goals import read_goals as read_goals
 from xreset.resets.goals import write_goals as write_goals
 from xreset.retarget.file import Retargeted as Retargeted
+from xreset.retarget.file import read_retargeted as read_retargeted
+from xreset.retarget.file import write_retargeted as write_retargeted
 from xreset.retarget.pipeline import RetargetConfig as RetargetConfig
 from xreset.retarget.pipeline import retarget_demos as retarget_demos
 from xreset.robot_tools.judge import Judgement as Judgement

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -282,6 +283,8 @@ def resume(
     return out
 
 
+_MANY_ON_A_CPU = 256
+"""More worlds than these keep a CPU busy for minutes in each iteration."""
 _NO_MEMORY = re.compile("Failed to allocate|out of memory")
 """How Warp reports too little memory, as a ``RuntimeError``."""
 
@@ -299,6 +302,12 @@ def _run(
     if not minutes > 0:
         raise RunError(f"--minutes is {minutes}, expected more than 0.")
     processes = Processes.of_environment()
+    if info.device == "cpu" and info.num_envs > _MANY_ON_A_CPU:
+        print(
+            f"With {info.num_envs:,} worlds on a CPU, an iteration takes minutes. Train on a GPU; to see that a "
+            "training runs, 8 worlds are enough (--num-envs 8).",
+            file=sys.stderr,
+        )
     with ExitStack() as stack:
         stack.callback(torch.set_float32_matmul_precision, torch.get_float32_matmul_precision())
         if not torch.distributed.is_initialized():

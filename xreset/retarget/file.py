@@ -106,10 +106,10 @@ def write_retargeted(
     path: str | Path,
     retargeted: Retargeted,
     *,
-    config: Mapping[str, Any],
-    inputs: Mapping[str, str],
+    config: Mapping[str, Any] | None = None,
+    inputs: Mapping[str, str] | None = None,
 ) -> None:
-    """Write trajectories; see :func:`xreset.records.write_record` for ``config`` and ``inputs``."""
+    """Write trajectories. The file states the configuration that made them, and name -> SHA-256 of the input files."""
     write_record(path, SCHEMA, retargeted, config=config, inputs=inputs)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -37,7 +37,7 @@ from xreset.files import claim_folder, write_json, write_whole
 from xreset.inputs import Data
 from xreset.live.engine import make_controller
 from xreset.live.faults import Faults, FaultyDriver
-from xreset.progress import NamedProgress, unseen
+from xreset.progress import unseen
 from xreset.runtime import OnnxActor, Runner
 from xreset.task.terminations import out_of_bounds
 
@@ -90,7 +90,7 @@ def rehearse(
     device: str = "cpu",
     real_time: bool = False,
     out: str | Path | None = None,
-    progress: NamedProgress = unseen,
+    progress: Callable[[str, float, int], None] = unseen,
 ) -> list[Rehearsal]:
     """Rehearse a policy for a robot: play the same episodes with each fault in each engine, and write the results.
 

@@ -122,7 +122,7 @@ class Arrays(Case):
             if line.startswith("| `")
             for name in line.split("|")[1].split("`")[1::2]
         }
-        self.assertEqual(documented, set(arrays) - {"meta"})
+        self.assertEqual(documented, set(arrays))
         self.assertEqual(str(arrays["schema"]), "xreset-rollouts/1")
         self.assertEqual(arrays["joint_pos"].shape, (20, len(self.robot.joints)))
         np.testing.assert_allclose(

@@ -66,7 +66,8 @@ def crossed_bootstrap_ci95(
 
 def difference_ci95(one: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> tuple[float, float]:
     """Return the 95 % interval of the mean of ``other`` minus that of ``one``: crossed bootstraps with the same
-    draws of demonstrations, and each with its own draws of trainings.
+    draws of demonstrations, and each with its own draws of trainings. Episodes are drawn in place of demonstrations
+    where there is one training and one demonstration.
 
     Args:
         one: values, runs and groups, as of :func:`crossed_bootstrap_ci95`.
@@ -83,10 +84,12 @@ def _means(
     group_rng: np.random.Generator,
     draws: int = 2000,
 ) -> np.ndarray:
-    """Return the mean of values, by runs and groups, in each draw [draws]."""
+    """Return the mean of values in each draw of runs and groups; of episodes, where there is one of both [draws]."""
     values, runs, groups = crossed
     run_names, run = np.unique(runs, return_inverse=True)
     group_names, group = np.unique(groups, return_inverse=True)
+    if len(run_names) == len(group_names) == 1:
+        group_names = group = np.arange(len(values))
     sums, counts = np.zeros((2, len(run_names), len(group_names)))
     np.add.at(sums, (run, group), values)
     np.add.at(counts, (run, group), 1)

@@ -339,6 +339,9 @@ class ScoreTest(Compared):
         few = [hard[demos[:80]] + each, runs[:80], demos[:80]]
         low, high = difference_ci95(few, [both[1], runs, demos])
         self.assertGreater(high - low, 0.3 * abs(each[0] - each[-1]), "the seeds are drawn, too")
+        one = np.zeros(40, int)
+        low, high = difference_ci95([hard, one, one], [hard + rng.normal(size=40), one, one])
+        self.assertGreater(high - low, 0.3, "episodes of one demonstration are drawn")
         with self.assertRaisesRegex(ValueError, "every training needs"):
             difference_ci95(
                 [both[0][:3], runs[:3], demos[:3]], [both[1][:41], runs[:41], demos[:41]]

@@ -419,6 +419,16 @@ class TablesTest(InFolder):
             [note for note in notes if "comparable" in note], "objects alone are not compared"
         )
 
+    def test_results_of_an_engine_that_is_missing_here_are_shown(self):
+        self.write("ours-seed0", 1.0, 1.0, 0.33, 0.33)
+        missing = mock.Mock(reason="not installed")
+        with mock.patch("xreset.eval.study.plan.backend_status", return_value=missing):
+            plan = self.plan(self.TEXT)
+        rows = fill(plan, plan.study.tables[1]).as_rows("mujoco")
+        self.assertEqual(rows[0][1:], ("tomato soup can", "potted meat can", "all of them"))
+        _, notes = write_page(plan, self.folder / "page")
+        self.assertIn("Not evaluated in mujoco on this machine: not installed", notes)
+
     def test_results_of_other_episodes_do_not_count(self):
         self.write("ik", 0.33, 0.33, 0.33, 0.33)
         for changes, left in (
@@ -501,6 +511,11 @@ class WholeTest(unittest.TestCase):
             with self.subTest(message), self.assertRaisesRegex(RunError, message):
                 self.plan(change)
         self.assertEqual(latest_checkpoint(self.out / "x-reset-seed0").read_bytes(), before)
+
+    def test_other_meshes_are_refused_also_before_their_bank_is_made(self):
+        other = ("[data.", "[data.meshes]\nsynthetic_per_object = 1\nmeshes = 'meshes'\n\n[data.")
+        with self.assertRaisesRegex(RunError, "stand-ins is True there and False in the study"):
+            self.plan(other, ('data = "', 'data = "meshes" #'))
 
     def test_a_policy_that_was_brought_without_checkpoints_counts(self):
         plan = self.plan()

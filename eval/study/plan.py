@@ -99,7 +99,10 @@ class Plan:
         wanted = canonical_names(spec.objects, known) or known
         objects = [name for name in wanted if spec.unseen or name in run.objects]
         engines = [engine for engine in spec.engines if engine not in self.unavailable]
-        if not objects or not engines:
+        if not objects:
+            return
+        self.played.setdefault((run.group, key), set()).update(objects)
+        if not engines:
             return
         per_object = spec.per_object
         if per_object is None and data == run.spec.data:
@@ -108,7 +111,6 @@ class Plan:
         needs = [] if run.spec.policy else [f"train {run.folder.name}"]
         if run.spec.policy == "ik":
             needs = [self.bank(subset, run.spec.robot)]
-        self.played.setdefault((run.group, key), set()).update(objects)
         name = f"{key} {run.folder.name}"
         folder = run.folder / key
         todo = partial(eval_todo, run, folder, spec, subset, engines)

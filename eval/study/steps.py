@@ -162,6 +162,8 @@ class Run:
         for name in ("robot", "backend", "num_envs"):
             found[name] = getattr(info, name)
             wanted[name] = getattr(self.spec, name)
+        found["stand-ins"] = info.objects is None
+        wanted["stand-ins"] = self.subset.meshes is None
         found["other networks to begin with"] = info.weights is not None
         wanted["other networks to begin with"] = self.weights is not None
         if self.bank.is_file():

@@ -173,6 +173,17 @@ class FaultTest(unittest.TestCase):
         with self.assertLogs("xreset"):
             self.assertEqual(self.stopped(driver, Steady(interrupted)), "Ctrl-C was pressed.")
 
+    def test_a_clock_that_moves_when_the_driver_reads(self):
+        driver = Scripted()
+
+        def moved(time, reading):
+            driver.time = time + 0.015
+            return reading
+
+        driver.fault = moved
+        driver.wait_until = lambda moment: None  # type: ignore[method-assign]
+        self.assertIsNone(Runner(Steady(), driver).run(3).reason)
+
     def test_a_clock_that_nobody_moves(self):
         driver = Scripted()
         driver.wait_until = lambda moment: None  # type: ignore[method-assign]

@@ -93,7 +93,7 @@ class Runner:
         return self.outcome
 
     def _loop(self, end: float) -> None:
-        due = self.driver.now()
+        due = seen = self.driver.now()  # seen: when the last step ended
         still = 0.0  # time for which the clock has stood still
         while self.driver.now() < min(end, self._stopped_at.max() + self.limits.slow_down):
             if not self._tick():
@@ -107,7 +107,8 @@ class Runner:
             if late > self.limits.late:
                 self._stop_all(f"A control step took {late:.2f} s too long.")
             self.driver.wait_until(due)
-            still = still + due - now if self.driver.now() <= now else 0.0
+            still = still + due - now if self.driver.now() <= seen else 0.0
+            seen = self.driver.now()
             if still > self.limits.late:
                 self._stop_all(
                     "The driver's clock stands still. Override now() and wait_until() together."

@@ -23,7 +23,7 @@ from xreset.resets.closing import closing_states, positions_between, rotations_b
 from xreset.resets.config import ClosingConfig, SqueezeConfig
 from xreset.resets.distribution import ResetDistribution, bank_starts
 from xreset.resets.fingers import Fingers, fingers_of, squeeze_targets
-from xreset.retarget.file import Retargeted, write_retargeted
+from xreset.retarget.file import Retargeted, object_sources, write_retargeted
 from xreset.task.config import ResetConfig
 
 ROBOT = toy_grasp.robot()
@@ -310,8 +310,9 @@ class CommandTest(unittest.TestCase):
                 self.folder / "r.npz",
                 grasp_and_lift(),
                 config={},
-                inputs={"object brick": source},
+                inputs={"object brick": source, "object robot": "a toy", "robot": "openarm"},
             )
+            self.assertEqual(object_sources(self.folder / "r.npz")["robot"], "a toy")
             words = "made with other meshes of brick. Give the same --objects folder"
             self.assertEqual(self.resets()[2].count(words), told)
 

@@ -127,7 +127,8 @@ def object_sources(path: str | Path) -> dict[str, str]:
     meta = read_npz(path, SCHEMA, {}, what="retargeted trajectories").get("meta")
     try:
         inputs = json.loads(str(meta))["inputs"]
-        return {name.removeprefix("object "): source for name, source in inputs.items()}
+        objects = [name for name in inputs if name.startswith("object ")]
+        return {name.removeprefix("object "): inputs[name] for name in objects}
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return {}
 

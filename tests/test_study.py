@@ -429,6 +429,14 @@ class TablesTest(InFolder):
         _, notes = write_page(plan, self.folder / "page")
         self.assertIn("Not evaluated in mujoco on this machine: not installed", notes)
 
+    def test_results_that_no_run_plays_any_more_fill_no_table(self):
+        self.write("ours-seed0", 1.0, 1.0, 0.33, 0.33)
+        later = "[evaluations.eval-later]\nengines = ['mujoco']\n[runs.ours]\nevaluations = ['eval-later']\n"
+        plan = self.plan(self.TEXT.replace("[runs.ours]\n", later))
+        self.assertEqual(fill(plan, plan.study.tables[1]).engines, {})
+        page, _ = write_page(plan, self.folder / "page")
+        self.assertIn("Nothing is evaluated yet", page.read_text())
+
     def test_results_of_other_episodes_do_not_count(self):
         self.write("ik", 0.33, 0.33, 0.33, 0.33)
         for changes, left in (

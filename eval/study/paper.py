@@ -14,10 +14,7 @@ FILE = Path(__file__).parent / "paper.toml"
 ALL = "all"
 """In place of an object: the mean over all of them."""
 
-TRAINING = (
-    "10,000 iterations of 16 steps in 4,096 worlds"
-    " on four GPUs (Table VIII), an unstated number of seeds"
-)
+TRAINING = "10,000 iterations of 16 steps in 4,096 worlds on four GPUs (Table VIII), an unstated number of seeds"
 """How long the paper's policies were trained, in the paper's words."""
 
 Axis = Literal["object", "method", "metric"]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import chain, product
 from math import nan
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -73,25 +74,28 @@ def fill(plan: Plan, table: TableSpec) -> FilledTable:
     columns = [name for name in layout.names if name in names[layout.columns]]
     fixed = {"object": layout.object, "metric": layout.metric}
     stated = layout.figures() if table.paper else {}
-    run_of = {shown: name for name, shown in table.runs.items()}
+    run_of = {method: name for name, method in table.runs.items()}
     trainings = {name: trainings_of(plan, name, table.evaluation) for name in table.runs}
     episodes = {
         name: _episodes(found, plan.study.runs[name].alone) for name, found in trainings.items()
     }
+
+    def cell(engine: str, row: str, column: str) -> tuple[Any, ...]:
+        """Return the values of :data:`_CELL`."""
+        key = fixed | {layout.rows: row, layout.columns: column}
+        run = run_of[key["method"]]
+        wanted = objects[run] if key["object"] == ALL else {key["object"]}
+        values = estimate(_episodes_with(episodes[run], engine, wanted), key["metric"])
+        figure, text = stated.get((key["method"], key["object"], key["metric"]), (nan, ""))
+        text = estimate_text(key["metric"], *values) + text
+        return _shown(layout.rows, row), _shown(layout.columns, column), *values, figure, text
+
     engines = {}
     for engine in sorted(set().union(*(t.results for t in chain(*trainings.values())))):
-        cells = []
-        for row, column in product(rows, columns):
-            key = fixed | {layout.rows: row, layout.columns: column}
-            run = run_of[key["method"]]
-            wanted = objects[run] if key["object"] == ALL else {key["object"]}
-            values = estimate(_episodes_with(episodes[run], engine, wanted), key["metric"])
-            figure, text = stated.get((key["method"], key["object"], key["metric"]), (nan, ""))
-            shown = (_shown(layout.rows, row), _shown(layout.columns, column))
-            mean = estimate_text(key["metric"], *values)
-            cells.append((*shown, *values, figure, mean + text))
-        found = pd.DataFrame(cells, columns=_CELL)
-        engines[engine] = found.set_index(["row", "column"]).unstack(sort=False)
+        cells = [cell(engine, row, column) for row, column in product(rows, columns)]
+        if cells:  # none, if no planned run plays what the results are of
+            found = pd.DataFrame(cells, columns=_CELL)
+            engines[engine] = found.set_index(["row", "column"]).unstack(sort=False)
     return FilledTable(
         title=table.title or layout.title,
         unit="cm" if fixed["metric"] == "least_distance" else "%",

@@ -116,7 +116,7 @@ def _measure(env: ManipulationEnv, config: TrainConfig, options: Options, folder
         "",
         title=f"training: {n} worlds, {options.robot}, {options.extra['recipe']}, {config.ppo.precision}",
     )
-    simulated = trained * config.task.timestep * config.task.substeps
+    simulated = trained * backend.scene.control_dt
     faults = f"{int(env.nonfinite_count)} not finite, {int(env.overflow_count)} overflows"
     note = {
         "raw": f"{still * n:,.0f} with constant targets",

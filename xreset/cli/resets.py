@@ -10,7 +10,7 @@ import tyro
 
 from xreset.accounts import accounts_path, write_accounts
 from xreset.cli._common import Device, Objects, Several, Source, show_accounts
-from xreset.cli._terminal import Progress, console
+from xreset.cli._terminal import Progress, console, show_notes
 from xreset.files import file_hash
 from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
 
@@ -58,10 +58,8 @@ def resets(
     loaded = load_objects(sorted({*map(str, data.object_name)}), objects)
     stated = object_sources(retargeted)
     if changed := [o.name for o in loaded if stated.get(o.name, o.source) != o.source]:
-        console.print(
-            f"note: {retargeted} was made with other meshes of {', '.join(changed)}. Give the same --objects folder.",
-            style="yellow",
-        )
+        meshes = f"{retargeted} was made with other meshes of {', '.join(changed)}"
+        show_notes([f"{meshes}. Give the same --objects folder."])
     where = {"num_envs": num_envs, "device": device}
     options = {"limits": limits, "closing": closing, "squeeze": squeeze}
     title = f"states stable in {', '.join(backends)}"

@@ -107,8 +107,9 @@ class Runner:
             if late > self.limits.late:
                 self._stop_all(f"A control step took {late:.2f} s too long.")
             self.driver.wait_until(due)
-            still = still + due - now if self.driver.now() <= seen else 0.0
-            seen = self.driver.now()
+            ended = self.driver.now()
+            still = 0.0 if ended > seen else still + (due - now)
+            seen = ended
             if still > self.limits.late:
                 self._stop_all(
                     "The driver's clock stands still. Override now() and wait_until() together."

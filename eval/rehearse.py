@@ -9,28 +9,17 @@ from __future__ import annotations
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from xreset.demos.synth import synthesize
-from xreset.env import ManipulationEnv
 from xreset.errors import XResetError
-from xreset.eval.metrics import EpisodeMetrics
 from xreset.eval.pages import render
 from xreset.eval.plots import COLORS, svg
 from xreset.eval.policy_spec import PolicySpec, load_policy
 from xreset.eval.results import Episode
-from xreset.eval.rollout import (
-    Engine,
-    Trial,
-    chosen_engines,
-    episode_of,
-    in_order,
-    load_trial,
-    play_rounds,
-)
+from xreset.eval.rollout import Engine, Round, Trial, chosen_engines, load_trial, play_rounds
 from xreset.eval.sensitivity import FAULTS, SWEEPS, Property, amount, chosen, nominal_task
 from xreset.eval.stress import COSTLY, Stress, by_property, draw_curves, plot_size, sweep
 from xreset.files import claim_folder, write_json, write_whole
@@ -39,7 +28,6 @@ from xreset.live.engine import make_controller
 from xreset.live.faults import Faults, FaultyDriver
 from xreset.progress import unseen
 from xreset.runtime import OnnxActor, Runner
-from xreset.task.terminations import out_of_bounds
 
 SCHEMA = "xreset-rehearsal/1"
 
@@ -177,35 +165,24 @@ def _play(
     stopped: Counter[str],
 ) -> tuple[Episode, ...]:
     """Play every demonstration through the loop with a fault; count in ``stopped`` why the runner stopped robots."""
-    episodes: list[Episode] = []
-    with closing(play_rounds(engine, trial, repetitions)) as rounds:
-        for r in rounds:
-            env = r.env
-            controller = make_controller(env, actor)
-            metrics = EpisodeMetrics(env.reading(), env.goal_pos, env.goal_quat, r.points)
 
-            def look(
-                step: int, env: ManipulationEnv = env, metrics: EpisodeMetrics = metrics
-            ) -> None:
-                reading = env.reading()
-                table = env.backend.scene.table
-                metrics.update(
-                    reading,
-                    out_of_bounds(reading.task_state.object_pos, table, env.task.termination),
-                )
+    def play(r: Round) -> None:
+        env = r.env
+        controller = make_controller(env, actor)
+        seeds = [
+            (trial.seed, int(sequence), int(repetition))
+            for sequence, repetition in zip(r.sequence, r.repetition, strict=True)
+        ]
+        driver = FaultyDriver(
+            env, fault, seeds, lambda: r.update_metrics(env.reading()), real_time=real_time
+        )
+        outcome = Runner(controller, driver).run(env.max_episode_length * controller.dt)
+        for world in r.fresh:
+            reason = outcome.reasons[world]
+            if reason is not None:
+                stopped[re.sub(r"-?\d+\.\d+", "...", reason)] += 1
 
-            seeds = [
-                (trial.seed, int(sequence), int(repetition))
-                for sequence, repetition in zip(r.sequence, r.repetition, strict=True)
-            ]
-            driver = FaultyDriver(env, fault, seeds, look, real_time=real_time)
-            outcome = Runner(controller, driver).run(env.max_episode_length * controller.dt)
-            for world in r.fresh:
-                episodes.append(episode_of(metrics, r, world, trial.bank))
-                reason = outcome.reasons[world]
-                if reason is not None:
-                    stopped[re.sub(r"-?\d+\.\d+", "...", reason)] += 1
-    return in_order(episodes)
+    return play_rounds(engine, trial, repetitions, play)
 
 
 def judge(found: Sequence[Rehearsal]) -> tuple[str, list[str]]:

@@ -6,8 +6,8 @@ Shape letters: N worlds, J joints.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -128,28 +128,12 @@ class Trial:
         return ResetDistribution(self.bank, self.robot, self.names, self.task.reset, device, pivots)
 
     @contextmanager
-    def worlds(
-        self, engine: Engine, object_index: Tensor
-    ) -> Iterator[tuple[ManipulationEnv, MetricPoints]]:
-        """Open an environment in an engine.
-
-        Args:
-            engine: where to play.
-            object_index: [N] index of the object in each world.
-
-        Yields:
-            The environment, and the metric's points of each world's object.
-        """
+    def worlds(self, engine: Engine, object_index: Tensor) -> Iterator[ManipulationEnv]:
+        """Open an environment in an engine; object_index: [N] index of the object in each world."""
         # The scene's friction is a placeholder, because the environment sets friction itself.
         scene = make_scene(self.robot, self.objects, self.task)
         with engine.make(scene, len(object_index), object_index) as backend:
-            env = ManipulationEnv(backend, self.task, self.starts(backend.device), seed=self.seed)
-            yield (
-                env,
-                MetricPoints.of(self.objects, self.task.object_frame).to(backend.device)[
-                    backend.object_index
-                ],
-            )
+            yield ManipulationEnv(backend, self.task, self.starts(backend.device), seed=self.seed)
 
 
 def load_trial(
@@ -227,34 +211,29 @@ def roll_out(
         repetitions: episodes of each demonstration, each with another perturbation of robot and object.
         progress: called with (control steps done, control steps in all).
     """
-    episodes: list[Episode] = []
     traces: list[Trace] = []
     steps = 0
     seconds = 0.0
-    with closing(play_rounds(engine, trial, repetitions)) as rounds:
-        for r in rounds:
-            env = r.env
-            length = env.max_episode_length
-            recorder = _Recorder(env, [world for world in r.fresh if r.repetition[world] == 0])
-            policy.begin(env)
-            reading = env.reading()
-            metrics = EpisodeMetrics(reading, env.task_goal_pos, env.goal_quat, r.points)
-            recorder.look(0, reading)
-            for step in range(1, length + 1):
-                before = time.perf_counter()
-                reading, _ = env.advance(policy.act(env.get_observations()))
-                lost = out_of_bounds(
-                    reading.task_state.object_pos, env.backend.scene.table, env.task.termination
-                )
-                metrics.update(reading, lost)
-                seconds += time.perf_counter() - before
-                recorder.look(step, reading)
-                progress(r.number * length + step, r.total * length)
-            steps += length * env.num_envs
-            traces += recorder.traces(trial.names)
-            episodes += [episode_of(metrics, r, world, trial.bank) for world in r.fresh]
+
+    def play(r: Round) -> None:
+        nonlocal steps, seconds
+        env = r.env
+        length = env.max_episode_length
+        recorder = _Recorder(env, [world for world in r.fresh if r.repetition[world] == 0])
+        policy.begin(env)
+        recorder.record(0, env.reading())
+        for step in range(1, length + 1):
+            before = time.perf_counter()
+            reading, _ = env.advance(policy.act(env.get_observations()))
+            r.update_metrics(reading)
+            seconds += time.perf_counter() - before
+            recorder.record(step, reading)
+            progress(r.number * length + step, r.total * length)
+        steps += length * env.num_envs
+        traces.extend(recorder.traces())
+
     return Rollouts(
-        episodes=in_order(episodes),
+        episodes=play_rounds(engine, trial, repetitions, play),
         traces=tuple(sorted(traces, key=lambda t: t.sequence)),
         control_steps_per_second=steps / seconds,
     )
@@ -262,11 +241,11 @@ def roll_out(
 
 @dataclass(frozen=True, kw_only=True)
 class Round:
-    """Worlds that were just reset, each to play one item."""
+    """Worlds that were just reset, each to play one episode."""
 
     env: ManipulationEnv
-    points: MetricPoints
-    """The metric's points of each world's object."""
+    metrics: EpisodeMetrics
+    """Metrics of these episodes."""
     sequence: np.ndarray
     """[N] index of each world's demonstration."""
     repetition: np.ndarray
@@ -277,9 +256,24 @@ class Round:
     total: int
     """Number of rounds."""
 
+    def update_metrics(self, reading: Reading) -> None:
+        """Add the reading after a control step to the metrics."""
+        position = reading.task_state.object_pos
+        table = self.env.backend.scene.table
+        self.metrics.update(reading, out_of_bounds(position, table, self.env.task.termination))
 
-def play_rounds(engine: Engine, trial: Trial, repetitions: int) -> Generator[Round]:
-    """Open an engine, and yield as many rounds as its worlds need to play each demonstration ``repetitions`` times."""
+
+def play_rounds(
+    engine: Engine, trial: Trial, repetitions: int, play: Callable[[Round], None]
+) -> tuple[Episode, ...]:
+    """Play each demonstration ``repetitions`` times, in as many rounds as the worlds of an engine need.
+
+    Args:
+        play: plays a round, and calls :meth:`Round.update_metrics` after every control step.
+
+    Returns:
+        The episodes, in the order of the demonstrations, then of the perturbations of a start.
+    """
     bank = trial.bank
     count = len(bank.sequence_name)
     sequence = np.repeat(np.arange(count), repetitions)
@@ -287,19 +281,25 @@ def play_rounds(engine: Engine, trial: Trial, repetitions: int) -> Generator[Rou
     objects = [trial.names.index(name) for name in bank.sequence_object[sequence]]
     starts = trial.starts()
     plan = schedule(np.array(objects), trial.num_envs)
-    with trial.worlds(engine, torch.as_tensor(plan.object_index)) as (env, points):
+    episodes: list[Episode] = []
+    with trial.worlds(engine, torch.as_tensor(plan.object_index)) as env:
+        points = MetricPoints.of(trial.objects, trial.task.object_frame).to(env.device)
+        points = points[env.backend.object_index]
         for number, (items, fresh) in enumerate(plan):
             start = episode_starts(starts, sequence[items], repetition[items], trial.seed)
             env.reset(start=start.to(env.device))
-            yield Round(
+            r = Round(
                 env=env,
-                points=points,
+                metrics=EpisodeMetrics(env.reading(), env.task_goal_pos, env.goal_quat, points),
                 sequence=sequence[items],
                 repetition=repetition[items],
                 fresh=np.flatnonzero(fresh).tolist(),
                 number=number,
                 total=len(plan.rounds),
             )
+            play(r)
+            episodes += [_episode(r, world, bank) for world in r.fresh]
+    return tuple(sorted(episodes, key=lambda e: (e.sequence, e.repetition)))
 
 
 def episode_starts(
@@ -314,12 +314,12 @@ def episode_starts(
     return Reset.cat(parts)
 
 
-def episode_of(metrics: EpisodeMetrics, played: Round, world: int, bank: ResetBank) -> Episode:
-    """Return the result of one world of a round."""
+def _episode(played: Round, world: int, bank: ResetBank) -> Episode:
+    """Return the result of one world: the metrics that have the names of fields of an episode."""
     values: dict[str, Any] = {}
     for f in fields(Episode):
-        if hasattr(metrics, f.name):
-            value = getattr(metrics, f.name)[world].item()
+        if hasattr(played.metrics, f.name):
+            value = getattr(played.metrics, f.name)[world].item()
             values[f.name] = value if isinstance(value, bool) else round(value, 6)
     sequence = int(played.sequence[world])
     return Episode(
@@ -329,11 +329,6 @@ def episode_of(metrics: EpisodeMetrics, played: Round, world: int, bank: ResetBa
         repetition=int(played.repetition[world]),
         **values,
     )
-
-
-def in_order(episodes: list[Episode]) -> tuple[Episode, ...]:
-    """Return episodes in the order of the demonstrations, then of the perturbations of a start."""
-    return tuple(sorted(episodes, key=lambda e: (e.sequence, e.repetition)))
 
 
 _STATES = ("joint_pos", "object_pos", "object_quat")
@@ -351,7 +346,7 @@ class _Recorder:
         self._frames: dict[str, list[np.ndarray]] = {name: [] for name in _STATES}
         self._targets: list[np.ndarray] = []
 
-    def look(self, step: int, reading: Reading) -> None:
+    def record(self, step: int, reading: Reading) -> None:
         """Record a state every few steps, and the targets of every step."""
         if not self._worlds:
             return
@@ -366,8 +361,8 @@ class _Recorder:
         """A copy, because the environment writes the next values in place."""
         return values[self._worlds].cpu().numpy().copy()
 
-    def traces(self, names: tuple[str, ...]) -> list[Trace]:
-        """One trace of each recorded world; ``names``: of the objects."""
+    def traces(self) -> list[Trace]:
+        """One trace of each recorded world."""
         if not self._worlds:
             return []
         env = self._env
@@ -375,11 +370,12 @@ class _Recorder:
         targets = np.stack(self._targets)
         goal_pos = self._rows(env.goal_pos)
         goal_quat = self._rows(env.goal_quat)
+        objects = env.backend.scene.objects
         out = []
         for i, world in enumerate(self._worlds):
             trace = Trace(
                 sequence=int(env.sequence[world]),
-                object=names[int(env.backend.object_index[world])],
+                object=objects[int(env.backend.object_index[world])].name,
                 goal_pos=goal_pos[i],
                 goal_quat=goal_quat[i],
                 time=np.array(self._time),

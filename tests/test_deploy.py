@@ -69,10 +69,7 @@ class RuntimeTest(unittest.TestCase):
         trial = load_trial(spec, synthesize([SOUP], 1))
         zero = np.zeros(1, int)
         frames = []
-        with trial.worlds(engine("mujoco", workers=0), torch.zeros(1, dtype=torch.long)) as (
-            env,
-            _,
-        ):
+        with trial.worlds(engine("mujoco", workers=0), torch.zeros(1, dtype=torch.long)) as env:
             env.reset(start=episode_starts(trial.starts(), zero, zero, seed=0))
             policy = spec.begin(env)
             values = {

@@ -225,10 +225,7 @@ class EngineTest(unittest.TestCase):
         actions = np.random.default_rng(0).uniform(-1.2, 1.2, (STEPS, 2, len(played.robot.joints)))
         actor = Recorded(actions.astype(np.float32))
         recorded = []
-        with played.worlds(engine("mujoco", workers=0), torch.zeros(2, dtype=torch.long)) as (
-            env,
-            _,
-        ):
+        with played.worlds(engine("mujoco", workers=0), torch.zeros(2, dtype=torch.long)) as env:
             env.reset(start=start)
             for action in actor.actions:
                 seen = env.get_observations()

@@ -16,7 +16,7 @@ from tests.command import xreset
 from tests.toy_bank import SOUP
 from tests.toy_results import episodes
 from xreset.eval.rehearse import PROPERTIES, Rehearsal, judge, page
-from xreset.eval.rollout import engine
+from xreset.eval.rollout import engine, play_rounds
 from xreset.eval.stress import curve
 from xreset.files import read_json
 from xreset.live.engine import EngineDriver
@@ -37,7 +37,7 @@ class FaultyDriverTest(unittest.TestCase):
         index = torch.zeros(worlds, dtype=torch.long)
         readings = []
         targets = []
-        with self.trial.worlds(engine("mujoco", workers=0), index) as (env, _):
+        with self.trial.worlds(engine("mujoco", workers=0), index) as env:
             env.reset(start=self.trial.starts().home(index, torch.Generator().manual_seed(0)))
             env.backend.set_state(toy_grasp.start()[index])
             driver = EngineDriver(env)
@@ -110,6 +110,19 @@ class FaultyDriverTest(unittest.TestCase):
                 for a, b in zip(first, other, strict=True)
             ]
             self.assertEqual(all(equal), same)
+
+
+@unittest.skipUnless(find_spec("mujoco"), "mujoco is not installed")
+class FrameTest(unittest.TestCase):
+    def test_distances_do_not_depend_on_the_frame_of_the_object(self):
+        task = evaluation_task(TaskConfig())
+        distances = []
+        for frame in ("mesh", "center"):
+            in_frame = replace(task, object_frame=frame, reset=toy_grasp.AT_HOME)
+            trial = toy_grasp.trial(in_frame)
+            episodes = play_rounds(engine("mujoco", workers=0), trial, 1, lambda r: None)
+            distances.append(episodes[0].final_distance)
+        self.assertAlmostEqual(distances[0], distances[1], places=5)
 
 
 class VerdictTest(unittest.TestCase):

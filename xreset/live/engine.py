@@ -25,7 +25,7 @@ class EngineDriver(Driver):
     def __init__(
         self,
         env: ManipulationEnv,
-        look: Callable[[int], None] = lambda step: None,
+        look: Callable[[], None] = lambda: None,
         *,
         real_time: bool = False,
     ) -> None:
@@ -33,7 +33,7 @@ class EngineDriver(Driver):
 
         Args:
             env: the worlds.
-            look: called with (control steps done) after every control step.
+            look: called after every control step.
             real_time: whether the simulation waits for the wall clock.
         """
         self.env = env
@@ -57,7 +57,7 @@ class EngineDriver(Driver):
             due -= count
             time.sleep(max(0.0, self._begun + self.now() - time.monotonic()))
             if self._substeps % scene.substeps == 0:
-                self._look(self._substeps // scene.substeps)
+                self._look()
 
     def _advance(self, substeps: int) -> None:
         self.env.backend.set_joint_targets(self._target)

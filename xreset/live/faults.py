@@ -73,7 +73,7 @@ class FaultyDriver(EngineDriver):
         env: ManipulationEnv,
         faults: Faults,
         seeds: Sequence[Sequence[int]],
-        look: Callable[[int], None] = lambda step: None,
+        look: Callable[[], None] = lambda: None,
         *,
         real_time: bool = False,
     ) -> None:
@@ -83,7 +83,7 @@ class FaultyDriver(EngineDriver):
             env: the worlds.
             faults: faults of all worlds.
             seeds: seed of each world's draws.
-            look: called with (control steps done) after every control step.
+            look: called after every control step.
             real_time: whether the simulation waits for the wall clock.
         """
         super().__init__(env, look, real_time=real_time)

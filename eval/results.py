@@ -109,6 +109,27 @@ class Trace:
     joint_target: np.ndarray | None = None
     """[C, J] of every control step; None in files of older versions."""
 
+    def actions(self, source: str) -> tuple[np.ndarray, int]:
+        """Return the targets [C, J] of every control step, and the number of control steps from one state to the next.
+
+        Args:
+            source: what the trace was read from, for messages.
+
+        Raises:
+            FileFormatError: the trace has no targets, or fewer than states.
+        """
+        if self.joint_target is None:
+            raise FileFormatError(
+                f"{source} holds states without the actions that led to them. Evaluate again."
+            )
+        steps = len(self.joint_target)
+        every = steps // (len(self.time) - 1)
+        if every < 1:
+            raise FileFormatError(
+                f"{source} has {steps} actions for {len(self.time)} states, expected as many or more."
+            )
+        return self.joint_target, every
+
 
 @dataclass(frozen=True, kw_only=True)
 class Rollouts:
@@ -322,14 +343,13 @@ def _rates(episodes: Table) -> dict[str, Any]:
 
 def write_results(
     folder: Path, summary: EvalResult, rollouts: Rollouts, joint_names: tuple[str, ...]
-) -> Path:
-    """Write ``ENGINE.json``, ``ENGINE.episodes.json`` and ``ENGINE.trace.npz``; return the path of the first."""
+) -> None:
+    """Write ``ENGINE.json``, ``ENGINE.episodes.json`` and ``ENGINE.trace.npz``."""
     name = summary.backend
     episodes = [asdict(e) for e in rollouts.episodes]
     write_json(folder / f"{name}.episodes.json", {"schema": EPISODES_SCHEMA, "episodes": episodes})
     write_traces(folder / f"{name}.trace.npz", rollouts.traces, joint_names)
     write_json(folder / f"{name}.json", {"schema": SCHEMA} | asdict(summary))
-    return folder / f"{name}.json"
 
 
 def write_traces(

@@ -18,7 +18,7 @@ import torch
 
 from xreset.description import load_robot
 from xreset.errors import DemoError, FileFormatError
-from xreset.eval.engines.grasps import STANDARD, Grasps, closing_episode, find_grasps
+from xreset.eval.engines.grasps import Grasps, closing_episode, find_grasps
 from xreset.eval.engines.recording import Recording
 from xreset.eval.results import TRACE_SCHEMA, Trace, read_result, read_traces
 from xreset.eval.rollout import nominal_scene
@@ -144,7 +144,7 @@ def _check_episode(episode: int, count: int, found: str) -> None:
 def grasp_and_lift(robot: RobotSpec, thing: ObjectSpec, grasp: Grasps) -> Actions:
     """Return the open-loop try of one grasp: the hand, open around the object at rest, closes, lifts and shakes."""
     scene = SceneSpec(robot=robot, objects=(thing,))
-    start, targets = closing_episode(robot, grasp, scene.control_dt, STANDARD)
+    start, targets = closing_episode(scene, grasp)
     label = f"grasp and lift of {thing.name}, {grasp.label[0]}"
     return Actions(scene=scene, label=label, start=start, joint_target=targets[:, 0])
 
@@ -154,14 +154,10 @@ def recorded_actions(robot: RobotSpec, thing: ObjectSpec, trace: Trace, *, label
     evaluation.
 
     Raises:
-        FileFormatError: the trace has no actions, or its control step is no whole number of physics steps.
+        FileFormatError: the trace has too few actions, or its control step is no whole number of physics steps.
     """
-    if trace.joint_target is None:
-        raise FileFormatError(
-            "The trace holds states without the actions that led to them. Evaluate again."
-        )
-    steps_per_frame = len(trace.joint_target) // (len(trace.time) - 1)
-    dt = float(trace.time[1] - trace.time[0]) / max(1, steps_per_frame)
+    targets, every = trace.actions(label)
+    dt = float(trace.time[1] - trace.time[0]) / every
     substeps = round(dt / EVALUATION_TIMESTEP)
     if abs(substeps * EVALUATION_TIMESTEP - dt) > 1e-5:
         raise FileFormatError(
@@ -169,7 +165,7 @@ def recorded_actions(robot: RobotSpec, thing: ObjectSpec, trace: Trace, *, label
         )
     poses = (trace.joint_pos, trace.object_pos, trace.object_quat)
     first = [torch.as_tensor(pose[:1]) for pose in poses]
-    target = torch.as_tensor(trace.joint_target).float()
+    target = torch.as_tensor(targets).float()
     scene = nominal_scene(robot, (thing,), TaskConfig(substeps=substeps))
     return Actions(scene=scene, label=label, start=State.at_rest(*first), joint_target=target)
 

@@ -18,10 +18,9 @@ from torch import Tensor
 
 from xreset.eval.engines.grasps import (
     LIFT_HEIGHT,
-    STANDARD,
-    GraspMotion,
     Grasps,
     closing_episode,
+    closing_steps,
     find_grasps,
     lifting_targets,
     squeezed,
@@ -70,13 +69,13 @@ class Metric:
     """``met`` or ``missed``; a number that could not be measured does not meet the target."""
 
     @classmethod
-    def of(cls, name: str, values: Tensor, q: float | None = 0.5) -> Metric:
-        """Judge a quantile of some numbers [n], by default the median; ``q`` None: their mean."""
+    def of(cls, name: str, values: Tensor, mean: bool = False) -> Metric:
+        """Judge the median, or the mean, of some numbers [n]."""
         row = _METRICS[name]
         numbers = values.double().flatten()
         measured = math.nan
         if len(numbers):
-            measured = float(numbers.mean() if q is None else numbers.quantile(q))
+            measured = float(numbers.mean() if mean else numbers.quantile(0.5))
         met = measured <= row["target"] if row["sense"] == "at most" else measured >= row["target"]
         return cls(
             metric=name,
@@ -104,30 +103,25 @@ class CommonStates:
     """[G, ...]"""
 
 
-def try_closings(
-    tested: Engine, scene: SceneSpec, grasps: Grasps, tries: GraspMotion
-) -> tuple[Recording, Recording]:
+def try_closings(tested: Engine, scene: SceneSpec, grasps: Grasps) -> tuple[Recording, Recording]:
     """Close each hand at the scene's frictions.
 
     Returns:
         The closing around objects too heavy to move, up to the lift; and the whole try around objects at rest on the
         table.
     """
-    dt = scene.control_dt
-    start, targets = closing_episode(scene.robot, grasps, dt, tries)
+    start, targets = closing_episode(scene, grasps)
     with tested.make(scene, len(grasps), grasps.object_index) as backend:
         whole = play(backend, start, targets)
         mass = torch.tensor([thing.mass for thing in scene.objects])[grasps.object_index]
         backend.set_object_mass(PRESS_MASS * mass.to(backend.device))
         backend.set_object_gravity(torch.zeros_like(mass, device=backend.device))
-        return play(backend, start, targets[: tries.closing_steps(dt)]), whole
+        return play(backend, start, targets[: closing_steps(scene.control_dt)]), whole
 
 
-def try_holds(
-    tested: Engine, scene: SceneSpec, common: CommonStates, tries: GraspMotion
-) -> tuple[Recording, ...]:
+def try_holds(tested: Engine, scene: SceneSpec, common: CommonStates) -> tuple[Recording, ...]:
     """Lift and shake, once with each of the frictions."""
-    targets = lifting_targets(scene.robot, common.start, scene.control_dt, tries)
+    targets = lifting_targets(scene, common.start)
     recordings = []
     with tested.make(scene, len(common.object_index), common.object_index) as backend:
         for mu in FRICTIONS:
@@ -138,13 +132,7 @@ def try_holds(
 
 
 def common_states(
-    robot: RobotSpec,
-    table: Grasps,
-    air: Grasps,
-    closings: Mapping[str, Recording],
-    count: int,
-    dt: float,
-    tries: GraspMotion,
+    scene: SceneSpec, table: Grasps, air: Grasps, closings: Mapping[str, Recording], count: int
 ) -> CommonStates:
     """Return states that favor no engine: some from demonstrations in the air, the others from the closings of all
     engines in turn.
@@ -152,20 +140,18 @@ def common_states(
     A closing counts if a fingertip touches the object when the hand has closed.
 
     Args:
-        robot: the robot.
+        scene: robot and control step.
         table: grasps of the closings.
         air: grasps in the air.
         closings: whole closings, by engine.
         count: largest number of states; there are fewer where hands have closed on nothing.
-        dt: control step [s].
-        tries: how grasps are tried.
     """
     shown = air[: round(count * IN_AIR)]
-    closed = squeezed(Kinematics(robot), shown.joint_pos, tries.squeeze)
+    closed = squeezed(Kinematics(scene.robot), shown.joint_pos)
     states = [State.at_rest(shown.joint_pos, shown.object_pos, shown.object_quat, closed)]
     labels = [f"{label} as demonstrated" for label in shown.label]
     index = [shown.object_index]
-    last = tries.closing_steps(dt) - 1
+    last = closing_steps(scene.control_dt) - 1
     names = list(closings)
     for g in range(len(table)):
         first = g % len(names)
@@ -251,7 +237,6 @@ def compare(
     engines: Iterable[Engine],
     *,
     grasps: int = 48,
-    tries: GraspMotion = STANDARD,
     reference: Engine | None = None,
     progress: NamedProgress = unseen,
 ) -> Parity:
@@ -263,7 +248,6 @@ def compare(
         motion: where grasps are taken from.
         engines: the engines to measure.
         grasps: number of closings, and of holds from common states.
-        tries: how grasps are tried.
         reference: default: the backend ``mujoco``.
         progress: called with (what is being done, tries done, tries in all).
 
@@ -280,14 +264,14 @@ def compare(
     closings: dict[Engine, tuple[Recording, Recording]] = {}
     for done, e in enumerate(everyone):
         progress(f"{e.name}: closing {len(table)} hands", done, total)
-        closings[e] = try_closings(e, scene, table, tries)
+        closings[e] = try_closings(e, scene, table)
     air = find_grasps(motion, robot, objects, grasps, where="air")
     closed = {e.name: whole for e, (_, whole) in closings.items() if e is not floor}
-    common = common_states(robot, table, air, closed, grasps, scene.control_dt, tries)
+    common = common_states(scene, table, air, closed, grasps)
     holds: dict[Engine, tuple[Recording, ...]] = {}
     for done, e in enumerate(everyone, len(everyone)):
         progress(f"{e.name}: holding {len(common.label)} objects", done, total)
-        holds[e] = try_holds(e, scene, common, tries)
+        holds[e] = try_holds(e, scene, common)
     progress("", total, total)
 
     surfaces = [
@@ -373,9 +357,9 @@ def carried(recording: Recording) -> Tensor:
 def outcome_metric(name: str, found: Sequence[Recording], reference: Sequence[Recording]) -> Metric:
     """Return the share of the tries that end alike, carried or not."""
     same = [carried(a) == carried(b) for a, b in zip(found, reference, strict=True)]
-    return Metric.of(name, torch.cat(same), q=None)
+    return Metric.of(name, torch.cat(same), mean=True)
 
 
 def palm_distance(found: Recording, reference: Recording, points: Tensor) -> Tensor:
     """[G] mean distance of the surface points [G, P, 3] in the palm's frame at the end [m]."""
-    return (found.in_palm(-1, points) - reference.in_palm(-1, points)).norm(dim=-1).mean(-1)
+    return (found.in_palm(points) - reference.in_palm(points)).norm(dim=-1).mean(-1)

@@ -25,7 +25,7 @@ from xreset.geometry.rotations import quat_rotate_inverse
 from xreset.geometry.surface import Surface
 from xreset.physics import State
 from xreset.retarget.file import Retargeted
-from xreset.spec import ObjectSpec, RobotSpec, lowest_point
+from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, lowest_point
 from xreset.tensors import Tensors
 
 REST_DISTANCE = 0.010
@@ -133,7 +133,7 @@ def _at_hand(
     rows = rows[motion.object_name[motion.sequence_of_frame[rows]] == thing.name]
     if not len(rows):
         return rows
-    links = [tip.link for tip in robot.fingertips]
+    links = robot.tracked_links[1:]
     tips = Kinematics(robot).points(
         torch.as_tensor(motion.joint_pos[rows], dtype=torch.float64), links
     )
@@ -161,16 +161,6 @@ def _in_turns(motion: Retargeted, rows: np.ndarray, *, last_first: bool) -> np.n
 
 # Trying grasps --------------------------------------------------------------------------------------------------------
 
-_FINGER_STEPS = 4
-_FINGER_DAMPING = 0.02
-"""[m] Small against a finger's length, by which one radian moves its tip."""
-_ARM_ITERATIONS = 2
-_ARM_DAMPING = 0.01
-"""[m]"""
-_TURN_LENGTH = 0.3
-"""[m] Makes turning the palm comparable to moving it."""
-
-
 OPENING = 0.025
 """Distance of the fingertips at the start from where they hold, away from the opposite fingertips [m]."""
 REACH = 0.010
@@ -183,55 +173,77 @@ _FREQUENCY = 2.5
 """Frequency of the shake [Hz]; its amplitude grows from nothing and fades again."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class GraspMotion:
-    """How hard and how fast a grasp is tried. Durations in seconds."""
-
-    squeeze: float = 12.0
-    """Force [N] with which thumb and fingers press against each other if the object is there."""
-    settle: float = 0.2
-    """Time for the object to come to rest before the hand moves."""
-    close: float = 0.6
-    """Time for the fingers to close, at constant speed."""
-    hold: float = 0.4
-    """Time before and after the lift."""
-    lift: float = 0.8
-    """Time for the lift, with the least jerk."""
-    shake: float = 0.8
-    """Time for the shake along x, and again along y."""
-
-    def closing_steps(self, dt: float) -> int:
-        """Return the number of control steps of :func:`closing_episode` before the lift begins."""
-        return sum(round(seconds / dt) for seconds in (self.settle, self.close, self.hold))
+SQUEEZE = 12.0
+"""Force with which thumb and fingers press against each other if the object is there [N]."""
+SETTLE_TIME = 0.2
+"""Time for the object to come to rest before the hand moves [s]."""
+CLOSE_TIME = 0.6
+"""Time for the fingers to close, at constant speed [s]."""
+HOLD_TIME = 0.4
+"""Time before and after the lift [s]."""
+LIFT_TIME = 0.8
+"""Time for the lift, with the least jerk [s]."""
+SHAKE_TIME = 0.8
+"""Time for the shake along x, and again along y [s]."""
 
 
-STANDARD = GraspMotion()
+def closing_steps(dt: float) -> int:
+    """Return the number of control steps of :func:`closing_episode` before the lift begins; dt: control step [s]."""
+    return sum(round(seconds / dt) for seconds in (SETTLE_TIME, CLOSE_TIME, HOLD_TIME))
 
 
-def closing_episode(
-    robot: RobotSpec, grasps: Grasps, dt: float, motion: GraspMotion
-) -> tuple[State, Tensor]:
+def closing_episode(scene: SceneSpec, grasps: Grasps) -> tuple[State, Tensor]:
     """Return start [G, ...] and targets [T, G, J] of a whole try: the open hand around an object at rest closes, lifts
-    and shakes; dt: control step [s]."""
-    kinematics = Kinematics(robot)
+    and shakes."""
+    kinematics = Kinematics(scene.robot)
+    dt = scene.control_dt
     held = grasps.joint_pos
     opened = moved_fingertips(kinematics, held, -OPENING)
-    closed = squeezed(kinematics, held, motion.squeeze)
+    closed = squeezed(kinematics, held)
     parts = (
-        torch.zeros(round(motion.settle / dt)),
-        torch.linspace(0, 1, round(motion.close / dt) + 1)[1:],
-        torch.ones(round(motion.hold / dt)),
+        torch.zeros(round(SETTLE_TIME / dt)),
+        torch.linspace(0, 1, round(CLOSE_TIME / dt) + 1)[1:],
+        torch.ones(round(HOLD_TIME / dt)),
     )
     closing = opened + torch.cat(parts)[:, None, None] * (closed - opened)
-    targets = torch.cat((closing, _carried(kinematics, closed, motion, dt)))
+    targets = torch.cat((closing, _carried(kinematics, closed, dt)))
     return State.at_rest(opened, grasps.object_pos, grasps.object_quat), targets.float()
 
 
-def lifting_targets(robot: RobotSpec, start: State, dt: float, motion: GraspMotion) -> Tensor:
+def lifting_targets(scene: SceneSpec, start: State) -> Tensor:
     """[T, G, J] targets that lift and shake what the hand holds in states [G, ...], from the targets of each state."""
     targets = start.joint_target.double()
-    still = targets.expand(round(motion.hold / dt), *targets.shape)
-    return torch.cat((still, _carried(Kinematics(robot), targets, motion, dt))).float()
+    still = targets.expand(round(HOLD_TIME / scene.control_dt), *targets.shape)
+    lifted = _carried(Kinematics(scene.robot), targets, scene.control_dt)
+    return torch.cat((still, lifted)).float()
+
+
+def _carried(kinematics: Kinematics, closed: Tensor, dt: float) -> Tensor:
+    """[T, G, J] targets that lift, hold and shake the object in the closed hand [G, J]."""
+    t = torch.linspace(0, 1, round(LIFT_TIME / dt) + 1)[1:]
+    up = torch.zeros(len(t) + round(HOLD_TIME / dt), 3)
+    up[:, 2] = LIFT_HEIGHT
+    up[: len(t), 2] *= t**3 * (10 - 15 * t + 6 * t**2)
+    steps = round(SHAKE_TIME / dt)
+    t = torch.arange(1, steps + 1) / steps
+    wave = AMPLITUDE * torch.sin(math.pi * t) * torch.sin(2 * math.pi * _FREQUENCY * SHAKE_TIME * t)
+    shake = torch.zeros(2, steps, 3)
+    shake[0, :, 0] = wave
+    shake[1, :, 1] = wave
+    shake[..., 2] = LIFT_HEIGHT
+    return carried_palm(kinematics, closed, torch.cat((up, shake.flatten(0, 1))))
+
+
+# Joint positions of a hand --------------------------------------------------------------------------------------------
+
+_FINGER_STEPS = 4
+_FINGER_DAMPING = 0.02
+"""[m] Small against a finger's length, by which one radian moves its tip."""
+_ARM_ITERATIONS = 2
+_ARM_DAMPING = 0.01
+"""[m]"""
+_TURN_LENGTH = 0.3
+"""[m] Makes turning the palm comparable to moving it."""
 
 
 def moved_fingertips(kinematics: Kinematics, joint_pos: Tensor, distance: float) -> Tensor:
@@ -254,7 +266,7 @@ def moved_fingertips(kinematics: Kinematics, joint_pos: Tensor, distance: float)
     return q
 
 
-def squeezed(kinematics: Kinematics, joint_pos: Tensor, squeeze: float) -> Tensor:
+def squeezed(kinematics: Kinematics, joint_pos: Tensor) -> Tensor:
     """Return joint targets [G, J] with which the hand reaches and squeezes.
 
     Held where the reach ends, each joint's drive gives the torque J^T f of the fingertip forces f, because its target
@@ -263,7 +275,6 @@ def squeezed(kinematics: Kinematics, joint_pos: Tensor, squeeze: float) -> Tenso
     Args:
         kinematics: of the robot.
         joint_pos: [G, J] the hand as it holds the object (rad, m).
-        squeeze: force [N].
     """
     robot = kinematics.robot
     hand = torch.as_tensor(robot.hand_indices)
@@ -273,25 +284,21 @@ def squeezed(kinematics: Kinematics, joint_pos: Tensor, squeeze: float) -> Tenso
     q = moved_fingertips(kinematics, joint_pos, REACH)
     share = torch.full((len(robot.fingertips), 1), 1.0 / (len(robot.fingertips) - 1), dtype=q.dtype)
     share[0] = 1.0
-    force = (_closing_direction(kinematics, joint_pos) * share * squeeze).flatten(-2)
+    force = (_closing_direction(kinematics, joint_pos) * share * SQUEEZE).flatten(-2)
     torque = (_tip_jacobian(kinematics, q).mT @ force[..., None])[..., 0]
     return kinematics.clamp(q.index_add(-1, hand, torque / stiffness))
 
 
-def _tip_links(kinematics: Kinematics) -> list[str]:
-    return [tip.link for tip in kinematics.robot.fingertips]
-
-
 def _closing_direction(kinematics: Kinematics, q: Tensor) -> Tensor:
     """[G, E, 3] unit vectors: the thumb's from its tip to the mean of the other tips, and theirs the other way."""
-    tips = kinematics.points(q, _tip_links(kinematics))
+    tips = kinematics.points(q, kinematics.robot.tracked_links[1:])
     line = torch.nn.functional.normalize(tips[:, 1:].mean(1) - tips[:, 0], dim=-1)
     return torch.stack([line, *[-line] * (tips.shape[1] - 1)], dim=1)
 
 
 def _tip_jacobian(kinematics: Kinematics, q: Tensor) -> Tensor:
     """[G, 3 E, H] Jacobian of the fingertips' positions."""
-    linear = kinematics.jacobian(q, _tip_links(kinematics)).linear
+    linear = kinematics.jacobian(q, kinematics.robot.tracked_links[1:]).linear
     return linear[..., torch.as_tensor(kinematics.robot.hand_indices)].flatten(-3, -2)
 
 
@@ -331,21 +338,3 @@ def _least_squares(jacobian: Tensor, step: Tensor, damping: float) -> Tensor:
     """[..., J] damped joint step for a step [..., R] with the Jacobian [..., R, J]."""
     square = jacobian @ jacobian.mT + damping**2 * torch.eye(jacobian.shape[-2]).to(jacobian)
     return (jacobian.mT @ torch.linalg.solve(square, step[..., None]))[..., 0]
-
-
-def _carried(kinematics: Kinematics, closed: Tensor, motion: GraspMotion, dt: float) -> Tensor:
-    """[T, G, J] targets that lift, hold and shake the object in the closed hand [G, J]."""
-    t = torch.linspace(0, 1, round(motion.lift / dt) + 1)[1:]
-    up = torch.zeros(len(t) + round(motion.hold / dt), 3)
-    up[:, 2] = LIFT_HEIGHT
-    up[: len(t), 2] *= t**3 * (10 - 15 * t + 6 * t**2)
-    steps = round(motion.shake / dt)
-    t = torch.arange(1, steps + 1) / steps
-    wave = (
-        AMPLITUDE * torch.sin(math.pi * t) * torch.sin(2 * math.pi * _FREQUENCY * motion.shake * t)
-    )
-    shake = torch.zeros(2, steps, 3)
-    shake[0, :, 0] = wave
-    shake[1, :, 1] = wave
-    shake[..., 2] = LIFT_HEIGHT
-    return carried_palm(kinematics, closed, torch.cat((up, shake.flatten(0, 1))))

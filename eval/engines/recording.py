@@ -54,14 +54,10 @@ class Recording:
             self.joint_target[step],
         )
 
-    def in_palm(self, step: int, points: Tensor) -> Tensor:
-        """Return points [G, P, 3] of the objects' mesh frames in the palm's frame after a control step [m]."""
-        world = self.object_pos[step][:, None] + quat_rotate(
-            self.object_quat[step][:, None], points
-        )
-        return quat_rotate_inverse(
-            self.palm_quat[step][:, None], world - self.palm_pos[step][:, None]
-        )
+    def in_palm(self, points: Tensor) -> Tensor:
+        """Return where points [G, P, 3] of the objects' mesh frames are at the end, in the palm's frame [m]."""
+        world = self.object_pos[-1, :, None] + quat_rotate(self.object_quat[-1, :, None], points)
+        return quat_rotate_inverse(self.palm_quat[-1, :, None], world - self.palm_pos[-1, :, None])
 
 
 def play(backend: Backend, start: State, targets: Tensor) -> Recording:

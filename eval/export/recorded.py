@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from xreset.description import load_robot
-from xreset.errors import FileFormatError, RunError
+from xreset.errors import RunError
 from xreset.eval.report.clips import finite_states
 from xreset.eval.report.read import results_in
 from xreset.eval.results import Table, Trace, read_evaluation, read_traces, recorded
@@ -139,18 +139,9 @@ def read_recorded(
 
 def _actions(trace: Trace, file: Path) -> np.ndarray:
     """Return the action [T, J] at each state."""
-    if trace.joint_target is None:
-        raise FileFormatError(
-            f"{file} holds states without the actions that led to them. Evaluate again."
-        )
-    frames = len(trace.time)
-    steps = len(trace.joint_target)
-    every = steps // (frames - 1)
-    if every < 1:
-        raise FileFormatError(
-            f"{file} has {steps} actions for {frames} states, expected as many or more."
-        )
-    return trace.joint_target[np.minimum(np.arange(1, frames + 1) * every - 1, steps - 1)]
+    targets, every = trace.actions(str(file))
+    last = np.arange(1, len(trace.time) + 1) * every - 1
+    return targets[np.minimum(last, len(targets) - 1)]
 
 
 def _rate(interval: float) -> float:

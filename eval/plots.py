@@ -25,22 +25,13 @@ INK = "#010203"
 
 
 @contextmanager
-def picture(
-    path: Path, size: tuple[float, float], *, dpi: int = 120, **style: Any
-) -> Iterator[Figure]:
-    """Yield a figure that is written as PNG at the end of the block.
-
-    Args:
-        size: width and height [inches].
-        style: matplotlib's settings, with _ in place of the first dot.
-    """
-    with figure_style(
-        {name.replace("_", ".", 1): value for name, value in style.items()}
-    ) as figure_class:
+def picture(path: Path, size: tuple[float, float]) -> Iterator[Figure]:
+    """Yield a figure that is written as PNG at the end of the block; size: width and height [inches]."""
+    with figure_style({}) as figure_class:
         figure = figure_class(figsize=size, layout="constrained", facecolor="white")
         yield figure
         buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=dpi)
+        figure.savefig(buffer, format="png", dpi=120)
     write_whole(path, buffer.getbuffer())
 
 
@@ -71,21 +62,22 @@ def svg(draw: Callable[[Figure], None], size: tuple[float, float], salt: str) ->
 
 
 @contextmanager
-def figure_style(style: dict[str, Any]) -> Iterator[type[Figure]]:
-    """Yield matplotlib's ``Figure`` class; figures made in the block have the style of the project."""
+def figure_style(more: dict[str, Any]) -> Iterator[type[Figure]]:
+    """Yield matplotlib's ``Figure`` class; figures made in the block have the style of the project, and ``more``."""
     with needs("matplotlib", "eval"):
         import matplotlib
         from matplotlib.figure import Figure
-    base = {
+    style = {
         "font.family": "sans-serif",
         "font.sans-serif": ["DejaVu Sans"],
         "font.size": 10.5,
         "axes.spines.top": False,
         "axes.spines.right": False,
         "axes.axisbelow": True,
+        "text.parse_math": False,  # a dollar sign in a name is one
     }
-    base |= dict.fromkeys(
+    style |= dict.fromkeys(
         ("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), INK
     )
-    with matplotlib.rc_context(base | style):  # pyright: ignore[reportArgumentType]
+    with matplotlib.rc_context(style | more):  # pyright: ignore[reportArgumentType]
         yield Figure

@@ -99,12 +99,11 @@ class PolicySpec(Brief):
             device: where the engine runs: cpu or cuda.
             seed: seed of every random number.
         """
-        task = evaluation_task(self.task)
         return make_env(
             self.robot,
             objects,
             bank,
-            task,
+            evaluation_task(self.task),
             engine=engine,
             num_envs=num_envs,
             device=device,

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from xreset.demos.synth import synthesize
-from xreset.errors import XResetError
 from xreset.eval.pages import render
 from xreset.eval.plots import COLORS, svg
 from xreset.eval.policy_spec import PolicySpec, load_policy
@@ -150,9 +149,7 @@ def _setting(trial: Trial, prop: Property | None, value: float) -> tuple[Trial, 
     try:
         return replace(trial, task=task), Faults(**prop.fixed, **sizes)
     except ValueError as error:
-        raise XResetError(
-            f"{prop.option} {amount(prop.unit, value)} cannot be tried: {error}."
-        ) from None
+        raise prop.impossible(value, error) from None
 
 
 def _play(

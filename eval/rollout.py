@@ -55,8 +55,11 @@ class Engine:
     make: MakeBackend
     version: str
     device: str = "cpu"
-    slow: bool = False
-    """Whether it is too slow on its device to play many episodes."""
+
+    @property
+    def slow(self) -> bool:
+        """Whether it is too slow on its device to play many episodes."""
+        return self.name in SLOW_ON_CPU and self.device == "cpu"
 
 
 def engine(name: str, *, device: str = "cpu", **options: Any) -> Engine:
@@ -78,13 +81,7 @@ def engine(name: str, *, device: str = "cpu", **options: Any) -> Engine:
             name, scene, num_worlds, object_index=object_index, device=used, **options
         )
 
-    return Engine(
-        name=name,
-        make=make,
-        version=version,
-        device=used,
-        slow=name in SLOW_ON_CPU and used == "cpu",
-    )
+    return Engine(name=name, make=make, version=version, device=used)
 
 
 def chosen_engines(engines: str | Iterable[str | Engine], device: str) -> list[Engine]:
@@ -340,9 +337,7 @@ class _Recorder:
     def __init__(self, env: ManipulationEnv, worlds: list[int]) -> None:
         self._env = env
         self._worlds = worlds
-        self._dt = env.backend.scene.control_dt
-        self._every = max(1, round(TRACE_INTERVAL / self._dt))
-        self._time: list[float] = []
+        self._every = max(1, round(TRACE_INTERVAL / env.backend.scene.control_dt))
         self._frames: dict[str, list[np.ndarray]] = {name: [] for name in _STATES}
         self._targets: list[np.ndarray] = []
 
@@ -351,7 +346,6 @@ class _Recorder:
         if not self._worlds:
             return
         if step % self._every == 0:
-            self._time.append(step * self._dt)
             for name, frames in self._frames.items():
                 frames.append(self._rows(getattr(reading.state, name)))
         if step:
@@ -370,17 +364,18 @@ class _Recorder:
         targets = np.stack(self._targets)
         goal_pos = self._rows(env.goal_pos)
         goal_quat = self._rows(env.goal_quat)
-        objects = env.backend.scene.objects
-        out = []
+        scene = env.backend.scene
+        steps = self._every * np.arange(len(frames["joint_pos"]))
+        traces = []
         for i, world in enumerate(self._worlds):
             trace = Trace(
                 sequence=int(env.sequence[world]),
-                object=objects[int(env.backend.object_index[world])].name,
+                object=scene.objects[int(env.backend.object_index[world])].name,
                 goal_pos=goal_pos[i],
                 goal_quat=goal_quat[i],
-                time=np.array(self._time),
+                time=steps * scene.control_dt,
                 joint_target=targets[:, i],
                 **{name: values[:, i] for name, values in frames.items()},
             )
-            out.append(trace)
-        return out
+            traces.append(trace)
+        return traces

@@ -97,17 +97,18 @@ class Property:
         Raises:
             XResetError: the property cannot have the value.
         """
+        drawn = value
         if self.unit == "ms":
-            value /= 1000 * task.timestep * task.substeps  # the task counts control steps
+            drawn /= 1000 * task.timestep * task.substeps  # the task counts control steps
         try:
-            return replace(
-                task,
-                randomization=replace(task.randomization, **{self.changed_field: (value, value)}),
-            )
+            changed = replace(task.randomization, **{self.changed_field: (drawn, drawn)})
+            return replace(task, randomization=changed)
         except ValueError as error:
-            raise XResetError(
-                f"{self.option} {amount(self.unit, value)} cannot be tried: {error}."
-            ) from None
+            raise self.impossible(value, error) from None
+
+    def impossible(self, value: float, error: ValueError) -> XResetError:
+        """Return the error that the property cannot have a value."""
+        return XResetError(f"{self.option} {amount(self.unit, value)} cannot be tried: {error}.")
 
 
 def amount(unit: str, value: float) -> str:

@@ -245,10 +245,10 @@ def _limit(outwards: Sequence[Point]) -> float | None:
 
 def write_plot(path: Path, found: Sequence[Stress], title: str) -> None:
     """Draw task progress against each property, a line for each engine, as a picture."""
-    with picture(path, plot_size(found), dpi=110, font_size=9) as figure:
+    with picture(path, plot_size(found)) as figure:
         draw_curves(figure, found)
         note = "(shaded: difference to the nominal value, 95 %; dashed: ten points less)"
-        figure.suptitle(f"{title}\n{note}", fontsize="medium", fontweight="bold")
+        figure.suptitle(f"{title}\n{note}", fontsize="small", fontweight="bold")
 
 
 def by_property(found: Sequence[Stress]) -> dict[str, list[Curve | None]]:

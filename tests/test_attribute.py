@@ -13,8 +13,15 @@ from tests import toy_grasp
 from tests.command import xreset
 from tests.toy_results import episodes
 from xreset.errors import XResetError
-from xreset.eval.engines.attribution import Attribution, Row, attribute, change_towards
-from xreset.eval.engines.attribution_view import not_tried, rich_table, verdict
+from xreset.eval.engines.attribution import (
+    Attribution,
+    Row,
+    attribute,
+    change_towards,
+    not_tried,
+    rich_table,
+    verdict,
+)
 from xreset.eval.engines.measure import Measured, measure
 from xreset.eval.rollout import Engine, engine
 from xreset.eval.sensitivity import COMPARED, Effect, nominal_task

@@ -26,8 +26,15 @@ from xreset.eval.engines.actions import (
     write_actions,
 )
 from xreset.eval.engines.recording import Recording
-from xreset.eval.engines.replay import THRESHOLDS, Divergence, TraceResult, compared, trace
-from xreset.eval.engines.trace_view import rich_table, sentences
+from xreset.eval.engines.replay import (
+    THRESHOLDS,
+    Divergence,
+    TraceResult,
+    compared,
+    rich_table,
+    sentences,
+    trace,
+)
 from xreset.eval.results import write_results
 from xreset.eval.rollout import engine, roll_out
 from xreset.eval.setting import Place

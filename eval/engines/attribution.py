@@ -1,4 +1,5 @@
-"""The experiment: a policy in engine A, in A with one property of B at a time, with all of these at once, and in B.
+"""What a policy's score owes to differences of engines: the policy plays in engine A, in A with one property of B at a
+time, with all of these at once, and in B.
 
 Every run plays the same episodes from the same starts, so runs are compared episode by episode.
 """
@@ -6,12 +7,13 @@ Every run plays the same episodes from the same starts, so runs are compared epi
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
 
 import numpy as np
+from rich.table import Table
 
 from xreset.errors import XResetError
 from xreset.eval.engines.measure import Measured, measure
@@ -19,6 +21,7 @@ from xreset.eval.policy_spec import PolicySpec
 from xreset.eval.results import Episode
 from xreset.eval.rollout import Engine, Trial, nominal_scene, roll_out
 from xreset.eval.sensitivity import COMPARED, Effect, Property, nominal_task
+from xreset.eval.table import success_text
 from xreset.plugins import backend_class
 from xreset.progress import NamedProgress, unseen
 from xreset.task.config import TaskConfig
@@ -73,6 +76,11 @@ class Attribution:
         """The difference between B and A."""
         return self.rows[-1].effect
 
+    def measured(self, name: str) -> tuple[float, float]:
+        """Return what was measured of a property in A and in B; NaN where that was impossible."""
+        field = COMPARED[name].measured
+        return getattr(self.measured_a, field), getattr(self.measured_b, field)
+
     def share(self, row: Row) -> float:
         """Return the share of the gap that a run brings about; NaN where A and B do not differ for sure."""
         return row.effect.difference / self.gap.difference if self.gap.is_certain else math.nan
@@ -89,8 +97,8 @@ class Attribution:
     def as_dict(self) -> dict[str, Any]:
         """Return JSON-able content."""
         properties = []
-        for name, prop in COMPARED.items():
-            a, b = [_number(getattr(m, prop.measured)) for m in (self.measured_a, self.measured_b)]
+        for name in COMPARED:
+            a, b = map(_number, self.measured(name))
             properties.append({"name": name, "a": a, "b": b, "not_tried": self.skipped.get(name)})
         costly = self.costs()
         return {
@@ -237,3 +245,77 @@ def change_towards(
     if other < 0:
         return "less than half of the object's own coefficient, which no other material gives"
     return replace(task, randomization=replace(task.randomization, **{prop.changed_field: other}))
+
+
+# For a terminal -------------------------------------------------------------------------------------------------------
+
+
+def rich_table(found: Attribution, title: str) -> Table:
+    """One row for each run: change, score, and difference to A as it is. Bold: the interval leaves out zero."""
+    table = Table("", title=title, title_justify="left")
+    names = (
+        "value",
+        "task progress",
+        "grasp",
+        "reorient",
+        "published success",
+        f"against {found.a}",
+        "of gap",
+    )
+    for name in names:
+        table.add_column(name, justify="right")
+    for row in found.rows:
+        effect = row.effect
+        low, high = effect.ci95
+        least, most = effect.difference_ci95
+        share = found.share(row)
+        first = row is found.rows[0]
+        table.add_row(
+            row.name,
+            " -> ".join(_shown(row.name, found)) if row.kind == "towards" else "",
+            f"{effect.task_progress:.1%}\n{100 * low:.0f}-{100 * high:.0f}",
+            f"{row.mean('grasp'):.0%}",
+            f"{row.mean('reorient'):.0%}",
+            success_text(effect.published_success),
+            ""
+            if first
+            else f"{100 * effect.difference:+.1f}\n{100 * least:+.1f} to {100 * most:+.1f}",
+            "" if first or math.isnan(share) else f"{share:.0%}",
+            style="bold" if effect.is_certain else None,
+        )
+    return table
+
+
+def _shown(name: str, found: Attribution) -> list[str]:
+    """Return what was measured of a property in A and in B, in words."""
+    shown = COMPARED[name].shown
+    return [shown(value) if math.isfinite(value) else "unknown" for value in found.measured(name)]
+
+
+def not_tried(found: Attribution) -> Iterator[str]:
+    """Yield a line for each property that was not changed towards B: its value in both engines, and the reason."""
+    for name, reason in found.skipped.items():
+        a, b = _shown(name, found)
+        yield f"not tried: {name} ({a} in {found.a}, {b} in {found.b}): {reason}"
+
+
+def verdict(found: Attribution) -> str:
+    """Return the result in a sentence or two."""
+    low, high = found.gap.difference_ci95
+    size = f"{100 * found.gap.difference:+.1f} points of task progress ({100 * low:+.1f} to {100 * high:+.1f})"
+    if not found.gap.is_certain:
+        return (
+            f"{found.b} and {found.a} do not differ for sure: {size} over {len(found.rows[0].episodes)} episodes. "
+            "There is nothing to attribute. More episodes would show smaller differences."
+        )
+    row = found.costs()
+    if row is None:
+        return (
+            f"{found.b} differs from {found.a} by {size}, and none of the properties that could be changed explains "
+            "it."
+        )
+    best = f"{row.name!r} alone brings about {found.share(row):.0%} of it"
+    for together in found.rows:
+        if together.kind == "all":
+            best += f", {together.name} {found.share(together):.0%}"
+    return f"{found.b} differs from {found.a} by {size}; {best}."

@@ -16,7 +16,7 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from xreset.backends.conformance.harness import free_place
+from xreset.backends.conformance.harness import Worlds, free_place
 from xreset.backends.conformance.scene import shape, solid
 from xreset.errors import XResetError
 from xreset.eval.rollout import Engine
@@ -24,7 +24,7 @@ from xreset.geometry.dynamics import mass_matrix
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import hull, transformed
 from xreset.geometry.urdf import link_meshes, robot_tree
-from xreset.physics import Backend, State
+from xreset.physics import State
 from xreset.spec import GRAVITY, ObjectSpec, SceneSpec, Shape
 
 
@@ -117,7 +117,7 @@ def measure(engine: Engine, scene: SceneSpec) -> Measured:
     """
     bench = _Bench(scene)
     with engine.make(bench.scene, len(_WORLDS), torch.tensor(list(_WORLDS.values()))) as backend:
-        log = bench.run(backend)
+        log = bench.run(Worlds(backend))
     return bench.evaluate(log)
 
 
@@ -147,30 +147,28 @@ class _Bench:
         torsional = max(scene.friction.torsional, 1e-3)
         self._spin = 4.0 * torsional * _SLAB_MASS * GRAVITY / _TOP_INERTIA[2] * _TIME
 
-    def run(self, backend: Backend) -> dict[str, Tensor]:
+    def run(self, worlds: Worlds) -> dict[str, Tensor]:
         """Play all experiments; returns the worlds' states [T, N, ...] after each physics step, the start first."""
         start = self._start()
         grounded = [index in (_SLAB, _TOP) for index in _WORLDS.values()]
-        backend.set_object_gravity(torch.tensor(grounded).float().to(backend.device))
-        backend.set_state(start.to(backend.device))
+        worlds.set_parameter("object_gravity", torch.tensor(grounded))
+        worlds.set(start)
         targets = start.joint_target.clone()
         targets[_AT["drives"]] += torch.as_tensor(self._drive_steps())
         rows = {name: [value] for name, value in vars(start).items()}
         for step in range(round(_TIME / self._dt)):
-            force = self._loads(step).to(backend.device)
-            backend.set_object_wrench(force, torch.zeros_like(force))
+            worlds.push(self._loads(step), torch.zeros(3))
             if step % self.scene.substeps == 0:
-                backend.set_joint_targets(targets.to(backend.device))
-            backend.step(1)
-            state = backend.state()
-            for name, values in rows.items():
-                values.append(getattr(state, name).cpu().clone())
+                worlds.set_targets(targets)
+            worlds.step(1)
+            for name, value in vars(worlds.state()).items():
+                rows[name].append(value)
         log = {name: torch.stack(values).double() for name, values in rows.items()}
         sound = torch.cat(list(log.values()), dim=-1).isfinite().all(-1).all(0)
         broken = [name for name, i in _AT.items() if not sound[i]]
         if broken:
             raise XResetError(
-                f"{backend.name}: the experiments {', '.join(broken)} are not finite, so nothing can be measured."
+                f"{worlds.backend.name}: the experiments {', '.join(broken)} are not finite. Nothing can be measured."
             )
         return log
 

@@ -140,7 +140,7 @@ def write_picture(path: Path, groups: Groups, tags: Sequence[str], found: Table,
     if not found.empty:
         heights.append(_PANEL)
     size = (_WIDTH, sum(heights) + 0.1 + 0.25 * ceil(len(order) / 3))
-    with picture(path, size, text_parse_math=False) as figure:
+    with picture(path, size) as figure:
         parts = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
         if tags:
             panels = parts[0].subplots(rows, min(len(tags), 2), squeeze=False).flat

@@ -176,7 +176,7 @@ def draw(path: Path, table: FilledTable) -> None:
     count = len(table.engines)
     rows = max(len(own) for own in table.engines.values())
     size = (max(7.0, 1.1 * rows + 2), 2.6 * count + 0.4)
-    with picture(path, size, text_parse_math=False) as figure:
+    with picture(path, size) as figure:
         panels = figure.subplots(count, 1, squeeze=False)[:, 0]
         for ax, (engine, own) in zip(panels, table.engines.items(), strict=True):
             draw_bars(ax, own["mean"], own["low"], own["high"])

@@ -260,7 +260,7 @@ def trace(
         out: Folder for trace.json, and actions.npz: the actions, and what every engine did.
     """
     from xreset.eval import rollout
-    from xreset.eval.engines import actions, replay, trace_view
+    from xreset.eval.engines import actions, replay
 
     base = rollout.engine(reference, device=place.device)
     names = [name for name in dict.fromkeys(backend) or usable_engines() if name != reference]
@@ -279,8 +279,8 @@ def trace(
         replays = {e.engine.name: e.recording for e in (result.reference, *result.engines)}
         actions.write_actions(out / "actions.npz", played, replays)
         write_json(out / "trace.json", result.as_dict())
-    console.print(trace_view.rich_table(result))
-    for sentence in trace_view.sentences(result):
+    console.print(replay.rich_table(result))
+    for sentence in replay.sentences(result):
         console.print(sentence)
     console.print(f"results in {out}")
 
@@ -313,7 +313,7 @@ def attribute(
         out: Folder for attribution.json; default: attribute/ next to the policy's results.
     """
     from xreset.eval import policy_spec, rollout
-    from xreset.eval.engines import attribution, attribution_view
+    from xreset.eval.engines import attribution
 
     if backend == towards:
         raise XResetError(f"--backend and --towards are both {backend!r}. Choose two engines.")
@@ -341,10 +341,10 @@ def attribute(
         "inputs": played.inputs,
     }
     write_json(out / "attribution.json", content)
-    console.print(attribution_view.rich_table(found, title))
-    for line in attribution_view.not_tried(found):
+    console.print(attribution.rich_table(found, title))
+    for line in attribution.not_tried(found):
         console.print(line, style="dim")
-    console.print(attribution_view.verdict(found))
+    console.print(attribution.verdict(found))
     console.print(f"results in {out}")
 
 

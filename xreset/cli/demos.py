@@ -316,21 +316,17 @@ def _print_summary(demos: Demos, path: Path) -> None:
         height = own.object_pos[:, 2]
         lift = np.median(np.maximum.reduceat(height, first) - height[first])
         distance, angle = map(np.median, start_to_goal(own))
-        counts = (
+        row = (
+            name,
             f"{right}",
             f"{len(own) - right}",
             f"{own.num_frames}",
             f"{own.hand_valid.mean():.0%}",
+            f"{100 * lift:.1f}",
+            f"{100 * distance:.1f}",
+            f"{np.degrees(angle):.0f}",
         )
-        table.append(
-            (
-                name,
-                *counts,
-                f"{100 * lift:.1f}",
-                f"{100 * distance:.1f}",
-                f"{np.degrees(angle):.0f}",
-            )
-        )
+        table.append(row)
     show_table(
         table,
         caption="right, left: sequences. hand: frames with a hand. lift, goal: medians, from the start",

@@ -37,7 +37,7 @@ from xreset.text import Brief, shown
 SCHEMA_NAME = "xreset-demos/1"
 SIDES = ("right", "left")
 
-CALIBRATION_ERROR = 0.020
+_ON_TABLE = 0.020
 """Largest height above the table at which an object counts as standing on it [m]. In 270 sequences of DexYCB all but
 one are within 12 mm; that one is 44 mm up."""
 _HAND = 0.5
@@ -351,7 +351,7 @@ def _turned(R: np.ndarray, quats: np.ndarray) -> np.ndarray:
     return turned.as_quat(scalar_first=True).astype(quats.dtype)
 
 
-def start_height(demos: Demos, objects: Mapping[str, ObjectSpec]) -> np.ndarray:
+def _start_height(demos: Demos, objects: Mapping[str, ObjectSpec]) -> np.ndarray:
     """[S] height of the object's lowest vertex in each sequence's first frame [m]."""
     heights = []
     for name, pos, quat in zip(demos.object_name.tolist(), *demos.start_pose, strict=True):
@@ -361,7 +361,7 @@ def start_height(demos: Demos, objects: Mapping[str, ObjectSpec]) -> np.ndarray:
 
 def on_something(demos: Demos, objects: Mapping[str, ObjectSpec]) -> np.ndarray:
     """[S] bool: whether the object starts so high that it must stand on something else than the table."""
-    return start_height(demos, objects) > CALIBRATION_ERROR
+    return _start_height(demos, objects) > _ON_TABLE
 
 
 def grounded(demos: Demos, objects: Mapping[str, ObjectSpec]) -> Demos:
@@ -370,8 +370,8 @@ def grounded(demos: Demos, objects: Mapping[str, ObjectSpec]) -> Demos:
     A sequence whose object starts on top of something else stays where it is: its hand would else reach into the table.
     The scene does not have the thing below the object, so in physics the object first drops by that height.
     """
-    height = start_height(demos, objects)
-    height[height > CALIBRATION_ERROR] = 0.0
+    height = _start_height(demos, objects)
+    height[height > _ON_TABLE] = 0.0
     shift = np.zeros((demos.num_frames, 3))
     shift[:, 2] = -height[demos.sequence_of_frame]
     return replace(

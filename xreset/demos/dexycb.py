@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 from xreset.checks import is_rigid
 from xreset.demos.archive import SIDES, Demos, merge_demos, one_sequence
 from xreset.errors import DemoError, FileFormatError
+from xreset.geometry.shapes import transformed
 from xreset.objects.ycb import NAME_OF_ID
 from xreset.progress import Progress, unseen
 from xreset.records import Field, read_npz
@@ -95,15 +96,11 @@ def _read(folder: Path, meta: Mapping[str, Any], extrinsics: _Poses) -> Demos:
         object_name=NAME_OF_ID[meta["ycb_ids"][grasped]],
         side=meta["mano_sides"][0],
         fps=FPS,
-        keypoints=_transform(T_table_world, keypoints),
+        keypoints=transformed(keypoints, T_table_world),
         wrist=turn * Rotation.from_rotvec(pose_hand[valid, :3]) if valid.any() else None,
-        object_pos=_transform(T_table_world, pose_object[:, 4:]),
+        object_pos=transformed(pose_object[:, 4:], T_table_world),
         object_rot=turn * Rotation.from_quat(pose_object[:, :4]),
     )
-
-
-def _transform(T: np.ndarray, points: np.ndarray) -> np.ndarray:
-    return points @ T[:3, :3].T + T[:3, 3]
 
 
 def _read_joints(folder: Path, frame: int, cameras: _Poses) -> np.ndarray:
@@ -117,7 +114,7 @@ def _read_joints(folder: Path, frame: int, cameras: _Poses) -> np.ndarray:
             (joints,) = _read_npz(path, {"joint_3d": Field((1, 21, 3), "fi", within=None)})
             if (joints == -1).all():
                 return np.full((21, 3), np.nan)
-            return _transform(pose, joints[0])
+            return transformed(joints[0], pose)
     raise DemoError(
         f"{folder}: no calibrated camera ({', '.join(cameras) or 'none of meta.yml is'}) has labels_{frame:06d}.npz."
         " Unpack at least one camera's folder of this sequence completely, and DexYCB's calibration archive."

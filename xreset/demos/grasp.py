@@ -11,9 +11,7 @@ Everything is in a frame with z up and the table at z = 0; the object is its con
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -23,7 +21,6 @@ from xreset.demos import hand
 from xreset.geometry.shapes import half_spaces
 from xreset.spec import ObjectSpec
 
-T = TypeVar("T")
 TIPS = (4, 8, 12, 16, 20)
 """Keypoints of the fingertips, thumb first."""
 SKIN = 0.002
@@ -144,7 +141,7 @@ class Grasp:
     """Deepest keypoint or bone inside object or table [m]."""
 
 
-def plan_contacts(solid: Solid, azimuths: np.ndarray, side: str = "right") -> list[Contacts]:
+def plan_contacts(solid: Solid, azimuths: np.ndarray, side: str) -> list[Contacts]:
     """Return all contacts that a hand could use, best first.
 
     Args:
@@ -164,18 +161,6 @@ def plan_contacts(solid: Solid, azimuths: np.ndarray, side: str = "right") -> li
             effort = 0.0 if from_above else _TILT_COST * (_SIDE_TILTS[0] - tilt)
             found += _contacts_at(solid, centers, approach, closing, side, effort)
     return sorted(found, key=lambda contacts: contacts.cost)
-
-
-def best_of(
-    count: int, make: Callable[[], T], *, is_good: Callable[[T], bool], cost: Callable[[T], float]
-) -> T:
-    """Return the first good one of at most ``count`` random attempts, or else the one with the lowest cost."""
-    tries = []
-    for _ in range(count):
-        tries.append(make())
-        if is_good(tries[-1]):
-            break
-    return min(tries, key=cost)
 
 
 def handedness(side: str) -> float:
@@ -279,7 +264,7 @@ def _contacts_at(
     return found
 
 
-def fit_hand(solid: Solid, contacts: Contacts, side: str = "right") -> Grasp:
+def fit_hand(solid: Solid, contacts: Contacts, side: str) -> Grasp:
     """Find the hand whose fingertips are on their contacts, without a bone inside object or table."""
     fits = [_fit_from(solid, contacts, lean, side) for lean in _LEANS]
     return min(fits, key=lambda fit: fit[1])[0]

@@ -74,7 +74,7 @@ def _chain(base: np.ndarray, bones: np.ndarray) -> np.ndarray:
     return base + np.concatenate((start, np.cumsum(bones, axis=-2)), axis=-2)
 
 
-def hand_axes(direction: np.ndarray, palm: np.ndarray, side: str = "right") -> np.ndarray:
+def hand_axes(direction: np.ndarray, palm: np.ndarray, side: str) -> np.ndarray:
     """[3, 3] orientation of a hand whose fingers point along ``direction`` and whose palm faces ``palm`` (orthogonal
     unit vectors)."""
     x = -direction if side == "right" else direction

@@ -24,6 +24,7 @@ from xreset.demos import hand
 from xreset.demos.archive import SIDES, Demos, merge_demos, one_sequence
 from xreset.errors import DemoError
 from xreset.files import max_bytes
+from xreset.geometry.shapes import transformed
 from xreset.objects.catalogue import official_name
 from xreset.records import RATE, UNIT_TOLERANCE, Field, read_npz
 from xreset.text import is_plain, shown
@@ -168,8 +169,7 @@ def read_transform(path: str | Path) -> np.ndarray:
     if T.shape != (4, 4) or not is_rigid(T):
         raise DemoError(
             f"{path} holds {T.shape} numbers {shown(T.tolist())}, expected the 4x4 matrix of a rotation and a"
-            " translation,"
-            " with the last row 0 0 0 1."
+            " translation, with the last row 0 0 0 1."
         )
     return T.astype(float)
 
@@ -257,15 +257,14 @@ def _sequence(arrays: Mapping[str, np.ndarray], convention: Convention) -> Demos
     points[~valid] = np.nan
     points = points[:, ORDERS[convention.order]]
     T_table = np.eye(4) if convention.table_from_camera is None else convention.table_from_camera
-    points = points @ T_table[:3, :3].T + T_table[:3, 3]
+    points = transformed(points, T_table)
     pos, turn = _object_pose(arrays)
-    pos = scale * pos @ T_table[:3, :3].T + T_table[:3, 3]
+    pos = transformed(scale * pos, T_table)
     turn = Rotation.from_matrix(T_table[:3, :3]) * turn
     if not _START[0] <= pos[0, 2] <= _START[1]:
         raise DemoError(
             f"the object starts at z = {pos[0, 2]:.3f} m, but it must start on a table whose top is at z = 0. Are"
-            " these the"
-            " camera's coordinates (--coordinates camera --table-from-camera FILE), or is that matrix the"
+            " these the camera's coordinates (--coordinates camera --table-from-camera FILE), or is that matrix the"
             " inverse of what it should be?"
         )
     fps, (points, pos, turn) = _evenly(arrays, convention, (points, pos, turn))
@@ -314,23 +313,20 @@ def _check_hand(points: np.ndarray, convention: Convention, side: str) -> None:
     if lengths[convention.order] > _ORDER_RATIO * lengths[best]:
         raise DemoError(
             f"in the order {convention.order} the bones of the hand are {lengths[convention.order]:.2f} m long"
-            " together, in the order"
-            f" {best} {lengths[best]:.2f} m. Use --order {best}."
+            f" together, in the order {best} {lengths[best]:.2f} m. Use --order {best}."
         )
     points = points[:, order]
     bones = hand.bone_lengths(points)
     spread = np.median(bones.std(axis=0) / bones.mean(axis=0))
     if spread > _BONE_SPREAD:
         raise DemoError(
-            f"the lengths of the hand's bones change by {spread:.0%} (standard deviation) during the sequence, so"
-            " the keypoints are"
-            " not metric. MediaPipe's normalised landmarks, for example, are coordinates of the image."
+            f"the lengths of the hand's bones change by {spread:.0%} (standard deviation) during the sequence, so the"
+            " keypoints are not metric. MediaPipe's normalised landmarks, for example, are coordinates of the image."
         )
     if len(points) > 1 and np.linalg.norm(points.mean(axis=1), axis=1).max() < _CENTERED:
         raise DemoError(
-            "the keypoints are centred on the hand in every frame, like MediaPipe's world landmarks, so the"
-            " place of the hand is"
-            " unknown. Add the hand's position in the camera's or the table's frame first."
+            "the keypoints are centred on the hand in every frame, like MediaPipe's world landmarks, so the place of"
+            " the hand is unknown. Add the hand's position in the camera's or the table's frame first."
         )
     palm_normal = np.cross(points[:, 5] - points[:, 0], points[:, 17] - points[:, 0])
     if side == "left":
@@ -340,9 +336,9 @@ def _check_hand(points: np.ndarray, convention: Convention, side: str) -> None:
     curl = np.median((fingers * palm_normal[:, None]).sum(axis=-1))
     if curl < -_CURL:
         raise DemoError(
-            f"as a {side} hand its fingers bend {-1e3 * curl:.0f} mm towards the back of the hand. It is the"
-            " other hand (--side)"
-            " or the coordinates are left-handed, as Unity's are: negate one axis of keypoints and poses."
+            f"as a {side} hand its fingers bend {-1e3 * curl:.0f} mm towards the back of the hand. It is the other"
+            " hand (--side), or the coordinates are left-handed, as Unity's are: negate one axis of keypoints and"
+            " poses."
         )
 
 

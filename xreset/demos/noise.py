@@ -1,4 +1,4 @@
-"""Demonstrations as a worse hand tracker would have recorded them, to see what retargeting and training bear.
+"""Demonstrations as a worse hand tracker would have recorded them, to see what retargeting and training tolerate.
 
 The noise is the published paper's (arXiv 2609.35715, Table A5): in each demonstration the whole hand is shifted by one
 offset, and its fingers wander around their places, slower than from frame to frame. Object poses stay as they are.

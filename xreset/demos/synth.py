@@ -12,28 +12,21 @@ import zlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xreset.demos import hand
 from xreset.demos.archive import Demos, merge_demos, one_sequence
-from xreset.demos.grasp import (
-    Contacts,
-    Grasp,
-    Solid,
-    best_of,
-    fit_hand,
-    handedness,
-    plan_contacts,
-)
+from xreset.demos.grasp import Contacts, Grasp, Solid, fit_hand, handedness, plan_contacts
 from xreset.errors import DemoError
 from xreset.objects.catalogue import load_objects, object_names
 from xreset.objects.rest import rest_height, resting_orientation
 from xreset.progress import unseen
 from xreset.spec import ObjectSpec
 
+T = TypeVar("T")
 SUBJECT = "synthetic"
 WORKSPACE = ((0.42, 0.72), (0.12, 0.40))
 """Ranges of x and y in which objects start [m]."""
@@ -48,11 +41,15 @@ _REST_UP = {  # mesh directions that may point up at the start; else z
     "005_tomato_soup_can": (_Z, (1.0, 0.0, 0.0)),  # 9 of 20 lie in DexYCB
     "035_power_drill": (_Z, (0.0, 1.0, 0.0)),
 }
-_NEAR_BEST = 1.0  # plans whose cost is within this of the best are as good
-_TRIES = 12
+_NEAR_BEST = 1.0
+"""Plans whose cost is within this of the best are as good."""
 _GRASP_TRIES = 5
-_GOOD_TIP_ERROR = 0.006  # [m]
-_GOOD_PENETRATION = 0.004  # [m]
+"""Grasps that a sequence tries until one has an approach that stays clear."""
+_TRIES = 12
+"""Attempts at each grasp, and approaches to it."""
+_GOOD_TIP_ERROR = 0.006
+_GOOD_PENETRATION = 0.004
+"""[m] A grasp is good below both."""
 LIFT = (0.14, 0.41)
 """Range of heights to which objects are lifted [m]: the 5th and 95th percentile of 180 right-hand DexYCB sequences."""
 
@@ -120,16 +117,16 @@ def _sequence(
     rng: np.random.Generator,
 ) -> Demos:
     resting, plans = starts[int(rng.integers(len(starts)))]
-    timing = random_timing(fps, rng)
-    path = best_of(
+    timing = _random_timing(fps, rng)
+    path = _best_of(
         _GRASP_TRIES,
-        lambda: clear_approach(_grasp(obj, resting, plans, side, rng), timing, rng),
+        lambda: _clear_approach(_grasp(obj, resting, plans, side, rng), timing, rng),
         is_good=lambda path: path.gap > 0,
         cost=lambda path: -path.gap,
     )
     grasp = path.grasp
     solid = grasp.solid
-    object_pos, object_rot = object_path(solid.pos, solid.rotation, timing, rng)
+    object_pos, object_rot = _object_path(solid.pos, solid.rotation, timing, rng)
     # From the lift on, the hand moves with the object.
     moved = object_rot * solid.rotation.inv()
     held = (np.arange(timing.frames) >= timing.lift)[:, None]
@@ -144,7 +141,7 @@ def _sequence(
         object_name=obj.name,
         side=side,
         fps=fps,
-        keypoints=place_hand(wrist_pos, wrist_rot, path.angles, side),
+        keypoints=_placed_hand(wrist_pos, wrist_rot, path.angles, side),
         wrist=wrist_rot,
         object_pos=object_pos,
         object_rot=object_rot,
@@ -188,7 +185,7 @@ def _grasp(
         )
         return fit_hand(Solid.of(obj, place + resting.pos, yaw * resting.rotation), contacts, side)
 
-    return best_of(
+    return _best_of(
         _TRIES,
         attempt,
         is_good=lambda grasp: (
@@ -200,11 +197,23 @@ def _grasp(
     )
 
 
+def _best_of(
+    count: int, make: Callable[[], T], *, is_good: Callable[[T], bool], cost: Callable[[T], float]
+) -> T:
+    """Return the first good one of at most ``count`` random attempts, or else the one with the lowest cost."""
+    tries = []
+    for _ in range(count):
+        tries.append(make())
+        if is_good(tries[-1]):
+            break
+    return min(tries, key=cost)
+
+
 # Motion ---------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
-class Timing:
+class _Timing:
     """Events of a demonstration, as numbers of frames."""
 
     frames: int
@@ -220,7 +229,7 @@ class Timing:
 
 
 @dataclass(frozen=True, kw_only=True)
-class HandPath:
+class _HandPath:
     """A hand's motion up to the grasp, [T] frames; the grasp holds to the end."""
 
     grasp: Grasp
@@ -234,7 +243,7 @@ class HandPath:
     """Smallest distance of a keypoint to object and table until the lift [m]."""
 
 
-def random_timing(fps: float, rng: np.random.Generator) -> Timing:
+def _random_timing(fps: float, rng: np.random.Generator) -> _Timing:
     """Draw the timing of a demonstration of about 2.4 s whose object leaves the table after about 1.15 s."""
     durations = [
         rng.uniform(*span)
@@ -243,11 +252,11 @@ def random_timing(fps: float, rng: np.random.Generator) -> Timing:
     reach, close, lift, end, last = (
         round(float(seconds) * fps) for seconds in np.cumsum(durations)
     )
-    return Timing(frames=last + 1, reach=reach, close=close, lift=lift, end=end)
+    return _Timing(frames=last + 1, reach=reach, close=close, lift=lift, end=end)
 
 
-def object_path(
-    pos: np.ndarray, rest: Rotation, timing: Timing, rng: np.random.Generator
+def _object_path(
+    pos: np.ndarray, rest: Rotation, timing: _Timing, rng: np.random.Generator
 ) -> tuple[np.ndarray, Rotation]:
     """Draw the object's motion: at rest, lifted, turned, at the goal.
 
@@ -272,10 +281,10 @@ def object_path(
     return pos + rise[:, None] * (goal - pos), object_rot
 
 
-def clear_approach(grasp: Grasp, timing: Timing, rng: np.random.Generator) -> HandPath:
+def _clear_approach(grasp: Grasp, timing: _Timing, rng: np.random.Generator) -> _HandPath:
     """Return the first of some random approaches that stays clear of object and table, or else the one with the largest
     gap."""
-    return best_of(
+    return _best_of(
         _TRIES,
         lambda: _approach(grasp, timing, rng),
         is_good=lambda path: path.gap > _CLEAR,
@@ -283,14 +292,14 @@ def clear_approach(grasp: Grasp, timing: Timing, rng: np.random.Generator) -> Ha
     )
 
 
-def place_hand(pos: np.ndarray, rotation: Rotation, angles: np.ndarray, side: str) -> np.ndarray:
+def _placed_hand(pos: np.ndarray, rotation: Rotation, angles: np.ndarray, side: str) -> np.ndarray:
     """[T, 21, 3] keypoints of a hand for wrist positions [T, 3], T wrist orientations and joint angles [T, 17]."""
     return (
         np.einsum("nij,nkj->nki", rotation.as_matrix(), hand.keypoints(angles, side)) + pos[:, None]
     )
 
 
-def _approach(grasp: Grasp, timing: Timing, rng: np.random.Generator) -> HandPath:
+def _approach(grasp: Grasp, timing: _Timing, rng: np.random.Generator) -> _HandPath:
     """Move to a place before the object while the hand opens, then forward, then close: minimum-jerk motions that
     overlap."""
     frame = np.arange(timing.frames)
@@ -319,9 +328,9 @@ def _approach(grasp: Grasp, timing: Timing, rng: np.random.Generator) -> HandPat
     opening = _minimum_jerk(frame, 0.1 * timing.reach, 0.65 * timing.reach)[:, None]
     closing = _minimum_jerk(frame, 0.8 * timing.reach, timing.close)[:, None]
     angles = hand.RELAXED + opening * (opened - hand.RELAXED) + closing * (grasp.angles - opened)
-    points = place_hand(wrist_pos, wrist_rot, angles, grasp.side)[: timing.lift]
+    points = _placed_hand(wrist_pos, wrist_rot, angles, grasp.side)[: timing.lift]
     gap = min(grasp.solid.distance(points).min(), points[..., 2].min())
-    return HandPath(
+    return _HandPath(
         grasp=grasp, wrist_pos=wrist_pos, wrist_rot=wrist_rot, angles=angles, gap=float(gap)
     )
 

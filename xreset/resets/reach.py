@@ -13,7 +13,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from xreset.geometry.rotations import matrix_to_quat
-from xreset.retarget.arm.config import ArmConfig
+from xreset.retarget.arm.config import QUICK
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track
 from xreset.retarget.validity import Thresholds, classify
@@ -28,7 +28,6 @@ _LOWEST = 0.05
 """Least height of the point between the fingers [m]: nearer to the table the shape of a real grasp matters."""
 _THRESHOLDS = Thresholds(wrist_position=0.02, wrist_orientation=float(np.radians(15.0)))
 """A policy can choose its grasp, so the hand need not be exact."""
-_EFFORT = ArmConfig(restarts=4, branches=2, first_iterations=40, reseeds=0)
 
 
 class Reach:
@@ -77,16 +76,11 @@ class Reach:
 
     def _reached(self, center: np.ndarray, hand: Rotation) -> np.ndarray:
         """[N] bool: whether the arm carries the hand to N orientations with the point between its fingers at [N, 3]."""
-        count = len(center)
         center = np.column_stack((center[:, :2], np.maximum(center[:, 2], _LOWEST)))
-        zero = torch.zeros(count, 1, dtype=torch.float64)
-        targets = ArmTargets(
-            root_pos=torch.as_tensor(center - hand.apply(self._center))[:, None],
-            root_quat=matrix_to_quat(torch.as_tensor(hand.as_matrix()))[:, None],
-            hand_joints=self._hand_joints.expand(count, 1, -1),
-            annotated=torch.ones(count, 1, dtype=torch.bool),
-            hand_error=zero,
-            hand_clearance=zero,
+        targets = ArmTargets.of_poses(
+            torch.as_tensor(center - hand.apply(self._center)),
+            matrix_to_quat(torch.as_tensor(hand.as_matrix())),
+            self._hand_joints,
         )
-        _, measures = track(self._model, targets, _THRESHOLDS, _EFFORT)
+        _, measures = track(self._model, targets, _THRESHOLDS, QUICK)
         return (classify(measures, _THRESHOLDS) == 0)[:, 0].numpy()

@@ -49,46 +49,6 @@ class RetargetConfig:
     """A human keypoint nearer than this to the object's surface touches it [m]."""
 
 
-def rest_on_table(demos: Demos, objects: Sequence[ObjectSpec]) -> Demos:
-    """Return the demonstrations over a level table on which each object rests in its first frame (the paper, appendix
-    D.a).
-
-    Raises:
-        DemoError: an object of the demonstrations is not among ``objects``.
-    """
-    return grounded(levelled(demos), _by_name(demos, objects))
-
-
-def human_contacts(
-    demos: Demos, surfaces: Mapping[str, Surface], distance: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Find where human hands touch the objects.
-
-    Args:
-        demos: demonstrations over the table.
-        surfaces: surface of every object that the demonstrations name.
-        distance: a keypoint nearer to the surface than this touches it [m].
-
-    Returns:
-        Contact points [F, 21, 3] in the world, zero where there is no contact, and whether there is one [F, 21].
-    """
-    keypoints = np.where(
-        demos.hand_valid[:, None, None], demos.hand_keypoints.astype(np.float64), np.nan
-    )
-    object_pos = demos.object_pos.astype(np.float64)
-    object_quat = demos.object_quat_wxyz.astype(np.float64)
-    points = np.zeros_like(keypoints)
-    touching = np.zeros(keypoints.shape[:2], dtype=bool)
-    object_name = demos.object_name[demos.sequence_of_frame]
-    for name in np.unique(object_name).tolist():
-        rows = object_name == name
-        contacts = keypoint_contacts(
-            surfaces[name], keypoints[rows], object_pos[rows], object_quat[rows], distance
-        )
-        points[rows], touching[rows] = contacts
-    return points, touching
-
-
 def retarget_demos(
     demos: Demos,
     robot: RobotSpec,
@@ -172,29 +132,17 @@ def wrist_paths(
     demos: Demos,
     robot: RobotSpec,
     objects: Sequence[ObjectSpec],
-    config: RetargetConfig | None = None,
     *,
     progress: Progress = unseen,
 ) -> list[ArmTargets]:
     """Return the paths that hand retargeting demands of the arm, in batches. Arguments and errors as in
     :func:`retarget_demos`."""
-    hands = HandMotions(demos, robot, objects, config)
+    hands = HandMotions(demos, robot, objects)
     arm = ArmModel(robot)
     return [
         _arm_targets(hands.model, arm, targets, motion)
         for *_, targets, motion in hands.batches(progress)
     ]
-
-
-def _by_name(demos: Demos, objects: Sequence[ObjectSpec]) -> dict[str, ObjectSpec]:
-    """Return the objects that the demonstrations name, in the order of their names."""
-    given = {spec.name: spec for spec in objects}
-    needed = sorted(set(demos.object_name.tolist()))
-    if missing := [name for name in needed if name not in given]:
-        raise DemoError(
-            f"The demonstrations contain objects that were not given: {', '.join(missing)}. Given: {', '.join(given)}."
-        )
-    return {name: given[name] for name in needed}
 
 
 class HandMotions:
@@ -205,12 +153,11 @@ class HandMotions:
         demos: Demos,
         robot: RobotSpec,
         objects: Sequence[ObjectSpec],
-        config: RetargetConfig | None = None,
+        config: RetargetConfig = RetargetConfig(),
         *,
         device: str = "cpu",
     ) -> None:
         """Find the contacts; arguments and errors as of :func:`retarget_demos`."""
-        config = config or RetargetConfig()
         self.model = HandModel(robot, device=device)
         """The robot's hand."""
         self._config = config.hand
@@ -263,9 +210,7 @@ class HandMotions:
         keypoints = self._keypoints[:, hand.keypoint_indices]
         if hand.is_jaw and self._config.jaw == "analytic":
             keypoints = jaw_keypoints(hand, self._keypoints)
-        held = np.logical_and(
-            self.touching[:, _THUMB].any(axis=1), self.touching[:, _FINGERS].any(axis=1)
-        )
+        held = self.touching[:, _THUMB].any(axis=1) & self.touching[:, _FINGERS].any(axis=1)
         which = [self._objects.index(name) for name in demos.object_name[sequences].tolist()]
         return HandTargets(
             keypoints=padded(keypoints),
@@ -278,6 +223,57 @@ class HandMotions:
             object_index=torch.tensor(which),
             fields=self._fields,
         )
+
+
+def human_contacts(
+    demos: Demos, surfaces: Mapping[str, Surface], distance: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find where human hands touch the objects.
+
+    Args:
+        demos: demonstrations over the table.
+        surfaces: surface of every object that the demonstrations name.
+        distance: a keypoint nearer to the surface than this touches it [m].
+
+    Returns:
+        Contact points [F, 21, 3] in the world, zero where there is no contact, and whether there is one [F, 21].
+    """
+    keypoints = np.where(
+        demos.hand_valid[:, None, None], demos.hand_keypoints.astype(np.float64), np.nan
+    )
+    object_pos = demos.object_pos.astype(np.float64)
+    object_quat = demos.object_quat_wxyz.astype(np.float64)
+    points = np.zeros_like(keypoints)
+    touching = np.zeros(keypoints.shape[:2], dtype=bool)
+    object_name = demos.object_name[demos.sequence_of_frame]
+    for name in np.unique(object_name).tolist():
+        rows = object_name == name
+        contacts = keypoint_contacts(
+            surfaces[name], keypoints[rows], object_pos[rows], object_quat[rows], distance
+        )
+        points[rows], touching[rows] = contacts
+    return points, touching
+
+
+def rest_on_table(demos: Demos, objects: Sequence[ObjectSpec]) -> Demos:
+    """Return the demonstrations over a level table on which each object rests in its first frame (the paper, appendix
+    D.a).
+
+    Raises:
+        DemoError: an object of the demonstrations is not among ``objects``.
+    """
+    return grounded(levelled(demos), _by_name(demos, objects))
+
+
+def _by_name(demos: Demos, objects: Sequence[ObjectSpec]) -> dict[str, ObjectSpec]:
+    """Return the objects that the demonstrations name, in the order of their names."""
+    given = {spec.name: spec for spec in objects}
+    needed = sorted(set(demos.object_name.tolist()))
+    if missing := [name for name in needed if name not in given]:
+        raise DemoError(
+            f"The demonstrations contain objects that were not given: {', '.join(missing)}. Given: {', '.join(given)}."
+        )
+    return {name: given[name] for name in needed}
 
 
 def _arm_targets(

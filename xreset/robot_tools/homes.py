@@ -34,18 +34,10 @@ def hold_near(robot: RobotSpec, T_world_root: np.ndarray) -> tuple[RobotSpec, st
     model = ArmModel(robot)
     steps = torch.tensor(list(product(_STEPS, _STEPS, _STEPS)), dtype=torch.float64)
     steps = steps[steps.norm(dim=1).argsort(stable=True)]
-    count = len(steps)
     root = torch.as_tensor(T_world_root)
     hand = torch.as_tensor(robot.home[model.hand.joint_indices])
-    zero = torch.zeros(count, 1, dtype=torch.float64)
-    targets = ArmTargets(
-        root_pos=root[:3, 3] + steps[:, None],
-        root_quat=matrix_to_quat(root[:3, :3]).expand(count, 1, 4),
-        hand_joints=hand.expand(count, 1, -1),
-        annotated=torch.ones(count, 1, dtype=torch.bool),
-        hand_error=zero,
-        hand_clearance=zero,
-    )
+    quat = matrix_to_quat(root[:3, :3]).expand(len(steps), 4)
+    targets = ArmTargets.of_poses(root[:3, 3] + steps, quat, hand)
     joints, measures = track(model, targets, Thresholds())
     reached = np.flatnonzero(classify(measures, Thresholds())[:, 0] == 0)
     if not len(reached):

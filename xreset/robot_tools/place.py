@@ -21,7 +21,7 @@ from xreset.errors import RobotError
 from xreset.geometry.collision import table_clearance
 from xreset.geometry.kinematics import Kinematics
 from xreset.progress import Progress, unseen
-from xreset.retarget.arm.config import ArmConfig
+from xreset.retarget.arm.config import QUICK
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track
 from xreset.retarget.validity import Thresholds, classify
@@ -147,14 +147,13 @@ def reach(robot: RobotSpec, wrists: ArmTargets, least: int = 0) -> tuple[float, 
     thresholds = Thresholds(
         hand_error=np.inf, wrist_position=_POSITION, wrist_orientation=_ORIENTATION
     )
-    effort = ArmConfig(restarts=4, branches=2, first_iterations=40, reseeds=0)
     frames = len(wrists.annotated)
     possible = frames
     dexterity = torch.zeros(0, dtype=torch.float64)
     for part in (wrists[:_FIRST], wrists[_FIRST:]) if least else (wrists,):
         if round(200 * possible / frames) < least:
             break
-        joints, measures = track(model, part, thresholds, effort)
+        joints, measures = track(model, part, thresholds, QUICK)
         reached = (classify(measures, thresholds) == 0)[:, 0]
         possible -= int((~reached).sum())
         configurations = model.full(joints[reached, 0], part.hand_joints[reached, 0])

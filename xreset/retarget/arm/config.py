@@ -42,3 +42,7 @@ class ArmConfig(Checked):
     """Most steps for every other frame."""
     seed: NotNegative[int] = 0
     """Seed of the random starts."""
+
+
+QUICK = ArmConfig(restarts=4, branches=2, first_iterations=40, reseeds=0)
+"""Effort for single frames, of which thousands are tried: what the arm can reach."""

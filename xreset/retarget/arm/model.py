@@ -50,6 +50,20 @@ class ArmTargets(Tensors):
     hand_clearance: Tensor
     """[S, T] smallest signed distance between the hand's own shapes [m]; the arm cannot change it."""
 
+    @staticmethod
+    def of_poses(root_pos: Tensor, root_quat: Tensor, hand_joints: Tensor) -> ArmTargets:
+        """Return hand poses [S, 3], [S, 4], each a path of one frame, in which the hand has joints [J_hand]."""
+        count = len(root_pos)
+        zero = root_pos.new_zeros(count, 1)
+        return ArmTargets(
+            root_pos=root_pos[:, None],
+            root_quat=root_quat[:, None],
+            hand_joints=hand_joints.expand(count, 1, -1),
+            annotated=torch.ones(count, 1, dtype=torch.bool),
+            hand_error=zero,
+            hand_clearance=zero,
+        )
+
     def reversed(self) -> Self:
         """Return the path from the last frame to the first."""
         return self.map(lambda x: x.flip(1))
@@ -96,10 +110,7 @@ class ArmModel:
         self.upper = self.kinematics.upper[self.arm]
         in_hand = self.hand.link_names
         names = self.kinematics.link_names
-        self.carriers: tuple[str, ...] = (
-            robot.hand_root,
-            *(link for link in names if link not in in_hand),
-        )
+        self.carriers = (robot.hand_root, *(link for link in names if link not in in_hand))
         """Links whose motion the arm's joints determine: the hand root, which carries the hand, then the arm's
         links."""
         carrier_of = {link: 0 if link in in_hand else self.carriers.index(link) for link in names}
@@ -129,8 +140,7 @@ class ArmModel:
         poses = torch.eye(4, dtype=hand_joints.dtype).repeat(
             *hand_joints.shape[:-1], len(self._carrier), 1, 1
         )
-        moving = self._supported_in_hand
-        if moving:
+        if moving := self._supported_in_hand:
             poses[..., : len(moving), :, :] = self.hand.link_poses(hand_joints, moving)
         return poses
 

@@ -84,9 +84,9 @@ class HandModel:
                 f"robot {robot.name!r}: the joints below the hand root {robot.hand_root!r} are {below}, but the hand "
                 f"group is {group}. Choose the last link that the arm moves as hand_root."
             )
-        self.names: tuple[str, ...] = tuple(spec.keypoint for spec in robot.keypoints)
+        self.names = tuple(spec.keypoint for spec in robot.keypoints)
         """Human keypoint of each mapped keypoint (length P)."""
-        self.links: tuple[str, ...] = tuple(spec.link for spec in robot.keypoints)
+        self.links = tuple(spec.link for spec in robot.keypoints)
         """Link of each mapped keypoint."""
         count = len(set(self.links))
         if count < 3:

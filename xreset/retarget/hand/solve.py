@@ -37,9 +37,7 @@ _GROWTH_STEPS = 6
 
 
 def retarget_hand(
-    model: HandModel,
-    targets: HandTargets,
-    config: HandConfig | None = None,
+    model: HandModel, targets: HandTargets, config: HandConfig | None = None
 ) -> HandState:
     """Find hand motions that minimize the cost; sequences are independent of one another.
 

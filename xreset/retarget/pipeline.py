@@ -210,7 +210,9 @@ class HandMotions:
         keypoints = self._keypoints[:, hand.keypoint_indices]
         if hand.is_jaw and self._config.jaw == "analytic":
             keypoints = jaw_keypoints(hand, self._keypoints)
-        held = self.touching[:, _THUMB].any(axis=1) & self.touching[:, _FINGERS].any(axis=1)
+        held = np.logical_and(
+            self.touching[:, _THUMB].any(axis=1), self.touching[:, _FINGERS].any(axis=1)
+        )
         which = [self._objects.index(name) for name in demos.object_name[sequences].tolist()]
         return HandTargets(
             keypoints=padded(keypoints),

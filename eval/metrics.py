@@ -23,7 +23,7 @@ from xreset.geometry.rotations import quat_angle
 from xreset.objects.sampling import center, keypoints, metric_points
 from xreset.spec import ObjectSpec
 from xreset.task.reading import Reading
-from xreset.task.rewards import contact_gate, keypoint_distance, mean_distance
+from xreset.task.rewards import contact_gate, point_distances
 from xreset.tensors import Tensors
 
 STAGE_SCORES = (0.0, 0.33, 0.66, 1.0)
@@ -86,7 +86,7 @@ class EpisodeMetrics:
         self._goal_pos = goal_pos.clone()
         self._goal_quat = goal_quat.clone()
         self._start_height = start.task_state.object_pos[:, 2].clone()
-        self._start_distance = self._keypoint_distance(start)
+        self._start_distance = self._distances(start, points.keypoints).amax(dim=-1)
         self._best = self._start_distance.clone()
         far = torch.full_like(self._best, torch.inf)
         self.least_distance = far.clone()
@@ -148,27 +148,17 @@ class EpisodeMetrics:
             at_goal  # only the last reading counts; a world that ended early is not at its goal
         )
         self.reorient_once |= at_goal
-        self._best = torch.where(
-            live, torch.minimum(self._best, self._keypoint_distance(reading)), self._best
-        )
-        distance = mean_distance(
-            state.object_pos,
-            state.object_quat,
-            self._goal_pos,
-            self._goal_quat,
-            self._points.surface,
-        )
+        farthest = self._distances(reading, self._points.keypoints).amax(dim=-1)
+        self._best = torch.where(live, torch.minimum(self._best, farthest), self._best)
+        distance = self._distances(reading, self._points.surface).mean(dim=-1)
         self.final_distance = torch.where(live, distance, self.final_distance)
         self.final_position_error = torch.where(live, position_error, self.final_position_error)
         self.final_angle = torch.where(live, angle, self.final_angle)
         self.least_distance = torch.minimum(self.least_distance, self.final_distance)
 
-    def _keypoint_distance(self, reading: Reading) -> Tensor:
+    def _distances(self, reading: Reading, points: Tensor) -> Tensor:
+        """[N, P] distances of points [N, P, 3] of the objects from their places at the goal [m]."""
         state = reading.task_state
-        return keypoint_distance(
-            state.object_pos,
-            state.object_quat,
-            self._goal_pos,
-            self._goal_quat,
-            self._points.keypoints,
+        return point_distances(
+            state.object_pos, state.object_quat, self._goal_pos, self._goal_quat, points
         )

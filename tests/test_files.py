@@ -82,11 +82,11 @@ class AtomicWriteTest(InFolder):
     def test_a_file_is_replaced_whole_or_not_at_all(self):
         path = self.folder / "deep" / "er" / "a.txt"
         for text in ("first", "second"):
-            with atomic_write(path, "w") as file:
-                file.write(text)
+            with atomic_write(path) as file:
+                file.write(text.encode())
             self.assertEqual(path.read_text(), text)
-        with self.assertRaises(ZeroDivisionError), atomic_write(path, "w") as file:
-            file.write("new")
+        with self.assertRaises(ZeroDivisionError), atomic_write(path) as file:
+            file.write(b"new")
             raise ZeroDivisionError
         self.assertEqual(path.read_text(), "second")
         self.assertEqual([f.name for f in path.parent.iterdir()], ["a.txt"])

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -58,25 +58,20 @@ def accounts(
         post_contact: [N] bool
         reason: [N] text: why it is lost, empty where it is kept.
     """
-    of_phase: dict[Phase, np.ndarray] = {
-        "pre-contact": ~post_contact,
-        "post-contact": post_contact,
-        "both": np.ones(len(reason), dtype=bool),
-    }
-
-    def account(name: str, phase: Phase, chosen: np.ndarray) -> Account:
-        counts = Counter(reason[chosen].tolist())
-        kept = counts.pop("", 0)
-        return Account(object_name=name, phase=phase, kept=kept, lost=dict(counts.most_common()))
-
+    phases: dict[Phase, np.ndarray] = {"pre-contact": ~post_contact, "post-contact": post_contact}
     rows = []
-    phases: tuple[Phase, ...] = ("pre-contact", "post-contact")
     for name in np.unique(object_name).tolist():
-        for phase in phases:
-            rows.append(account(name, phase, of_phase[phase] & (object_name == name)))
-    for phase, chosen in of_phase.items():
-        rows.append(account("all", phase, chosen))
-    return rows
+        for phase, chosen in phases.items():
+            rows.append(_account(name, phase, reason[chosen & (object_name == name)]))
+    for phase, chosen in phases.items():
+        rows.append(_account("all", phase, reason[chosen]))
+    return [*rows, _account("all", "both", reason)]
+
+
+def _account(name: str, phase: Phase, reason: np.ndarray) -> Account:
+    counts = Counter(reason.tolist())
+    kept = counts.pop("", 0)
+    return Account(object_name=name, phase=phase, kept=kept, lost=dict(counts.most_common()))
 
 
 def described(lost: dict[str, int]) -> str:
@@ -91,15 +86,5 @@ def accounts_path(path: Path) -> Path:
 
 def write_accounts(path: Path, *, of: str, rows: Sequence[Account], **more: Any) -> None:
     """Write accounts as JSON: ``of`` what (such as ``frames``), and ``more`` by name."""
-    written = []
-    for row in rows:
-        written.append(
-            {
-                "object_name": row.object_name,
-                "phase": row.phase,
-                "total": row.total,
-                "kept": row.kept,
-                "lost": row.lost,
-            }
-        )
+    written = [{"total": row.total} | asdict(row) for row in rows]
     write_json(path, {"schema": SCHEMA, "of": of, "rows": written} | more)

@@ -40,8 +40,8 @@ def max_bytes() -> int:
 
 
 @contextmanager
-def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
-    """Open a temporary file that replaces ``path`` when the block ends, and is removed if the block raises.
+def atomic_write(path: str | Path) -> Iterator[IO[bytes]]:
+    """Open a temporary binary file that replaces ``path`` when the block ends, and is removed if the block raises.
 
     Raises:
         XResetError: the file cannot be written (no such folder, no permission, disk full, a device); ``path`` is then
@@ -52,7 +52,7 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
         # root could replace /dev/null by a file
         if path.exists() and not path.is_file() and not path.is_dir():
             raise XResetError(f"cannot write {path}: it is a device. Choose another place.")
-        with _temporary(path.parent, Path.touch) as temporary, open(temporary, mode) as file:
+        with _temporary(path.parent, Path.touch) as temporary, open(temporary, "wb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -239,25 +239,14 @@ def code_version() -> str:
     root = Path(__file__).parent.parent
     commit = ""
     if (root / ".git").exists():
-        command = [
-            "git",
-            "--no-optional-locks",
-            "-C",
-            str(root),
-            "describe",
-            "--always",
-            "--dirty=.dirty",
-        ]
+        command = ["git", "--no-optional-locks", "-C", str(root), "describe", "--always"]
+        command += ["--dirty=.dirty", "--abbrev=12", "--exclude=*"]
         environment = {
             name: value for name, value in os.environ.items() if not name.startswith("GIT_")
         }
         with suppress(OSError, subprocess.TimeoutExpired):
             found = subprocess.run(
-                [*command, "--abbrev=12", "--exclude=*"],
-                capture_output=True,
-                text=True,
-                timeout=20,
-                env=environment,
+                command, capture_output=True, text=True, timeout=20, env=environment
             )
             commit = found.stdout.strip()
     else:

@@ -148,8 +148,8 @@ def load_inputs(
     names = _object_names(data)
     if only:
         names = tuple(dict.fromkeys(canonical_names(only, names)))
-    if only and isinstance(data, Demos):
-        data = data.select(objects=names)
+        if isinstance(data, Demos):
+            data = data.select(objects=names)
     if isinstance(data, Demos):
         by_name = demo_objects(data, folder)
         loaded = tuple(by_name[name] for name in names)
@@ -168,7 +168,11 @@ def load_inputs(
     )
     if isinstance(data, GoalSet):
         return replace(inputs, data=checked_goals(inputs.name, data, inputs.robot, loaded))
-    _check(inputs)
+    if isinstance(data, Retargeted):
+        check_retargeted(inputs.name, data, inputs.robot)
+    if isinstance(data, ResetBank):
+        check_robot(inputs.name, "reset bank", data, inputs.robot)
+        check_objects(inputs.name, data, loaded)
     return inputs
 
 
@@ -188,13 +192,3 @@ def _object_names(data: Data) -> tuple[str, ...]:
     if isinstance(data, ResetBank):
         return data.object_names
     return tuple(sorted(set(np.asarray(data.object_name).tolist())))
-
-
-def _check(inputs: Inputs) -> None:
-    """Refuse motion and banks that were made for another robot, and banks that were made with other objects."""
-    data = inputs.data
-    if isinstance(data, Retargeted):
-        check_retargeted(inputs.name, data, inputs.robot)
-    if isinstance(data, ResetBank):
-        check_robot(inputs.name, "reset bank", data, inputs.robot)
-        check_objects(inputs.name, data, inputs.objects)

@@ -264,8 +264,7 @@ class ZeroPolicy:
 
     def act(self, observations: TensorDict) -> Tensor:
         """[N, J] zeros."""
-        flat = observations["policy"]
-        return torch.zeros(flat.shape[0], self._num_actions, device=flat.device)
+        return observations["policy"].new_zeros(len(observations), self._num_actions)
 
 
 class RandomPolicy:
@@ -282,7 +281,5 @@ class RandomPolicy:
 
     def act(self, observations: TensorDict) -> Tensor:
         """[N, J] uniform."""
-        flat = observations["policy"]
-        return (
-            2.0 * torch.rand(flat.shape[0], self._num_actions, generator=self._generator) - 1.0
-        ).to(flat.device)
+        share = torch.rand(len(observations), self._num_actions, generator=self._generator)
+        return (2.0 * share - 1.0).to(observations["policy"].device)

@@ -354,7 +354,7 @@ def read_record(
     schema_name: str,
     *,
     what: str,
-    check: Callable[[dict[str, np.ndarray]], str | None] | None = None,
+    check: Callable[[dict[str, np.ndarray]], str | None],
 ) -> T:
     """Read a dataclass of :func:`schema_of`'s kind; arguments and errors as of :func:`read_npz`."""
     arrays: dict[str, Any] = read_npz(path, schema_name, schema_of(cls), what=what, check=check)

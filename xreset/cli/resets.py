@@ -11,7 +11,6 @@ import tyro
 from xreset.accounts import accounts_path, write_accounts
 from xreset.cli._common import Device, Objects, Several, Source, show_accounts
 from xreset.cli._terminal import Progress, console, show_notes
-from xreset.files import file_hash
 from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
 
 
@@ -44,32 +43,28 @@ def resets(
         settle: Let objects come to rest (in the first engine) before episodes begin at home. Default: the recorded
             poses, as in the paper, from which one object in eight tips or rolls.
     """
-    from xreset.description import load_robot
-    from xreset.objects.catalogue import load_objects
-    from xreset.resets.bank import check_retargeted, write_bank
+    from xreset.inputs import load_inputs
+    from xreset.resets.bank import write_bank
     from xreset.resets.filter import make_bank
     from xreset.resets.settle import settle_starts
-    from xreset.retarget.file import object_sources, read_retargeted
+    from xreset.retarget.file import object_sources
 
     backends = list(dict.fromkeys(backend)) or ["mujoco"]
-    data = read_retargeted(retargeted)
-    spec = load_robot(robot or data.robot)
-    check_retargeted(retargeted, data, spec)
-    loaded = load_objects(sorted({*map(str, data.object_name)}), objects)
+    inputs = load_inputs(retargeted, robot=robot, objects=objects, accept=("motion",))
+    motion = inputs.motion()
+    scene = (inputs.robot, inputs.objects)
     stated = object_sources(retargeted)
-    if changed := [o.name for o in loaded if stated.get(o.name, o.source) != o.source]:
+    if changed := [o.name for o in inputs.objects if stated.get(o.name, o.source) != o.source]:
         meshes = f"{retargeted} was made with other meshes of {', '.join(changed)}"
         show_notes([f"{meshes}. Give the same --objects folder."])
     where = {"num_envs": num_envs, "device": device}
     options = {"limits": limits, "closing": closing, "squeeze": squeeze}
     title = f"states stable in {', '.join(backends)}"
     with Progress() as bar:
-        bank = make_bank(
-            data, spec, loaded, backends, progress=bar.count(title), **where, **options
-        )
+        bank = make_bank(motion, *scene, backends, progress=bar.count(title), **where, **options)
         if settle:
             count = bar.count("start poses come to rest")
-            bank, at_rest = settle_starts(bank, spec, loaded, backends[0], progress=count, **where)
+            bank, at_rest = settle_starts(bank, *scene, backends[0], progress=count, **where)
             moved = f"{at_rest.sum()} of {len(at_rest)} objects came to rest at the start"
             console.print(f"{moved}; the others start as recorded")
     config = {
@@ -80,19 +75,19 @@ def resets(
         "squeeze": asdict(squeeze),
         "settle": settle,
     }
-    write_bank(out, bank, config=config, inputs={"retargeted": file_hash(retargeted)})
+    write_bank(out, bank, config=config, inputs={"retargeted": str(inputs.hash)})
     accounts = bank.accounts()
     write_accounts(
         accounts_path(out), of="states tried in physics", rows=accounts, pressing=bank.num_pressing
     )
-    show_accounts(accounts, f"{spec.name}: {title}")
+    show_accounts(accounts, f"{bank.robot}: {title}")
     if squeeze.force > 0:
         console.print(
             f"{bank.num_pressing} of {int(bank.post_contact.sum())} states after contact press with {squeeze.force:g} N"
         )
     tried = bank.num_states + len(bank.rejected_reason)
     console.print(
-        f"{accounts[-1].kept / max(data.annotated.sum(), 1):.0%} of the annotated frames are kept"
+        f"{accounts[-1].kept / max(motion.annotated.sum(), 1):.0%} of the annotated frames are kept"
     )
     console.print(
         f"{bank.num_states} states of {tried} kept in {out}; counts in {accounts_path(out)}"

@@ -18,7 +18,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from xreset.demos import hand
-from xreset.geometry.shapes import half_spaces
+from xreset.geometry.shapes import half_spaces, plane_heights
 from xreset.spec import ObjectSpec
 
 TIPS = (4, 8, 12, 16, 20)
@@ -72,9 +72,8 @@ class Solid:
     def distance(self, points: np.ndarray) -> np.ndarray:
         """[...] signed distance of points [..., 3] to the surface, negative inside; outside it is a lower bound near
         edges."""
-        return np.min(
-            [(points @ plane[:, :3].T + plane[:, 3]).max(axis=-1) for plane in self.planes], axis=0
-        )
+        distances = [plane_heights(points, planes).max(axis=-1) for planes in self.planes]
+        return np.min(distances, axis=0)
 
     def crossings(
         self, origins: np.ndarray, direction: np.ndarray
@@ -93,7 +92,7 @@ class Solid:
         directions = np.broadcast_to(direction, origins.shape)
         for plane in self.planes:
             slope = directions @ plane[:, :3].T
-            height = origins @ plane[:, :3].T + plane[:, 3]
+            height = plane_heights(origins, plane)
             with np.errstate(divide="ignore", invalid="ignore"):
                 hit = -height / slope
             outside = ((np.abs(slope) < 1e-12) & (height > 0)).any(axis=1)

@@ -21,7 +21,7 @@ from torch import Tensor
 from xreset.geometry.collision import SelfCollision, bounding_ball, support_points
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.shapes import half_spaces, shape_mesh, transformed
+from xreset.geometry.shapes import half_spaces, plane_heights, shape_mesh, transformed
 from xreset.geometry.solids import link_field
 from xreset.spec import Geometry, Shape
 from xreset.tensors import Tensors
@@ -223,9 +223,9 @@ def shell_balls(geometry: Geometry, centers: np.ndarray, radius: float) -> tuple
     surface = np.unique(vertices.round(9), axis=0)
     bare = surface[np.linalg.norm(surface[:, None] - centers, axis=-1).min(axis=-1) > radius + BARE]
     for _ in range(_INWARD_STEPS):
-        beyond = np.maximum(bare @ planes[:, :3].T + planes[:, 3] + small, 0.0)
+        beyond = np.maximum(plane_heights(bare, planes) + small, 0.0)
         bare = bare - beyond.max(axis=1)[:, None] * planes[beyond.argmax(axis=1), :3]
-    inside = (bare @ planes[:, :3].T + planes[:, 3]).max(axis=1) < -0.9 * small
+    inside = plane_heights(bare, planes).max(axis=1) < -0.9 * small
     bare = np.unique(bare[inside].round(6), axis=0)
     return bare[_apart(bare, np.zeros(len(bare)), small)], small
 

@@ -84,7 +84,7 @@ def hull(points: np.ndarray, tolerance: float = 0.0) -> Shape:
         ) from error
     index = np.full(len(points), -1)
     index[convex.vertices] = np.arange(len(convex.vertices))
-    normals = _triangle_normals(points[convex.simplices])
+    normals = triangle_normals(points[convex.simplices])
     # qhull's triangles have no consistent winding
     inward = (normals * convex.equations[:, :3]).sum(axis=1) < 0
     faces = convex.simplices.copy()
@@ -108,7 +108,7 @@ def _outermost(points: np.ndarray, tolerance: float) -> np.ndarray:
     chosen = np.unique((points @ directions.T).argmax(axis=0))
     while True:
         planes = ConvexHull(points[chosen]).equations
-        beyond = points @ planes[:, :3].T + planes[:, 3]
+        beyond = plane_heights(points, planes)
         farthest = beyond.argmax(axis=0)
         worst = beyond.max(axis=0)
         missing = np.unique(farthest[worst > max(tolerance, worst.max() / 2)])
@@ -249,6 +249,11 @@ def half_spaces(shape: Shape) -> np.ndarray:
     return np.unique(ConvexHull(vertices).equations.round(9), axis=0)
 
 
+def plane_heights(points: np.ndarray, planes: np.ndarray) -> np.ndarray:
+    """[..., P] heights of points [..., 3] above planes [P, 4] of :func:`half_spaces`, negative inside."""
+    return points @ planes[:, :3].T + planes[:, 3]
+
+
 def mass_properties(
     vertices: np.ndarray, faces: np.ndarray, mass: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -270,7 +275,7 @@ def shell_properties(
     The second moment of a triangle, the mean of x x^T, is (the sum over its corners + that of the corners' sum) / 12.
     """
     corners = vertices[faces]
-    area = np.linalg.norm(_triangle_normals(corners), axis=1)
+    area = np.linalg.norm(triangle_normals(corners), axis=1)
     weight = mass * area / area.sum()
     com = np.einsum("f,fi->i", weight, corners.mean(axis=1)) / mass
     local = corners - com
@@ -282,6 +287,6 @@ def shell_properties(
     return com, np.trace(second) * np.eye(3) - second
 
 
-def _triangle_normals(corners: np.ndarray) -> np.ndarray:
+def triangle_normals(corners: np.ndarray) -> np.ndarray:
     """[F, 3] normals of triangles [F, 3, 3], twice as long as the area."""
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

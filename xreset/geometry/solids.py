@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from xreset.geometry.collision import support_points
 from xreset.geometry.fields import DistanceFields
-from xreset.geometry.shapes import half_spaces, shape_mesh
+from xreset.geometry.shapes import half_spaces, plane_heights, shape_mesh
 from xreset.spec import Shape
 
 GAP = 0.02
@@ -80,7 +80,7 @@ def _distance_from_hull(shape: Shape, points: np.ndarray) -> np.ndarray:
     mesh = shape_mesh(shape)
     parts = []
     for part in np.array_split(points, len(points) * len(planes) // _ENTRIES + 1):
-        parts.append((part @ planes[:, :3].T + planes[:, 3]).max(axis=1))
+        parts.append(plane_heights(part, planes).max(axis=1))
     distance = np.concatenate(parts)  # exact inside, and where a face is nearest
     outside = distance > _SAMPLES / 2
     vertices = subdivide_to_size(mesh.vertices, mesh.faces, _SAMPLES)[0]

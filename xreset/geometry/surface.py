@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from xreset.geometry.fields import DistanceFields
-from xreset.geometry.shapes import half_spaces, surface_of
+from xreset.geometry.shapes import half_spaces, plane_heights, surface_of
 from xreset.spec import ObjectSpec, Shape
 
 _SAMPLE_SPACING = 0.003
@@ -115,9 +115,8 @@ def _nodes_inside(pieces: Sequence[Shape], nodes: np.ndarray) -> np.ndarray:
             .all(axis=1)
             .nonzero()[0]
         )
-        planes = half_spaces(piece)
-        height = shifted[in_box] @ planes[:, :3].T + planes[:, 3]
-        inside[in_box[(height <= 0).all(axis=1)]] = True
+        heights = plane_heights(shifted[in_box], half_spaces(piece))
+        inside[in_box[(heights <= 0).all(axis=1)]] = True
     return inside.reshape(nodes.shape[:3])
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -316,9 +316,7 @@ def _run(
             stack.enter_context(claim_folder(out))
             stack.enter_context(claim_folder(out / "checkpoints"))
         try:
-            runner = stack.enter_context(
-                _runner(processes, out, info, inputs, resumed=resumed, wandb=wandb)
-            )
+            runner = _runner(stack, processes, out, info, inputs, resumed=resumed, wandb=wandb)
             runner.learn(info.config.iterations, seconds=60 * minutes)
         except (MemoryError, RuntimeError) as error:
             if isinstance(error, RuntimeError) and not _NO_MEMORY.search(str(error)):
@@ -341,8 +339,8 @@ def _run(
             )
 
 
-@contextmanager
 def _runner(
+    stack: ExitStack,
     processes: Processes,
     out: Path,
     info: RunInfo,
@@ -350,9 +348,9 @@ def _runner(
     *,
     resumed: bool,
     wandb: str | None,
-) -> Iterator[TrainingRunner]:
-    """Yield a run's runner, which has read the checkpoint that it continues from, or the networks that it begins
-    with."""
+) -> TrainingRunner:
+    """Return a run's runner, which has read the checkpoint that it continues from, or the networks that it begins with;
+    the stack closes its worlds."""
     device = processes.device(info.device)
     begin = latest_checkpoint(out) if resumed and checkpoints(out) else None
     # a run that continues draws other numbers than it began with
@@ -360,29 +358,35 @@ def _runner(
     if device.startswith("cuda:"):
         torch.cuda.set_device(device)
     torch.manual_seed(seed)
-    scene = (inputs.robot, inputs.objects, inputs.bank)
-    task = info.config.task
-    with make_env(
-        *scene, task, engine=info.backend, num_envs=info.num_envs, device=device, seed=seed
-    ) as env:
-        if env.vision is not None:
-            env.vision.check_sees_objects()
-        teacher = out / TEACHER if info.teacher else None
-        runner = TrainingRunner(env, info.config, out, teacher=teacher, wandb=wandb)
-        if begin is not None:
-            runner.load_checkpoint(begin)
-        elif info.weights is not None:
-            runner.load_networks(Path(info.weights))
-        if processes.is_main:
-            # before the first checkpoint a killed run leaves nothing worth keeping; files without a run are of others
-            if begin is None and (out / "run.json").is_file():
-                for events in out.glob("events.out.tfevents.*"):
-                    events.unlink()
-            write_run(out, info)
-            if resumed:
-                done = f"continuing after iteration {runner.iteration}"
-                print(
-                    done if begin else "there is no checkpoint yet: starting from the beginning",
-                    flush=True,
-                )
-        yield runner
+    env = make_env(
+        inputs.robot,
+        inputs.objects,
+        inputs.bank,
+        info.config.task,
+        engine=info.backend,
+        num_envs=info.num_envs,
+        device=device,
+        seed=seed,
+    )
+    stack.enter_context(env)
+    if env.vision is not None:
+        env.vision.check_sees_objects()
+    teacher = out / TEACHER if info.teacher else None
+    runner = TrainingRunner(env, info.config, out, teacher=teacher, wandb=wandb)
+    if begin is not None:
+        runner.load_checkpoint(begin)
+    elif info.weights is not None:
+        runner.load_networks(Path(info.weights))
+    if processes.is_main:
+        # before the first checkpoint a killed run leaves nothing worth keeping; files without a run are of others
+        if begin is None and (out / "run.json").is_file():
+            for events in out.glob("events.out.tfevents.*"):
+                events.unlink()
+        write_run(out, info)
+        if resumed:
+            done = f"continuing after iteration {runner.iteration}"
+            print(
+                done if begin else "there is no checkpoint yet: starting from the beginning",
+                flush=True,
+            )
+    return runner

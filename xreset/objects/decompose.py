@@ -18,7 +18,14 @@ import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
 
 from xreset.errors import ObjectError, needs
-from xreset.geometry.shapes import half_spaces, hull, mass_properties, shape_mesh
+from xreset.geometry.shapes import (
+    half_spaces,
+    hull,
+    mass_properties,
+    plane_heights,
+    shape_mesh,
+    triangle_normals,
+)
 from xreset.objects.sampling import sample_surface
 from xreset.spec import Shape
 
@@ -213,16 +220,10 @@ def _capped(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     for loop, edges in openings(mesh):
         center = mesh.vertices[loop].mean(axis=0)
         a, b = edges.T
-        area = (
-            np.linalg.norm(
-                np.cross(mesh.vertices[a] - center, mesh.vertices[b] - center), axis=1
-            ).sum()
-            / 2
-        )
-        if area <= _SMALL_HOLE * mesh.area:
-            faces.append(
-                np.column_stack((b, a, np.full(len(a), len(mesh.vertices) + len(centers))))
-            )
+        normals = np.cross(mesh.vertices[a] - center, mesh.vertices[b] - center)
+        if np.linalg.norm(normals, axis=1).sum() / 2 <= _SMALL_HOLE * mesh.area:
+            tip = len(mesh.vertices) + len(centers)
+            faces.append(np.column_stack((b, a, np.full(len(a), tip))))
             centers.append(center)
     vertices = np.concatenate((mesh.vertices, np.reshape(centers, (-1, 3))))
     return trimesh.Trimesh(vertices, np.concatenate(faces), process=False)
@@ -256,9 +257,8 @@ class _Surface:
         farthest = 0.0
         pool = vertices[faces]
         middle = pool.mean(axis=1)
-        bound: np.ndarray = self._tree.query(middle)[0] + np.linalg.norm(
-            pool - middle[:, None], axis=2
-        ).max(axis=1)
+        radius = np.linalg.norm(pool - middle[:, None], axis=2).max(axis=1)
+        bound = np.asarray(self._tree.query(middle)[0]) + radius
         while bound.size and bound.max() > farthest + _EXACT:
             first, rest = np.split(np.argsort(-bound, kind="stable"), [_BATCH])
             corners = pool[first]
@@ -297,7 +297,7 @@ class _Surface:
         """Return the distance of its worst point from all pieces: exact next to a face, too small next to an edge
         [m]."""
         planes = [half_spaces(shape) for shape in shapes]
-        distances = [(self._points @ plane[:, :3].T + plane[:, 3]).max(axis=1) for plane in planes]
+        distances = [plane_heights(self._points, own).max(axis=1) for own in planes]
         return float(np.min(distances, axis=0).max().clip(0.0))
 
 
@@ -313,9 +313,8 @@ class _Solid(_Surface):
         outside = piece - self.solid
         if outside.volume() < _SPECK / 100:
             return 0.0
-        return (
-            self.quick_deviation(*_arrays(outside)) if quick else self.deviation(*_arrays(outside))
-        )
+        measure = self.quick_deviation if quick else self.deviation
+        return measure(*_arrays(outside))
 
 
 # Cutting and joining
@@ -467,9 +466,7 @@ def _planes(vertices: np.ndarray, faces: np.ndarray) -> list[list[tuple[np.ndarr
     """Return the sets of planes (normal, offset) that are tried on a part: across its principal axes and x, y, z, then
     some in pairs."""
     corners = vertices[faces]
-    area = np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-    )
+    area = np.linalg.norm(triangle_normals(corners), axis=1)
     if not area.sum():
         return []
     middle = corners.mean(axis=1)
@@ -520,7 +517,7 @@ def limited_hull(points: np.ndarray) -> Shape:
     while len(chosen) < _MAX_VERTICES:
         # joggled: the first few may be coplanar
         inner = ConvexHull(vertices[chosen], qhull_options="QJ")
-        outside = (vertices @ inner.equations[:, :3].T + inner.equations[:, 3]).max(axis=1)
+        outside = plane_heights(vertices, inner.equations).max(axis=1)
         outside[chosen] = -np.inf
         chosen.append(int(outside.argmax()))
     return hull(vertices[chosen])

@@ -129,24 +129,13 @@ def contact_gate(tip_force: Tensor, threshold: float, *, opposing: bool = False)
 def point_distances(
     pos: Tensor, quat: Tensor, goal_pos: Tensor, goal_quat: Tensor, points: Tensor
 ) -> Tensor:
-    """[N, P] distance |o_i - g_i| of each object-frame point [N, P, 3] from its place at the goal [m]."""
+    """[N, P] distance |o_i - g_i| of each object-frame point [N, P, 3] from its place at the goal [m].
+
+    The draft's pose error is the largest one of four keypoints, the published paper's is the mean over surface points.
+    """
     here = pos[:, None] + quat_rotate(quat[:, None], points)
     goal = goal_pos[:, None] + quat_rotate(goal_quat[:, None], points)
     return (here - goal).norm(dim=-1)
-
-
-def keypoint_distance(
-    pos: Tensor, quat: Tensor, goal_pos: Tensor, goal_quat: Tensor, keypoints: Tensor
-) -> Tensor:
-    """[N] pose error d(o, g) = max_i |o_i - g_i| of object-frame keypoints [N, 4, 3] (the draft)."""
-    return point_distances(pos, quat, goal_pos, goal_quat, keypoints).amax(dim=-1)
-
-
-def mean_distance(
-    pos: Tensor, quat: Tensor, goal_pos: Tensor, goal_quat: Tensor, points: Tensor
-) -> Tensor:
-    """[N] pose error d = mean_i |o_i - g_i| of object-frame surface points [N, P, 3] (the published paper)."""
-    return point_distances(pos, quat, goal_pos, goal_quat, points).mean(dim=-1)
 
 
 def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
@@ -164,7 +153,8 @@ def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
     success_reward = c.success * success.to(gate_f.dtype)
     distance = position_error
     if c.points or c.success_shape == "points":
-        distance = mean_distance(x.object_pos, x.object_quat, x.goal_pos, x.goal_quat, x.points)
+        distances = point_distances(x.object_pos, x.object_quat, x.goal_pos, x.goal_quat, x.points)
+        distance = distances.mean(dim=-1)
     if c.success_shape == "points":
         success = gate & (distance <= x.success_position)
         success_reward = c.success * success.to(gate_f.dtype) / (1.0 + 10.0 * distance)

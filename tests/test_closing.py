@@ -260,12 +260,10 @@ class CommandTest(unittest.TestCase):
         except ImportError as error:
             self.skipTest(str(error))
         self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
-        self.enterContext(mock.patch("xreset.description.load_robot", lambda _: ROBOT))
+        self.enterContext(mock.patch("xreset.inputs.load_robot", lambda _: ROBOT))
         in_this_process = partial(make_backend, workers=0)
         self.enterContext(mock.patch("xreset.resets.probe.make_backend", in_this_process))
-        self.enterContext(
-            mock.patch("xreset.objects.catalogue.load_objects", lambda *_: (toy_grasp.brick(),))
-        )
+        self.enterContext(mock.patch("xreset.inputs.load_objects", lambda *_: (toy_grasp.brick(),)))
         write_retargeted(self.folder / "r.npz", grasp_and_lift(), config={}, inputs={})
 
     def resets(self, *options: str):

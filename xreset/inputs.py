@@ -9,8 +9,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
 from xreset.demos.archive import SCHEMA_NAME as DEMOS
 from xreset.demos.archive import Demos, demo_objects, read_demos
 from xreset.description import load_robot
@@ -145,7 +143,7 @@ def load_inputs(
             f"Found {shown(data)}, expected Demos, Retargeted, a ResetBank or their file."
         )
     folder = Path(objects) if objects else None
-    names = _object_names(data)
+    names = data.object_names
     if only:
         names = tuple(dict.fromkeys(canonical_names(only, names)))
         if isinstance(data, Demos):
@@ -186,9 +184,3 @@ def _read(path: Path, accept: tuple[Kind, ...]) -> Data:
     raise FileFormatError(
         f"{path} states schema {shown(stated)}, expected {' or '.join(expected)}."
     )
-
-
-def _object_names(data: Data) -> tuple[str, ...]:
-    if isinstance(data, ResetBank):
-        return data.object_names
-    return tuple(sorted(set(np.asarray(data.object_name).tolist())))

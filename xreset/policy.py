@@ -264,7 +264,8 @@ class ZeroPolicy:
 
     def act(self, observations: TensorDict) -> Tensor:
         """[N, J] zeros."""
-        return observations["policy"].new_zeros(len(observations), self._num_actions)
+        flat = observations["policy"]
+        return flat.new_zeros(len(flat), self._num_actions)
 
 
 class RandomPolicy:
@@ -281,5 +282,6 @@ class RandomPolicy:
 
     def act(self, observations: TensorDict) -> Tensor:
         """[N, J] uniform."""
-        share = torch.rand(len(observations), self._num_actions, generator=self._generator)
-        return (2.0 * share - 1.0).to(observations["policy"].device)
+        flat = observations["policy"]
+        share = torch.rand(len(flat), self._num_actions, generator=self._generator)
+        return (2.0 * share - 1.0).to(flat.device)

@@ -309,7 +309,7 @@ def _print_summary(demos: Demos, path: Path) -> None:
     from xreset.demos.plausible import doubts, start_to_goal
 
     table = [("object", "right", "left", "frames", "hand", "lift, cm", "goal, cm", "goal, deg")]
-    for name in sorted(set(demos.object_name.tolist())):
+    for name in demos.object_names:
         own = demos.select(objects=[name])
         right = np.count_nonzero(own.hand_side == "right")
         first = own.frame_offsets[:-1]

@@ -64,6 +64,11 @@ class ObjectMotions(Brief):
     object_pos: np.ndarray
     object_quat_wxyz: np.ndarray
 
+    @property
+    def object_names(self) -> tuple[str, ...]:
+        """Names of the objects, sorted."""
+        return tuple(np.unique(self.object_name).tolist())
+
     def frames(self, sequence: int) -> slice:
         """Frames of a sequence."""
         return slice(int(self.frame_offsets[sequence]), int(self.frame_offsets[sequence + 1]))
@@ -174,7 +179,7 @@ class Demos(ObjectMotions):
                 )
         if objects is not None:
             try:
-                objects = canonical_names(objects, sorted(set(self.object_name.tolist())))
+                objects = canonical_names(objects, self.object_names)
             except ObjectError as error:
                 raise DemoError(f"The demonstrations lack an object: {error}") from None
         wanted = {
@@ -215,7 +220,7 @@ class Demos(ObjectMotions):
     def _known(self, field: str, wanted: Iterable[str]) -> list[str]:
         """Return the wanted values of a field, all of which exist."""
         wanted = list(wanted)
-        known = sorted(set(getattr(self, field).tolist()))
+        known = np.unique(getattr(self, field)).tolist()
         if missing := [name for name in wanted if name not in known]:
             raise DemoError(
                 f"The demonstrations have no {field} {', '.join(missing)}. Choose from: {shown(known)}."

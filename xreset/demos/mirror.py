@@ -77,9 +77,7 @@ def mirrored(demos: Demos, symmetries: Mapping[str, Symmetry], *, tolerance: flo
     Raises:
         DemoError: no object is symmetric enough; the message lists the deviations.
     """
-    measured = {
-        name: symmetries[name].deviation for name in sorted(set(demos.object_name.tolist()))
-    }
+    measured = {name: symmetries[name].deviation for name in demos.object_names}
     kept = [name for name, deviation in measured.items() if deviation <= tolerance]
     if not kept:
         listed = ", ".join(

@@ -162,18 +162,17 @@ def starts_and_goals(
     came from."""
     start_pos, start_quat = motions.start_pose
     goal_pos, goal_quat = motions.goal_pose
-    object_names = tuple(sorted({*map(str, motions.object_name)}))
     sources = sources or {}
     return ResetBank(
         **no_states(robot),
-        sequence_name=np.asarray(motions.sequence_name),
-        sequence_object=np.asarray(motions.object_name),
+        sequence_name=motions.sequence_name,
+        sequence_object=motions.object_name,
         start_pos=start_pos.astype(np.float32),
         start_quat_wxyz=start_quat.astype(np.float32),
         goal_pos=goal_pos.astype(np.float32),
         goal_quat_wxyz=goal_quat.astype(np.float32),
-        object_names=object_names,
-        object_sources=tuple(sources.get(name, "") for name in object_names),
+        object_names=motions.object_names,
+        object_sources=tuple(sources.get(name, "") for name in motions.object_names),
     )
 
 

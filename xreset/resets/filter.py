@@ -107,7 +107,7 @@ def make_bank(
     part = part[valid]
     sequence = retargeted.sequence_of_frame[frame]
     post_contact = retargeted.post_contact[frame]
-    object_name = np.asarray(retargeted.object_name)[sequence]
+    object_name = retargeted.object_name[sequence]
     used = tuple(o for o in objects if o.name in object_name)
     names = [o.name for o in used]
     object_index = np.array([names.index(name) for name in object_name])

@@ -15,7 +15,6 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Annotated
@@ -126,12 +125,14 @@ def make_goals(
     episodes: list[_Episode] = []
     for obj in specs:
         done = len(episodes)
-        found = _reached(
-            reach,
-            wanted,
-            partial(_draw, obj, rests[obj.name], own, config),
-            lambda count, done=done: progress(done + count, len(wanted) * len(specs)),
-        )
+        found: dict[tuple[str, int], _Episode] = {}
+        for attempt in range(_DRAWS):
+            drawn = []
+            for family, number in wanted:
+                if (family, number) not in found:
+                    drawn.append(_draw(obj, rests[obj.name], own, config, family, number, attempt))
+            found |= {(e.family, e.number): e for e in _reached(reach, drawn)}
+            progress(done + len(found), len(wanted) * len(specs))
         if missing := [
             f"{family}_{number:03d}" for family, number in wanted if (family, number) not in found
         ]:
@@ -337,32 +338,19 @@ def _about_z(angle: float) -> Rotation:
     return Rotation.from_rotvec((0.0, 0.0, angle))
 
 
-def _reached(
-    reach: Reach,
-    wanted: Sequence[tuple[str, int]],
-    draw: Callable[[str, int, int], _Episode],
-    progress: Callable[[int], None],
-) -> dict[tuple[str, int], _Episode]:
-    """Return an episode for each (family, number), drawn again until its goal is above the table and can be reached;
-    those that never can are missing."""
-    found: dict[tuple[str, int], _Episode] = {}
-    for attempt in range(_DRAWS):
-        drawn = [draw(*item, attempt) for item in wanted if item not in found]
-        drawn = [
-            e
-            for e in drawn
-            if e.goal[2] >= rest_height(e.obj, _quat(e.goal_turn)) + e.goal_turn.apply(e.obj.com)[2]
-        ]
-        if drawn:
-            turns = Rotation.concatenate([e.goal_turn * e.start_turn.inv() for e in drawn])
-            held = reach.holds(
-                np.stack([e.start for e in drawn]), np.stack([e.goal for e in drawn]), turns
-            )
-            found |= {
-                (e.family, e.number): e for e, holds in zip(drawn, held, strict=True) if holds
-            }
-        progress(len(found))
-    return found
+def _reached(reach: Reach, drawn: Sequence[_Episode]) -> list[_Episode]:
+    """Return the episodes whose goal is above the table and can be reached."""
+    above = [
+        e
+        for e in drawn
+        if e.goal[2] >= rest_height(e.obj, _quat(e.goal_turn)) + e.goal_turn.apply(e.obj.com)[2]
+    ]
+    if not above:
+        return []
+    turns = Rotation.concatenate([e.goal_turn * e.start_turn.inv() for e in above])
+    starts = np.stack([e.start for e in above])
+    held = reach.holds(starts, np.stack([e.goal for e in above]), turns)
+    return [e for e, holds in zip(above, held, strict=True) if holds]
 
 
 def _turns(quats: np.ndarray) -> Rotation:

@@ -89,17 +89,13 @@ class Retargeted(ObjectMotions):
     def post_contact(self) -> np.ndarray:
         """[F] bool: whether the human has touched the object by that frame."""
         owner = self.sequence_of_frame
-        first = np.asarray(self.first_contact)[owner]
+        first = self.first_contact[owner]
         return (first >= 0) & (np.arange(len(owner)) - self.frame_offsets[owner] >= first)
 
     def accounts(self) -> list[Account]:
         """Count valid frames and the reasons of invalid ones, by object and phase."""
         reason = np.where(self.valid, "", np.asarray(self.reason_names)[self.reason])
-        return accounts(
-            np.asarray(self.object_name)[self.sequence_of_frame],
-            self.post_contact,
-            reason,
-        )
+        return accounts(self.object_name[self.sequence_of_frame], self.post_contact, reason)
 
 
 def write_retargeted(

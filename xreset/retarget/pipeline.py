@@ -248,7 +248,7 @@ def human_contacts(
     points = np.zeros_like(keypoints)
     touching = np.zeros(keypoints.shape[:2], dtype=bool)
     object_name = demos.object_name[demos.sequence_of_frame]
-    for name in np.unique(object_name).tolist():
+    for name in demos.object_names:
         rows = object_name == name
         contacts = keypoint_contacts(
             surfaces[name], keypoints[rows], object_pos[rows], object_quat[rows], distance
@@ -270,12 +270,11 @@ def rest_on_table(demos: Demos, objects: Sequence[ObjectSpec]) -> Demos:
 def _by_name(demos: Demos, objects: Sequence[ObjectSpec]) -> dict[str, ObjectSpec]:
     """Return the objects that the demonstrations name, in the order of their names."""
     given = {spec.name: spec for spec in objects}
-    needed = sorted(set(demos.object_name.tolist()))
-    if missing := [name for name in needed if name not in given]:
+    if missing := [name for name in demos.object_names if name not in given]:
         raise DemoError(
             f"The demonstrations contain objects that were not given: {', '.join(missing)}. Given: {', '.join(given)}."
         )
-    return {name: given[name] for name in needed}
+    return {name: given[name] for name in demos.object_names}
 
 
 def _arm_targets(

@@ -131,14 +131,11 @@ def policy_group(
     observed_quat = quat_multiply(turn, x.observed_quat)
     if c.rotation == "to_goal":
         to_goal = _shown(quat_multiply(x.goal_quat, quat_conjugate(observed_quat)), c)
-        return torch.cat(
-            (pos, x.goal_pos, to_goal, x.gravity_fraction[:, None], x.previous_action), dim=-1
-        )
-    rotation, goal_rotation = _shown(torch.stack((observed_quat, x.goal_quat)), c)
-    return torch.cat(
-        (pos, rotation, x.goal_pos, goal_rotation, x.gravity_fraction[:, None], x.previous_action),
-        dim=-1,
-    )
+        poses = (pos, x.goal_pos, to_goal)
+    else:
+        rotation, goal_rotation = _shown(torch.stack((observed_quat, x.goal_quat)), c)
+        poses = (pos, rotation, x.goal_pos, goal_rotation)
+    return torch.cat((*poses, x.gravity_fraction[:, None], x.previous_action), dim=-1)
 
 
 def goal_group(x: ObservationInput, c: ObservationConfig) -> Tensor:

@@ -58,8 +58,8 @@ def policy_contract(robot: RobotSpec, task: TaskConfig, objects: tuple[str, ...]
         schema=SCHEMA,
         robot=robot.name,
         robot_fingerprint=robot.fingerprint,
-        joint_names=tuple(robot.joint_names),
-        fingertip_names=tuple(robot.fingertip_names),
+        joint_names=robot.joint_names,
+        fingertip_names=robot.fingertip_names,
         objects=objects,
         observation_layout=layout(
             len(robot.joints), len(robot.fingertips), task.observation, task.vision

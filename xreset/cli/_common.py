@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-import tyro
+from tyro.conf import Positional, UseAppendAction, arg
 
 from xreset.accounts import Account, described
 from xreset.cli import INVOCATION
@@ -21,63 +21,49 @@ if TYPE_CHECKING:
     from xreset.eval import rollout
 
 _T = TypeVar("_T")
-Source = Annotated[Path, tyro.conf.Positional]
+Source = Annotated[Path, Positional]
 """A file or folder, given without a flag."""
-Sources = Annotated[tuple[Path, ...], tyro.conf.Positional]
+Sources = Annotated[tuple[Path, ...], Positional]
 """Files or folders, given without a flag."""
-Name = Annotated[str, tyro.conf.Positional]
+Name = Annotated[str, Positional]
 """A text, given without a flag."""
-Several = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
+Names = Annotated[tuple[str, ...], Positional]
+"""Texts, given without a flag."""
+Several = Annotated[tuple[str, ...], UseAppendAction]
 """A flag that may be given again. Its default must be empty, because values are appended to it."""
-Flat = Annotated[_T, tyro.conf.arg(name="")]
+Flat = Annotated[_T, arg(name="")]
 """A dataclass whose fields are options of the command itself."""
 
 
 # Options that several commands share, with their help -----------------------------------------------------------------
 
 _POLICY = "Run folder, exported policy (.onnx), or name of a policy that ships with xreset (xreset policies list)"
-Policy = Annotated[str, tyro.conf.Positional, tyro.conf.arg(help=f"{_POLICY}.")]
+Policy = Annotated[Name, arg(help=f"{_POLICY}.")]
 PolicyOrBaseline = Annotated[
-    str,
-    tyro.conf.Positional,
-    tyro.conf.arg(
-        help=f"{_POLICY}; or a baseline: zero, random, ik (open-loop kinematic retargeting)."
-    ),
+    Name, arg(help=f"{_POLICY}; or a baseline: zero, random, ik (open-loop kinematic retargeting).")
 ]
-RobotName = Annotated[
-    str, tyro.conf.Positional, tyro.conf.arg(help="Name of a robot, or a folder with a robot.toml.")
-]
+RobotName = Annotated[Name, arg(help="Name of a robot, or a folder with a robot.toml.")]
 Robot = Annotated[
-    str | None,
-    tyro.conf.arg(help="Name or folder of the robot; default: the policy's, or the file's."),
+    str | None, arg(help="Name or folder of the robot; default: the policy's, or the file's.")
 ]
 Objects = Annotated[
-    Path | None, tyro.conf.arg(help="Folder of real meshes; default: the built-in stand-ins.")
+    Path | None, arg(help="Folder of real meshes; default: the built-in stand-ins.")
 ]
 TrainedObjects = Annotated[
     Path | None,
-    tyro.conf.arg(help="Folder of real meshes; default: that of the training, else the stand-ins."),
+    arg(help="Folder of real meshes; default: that of the training, else the stand-ins."),
 ]
-Engines = Annotated[
-    tuple[str, ...],
-    tyro.conf.UseAppendAction,
-    tyro.conf.arg(help="Physics engine; give it again for more. Default: mujoco."),
-]
+Engines = Annotated[Several, arg(help="Physics engine; give it again for more. Default: mujoco.")]
 AllEngines = Annotated[
-    tuple[str, ...],
-    tyro.conf.UseAppendAction,
-    tyro.conf.arg(
-        help="Physics engine; give it again for more. Default: all that can be used here."
-    ),
+    Several,
+    arg(help="Physics engine; give it again for more. Default: all that can be used here."),
 ]
 Device = Annotated[
     str,
-    tyro.conf.arg(
-        help="Where engines run that can use a GPU: cpu or cuda; the others run on the CPU."
-    ),
+    arg(help="Where engines run that can use a GPU: cpu or cuda; the others run on the CPU."),
 ]
-Host = Annotated[str, tyro.conf.arg(help="Address to serve at; 0.0.0.0 allows other machines.")]
-Port = Annotated[int, tyro.conf.arg(help="Port to serve at; if it is taken, the next free one.")]
+Host = Annotated[str, arg(help="Address to serve at; 0.0.0.0 allows other machines.")]
+Port = Annotated[int, arg(help="Port to serve at; if it is taken, the next free one.")]
 
 
 @contextmanager

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-import tyro
-
-from xreset.cli._common import Several
+from xreset.cli._common import Names, Several
 from xreset.cli._terminal import console
 
 
 def compare(
-    runs: Annotated[tuple[str, ...], tyro.conf.Positional],
+    runs: Names,
     *,
     x: Literal["minutes", "steps", "iterations"] = "minutes",
     curve: Several = (),

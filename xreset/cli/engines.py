@@ -6,8 +6,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import tyro
 from rich.text import Text
+from tyro.conf import UseAppendAction, arg
 
 from xreset.cli._common import (
     AllEngines,
@@ -49,7 +49,7 @@ def check(
     backend: AllEngines = (),
     robot: str | None = None,
     device: Device = "cpu",
-    only: Annotated[tuple[str, ...], tyro.conf.arg(name="check"), tyro.conf.UseAppendAction] = (),
+    only: Annotated[Several, arg(name="check")] = (),
     json: Path | None = None,
     verbose: bool = False,
 ) -> None:
@@ -73,10 +73,7 @@ def check(
         what = f" {status.version}, {spec.name}, {used}: verdict, check, and what came nearest to its tolerance"
         console.print(Text.assemble((name, "bold"), what))
         results = conformance.run(
-            make,
-            robot=spec,
-            only=only or None,
-            report=lambda result: _print_check(result, verbose),
+            make, robot=spec, only=only or None, report=lambda result: _print_check(result, verbose)
         )
         runs.append(
             {
@@ -184,12 +181,7 @@ def compare(
         # now: after minutes of work the file may be another, or gone
         inputs = {"motion": file_hash(motion)}
         result = agreement.compare(
-            loaded.robot,
-            loaded.objects,
-            grasped,
-            engines,
-            grasps=grasps,
-            progress=move,
+            loaded.robot, loaded.objects, grasped, engines, grasps=grasps, progress=move
         )
     _print(result)
     for tested in (result.reference, result.floor, *result.engines):
@@ -269,13 +261,7 @@ def trace(
         move = bar.stages()
         move("actions")
         played = actions.from_file(source, place, object, episode)
-        result = replay.trace(
-            played,
-            base,
-            engines,
-            seed=place.seed,
-            progress=move,
-        )
+        result = replay.trace(played, base, engines, seed=place.seed, progress=move)
         replays = {e.engine.name: e.recording for e in (result.reference, *result.engines)}
         actions.write_actions(out / "actions.npz", played, replays)
         write_json(out / "trace.json", result.as_dict())
@@ -350,7 +336,7 @@ def attribute(
 
 def page(
     *,
-    source: Annotated[tuple[Path, ...], tyro.conf.arg(name="from"), tyro.conf.UseAppendAction],
+    source: Annotated[tuple[Path, ...], arg(name="from"), UseAppendAction],
     out: Path | None = None,
 ) -> None:
     """Make a Markdown page of what was measured of the engines.

@@ -6,9 +6,9 @@ from collections import Counter
 from pathlib import Path
 from typing import Annotated
 
-import tyro
+from tyro.conf import UseAppendAction
 
-from xreset.cli._common import Objects, Several
+from xreset.cli._common import Names, Objects, Several
 from xreset.cli._terminal import Progress, console
 from xreset.resets.config import GoalConfig
 
@@ -16,13 +16,13 @@ Pose = tuple[float, float, float, float, float, float, float]
 
 
 def goals(
-    names: Annotated[tuple[str, ...], tyro.conf.Positional] = (),
+    names: Names = (),
     *,
     robot: str,
     out: Path,
     objects: Objects = None,
     family: Several = (),
-    pose: Annotated[tuple[Pose, ...], tyro.conf.UseAppendAction] = (),
+    pose: Annotated[tuple[Pose, ...], UseAppendAction] = (),
     draw: GoalConfig = GoalConfig(),
 ) -> None:
     """Give objects starts and goals without demonstrations, for `xreset eval --demos` and `xreset train --goals`.

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
-import tyro
+from tyro.conf import arg
 
 from xreset.accounts import accounts_path, write_accounts
 from xreset.cli._common import Device, Objects, Several, Source, show_accounts
@@ -23,7 +23,7 @@ def resets(
     objects: Objects = None,
     num_envs: int = 64,
     device: Device = "cpu",
-    limits: Annotated[FilterConfig, tyro.conf.arg(name="filter")] = FilterConfig(),
+    limits: Annotated[FilterConfig, arg(name="filter")] = FilterConfig(),
     closing: ClosingConfig = ClosingConfig(),
     squeeze: SqueezeConfig = SqueezeConfig(),
     settle: bool = False,

@@ -89,13 +89,8 @@ def hull(points: np.ndarray, tolerance: float = 0.0) -> Shape:
     inward = (normals * convex.equations[:, :3]).sum(axis=1) < 0
     faces = convex.simplices.copy()
     faces[inward] = faces[inward][:, ::-1]
-    return Shape(
-        geometry=Geometry(
-            kind="hull",
-            vertices=points[convex.vertices],
-            faces=index[faces].astype(np.int64),
-        )
-    )
+    triangles = index[faces].astype(np.int64)
+    return Shape(geometry=Geometry(kind="hull", vertices=points[convex.vertices], faces=triangles))
 
 
 def _outermost(points: np.ndarray, tolerance: float) -> np.ndarray:
@@ -181,7 +176,7 @@ def section(
     half_v: ArrayLike,
     *,
     power: float = 2.0,
-    count: int = 16,
+    count: int,
 ) -> np.ndarray:
     """[count, 3] points of a superellipse |u|^power + |v|^power = 1 with half axes ``half_u`` and ``half_v`` (vectors).
 

@@ -68,7 +68,7 @@ def fixed(parent: str, child: str, T_parent_child: np.ndarray) -> Joint:
     )
 
 
-def urdf_text(tree: RobotTree, comment: str = "") -> str:
+def urdf_text(tree: RobotTree, comment: str) -> str:
     """Return the text of a tree's URDF.
 
     Args:

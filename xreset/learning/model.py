@@ -28,7 +28,7 @@ LstmState = tuple[Tensor, Tensor]
 class PointNet(nn.Module):
     """Embeds clouds [..., P, K] as [..., dims[-1]]: the same MLP for every point, then the maximum over points."""
 
-    def __init__(self, dims: Sequence[int], point_width: int = 3) -> None:
+    def __init__(self, dims: Sequence[int], point_width: int) -> None:
         """Build the per-point MLP K -> dims[0] -> ..., K being ``point_width``; no activation after the last layer."""
         super().__init__()
         layers: list[nn.Module] = []

@@ -30,7 +30,8 @@ class Fingers:
     finger: Tensor
     """[G] finger of each link, thumb first."""
     gap: Tensor
-    """[M, G] signed distance from a link's shapes, approximated by balls, to the object's collision pieces [m]."""
+    """[M, G] signed distance from a link's shapes, approximated by balls, to the object's collision pieces [m]. A link
+    without shapes is a point."""
     point: Tensor
     """[M, G, 3] nearest point of the link, in the link's frame."""
     inward: Tensor
@@ -87,7 +88,9 @@ def fingers_of(
     point = q.new_zeros(len(q), len(links), 3)
     inward = torch.zeros_like(point)
     for g, link in enumerate(links):
-        centers, radii = _balls(kinematics, link)
+        shapes = kinematics.tree.link(link).collisions
+        balls = link_balls(shapes) if shapes else (np.zeros((1, 3)), np.zeros(1))
+        centers, radii = map(torch.as_tensor, balls)
         R = poses[:, g, :3, :3]
         world = centers @ R.mT + poses[:, g, None, :3, 3]
         local = quat_rotate_inverse(quat[:, None].expand(-1, len(centers), 4), world - pos[:, None])
@@ -101,16 +104,6 @@ def fingers_of(
     return Fingers(
         links=tuple(links), finger=torch.tensor(finger), gap=gap, point=point, inward=inward
     )
-
-
-def _balls(kinematics: Kinematics, link: str) -> tuple[Tensor, Tensor]:
-    """Return centers [B, 3] and radii [B] of the balls that stand for a link's collision shapes; a point at its origin
-    if it has none."""
-    shapes = kinematics.tree.link(link).collisions
-    if not shapes:
-        return torch.zeros(1, 3, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
-    centers, radii = link_balls(shapes)
-    return torch.as_tensor(centers), torch.as_tensor(radii)
 
 
 def squeeze_targets(

@@ -15,11 +15,7 @@ from torch import Tensor
 
 from xreset.errors import RobotError
 from xreset.geometry.balls import bounding_balls
-from xreset.geometry.collision import (
-    SelfCollision,
-    height_above_table,
-    table_points,
-)
+from xreset.geometry.collision import SelfCollision, height_above_table, table_points
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matrix_to_quat, matvec, quat_angle
 from xreset.retarget.arm.config import ArmConfig

@@ -224,11 +224,7 @@ def _first_frames(problem: ArmProblem) -> Tensor:
     spread[0] = 0.0
     lower = torch.maximum(model.lower, home - torch.pi)
     upper = torch.minimum(model.upper, home + torch.pi)
-    start = torch.where(
-        spread < 0,
-        home + spread * (home - lower),
-        home + spread * (upper - home),
-    )
+    start = home + spread * torch.where(spread < 0, home - lower, upper - home)
     frame = problem.repeated(config.restarts)[:, 0]
     solved = solve(frame, start.repeat(sequences, 1), config.first_iterations)
     cost = system(frame, solved).cost
@@ -357,14 +353,8 @@ def system(frame: ArmProblem, q: Tensor, previous: Tensor | None = None) -> Quad
     turn = quat_to_axis_angle(
         quat_multiply(matrix_to_quat(rot[:, 0]), quat_conjugate(frame.root_quat))
     )
-    residuals = [
-        position_scale * (origins[:, 0] - frame.root_pos),
-        orientation_scale * turn,
-    ]
-    jacobians = [
-        position_scale * linear[:, 0],
-        orientation_scale * angular[:, 0],
-    ]
+    residuals = [position_scale * (origins[:, 0] - frame.root_pos), orientation_scale * turn]
+    jacobians = [position_scale * linear[:, 0], orientation_scale * angular[:, 0]]
     if previous is not None:
         scale = config.smoothness_weight**0.5
         residuals.append(scale * (q - previous))

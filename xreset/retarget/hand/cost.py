@@ -23,12 +23,7 @@ from xreset.geometry.rotations import (
     quat_to_matrix,
 )
 from xreset.retarget.hand import terms
-from xreset.retarget.hand.clearance import (
-    Distances,
-    Objects,
-    pad_distances,
-    too_near,
-)
+from xreset.retarget.hand.clearance import Distances, Objects, pad_distances, too_near
 from xreset.retarget.hand.config import HandConfig
 from xreset.retarget.hand.model import HandModel, HandState, HandTargets
 from xreset.retarget.least_squares import Quadratic
@@ -94,14 +89,7 @@ def _frames(
         targets.object_index.repeat_interleave(frames),
         targets.fields,
     )
-    near = too_near(
-        model,
-        bodies,
-        objects,
-        annotated,
-        config.object_clearance,
-        config.self_depth,
-    )
+    near = too_near(model, bodies, objects, annotated, config.object_clearance, config.self_depth)
     value, slope = _by_frame(near, len(annotated))
     found = found + Quadratic.of_residuals(value / scale, slope / scale) * config.clearance_weight
 
@@ -110,11 +98,8 @@ def _frames(
         value, slope = pad_distances(model, bodies, objects, held)
         value = (value - config.object_clearance) / scale
         slope = slope / scale
-        pads = terms.attraction(
-            value,
-            config.pad_weight * model.pad_shares,
-            config.pad_reach / scale,
-        )
+        weight = config.pad_weight * model.pad_shares
+        pads = terms.attraction(value, weight, config.pad_reach / scale)
         found.cost[held] += pads.cost
         found.gradient[held] += matvec(slope.mT, pads.gradient)
         found.curvature[held] += (slope.mT * pads.curvature[:, None]) @ slope
@@ -142,13 +127,8 @@ def _keypoint_terms(
         on * config.global_weight * torch.where(model.is_tip, config.tip_factor, 1.0).to(x.dtype)
     )
     in_contact = on * config.contact_weight * targets.in_contact.flatten(0, 1)
-    contact = terms.contact(
-        x,
-        touched,
-        in_contact,
-        config.contact_margin / scale,
-        config.contact_knee / scale,
-    )
+    margin = config.contact_margin / scale
+    contact = terms.contact(x, touched, in_contact, margin, config.contact_knee / scale)
     on_points = terms.difference(x, human, alignment) + contact
 
     moves = torch.cat((J[:, b] - J[:, a], J), dim=1)  # [B, C + P, 3, n]

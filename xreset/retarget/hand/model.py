@@ -127,11 +127,8 @@ class HandModel:
         """[G] index among the bodies of each link with balls."""
 
     def _body_indices(self, links: Sequence[str]) -> Tensor:
-        return torch.tensor(
-            [self._bodies.index(link) for link in links],
-            dtype=torch.long,
-            device=self.device,
-        )
+        indices = [self._bodies.index(link) for link in links]
+        return torch.tensor(indices, dtype=torch.long, device=self.device)
 
     def _pads(self) -> list[Tensor]:
         """Return the balls of the two pads of a jaw, a hand whose one joint moves two fingers: where these face each

@@ -29,11 +29,7 @@ def difference(x: Tensor, target: Tensor, weight: Tensor) -> Quadratic:
     off = x - target
     w = weight[..., None]
     identity = torch.eye(3, dtype=x.dtype, device=x.device)
-    return Quadratic(
-        (weight * off.square().sum(-1)).sum(-1),
-        w * off,
-        w[..., None] * identity,
-    )
+    return Quadratic((weight * off.square().sum(-1)).sum(-1), w * off, w[..., None] * identity)
 
 
 def direction(x: Tensor, target: Tensor, weight: Tensor) -> Quadratic:

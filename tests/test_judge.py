@@ -17,7 +17,7 @@ from tests import toy_grasp
 from tests.toy_grasp import OPEN, brick, brick_pose, robot
 from xreset.cli import main
 from xreset.description import load_robot
-from xreset.errors import RobotError
+from xreset.errors import DemoError, RobotError
 from xreset.geometry.kinematics import Kinematics
 from xreset.resets.bank import write_bank
 from xreset.resets.config import SqueezeConfig
@@ -79,6 +79,8 @@ class Judge(unittest.TestCase):
         wide[:, robot().joint_names.index("jaw_a_slide")] = OPEN + 0.03
         with self.assertRaisesRegex(RobotError, "within 10 mm of the object"):
             judging.judge(replace(bank(), joint_pos=wide), robot(), (brick(),))
+        with self.assertRaisesRegex(DemoError, "not given: brick. Given: ."):
+            judging.judge(bank(), robot(), ())
 
     def test_a_weak_grip_drops_in_the_command(self):
         folder = Path(self.enterContext(tempfile.TemporaryDirectory()))

@@ -169,6 +169,8 @@ class FilterTest(unittest.TestCase):
         none = self.retargeted(valid=np.zeros(6, dtype=bool), reason=np.ones(6, dtype=int))
         with self.assertRaisesRegex(DemoError, "no frame of the retargeted trajectories is valid"):
             make_bank(none, self.robot, self.objects, ["mujoco"])
+        with self.assertRaisesRegex(DemoError, "objects that were not given"):
+            make_bank(self.retargeted(), self.robot, self.objects[:0], ["mujoco"])
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ up and the table's top at z = 0. Shape letters: J actuated joints, E fingertips.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from xreset.checks import NotNegative, Number, Positive, Rule, Text
-from xreset.errors import XResetError
+from xreset.errors import DemoError, XResetError
 from xreset.text import Brief, shown
 
 GRAVITY = 9.81
@@ -290,6 +290,17 @@ def checked_objects(robot: Any, objects: Any) -> tuple[ObjectSpec, ...]:
                 f"objects has {shown(obj)}, expected an ObjectSpec: xreset.load_object(NAME)."
             )
     return found
+
+
+def objects_named(objects: Sequence[ObjectSpec], names: Iterable[str]) -> dict[str, ObjectSpec]:
+    """Return the objects with these names, in the order of their names; ``DemoError`` states the missing ones."""
+    given = {spec.name: spec for spec in objects}
+    needed = sorted(set(names))
+    if missing := [name for name in needed if name not in given]:
+        raise DemoError(
+            f"The demonstrations contain objects that were not given: {', '.join(missing)}. Given: {', '.join(given)}."
+        )
+    return {name: given[name] for name in needed}
 
 
 def lowest_point(shapes: Sequence[Shape], turn: np.ndarray | None = None) -> float:

@@ -23,7 +23,7 @@ from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
 from xreset.resets.fingers import fingers_of, squeeze_targets
 from xreset.resets.probe import probe
 from xreset.retarget.file import Retargeted
-from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, checked_objects
+from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, checked_objects, objects_named
 from xreset.task.config import TerminationConfig
 from xreset.task.terminations import out_of_bounds
 
@@ -88,8 +88,8 @@ def make_bank(
         progress: called with (candidates tried, candidates in all).
 
     Raises:
-        DemoError: no frame is valid.
-        FileFormatError: the trajectories are for another robot.
+        DemoError: no frame is valid, or an object of a valid frame is not among ``objects``.
+        FileFormatError: the trajectories are for a robot with other joints.
     """
     objects = checked_objects(robot, objects)
     check_joints("The motion is", retargeted, robot)
@@ -101,6 +101,8 @@ def make_bank(
             "no frame of the retargeted trajectories is valid, so there is no state to try. "
             "Look at the reasons of xreset retarget."
         )
+    owner = retargeted.sequence_of_frame[retargeted.valid]
+    objects_named(objects, np.asarray(retargeted.object_name)[owner])
     frame, part = closing_states(retargeted, robot, objects, closing or ClosingConfig())
     valid = retargeted.valid[frame]
     frame = frame[valid]

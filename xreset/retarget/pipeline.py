@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from xreset.demos.archive import Demos, grounded, levelled
-from xreset.errors import DemoError
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.rotations import matrix_to_quat
 from xreset.geometry.surface import Surface, keypoint_contacts
@@ -27,7 +26,7 @@ from xreset.retarget.hand.jaw import jaw_keypoints
 from xreset.retarget.hand.model import HandModel, HandState, HandTargets
 from xreset.retarget.hand.solve import retarget_hand
 from xreset.retarget.validity import REASONS, Thresholds, classify
-from xreset.spec import ObjectSpec, RobotSpec, checked_objects
+from xreset.spec import ObjectSpec, RobotSpec, checked_objects, objects_named
 from xreset.tensors import one_thread
 
 _SEQUENCES_PER_BATCH = 24
@@ -161,7 +160,10 @@ class HandMotions:
         self.model = HandModel(robot, device=device)
         """The robot's hand."""
         self._config = config.hand
-        surfaces = {name: Surface(spec) for name, spec in _by_name(demos, objects).items()}
+        surfaces = {
+            name: Surface(spec)
+            for name, spec in objects_named(objects, demos.object_name.tolist()).items()
+        }
         self._objects = list(surfaces)
         self._fields = DistanceFields.join([surface.field for surface in surfaces.values()])
         self.demos = demos = rest_on_table(demos, objects)
@@ -264,17 +266,7 @@ def rest_on_table(demos: Demos, objects: Sequence[ObjectSpec]) -> Demos:
     Raises:
         DemoError: an object of the demonstrations is not among ``objects``.
     """
-    return grounded(levelled(demos), _by_name(demos, objects))
-
-
-def _by_name(demos: Demos, objects: Sequence[ObjectSpec]) -> dict[str, ObjectSpec]:
-    """Return the objects that the demonstrations name, in the order of their names."""
-    given = {spec.name: spec for spec in objects}
-    if missing := [name for name in demos.object_names if name not in given]:
-        raise DemoError(
-            f"The demonstrations contain objects that were not given: {', '.join(missing)}. Given: {', '.join(given)}."
-        )
-    return {name: given[name] for name in demos.object_names}
+    return grounded(levelled(demos), objects_named(objects, demos.object_name.tolist()))
 
 
 def _arm_targets(

@@ -37,7 +37,7 @@ from xreset.resets.bank import ResetBank, check_states
 from xreset.resets.config import SqueezeConfig
 from xreset.resets.fingers import Fingers, fingers_of, squeeze_targets
 from xreset.resets.probe import probe
-from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, checked_objects
+from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, checked_objects, objects_named
 
 SCHEMA = "xreset-judge/1"
 PHASES = ("hold", "lift", "turn")
@@ -139,6 +139,8 @@ def judge(
 
     Raises:
         RobotError: the bank has no lifted grasp of any object.
+        DemoError: a lifted object of the bank is not among ``objects``.
+        FileFormatError: the bank's states are for a robot with other joints, or for other meshes.
     """
     objects = checked_objects(robot, objects)
     check_states(bank, robot, objects)
@@ -150,6 +152,7 @@ def judge(
             f"robot {robot.name!r}: the bank has no state in which an object is in the air. Look at the reasons of "
             "xreset resets and xreset retarget."
         )
+    objects_named(objects, lifted.object_name)
     fingers = fingers_of(
         robot,
         objects,

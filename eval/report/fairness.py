@@ -86,7 +86,8 @@ def _difference(table: Table, column: str, what: str, advice: str = "") -> list[
             everywhere = len(own) == (table["run"] == label).sum()
             names += [label] if everywhere else [f"{label} in {engine}" for engine in own["engine"]]
         parts.append(f"{value}: {', '.join(names)}")
-    return [f"These results are not comparable: not the same {what} ({'; '.join(parts)}).{advice}"]
+    verdict = "perhaps not comparable" if advice else "not comparable"
+    return [f"These results are {verdict}: not the same {what} ({'; '.join(parts)}).{advice}"]
 
 
 def begun(trainings: Sequence[Training]) -> list[str]:

@@ -83,6 +83,34 @@ class PageTest(unittest.TestCase):
                 if line.startswith("    ") and not line.lstrip().startswith(("-", "|")):
                     self.assertLessEqual(len(line) - 4, 100, f"{page.name}: {line}")
 
+    def test_code_blocks_begin_after_an_empty_line(self):
+        # otherwise the site shows them as running text
+        for page in PAGES:
+            text = re.sub(r"(?ms)^```.*?^```", "", page.read_text())
+            for start in re.findall(r"(?m)^[^-\s].*\n {4}\S.*", text):
+                self.fail(f"{page.name}: {start}")
+
+    def test_classes_and_files_exist(self):
+        folders = ("xreset", "backends", "robots", "eval", "examples", "tests", "ci")
+        sources = [file for folder in folders for file in (ROOT / folder).rglob("*.py")]
+        defined = {"DataFrame"}  # of pandas
+        for file in sources:
+            defined.update(re.findall(r"(?:class|import) (\w+)", file.read_text()))
+        files = 0
+        for page in PAGES:
+            text = re.sub(r"(?ms)^```.*?^```|^    .*?$", "", page.read_text())
+            classes = set(re.findall(r"`(?:xreset\.)?([A-Z][a-z]+[A-Z]\w+)`", text))
+            self.assertEqual(classes - defined, set(), page.name)
+            for name in re.findall(rf"`((?:{'|'.join(folders)})/[a-z_/]+\.[a-z]+)`", text):
+                self.assertTrue((ROOT / name).is_file(), f"{page.name}: {name}")
+                files += 1
+        self.assertGreater(files, 20)
+
+    def test_the_citation_is_of_this_version(self):
+        version = re.search(r'(?m)^version = "(.*)"$', (ROOT / "pyproject.toml").read_text())
+        assert version
+        self.assertIn(f"\nversion: {version[1]}\n", (ROOT / "CITATION.cff").read_text())
+
     def test_every_public_name_is_in_the_reference(self):
         import xreset
 

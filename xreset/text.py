@@ -43,11 +43,7 @@ def is_plain(text: str) -> bool:
 
 def plain(text: str) -> str:
     """Return the text with every character that :func:`is_plain` refuses as an escape."""
-    return (
-        text
-        if is_plain(text)
-        else "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in text)
-    )
+    return "".join(c if is_plain(c) else ascii(c)[1:-1] for c in text)
 
 
 def short_name(name: str, gap: str = " ") -> str:

@@ -216,36 +216,31 @@ def _contacts_at(
     facing_fingers = -(normal_in[(enter == start).argmax(axis=0), number] @ closing)
     facing_thumb = normal_out[(leave == end).argmax(axis=0), number] @ closing
 
-    start = start.reshape(-1, 5)
-    facing_fingers = facing_fingers.reshape(-1, 5)
-    above_table = origins[..., 2] > 0.007
-    fits = (
-        np.isfinite(start)
-        & (room_before.reshape(-1, 5) > _FINGER_ROOM)
-        & (facing_fingers > 0.6)
-        & above_table
+    # [n, 5], the thumb first
+    start, end, room_before, room_after, facing_fingers, facing_thumb = (
+        values.reshape(-1, 5)
+        for values in (start, end, room_before, room_after, facing_fingers, facing_thumb)
     )
+    above_table = origins[..., 2] > 0.007
+    fits = np.isfinite(start) & (room_before > _FINGER_ROOM) & (facing_fingers > 0.6) & above_table
     middle_start = np.median(np.where(fits, start, 0.0)[:, 1:3], axis=1, keepdims=True)
     finger = fits & (np.abs(start - middle_start) < 0.025)
-    end = end.reshape(-1, 5)[:, 0]
-    facing_thumb = facing_thumb.reshape(-1, 5)[:, 0]
-    room_after = room_after.reshape(-1, 5)[:, 0]
-    thumb = (
-        np.isfinite(end) & (room_after > _FINGER_ROOM) & (facing_thumb > 0.75) & above_table[:, 0]
-    )
-    width = end - start[:, 0]
+    thumb = np.isfinite(end) & (room_after > _FINGER_ROOM) & (facing_thumb > 0.75) & above_table
+    width = (end - start)[:, 0]
     # length of the object before each center, along the approach: how deep the hand must reach
     into, out, *_ = solid.crossings(centers, approach)
     depth = -np.where((into <= out) & (into < 0), into, 0.0).min(axis=0)
     with np.errstate(invalid="ignore"):
-        good = thumb & finger[:, 1] & finger[:, 2] & (width < MAX_OPENING) & (width > MIN_WIDTH)
+        good = (
+            thumb[:, 0] & finger[:, 1:3].all(axis=1) & (width < MAX_OPENING) & (width > MIN_WIDTH)
+        )
     good &= (depth > 0.004) & (depth < 0.055)
 
     found = []
     for i in np.flatnonzero(good):
         fingers = np.flatnonzero(finger[i, 1:]) + 1
         points = np.full((5, 3), np.nan)
-        points[0] = origins[i, 0] + (end[i] + SKIN) * closing
+        points[0] = origins[i, 0] + (end[i, 0] + SKIN) * closing
         points[fingers] = origins[i, fingers] + (start[i, fingers] - SKIN)[:, None] * closing
         middle = (points[0] + points[fingers].mean(axis=0)) / 2
         # of the weight about the grasp
@@ -255,7 +250,7 @@ def _contacts_at(
             + lever / 0.03
             + np.linalg.norm(middle - solid.com) / 0.06
             + 0.5 * (4 - len(fingers))
-            + 3.0 * (2 - facing_thumb[i] - facing_fingers[i, 1:3].mean())
+            + 3.0 * (2 - facing_thumb[i, 0] - facing_fingers[i, 1:3].mean())
             + abs(min(depth[i], 0.03) - 0.03) / 0.02
             + max(0.0, width[i] - 0.07) / 0.01
         )

@@ -6,7 +6,7 @@ Shape letters: F frames of all sequences, S sequences of a batch padded to T fra
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -112,10 +112,10 @@ def retarget_demos(
         palm_quat_wxyz=matrix_to_quat(links[:, 0, :3, :3]).numpy(),
         fingertip_names=robot.fingertip_names,
         fingertip_pos=links[:, 1:, :3, 3].numpy(),
-        object_pos=demos.object_pos.astype(np.float64),
-        object_quat_wxyz=demos.object_quat_wxyz.astype(np.float64),
-        goal_pos=goal_pos.astype(np.float64),
-        goal_quat_wxyz=goal_quat.astype(np.float64),
+        object_pos=demos.object_pos,
+        object_quat_wxyz=demos.object_quat_wxyz,
+        goal_pos=goal_pos,
+        goal_quat_wxyz=goal_quat,
         annotated=demos.hand_valid,
         valid=reason == 0,
         reason=reason,
@@ -171,9 +171,7 @@ class HandMotions:
             demos, surfaces, config.contact_distance
         )
         """Contact points [F, 21, 3] of the human keypoints, and which of them [F, 21] touch the object."""
-        self._keypoints = np.where(
-            demos.hand_valid[:, None, None], demos.hand_keypoints, 0.0
-        ).astype(np.float64)
+        self._keypoints = np.where(demos.hand_valid[:, None, None], demos.hand_keypoints, 0.0)
 
     def batches(
         self, progress: Progress = unseen
@@ -222,8 +220,8 @@ class HandMotions:
             contact_points=padded(self._contact_points[:, hand.keypoint_indices]),
             in_contact=padded(self.touching[:, hand.keypoint_indices]),
             held=padded(held),
-            object_pos=padded(demos.object_pos.astype(np.float64)),
-            object_quat=padded(demos.object_quat_wxyz.astype(np.float64)),
+            object_pos=padded(demos.object_pos),
+            object_quat=padded(demos.object_quat_wxyz),
             object_index=torch.tensor(which),
             fields=self._fields,
         )
@@ -242,31 +240,32 @@ def human_contacts(
     Returns:
         Contact points [F, 21, 3] in the world, zero where there is no contact, and whether there is one [F, 21].
     """
-    keypoints = np.where(
-        demos.hand_valid[:, None, None], demos.hand_keypoints.astype(np.float64), np.nan
-    )
-    object_pos = demos.object_pos.astype(np.float64)
-    object_quat = demos.object_quat_wxyz.astype(np.float64)
+    keypoints = np.where(demos.hand_valid[:, None, None], demos.hand_keypoints, np.nan)
     points = np.zeros_like(keypoints)
     touching = np.zeros(keypoints.shape[:2], dtype=bool)
     object_name = demos.object_name[demos.sequence_of_frame]
     for name in demos.object_names:
         rows = object_name == name
-        contacts = keypoint_contacts(
-            surfaces[name], keypoints[rows], object_pos[rows], object_quat[rows], distance
+        points[rows], touching[rows] = keypoint_contacts(
+            surfaces[name],
+            keypoints[rows],
+            demos.object_pos[rows],
+            demos.object_quat_wxyz[rows],
+            distance,
         )
-        points[rows], touching[rows] = contacts
     return points, touching
 
 
 def rest_on_table(demos: Demos, objects: Sequence[ObjectSpec]) -> Demos:
     """Return the demonstrations over a level table on which each object rests in its first frame (the paper, appendix
-    D.a).
+    D.a); keypoints and object poses are in double precision.
 
     Raises:
         DemoError: an object of the demonstrations is not among ``objects``.
     """
-    return grounded(levelled(demos), objects_named(objects, demos.object_name.tolist()))
+    demos = grounded(levelled(demos), objects_named(objects, demos.object_name.tolist()))
+    names = ("hand_keypoints", "object_pos", "object_quat_wxyz")
+    return replace(demos, **{name: getattr(demos, name).astype(np.float64) for name in names})
 
 
 def _arm_targets(

@@ -45,6 +45,15 @@ _ALONG = 0.9
 """Cosine of the angle to an axis below which fingers do not point along it."""
 
 
+_TO_SAY = (
+    "whether each finger and the thumb are what they are called, and the palm looks where its z axis points (see the "
+    "picture)",
+    "efforts and gains of the drives, where the maker's figures are better than the rule",
+    "where the base stands: xreset robots place FOLDER --demos DEMOS --write",
+)
+"""What no file and no geometry says."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Imported:
     """What an import made."""
@@ -141,14 +150,6 @@ def import_robot(
         f"{flange!r}, its inner side along ({_vector(T_flange_palm[:3, 2])}). The angle about {along} is yours to know"
     )
     return Imported(folder=out, guessed=tuple(notes), to_say=(mounting, *_TO_SAY))
-
-
-_TO_SAY = (
-    "whether each finger and the thumb are what they are called, and the palm looks where its z axis points (see the "
-    "picture)",
-    "efforts and gains of the drives, where the maker's figures are better than the rule",
-    "where the base stands: xreset robots place FOLDER --demos DEMOS --write",
-)
 
 
 def _out_of_flange(arm: RobotTree, flange: str) -> np.ndarray:

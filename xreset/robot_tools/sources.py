@@ -22,25 +22,21 @@ _ROTOR_AT_MOST = 0.01
 _TURNS = 2 * math.pi
 """[rad] Range in either direction of a joint without limits."""
 _FLANGES = (
-    *(
-        "tool0",
-        "flange",
-        "tool_link",
-        "ee_link",
-        "link_eef",
-        "link_ee",
-        "end_effector_link",
-        "attachment",
-    ),
-    *(
-        "panda_link8",
-        "fr3_link8",
-        "fer_link8",
-        "iiwa_link_ee",
-        "lbr_link_ee",
-        "lbr_iiwa_link_7",
-        "bracelet_link",
-    ),
+    "tool0",
+    "flange",
+    "tool_link",
+    "ee_link",
+    "link_eef",
+    "link_ee",
+    "end_effector_link",
+    "attachment",
+    "panda_link8",
+    "fr3_link8",
+    "fer_link8",
+    "iiwa_link_ee",
+    "lbr_link_ee",
+    "lbr_iiwa_link_7",
+    "bracelet_link",
 )
 """Links that carry the tool in the makers' files: UR, ABB and Fanuc (ROS-Industrial), xArm, Panda and FR3, iiwa,
 Kinova."""

@@ -111,7 +111,8 @@ def _keypoint_terms(
 ) -> Quadratic:
     """Compute the terms of the keypoints and of the bones between them."""
     scale = config.length_scale
-    x, J = (values / scale for values in model.keypoints_of(bodies))
+    x = bodies.pos[:, model.keypoint_body] / scale
+    J = bodies.linear[:, model.keypoint_body] / scale
     human = targets.keypoints.flatten(0, 1) / scale
     touched = targets.contact_points.flatten(0, 1) / scale
     on = targets.annotated.flatten().to(x.dtype)[:, None]

@@ -122,7 +122,8 @@ class HandModel:
         )
         """[N] share of each of these balls in its pad: the shares of a pad add up to 1."""
         self._bodies = tuple(dict.fromkeys((*self.links, *self.balls.links)))
-        self._keypoint_bodies = self._body_indices(self.links)
+        self.keypoint_body = self._body_indices(self.links)
+        """[P] index among the bodies of each keypoint's link."""
         self.group_body = self._body_indices(self.balls.links)
         """[G] index among the bodies of each link with balls."""
 
@@ -177,10 +178,6 @@ class HandModel:
             linear=torch.cat((links.linear, identity, turn.mT), dim=-1),
             angular=torch.cat((links.angular, torch.zeros_like(identity), identity), dim=-1),
         )
-
-    def keypoints_of(self, bodies: PointJacobian) -> tuple[Tensor, Tensor]:
-        """Return keypoints [B, P, 3] and their Jacobian [B, P, 3, n]."""
-        return bodies.pos[:, self._keypoint_bodies], bodies.linear[:, self._keypoint_bodies]
 
     def ball_centers(self, bodies: PointJacobian, frame: Tensor, ball: Tensor) -> Tensor:
         """[..., 3] centers in the world of balls [...] in frames [...]."""

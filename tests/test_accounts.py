@@ -38,7 +38,6 @@ class AccountsTest(unittest.TestCase):
                 self.assertEqual(number, (mine & (self.reason == reason)).sum())
         annotated = rows[-1].without("not annotated")
         self.assertEqual(annotated.total, (self.reason != "not annotated").sum())
-        self.assertEqual(annotated.share, rows[-1].kept / annotated.total)
         self.assertRegex(described(rows[-1].lost), r"^jump \d+, ")
 
     def test_file(self):

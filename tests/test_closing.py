@@ -168,7 +168,7 @@ class FingersTest(unittest.TestCase):
         )
         np.testing.assert_allclose(fingers.gap[:, 0], jaws - 0.02, atol=3e-4)
         np.testing.assert_allclose(fingers.gap[:, 1], 1.1 * jaws - 0.002 - 0.02, atol=3e-4)
-        np.testing.assert_allclose(fingers.nearest, jaws - 0.02, atol=3e-4)
+        np.testing.assert_allclose(fingers.gap.amin(dim=-1), jaws - 0.02, atol=3e-4)
         self.assertEqual(
             fingers.leading.tolist(), [[True, True, False]] * 3, "finger_b has no shape of its own"
         )

@@ -37,11 +37,6 @@ class Account:
         """Number of frames or states, kept and lost."""
         return self.kept + sum(self.lost.values())
 
-    @property
-    def share(self) -> float:
-        """Share that is kept; NaN if there was nothing."""
-        return self.kept / self.total if self.total else float("nan")
-
     def without(self, reason: str) -> Account:
         """Return the account of what was not lost for that reason."""
         return replace(self, lost={name: n for name, n in self.lost.items() if name != reason})

@@ -29,7 +29,7 @@ from xreset.task.config import TaskConfig
 from xreset.task.randomization import Drawn
 from xreset.task.reading import Reading, step_log
 from xreset.task.rewards import Reward, RewardInput, compute_reward, own_term
-from xreset.task.terminations import episode_steps, out_of_bounds
+from xreset.task.terminations import out_of_bounds
 from xreset.task.variation import Variation
 from xreset.tensors import where
 
@@ -155,7 +155,8 @@ class ManipulationEnv:
         scene = backend.scene
         self.num_envs = backend.num_worlds
         self.num_actions = len(scene.robot.joints)
-        self.max_episode_length = episode_steps(task.termination, scene.control_dt)
+        steps = round(task.termination.episode_seconds / scene.control_dt)
+        self.max_episode_length = max(1, steps)
         self.generator = torch.Generator(device=self.device)
         self.generator.manual_seed(seed)
         self._graphs = GraphRunner(self.device, self.generator)

@@ -118,6 +118,6 @@ def show_accounts(rows: Sequence[Account], title: str) -> None:
     """Print how many frames or states of each object and phase are kept, and why the others are not."""
     table = [("object", "phase", "in all", "kept", "others")]
     for row in rows:
-        kept = f"{row.kept} ({row.share:.0%})" if row.total else "0"
+        kept = f"{row.kept} ({row.kept / row.total:.0%})" if row.total else "0"
         table.append((row.object_name, row.phase, str(row.total), kept, described(row.lost)))
     show_table(table, title=title)

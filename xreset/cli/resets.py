@@ -77,21 +77,17 @@ def resets(
     }
     write_bank(out, bank, config=config, inputs={"retargeted": str(inputs.hash)})
     accounts = bank.accounts()
-    write_accounts(
-        accounts_path(out), of="states tried in physics", rows=accounts, pressing=bank.num_pressing
-    )
+    counts = accounts_path(out)
+    write_accounts(counts, of="states tried in physics", rows=accounts, pressing=bank.num_pressing)
     show_accounts(accounts, f"{bank.robot}: {title}")
     if squeeze.force > 0:
         console.print(
-            f"{bank.num_pressing} of {int(bank.post_contact.sum())} states after contact press with {squeeze.force:g} N"
+            f"{bank.num_pressing} of {bank.post_contact.sum()} states after contact press with {squeeze.force:g} N"
         )
     tried = bank.num_states + len(bank.rejected_reason)
-    console.print(
-        f"{accounts[-1].kept / max(motion.annotated.sum(), 1):.0%} of the annotated frames are kept"
-    )
-    console.print(
-        f"{bank.num_states} states of {tried} kept in {out}; counts in {accounts_path(out)}"
-    )
+    share = accounts[-1].kept / max(motion.annotated.sum(), 1)
+    console.print(f"{share:.0%} of the annotated frames are kept")
+    console.print(f"{bank.num_states} states of {tried} kept in {out}; counts in {counts}")
 
 
 COMMAND = resets

@@ -144,7 +144,11 @@ def read_keypoints(path: str | Path, convention: Convention) -> Demos:
     parts = []
     for file in files:
         name = file.relative_to(folder).with_suffix("").as_posix()
-        sequences = _read_csv(file, name) if file.suffix == ".csv" else [_read_npz(file, name)]
+        if file.suffix == ".csv":
+            sequences = _read_csv(file, name)
+        else:
+            arrays = read_npz(file, None, _FILE, what="a tracker's keypoints")
+            sequences = [{"sequence": np.array(name)} | arrays]
         for arrays in sequences:
             parts.append(sequence_of(arrays, f"{file}, sequence {arrays['sequence']}", convention))
     return merge_demos(parts)
@@ -171,14 +175,10 @@ def read_transform(path: str | Path) -> np.ndarray:
             f"{path} holds {T.shape} numbers {shown(T.tolist())}, expected the 4x4 matrix of a rotation and a"
             " translation, with the last row 0 0 0 1."
         )
-    return T.astype(float)
+    return T
 
 
 # Files
-
-
-def _read_npz(path: Path, name: str) -> dict[str, np.ndarray]:
-    return {"sequence": np.array(name)} | read_npz(path, None, _FILE, what="a tracker's keypoints")
 
 
 def _read_csv(path: Path, name: str) -> Iterator[dict[str, np.ndarray]]:

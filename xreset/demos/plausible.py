@@ -39,7 +39,7 @@ def doubts(demos: Demos) -> list[str]:
         # a right hand's fingers point along the wrist's -x axis, a left hand's along +x
         fingers = hand[:, [5, 9, 13, 17]].mean(axis=1) - hand[:, 0]
         fingers /= np.linalg.norm(fingers, axis=1, keepdims=True).clip(1e-9)
-        wrist = Rotation.from_quat(demos.wrist_quat_wxyz[valid].astype(float), scalar_first=True)
+        wrist = Rotation.from_quat(demos.wrist_quat_wxyz[valid], scalar_first=True)
         along = (wrist.apply([1.0, 0.0, 0.0]) * fingers).sum(axis=1)
         is_right = demos.hand_side[demos.sequence_of_frame][valid] == "right"
         cosine = np.median(np.where(is_right, -along, along))

@@ -57,20 +57,21 @@ def drive_shares(robot: RobotSpec) -> np.ndarray:
         home = mimic.multiplier * robot.home[source] + mimic.offset
         followers.append(JointSpec(name=mimic.joint, group="hand", drive=idle, home=home))
     uncoupled = replace(robot, joints=(*robot.joints, *followers), mimics=())
-    M = mass_matrix(uncoupled, uncoupled.home) + np.diag(_drive_values(uncoupled, "armature"))
+    M = mass_matrix(uncoupled, uncoupled.home) + np.diag(drive_values(uncoupled, "armature"))
     return np.linalg.solve(U.T @ M @ U, U.T @ M)
 
 
 def drive_inertia(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
     """[J] inertia of each joint when it moves alone, armature included: the mass matrix' diagonal [kg m^2 or kg]."""
-    return np.diag(mass_matrix(robot, joint_pos)) + _drive_values(robot, "armature")
+    return np.diag(mass_matrix(robot, joint_pos)) + drive_values(robot, "armature")
 
 
 def damping_ratio(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
     """[J] kd / (2 sqrt(kp I)) of each drive, 1 being critical damping, with I from :func:`drive_inertia`."""
-    stiffness = _drive_values(robot, "kp") * drive_inertia(robot, joint_pos)
-    return _drive_values(robot, "kd") / (2 * np.sqrt(stiffness))
+    stiffness = drive_values(robot, "kp") * drive_inertia(robot, joint_pos)
+    return drive_values(robot, "kd") / (2 * np.sqrt(stiffness))
 
 
-def _drive_values(robot: RobotSpec, name: str) -> np.ndarray:
+def drive_values(robot: RobotSpec, name: str) -> np.ndarray:
+    """[J] an entry of each joint's :class:`~xreset.spec.DriveSpec`."""
     return np.array([getattr(joint.drive, name) for joint in robot.joints])

@@ -62,7 +62,7 @@ def _frames_to_follow(retargeted: Retargeted, fingers: Fingers, within: float) -
     count = np.cumsum(over)
     # in this frame, or in an earlier one of the same sequence
     over = count - (count - over)[start] > 0
-    gap = fingers.nearest.numpy()
+    gap = fingers.gap.amin(dim=-1).numpy()
     near = np.minimum(gap[:-1], gap[1:]) < within
     same_sequence = owner[:-1] == owner[1:]
     return np.flatnonzero(

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from xreset.geometry.balls import link_balls
+from xreset.geometry.dynamics import drive_values
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matvec, quat_rotate, quat_rotate_inverse
@@ -36,11 +37,6 @@ class Fingers:
     """[M, G, 3] nearest point of the link, in the link's frame."""
     inward: Tensor
     """[M, G, 3] unit vector into the object there, world frame."""
-
-    @property
-    def nearest(self) -> Tensor:
-        """[M] the smallest gap."""
-        return self.gap.amin(dim=-1)
 
     @property
     def leading(self) -> Tensor:
@@ -128,8 +124,8 @@ def squeeze_targets(
     torque = torch.einsum(
         "mgi,mgij->mj", config.force * pressing[..., None] * fingers.inward, jacobian
     )
-    effort = torch.tensor([joint.drive.effort for joint in robot.joints], dtype=torch.float64)
-    kp = torch.tensor([joint.drive.kp for joint in robot.joints], dtype=torch.float64)
+    effort = torch.as_tensor(drive_values(robot, "effort"))
+    kp = torch.as_tensor(drive_values(robot, "kp"))
     is_hand = torch.tensor([joint.group == "hand" and joint.drive.kp > 0 for joint in robot.joints])
     beyond = torch.where(is_hand, torque.clamp(-effort, effort) / kp.clamp_min(1e-9), 0.0)
     return torch.where(beyond != 0, kinematics.clamp(q + beyond), q).numpy()

@@ -87,6 +87,4 @@ def rest_pose(backend: Backend, start: State) -> Tensor:
     still &= state.object_angvel.norm(dim=-1) < ANGULAR_VELOCITY
     lost = out_of_bounds(state.object_pos, backend.scene.table, TerminationConfig())
     at_rest = still & ~lost & ~health.nonfinite & ~health.overflow
-    return torch.cat(
-        (state.object_pos, state.object_quat, at_rest[:, None].to(state.object_pos.dtype)), dim=-1
-    )
+    return torch.cat((state.object_pos, state.object_quat, at_rest[:, None]), dim=-1)

@@ -233,8 +233,8 @@ def _play(kinematics: Kinematics, backend: Backend, start: State) -> Tensor:
     """Go through the phases; return [N, 1 + P + P (J + 7)]: whether the arm can raise and turn the hand, which phases
     are passed, then the joints and the object's pose after each phase."""
     backend.set_object_gravity(torch.ones(backend.num_worlds, device=backend.device))
-    start = start.to("cpu")
-    joints = start.joint_pos.double()
+    start = start.to("cpu").map(Tensor.double)
+    joints = start.joint_pos
     palm = kinematics.link_poses(joints, [kinematics.robot.palm])[:, 0]
     up, up_error = arm_path(kinematics, joints, palm, rise=HEIGHT, turn=0.0)
     right, turn_error = arm_path(kinematics, up[-1], palm, rise=HEIGHT, turn=TURN)
@@ -256,13 +256,13 @@ def _play(kinematics: Kinematics, backend: Backend, start: State) -> Tensor:
     ):
         _move(
             backend,
-            start.joint_target.double(),
+            start.joint_target,
             torch.cat((before[None], path)),
             kinematics.robot.arm_indices,
         )
         before = path[-1]
-        now = backend.state().to("cpu")
-        links = backend.links().to("cpu")
+        now = backend.state().to("cpu").map(Tensor.double)
+        links = backend.links().to("cpu").map(Tensor.double)
         now_pos, now_quat = _relative(
             now.object_pos, now.object_quat, links.pos[:, 0], links.quat[:, 0]
         )
@@ -279,9 +279,8 @@ def _relative(
     pos: Tensor, quat: Tensor, frame_pos: Tensor, frame_quat: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return poses in the frame of others."""
-    frame = frame_quat.double()
-    relative = quat_rotate_inverse(frame, pos.double() - frame_pos.double())
-    return relative, quat_multiply(quat_conjugate(frame), quat.double())
+    relative = quat_rotate_inverse(frame_quat, pos - frame_pos)
+    return relative, quat_multiply(quat_conjugate(frame_quat), quat)
 
 
 def arm_path(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from xreset.geometry.urdf import robot_tree
+from xreset.geometry.urdf import joint_limits, robot_tree
 from xreset.spec import RobotSpec
 from xreset.task.config import ActionConfig
 
@@ -36,12 +36,11 @@ class ActionSpace:
     ) -> None:
         """Read the joints of a robot."""
         self.config = config
-        tree = robot_tree(robot)
-        joints = [tree.joint(name) for name in robot.joint_names]
-        lower = torch.tensor([joint.lower for joint in joints], dtype=torch.float32, device=device)
-        upper = torch.tensor([joint.upper for joint in joints], dtype=torch.float32, device=device)
+        lower, upper = torch.tensor(joint_limits(robot), dtype=torch.float32, device=device)
         is_arm = torch.tensor([joint.group == "arm" for joint in robot.joints], device=device)
-        slides = torch.tensor([joint.type == "prismatic" for joint in joints], device=device)
+        tree = robot_tree(robot)
+        kinds = [tree.joint(name).type for name in robot.joint_names]
+        slides = torch.tensor([kind == "prismatic" for kind in kinds], device=device)
         unit = torch.where(slides & ~is_arm, FINGER, 1.0)
         hand_step = config.hand_step if config.hand == "relative" else 0.0
         zero = (lower + upper) / 2

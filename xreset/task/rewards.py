@@ -149,15 +149,14 @@ def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
     position_error = (x.object_pos - x.goal_pos).norm(dim=-1)
     rotation_error = quat_angle(x.object_quat, x.goal_quat)
     success = gate & (position_error < x.success_position) & (rotation_error < c.success_rotation)
-    gate_f = gate.to(position_error.dtype)
-    success_reward = c.success * success.to(gate_f.dtype)
+    success_reward = c.success * success
     distance = position_error
     if c.points or c.success_shape == "points":
         distances = point_distances(x.object_pos, x.object_quat, x.goal_pos, x.goal_quat, x.points)
         distance = distances.mean(dim=-1)
     if c.success_shape == "points":
         success = gate & (distance <= x.success_position)
-        success_reward = c.success * success.to(gate_f.dtype) / (1.0 + 10.0 * distance)
+        success_reward = c.success * success / (1.0 + 10.0 * distance)
     change = (x.action - x.previous_action).square()
     if c.action_rate_arm is None:
         action_rate = c.action_rate * change.sum(dim=-1)
@@ -167,20 +166,20 @@ def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
     terms = {
         "reach": c.reach * (1.0 - torch.tanh(reach / c.reach_width)),
         "reach_near": c.reach_near * (1.0 - torch.tanh(reach / c.reach_near_width)),
-        "grasp": c.grasp * grasped.to(gate_f.dtype),
-        "position": c.position * gate_f * (1.0 - torch.tanh(position_error / c.position_width)),
-        "rotation": c.rotation * gate_f * (1.0 - torch.tanh(rotation_error / c.rotation_width)),
+        "grasp": c.grasp * grasped,
+        "position": c.position * gate * (1.0 - torch.tanh(position_error / c.position_width)),
+        "rotation": c.rotation * gate * (1.0 - torch.tanh(rotation_error / c.rotation_width)),
         "success": success_reward,
         "action": c.action * x.action.square().sum(dim=-1),
         "action_rate": action_rate,
-        "out_of_bounds": c.out_of_bounds * x.out_of_bounds.to(gate_f.dtype),
+        "out_of_bounds": c.out_of_bounds * x.out_of_bounds,
     }
     if c.proximity:
         terms["proximity"] = c.proximity * x.tip_distance.sum(dim=-1).clamp_max(c.proximity_cap)
     if c.palm_proximity:
         terms["palm_proximity"] = c.palm_proximity * x.palm_distance.clamp_max(c.palm_proximity_cap)
     if c.points:
-        terms["points"] = c.points * gate_f * (1.0 - distance / c.points_zero)
+        terms["points"] = c.points * gate * (1.0 - distance / c.points_zero)
     for name, weight in c.own.items():
         terms[name] = weight * _checked(name, own_term(name)(x), position_error)
     total = c.scale * torch.stack(list(terms.values())).sum(dim=0)

@@ -19,8 +19,3 @@ def out_of_bounds(object_pos: Tensor, table: TableSpec, c: TerminationConfig) ->
     ]
     beside = offset[0] | offset[1]
     return beside | (object_pos[:, 2] < c.object_low) | (object_pos[:, 2] > c.object_high)
-
-
-def episode_steps(c: TerminationConfig, control_dt: float) -> int:
-    """Control steps until the time limit."""
-    return max(1, round(c.episode_seconds / control_dt))

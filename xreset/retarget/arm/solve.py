@@ -279,7 +279,7 @@ def splice(
         # [S, K before, K now]
         change = (paths[:, None, :, t] - paths[:, :, None, t - 1]).abs().amax(-1)
         jumps = (change > jump) & annotated[:, t - 1, None, None]
-        total = value[:, :, None] - switch + worth[:, None, :, t] * (~jumps).to(paths.dtype)
+        total = value[:, :, None] - switch + worth[:, None, :, t] * ~jumps
         most, before = total.max(dim=1)
         value = most - cost[:, :, t]
         came_from.append(before)

@@ -17,7 +17,6 @@ from xreset.physics import Health, State
 from xreset.plugins import make_backend
 from xreset.resets.config import FilterConfig
 from xreset.resets.filter import REASONS, make_bank, rejection
-from xreset.resets.probe import settle
 from xreset.retarget.file import Retargeted
 from xreset.spec import SceneSpec
 
@@ -49,7 +48,10 @@ class FilterTest(unittest.TestCase):
         ]
         with backend_class(scene, 1, workers=0) as backend:
             start = State.at_rest(*rows)
-            settle(backend, start, gravity=0.0, steps=FilterConfig().steps)
+            backend.set_object_gravity(torch.zeros(1))
+            backend.set_state(start)
+            for _ in range(FilterConfig().steps):
+                backend.step()
             reason = int(rejection(backend, start, FilterConfig()))
         return None if reason < 0 else REASONS[reason]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from xreset.cameras.config import CameraConfig
+from xreset.geometry.shapes import transform
 
 
 def look_at(eye: tuple[float, ...], target: tuple[float, ...]) -> np.ndarray:
@@ -20,7 +21,4 @@ def look_at(eye: tuple[float, ...], target: tuple[float, ...]) -> np.ndarray:
 
 def mounted_pose(camera: CameraConfig) -> np.ndarray:
     """Return the pose [4, 4] of a camera in the frame of its link or of the world: x right, y down, z forward."""
-    T = np.eye(4)
-    T[:3, :3] = look_at(camera.pos, camera.target).T
-    T[:3, 3] = camera.pos
-    return T
+    return transform(look_at(camera.pos, camera.target).T, camera.pos)

@@ -37,7 +37,7 @@ def train(
 
     Args:
         out: Run folder to make, or to continue.
-        robot: Name or folder of the robot; with --goals alone, default: the robot of the goal set.
+        robot: Name or folder of the robot; default: that of the bank or of the goal set.
         resets: Reset bank, made by `xreset resets`.
         goals: Goal set, made by `xreset goals`. With --resets, its starts and goals are added to the demonstrated ones;
             without, every episode begins at home.
@@ -71,9 +71,9 @@ def train(
             out, iterations=iterations, minutes=minutes, own=config.task.reward.own, wandb=wandb
         )
         return
-    if goals is None and (robot is None or resets is None):
+    if goals is None and resets is None:
         raise RunError(
-            "A new run needs --robot and --resets, or --goals. To continue the run in --out, add --resume."
+            "A new run needs --resets or --goals. To continue the run in --out, add --resume."
         )
     training.train(
         resets,

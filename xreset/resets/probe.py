@@ -54,17 +54,13 @@ def probe(
     ) as backend:
         for items, fresh in plan:
             start = states[torch.as_tensor(items)].to(backend.device)
-            settle(backend, start, gravity=gravity, steps=steps)
+            share = torch.full((backend.num_worlds,), gravity, device=backend.device)
+            backend.set_object_gravity(share)
+            backend.set_state(start)
+            for _ in range(steps):
+                backend.step()
             rows.append(items[fresh])
             verdicts.append(judge(backend, start).cpu().numpy()[fresh])
             done += len(rows[-1])
             progress(done)
     return np.concatenate(verdicts)[np.argsort(np.concatenate(rows))]
-
-
-def settle(backend: Backend, start: State, *, gravity: float, steps: int) -> None:
-    """Put the worlds into states [N], with a fraction of the objects' weight, and take control steps."""
-    backend.set_object_gravity(torch.full((backend.num_worlds,), gravity, device=backend.device))
-    backend.set_state(start)
-    for _ in range(steps):
-        backend.step()

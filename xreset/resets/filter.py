@@ -102,7 +102,7 @@ def make_bank(
             "Look at the reasons of xreset retarget."
         )
     owner = retargeted.sequence_of_frame[retargeted.valid]
-    objects_named(objects, np.asarray(retargeted.object_name)[owner])
+    objects_named(objects, retargeted.object_name[owner])
     frame, part = closing_states(retargeted, robot, objects, closing or ClosingConfig())
     valid = retargeted.valid[frame]
     frame = frame[valid]

@@ -161,8 +161,7 @@ class HandMotions:
         """The robot's hand."""
         self._config = config.hand
         surfaces = {
-            name: Surface(spec)
-            for name, spec in objects_named(objects, demos.object_name.tolist()).items()
+            name: Surface(spec) for name, spec in objects_named(objects, demos.object_names).items()
         }
         self._objects = list(surfaces)
         self._fields = DistanceFields.join([surface.field for surface in surfaces.values()])
@@ -263,7 +262,7 @@ def rest_on_table(demos: Demos, objects: Sequence[ObjectSpec]) -> Demos:
     Raises:
         DemoError: an object of the demonstrations is not among ``objects``.
     """
-    demos = grounded(levelled(demos), objects_named(objects, demos.object_name.tolist()))
+    demos = grounded(levelled(demos), objects_named(objects, demos.object_names))
     names = ("hand_keypoints", "object_pos", "object_quat_wxyz")
     return replace(demos, **{name: getattr(demos, name).astype(np.float64) for name in names})
 

@@ -95,7 +95,7 @@ class PageTest(unittest.TestCase):
         sources = [file for folder in folders for file in (ROOT / folder).rglob("*.py")]
         defined = {"DataFrame"}  # of pandas
         for file in sources:
-            defined.update(re.findall(r"(?:class|import) (\w+)", file.read_text()))
+            defined.update(re.findall(r"(?m)(?:class |import |^)(\w+)", file.read_text()))
         files = 0
         for page in PAGES:
             text = re.sub(r"(?ms)^```.*?^```|^    .*?$", "", page.read_text())

@@ -182,6 +182,8 @@ class RefusalTest(WithEnv):
         for shape in ((7,), (1, 7), (N, 1), ()):
             with self.subTest(shape), self.assertRaisesRegex(XResetError, r"expected \(3, 7\)"):
                 env.step(torch.zeros(shape))
+        with self.assertRaisesRegex(XResetError, "a ndarray, expected a tensor"):
+            env.step(np.zeros((3, 7)))
 
     def test_observations_do_not_hold_the_graph_of_an_action(self):
         observations, reward, *_ = self.make().step(torch.zeros(N, 7, requires_grad=True) * 1.0)

@@ -15,6 +15,7 @@ from xreset.errors import FileFormatError, RunError, XResetError
 from xreset.eval.export.lerobot import write_lerobot
 from xreset.eval.export.recorded import read_recorded, write_arrays
 from xreset.eval.results import write_results
+from xreset.files import file_hash
 
 PARQUET = importlib.util.find_spec("pyarrow") is not None
 FILMS = PARQUET and importlib.util.find_spec("imageio_ffmpeg") is not None
@@ -124,6 +125,7 @@ class Arrays(Case):
         }
         self.assertEqual(documented, set(arrays))
         self.assertEqual(str(arrays["schema"]), "xreset-rollouts/1")
+        self.assertIn(file_hash(self.folder / "eval/sapien.trace.npz"), str(arrays["meta"]))
         self.assertEqual(arrays["joint_pos"].shape, (20, len(self.robot.joints)))
         np.testing.assert_allclose(
             arrays["object_pos"][5:10], recording.episodes["trace"][1].object_pos, atol=1e-7

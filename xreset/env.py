@@ -280,6 +280,9 @@ class ManipulationEnv:
             Observations (of the new episode where one has begun), reward [N], done [N] (0 or 1), and a dictionary with
             ``time_outs`` [N] (the episode ended without failing: bootstrap its value), ``faulty`` [N] bool (the
             simulation failed: learn nothing from this step) and ``log``.
+
+        Raises:
+            XResetError: the action is no tensor, or has another shape.
         """
         self._apply_action(action)
         self._graphs.run(self._compute_rewards)
@@ -408,6 +411,10 @@ class ManipulationEnv:
     # Parts
 
     def _apply_action(self, action: Tensor, push: Tensor | None = None) -> None:
+        if not isinstance(action, Tensor):
+            raise XResetError(
+                f"The actions are a {type(action).__name__}, expected a tensor: torch.as_tensor(actions)."
+            )
         if action.shape != self._action.shape:
             raise XResetError(
                 f"The actions have the shape {tuple(action.shape)}, expected {tuple(self._action.shape)}."

@@ -18,6 +18,7 @@ from xreset.errors import RunError
 from xreset.eval.report.clips import finite_states
 from xreset.eval.report.read import results_in
 from xreset.eval.results import Table, Trace, read_evaluation, read_traces, recorded
+from xreset.files import file_hash
 from xreset.records import write_npz
 from xreset.spec import RobotSpec
 from xreset.text import short_name
@@ -51,6 +52,8 @@ class Recording:
     words; ``trace``, its states [T]; ``action`` [T, J], joint targets: the last target before the next frame, of
     the last frame its own; ``meshes``, folder of the object's mesh or None: a stand-in. Joint positions in rad
     (prismatic: m), poses in the world frame (z up, table top at z = 0), quaternions (w, x, y, z)."""
+    inputs: dict[str, str]
+    """Name -> SHA-256 of each file of traces."""
 
     @property
     def offsets(self) -> np.ndarray:
@@ -85,6 +88,7 @@ def read_recorded(
     rows = []
     robots: dict[str, RobotSpec] = {}
     intervals: dict[float, Path] = {}
+    inputs: dict[str, str] = {}
     for folder in folders:
         results = results_in(folder)
         evaluation = read_evaluation(results)
@@ -96,10 +100,12 @@ def read_recorded(
             if name not in robots:
                 robots[name] = load_robot(name)
             traces = read_traces(results, engine, robots[name].joint_names)
+            file = results / f"{engine}.trace.npz"
+            inputs[f"trace {len(inputs)}"] = file_hash(file)
             shown = recorded(evaluation.to_frame(), engine, traces)
             for episode in shown.to_dict("records"):
                 trace = episode.pop("trace")
-                action = _actions(trace, results / f"{engine}.trace.npz")
+                action = _actions(trace, file)
                 intervals.setdefault(round(float(np.median(np.diff(trace.time))), 6), results)
                 if not (finite_states(trace).all() and np.isfinite(action).all()):
                     logging.getLogger(__name__).warning(
@@ -134,6 +140,7 @@ def read_recorded(
         robot=next(iter(robots.values())),
         fps=_rate(next(iter(intervals))),
         episodes=pd.DataFrame(rows),
+        inputs=inputs,
     )
 
 
@@ -175,4 +182,4 @@ def write_arrays(path: str | Path, recording: Recording) -> None:
         "goal_pos": np.stack([t.goal_pos for t in traces]).astype(np.float32),
         "goal_quat_wxyz": np.stack([t.goal_quat for t in traces]).astype(np.float32),
     }
-    write_npz(path, SCHEMA, arrays)
+    write_npz(path, SCHEMA, arrays, inputs=recording.inputs)

@@ -51,7 +51,11 @@ RejectedIndices = Annotated[np.ndarray, Field(("C",), "i", within=(0, inf))]
 @dataclass(frozen=True, kw_only=True, repr=False)
 class ResetBank(Brief):
     """Contents of a reset bank: starts and goals of demonstrations [S], stable states [L] and rejected candidates
-    [C]."""
+    [C].
+
+    A state is ``joint_pos`` [L, J], ``object_pos`` [L, 3] and ``object_quat_wxyz`` [L, 4], in the world frame; it is
+    of the frame ``frame_index`` [L] of the demonstration ``sequence_index`` [L].
+    """
 
     robot: Text
     robot_fingerprint: Text

@@ -43,7 +43,10 @@ FrameDistances = Annotated[np.ndarray, Field(("F",), "f", within=None)]
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Retargeted(ObjectMotions):
-    """Robot trajectories of demonstrations, in the table frame."""
+    """Robot trajectories of demonstrations, in the table frame.
+
+    ``palm_pos`` [F, 3], ``palm_quat_wxyz`` [F, 4] and ``fingertip_pos`` [F, E, 3] follow from ``joint_pos``.
+    """
 
     robot: Text
     robot_fingerprint: Text

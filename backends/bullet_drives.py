@@ -8,6 +8,9 @@ import numpy as np
 
 from xreset.backends.rigid import Mechanism, MovingJoints
 
+_MASS_MATRIX_STEPS = 8
+"""Bullet steps between two updates of the mass matrix."""
+
 
 class BulletDrives:
     """Joint torques: PD drives with effort limits, armature, dry friction and mimic couplings.
@@ -25,13 +28,10 @@ class BulletDrives:
     with armature on the light links of a hand.
     """
 
-    def __init__(
-        self, client: Any, body: int, robot: Mechanism, dt: float, mass_matrix_steps: int
-    ) -> None:
+    def __init__(self, client: Any, body: int, robot: Mechanism, dt: float) -> None:
         self._p = client
         self._body = body
         self._dt = dt
-        self._mass_matrix_steps = mass_matrix_steps
         spec = robot.robot
         count = len(robot.joint_names)
         self._links = list(range(1, count + 1))  # link 0 is the base
@@ -108,7 +108,7 @@ class BulletDrives:
         saturated = np.abs(wanted) > self._effort
         if self._mass_matrix_age == 0 or saturated.tobytes() != self._saturated.tobytes():
             self._factorise(q, saturated)
-        self._mass_matrix_age = (self._mass_matrix_age + 1) % self._mass_matrix_steps
+        self._mass_matrix_age = (self._mass_matrix_age + 1) % _MASS_MATRIX_STEPS
         if joints.has_dry_friction:
             stopping = (
                 -(v / dt + self._inverse @ net)[self.driven] / np.diag(self._inverse)[self.driven]

@@ -48,9 +48,8 @@ _HIT_SELF = 4
 _IMPRATIO = 10.0
 _SOLIMP = (0.95, 0.99, 0.001, 0.5, 2.0)
 _SOLIMP_MIMIC = (0.99, 0.999, 0.001, 0.5, 2.0)
-_STIFF_MIMIC = (
-    0.8  # share of a mimic joint's lag that the next step takes away; its rate goes wholly
-)
+_STIFF_MIMIC = 0.8
+"""Share of a mimic joint's lag that the next step takes away; its rate goes wholly."""
 _CONDIM = 4
 _ROLLING = 1e-4  # MuJoCo wants a positive number although condim 4 does not use it
 _ARENA = 16 << 20  # bytes for contacts and constraints of one MjData

@@ -47,9 +47,8 @@ class MujocoWorld(World):
         self._sensing = model.opt.disableflags | mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self._silent = self._sensing | mujoco.mjtDisableBit.mjDSBL_SENSOR
         self._option.disableflags = self._silent
-        self._ahead = (
-            False  # whether the first half of the next step is done, with the present parameters
-        )
+        self._ahead = False
+        """Whether the first half of the next step is done, with the present parameters."""
         self._overflowed = False
         self._overflows = 0
 

@@ -60,8 +60,6 @@ INTERNAL_STEPS = 2
 """Bullet steps per physics step. Objects creep in a grasp by 2 mm in 2 s with 2, by 4 mm with 1, which is 1.6 times as
 fast."""
 _SOLVER_ITERATIONS = 50
-_MASS_MATRIX_STEPS = 8
-"""Bullet steps between two updates of the mass matrix that the drives need."""
 _GEOM_INITIALIZE_SAT_FEATURES = 4
 """Bullet's flag of a collision shape, which PyBullet does not name: contacts between polyhedra are found on faces."""
 _FAR = 100.0
@@ -117,7 +115,7 @@ class PybulletWorld(World):
         self._remove_defaults(self._table, -1, ())
         self._set_collision_pairs()
 
-        self._drives = BulletDrives(p, self._robot, self._mechanism, dt, _MASS_MATRIX_STEPS)
+        self._drives = BulletDrives(p, self._robot, self._mechanism, dt)
         self._drives.scale(self._drive_scale)
         self._frames = TrackedFrames(self._mechanism)
         self._from_principal = conjugate(self._inertia.quat)

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from xreset.backends.rigid import object_inertia
 from xreset.errors import XResetError
-from xreset.physics import Contacts, Parameter, Parameters, State
+from xreset.physics import Contacts, Links, Parameter, Parameters, State
 from xreset.spec import SceneSpec
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 # Shared arrays --------------------------------------------------------------------------------------------------------
 
 STATE_FIELDS = tuple(field.name for field in fields(State))
-LINK_FIELDS = ("link_pos", "link_quat", "link_linvel", "link_angvel")
+LINK_FIELDS = tuple(f"link_{field.name}" for field in fields(Links))
 CONTACT_FIELDS = tuple(field.name for field in fields(Contacts))
 
 
@@ -93,6 +93,11 @@ class Job:
     first: int
     object_index: tuple[int, ...]
 
+    @property
+    def stop(self) -> int:
+        """The number after that of its last world."""
+        return self.first + len(self.object_index)
+
 
 @dataclass(eq=False)  # exceptions are hashable
 class WorldFailure(Exception):
@@ -120,8 +125,7 @@ class LocalWorlds:
 
     def __init__(self, job: Job, arrays: Mapping[str, np.ndarray]) -> None:
         self._job = job
-        mine = slice(job.first, job.first + len(job.object_index))
-        self._arrays = {name: array[mine] for name, array in arrays.items()}
+        self._arrays = {name: array[job.first : job.stop] for name, array in arrays.items()}
         self._given: dict[str, np.ndarray] = {}
         self._worlds: list[World] = []
         self._inertia_changes: list[dict[str, Any]] = [{} for _ in job.object_index]
@@ -252,7 +256,7 @@ class WorkerTeam:
         for worker in self._workers:
             mine = worlds
             if worlds is not None:
-                mine = worlds[(worlds >= worker.first) & (worlds < worker.stop)]
+                mine = worlds[(worlds >= worker.job.first) & (worlds < worker.job.stop)]
                 if not mine.size:
                     continue
             worker.send((method, mine, argument))
@@ -283,8 +287,6 @@ class _Worker:
 
     def __init__(self, job: Job, memory: int) -> None:
         self.job = job
-        self.first = job.first
-        self.stop = job.first + len(job.object_index)
         self.pipe, pipe_of_worker = Pipe()
         path = [os.path.abspath(entry) for entry in sys.path]
         with pipe_of_worker:
@@ -324,14 +326,15 @@ class _Worker:
         self.pipe.close()
         self.wait()
         code = self._process.returncode
+        job = self.job
         how = (
             f"was ended by {signal.Signals(-code).name}"
             if code < 0
             else f"ended with exit code {code}"
         )
         return (
-            f"A worker process of the backend {self.job.backend!r} {how} during {command!r}; it ran worlds "
-            f"{self.first} to {self.stop - 1}. Its messages are on standard error. After SIGKILL, it may have run out "
+            f"A worker process of the backend {job.backend!r} {how} during {command!r}; it ran worlds "
+            f"{job.first} to {job.stop - 1}. Its messages are on standard error. After SIGKILL, it may have run out "
             "of memory: use fewer worlds or workers. workers=0 runs the worlds in this process, for a debugger."
         )
 

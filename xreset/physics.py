@@ -325,15 +325,15 @@ class Backend(ABC):
         self._set("torsional_friction", torsional, worlds)
 
     def set_object_inertia(self, scale: Tensor, worlds: Tensor | None = None) -> None:
-        """Set the factor [M] on the object's inertia about its centre of mass, beside what its mass does; 1 is what the
-        spec says."""
+        """Set the factor [M] on the object's inertia about its centre of mass, next to what its mass does; 1 is what
+        the spec says."""
         self._set("object_inertia", scale, worlds)
 
     def set_object_com(self, offset: Tensor, worlds: Tensor | None = None) -> None:
         """Move the object's centre of mass by [M, 3] m from where its spec has it, in its mesh frame; its inertia about
         it stays.
 
-        Of an object that moves, set the state anew.
+        Of an object that moves, set the state again.
         """
         self._set("object_com", offset, worlds)
 

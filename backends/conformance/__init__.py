@@ -15,6 +15,7 @@ import tomllib
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from xreset.backends.conformance import (
     contact_checks,
@@ -55,16 +56,13 @@ _MODULES = (state_checks, world_checks, robot_checks, motion_checks, contact_che
 _TABLE = tomllib.loads(Path(__file__).with_name("checks.toml").read_text())
 
 
-def _read_checks() -> tuple[Check, ...]:
-    functions = {}
-    for module in _MODULES:
-        functions |= vars(module)
-    return tuple(
-        Check(name=name, run=functions[name], **row) for name, row in _TABLE["checks"].items()
-    )
+_FUNCTIONS: dict[str, Any] = {}
+for _module in _MODULES:
+    _FUNCTIONS |= vars(_module)
 
-
-CHECKS = _read_checks()
+CHECKS = tuple(
+    Check(name=name, run=_FUNCTIONS[name], **row) for name, row in _TABLE["checks"].items()
+)
 """All checks, in the order in which they run."""
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from functools import cached_property
@@ -30,6 +31,8 @@ REFINEMENT = 8
 """How much finer the steps are of the reference that the reference itself is compared with."""
 _HALVINGS = 6
 """How often a random configuration is moved half the way home while the robot reaches into the table."""
+FRICTIONS = torch.tensor([[0.8, 0.4, 0.3], [0.7, 0.5, 0.9], [0.6, 0.3, 0.45], [0.9, 0.6, 0.2]])
+"""[N, 3] friction of the pairs, different in each of the shared worlds."""
 
 
 class Worlds:
@@ -294,6 +297,15 @@ def state_errors(found: State, expected: State, words: str = "") -> dict[str, Te
             a = torch.where((a * b).sum(-1, keepdim=True) < 0, -a, a)
         errors[f"{words} {field.name}".strip()] = a - b
     return errors
+
+
+def stacked(cases: Iterable[dict[str, Tensor]]) -> dict[str, Tensor]:
+    """Return the errors of several cases [T, ...], by name."""
+    errors = defaultdict(list)
+    for case in cases:
+        for what, error in case.items():
+            errors[what].append(error)
+    return {what: torch.stack(rows) for what, rows in errors.items()}
 
 
 def named(names: Sequence[str], errors: Tensor | Sequence[float]) -> list[tuple[str, float]]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-
 import torch
 from torch import Tensor
 
 from xreset.backends.conformance.harness import (
     Bench,
     small_motion,
+    stacked,
     state_errors,
 )
 from xreset.backends.conformance.results import Measured, Skipped
@@ -32,13 +31,12 @@ def state_round_trip(bench: Bench) -> Measured:
 def links_after_set(bench: Bench) -> Measured:
     """Set random states and compare the tracked links with the URDF's kinematics, without a step."""
     worlds = bench.worlds()
-    errors = defaultdict(list)
+    errors = []
     for seed in range(100, 110):
         state = bench.random_state(seed)
         worlds.set(state)
-        for what, error in _link_errors(bench.kinematics, state, worlds.links()).items():
-            errors[what].append(error)
-    return {what: torch.stack(rows) for what, rows in errors.items()}
+        errors.append(_link_errors(bench.kinematics, state, worlds.links()))
+    return stacked(errors)
 
 
 def links_after_steps(bench: Bench) -> Measured:
@@ -115,10 +113,9 @@ def _errors_on_the_way(bench: Bench, which: Tensor) -> Measured:
     """Return the errors of some tracked links' poses, [T, N, ...], while every joint moves."""
     worlds = bench.worlds()
     worlds.set_targets(bench.start().joint_pos + small_motion(bench.kinematics))
-    errors = defaultdict(list)
+    errors = []
     for _ in range(6):
         worlds.step(4)
         now = _link_errors(bench.kinematics, worlds.state(), worlds.links())
-        for what in ("pos", "angle"):
-            errors[what].append(now[what][:, which])
-    return {what: torch.stack(rows) for what, rows in errors.items()}
+        errors.append({what: now[what][:, which] for what in ("pos", "angle")})
+    return stacked(errors)

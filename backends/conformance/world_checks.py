@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 
 import torch
 from torch import Tensor
 
 from xreset.backends.conformance.harness import (
+    FRICTIONS,
     Bench,
     Worlds,
     replace_fields,
     small_motion,
+    stacked,
     state_errors,
 )
 from xreset.backends.conformance.results import Measured, Skipped
@@ -132,9 +133,7 @@ def masked_set(bench: Bench) -> Measured:
         "object_mass": bench.masses * scale,
         "object_inertia": scale.flip(0),
         "object_com": 0.01 * scale[:, None] * torch.tensor([1.0, -1.0, 0.5]),
-        "friction": torch.tensor(
-            [[0.8, 0.4, 0.3], [0.7, 0.5, 0.9], [0.6, 0.3, 0.45], [0.9, 0.6, 0.2]]
-        ),
+        "friction": FRICTIONS,
         "torsional_friction": 2e-3 * scale,
         "object_gravity": torch.tensor([0.9, 0.5, 0.1, 0.0]),
         "drives": scale[:, None, None].expand(-1, 3, len(bench.scene.robot.joints)),
@@ -167,7 +166,7 @@ def broken_world(bench: Bench) -> Measured:
     good = bench.start()
     expected = worlds.advance(good, 4)
     others = [0, 2, 3]
-    errors = defaultdict(list)
+    errors = []
     for field, value in (
         ("object_linvel", torch.nan),
         ("object_pos", torch.inf),
@@ -185,9 +184,8 @@ def broken_world(bench: Bench) -> Measured:
             "worlds broken after healing": worlds.nonfinite().sum(),
             "healed object_pos": worlds.state().object_pos[1] - good.object_pos[1],
         }
-        for what, error in found.items():
-            errors[what].append(error)
-    return {what: torch.stack(rows) for what, rows in errors.items()}
+        errors.append(found)
+    return stacked(errors)
 
 
 def _busy(bench: Bench, worlds: Worlds) -> State:

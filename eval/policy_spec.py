@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 BASELINES = ("zero", "random", "ik")
 """Names of the policies that need no training."""
+LEAD_IN = 1.0
+"""Time in which the baseline ``ik`` moves from home to the first frame [s]."""
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -236,23 +238,16 @@ class KinematicRetargeting:
 
     name = "ik"
 
-    def __init__(self, motion: Retargeted, *, lead_in: float = 1.0) -> None:
-        """Prepare.
-
-        Args:
-            motion: in the order of the environment's demonstrations.
-            lead_in: time of the way from home to the first frame [s].
-        """
+    def __init__(self, motion: Retargeted) -> None:
+        """Take motion, in the order of the environment's demonstrations."""
         self._motion = motion
-        self._lead_in = lead_in
         self._env: ManipulationEnv | None = None
-        self._step = 0
 
     def begin(self, env: ManipulationEnv) -> None:
         """Lay out the targets [N, steps, J] of the episodes that have just begun."""
         motion = self._motion
         dt = env.backend.scene.control_dt
-        lead = max(1, round(self._lead_in / dt))
+        lead = max(1, round(LEAD_IN / dt))
         time = torch.arange(env.max_episode_length) * dt
         blend = ((torch.arange(len(time)) + 1) / lead).clamp(0, 1)[:, None]
         plans = []

@@ -74,6 +74,7 @@ def select(
     meshes = setting.objects or read_run(folder).objects
     played: list[Candidate] = []
     best: Candidate | None = None
+    order = engines
     with tempfile.TemporaryDirectory(prefix="xreset-") as scratch:
         files: dict[str, Path] = {}
         for path in found:
@@ -85,11 +86,6 @@ def select(
             )
             scores: dict[str, float] = {}
             bar = best.worst if best else -1.0
-            order = (
-                engines
-                if best is None
-                else sorted(engines, key=lambda e, b=best: b.task_progress[e.name])
-            )
             for engine in order:
                 rollouts = roll_out(policy.start(None), engine, trial, repetitions=episodes)
                 scores[engine.name] = float(np.mean([e.task_progress for e in rollouts.episodes]))
@@ -100,6 +96,7 @@ def select(
             played.append(candidate)
             if candidate.worst > bar:
                 best = candidate
+                order = sorted(engines, key=lambda engine: scores[engine.name])
         assert best is not None
         choice = Choice(
             chosen=best.name,

@@ -13,33 +13,33 @@ def mean_of_known(values: Sequence[float | None]) -> float | None:
     return float(np.mean(known)) if len(known) == len(values) else None
 
 
-def bootstrap_ci95(
-    values: np.ndarray, groups: np.ndarray | None = None, *, draws: int = 2000, seed: int = 0
-) -> tuple[float, float]:
-    """Return the 95 % percentile bootstrap interval of the mean.
+DRAWS = 2000
+"""Resamples of a bootstrap."""
+
+
+def bootstrap_ci95(values: np.ndarray, groups: np.ndarray | None = None) -> tuple[float, float]:
+    """Return the 95 % percentile bootstrap interval of the mean. The same values give the same interval.
 
     Args:
         values: [E] one value per episode.
         groups: [E] demonstration of each episode. Episodes of one demonstration resemble one another, so whole
             demonstrations are drawn (cluster bootstrap); with a single one, or None, episodes are drawn.
-        draws: resamples.
-        seed: of the resampling: the same values give the same interval.
     """
     values = np.asarray(values, dtype=float)
     if len(values) < 2:
         return float(values.mean()), float(values.mean())
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     if groups is None or len(np.unique(groups)) < 2:
         groups = np.arange(len(values))
     _, number = np.unique(groups, return_inverse=True)
     sums = np.bincount(number, values)
     counts = np.bincount(number)
-    picks = rng.integers(len(sums), size=(draws, len(sums)))
+    picks = rng.integers(len(sums), size=(DRAWS, len(sums)))
     return _interval(sums[picks].sum(axis=1) / counts[picks].sum(axis=1))
 
 
 def crossed_bootstrap_ci95(
-    values: np.ndarray, runs: np.ndarray, groups: np.ndarray, *, draws: int = 2000, seed: int = 0
+    values: np.ndarray, runs: np.ndarray, groups: np.ndarray
 ) -> tuple[float, float]:
     """Return the 95 % percentile bootstrap interval of the mean over trainings that were evaluated on the same
     demonstrations.
@@ -59,9 +59,9 @@ def crossed_bootstrap_ci95(
         ValueError: a training has no episode of some demonstration.
     """
     if len(np.unique(runs)) == 1:
-        return bootstrap_ci95(values, groups, draws=draws, seed=seed)
-    rng = np.random.default_rng(seed)
-    return _interval(_means((values, runs, groups), rng, rng, draws))
+        return bootstrap_ci95(values, groups)
+    rng = np.random.default_rng(0)
+    return _interval(_means((values, runs, groups), rng, rng))
 
 
 def difference_ci95(one: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> tuple[float, float]:
@@ -82,7 +82,6 @@ def _means(
     crossed: Sequence[np.ndarray],
     run_rng: np.random.Generator,
     group_rng: np.random.Generator,
-    draws: int = 2000,
 ) -> np.ndarray:
     """Return the mean of values in each draw of runs and groups; of episodes, where there is one of both [draws]."""
     values, runs, groups = crossed
@@ -96,7 +95,7 @@ def _means(
     if (counts == 0).any():
         raise ValueError("every training needs episodes of every demonstration")
     run_times, group_times = (
-        rng.multinomial(n, np.full(n, 1 / n), size=draws)
+        rng.multinomial(n, np.full(n, 1 / n), size=DRAWS)
         for rng, n in zip((run_rng, group_rng), counts.shape, strict=True)
     )
     means = ((run_times @ sums) * group_times).sum(axis=1)

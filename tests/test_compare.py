@@ -318,7 +318,8 @@ class ScoreTest(Compared):
         of_run, of_demo = rng.normal(size=8), 2 * rng.normal(size=30)
         values = (of_run[:, None] + of_demo).ravel()
         runs, demos = np.repeat(np.arange(8), 30), np.tile(np.arange(30), 8)
-        low, high = crossed_bootstrap_ci95(values, runs, demos, draws=20000)
+        with mock.patch("xreset.eval.stats.DRAWS", 20000):
+            low, high = crossed_bootstrap_ci95(values, runs, demos)
         expected = 2 * 1.96 * np.sqrt(of_run.var() / 8 + of_demo.var() / 30)
         self.assertAlmostEqual(high - low, expected, delta=0.05 * expected)
         self.assertEqual(

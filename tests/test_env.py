@@ -780,7 +780,8 @@ class KinematicRetargetingTest(WithEnv):
         retargeted = SimpleNamespace(
             joint_pos=np.concatenate(paths), frame_offsets=np.cumsum([0, *lengths]), fps=30.0
         )
-        policy = KinematicRetargeting(retargeted, lead_in=0.1)  # 6 control steps
+        self.enterContext(mock.patch("xreset.eval.policy_spec.LEAD_IN", 0.1))  # 6 control steps
+        policy = KinematicRetargeting(retargeted)
         policy.begin(env)
         targets = []
         for _ in range(env.max_episode_length):

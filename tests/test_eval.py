@@ -272,13 +272,14 @@ class BootstrapTest(unittest.TestCase):
         self.assertEqual(bootstrap_ci95(values), (low, high))
         self.assertEqual(bootstrap_ci95(np.array([0.3])), (0.3, 0.3))
 
+    @mock.patch("xreset.eval.stats.DRAWS", 400)
     def covered(self, cluster: bool) -> float:
         """Share of 200 experiments whose interval holds the true mean: 15 demonstrations, 5 episodes each, which are nearly alike."""
         rng, hits = np.random.default_rng(3), 0
         for _ in range(200):
             groups = np.repeat(np.arange(15), 5)
             values = rng.normal(0, 1, 15)[groups] + 0.1 * rng.normal(size=75)
-            low, high = bootstrap_ci95(values, groups if cluster else None, draws=400)
+            low, high = bootstrap_ci95(values, groups if cluster else None)
             hits += low <= 0 <= high
         return hits / 200
 

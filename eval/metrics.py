@@ -144,9 +144,8 @@ class EpisodeMetrics:
         position_error = (state.object_pos - self._goal_pos).norm(dim=-1)
         angle = quat_angle(state.object_quat, self._goal_quat)
         at_goal = live & (position_error <= GOAL_DISTANCE) & (angle <= GOAL_ANGLE)
-        self.reorient = (
-            at_goal  # only the last reading counts; a world that ended early is not at its goal
-        )
+        # Only the last reading counts; a world that ended early is not at its goal.
+        self.reorient = at_goal
         self.reorient_once |= at_goal
         farthest = self._distances(reading, self._points.keypoints).amax(dim=-1)
         self._best = torch.where(live, torch.minimum(self._best, farthest), self._best)

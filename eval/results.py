@@ -109,6 +109,12 @@ class Trace:
     joint_target: np.ndarray | None = None
     """[C, J] of every control step; None in files of older versions."""
 
+    @property
+    def finite(self) -> np.ndarray:
+        """[T] bool: which states are finite."""
+        state = np.concatenate((self.joint_pos, self.object_pos, self.object_quat), axis=1)
+        return np.asarray(np.isfinite(state).all(axis=1))
+
     def actions(self, source: str) -> tuple[np.ndarray, int]:
         """Return the targets [C, J] of every control step, and the number of control steps from one state to the next.
 

@@ -330,7 +330,7 @@ def _reachable(scene: SceneSpec, *, tip: bool) -> tuple[np.ndarray, np.ndarray, 
             best_margin = margin
             best = (point, normal, along)
     if best is None:
-        what = "fingertip" if tip else "link beside the fingertips"
+        what = "fingertip" if tip else "link other than the fingertips"
         raise XResetError(
             f"no {what} of {robot.name!r} at home can be reached from outside, so its friction cannot be measured."
         )

@@ -36,11 +36,10 @@ def read(paths: Iterable[Path]) -> list[Json]:
         try:
             page([data])  # asks the file for everything that the page needs
         except (
-            KeyError,
+            LookupError,
             TypeError,
             AttributeError,
             ValueError,
-            IndexError,
             OverflowError,
             UndefinedError,
         ) as error:

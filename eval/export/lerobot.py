@@ -250,10 +250,8 @@ def _stats(key: str, rows: np.ndarray) -> dict[str, list[Any]]:
         "mean": rows.mean(axis=0),
         "std": rows.std(axis=0),
     }
-    for name, value in zip(
-        _QUANTILES, np.quantile(rows, list(_QUANTILES.values()), axis=0), strict=True
-    ):
-        stats[name] = value
+    for name, share in _QUANTILES.items():
+        stats[name] = np.quantile(rows, share, axis=0)
     shape = (3, 1, 1) if key.startswith(_IMAGES) else (-1,)
     lists = {name: value.reshape(shape).tolist() for name, value in stats.items()}
     return lists | {"count": [len(rows)]}

@@ -15,7 +15,6 @@ import pandas as pd
 
 from xreset.description import load_robot
 from xreset.errors import RunError
-from xreset.eval.report.clips import finite_states
 from xreset.eval.report.read import results_in
 from xreset.eval.results import Table, Trace, read_evaluation, read_traces, recorded
 from xreset.files import file_hash
@@ -107,7 +106,7 @@ def read_recorded(
                 trace = episode.pop("trace")
                 action = _actions(trace, file)
                 intervals.setdefault(round(float(np.median(np.diff(trace.time))), 6), results)
-                if not (finite_states(trace).all() and np.isfinite(action).all()):
+                if not (trace.finite.all() and np.isfinite(action).all()):
                     logging.getLogger(__name__).warning(
                         "%s, %s, demonstration %d is left out: its engine broke down.",
                         results,

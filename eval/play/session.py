@@ -142,19 +142,19 @@ class Session:
         self._seed = seed
         self.engine = engine
         self.time = 0.0
-        self._open(policy, robot, thing, engine)
+        self._open(policy, robot, thing)
 
     # Choosing ---------------------------------------------------------------------------------------------------------
 
     def choose_policy(
         self, policy: str | Path | PolicySpec, *, robot: str | Path | None = None
     ) -> None:
-        """Let another policy act, and begin anew. Arguments and errors as for the constructor's."""
-        self._open(policy, robot, self.object_name, self.engine)
+        """Let another policy act, and begin again. Arguments and errors as for the constructor's."""
+        self._open(policy, robot, self.object_name)
 
     def choose_object(self, name: str) -> None:
-        """Play with another object, and begin anew; ``XResetError`` if it is unknown."""
-        self._open(self.policy, None, name, self.engine)
+        """Play with another object, and begin again; ``XResetError`` if it is unknown."""
+        self._open(self.policy, None, name)
 
     def choose_engine(self, name: str) -> None:
         """Go on in another engine at the same state, with the same memory of the policy.
@@ -179,7 +179,6 @@ class Session:
         policy: str | Path | PolicySpec,
         robot: str | Path | None,
         thing: str | None,
-        engine: str,
     ) -> None:
         """Open worlds; where this fails, the session stays as it was."""
         policy = load_policy(policy, robot=robot, seed=self._seed)
@@ -193,7 +192,7 @@ class Session:
             names = load_inputs(source, robot=policy.robot, objects=folder).bank.object_names
             thing = canonical_name(thing or _usual(names), names)
         inputs = load_inputs(source, robot=policy.robot, objects=folder, only=[thing])
-        env = self._make_env(policy, inputs, engine)
+        env = self._make_env(policy, inputs, self.engine)
         try:
             player = policy.begin(env)
         except BaseException:
@@ -226,7 +225,7 @@ class Session:
         return self.env.backend.scene.control_dt
 
     def begin(self, *, keep_goal: bool = False) -> None:
-        """Begin anew: the robot at home, and a start and a goal drawn from the demonstrations.
+        """Begin again: the robot at home, and a start and a goal drawn from the demonstrations.
 
         Args:
             keep_goal: Draw a start only, and leave the goal where it is.

@@ -113,12 +113,6 @@ def camera_for(trace: Trace, *, distance: float = 1.0) -> Camera:
     )
 
 
-def finite_states(trace: Trace) -> np.ndarray:
-    """Return which states [T] of a trace are finite."""
-    state = np.concatenate((trace.joint_pos, trace.object_pos, trace.object_quat), axis=1)
-    return np.asarray(np.isfinite(state).all(axis=1))
-
-
 def draw_state(
     renderer: Renderer, trace: Trace, row: int, eyes: Cameras | None = None
 ) -> np.ndarray:
@@ -202,7 +196,7 @@ def _draw(
     if strip:
         rows = np.linspace(0, len(trace.time) - 1, MOMENTS).round().astype(int)
         size = STRIP_SIZE
-    finite = finite_states(trace)
+    finite = trace.finite
     last = len(finite) - 1 if finite.all() else int(np.argmin(finite)) - 1
     drawn = np.minimum(rows, last).tolist()
     renderer = Renderer(scene, size=size, camera=camera)
@@ -229,7 +223,7 @@ def draw_report(
         XResetError: no demonstration was recorded in every engine, or the robot or an object cannot be loaded.
     """
     spec = load_robot(robot or data.robot)
-    meshes = data.first.meshes(objects)
+    meshes = data.training.first.meshes(objects)
     vision = data.run.config.task.vision if data.run else None
     shown = data.training.recorded(spec)
     clips = draw_clips(best_everywhere(shown), spec, meshes, vision)
@@ -237,7 +231,7 @@ def draw_report(
         raise XResetError(
             "no demonstration was recorded in every engine. Evaluate all engines in one command."
         )
-    worst = worst_episodes(shown[shown["engine"] == data.first.backend], FAILURES)
+    worst = worst_episodes(shown[shown["engine"] == data.training.first.backend], FAILURES)
     return clips, draw_clips(worst, spec, meshes, vision, strips=True)
 
 
@@ -261,7 +255,7 @@ def make_film(
     """
     data = collect(folder)
     spec = load_robot(robot or data.robot)
-    meshes = data.first.meshes(objects)
+    meshes = data.training.first.meshes(objects)
     columns = {}
     for name, own in data.training.recorded(spec).groupby("object"):
         if clips := draw_clips(best_everywhere(own), spec, meshes):
@@ -296,19 +290,9 @@ def encode_mp4(frames: np.ndarray, fps: float, *, keyframes: int | None = None) 
     """
     with needs("imageio-ffmpeg", "eval"):
         import imageio_ffmpeg
-    settings = [
-        "-crf",
-        "24",
-        "-preset",
-        "veryfast",
-        "-movflags",
-        "+faststart",
-        "-threads",
-        "1",
-        "-bitexact",
-    ]
+    settings = "-crf 24 -preset veryfast -movflags +faststart -threads 1 -bitexact"
     if keyframes is not None:
-        settings += ["-g", str(keyframes)]
+        settings += f" -g {keyframes}"
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "clip.mp4"
         writer = imageio_ffmpeg.write_frames(  # its annotations are narrower than what it takes
@@ -318,7 +302,7 @@ def encode_mp4(frames: np.ndarray, fps: float, *, keyframes: int | None = None) 
             codec="libx264",
             macro_block_size=2,
             quality=None,  # pyright: ignore[reportArgumentType]
-            output_params=settings,
+            output_params=settings.split(),
         )
         try:
             writer.send(None)

@@ -47,7 +47,7 @@ def _condition_table(trainings: Sequence[Training]) -> Table:
     for training in trainings:
         for engine, result in training.results.items():
             episodes = training.episodes[training.episodes["engine"] == engine]
-            row = {
+            row: dict[str, Any] = {
                 "run": training.label,
                 "engine": engine,
                 "version": result.backend_version,
@@ -63,14 +63,10 @@ def _condition_table(trainings: Sequence[Training]) -> Table:
                 "number of episodes": result.episodes,
                 "seed of the evaluation": result.seed,
             }
-            rows.append(
-                row
-                | {
-                    name: text
-                    for name, text in training.facts.items()
-                    if name.startswith(_PLAYED_TASK)
-                }
-            )
+            for name, text in training.facts.items():
+                if name.startswith(_PLAYED_TASK):
+                    row[name] = text
+            rows.append(row)
     return pd.DataFrame(rows)
 
 

@@ -76,9 +76,6 @@ def draw_training(curves: Table) -> str:
     return svg(draw, (10.6, 2.7), "curves") if tags else ""
 
 
-# Comparisons ----------------------------------------------------------------------------------------------------------
-
-
 def draw_lines(ax: Axes, tag: str, lines: Mapping[str, Table], x: X, order: Sequence[str]) -> None:
     """Draw one line for each group, with a band from ``low`` to ``high`` where they differ; curves of the task, which
     are shares, in percent.
@@ -103,13 +100,21 @@ def draw_lines(ax: Axes, tag: str, lines: Mapping[str, Table], x: X, order: Sequ
         ax.plot(
             at, values["mean"], color=color(index), linestyle=_style(index), linewidth=1.5, **look
         )
-    ax.set_title(TITLES.get(tag, tag), fontsize="medium", loc="left")
+    _finish_panel(ax, TITLES.get(tag, tag), percent)
     ax.set_xlabel(AXES[x][0])
     ax.set_xlim(left=0)
+    if percent:
+        ax.set_ylim(bottom=0)
+
+
+def _finish_panel(ax: Axes, title: str, percent: bool) -> None:
+    ax.set_title(title, fontsize="medium", loc="left")
     ax.grid(axis="y", color=INK, alpha=0.12)
     if percent:
         ax.yaxis.set_major_formatter(lambda value, _: f"{value:g} %")
-        ax.set_ylim(bottom=0)
+
+
+# Comparisons ----------------------------------------------------------------------------------------------------------
 
 
 def draw_scores(ax: Axes, found: Table, order: Sequence[str]) -> None:
@@ -120,9 +125,7 @@ def draw_scores(ax: Axes, found: Table, order: Sequence[str]) -> None:
     draw_bars(ax, *values)
     ax.set_ylim(0, 104)
     ax.set_yticks(range(0, 101, 25))
-    ax.yaxis.set_major_formatter(lambda value, _: f"{value:.0f} %")
-    ax.grid(axis="y", color=INK, alpha=0.12)
-    ax.set_title("task progress from home, 95 % interval", fontsize="medium", loc="left")
+    _finish_panel(ax, "task progress from home, 95 % interval", percent=True)
 
 
 def write_picture(path: Path, groups: Groups, tags: Sequence[str], found: Table, x: X) -> None:
@@ -153,13 +156,10 @@ def write_picture(path: Path, groups: Groups, tags: Sequence[str], found: Table,
         if not found.empty:
             draw_scores(parts[-1].subplots(), found, order)
         handles = []
-        # matplotlib leaves out labels that begin with an underscore
         for i, label in enumerate(order):
-            handles.append(
-                Line2D(
-                    [], [], color=color(i), linestyle=_style(i), linewidth=2.5, label=f" {label}"
-                )
-            )
+            look = {"color": color(i), "linestyle": _style(i)}
+            # matplotlib leaves out labels that begin with an underscore
+            handles.append(Line2D([], [], linewidth=2.5, label=f" {label}", **look))
         figure.legend(handles=handles, loc="outside upper center", ncols=3, frameon=False)
 
 

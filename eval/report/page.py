@@ -24,7 +24,7 @@ def page(data: ReportData, clips: Sequence[Clip], strips: Sequence[Clip] = ()) -
     """Return the whole page; clips, and strips of failures, may be empty. The page runs no script but its own."""
     script = render("report.js")
     episodes = data.training.episodes
-    first = episodes[episodes["engine"] == data.first.backend]
+    first = episodes[episodes["engine"] == data.training.first.backend]
     results = list(data.training.results.values())
     demonstrations: dict[str, list[Any]] = {}
     for i, result in enumerate(results):

@@ -79,14 +79,9 @@ class ReportData:
     """What the reader must know before comparing engines, or what is missing."""
 
     @property
-    def first(self) -> EvalResult:
-        """The result of the first engine."""
-        return self.training.first
-
-    @property
     def robot(self) -> str:
         """Name or folder of the robot."""
-        return self.first.robot if self.run is None else self.run.robot
+        return self.training.first.robot if self.run is None else self.run.robot
 
 
 def collect(folder: Path) -> ReportData:

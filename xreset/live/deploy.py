@@ -62,12 +62,11 @@ def deploy_contract(
     trained = policy_contract(robot, task, tuple(o.name for o in objects))
     listed = {}
     for each in objects:
-        points = surface_points(each, task.observation.cloud_points).astype(np.float32)
-        middle = center(each).astype(np.float32)
+        points = surface_points(each, task.observation.cloud_points)
         listed[each.name] = {
             "source": each.source,
-            "points": points.tolist(),
-            "center": middle.tolist(),
+            "points": points.astype(np.float32).tolist(),
+            "center": center(each).astype(np.float32).tolist(),
         }
     observation = asdict(task.observation)
     observation.pop("noise")

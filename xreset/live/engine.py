@@ -100,23 +100,17 @@ def _array(value: Tensor) -> np.ndarray:
 
 
 def make_controller(env: ManipulationEnv, actor: OnnxActor | Any) -> Controller:
-    """Return a controller for the worlds of an environment.
+    """Return a controller whose episode begins in the worlds of an environment, with their objects, goals and targets.
 
     Args:
-        env: the worlds, of the policy's own task.
+        env: the worlds, just reset, of the policy's own task.
         actor: the policy's network.
     """
     scene = env.backend.scene
     controller = Controller(deploy_contract(scene.robot, env.task, scene.objects), actor)
-    begin(controller, env)
-    return controller
-
-
-def begin(controller: Controller, env: ManipulationEnv) -> None:
-    """Begin an episode in worlds that were just reset, with their objects, goals and targets."""
-    names = [env.backend.scene.objects[i].name for i in env.backend.object_index.tolist()]
+    names = [scene.objects[i].name for i in env.backend.object_index.tolist()]
     points = np.stack([controller.points(name) for name in names])
     centers = np.stack([controller.center(name) for name in names])
-    controller.begin(
-        points, _array(env.goal_pos), _array(env.goal_quat), _array(env.joint_target), centers
-    )
+    goal = (_array(env.goal_pos), _array(env.goal_quat))
+    controller.begin(points, *goal, _array(env.joint_target), centers)
+    return controller

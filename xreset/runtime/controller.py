@@ -144,17 +144,19 @@ class Controller:
 
     def points(self, name: str) -> Array:
         """[P, 3] points of an object of the contract."""
+        return self._of_object(name, "points")
+
+    def center(self, name: str) -> Array:
+        """[3] center of an object of the contract, in its frame."""
+        return self._of_object(name, "center")
+
+    def _of_object(self, name: str, entry: str) -> Array:
         objects = self.contract["objects"]
         if name not in objects:
             raise LiveError(
                 f"The contract has no object {name!r}. Choose from: {', '.join(objects)}."
             )
-        return np.array(objects[name]["points"], dtype=np.float32)
-
-    def center(self, name: str) -> Array:
-        """[3] center of an object of the contract, in its frame."""
-        self.points(name)  # refuses an unknown name
-        return np.array(self.contract["objects"][name]["center"], dtype=np.float32)
+        return np.array(objects[name][entry], dtype=np.float32)
 
     def step(self, reading: Reading) -> Array:
         """[N, J] new joint targets for a reading with the axis N."""
@@ -167,15 +169,16 @@ class Controller:
         """Return the policy's inputs: [N, F] flat, and the cloud [N, H, P, K]."""
         o = self.contract["observation"]
         links = reading.links or self.kinematics.links(reading.joint_pos, reading.joint_vel)
+        limits = (self._scaled_lower, self._scaled_upper)
+        joint_pos = _scaled(reading.joint_pos, *limits)
+        if o["content"] == "published":
+            joints = [joint_pos, _scaled(self.target, *limits)]
+            flat = np.concatenate((*self._observe_geometry(reading, links), *joints), axis=1)
+            return flat, self._observe_cloud(reading)
         count = len(self.target)
         force = reading.tip_force
         if force is None:
             force = np.zeros_like(links.tip_pos)
-        limits = (self._scaled_lower, self._scaled_upper)
-        if o["content"] == "published":
-            joints = [_scaled(reading.joint_pos, *limits), _scaled(self.target, *limits)]
-            flat = np.concatenate((*self._observe_geometry(reading, links), *joints), axis=1)
-            return flat, self._observe_cloud(reading)
         pose = [self._origin(reading.object_pos, reading.object_quat)]
         if o["rotation"] == "to_goal":
             inverse = reading.object_quat * np.array([1, -1, -1, -1], np.float32)
@@ -187,7 +190,7 @@ class Controller:
             *pose,
             np.ones((count, 1), np.float32),  # the share of its weight that the object has
             self.action,
-            _scaled(reading.joint_pos, *limits),
+            joint_pos,
             np.float32(o["joint_vel_scale"]) * reading.joint_vel,
             links.palm_pos,
             _shown(links.palm_quat, o["rotation"]),

@@ -105,10 +105,11 @@ def run(
 
 
 def _run_one(check: Check, bench: Bench) -> CheckResult:
+    measures = []
+
     def ended(verdict: Verdict, problem: str) -> CheckResult:
         return CheckResult(check=check, verdict=verdict, problem=problem, measures=tuple(measures))
 
-    measures = []
     if check.own_robot_only and not bench.own_robot:
         return ended("skipped", "it needs the suite's own robot")
     try:

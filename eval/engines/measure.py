@@ -115,14 +115,14 @@ def measure(engine: Engine, scene: SceneSpec) -> Measured:
     Raises:
         XResetError: the state is not finite, or no link can be reached from outside.
     """
-    bench = _Bench(scene)
-    with engine.make(bench.scene, len(_WORLDS), torch.tensor(list(_WORLDS.values()))) as backend:
-        log = bench.run(Worlds(backend))
-    return bench.evaluate(log)
+    experiments = _Experiments(scene)
+    objects = torch.tensor(list(_WORLDS.values()))
+    with engine.make(experiments.scene, len(objects), objects) as backend:
+        return experiments.measured(experiments.run(Worlds(backend)))
 
 
-class _Bench:
-    """The worlds of the experiments."""
+class _Experiments:
+    """All experiments, each in a world of its own."""
 
     def __init__(self, scene: SceneSpec) -> None:
         self._robot = scene.robot
@@ -172,7 +172,7 @@ class _Bench:
             )
         return log
 
-    def evaluate(self, log: dict[str, Tensor]) -> Measured:
+    def measured(self, log: dict[str, Tensor]) -> Measured:
         """Return what the worlds' states say of the engine."""
         dt = self._dt
         t = _PUSH_STEPS * dt

@@ -114,7 +114,7 @@ def _known_differences(check: Json, engine: str, robot: str, name: str) -> list[
     rows = []
     for m in check["measures"]:
         if m["verdict"] == "known difference":
-            amounts = [_amount(m[key], m) for key in ("measured", "tolerance", "bound")]
+            amounts = (_amount(m, key) for key in ("measured", "tolerance", "bound"))
             rows.append((engine, robot, f"{name}: {m['what']}", *amounts, m["reason"]))
     return rows
 
@@ -125,8 +125,9 @@ def _not_done(check: Json, *where: str) -> list[tuple[str, ...]]:
     failures = []
     for m in check["measures"]:
         if m["verdict"] == "failed":
-            amounts = [_amount(m[key], m) for key in ("measured", "tolerance")]
-            failures.append(f"{m['what']}: {amounts[0]}, tolerance {amounts[1]}")
+            failures.append(
+                f"{m['what']}: {_amount(m, 'measured')}, tolerance {_amount(m, 'tolerance')}"
+            )
     return [(*where, check["verdict"], check["problem"] or "; ".join(failures))]
 
 
@@ -156,9 +157,9 @@ def _verdict(check: Json | None) -> str:
     )
 
 
-def _amount(value: Any, measure: Json) -> str:
+def _amount(measure: Json, entry: str) -> str:
     """Two digits that matter, with the unit; numbers that are not finite are text in the file."""
-    return f"{float(value):.2g} {measure['unit']}".rstrip()
+    return f"{float(measure[entry]):.2g} {measure['unit']}".rstrip()
 
 
 def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:

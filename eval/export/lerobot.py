@@ -17,7 +17,7 @@ import pandas as pd
 
 from xreset.cameras.config import CAMERAS, VisionConfig
 from xreset.errors import XResetError, needs
-from xreset.eval.export.recorded import Recording
+from xreset.eval.export.recorded import RecordedEpisodes
 from xreset.eval.report.clips import draw_state, draw_view, encode_mp4, policy_cameras
 from xreset.eval.results import Trace
 from xreset.files import atomic_folder, write_json
@@ -47,7 +47,7 @@ _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
 def write_lerobot(
     folder: Path,
-    recording: Recording,
+    recording: RecordedEpisodes,
     *,
     video: bool = True,
     size: tuple[int, int] = (320, 240),
@@ -88,7 +88,7 @@ def write_lerobot(
 
 
 def _write(
-    root: Path, recording: Recording, videos: tuple[str, ...], size: tuple[int, int]
+    root: Path, recording: RecordedEpisodes, videos: tuple[str, ...], size: tuple[int, int]
 ) -> None:
     import pyarrow as pa
     from pyarrow import parquet
@@ -164,7 +164,7 @@ def _write(
     write_json(root / "meta/info.json", _info(recording, len(tasks), features))
 
 
-def _info(recording: Recording, tasks: int, features: dict[str, Any]) -> dict[str, Any]:
+def _info(recording: RecordedEpisodes, tasks: int, features: dict[str, Any]) -> dict[str, Any]:
     file = "chunk-{chunk_index:03d}/file-{file_index:03d}"
     count = len(recording.episodes)
     return {
@@ -185,7 +185,7 @@ def _info(recording: Recording, tasks: int, features: dict[str, Any]) -> dict[st
 
 
 def _features(
-    recording: Recording, videos: tuple[str, ...], size: tuple[int, int]
+    recording: RecordedEpisodes, videos: tuple[str, ...], size: tuple[int, int]
 ) -> dict[str, dict[str, Any]]:
     joints = list(recording.robot.joint_names)
     vectors = {

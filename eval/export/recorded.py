@@ -40,7 +40,7 @@ _COLUMNS = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recording:
+class RecordedEpisodes:
     """Recorded episodes of one robot at one rate."""
 
     robot: RobotSpec
@@ -67,7 +67,7 @@ def read_recorded(
     robot: str | None = None,
     objects: Path | None = None,
     task: str = TASK,
-) -> Recording:
+) -> RecordedEpisodes:
     """Read the recorded episodes of evaluations: the first of each demonstration and engine.
 
     An episode in which the engine broke down is left out, with a warning.
@@ -135,7 +135,7 @@ def read_recorded(
         raise RunError(
             f"the episodes have different rates, frames per second: {listing}. Export them one by one."
         )
-    return Recording(
+    return RecordedEpisodes(
         robot=next(iter(robots.values())),
         fps=_rate(next(iter(intervals))),
         episodes=pd.DataFrame(rows),
@@ -155,7 +155,7 @@ def _rate(interval: float) -> float:
     return float(round(rate)) if abs(rate - round(rate)) < 1e-3 else rate
 
 
-def write_arrays(path: str | Path, recording: Recording) -> None:
+def write_arrays(path: str | Path, recording: RecordedEpisodes) -> None:
     """Write all episodes, one after another, as plain arrays in one npz file; ``docs/rollouts.md`` has the schema.
 
     Raises:

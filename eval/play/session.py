@@ -387,12 +387,12 @@ class Session:
         force = torch.zeros(3)
         torque = torch.zeros(3)
         offset = None
-        pull = self._pull
-        state = backend.state()
-        if pull is not None and pull.link is None:
-            force, torque = self._pull_object(pull, state)
-        elif pull is not None and pull.link is not None:
-            offset = self._pull_robot(pull, pull.link, state)
+        if self._pull is not None:
+            state = backend.state()
+            if self._pull.link is None:
+                force, torque = self._pull_object(self._pull, state)
+            else:
+                offset = self._pull_robot(self._pull, self._pull.link, state)
         if "object_wrench" in backend.capabilities:
             backend.set_object_wrench(
                 force[None].to(self.env.device), torque[None].to(self.env.device)

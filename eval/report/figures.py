@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-CURVES = ("episode/return", "task/grasped", "task/success")
+REPORT_CURVES = ("episode/return", "task/grasped", "task/success")
 """Curves of a report's page."""
 TITLES = {
     "task/success": "at the goal",
@@ -60,12 +60,12 @@ def draw_bars(ax: Axes, mean: Table, low: Table, high: Table) -> None:
 
 
 def draw_training(curves: Table) -> str:
-    """Return the drawing of a report's learning curves as SVG; empty if there are none of :data:`CURVES`.
+    """Return the drawing of a report's learning curves as SVG; empty if there are none of :data:`REPORT_CURVES`.
 
     Args:
         curves: :func:`xreset.eval.report.read.read_curves`.
     """
-    tags = [tag for tag in CURVES if tag in curves]
+    tags = [tag for tag in REPORT_CURVES if tag in curves]
 
     def draw(figure: Figure) -> None:
         for ax, tag in zip(figure.subplots(1, len(tags), squeeze=False)[0], tags, strict=True):

@@ -18,7 +18,7 @@ from xreset.eval.report.read import ReportData, Training, collect, read_training
 from xreset.eval.table import caption
 from xreset.files import claim_folder, write_whole
 
-CURVES = ("task/success", "task/success_from_home")
+DEFAULT_CURVES = ("task/success", "task/success_from_home")
 """Curves that a comparison draws by default."""
 
 
@@ -64,7 +64,7 @@ def compare(
     Args:
         runs: folders, as ``FOLDER`` or ``LABEL=FOLDER``.
         x: horizontal axis of the learning curves.
-        curves: names of curves as in TensorBoard; default: :data:`CURVES`.
+        curves: names of curves as in TensorBoard; default: :data:`DEFAULT_CURVES`.
         apart: show trainings that differ in their seed only one by one, not as a group.
 
     Raises:
@@ -105,7 +105,7 @@ def choose_curves(trainings: Sequence[Training], wanted: Sequence[str]) -> tuple
     known = sorted(set().union(*(t.curves for t in trainings)))
     if not known and not wanted:
         return ()
-    chosen = tuple(dict.fromkeys(wanted or CURVES))
+    chosen = tuple(dict.fromkeys(wanted or DEFAULT_CURVES))
     if unknown := set(chosen) - set(known):
         raise RunError(
             f"there is no curve {', '.join(sorted(unknown))}; there are {', '.join(known) or 'none'}. "

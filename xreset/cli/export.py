@@ -106,7 +106,7 @@ def _recording(
     robot: str | None,
     objects: Path | None,
     task: str | None,
-) -> recorded.Recording:
+) -> recorded.RecordedEpisodes:
     from xreset.eval.export import recorded
 
     if not folders:
@@ -118,7 +118,7 @@ def _recording(
     )
 
 
-def _say(recording: recorded.Recording, out: Path) -> None:
+def _say(recording: recorded.RecordedEpisodes, out: Path) -> None:
     engines = ", ".join(recording.episodes["engine"].unique())
     console.print(
         f"{out}: {len(recording.episodes)} episodes of {recording.robot.name} in {engines},"

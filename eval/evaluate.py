@@ -64,15 +64,15 @@ def evaluate(
     results = []
     tables = []
     with claim_folder(folder):
-        for e in chosen:
+        for engine in chosen:
             player = policy.start(trial.motion)
             rollouts = roll_out(
-                player, e, trial, repetitions=episodes, progress=partial(progress, e.name)
+                player, engine, trial, repetitions=episodes, progress=partial(progress, engine.name)
             )
             result = summarize(
                 rollouts,
-                backend=e.name,
-                backend_version=e.version,
+                backend=engine.name,
+                backend_version=engine.version,
                 robot=trial.robot.name,
                 policy=policy.name,
                 seed=seed,

@@ -163,18 +163,18 @@ def _play(
 ) -> tuple[Episode, ...]:
     """Play every demonstration through the loop with a fault; count in ``stopped`` why the runner stopped robots."""
 
-    def play(r: Round) -> None:
-        env = r.env
+    def play(played: Round) -> None:
+        env = played.env
         controller = make_controller(env, actor)
         seeds = [
             (trial.seed, int(sequence), int(repetition))
-            for sequence, repetition in zip(r.sequence, r.repetition, strict=True)
+            for sequence, repetition in zip(played.sequence, played.repetition, strict=True)
         ]
         driver = FaultyDriver(
-            env, fault, seeds, lambda: r.update_metrics(env.reading()), real_time=real_time
+            env, fault, seeds, lambda: played.update_metrics(env.reading()), real_time=real_time
         )
         outcome = Runner(controller, driver).run(env.max_episode_length * controller.dt)
-        for world in r.fresh:
+        for world in played.fresh:
             reason = outcome.reasons[world]
             if reason is not None:
                 stopped[re.sub(r"-?\d+\.\d+", "...", reason)] += 1

@@ -212,20 +212,22 @@ def roll_out(
     steps = 0
     seconds = 0.0
 
-    def play(r: Round) -> None:
+    def play(played: Round) -> None:
         nonlocal steps, seconds
-        env = r.env
+        env = played.env
         length = env.max_episode_length
-        recorder = _Recorder(env, [world for world in r.fresh if r.repetition[world] == 0])
+        recorder = _Recorder(
+            env, [world for world in played.fresh if played.repetition[world] == 0]
+        )
         policy.begin(env)
         recorder.record(0, env.reading())
         for step in range(1, length + 1):
             before = time.perf_counter()
             reading, _ = env.advance(policy.act(env.get_observations()))
-            r.update_metrics(reading)
+            played.update_metrics(reading)
             seconds += time.perf_counter() - before
             recorder.record(step, reading)
-            progress(r.number * length + step, r.total * length)
+            progress(played.number * length + step, played.total * length)
         steps += length * env.num_envs
         traces.extend(recorder.traces())
 
@@ -285,7 +287,7 @@ def play_rounds(
         for number, (items, fresh) in enumerate(plan):
             start = episode_starts(starts, sequence[items], repetition[items], trial.seed)
             env.reset(start=start.to(env.device))
-            r = Round(
+            played = Round(
                 env=env,
                 metrics=EpisodeMetrics(env.reading(), env.task_goal_pos, env.goal_quat, points),
                 sequence=sequence[items],
@@ -294,8 +296,8 @@ def play_rounds(
                 number=number,
                 total=len(plan.rounds),
             )
-            play(r)
-            episodes += [_episode(r, world, bank) for world in r.fresh]
+            play(played)
+            episodes += [_episode(played, world, bank) for world in played.fresh]
     return tuple(sorted(episodes, key=lambda e: (e.sequence, e.repetition)))
 
 

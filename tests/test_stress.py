@@ -149,6 +149,7 @@ class CommandTest(unittest.TestCase):
         xreset("demos", "synth", "--objects", SOUP, "--per-object", 1, "--out", demos)
         options = ("--robot", "openarm", "--demos", demos, "--episodes", 1, "--out", folder)
         sweeps = ("--property", "arm-stiffness=0.5", "--property", "action-latency=1")
+        sweeps += ("--property", "camera-latency=33")  # of cameras, which the policy does not have
         with mock.patch.object(
             MujocoBackend, "capabilities", MujocoBackend.capabilities - {"drives"}
         ):
@@ -167,6 +168,7 @@ class CommandTest(unittest.TestCase):
             "cannot be set",
         ):
             self.assertIn(expected, out)
+        self.assertNotIn("camera", out)
 
 
 if __name__ == "__main__":

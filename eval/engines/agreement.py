@@ -262,16 +262,16 @@ def compare(
 
     table = find_grasps(motion, robot, objects, grasps, where="table")
     closings: dict[Engine, tuple[Recording, Recording]] = {}
-    for done, e in enumerate(everyone):
-        progress(f"{e.name}: closing {len(table)} hands", done, total)
-        closings[e] = try_closings(e, scene, table)
+    for done, tested in enumerate(everyone):
+        progress(f"{tested.name}: closing {len(table)} hands", done, total)
+        closings[tested] = try_closings(tested, scene, table)
     air = find_grasps(motion, robot, objects, grasps, where="air")
-    closed = {e.name: whole for e, (_, whole) in closings.items() if e is not floor}
+    closed = {tested.name: whole for tested, (_, whole) in closings.items() if tested is not floor}
     common = common_states(scene, table, air, closed, grasps)
     holds: dict[Engine, tuple[Recording, ...]] = {}
-    for done, e in enumerate(everyone, len(everyone)):
-        progress(f"{e.name}: holding {len(common.label)} objects", done, total)
-        holds[e] = try_holds(e, scene, common)
+    for done, tested in enumerate(everyone, len(everyone)):
+        progress(f"{tested.name}: holding {len(common.label)} objects", done, total)
+        holds[tested] = try_holds(tested, scene, common)
     progress("", total, total)
 
     surfaces = [
@@ -280,21 +280,21 @@ def compare(
     points = torch.stack(surfaces)[common.object_index]
     window = round(PRESS_TIME / scene.control_dt)
 
-    def judged(e: Engine) -> EngineParity:
-        press, closing = closings[e]
+    def judged(tested: Engine) -> EngineParity:
+        press, closing = closings[tested]
         metrics: tuple[Metric, ...] = ()
-        if e is not reference:
+        if tested is not reference:
             press_there, closing_there = closings[reference]
             metrics = (
                 *press_metrics(press, press_there, window),
-                *hold_metrics(holds[e], holds[reference], points),
+                *hold_metrics(holds[tested], holds[reference], points),
                 outcome_metric("closing, outcome", [closing], [closing_there]),
             )
         outcomes = {"closing": closing}
-        for mu, recording in zip(FRICTIONS, holds[e], strict=True):
+        for mu, recording in zip(FRICTIONS, holds[tested], strict=True):
             outcomes[f"hold {mu:g}"] = recording
         return EngineParity(
-            engine=e,
+            engine=tested,
             metrics=metrics,
             carried={name: tuple(carried(r).tolist()) for name, r in outcomes.items()},
             broken=sum(int(r.broken.sum()) for r in (*outcomes.values(), press)),
@@ -305,7 +305,7 @@ def compare(
         objects=tuple(objects),
         reference=judged(reference),
         floor=judged(floor),
-        engines=tuple(judged(e) for e in everyone[2:]),
+        engines=tuple(judged(tested) for tested in everyone[2:]),
         closing=table,
         hold=common,
     )

@@ -309,11 +309,9 @@ class Page(WebPage):
             self._see = gui.add_checkbox("the object's points that the policy sees", False, order=0)
             self._see.on_update(lambda _: setattr(self._points, "visible", self._see.value))
             self._input = gui.add_dropdown("input", tuple(self.session.inputs), order=3)
-            self._curves = [
-                _Curves(gui, folder, "fingertip forces [N]", 1),
-                _Curves(gui, folder, "terms of the reward", 2),
-                _Curves(gui, folder, "this input of the policy", 4, legend=False),
-            ]
+            self._forces = _Curves(gui, folder, "fingertip forces [N]", 1)
+            self._rewards = _Curves(gui, folder, "terms of the reward", 2)
+            self._inputs = _Curves(gui, folder, "this input of the policy", 4, legend=False)
         with gui.add_folder("save", expand_by_default=False):
             self._seconds = gui.add_slider("seconds", 2, 60, 1, 10)
             film = gui.add_button("Film (mp4)")
@@ -396,17 +394,13 @@ class Page(WebPage):
         moments = moments[:: max(1, len(moments) // CURVE_POINTS)]
         times = np.array([moment.time for moment in moments])
         forces = np.array([np.linalg.norm(moment.tip_force, axis=1) for moment in moments])
+        self._forces.show(times, forces, session.policy.robot.fingertip_names)
+        rewards = np.array([moment.reward for moment in moments])
+        self._rewards.show(times, rewards, session.terms)
         place = session.inputs[self._input.value]
         inputs = np.array([moment.inputs[place] for moment in moments])
         columns = [f"{self._input.value} {i}" for i in range(inputs.shape[1])]
-        rewards = np.array([moment.reward for moment in moments])
-        curves = (
-            (forces, session.policy.robot.fingertip_names),
-            (rewards, session.terms),
-            (inputs, columns),
-        )
-        for curve, (values, names) in zip(self._curves, curves, strict=True):
-            curve.show(times, values, names)
+        self._inputs.show(times, inputs, columns)
 
     def _status(self) -> str:
         session = self.session

@@ -20,12 +20,12 @@ from xreset.eval.results import Table
 
 X = Literal["minutes", "steps", "iterations"]
 """Horizontal axis of a learning curve."""
-AXES: dict[X, tuple[str, float, int]] = {
-    "minutes": ("minutes of training", 1.0, 1),
-    "steps": ("million environment steps", 1e-6, 1),
-    "iterations": ("iterations of training", 1.0, 0),
+AXES: dict[X, tuple[str, int]] = {
+    "minutes": ("minutes of training", 1),
+    "steps": ("million environment steps", 1),
+    "iterations": ("iterations of training", 0),
 }
-"""Label of an axis, factor to its unit, and digits in tables."""
+"""Label of an axis, and digits in tables."""
 _SPEED = ["speed/collect_seconds", "speed/learn_seconds", "speed/env_steps_per_second"]
 
 

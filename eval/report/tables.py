@@ -17,7 +17,12 @@ from xreset.eval.results import Table
 from xreset.eval.table import METRICS, Rows, estimate_text
 from xreset.learning.clock import SHARES, Lift
 
-_LIFT_FIELDS: dict[X, str] = {"minutes": "minutes", "steps": "env_steps", "iterations": "iteration"}
+_LIFT_FIELDS: dict[X, tuple[str, float]] = {
+    "minutes": ("minutes", 1.0),
+    "steps": ("env_steps", 1e-6),
+    "iterations": ("iteration", 1.0),
+}
+"""Field of a :class:`Lift` for each axis, and the factor to the axis's unit."""
 
 
 def results(groups: Groups, found: Table) -> Rows:
@@ -61,13 +66,14 @@ def lifted(groups: Groups, x: X) -> Rows:
 
 
 def _lifted(clocks: Sequence[Lift], share: float, x: X) -> str:
-    _, scale, digits = AXES[x]
+    _, digits = AXES[x]
+    field, scale = _LIFT_FIELDS[x]
     times = []
     hits = 0
     for clock in clocks:
         passed = [passing for passing in clock.passed if passing.share == share]
         hits += len(passed)
-        amount = getattr(passed[0] if passed else clock, _LIFT_FIELDS[x]) * scale
+        amount = getattr(passed[0] if passed else clock, field) * scale
         times.append(f"{'' if passed else '>'}{amount:.{digits}f}")
     low, high = binomtest(hits, len(clocks)).proportion_ci(method="wilson")
     return f"{hits / len(clocks):.0%} ({100 * low:.0f}-{100 * high:.0f}); {', '.join(times)}"
@@ -103,7 +109,7 @@ def different(groups: Groups) -> Rows:
 def _lengths(member: Training) -> dict[str, str]:
     """Return how long was trained; nothing that was not logged."""
     lengths = {}
-    for x, (label, _, digits) in AXES.items() if len(member.curves) else ():
+    for x, (label, digits) in AXES.items() if len(member.curves) else ():
         try:
             lengths[label] = f"{amounts(member, x).iloc[-1]:,.{digits}f}"
         except RunError:

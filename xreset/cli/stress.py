@@ -56,7 +56,10 @@ def stress(
     sweeps.write_plot(folder / "stress.png", found, f"{spec.name}: robustness")
     table = [("property", "value", *(result.backend for result in found))]
     swept = sweeps.by_property(found)
+    tried = set(swept).union(*(result.left_out for result in found))
     for prop in properties:
+        if prop.option not in tried:  # a property of cameras, which the policy does not have
+            continue
         for i, value in enumerate(sorted({*prop.values, prop.nominal})):
             cells = []
             for curve in swept.get(prop.option, [None] * len(found)):

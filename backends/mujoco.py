@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from copy import copy
-from typing import ClassVar, get_args
+from typing import get_args
 from weakref import WeakValueDictionary
 
 import numpy as np
 
 from xreset.backends.pool import PoolBackend, World
-from xreset.backends.rigid import ContactArrays, Inertia, LinkArrays, conjugate, object_inertia
-from xreset.physics import Capability, KnownDifference, unavailable
+from xreset.backends.rigid import (
+    ContactArrays,
+    Inertia,
+    LinkArrays,
+    StateArrays,
+    conjugate,
+    object_inertia,
+)
+from xreset.physics import Capability, unavailable
 from xreset.spec import SceneSpec
 
 try:
@@ -79,7 +86,7 @@ class MujocoWorld(World):
         self._q_ones = np.ones(model.nq)
         self._v_ones = np.ones(model.nv)
 
-    def set_state(self, state: Mapping[str, np.ndarray]) -> None:
+    def set_state(self, state: StateArrays) -> None:
         at = self._at
         mujoco.mj_resetData(self._model, self._data)
         self._overflowed = False
@@ -94,7 +101,7 @@ class MujocoWorld(World):
         self._object_spin[:] = _rotate(conjugate(quat), state["object_angvel"])
         self._ahead = False
 
-    def get_state(self) -> dict[str, np.ndarray]:
+    def get_state(self) -> StateArrays:
         return {
             "joint_pos": self._qpos.take(self._joint_qpos),
             "joint_vel": self._qvel.take(self._joint_dof),
@@ -131,7 +138,7 @@ class MujocoWorld(World):
         self._ahead = True
         return self._links
 
-    def health(self, state: Mapping[str, np.ndarray]) -> tuple[bool, bool]:
+    def health(self, state: StateArrays) -> tuple[bool, bool]:
         """See :meth:`World.health`. Reads the engine's own memory: two arrays, which include the mimic joints."""
         # One bad number spoils a sum, which costs less than looking at each.
         finite = math.isfinite(self._qpos.dot(self._q_ones) + self._qvel.dot(self._v_ones))
@@ -199,10 +206,10 @@ class MujocoWorld(World):
 class MujocoBackend(PoolBackend):
     """MuJoCo on the CPU."""
 
-    name: ClassVar[str] = "mujoco"
-    capabilities: ClassVar[frozenset[Capability]] = frozenset(get_args(Capability))
-    known_differences: ClassVar[tuple[KnownDifference, ...]] = KNOWN_DIFFERENCES
-    world_class: ClassVar[type[World]] = MujocoWorld
+    name = "mujoco"
+    capabilities = frozenset(get_args(Capability))
+    known_differences = KNOWN_DIFFERENCES
+    world_class = MujocoWorld
 
     @classmethod
     def engine_version(cls) -> str:

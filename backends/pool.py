@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import weakref
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any, ClassVar
 
@@ -18,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.backends.rigid import ContactArrays, Inertia, LinkArrays
+from xreset.backends.rigid import ContactArrays, Inertia, LinkArrays, StateArrays
 from xreset.backends.workers import (
     CONTACT_FIELDS,
     STATE_FIELDS,
@@ -53,11 +52,11 @@ class World(ABC):
         """Build the world with ``scene.objects[object_index]`` in it."""
 
     @abstractmethod
-    def set_state(self, state: Mapping[str, np.ndarray]) -> None:
+    def set_state(self, state: StateArrays) -> None:
         """Set every field of :class:`State`; nothing of the past may remain, except physical parameters."""
 
     @abstractmethod
-    def get_state(self) -> dict[str, np.ndarray]:
+    def get_state(self) -> StateArrays:
         """Return every field of :class:`State`.
 
         The arrays may be views of the engine's memory, which the next call that changes the world overwrites.
@@ -85,7 +84,7 @@ class World(ABC):
         All are zero right after :meth:`set_state`.
         """
 
-    def health(self, state: Mapping[str, np.ndarray]) -> tuple[bool, bool]:
+    def health(self, state: StateArrays) -> tuple[bool, bool]:
         """Return whether the state is not finite, and whether contacts overflowed in the last :meth:`step`.
 
         ``state`` is what :meth:`get_state` has just returned, so nothing has to be read again.
@@ -133,7 +132,7 @@ class World(ABC):
         """Free what the engine holds."""
 
 
-def is_finite(state: Mapping[str, np.ndarray]) -> bool:
+def is_finite(state: StateArrays) -> bool:
     """Return whether all numbers of a state are finite.
 
     One bad number spoils the sum, which costs less than looking at each.

@@ -15,7 +15,7 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
 from importlib.metadata import version
@@ -42,6 +42,7 @@ from xreset.backends.rigid import (
     ContactArrays,
     Inertia,
     LinkArrays,
+    StateArrays,
     TrackedFrames,
     conjugate,
     cross,
@@ -124,7 +125,7 @@ class PybulletWorld(World):
         self._quat = np.array([1.0, 0.0, 0.0, 0.0])
         self._clean = p.saveState()
 
-    def set_state(self, state: Mapping[str, np.ndarray]) -> None:
+    def set_state(self, state: StateArrays) -> None:
         if not is_finite(self.get_state()):
             self._rebuild()
         p = self._p
@@ -139,7 +140,7 @@ class PybulletWorld(World):
         p.resetBaseVelocity(self._object, state["object_linvel"] + cross(omega, arm), omega)
         self._fresh = True
 
-    def get_state(self) -> dict[str, np.ndarray]:
+    def get_state(self) -> StateArrays:
         com, turn = self._p.getBasePositionAndOrientation(self._object)
         linear, angular = self._p.getBaseVelocity(self._object)
         angvel = np.array(angular)

@@ -7,7 +7,7 @@ need every step.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
@@ -20,6 +20,8 @@ from xreset.geometry.dynamics import drive_shares
 from xreset.geometry.urdf import Joint, Link, RobotTree, robot_tree
 from xreset.spec import ObjectSpec, RobotSpec, Shape
 
+StateArrays = Mapping[str, np.ndarray]
+"""A value in double precision for each field of :class:`~xreset.physics.State`, of one world."""
 LinkArrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """Of the tracked links: position [K, 3], orientation [K, 4], velocity of the origin [K, 3], angular velocity [K, 3]."""
 ContactArrays = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -180,15 +182,14 @@ class TrackedFrames:
     """The tracked links of a robot as frames on its bodies."""
 
     def __init__(self, robot: Mechanism) -> None:
-        self.bodies, frames = map(
-            list, zip(*(robot.frames[link] for link in robot.robot.tracked_links), strict=True)
-        )
+        places = [robot.frames[link] for link in robot.robot.tracked_links]
+        self.bodies = [body for body, _ in places]
         """[K] index of the body of each tracked link."""
+        self._pos = np.array([T[:3, 3] for _, T in places])
+        self._quat = np.array([matrix_to_quat(T[:3, :3]) for _, T in places])
         inertias = [robot.bodies[body].inertia for body in self.bodies]
-        com = np.array([np.zeros(3) if inertia is None else inertia.com for inertia in inertias])
-        self._pos = np.array([T[:3, 3] for T in frames])
-        self._quat = np.array([matrix_to_quat(T[:3, :3]) for T in frames])
-        self._lever = self._pos - com
+        com = [np.zeros(3) if inertia is None else inertia.com for inertia in inertias]
+        self._lever = self._pos - np.array(com)
 
     def locate(
         self, pos: np.ndarray, quat: np.ndarray, com_velocity: np.ndarray, angvel: np.ndarray

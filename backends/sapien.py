@@ -17,7 +17,7 @@ What differs from SAPIEN's defaults, and why:
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 from typing import Any, get_args
@@ -31,6 +31,7 @@ from xreset.backends.rigid import (
     ContactArrays,
     Inertia,
     LinkArrays,
+    StateArrays,
     TrackedFrames,
     cross,
     friction_forces,
@@ -84,7 +85,7 @@ class SapienWorld(World):
         """Of the last physics step: the object's velocity, angular velocity and orientation before it; the force and
         torque given."""
 
-    def set_state(self, state: Mapping[str, np.ndarray]) -> None:
+    def set_state(self, state: StateArrays) -> None:
         self._renew_scene()
         self._joints.reset(state["joint_pos"], state["joint_vel"], state["joint_target"])
         self._quat = np.array(state["object_quat"])
@@ -96,7 +97,7 @@ class SapienWorld(World):
         self._object.angular_velocity = omega
         self._last_step = None
 
-    def get_state(self) -> dict[str, np.ndarray]:
+    def get_state(self) -> StateArrays:
         pose = self._object.entity_pose
         self._quat = nearer(pose.q.astype(np.float64), self._quat)
         omega = self._object.angular_velocity.astype(np.float64)

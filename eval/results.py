@@ -17,7 +17,7 @@ import pandas as pd
 
 from xreset.checks import Checked, NotNegative, Positive, Range, Rule, Share, from_dict
 from xreset.errors import FileFormatError
-from xreset.eval.stats import bootstrap_ci95
+from xreset.eval.stats import Interval, bootstrap_ci95
 from xreset.eval.table import table_text
 from xreset.files import read_json, read_typed, write_json
 from xreset.records import POSITION, UNIT_TOLERANCE, Field, read_npz, write_npz
@@ -330,7 +330,7 @@ def summarize(rollouts: Rollouts, **about: Any) -> EvalResult:
     )
 
 
-def _ci95(episodes: Table, metric: str) -> tuple[float, float]:
+def _ci95(episodes: Table, metric: str) -> Interval:
     low, high = bootstrap_ci95(episodes[metric].to_numpy(float), episodes["sequence"].to_numpy())
     return round(low, 6), round(high, 6)
 

@@ -17,11 +17,9 @@ import numpy as np
 
 from xreset.errors import XResetError
 from xreset.eval.results import Episode
-from xreset.eval.stats import bootstrap_ci95, mean_of_known
+from xreset.eval.stats import Interval, bootstrap_ci95, mean_of_known
 from xreset.physics import Capability
 from xreset.task.config import RandomizationConfig, TaskConfig
-
-Interval = tuple[float, float]
 
 
 @dataclass(frozen=True, kw_only=True)

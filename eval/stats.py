@@ -13,11 +13,13 @@ def mean_of_known(values: Sequence[float | None]) -> float | None:
     return float(np.mean(known)) if len(known) == len(values) else None
 
 
+Interval = tuple[float, float]
+"""Lower and upper end of a 95 % interval."""
 DRAWS = 2000
 """Resamples of a bootstrap."""
 
 
-def bootstrap_ci95(values: np.ndarray, groups: np.ndarray | None = None) -> tuple[float, float]:
+def bootstrap_ci95(values: np.ndarray, groups: np.ndarray | None = None) -> Interval:
     """Return the 95 % percentile bootstrap interval of the mean. The same values give the same interval.
 
     Args:
@@ -38,9 +40,7 @@ def bootstrap_ci95(values: np.ndarray, groups: np.ndarray | None = None) -> tupl
     return _interval(sums[picks].sum(axis=1) / counts[picks].sum(axis=1))
 
 
-def crossed_bootstrap_ci95(
-    values: np.ndarray, runs: np.ndarray, groups: np.ndarray
-) -> tuple[float, float]:
+def crossed_bootstrap_ci95(values: np.ndarray, runs: np.ndarray, groups: np.ndarray) -> Interval:
     """Return the 95 % percentile bootstrap interval of the mean over trainings that were evaluated on the same
     demonstrations.
 
@@ -64,7 +64,7 @@ def crossed_bootstrap_ci95(
     return _interval(_means((values, runs, groups), rng, rng))
 
 
-def difference_ci95(one: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> tuple[float, float]:
+def difference_ci95(one: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> Interval:
     """Return the 95 % interval of the mean of ``other`` minus that of ``one``: crossed bootstraps with the same
     draws of demonstrations, and each with its own draws of trainings. Episodes are drawn in place of demonstrations
     where there is one training and one demonstration.
@@ -102,6 +102,6 @@ def _means(
     return means / ((run_times @ counts) * group_times).sum(axis=1)
 
 
-def _interval(means: np.ndarray) -> tuple[float, float]:
+def _interval(means: np.ndarray) -> Interval:
     low, high = np.percentile(means, [2.5, 97.5])
     return float(low), float(high)

@@ -20,7 +20,8 @@ from xreset.eval.plots import COLORS, picture
 from xreset.eval.policy_spec import PolicySpec
 from xreset.eval.results import Episode
 from xreset.eval.rollout import Engine, Trial, roll_out
-from xreset.eval.sensitivity import SWEEPS, Effect, Interval, Property, amount, nominal_task
+from xreset.eval.sensitivity import SWEEPS, Effect, Property, amount, nominal_task
+from xreset.eval.stats import Interval
 from xreset.files import read_typed, write_json
 from xreset.plugins import backend_class
 from xreset.progress import NamedProgress, unseen

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import rich.console
 from rich.table import Table
 
-from xreset.eval.stats import mean_of_known
+from xreset.eval.stats import Interval, mean_of_known
 
 if TYPE_CHECKING:
     from xreset.eval.results import DemoResult, EvalResult
@@ -87,7 +87,7 @@ class Figure:
     """A figure of an evaluation: a row of the terminal's table, a column of the report's table."""
 
     text: Callable[[EvalResult], str]
-    interval: Callable[[EvalResult], tuple[float, float] | None] | None = None
+    interval: Callable[[EvalResult], Interval | None] | None = None
     """95 % interval, in [0, 1]; None where the figure was not measured."""
     fault: bool = False
     """Whether every number but 0 is a fault."""
@@ -129,7 +129,7 @@ def result_rows(summaries: Sequence[EvalResult]) -> list[tuple[str, ...]]:
     return rows
 
 
-def _interval(interval: tuple[float, float] | None) -> str:
+def _interval(interval: Interval | None) -> str:
     return "-" if interval is None else f"{100 * interval[0]:.0f}-{100 * interval[1]:.0f}%"
 
 

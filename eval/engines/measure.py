@@ -7,11 +7,11 @@ rests on the table.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 from torch import Tensor
@@ -93,6 +93,10 @@ _WORLDS = {
 _AT = {name: i for i, name in enumerate(_WORLDS)}
 
 
+Log = dict[str, Tensor]
+"""States [T, N, ...] of the worlds after each physics step, the start first, by field."""
+
+
 def measure(engine: Engine, scene: SceneSpec) -> Measured:
     """Put an engine through the experiments.
 
@@ -147,8 +151,8 @@ class _Experiments:
         torsional = max(scene.friction.torsional, 1e-3)
         self._spin = 4.0 * torsional * _SLAB_MASS * GRAVITY / _TOP_INERTIA[2] * _TIME
 
-    def run(self, worlds: Worlds) -> dict[str, Tensor]:
-        """Play all experiments; returns the worlds' states [T, N, ...] after each physics step, the start first."""
+    def run(self, worlds: Worlds) -> Log:
+        """Play all experiments."""
         start = self._start()
         grounded = [index in (_SLAB, _TOP) for index in _WORLDS.values()]
         worlds.set_parameter("object_gravity", torch.tensor(grounded))
@@ -172,7 +176,7 @@ class _Experiments:
             )
         return log
 
-    def measured(self, log: dict[str, Tensor]) -> Measured:
+    def measured(self, log: Log) -> Measured:
         """Return what the worlds' states say of the engine."""
         dt = self._dt
         t = _PUSH_STEPS * dt
@@ -195,7 +199,7 @@ class _Experiments:
             timestep=step,
         )
 
-    def _pulled(self, log: dict[str, Tensor], name: str) -> float:
+    def _pulled(self, log: Log, name: str) -> float:
         """Return the friction of a paddle, from the impulses that were missing along and across the link."""
         _, normal, along = self._presses[name]
         begin = round((_SETTLE + _PULL_WINDOW[0]) / self._dt)
@@ -207,14 +211,14 @@ class _Experiments:
         pressed = _PRESS * time + float(gained @ normal)  # the press pushes against the normal
         return carried / pressed if pressed > 0.05 * _PRESS * time else float("nan")
 
-    def _slid(self, log: dict[str, Tensor], step: float) -> float:
+    def _slid(self, log: Log, step: float) -> float:
         """Return the friction from how far the slab has slid."""
         world = _AT["slide"]
         end = log["object_linvel"][-1, world, :2].norm()
         way = (log["object_pos"][-1, world, :2] - log["object_pos"][0, world, :2]).norm()
         return float((_SPEED**2 - end**2) / (2 * GRAVITY * (way + _SPEED * step / 2)))
 
-    def _torsion(self, log: dict[str, Tensor]) -> float:
+    def _torsion(self, log: Log) -> float:
         """Return the torsional friction [m] from the spin that a top has lost.
 
         It is measured while the top has half of its spin; NaN if friction takes that in one step.
@@ -268,7 +272,7 @@ class _Experiments:
                 steps[i] *= -1
         return steps
 
-    def _drives(self, log: dict[str, Tensor]) -> np.ndarray:
+    def _drives(self, log: Log) -> np.ndarray:
         """[2, J] shares of kp and kd, after a step of the targets."""
         position = log["joint_pos"][:, _AT["drives"]].numpy()
         velocity = log["joint_vel"][:, _AT["drives"]].numpy()
@@ -288,7 +292,7 @@ class _Experiments:
         return np.transpose(gains)
 
 
-def _solid(name: str, piece: Shape, inertia: Sequence[float] | np.ndarray) -> ObjectSpec:
+def _solid(name: str, piece: Shape, inertia: ArrayLike) -> ObjectSpec:
     """Return an object of the slab's mass whose centre of mass is its origin; inertia [3] along the axes."""
     thing = solid(name, _SLAB_MASS, (piece,))
     return replace(thing, com=np.zeros(3), inertia=np.diag(inertia))
@@ -355,6 +359,6 @@ def _z_to(direction: np.ndarray) -> np.ndarray:
     )
 
 
-def _median(values: Sequence[float] | np.ndarray) -> float:
+def _median(values: np.ndarray) -> float:
     """NaN if there are none."""
     return float(np.median(values)) if len(values) else float("nan")

@@ -15,7 +15,7 @@ from xreset.backends.conformance.results import SCHEMA as CONFORMANCE
 from xreset.backends.conformance.results import share_of
 from xreset.errors import FileFormatError, XResetError
 from xreset.eval.pages import render
-from xreset.eval.table import markdown
+from xreset.eval.table import Rows, markdown
 from xreset.files import read_json
 from xreset.physics import Capability
 from xreset.text import shown
@@ -162,7 +162,7 @@ def _amount(measure: Json, entry: str) -> str:
     return f"{float(measure[entry]):.2g} {measure['unit']}".rstrip()
 
 
-def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
+def _table(head: tuple[str, ...], rows: Rows) -> str:
     """A table in Markdown, whose cells may hold Markdown; empty without a row."""
 
     def escape(cell: str) -> str:

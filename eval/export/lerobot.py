@@ -22,7 +22,7 @@ from xreset.eval.report.clips import draw_state, draw_view, encode_mp4, policy_c
 from xreset.eval.results import Trace
 from xreset.files import atomic_folder, write_json
 from xreset.objects.catalogue import load_object
-from xreset.pictures.render import Renderer
+from xreset.pictures.render import Renderer, Size
 from xreset.spec import RobotSpec, SceneSpec
 
 SCHEMA = "xreset-lerobot/1"
@@ -50,7 +50,7 @@ def write_lerobot(
     recording: RecordedEpisodes,
     *,
     video: bool = True,
-    size: tuple[int, int] = (320, 240),
+    size: Size = (320, 240),
     cameras: Sequence[str] = (),
 ) -> None:
     """Write a data set; ``docs/rollouts.md`` has its features.
@@ -87,9 +87,7 @@ def write_lerobot(
         ) from error
 
 
-def _write(
-    root: Path, recording: RecordedEpisodes, videos: tuple[str, ...], size: tuple[int, int]
-) -> None:
+def _write(root: Path, recording: RecordedEpisodes, videos: tuple[str, ...], size: Size) -> None:
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -185,7 +183,7 @@ def _info(recording: RecordedEpisodes, tasks: int, features: dict[str, Any]) -> 
 
 
 def _features(
-    recording: RecordedEpisodes, videos: tuple[str, ...], size: tuple[int, int]
+    recording: RecordedEpisodes, videos: tuple[str, ...], size: Size
 ) -> dict[str, dict[str, Any]]:
     joints = list(recording.robot.joint_names)
     vectors = {
@@ -262,7 +260,7 @@ def _draw(
     episode: dict[str, Any],
     video: str,
     painters: dict[Any, Painter],
-    size: tuple[int, int],
+    size: Size,
 ) -> np.ndarray:
     """Return the film [T, H, W, 3] of an episode, always from the same camera, so that episodes can be compared."""
     trace = episode["trace"]

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from xreset.demos.synth import synthesize
@@ -314,9 +315,7 @@ class Session:
 
     # The user's hand --------------------------------------------------------------------------------------------------
 
-    def move_goal(
-        self, pos: Sequence[float] | np.ndarray, quat: Sequence[float] | np.ndarray
-    ) -> None:
+    def move_goal(self, pos: ArrayLike, quat: ArrayLike) -> None:
         """Set the goal, at the nearest position above the table that the object can have.
 
         Args:

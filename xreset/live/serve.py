@@ -27,6 +27,10 @@ _PATIENCE = 5.0
 """Time after which a client that does not answer a ping has gone [s]."""
 
 
+Message = dict[str, Any]
+"""A message of ``docs/live.md``, or the part of it below its verb."""
+
+
 class PolicyServer:
     """Listens until it is closed. Each client has an episode of its own."""
 
@@ -98,13 +102,13 @@ class _Episode:
     def __init__(self, controller: Controller) -> None:
         self._controller = controller
         self._has_begun = False
-        self._verbs: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
+        self._verbs: dict[str, Callable[[Message], Message]] = {
             "begin": self._begin,
             "goal": self._goal,
             "step": self._step,
         }
 
-    def answer(self, message: str | bytes) -> dict[str, Any]:
+    def answer(self, message: str | bytes) -> Message:
         """Return the answer to a message; what is wrong with it, if it cannot be answered."""
         try:
             try:
@@ -122,7 +126,7 @@ class _Episode:
         except LiveError as error:
             return {"error": str(error)}
 
-    def _begin(self, given: dict[str, Any]) -> dict[str, Any]:
+    def _begin(self, given: Message) -> Message:
         controller = self._controller
         contract = controller.contract
         if given.get("object") is not None:
@@ -137,11 +141,11 @@ class _Episode:
         self._has_begun = True
         return {"begun": True}
 
-    def _goal(self, given: dict[str, Any]) -> dict[str, Any]:
+    def _goal(self, given: Message) -> Message:
         self._controller.set_goal(*_goal(given))
         return {"goal": True}
 
-    def _step(self, given: dict[str, Any]) -> dict[str, Any]:
+    def _step(self, given: Message) -> Message:
         contract = self._controller.contract
         joints = len(contract["joints"])
         force = None
@@ -159,7 +163,7 @@ class _Episode:
         return {"target": self._controller.step(reading.batched())[0].tolist()}
 
 
-def _numbers(given: dict[str, Any], name: str, *shape: int) -> np.ndarray:
+def _numbers(given: Message, name: str, *shape: int) -> np.ndarray:
     """Return an entry of a message as an array of that shape."""
     try:
         value = np.array(given[name], dtype=np.float32)
@@ -174,11 +178,11 @@ def _numbers(given: dict[str, Any], name: str, *shape: int) -> np.ndarray:
     return value
 
 
-def _goal(given: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+def _goal(given: Message) -> tuple[np.ndarray, np.ndarray]:
     return _numbers(given, "goal_pos", 3), _quaternion(given, "goal_quat")
 
 
-def _quaternion(given: dict[str, Any], name: str) -> np.ndarray:
+def _quaternion(given: Message, name: str) -> np.ndarray:
     value = _numbers(given, name, 4)
     if abs(np.linalg.norm(value) - 1.0) > 0.01:
         raise LiveError(

@@ -41,6 +41,9 @@ from xreset.pictures.meshes import (
 )
 from xreset.spec import SceneSpec
 
+Size = tuple[int, int]
+"""Width and height [pixels]."""
+
 SKY_COLORS: tuple[Color, Color] = ((0.90, 0.93, 0.97), (0.98, 0.98, 0.98))
 """Background at the upper and lower edge of a picture."""
 AXIS_COLORS: tuple[Color, Color, Color] = (
@@ -80,7 +83,7 @@ class Camera:
         """Focal length in pixels of a picture of this height."""
         return height / 2 / math.tan(self.fov / 2)
 
-    def rays(self, size: tuple[int, int]) -> np.ndarray:
+    def rays(self, size: Size) -> np.ndarray:
         """[H * W, 3] float32 directions of the pixels' rays, row by row; their length along the view axis is 1."""
         width, height = size
         y, x = np.mgrid[:height, :width].astype(np.float32) + 0.5
@@ -90,7 +93,7 @@ class Camera:
             self.axes()
         )
 
-    def project(self, points: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    def project(self, points: np.ndarray, size: Size) -> tuple[np.ndarray, np.ndarray]:
         """Return pixels [P, 2] and distances along the view axis [P] of world points [P, 3] that are before the
         camera."""
         local = (points - self.eye) @ self.axes().T
@@ -117,7 +120,7 @@ class Renderer:
         self,
         scene: SceneSpec,
         *,
-        size: tuple[int, int] = (480, 360),
+        size: Size = (480, 360),
         camera: Camera | None = None,
         smooth: bool = False,
     ) -> None:
@@ -207,7 +210,7 @@ def draw_bodies(
     meshes: Sequence[trimesh.Trimesh],
     colors: Sequence[Color],
     camera: Camera,
-    size: tuple[int, int],
+    size: Size,
 ) -> np.ndarray:
     """Return a [H, W, 3] uint8 picture of meshes, each in its color, without a table."""
     bodies = []
@@ -250,7 +253,7 @@ def encode_png(picture: np.ndarray) -> bytes:
 
 
 def _image(
-    scene: Triangles, goal: Triangles | None, camera: Camera, size: tuple[int, int], smooth: bool
+    scene: Triangles, goal: Triangles | None, camera: Camera, size: Size, smooth: bool
 ) -> Image.Image:
     """Draw at twice the size; without ``smooth``, from one ray for each 2 x 2 pixels."""
     width, height = size

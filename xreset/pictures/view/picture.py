@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from xreset.description import load_robot
-from xreset.pictures.render import Points, Renderer, pose_matrix
+from xreset.pictures.render import Points, Renderer, Size, pose_matrix
 from xreset.pictures.view.colors import HUMAN_COLOR, REACHED_COLOR, TOUCH_COLOR, reason_color
 from xreset.pictures.view.data import BONES, View
 from xreset.plugins import robot_names
@@ -19,9 +19,7 @@ class Drawer:
     """Draws rows of a view. Colors are those of :mod:`xreset.pictures.view.colors`; the goal is a translucent
     object."""
 
-    def __init__(
-        self, view: View, *, size: tuple[int, int] = (640, 480), smooth: bool = False
-    ) -> None:
+    def __init__(self, view: View, *, size: Size = (640, 480), smooth: bool = False) -> None:
         """Prepare the meshes; see :class:`~xreset.pictures.render.Renderer` for the options."""
         # a scene needs one; it is drawn only if the view has one
         robot = view.robot or load_robot(robot_names()[0])

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from functools import partial, wraps
 from inspect import signature
 from pathlib import Path
@@ -41,7 +41,12 @@ def checked(command: Callable[..., None]) -> Callable[..., None]:
     def run(*positional: Any, **named: Any) -> None:
         options = _flat(signature(command).bind(*positional, **named).arguments)
         _check(options)
-        with _claimed(options):
+        with ExitStack() as claims:
+            for name in _WRITTEN:
+                path = options.get(name)
+                # a folder is claimed by what writes into it
+                if isinstance(path, Path) and path.suffix and path.parent.is_dir():
+                    claims.enter_context(claim(path))
             command(*positional, **named)
 
     return run
@@ -87,14 +92,3 @@ def _check_overwriting(options: dict[str, Any]) -> None:
                     f"--{name} is {path}, which is also the {other.replace('_', ' ')}. "
                     "Nothing was overwritten; choose another file."
                 )
-
-
-@contextmanager
-def _claimed(options: dict[str, Any]) -> Iterator[None]:
-    with ExitStack() as claims:
-        for name in _WRITTEN:
-            path = options.get(name)
-            # a folder is claimed by what writes into it
-            if isinstance(path, Path) and path.suffix and path.parent.is_dir():
-                claims.enter_context(claim(path))
-        yield

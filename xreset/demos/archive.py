@@ -440,8 +440,10 @@ def _offsets(lengths: Sequence[int] | np.ndarray) -> np.ndarray:
     return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
 
 
-def sides_problem(arrays: Mapping[str, Any]) -> str | None:
-    """Return what is wrong with the sides of the hands [S]."""
+def sequences_problem(arrays: Mapping[str, Any]) -> str | None:
+    """Return what is wrong with the sequences of motions: their frames, their names, or the sides of the hands [S]."""
+    if problem := offsets_problem(arrays, len(arrays["object_pos"])):
+        return problem
     names = arrays["sequence_name"]
     for name, side in zip(names.tolist(), arrays["hand_side"].tolist(), strict=True):
         if side not in SIDES:
@@ -460,9 +462,7 @@ def _problem(arrays: Mapping[str, Any]) -> str | None:
     """Return the first contradiction, or None. Types, shapes and the fields' own ranges have been checked."""
     offsets = arrays["frame_offsets"]
     names = arrays["sequence_name"]
-    if problem := offsets_problem(arrays, len(arrays["object_pos"])):
-        return problem
-    if problem := sides_problem(arrays):
+    if problem := sequences_problem(arrays):
         return problem
     level = arrays.get("T_level_from_table")
     if (arrays.get("subjects") is None) != (level is None):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from functools import lru_cache
 from pathlib import Path
 
 from xreset.errors import ObjectError
@@ -88,7 +87,7 @@ def load_object(name: str, folder: str | Path | None = None) -> ObjectSpec:
         ObjectError: unknown object, or no usable mesh of it in the folder.
     """
     if folder is None:
-        return _stand_in(canonical_name(name))
+        return stand_in(canonical_name(name))
     files = mesh_files(folder)
     try:
         full = canonical_name(name, files)
@@ -103,6 +102,3 @@ def load_objects(names: Iterable[str], folder: str | Path | None = None) -> tupl
     """Load several objects, in that order, or the one of a single name; see :func:`load_object`."""
     names = (names,) if isinstance(names, str) else names
     return tuple(load_object(name, folder) for name in names)
-
-
-_stand_in = lru_cache(maxsize=None)(stand_in)

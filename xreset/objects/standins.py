@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ STAND_INS = tuple(_SHAPES)
 """Official names of the objects that have a stand-in."""
 
 
+@cache
 def stand_in(name: str) -> ObjectSpec:
     """Make the stand-in of an official name (``KeyError`` if there is none).
 

@@ -23,14 +23,13 @@ from xreset.demos.archive import (
     SequenceQuaternions,
     SequenceTexts,
     Text,
-    sides_problem,
+    sequences_problem,
 )
 from xreset.records import (
     JOINT,
     POSITION,
     RATE,
     Field,
-    offsets_problem,
     read_npz,
     read_record,
     write_record,
@@ -134,9 +133,7 @@ def object_sources(path: str | Path) -> dict[str, str]:
 
 def _check(arrays: dict[str, np.ndarray]) -> str | None:
     offsets = arrays["frame_offsets"]
-    if problem := offsets_problem(arrays, len(arrays["joint_pos"])):
-        return problem
-    if problem := sides_problem(arrays):
+    if problem := sequences_problem(arrays):
         return problem
     if ((arrays["reason"] < 0) | (arrays["reason"] >= len(arrays["reason_names"]))).any():
         return "array 'reason' points beyond 'reason_names'."

@@ -1,1 +1,2 @@
-"""Tools for whoever writes a robot's description: check it, place its base, look at it."""
+"""Tools for whoever brings a robot: ``importer`` makes its description, ``check`` checks it, ``picture`` draws it,
+``place`` finds a place for its base, and ``judge`` says what it can hold."""

@@ -1,1 +1,2 @@
-"""The task as pure functions over batched tensors: observations, reward, terminations, resets, randomisation."""
+"""The task: actions, observations, reward and ends of episodes as pure functions over batched tensors; and what differs
+between worlds and episodes (``variation``, ``vision``), in fixed buffers."""

@@ -296,7 +296,7 @@ class ManipulationEnv:
         if begin is not None:
             self._over |= self._reset_mask
             self._reset_mask.copy_(begin)
-        if self._graphs.active or bool(self._reset_mask.any()):
+        if self._graphs.active or self._reset_mask.any():
             self._graphs.run(self._sample_resets)
             self._write_resets()
         self._look()

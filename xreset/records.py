@@ -298,7 +298,7 @@ def offsets_problem(arrays: Mapping[str, np.ndarray], frames: int) -> str | None
         return f"frame_offsets go from {offsets[0]} to {offsets[-1]}, expected 0 to {frames} (the number of frames)."
     lengths = np.diff(offsets)
     if (lengths <= 0).any():
-        i = int(np.argmax(lengths <= 0))
+        i = np.argmax(lengths <= 0)
         return (
             f"frame_offsets must increase, but sequence {i} ({names[i]!s}) has {lengths[i]} frames."
         )

@@ -35,7 +35,7 @@ def schedule(item_object: np.ndarray, max_worlds: int) -> Schedule:
     worlds = np.ones_like(counts)
     for _ in range(min(max_worlds, len(item_object)) - len(objects)):
         worlds[np.argmax(counts / worlds)] += 1  # the object whose worlds have most to do
-    num_rounds = int(np.max(-(-counts // worlds)))
+    num_rounds = np.max(-(-counts // worlds))
     columns = []
     fresh = []
     for number, count, width in zip(objects, counts, worlds, strict=True):

@@ -487,8 +487,8 @@ def _problem(arrays: Mapping[str, Any]) -> str | None:
         ),
     ):
         if not fits.all():
-            frame = int(np.argmin(fits))
-            sequence = int(np.searchsorted(offsets, frame, side="right")) - 1
+            frame = np.argmin(fits)
+            sequence = np.searchsorted(offsets, frame, side="right") - 1
             where = f"First in frame {frame - offsets[sequence]} of sequence {sequence} ({names[sequence]!s})."
             return f"{problem} {where} If the hand is unknown there, set hand_valid to False."
     return None

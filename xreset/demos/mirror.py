@@ -60,7 +60,7 @@ def symmetry(obj: ObjectSpec) -> Symmetry:
         minimize(mean_square, np.zeros(3), (axis,), method="Nelder-Mead", options=options)
         for axis in axes
     ]
-    best = int(np.argmin([fit.fun for fit in fits]))
+    best = np.argmin([fit.fun for fit in fits])
     normal, offset = _plane(fits[best].x, axes[best], center)
     deviation = np.percentile(deviations(fits[best].x, axes[best]), 95)
     return Symmetry(normal=normal, offset=offset, deviation=float(deviation))

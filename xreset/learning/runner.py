@@ -242,7 +242,7 @@ class TrainingRunner:
                 f"The critic observes the reward: do your own terms return finite numbers ({own})?"
             )
         for group, value in obs.items():
-            if not bool(value.isfinite().all()):
+            if not value.isfinite().all():
                 raise RunError(
                     f"The observation group {group!r} is not finite at iteration {self.iteration}. {remedy}"
                 )

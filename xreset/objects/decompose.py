@@ -519,5 +519,5 @@ def limited_hull(points: np.ndarray) -> Shape:
         inner = ConvexHull(vertices[chosen], qhull_options="QJ")
         outside = plane_heights(vertices, inner.equations).max(axis=1)
         outside[chosen] = -np.inf
-        chosen.append(int(outside.argmax()))
+        chosen.append(outside.argmax())
     return hull(vertices[chosen])

@@ -128,7 +128,7 @@ def _egg(rng: np.random.Generator) -> list[Shape]:
 
 def _wedge(rng: np.random.Generator) -> list[Shape]:
     """A prism over an irregular polygon."""
-    corners = int(rng.integers(3, 8))
+    corners = rng.integers(3, 8)
     angles = (np.arange(corners) + rng.uniform(-0.2, 0.2, corners)) * 2 * np.pi / corners
     radii = rng.uniform(0.028, 0.05, corners)
     outline = [

@@ -60,11 +60,11 @@ def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
     from the mean."""
     if len(points) < count:
         raise ValueError(f"{count} points wanted of {len(points)}")
-    chosen = [int(np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
+    chosen = [np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1))]
     distance = np.full(len(points), np.inf)
     while len(chosen) < count:
         distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
-        chosen.append(int(np.argmax(distance)))
+        chosen.append(np.argmax(distance))
     return points[chosen]
 
 

@@ -253,7 +253,7 @@ def check_retargeted(path: str | Path, data: Retargeted, robot: RobotSpec) -> No
     lower, upper = joint_limits(robot)
     outside = np.maximum(lower - data.joint_pos, data.joint_pos - upper)
     beyond = np.where(data.valid[:, None], outside, -np.inf)
-    frame, joint = np.unravel_index(int(beyond.argmax()), beyond.shape)
+    frame, joint = np.unravel_index(beyond.argmax(), beyond.shape)
     if beyond[frame, joint] > _TOLERANCE:
         raise FileFormatError(
             f"{path} holds {data.joint_names[joint]} = {data.joint_pos[frame, joint]:.4g} in frame {frame}, but the "

@@ -148,7 +148,7 @@ class ResetDistribution:
         self._grouped_sequences = _Grouped(bank.sequence_object, object_names, device)
         self._sequences = _tensor(self._grouped_sequences.rows, device)
         pivots = pivots or {}
-        of_sequence = [pivots.get(str(name), np.zeros(3)) for name in bank.sequence_object]
+        of_sequence = [pivots.get(name, np.zeros(3)) for name in bank.sequence_object]
         self._demos = _Demonstrations(
             start_pos=_tensor(bank.start_pos, device),
             start_quat=_tensor(bank.start_quat_wxyz, device),
@@ -199,7 +199,7 @@ class ResetDistribution:
         c = self.config
         device = generator.device
         noise = torch.randn(m, len(self._home), generator=generator, device=device)
-        noise = noise * self._home_std * float(c.home_noise)
+        noise = noise * self._home_std * c.home_noise
         joint_pos = torch.minimum(torch.maximum(self._home + noise, self._lower), self._upper)
         shift = 2.0 * torch.rand(m, 3, generator=generator, device=device) - 1.0
         spawn_xy = c.spawn_xy if c.training_xy is None else c.training_xy

@@ -43,7 +43,7 @@ class Reach:
         root = self._model.kinematics.link_poses(home[None], [robot.hand_root])[0, 0, :3, :3]
         at_home = Rotation.from_matrix(root.numpy())
         level = np.cross((0.0, 0.0, 1.0), at_home.apply(self._center))
-        level /= max(float(np.linalg.norm(level)), 1e-9)
+        level /= max(np.linalg.norm(level), 1e-9)
         turns = np.radians(list(product(_TILTS, _YAWS)))
         tilted = Rotation.from_rotvec(turns[:, :1] * level) * at_home
         self._grasps = (Rotation.from_rotvec(turns[:, 1:] * (0.0, 0.0, 1.0)) * tilted).as_quat()

@@ -84,9 +84,9 @@ def minimize(
         now = where(better, trial, now)
         here = where(better, there, here)
         best[rows] = now
-        if not bool(left.any()):
+        if not left.any():
             break
-        if not bool(left.all()):
+        if not left.all():
             rows = rows[left]
             damping = damping[left]
             now = now[left]

@@ -310,7 +310,7 @@ def _thumb(spec: RobotSpec) -> Problems:
     names = spec.fingertip_names
     meetings = opposition(spec, tips, np.zeros((len(tips), 3)))
     scores = np.sqrt(meetings).sum(axis=1)
-    best = int(scores.argmax())
+    best = scores.argmax()
     met = [", ".join(names[i] for i in np.flatnonzero(row)) or "no other" for row in meetings]  # noqa: XR002
     if scores[best] == 0:
         yield (

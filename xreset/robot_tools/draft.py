@@ -48,7 +48,7 @@ def draft_spec(
     for joint in tree.joints:
         if joint.type == "fixed" or joint.mimic is not None:
             continue
-        home = float(np.clip(0.0, joint.lower, joint.upper)) + (bent or {}).get(joint.name, 0.0)
+        home = np.clip(0.0, joint.lower, joint.upper) + (bent or {}).get(joint.name, 0.0)
         home = float(rounded(home, joint.lower, joint.upper))
         group = "hand" if joint.child in inside else "arm"
         drive = DriveSpec(kp=1.0, kd=0.1, effort=1.0, armature=_ARMATURE if group == "arm" else 0.0)

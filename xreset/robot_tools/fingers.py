@@ -172,7 +172,7 @@ class Hand:
         ends = [chain.links[-1] for chain in chains]
         tips = np.array([self._in_link(chain.links[-1], chain.points[-1]) for chain in chains])
         scores = np.sqrt(opposition(self._spec, ends, tips)).sum(axis=1)
-        first = int(scores.argmax())
+        first = scores.argmax()
         if scores[first] == 0 and len(chains) > 2:
             raise RobotError(
                 f"no finger can oppose the others. Name a link of the thumb with --thumb: {known}."
@@ -247,7 +247,7 @@ class Hand:
                     continue
                 self.bent[name] = _BEND * closing
                 if finger.name != "thumb":
-                    halfway = float(np.clip(0.0, joint.lower, joint.upper)) + 0.5 * closing
+                    halfway = np.clip(0.0, joint.lower, joint.upper) + 0.5 * closing
                     T = link_places(self._spec, {name: halfway})[last]
                     moved += T[:3, :3] @ tip + T[:3, 3] - finger.points[-1]
         z = moved - (moved @ x) * x
@@ -330,8 +330,8 @@ class Hand:
             )
         middle = bounding_ball(cloud)[0]
         away = middle - self._on_axis(last, cloud)
-        away /= max(float(np.linalg.norm(away)), 1e-9)
-        return np.array([*points, middle + away * float(((cloud - middle) @ away).max())])
+        away /= max(np.linalg.norm(away), 1e-9)
+        return np.array([*points, middle + away * ((cloud - middle) @ away).max()])
 
     def _on_axis(self, link: str, cloud: np.ndarray) -> np.ndarray:
         """[3] the point of the axis before a link that is nearest to the middle of points; the origin if there is
@@ -340,7 +340,7 @@ class Hand:
         if not len(cloud):
             return origin
         axis = self._at[link][:3, :3] @ self.tree.above[link].axis
-        return origin + axis * float((bounding_ball(cloud)[0] - origin) @ axis)
+        return origin + axis * ((bounding_ball(cloud)[0] - origin) @ axis)
 
 
 def _stated_finger(names: str) -> str:

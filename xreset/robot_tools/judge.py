@@ -45,11 +45,11 @@ LIFT = 0.01
 """Height of the object's origin above the demonstration's start from which a state is lifted [m]."""
 HEIGHT = 0.10
 """How far the arm raises the hand [m]."""
-TURN = float(np.pi / 4)
+TURN = np.pi / 4
 """By how much it turns the hand [rad]."""
 DISTANCE = 0.03
 """Largest change of the object's position in the palm's frame [m]."""
-ANGLE = float(np.pi / 4)
+ANGLE = np.pi / 4
 """Largest change of its orientation in the palm's frame [rad]."""
 _CLOSE_STEPS = 15
 """Control steps without weight."""

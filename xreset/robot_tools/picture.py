@@ -26,7 +26,7 @@ def robot_picture(robot: RobotSpec) -> np.ndarray:
     poses = kinematics.link_poses(torch.tensor(robot.home), robot.tracked_links).numpy()
     points = poses[:, :3, 3]
     middle = points.mean(axis=0)
-    distance = max(3.0 * float(np.ptp(points, axis=0).max()), 0.25)
+    distance = max(3.0 * np.ptp(points, axis=0).max(), 0.25)
     moving = list(kinematics.tree.moved_by)
     followed = list(dict.fromkeys(keypoint.link for keypoint in robot.keypoints))
     close = []

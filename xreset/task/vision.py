@@ -73,7 +73,7 @@ class Vision:
         unseen = []
         for i, spec in enumerate(self._backend.scene.objects):
             holds = self._backend.object_index == i
-            if bool(holds.any()) and not bool(shown[holds].any()):
+            if holds.any() and not shown[holds].any():
                 unseen.append(spec.name)
         if unseen:
             raise XResetError(

@@ -152,7 +152,7 @@ class HandModel:
             own = torch.tensor(
                 [link in tip.contact_links for link in balls.links], device=self.device
             )[balls.link]
-            if not bool(own.any()):
+            if not own.any():
                 return none
             front = centers @ (ahead / ahead.norm().clamp_min(1e-9)) + balls.radii
             pads.append((own & (front > front[own].max() - _PAD_DEPTH)).nonzero()[:, 0])

@@ -106,7 +106,7 @@ def _align_root(model: HandModel, targets: HandTargets) -> tuple[Tensor, Tensor]
 
 def _nearest_annotated(annotated: Tensor) -> Tensor:
     """[S, T] index of the annotated frame that is nearest in time; ``ValueError`` if a sequence has none."""
-    if not bool(annotated.any(dim=1).all()):
+    if not annotated.any(dim=1).all():
         raise ValueError("A sequence has no annotated frame. Select sequences that have one.")
     time = torch.arange(annotated.shape[1], device=annotated.device)
     distance = (time[:, None] - time).abs().expand(len(annotated), -1, -1)

@@ -15,7 +15,7 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_to_matrix
 from xreset.geometry.shapes import box, half_spaces, hull, shape_mesh
 from xreset.geometry.solids import link_field, signed_distance
-from xreset.geometry.surface import Surface, keypoint_contacts
+from xreset.geometry.surface import Surface
 from xreset.retarget.hand.clearance import Objects, too_near
 from xreset.retarget.hand.model import HandModel
 from xreset.spec import Geometry, Shape, TableSpec
@@ -61,9 +61,7 @@ class SurfaceTest(unittest.TestCase):
     def test_contacts_need_annotation_and_nearness(self):
         quat = np.array([[np.sqrt(0.5), 0, 0, np.sqrt(0.5)]])  # x of the object is y of the world
         keypoints = np.array([[[1.0, 2.045, 3.0], [1.0, 2.060, 3.0], [np.nan] * 3]])
-        points, contact = keypoint_contacts(
-            self.surface, keypoints, np.array([[1.0, 2.0, 3.0]]), quat, 0.02
-        )
+        points, contact = self.surface.contacts(keypoints, np.array([[1.0, 2.0, 3.0]]), quat, 0.02)
         self.assertEqual(contact.tolist(), [[True, False, False]])
         np.testing.assert_allclose(points[0, 0], [1.0, 2.03, 3.0], atol=1e-9)
         np.testing.assert_array_equal(points[0, 1:], 0.0)

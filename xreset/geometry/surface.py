@@ -103,6 +103,41 @@ class Surface:
         """Signed distance [N] and its gradient [N, 3] at points [N, 3]: see :meth:`DistanceFields.signed_distance`."""
         return self.field.signed_distance(points, torch.zeros(len(points), dtype=torch.long))
 
+    def contacts(
+        self,
+        keypoints: np.ndarray,
+        object_pos: np.ndarray,
+        object_quat: np.ndarray,
+        distance: float,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Find the contacts of keypoints with the object.
+
+        A keypoint nearer to the surface than ``distance`` touches its nearest surface point.
+
+        Args:
+            keypoints: [F, K, 3] in the world frame; NaN where not annotated.
+            object_pos: [F, 3]
+            object_quat: [F, 4]
+            distance: [m]
+
+        Returns:
+            Nearest surface points in the world frame [F, K, 3], zero where there is no contact, and whether there is
+            one [F, K].
+        """
+        rotation = Rotation.from_quat(object_quat, scalar_first=True).as_matrix()
+        local = np.einsum("fij,fki->fkj", rotation, keypoints - object_pos[:, None])
+        with np.errstate(invalid="ignore"):  # comparisons with NaN are false
+            close = ((local > self.low - distance) & (local < self.high + distance)).all(axis=-1)
+        points = np.zeros_like(local)
+        contact = np.zeros(local.shape[:2], dtype=bool)
+        if close.any():
+            touched = np.zeros_like(local)
+            touched[close], gap = self.nearest(local[close])
+            contact[close] = gap < distance
+            in_world = np.einsum("fij,fkj->fki", rotation, touched) + object_pos[:, None]
+            points[contact] = in_world[contact]
+        return points, contact
+
 
 def _nodes_inside(pieces: Sequence[Shape], nodes: np.ndarray) -> np.ndarray:
     """[X, Y, Z] whether nodes [X, Y, Z, 3] of a grid lie inside any of the convex pieces."""
@@ -118,40 +153,3 @@ def _nodes_inside(pieces: Sequence[Shape], nodes: np.ndarray) -> np.ndarray:
         heights = plane_heights(shifted[in_box], half_spaces(piece))
         inside[in_box[(heights <= 0).all(axis=1)]] = True
     return inside.reshape(nodes.shape[:3])
-
-
-def keypoint_contacts(
-    surface: Surface,
-    keypoints: np.ndarray,
-    object_pos: np.ndarray,
-    object_quat: np.ndarray,
-    distance: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Find the contacts of keypoints with an object.
-
-    A keypoint nearer to the surface than ``distance`` touches its nearest surface point.
-
-    Args:
-        surface: surface of the object.
-        keypoints: [F, K, 3] in the world frame; NaN where not annotated.
-        object_pos: [F, 3]
-        object_quat: [F, 4]
-        distance: [m]
-
-    Returns:
-        Nearest surface points in the world frame [F, K, 3], zero where there is no contact, and whether there is one
-        [F, K].
-    """
-    rotation = Rotation.from_quat(object_quat, scalar_first=True).as_matrix()
-    local = np.einsum("fij,fki->fkj", rotation, keypoints - object_pos[:, None])
-    with np.errstate(invalid="ignore"):  # comparisons with NaN are false
-        close = ((local > surface.low - distance) & (local < surface.high + distance)).all(axis=-1)
-    points = np.zeros_like(local)
-    contact = np.zeros(local.shape[:2], dtype=bool)
-    if close.any():
-        touched = np.zeros_like(local)
-        touched[close], gap = surface.nearest(local[close])
-        contact[close] = gap < distance
-        in_world = np.einsum("fij,fkj->fki", rotation, touched) + object_pos[:, None]
-        points[contact] = in_world[contact]
-    return points, contact

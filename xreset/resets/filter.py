@@ -53,8 +53,8 @@ def rejection(backend: Backend, start: State, limits: FilterConfig) -> Tensor:
         health.overflow,
     )
     reason = torch.full((backend.num_worlds,), -1, dtype=torch.long, device=backend.device)
-    for i, test in reversed(list(enumerate(tests))):
-        reason[test & (reason < 0)] = i
+    for i, test in enumerate(tests):
+        reason[test] = i
     return reason
 
 

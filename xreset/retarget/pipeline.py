@@ -15,7 +15,7 @@ from torch import Tensor
 from xreset.demos.archive import Demos, grounded, levelled
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.rotations import matrix_to_quat
-from xreset.geometry.surface import Surface, keypoint_contacts
+from xreset.geometry.surface import Surface
 from xreset.progress import Progress, unseen
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.arm.model import ArmModel, ArmTargets
@@ -245,12 +245,8 @@ def human_contacts(
     object_name = demos.object_name[demos.sequence_of_frame]
     for name in demos.object_names:
         rows = object_name == name
-        points[rows], touching[rows] = keypoint_contacts(
-            surfaces[name],
-            keypoints[rows],
-            demos.object_pos[rows],
-            demos.object_quat_wxyz[rows],
-            distance,
+        points[rows], touching[rows] = surfaces[name].contacts(
+            keypoints[rows], demos.object_pos[rows], demos.object_quat_wxyz[rows], distance
         )
     return points, touching
 

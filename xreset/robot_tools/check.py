@@ -244,15 +244,17 @@ def _drives(spec: RobotSpec) -> Problems:
     inertias = drive_inertia(spec, spec.home)
     for joint, ratio, inertia in zip(spec.joints, ratios, inertias, strict=True):
         if not 0.5 <= ratio <= 5:
-            text = "It swings below 0.5 and creeps above 5; 0.7 to 1.5 is usual. Change kd."
-            yield "warning", f"{joint.name!r} has the damping ratio {ratio:.2f} at home. {text}"
+            yield (
+                "warning",
+                f"{joint.name!r} has the damping ratio {ratio:.2f} at home. It swings below 0.5 and creeps above 5; "
+                "0.7 to 1.5 is usual. Change kd.",
+            )
         if joint.drive.kd * step > inertia:
             yield (
                 "warning",
                 f"{joint.name!r}: kd = {joint.drive.kd:g} is too much for its inertia {inertia:.3g} at a step of "
-                f"1/{1 / step:.0f} s; "
-                "engines that integrate drives explicitly become unstable. Lower kp and kd, or state the rotor as the "
-                "joint's armature.",
+                f"1/{1 / step:.0f} s; engines that integrate drives explicitly become unstable. Lower kp and kd, or "
+                "state the rotor as the joint's armature.",
             )
 
 

@@ -11,7 +11,8 @@ from xreset.cli import COMMANDS
 from xreset.cli.engines import COMMAND as ENGINES
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [*(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "AGENTS.md", "SECURITY.md"))]
+PAGES += sorted((ROOT / "docs").glob("*.md"))
 GROUPS = ("demos", "objects", "robots", "policies", "export")
 """Commands whose second word is a verb."""
 

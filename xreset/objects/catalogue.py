@@ -52,7 +52,8 @@ def canonical_names(names: Iterable[str], known: Iterable[str] = STAND_INS) -> t
             f"{other} ({ALIAS_OF[other]})" if other in ALIAS_OF else other for other in known
         ]
         what = f"Unknown object{'s' * (len(unknown) > 1)} {', '.join(dict.fromkeys(unknown))}"
-        raise ObjectError(f"{what}. Choose from: {', '.join(listing) or 'none'}.")
+        advice = " Other objects need the folder of their meshes." if known is STAND_INS else ""
+        raise ObjectError(f"{what}. Choose from: {', '.join(listing) or 'none'}.{advice}")
     return tuple(found)
 
 

@@ -28,6 +28,10 @@ ContactArrays = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Tip force [E, 3], tip touch [E] bool and table force [3], on the object."""
 
 
+Frames = dict[str, tuple[int, np.ndarray]]
+"""Link -> index of its body, and its pose [4, 4] in that body's frame."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Inertia:
     """Mass properties along principal axes."""
@@ -98,8 +102,7 @@ class Mechanism:
 
     robot: RobotSpec
     bodies: tuple[Body, ...]
-    frames: dict[str, tuple[int, np.ndarray]]
-    """Link -> index of its body, and its pose [4, 4] in that body's frame."""
+    frames: Frames
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
@@ -139,7 +142,7 @@ def mechanism(robot: RobotSpec) -> Mechanism:
     """
     tree = robot_tree(robot)
     _check_names(robot, tree)
-    frames: dict[str, tuple[int, np.ndarray]] = {}
+    frames: Frames = {}
     members: list[list[Link]] = []
     """Links of each body."""
     placed: list[tuple[Joint | None, int, np.ndarray]] = []
@@ -306,9 +309,7 @@ def _check_names(robot: RobotSpec, tree: RobotTree) -> None:
             )
 
 
-def _fused_inertia(
-    robot: RobotSpec, links: list[Link], frames: dict[str, tuple[int, np.ndarray]]
-) -> Inertia:
+def _fused_inertia(robot: RobotSpec, links: list[Link], frames: Frames) -> Inertia:
     mass = sum(link.mass for link in links)
     com = np.zeros(3)
     inertia = np.zeros((3, 3))

@@ -18,6 +18,7 @@ from xreset.backends.conformance.scene import gripper
 from xreset.geometry.collision import table_clearance
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_normalize
+from xreset.geometry.urdf import robot_tree
 from xreset.physics import Backend, Contacts, Links, Parameter, Parameters, State
 from xreset.plugins import backend_status, make_backend
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
@@ -242,6 +243,14 @@ class Bench:
             object_linvel=uniform(num_worlds, 3),
             object_angvel=4.0 * uniform(num_worlds, 3),
         )
+
+    @cached_property
+    def free_scene(self) -> SceneSpec:
+        """The scene with a robot whose links touch neither one another nor the table."""
+        robot = self.scene.robot
+        links = robot_tree(robot).link_names
+        free = replace(robot, self_collision_links=(), table_exclude=links)
+        return replace(self.scene, robot=free)
 
     @cached_property
     def place(self) -> tuple[float, float]:

@@ -16,7 +16,6 @@ from torch import Tensor
 
 from xreset.backends.conformance.harness import Bench, Worlds, finite_limits, named, replace_fields
 from xreset.backends.conformance.results import Measured, Skipped
-from xreset.backends.conformance.scene import without_collisions
 from xreset.backends.rigid import mechanism, object_inertia
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import robot_tree
@@ -57,7 +56,7 @@ def mass_properties(bench: Bench) -> Measured:
 
 def joint_tracking(bench: Bench) -> Measured:
     """Move every joint by itself, by a step and by a sine, and compare its path with the reference engine's."""
-    scene = without_collisions(bench.scene)
+    scene = bench.free_scene
     steps = round(_DURATION / scene.control_dt)
     time = scene.control_dt * torch.arange(steps)  # of the beginning of each control step
     sine = torch.sin(2.0 * torch.pi * _FREQUENCY * time)
@@ -66,7 +65,7 @@ def joint_tracking(bench: Bench) -> Measured:
 
 def effort_limit(bench: Bench) -> Measured:
     """Step every joint with an effort limit of 30 % of what its drive asks for; compare with the reference engine."""
-    scene = without_collisions(bench.scene)
+    scene = bench.free_scene
     _, way = _alone(bench, scene)
     weak = []
     for joint, distance in zip(scene.robot.joints, way.tolist(), strict=True):
@@ -173,7 +172,7 @@ def drive_scale(bench: Bench) -> Measured:
 
     All joints step at once.
     """
-    scene = without_collisions(bench.scene)
+    scene = bench.free_scene
     scales = torch.tensor(_DRIVE_SCALES)
     which = [0] * len(scales)
     _, way = _alone(bench, scene)
@@ -218,7 +217,7 @@ def _with_drives(scene: SceneSpec, drives: Sequence[DriveSpec]) -> SceneSpec:
 
 def joint_limits(bench: Bench) -> Measured:
     """Send every joint beyond its limits: it must come to rest there."""
-    scene = without_collisions(bench.scene)
+    scene = bench.free_scene
     kinematics = Kinematics(scene.robot)
     names = scene.robot.joint_names
     start, way = _alone(bench, scene)
@@ -246,7 +245,7 @@ def gravity_compensation(bench: Bench) -> Measured:
     """Hold several configurations for 2 s: an arm whose weight is compensated does not sag."""
     if not bench.scene.robot.gravity_compensated:
         raise Skipped("this robot's weight is not compensated")
-    scene = without_collisions(bench.scene)
+    scene = bench.free_scene
     random = torch.Generator().manual_seed(8)
     lower, upper = finite_limits(bench.kinematics, 2.0)
     share = 0.2 + 0.6 * torch.rand(
@@ -266,9 +265,8 @@ def own_weight(bench: Bench) -> Measured:
 
     At rest kp (target - q) = sum over links of m g dz/dq, in every world.
     """
-    scene = without_collisions(
-        replace(bench.scene, robot=replace(bench.scene.robot, gravity_compensated=False))
-    )
+    scene = bench.free_scene
+    scene = replace(scene, robot=replace(scene.robot, gravity_compensated=False))
     kinematics = bench.kinematics
     start = bench.start()
     with bench.other(scene, bench.which) as worlds:

@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from xreset.description import read_description
 from xreset.geometry.shapes import transform
-from xreset.geometry.urdf import robot_tree
 from xreset.spec import Geometry, ObjectSpec, PairFriction, RobotSpec, SceneSpec, Shape
 
 
@@ -64,15 +63,6 @@ def scene(robot: RobotSpec | None = None) -> SceneSpec:
     """Return the suite's scene: its own robot or another one, and its three objects."""
     friction = PairFriction(tip=0.9, link=0.5, table=0.6, torsional=0.002)
     return SceneSpec(robot=robot or gripper(), objects=objects(), friction=friction)
-
-
-def without_collisions(scene: SceneSpec) -> SceneSpec:
-    """Return the scene with a robot whose links touch neither one another nor the table."""
-    robot = scene.robot
-    return replace(
-        scene,
-        robot=replace(robot, self_collision_links=(), table_exclude=robot_tree(robot).link_names),
-    )
 
 
 def reorder_joints(scene: SceneSpec) -> SceneSpec:

@@ -261,12 +261,12 @@ class Page(WebPage):
         env = session.env
         state = env.backend.state()
         with self._server.atomic():
-            self._robot.place(state.joint_pos[0].cpu().numpy())
-            self._body.position = state.object_pos[0].cpu().numpy()
-            self._body.wxyz = state.object_quat[0].cpu().numpy()
+            self._robot.place(state.joint_pos[0].numpy())
+            self._body.position = state.object_pos[0].numpy()
+            self._body.wxyz = state.object_quat[0].numpy()
             self._body.visible = not session.away
-            self._goal.position = env.goal_pos[0].cpu().numpy()
-            self._goal.wxyz = env.goal_quat[0].cpu().numpy()
+            self._goal.position = env.goal_pos[0].numpy()
+            self._goal.wxyz = env.goal_quat[0].numpy()
             self._handle.position = self._goal.position + self._beside
             if not self._turning:
                 self._rings.position = self._goal.position

@@ -99,7 +99,7 @@ class _Pull:
 class Session:
     """A live episode. Nothing ends it: the time limit and the bounds of the training do not hold.
 
-    A session belongs to one thread.
+    A session belongs to one thread. Its engine runs on the CPU.
 
     Attributes:
         policy: the policy that acts.
@@ -283,7 +283,7 @@ class Session:
             distance=float((state.object_pos - self.env.goal_pos).norm()),
             angle=float(quat_angle(state.object_quat, self.env.goal_quat)),
             success=bool(reward.success),
-            **{name: value[0].detach().cpu().numpy().copy() for name, value in values.items()},
+            **{name: value[0].detach().numpy().copy() for name, value in values.items()},
         )
         self.history.append(moment)
         if self.away or self._pull is not None or moment.tip_force.any():
@@ -311,7 +311,7 @@ class Session:
     def cloud(self) -> np.ndarray:
         """[P, 3] the newest points of the object's surface that the policy observes, world frame [m]."""
         newest = self.env.get_observations()["perception"][0, -1, :, :3]
-        return newest.cpu().numpy() / self.env.task.observation.cloud_scale
+        return newest.numpy() / self.env.task.observation.cloud_scale
 
     # The user's hand --------------------------------------------------------------------------------------------------
 
@@ -341,11 +341,9 @@ class Session:
         point = torch.tensor(at, dtype=torch.float32)
         state = self.env.backend.state()
         if link is None:
-            local = quat_rotate_inverse(
-                state.object_quat[0].cpu(), point - state.object_pos[0].cpu()
-            )
+            local = quat_rotate_inverse(state.object_quat[0], point - state.object_pos[0])
         else:
-            pose = self._kinematics.link_poses(state.joint_pos[0].cpu().double(), [link])[0].float()
+            pose = self._kinematics.link_poses(state.joint_pos[0].double(), [link])[0].float()
             local = pose[:3, :3].T @ (point - pose[:3, 3])
         self._pull = _Pull(link=link, point=local, to=point)
 
@@ -393,27 +391,23 @@ class Session:
             else:
                 offset = self._pull_robot(self._pull, self._pull.link, state)
         if "object_wrench" in backend.capabilities:
-            backend.set_object_wrench(
-                force[None].to(self.env.device), torque[None].to(self.env.device)
-            )
+            backend.set_object_wrench(force[None], torque[None])
         return offset
 
     def _pull_object(self, pull: _Pull, state: State) -> tuple[Tensor, Tensor]:
         """Return force and torque [3] of a damped spring, which also carries the object's weight."""
         body = self.env.backend.scene.objects[0]
-        pos = state.object_pos[0].cpu()
-        quat = state.object_quat[0].cpu()
+        pos = state.object_pos[0]
+        quat = state.object_quat[0]
         arm = quat_rotate(quat, pull.point - torch.as_tensor(body.com, dtype=torch.float32))
         stretch = pull.to - pos - quat_rotate(quat, pull.point)
         stretch = stretch * min(1.0, PULL_LENGTH / max(float(stretch.norm()), 1e-6))
         spring = body.mass * PULL_RATE**2 * stretch
         damping = 2 * PULL_RATE
         weight = torch.tensor((0.0, 0.0, body.mass * GRAVITY))
-        force = spring - body.mass * damping * state.object_linvel[0].cpu() + weight
+        force = spring - body.mass * damping * state.object_linvel[0] + weight
         inertia = float(np.linalg.eigvalsh(body.inertia)[-1])
-        return force, torch.linalg.cross(arm, spring) - inertia * damping * state.object_angvel[
-            0
-        ].cpu()
+        return force, torch.linalg.cross(arm, spring) - inertia * damping * state.object_angvel[0]
 
     def _pull_robot(self, pull: _Pull, link: str, state: State) -> Tensor:
         """[1, J] what to add to the targets, so that the drives give the torques of a force at the point as well.
@@ -421,12 +415,12 @@ class Session:
         A force F at a point with Jacobian J acts as the joint torques J^T F. A drive gives kp (target - q), so a target
         that is J^T F / kp farther gives as much, up to the drive's effort limit.
         """
-        joint_pos = state.joint_pos[0].cpu().double()
+        joint_pos = state.joint_pos[0].double()
         at = self._kinematics.jacobian(joint_pos, [link], pull.point[None].double())
         force = ROBOT_STIFFNESS * (pull.to - at.pos[0])
         force = force * min(1.0, ROBOT_FORCE / max(float(force.norm()), 1e-6))
         torque = at.linear[0].T @ force
-        return (torque.float() / self._stiffness)[None].to(self.env.device)
+        return (torque.float() / self._stiffness)[None]
 
     def close(self) -> None:
         """Close the engine."""

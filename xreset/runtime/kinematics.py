@@ -61,15 +61,14 @@ class Kinematics:
                     angvel += axis
                     linvel += np.cross(axis, palm_pos - poses[index][:, :3, 3])
             index = step["parent"]
-        return Links(
-            palm_pos=palm_pos.astype(np.float32),
-            palm_quat=_quaternion(poses[palm][:, :3, :3]).astype(np.float32),
-            palm_linvel=linvel.astype(np.float32),
-            palm_angvel=angvel.astype(np.float32),
-            tip_pos=np.stack([poses[tip][:, :3, 3] for tip in self._chain["tips"]], axis=1).astype(
-                np.float32
-            ),
-        )
+        found = {
+            "palm_pos": palm_pos,
+            "palm_quat": _quaternion(poses[palm][:, :3, :3]),
+            "palm_linvel": linvel,
+            "palm_angvel": angvel,
+            "tip_pos": np.stack([poses[tip][:, :3, 3] for tip in self._chain["tips"]], axis=1),
+        }
+        return Links(**{name: value.astype(np.float32) for name, value in found.items()})
 
 
 def _quaternion(matrix: Array) -> Array:

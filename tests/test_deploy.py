@@ -113,7 +113,8 @@ class ContractTest(unittest.TestCase):
         trained = asdict(policy_contract(robot, self.task, ("brick",)))
         file = write_policy(self.folder / "toy.onnx", trained, value=0.01)
         self.out = self.folder / "out"
-        self.contract = write_deployed(file, robot, self.task, [toy_grasp.brick()], self.out)
+        self.contract = deploy_contract(robot, self.task, [toy_grasp.brick()], file)
+        write_deployed(file, self.contract, self.out)
         self.home = [joint["home"] for joint in self.contract["joints"]]
 
     def test_it_says_what_goes_in_and_out(self):
@@ -124,13 +125,7 @@ class ContractTest(unittest.TestCase):
         )
         self.assertEqual(np.shape(self.contract["objects"]["brick"]["points"]), (64, 3))
         with self.assertRaisesRegex(PolicyError, "exists already"):
-            write_deployed(
-                self.folder / "toy.onnx",
-                toy_grasp.robot(),
-                self.task,
-                [toy_grasp.brick()],
-                self.out,
-            )
+            write_deployed(self.folder / "toy.onnx", self.contract, self.out)
         with self.assertRaisesRegex(LiveError, "has no object 'hat'. Choose from: brick"):
             load_controller(self.out).points("hat")
 

@@ -38,6 +38,8 @@ _STATE_KEYS = {
     for f in fields(State)
 }
 
+_SPEED = (-1e4, 1e4)
+"""[rad/s, m/s]"""
 _FIELDS: Schema = {
     "robot": Field((), "U"),
     "robot_fingerprint": Field((), "U"),
@@ -50,12 +52,12 @@ _FIELDS: Schema = {
     "friction": Field((3,), "f", within=(0.0, 100.0)),
     "joint_target": Field(("T", "J"), "f", within=JOINT),
     "start_joint_pos": Field(("J",), "f", within=JOINT),
-    "start_joint_vel": Field(("J",), "f", within=(-1e4, 1e4)),
+    "start_joint_vel": Field(("J",), "f", within=_SPEED),
     "start_joint_target": Field(("J",), "f", within=JOINT),
     "start_object_pos": Field((3,), "f", within=POSITION),
     "start_object_quat_wxyz": Field((4,), "f", unit=True),
-    "start_object_linvel": Field((3,), "f", within=(-1e4, 1e4)),
-    "start_object_angvel": Field((3,), "f", within=(-1e4, 1e4)),
+    "start_object_linvel": Field((3,), "f", within=_SPEED),
+    "start_object_angvel": Field((3,), "f", within=_SPEED),
 }
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from xreset.eval.policy_spec import PolicySpec, load_policy
 from xreset.live.deploy import deploy_contract, write_deployed
 from xreset.objects.catalogue import load_objects
-from xreset.spec import ObjectSpec
 
 
 def export_deploy(
@@ -36,26 +36,21 @@ def export_deploy(
         PolicyError: the policy is a baseline or looks through cameras, or the folder is not empty.
         ObjectError: there is neither a stand-in nor a mesh of an object.
     """
-    spec, listed = _with_objects(policy, robot, objects, only)
-    write_deployed(spec.exported(), spec.robot, spec.task, listed, Path(out))
+    spec, contract = served(policy, robot=robot, objects=objects, only=only)
+    write_deployed(spec.exported(), contract, Path(out))
     return spec
 
 
 def served(
-    policy: str | Path, *, robot: str | Path | None, objects: str | Path | None, only: Sequence[str]
-) -> tuple[PolicySpec, dict]:
-    """Return a policy and its contract, for :class:`xreset.live.serve.PolicyServer`; see :func:`export_deploy`."""
-    spec, listed = _with_objects(policy, robot, objects, only)
-    return spec, deploy_contract(spec.robot, spec.task, listed, spec.exported())
-
-
-def _with_objects(
     policy: str | Path | PolicySpec,
+    *,
     robot: str | Path | None,
     objects: str | Path | None,
     only: Sequence[str],
-) -> tuple[PolicySpec, tuple[ObjectSpec, ...]]:
+) -> tuple[PolicySpec, dict[str, Any]]:
+    """Return a policy and its contract, for :class:`xreset.live.serve.PolicyServer`; see :func:`export_deploy`."""
     spec = load_policy(policy, robot=robot)
-    spec.exported()
+    file = spec.exported()
     folder = spec.meshes(objects)
-    return spec, load_objects(only or spec.objects_of(folder), folder)
+    listed = load_objects(only or spec.objects_of(folder), folder)
+    return spec, deploy_contract(spec.robot, spec.task, listed, file)

@@ -153,25 +153,19 @@ def _chain(robot: RobotSpec) -> dict[str, Any]:
     return {"base": base, "palm": tracked[0], "tips": tracked[1:], "steps": steps}
 
 
-def write_deployed(
-    policy: Path, robot: RobotSpec, task: TaskConfig, objects: Sequence[ObjectSpec], out: Path
-) -> dict[str, Any]:
-    """Write ``policy.onnx``, ``contract.json`` and the package ``runtime`` into a new folder; return the contract.
+def write_deployed(policy: Path, contract: dict[str, Any], out: Path) -> None:
+    """Write ``policy.onnx``, ``contract.json`` and the package ``runtime`` into a new folder.
 
     Args:
         policy: exported policy (.onnx).
-        robot: robot of the policy.
-        task: task of the policy's training.
-        objects: objects whose points the contract lists.
+        contract: what :func:`deploy_contract` says of it.
         out: folder to write; must not exist, or be empty.
 
     Raises:
         PolicyError: the folder is not empty.
-        LiveError: the task has options that the runtime does not carry out.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise PolicyError(f"{out} exists already. Choose another --out, or remove it.")
-    contract = deploy_contract(robot, task, objects, policy)
     with atomic_folder(out) as folder:
         shutil.copyfile(policy, folder / files.POLICY)
         shutil.copytree(
@@ -180,4 +174,3 @@ def write_deployed(
             ignore=shutil.ignore_patterns("__pycache__"),
         )
         write_json(folder / files.CONTRACT, contract)
-    return contract

@@ -94,6 +94,8 @@ class VisionConfig(Checked):
         return 2 if self.goal_image else 1, self.points, 4
 
 
+STUDENT_VISION = VisionConfig(view="points", goal_image=True)
+"""What a student of :func:`xreset.distill` sees unless it is told otherwise, but for its cameras."""
 FRONT = CameraConfig()
 """A camera in front of the table, opposite the robot."""
 SIDE = CameraConfig(pos=(0.55, -0.45, 0.55), target=(0.55, 0.22, 0.18))

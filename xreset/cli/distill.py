@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from xreset.cameras.config import VisionConfig
+from xreset.cameras.config import STUDENT_VISION, VisionConfig
 from xreset.cli._common import Objects, Policy, Robot, Several
 from xreset.errors import RunError
 
@@ -18,7 +18,7 @@ def distill(
     robot: Robot = None,
     objects: Objects = None,
     camera: Several = (),
-    vision: VisionConfig = VisionConfig(),
+    vision: VisionConfig = STUDENT_VISION,
     backend: str = "mujoco-warp",
     device: str | None = None,
     num_envs: int = 1024,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from xreset.cli._terminal import console, show_table
+from xreset.objects.catalogue import object_names
 from xreset.policies import card, shipped
 
 
@@ -16,7 +17,7 @@ def list_() -> None:
         console.print(f"{name}: {about.about}")
         facts = {
             "robot": contract.robot,
-            "objects": ", ".join(contract.objects),
+            "objects": _objects(contract.objects),
             "data": about.data,
             "recipe": about.recipe,
             "licence": f"{about.licence}; {file.stat().st_size / 1e6:.1f} MB",
@@ -30,6 +31,13 @@ def list_() -> None:
         for episodes, by_engine in about.results.items():
             table.append((episodes, *(by_engine.get(engine, "") for engine in engines)))
         show_table(table)
+
+
+def _objects(trained: tuple[str, ...]) -> str:
+    """Name the objects of the catalogue, and count the shapes that have names of one training only."""
+    known = [name for name in trained if name in object_names()]
+    others = len(trained) - len(known)
+    return ", ".join([*known, f"{others} other shapes"] if others else known)
 
 
 COMMAND = {"list": list_}

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from xreset.cameras.config import CAMERAS, CameraConfig, VisionConfig
+from xreset.cameras.config import CAMERAS, STUDENT_VISION, CameraConfig, VisionConfig
 from xreset.env import make_env
 from xreset.errors import PolicyError, RunError, XResetError
 from xreset.files import claim_folder, file_hash, write_whole
@@ -170,7 +170,7 @@ def distill(
     *,
     out: str | Path,
     cameras: Sequence[str | CameraConfig] = ("front",),
-    vision: VisionConfig | None = None,
+    vision: VisionConfig = STUDENT_VISION,
     config: TrainConfig | None = None,
     **options: Any,
 ) -> Path:
@@ -203,8 +203,7 @@ def distill(
             )
         chosen = tuple(CAMERAS[camera] if isinstance(camera, str) else camera for camera in cameras)
         told = OnnxPolicy(policy_file(teacher)).contract.task
-        vision = replace(vision or VisionConfig(), cameras=chosen)
-        config = student_config(told, vision)
+        config = student_config(told, replace(vision, cameras=chosen))
     if not config.task.vision.cameras:
         raise XResetError(
             "A student needs a camera. Give one or two of: " + ", ".join(CAMERAS) + "."

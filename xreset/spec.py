@@ -173,14 +173,19 @@ class RobotSpec:
         return np.array([joint.home for joint in self.joints])
 
     @property
+    def is_arm(self) -> np.ndarray:
+        """[J] bool: whether a joint is one of the arm's; the others are the hand's."""
+        return np.array([joint.group == "arm" for joint in self.joints], dtype=bool)
+
+    @property
     def arm_indices(self) -> np.ndarray:
         """Indices of the arm's joints in joint order."""
-        return np.flatnonzero([joint.group == "arm" for joint in self.joints])
+        return np.flatnonzero(self.is_arm)
 
     @property
     def hand_indices(self) -> np.ndarray:
         """Indices of the hand's joints in joint order."""
-        return np.flatnonzero([joint.group == "hand" for joint in self.joints])
+        return np.flatnonzero(~self.is_arm)
 
     @property
     def tracked_links(self) -> tuple[str, ...]:

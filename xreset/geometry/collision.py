@@ -155,7 +155,7 @@ class SelfCollision:
         pairs = combinations(dict.fromkeys(self._link), 2)
         counted = [pair for pair in pairs if _may_collide(robot, tree, *pair)]
         if moved_by_arm:
-            arm = [joint.name for joint in robot.joints if joint.group == "arm"]
+            arm = [robot.joint_names[i] for i in robot.arm_indices]
             moved = [tree.below(tree.joint(name).child) for name in arm]
 
             def movers(link: str) -> list[bool]:

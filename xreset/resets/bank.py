@@ -34,7 +34,7 @@ from xreset.records import (
     unique_problem,
     write_record,
 )
-from xreset.retarget.file import Retargeted
+from xreset.retarget.file import JointNames, ReasonNames, Retargeted
 from xreset.spec import ObjectSpec, RobotSpec
 from xreset.text import Brief, shown
 
@@ -45,6 +45,7 @@ _KINDS = {"f": np.float32, "i": np.int32, "b": np.bool_, "U": np.str_}
 
 StateJoints = Annotated[np.ndarray, Field(("L", "J"), "f", within=JOINT)]
 StateIndices = Annotated[np.ndarray, Field(("L",), "i", within=(0, inf))]
+ObjectTexts = Annotated[tuple[str, ...], Field(("O",), "U")]
 RejectedIndices = Annotated[np.ndarray, Field(("C",), "i", within=(0, inf))]
 
 
@@ -62,7 +63,7 @@ class ResetBank(Brief):
     """:attr:`xreset.spec.RobotSpec.fingerprint` of the robot that the bank was made for."""
     backends: Annotated[tuple[str, ...], Field(("B",), "U")]
     """Engines in which every state was stable."""
-    joint_names: Annotated[tuple[str, ...], Field(("J",), "U")]
+    joint_names: JointNames
 
     # States
     joint_pos: StateJoints
@@ -83,9 +84,9 @@ class ResetBank(Brief):
     goal_pos: SequencePositions
     """[S, 3] object position in the last frame."""
     goal_quat_wxyz: SequenceQuaternions
-    object_names: Annotated[tuple[str, ...], Field(("O",), "U")]
+    object_names: ObjectTexts
     """Objects of the sequences, sorted."""
-    object_sources: Annotated[tuple[str, ...], Field(("O",), "U")]
+    object_sources: ObjectTexts
     """Where each object's geometry came from (:attr:`xreset.spec.ObjectSpec.source`)."""
 
     # Rejected candidates
@@ -94,7 +95,7 @@ class ResetBank(Brief):
     rejected_post_contact: Annotated[np.ndarray, Field(("C",), "b")]
     rejected_reason: RejectedIndices
     """[C] index into ``reason_names``."""
-    reason_names: Annotated[tuple[str, ...], Field(("R",), "U")]
+    reason_names: ReasonNames
 
     # What files of earlier versions do not have
     joint_target: StateJoints | None = None

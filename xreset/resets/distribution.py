@@ -161,9 +161,7 @@ class ResetDistribution:
             [config.goal_xy, config.goal_xy, config.goal_z, config.goal_yaw], device=device
         )
         self._home = _tensor(robot.home, device)
-        self._home_std = _tensor(
-            np.array([robot.home_std[joint.group == "hand"] for joint in robot.joints]), device
-        )
+        self._home_std = _tensor(np.where(robot.is_arm, *robot.home_std), device)
 
     def start_pose(self, sequence: Tensor) -> tuple[Tensor, Tensor]:
         """Return the object's pose at the start of given demonstrations [M]: position [M, 3] and quaternion [M, 4]."""

@@ -126,6 +126,6 @@ def squeeze_targets(
     )
     effort = torch.as_tensor(drive_values(robot, "effort"))
     kp = torch.as_tensor(drive_values(robot, "kp"))
-    is_hand = torch.tensor([joint.group == "hand" and joint.drive.kp > 0 for joint in robot.joints])
-    beyond = torch.where(is_hand, torque.clamp(-effort, effort) / kp.clamp_min(1e-9), 0.0)
+    presses = torch.tensor(~robot.is_arm) & (kp > 0)
+    beyond = torch.where(presses, torque.clamp(-effort, effort) / kp.clamp_min(1e-9), 0.0)
     return torch.where(beyond != 0, kinematics.clamp(q + beyond), q).numpy()

@@ -37,6 +37,8 @@ from xreset.records import (
 
 SCHEMA = "xreset-retargeted/1"
 
+JointNames = Annotated[tuple[str, ...], Field(("J",), "U")]
+ReasonNames = Annotated[tuple[str, ...], Field(("R",), "U")]
 FrameDistances = Annotated[np.ndarray, Field(("F",), "f", within=None)]
 
 
@@ -58,7 +60,7 @@ class Retargeted(ObjectMotions):
     """Sequence i owns frames ``frame_offsets[i] : frame_offsets[i + 1]``."""
     fps: Annotated[float, Field((), "f", within=RATE)]
     """Frames per second."""
-    joint_names: Annotated[tuple[str, ...], Field(("J",), "U")]
+    joint_names: JointNames
     joint_pos: Annotated[np.ndarray, Field(("F", "J"), "f", within=JOINT)]
     """[F, J] within the joint limits; meaningful where ``valid``."""
     palm_pos: FramePositions
@@ -77,7 +79,7 @@ class Retargeted(ObjectMotions):
     """[F] whether the frame may be used as a reset."""
     reason: Annotated[np.ndarray, Field(("F",), "i")]
     """[F] index into ``reason_names``; 0 where valid."""
-    reason_names: Annotated[tuple[str, ...], Field(("R",), "U")]
+    reason_names: ReasonNames
     contact: FrameFlags
     """[F] whether a human keypoint touches the object."""
     first_contact: Annotated[np.ndarray, Field(("S",), "i")]

@@ -331,8 +331,7 @@ def _thumb(spec: RobotSpec) -> Problems:
 def _around_home(spec: RobotSpec) -> torch.Tensor:
     """[1 + samples, J] home, and joint positions spread around it as at the start of episodes."""
     home = torch.tensor(spec.home)
-    spread = torch.zeros_like(home)
-    spread[spec.arm_indices], spread[spec.hand_indices] = spec.home_std
+    spread = torch.tensor(np.where(spec.is_arm, *spec.home_std))
     noise = torch.randn(
         _SAMPLES, len(home), generator=torch.Generator().manual_seed(0), dtype=home.dtype
     )

@@ -37,7 +37,7 @@ class ActionSpace:
         """Read the joints of a robot."""
         self.config = config
         lower, upper = torch.tensor(joint_limits(robot), dtype=torch.float32, device=device)
-        is_arm = torch.tensor([joint.group == "arm" for joint in robot.joints], device=device)
+        is_arm = torch.tensor(robot.is_arm, device=device)
         tree = robot_tree(robot)
         kinds = [tree.joint(name).type for name in robot.joint_names]
         slides = torch.tensor([kind == "prismatic" for kind in kinds], device=device)

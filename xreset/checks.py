@@ -127,7 +127,7 @@ def from_dict(cls: type[T], data: Any, where: str = "configuration") -> T:
 
 def parsed(cls: type[T], data: Any, where: str) -> tuple[T | None, list[str]]:
     """Return the dataclass and no problem, or None and a sentence for each problem."""
-    problems: list[str] = []
+    problems = []
     value = _record(cls, data, where, problems)
     if problems:
         return None, _first(problems)

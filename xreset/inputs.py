@@ -3,7 +3,7 @@ objects."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -37,7 +37,7 @@ from xreset.text import shown
 Kind = Literal["demos", "motion", "bank", "goals"]
 Data = Demos | Retargeted | ResetBank
 
-_KINDS: dict[Kind, tuple[str, Callable[[Path], Data], str]] = {
+_KINDS = {
     "demos": (DEMOS, read_demos, "xreset demos"),
     "motion": (MOTION, read_retargeted, "xreset retarget"),
     "bank": (BANK, read_bank, "xreset resets"),

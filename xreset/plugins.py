@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import re
 import traceback
-from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -28,10 +27,8 @@ ENGINES = "xreset.backends"
 """Entry-point group of engines: ``name = "package.module:BackendClass"``."""
 ROBOTS = "xreset.robots"
 """Entry-point group of robots: ``name = "package.module"``, the module beside a ``robot.toml``."""
-_KINDS: Mapping[str, tuple[str, type[XResetError]]] = {
-    ENGINES: ("backend", BackendUnavailableError),
-    ROBOTS: ("robot", RobotError),
-}
+_KINDS = {ENGINES: ("backend", BackendUnavailableError), ROBOTS: ("robot", RobotError)}
+"""What messages call a plugin of a group, and the class of its errors."""
 
 
 def plugins(group: str) -> dict[str, EntryPoint]:

@@ -13,7 +13,7 @@ from importlib import import_module
 from io import TextIOWrapper
 from typing import Any, NoReturn
 
-COMMANDS: dict[str, str] = {
+COMMANDS = {
     "demos": "Import, synthesize, select, merge and describe human demonstrations.",
     "objects": "List objects, import meshes, and make random shapes.",
     "robots": "List, check, import, place and judge robots.",

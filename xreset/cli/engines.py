@@ -198,7 +198,7 @@ def compare(
 
 
 def _print(result: agreement.Parity) -> None:
-    columns: tuple[agreement.EngineParity, ...] = (result.floor, *result.engines)
+    columns = (result.floor, *result.engines)
     holds = [flags for name, flags in result.reference.carried.items() if name != "closing"]
     held = sum(map(sum, holds))
     tried = sum(map(len, holds))

@@ -24,7 +24,7 @@ def list_() -> None:
         }
         for what, text in facts.items():
             console.print(f"  {what + ':':9} {text}")
-        engines: list[str] = []
+        engines = []
         for by_engine in about.results.values():
             engines += [engine for engine in by_engine if engine not in engines]
         table = [("task progress", *engines)]

@@ -149,7 +149,7 @@ def plan_contacts(solid: Solid, azimuths: np.ndarray, side: str) -> list[Contact
     low = solid.vertices.min(axis=0)
     high = solid.vertices.max(axis=0)
     from_above = high[2] <= _LOW_OBJECT
-    found: list[Contacts] = []
+    found = []
     for azimuth in azimuths:
         closing = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
         # horizontal, away from the hand

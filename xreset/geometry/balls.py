@@ -137,7 +137,7 @@ def bounding_balls(
 def _apart(centers: np.ndarray, radii: np.ndarray, spacing: float) -> np.ndarray:
     """Choose balls that are farther from each other than ``spacing``, larger ones first; return their rows,
     ascending."""
-    kept: list[int] = []
+    kept = []
     for ball in np.argsort(-radii, kind="stable").tolist():
         if not kept or np.linalg.norm(centers[kept] - centers[ball], axis=1).min() > spacing:
             kept.append(ball)

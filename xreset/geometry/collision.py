@@ -75,9 +75,9 @@ class SupportPoints(NamedTuple):
 
 def table_points(kinematics: Kinematics) -> SupportPoints:
     """Return the support points of every link of a robot that may not touch the table."""
-    links: list[str] = []
+    links = []
     points = [np.zeros((0, 3))]
-    radii: list[float] = []
+    radii = []
     for name in kinematics.link_names:
         if name in kinematics.robot.table_exclude:
             continue

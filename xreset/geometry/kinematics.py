@@ -83,7 +83,7 @@ class Kinematics:
         self.root = tree.link(root or tree.root).name
         self.dtype = dtype
         self.device = torch.device(device)
-        self.link_names: tuple[str, ...] = tuple(tree.below(self.root))
+        self.link_names = tuple(tree.below(self.root))
         """Links from the root down, parents before children (length L)."""
         joints = [tree.above[name] for name in self.link_names[1:]]
         self._link_index = {name: i for i, name in enumerate(self.link_names)}
@@ -109,7 +109,7 @@ class Kinematics:
         self.joint_indices = np.array(indices, dtype=np.int64)
         """[J] indices of this kinematics' joints in the robot's joint order; all of them when the root is the
         URDF's."""
-        self.joint_names: tuple[str, ...] = tuple(robot.joint_names[i] for i in indices)
+        self.joint_names = tuple(robot.joint_names[i] for i in indices)
         """Names of the joints, in the robot's joint order."""
         self._couple(moving, mimics)
         self._chain(joints, moving)

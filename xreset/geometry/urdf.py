@@ -272,7 +272,7 @@ def _ordered(name: str, links: list[Link], joints: list[Joint]) -> RobotTree:
         raise RobotError(
             f"expected one root link, found {len(roots)} ({', '.join(roots) or 'none'})."
         )
-    order: list[str] = []
+    order = []
     stack = list(roots)
     while stack:
         parent = stack.pop()

@@ -31,7 +31,7 @@ class PointNet(nn.Module):
     def __init__(self, dims: Sequence[int], point_width: int) -> None:
         """Build the per-point MLP K -> dims[0] -> ..., K being ``point_width``; no activation after the last layer."""
         super().__init__()
-        layers: list[nn.Module] = []
+        layers = []
         for width_in, width_out in zip((point_width, *dims[:-1]), dims, strict=True):
             layers += [nn.Linear(width_in, width_out), nn.ELU()]
         self.mlp = nn.Sequential(*layers[:-1])
@@ -360,8 +360,8 @@ class ExportedPolicy(nn.Module):
         self.mlp = copy.deepcopy(model.mlp)
         assert model.distribution is not None, "a policy is stochastic while it learns"
         self.output = model.distribution.as_deterministic_output_module()
-        self.flat_dim: int = model.obs_dim
-        self.lstm_dim: int = model._latent_dim
+        self.flat_dim = model.obs_dim
+        self.lstm_dim = model._latent_dim
         self.cpu().eval()
 
     def forward(

@@ -255,7 +255,7 @@ _SAME_REQUEST = 2.0
 @contextmanager
 def _stop_on_interrupt() -> Iterator[list[float]]:
     """Yield the times of requests to stop (Ctrl-C or SIGTERM). A second request interrupts at once."""
-    requests: list[float] = []
+    requests = []
 
     def ask(_number: int, _frame: Any) -> None:
         if requests and time.monotonic() - requests[0] > _SAME_REQUEST:

@@ -7,7 +7,6 @@ z is up, the origin is the centre of the bounding box.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
@@ -183,7 +182,7 @@ def _banana(rng: np.random.Generator) -> list[Shape]:
     return [loft((ring(start - 0.02), ring(end + 0.02))) for start, end in ends]
 
 
-_FAMILIES: dict[str, Callable[[np.random.Generator], list[Shape]]] = {
+_FAMILIES = {
     make.__name__.strip("_"): make
     for make in (_box, _can, _cup, _egg, _wedge, _bottle, _hammer, _banana)
 }

@@ -38,7 +38,7 @@ def stand_in(name: str) -> ObjectSpec:
 
     Mass is the published one; center of mass and inertia are those of the pieces at uniform density.
     """
-    pieces: list[Shape] = []
+    pieces = []
     for kind, description in _SHAPES[name].items():
         pieces += _MAKERS[kind](description)
     vertices, faces = surface_of(pieces)

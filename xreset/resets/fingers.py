@@ -70,8 +70,8 @@ def fingers_of(
         torch.as_tensor(array, dtype=torch.float64)
         for array in (joint_pos, object_pos, object_quat)
     )
-    links: list[str] = []
-    finger: list[int] = []
+    links = []
+    finger = []
     for number, tip in enumerate(robot.fingertips):
         links += tip.contact_links
         finger += [number] * len(tip.contact_links)

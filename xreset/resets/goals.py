@@ -122,7 +122,7 @@ def make_goals(
     rests = _resting_poses(specs, spec, upright=config.upright)
     reach = Reach(spec)
     wanted = [*product(families, range(config.per_family)), *product([OWN], range(len(own)))]
-    episodes: list[_Episode] = []
+    episodes = []
     for obj in specs:
         done = len(episodes)
         found: dict[tuple[str, int], _Episode] = {}
@@ -257,7 +257,7 @@ def _resting_poses(
     Raises:
         GoalError: an object does not come to rest.
     """
-    episodes: list[_Episode] = []
+    episodes = []
     rows: dict[str, np.ndarray] = {}
     for obj in objects:
         random = np.random.default_rng(zlib.crc32(obj.name.encode()))

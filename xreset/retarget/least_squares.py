@@ -123,8 +123,8 @@ def solve_chain(diagonal: Tensor, coupling: Tensor, rhs: Tensor) -> Tensor:
     Raises:
         torch.linalg.LinAlgError: H is not positive definite.
     """
-    inverses: list[Tensor] = []
-    reduced: list[Tensor] = []
+    inverses = []
+    reduced = []
     for t in range(diagonal.shape[1]):
         block = diagonal[:, t]
         y = rhs[:, t]

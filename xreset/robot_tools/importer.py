@@ -103,7 +103,7 @@ def import_robot(
             raise RobotError(
                 f"{option} is {_vector(np.array(values))}, expected {unit} from {-most:.3g} to {most:.3g}."
             )
-    notes: list[str] = []
+    notes = []
     arm_tree = read_source(arm, notes)
     if flange is None:
         flange = last_link(arm_tree)

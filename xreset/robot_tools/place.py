@@ -100,7 +100,7 @@ def place(
     chosen = [robot]
     if config.rounds:
         chosen += [candidate for _, candidate in found[: config.elite] if candidate is not robot]
-    finalists: list[Finalist] = []
+    finalists = []
     for candidate in chosen:
         finalists.append(_finalist(candidate, robot, kept, paths))
         progress(done + len(finalists), total)

@@ -71,7 +71,7 @@ def layout(
     if c.rotation == "to_goal":
         pose = {"object_pos": 3, "goal_pos": 3, "rotation_to_goal": 6}
     perception = {"cloud" if c.cloud == "history" else "paired_cloud": prod(c.cloud_shape)}
-    groups: dict[str, dict[str, int]] = {
+    groups = {
         "policy": {**pose, "gravity_fraction": 1, "previous_action": num_joints},
         "proprio": {
             "joint_pos": num_joints,

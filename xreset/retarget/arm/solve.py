@@ -274,7 +274,7 @@ def splice(
     sequences, number, frames, _ = paths.shape
     switch = switch_cost * (1.0 - torch.eye(number, dtype=paths.dtype))
     value = worth[:, :, 0] - cost[:, :, 0]
-    came_from: list[Tensor] = []
+    came_from = []
     for t in range(1, frames):
         # [S, K before, K now]
         change = (paths[:, None, :, t] - paths[:, :, None, t - 1]).abs().amax(-1)
@@ -293,8 +293,8 @@ def splice(
 def spread_over(flags: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Choose at most ``count`` of the set frames of each row of ``flags`` [S, T], evenly spread: rows [C], ascending,
     and frames [C]."""
-    rows: list[Tensor] = []
-    frames: list[Tensor] = []
+    rows = []
+    frames = []
     for row, flagged in enumerate(flags):
         places = flagged.nonzero()[:, 0]
         number = min(count, len(places))

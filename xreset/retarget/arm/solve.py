@@ -76,7 +76,7 @@ def track(
         config=config or ArmConfig(),
     )
     forwards = branches(problem)
-    joints, worth = best(problem, forwards)
+    joints, worth = best_path(problem, forwards)
     failing = (problem.reasons(joints) > REASONS.index("hand error")).any(dim=1).nonzero()[:, 0]
     if len(failing):
         joints[failing] = _rescued(
@@ -97,7 +97,7 @@ def _rescued(problem: ArmProblem, paths: Paths, joints: Tensor, worth: Tensor) -
     if problem.annotated.shape[1] > 1:
         turned = problem.reversed()
         backwards = branches(turned)
-        back, other = best(turned, backwards)
+        back, other = best_path(turned, backwards)
         joints = torch.where((other > worth)[:, None, None], back.flip(1), joints)
         paths = Paths.cat((paths, backwards.map(lambda x: x.flip(2))), dim=1)
     if problem.config.reseeds:
@@ -125,10 +125,10 @@ def branches(problem: ArmProblem) -> Paths:
     """Return the paths from distinct solutions of the first frame."""
     starts = _first_frames(problem)  # [S, K, n]
     paths = follow(problem.repeated(starts.shape[1]), starts.flatten(0, 1))
-    return judged(problem, paths.unflatten(0, starts.shape[:2]))
+    return judged_paths(problem, paths.unflatten(0, starts.shape[:2]))
 
 
-def judged(problem: ArmProblem, paths: Tensor) -> Paths:
+def judged_paths(problem: ArmProblem, paths: Tensor) -> Paths:
     """Return paths [S, K, T, n] with which of their frames are good.
 
     A jump depends on the frame before, and so on the direction and on where paths are spliced; everything else depends
@@ -140,7 +140,7 @@ def judged(problem: ArmProblem, paths: Tensor) -> Paths:
     return Paths(paths, sound.view(paths.shape[:3]))
 
 
-def best(problem: ArmProblem, paths: Paths) -> tuple[Tensor, Tensor]:
+def best_path(problem: ArmProblem, paths: Paths) -> tuple[Tensor, Tensor]:
     """Return the path [S, T, n] that is worth most, and its worth [S]: see the config."""
     jump = arm_jump(paths.joints, problem.annotated[:, None])
     valid = (paths.sound & (jump <= problem.thresholds.arm_jump)).sum(-1)
@@ -162,7 +162,7 @@ def repaired(problem: ArmProblem, known: Paths, missed: Tensor) -> Tensor:
     # Sequences with fewer new paths than others repeat a known one.
     new = known.joints[:, :1].repeat(1, int(count.max()), 1, 1)
     new[owner, column] = paths
-    known = Paths.cat((known, judged(problem, new)), dim=1)
+    known = Paths.cat((known, judged_paths(problem, new)), dim=1)
     joints = known.joints
 
     annotated = problem.annotated

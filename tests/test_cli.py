@@ -1,14 +1,16 @@
 """The command line: quick to start, and clear when it is used wrongly."""
 
+import io
 import json
 import os
 import subprocess
 import sys
 import unittest
+from contextlib import redirect_stderr
 from unittest import mock
 
 from tests.command import xreset as run
-from xreset.cli import COMMANDS
+from xreset.cli import COMMANDS, _terminal
 from xreset.cli.engines import COMMAND as ENGINES
 
 HEAVY = {
@@ -107,6 +109,17 @@ class UsageTest(unittest.TestCase):
         self.assertEqual(code, 1)
         self.assertIn("red", err)
         self.assertNotIn("\x1b", err)
+
+    def test_without_a_terminal_progress_is_a_line_a_minute(self):
+        with (
+            mock.patch.object(_terminal, "monotonic", iter([0, 10, 61, 70, 130]).__next__),
+            redirect_stderr(io.StringIO()) as err,
+            _terminal.Progress(_terminal.Console(file=io.StringIO())) as bar,
+        ):
+            count = bar.count("sequences")
+            for done in range(1, 5):
+                count(done, 8)
+        self.assertEqual(err.getvalue(), "sequences: 25 %\nsequences: 50 %\n")
 
     def test_an_engine_that_does_not_exist(self):
         code, _, err = run("engines", "check", "--backend", "bulet")

@@ -575,7 +575,17 @@ class CommandTest(Compared):
         self.assertEqual(code, 0, printed)
         for expected in (*ENGINES, "[one]", "49.8", "num_envs", "These results are", "compare.md"):
             self.assertIn(expected, printed)
-        self.assertEqual(sorted(f.name for f in out.iterdir()), ["compare.md", "compare.png"])
+        self.assertEqual(
+            sorted(f.name for f in out.iterdir()), ["compare.csv", "compare.md", "compare.png"]
+        )
+        figures = pd.read_csv(out / "compare.csv")
+        self.assertEqual(
+            figures.columns.tolist(), ["group", "engine", "metric", "mean", "low", "high"]
+        )
+        first = figures.iloc[0]
+        self.assertEqual(first[["group", "metric"]].tolist(), ["[one]", "task_progress"])
+        self.assertAlmostEqual(first["mean"], 0.4975)
+        self.assertLess(first["low"], first["mean"])
 
     def test_mistakes_are_one_line(self):
         code, _, printed = run("compare", str(self.folder / "x"))

@@ -155,7 +155,7 @@ class Archive(InFolder):
             picked.goal_pose[0][1], self.demos.object_pos[self.demos.frames(0)][-1]
         )
         for options, message in (
-            ({"sides": ["left"]}, r"no hand_side left. Choose from: \['right"),
+            ({"sides": ["left"]}, "no hand side left. Choose from: 'right'"),
             ({"indices": [4]}, "there are 4 sequences"),
             (
                 {"objects": ["soup", "cup", "mug"]},
@@ -510,9 +510,11 @@ class Plausible(unittest.TestCase):
             mano = np.empty_like(demos.hand_keypoints)
             mano[:, ORDERS["mano"]] = demos.hand_keypoints
             pos = demos.object_pos.copy()
-            pos[-1] = pos[0]
+            pos[:] = pos[0]
             quat = demos.object_quat_wxyz.copy()
-            quat[-1] = quat[0]
+            quat[:] = quat[0]
+            jump = demos.object_pos.copy()
+            jump[20] += [0, 0, 0.5]
             for words, changes in (
                 ("MANO's order", {"hand_keypoints": mano}),
                 (r"\(w, x, y, z\)", {"wrist_quat_wxyz": demos.wrist_quat_wxyz[:, [1, 2, 3, 0]]}),
@@ -524,6 +526,7 @@ class Plausible(unittest.TestCase):
                     "1 of 1 sequences begin .* at its goal already",
                     {"object_pos": pos, "object_quat_wxyz": quat},
                 ),
+                ("1 of 1 sequences have an object that jumps", {"object_pos": jump}),
             ):
                 with self.subTest(words, side=side):
                     (doubt,) = doubts(replace(demos, **changes))

@@ -2,12 +2,14 @@
 
 import os
 import pickle
+import shutil
 import tracemalloc
 import unittest
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from tests.command import xreset as run
 from tests.data import InFolder
 from tests.test_keypoints import CAMERA, seen_from, written
 from xreset.demos.ho3d import read_ho3d
@@ -71,6 +73,14 @@ class Ho3d(InFolder):
         np.testing.assert_allclose(same, 1, atol=1e-5)
         self.assertEqual((found.sequence_name[0], found.hand_side[0]), ("SM2", "right"))
         self.assertEqual(found.object_name[0], self.demos.object_name[0])
+
+    def test_the_command_names_sequences_without_a_camera(self):
+        self.write()
+        shutil.copytree(self.meta, self.meta.parents[1] / "MC1" / "meta")
+        options = ("--fps", 10, "--cameras", self.cameras, "--out", self.folder / "out.npz")
+        code, out, _ = run("demos", "import", "ho3d", self.folder / "ho3d", *options)
+        self.assertEqual(code, 0)
+        self.assertRegex(out, "left out for want of a camera's pose in .*: MC1\n")
 
     def test_frames_that_are_missing_or_not_annotated(self):
         last = self.demos.num_frames - 1

@@ -355,6 +355,23 @@ class PipelineTest(unittest.TestCase):
         self.assertEqual(np.flatnonzero(self.result.contact[self.first])[0], first)
         self.assertGreater(first, 0)
 
+    def test_a_hand_that_is_elsewhere_while_the_object_moves_is_told(self):
+        np.testing.assert_array_equal(self.result.untouched, [False, False])
+        contact = self.result.contact.copy()
+        contact[self.first][self.result.first_contact[0] + 2 :] = False
+        gone = dataclasses.replace(self.result, contact=contact)
+        np.testing.assert_array_equal(gone.untouched, [True, False])
+        away = self.demos.select(indices=[0])
+        away = dataclasses.replace(away, hand_keypoints=away.hand_keypoints + np.float32(0.3))
+        left = np.full(1, "left")
+        write_demos(self.folder / "away.npz", dataclasses.replace(away, hand_side=left))
+        configs = {"hand": HandConfig(tolerance=0.1), "arm": ArmConfig(restarts=1, branches=1)}
+        out = self.folder / "away-robot.npz"
+        with contextlib.redirect_stdout(io.StringIO()) as text:
+            command(self.folder / "away.npz", robot="ur7e-sharpa", out=out, **configs)
+        self.assertIn("In 1 of 1 sequences the object moves while no hand", text.getvalue())
+        self.assertIn("1 of 1 sequences are of left hands", text.getvalue())
+
     def test_the_file_says_what_the_robot_does(self):
         result = self.result
         kinematics = Kinematics(self.robot)

@@ -400,6 +400,10 @@ class TablesTest(InFolder):
         ):
             self.assertTrue(any(note in n for n in notes), note)
         self.assertTrue((self.folder / "page" / "table-1.png").read_bytes().startswith(b"\x89PNG"))
+        lines = (self.folder / "page" / "table-1.csv").read_text().splitlines()
+        self.assertTrue(lines[0].startswith("engine,row,column,mean,low,high,paper,"), lines[0])
+        (soup,) = [line for line in lines if line.startswith("mujoco,tomato soup can,Ours,")]
+        self.assertEqual([float(text) for text in soup.split(",")[3:7]], [0.83, 0.66, 1.0, 90.8])
 
     def test_a_mean_over_some_objects_is_none_over_all(self):
         self.write("ours-tomato_soup_can-seed0", 1.0, 0.33)

@@ -129,6 +129,23 @@ class TrainingTest(unittest.TestCase):
         content = newest(self.out)
         self.assertEqual((content.iteration, content.env_steps), (2, 2 * 8 * 4))
 
+    def test_paths_are_found_from_another_working_directory(self):
+        data = json.loads((self.out / "run.json").read_text())
+        meshes = self.folder / "meshes"
+        meshes.mkdir()
+        moved = self.folder / "runs" / "moved"
+        moved.mkdir(parents=True)
+        (self.folder / "openarm").mkdir()  # has the name of a robot
+        data |= {"resets": "bank.npz", "objects": "meshes"}
+        (moved / "run.json").write_text(json.dumps(data))
+        info = read_run(moved)
+        self.assertEqual(
+            (info.robot, info.resets, info.objects),
+            ("openarm", str(self.bank.resolve()), str(meshes.resolve())),
+        )
+        (moved / "run.json").write_text(json.dumps(data | {"objects": "gone"}))
+        self.assertEqual(read_run(moved).objects, "gone")
+
     def test_goals_need_no_demonstrations(self):
         """Every episode begins at home; fine-tuning goes on with the run's networks and configuration; a bank keeps its
         states and gets the goals in addition."""
@@ -165,7 +182,10 @@ class TrainingTest(unittest.TestCase):
         self.assertTrue(
             any(not torch.equal(x, changed[name]) for name, x in one.actor_state_dict.items())
         )
-        self.resume(out, iterations=3)
+        said = self.resume(out)
+        self.assertIn("all 2 iterations are done: --iterations asks for more", said)
+        said = self.resume(out, iterations=3)
+        self.assertIn(f"policy after 3 iterations in {out / 'policy.onnx'}", said)
         after = newest(out)
         self.assertEqual((after.iteration, after.env_steps), (3, 3 * 8 * 4))
         self.assertGreater(after.elapsed, two.elapsed)

@@ -59,7 +59,7 @@ def compare(
     curves: Sequence[str] = (),
     apart: bool = False,
 ) -> Path:
-    """Write ``compare.png`` and ``compare.md``, and return the path of the latter.
+    """Write ``compare.png``, ``compare.csv`` (shares, or metres) and ``compare.md``, and return the path of the latter.
 
     Args:
         runs: folders, as ``FOLDER`` or ``LABEL=FOLDER``.
@@ -92,6 +92,7 @@ def compare(
         different=tables.different(groups),
     )
     write_picture(out / "compare.png", groups, tags, found, x)
+    write_whole(out / "compare.csv", found.to_csv(index=False))
     write_whole(out / "compare.md", content)
     return out / "compare.md"
 

@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 
+import pandas as pd
+
 from xreset.eval.pages import render
 from xreset.eval.report import fairness
 from xreset.eval.report.make import compare
@@ -24,7 +26,7 @@ _ALIKE = 0.05
 
 
 def write_page(plan: Plan, out: Path) -> tuple[Path, list[str]]:
-    """Write ``study.md``, its pictures, and comparisons of the trainings of each object.
+    """Write ``study.md``, its tables as pictures and CSV, and comparisons of the trainings of each object.
 
     Returns:
         The page, and what makes its figures incomparable, doubtful or incomplete.
@@ -41,6 +43,12 @@ def write_page(plan: Plan, out: Path) -> tuple[Path, list[str]]:
         if table.engines:
             notes |= dict.fromkeys(f"{table.title}: {note}" for note in _unfair(plan, table))
             draw(out / f"table-{i}.png", table)
+            every = pd.concat(
+                {e: t.stack("column", future_stack=True) for e, t in table.engines.items()}
+            )
+            write_whole(
+                out / f"table-{i}.csv", every.to_csv(index_label=["engine", "row", "column"])
+            )
     content = render(
         "study.md.j2",
         plan=plan,

@@ -7,6 +7,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from time import monotonic
 from typing import Any
 
 import rich.console
@@ -41,7 +42,7 @@ _FIGURES = ("", *"-+.0123456789")
 
 
 class Progress(rich.progress.Progress):
-    """Progress bars, which vanish at the end."""
+    """Progress bars, which vanish at the end. Where there is no terminal, lines once a minute in their place."""
 
     def __init__(self, where: Console = console) -> None:
         super().__init__(
@@ -54,6 +55,16 @@ class Progress(rich.progress.Progress):
             console=where,
             transient=True,
         )
+        self._shown = monotonic()
+
+    def update(self, task_id: rich.progress.TaskID, **changes: Any) -> None:
+        """See :meth:`rich.progress.Progress.update`."""
+        super().update(task_id, **changes)
+        now = monotonic()
+        if not self.console.is_terminal and now > self._shown + 60:
+            self._shown = now
+            task = self._tasks[task_id]
+            print(f"{task.description}: {task.percentage:.0f} %", file=sys.stderr)
 
     def count(self, what: str) -> Callable[[float, float], None]:
         """Add a bar; returns the function that moves it: (done, in all)."""

@@ -29,7 +29,7 @@ def compare(
         curve: Learning curve to draw, as TensorBoard names it (task/grasped_from_home, episode/return, ...); give it
             again for more. Default: task/success and task/success_from_home.
         apart: Show runs that differ only in their seed separately.
-        out: Folder for compare.png and compare.md.
+        out: Folder for compare.md, compare.png and compare.csv.
     """
     from rich.markdown import Markdown
 

@@ -47,7 +47,11 @@ def import_ho3d(folder: Source, *, out: Path, fps: float, cameras: Path) -> None
     """
     from xreset.demos.ho3d import read_ho3d
 
-    _save(read_ho3d(folder, fps=fps, cameras=cameras), out, {"dataset": "ho3d", "fps": fps})
+    demos = read_ho3d(folder, fps=fps, cameras=cameras)
+    _save(demos, out, {"dataset": "ho3d", "fps": fps})
+    every = {path.parent.name for path in folder.glob("train/*/meta")}
+    if without := sorted(every.difference(demos.sequence_name)):
+        show_notes([f"left out for want of a camera's pose in {cameras}: {', '.join(without)}"])
 
 
 def import_keypoints(
@@ -130,7 +134,6 @@ def synth(
     with Progress() as bar:
         for hand in ("right", "left"):
             if side in (hand, "both"):
-                progress = bar.count(f"{hand} hands")
                 part = synthesize(
                     objects or None,
                     per_object,
@@ -138,10 +141,9 @@ def synth(
                     fps=fps,
                     side=hand,
                     meshes=meshes,
-                    progress=progress,
+                    progress=bar.count(f"{hand} hands"),
                 )
                 parts.append(part)
-    demos = merge_demos(parts)
     config = {
         "objects": list(objects),
         "per_object": per_object,
@@ -149,7 +151,7 @@ def synth(
         "fps": fps,
         "side": side,
     }
-    _save(demos, out, config)
+    _save(merge_demos(parts), out, config)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,7 +159,7 @@ class Selection(Options):
     """Conditions that a sequence must meet, all of them, and how many sequences of each object are kept."""
 
     objects: tuple[str, ...] = ()
-    """Only sequences that grasp one of these objects."""
+    """Names of objects: only sequences that grasp one of them."""
     sequences: tuple[str, ...] = ()
     """Only the sequences of these names."""
     subjects: tuple[str, ...] = ()
@@ -227,8 +229,8 @@ def merge(files: Sources, *, out: Path) -> None:
     """
     from xreset.demos.archive import merge_demos
 
-    demos = merge_demos([_read(file) for file in files])
-    _save(demos, out, {"merge": len(files)}, **{f"demos {i}": file for i, file in enumerate(files)})
+    inputs = {f"demos {i}": file for i, file in enumerate(files)}
+    _save(merge_demos([*map(_read, files)]), out, {"merge": len(files)}, **inputs)
 
 
 def reflect(
@@ -257,8 +259,12 @@ def reflect(
     for name, found in sorted(symmetries.items()):
         verdict = "mirrored" if found.deviation <= tolerance else "left out: not symmetric enough"
         console.print(f"{name}: {1e3 * found.deviation:.1f} mm from its reflection, {verdict}")
-    result = mirrored(demos, symmetries, tolerance=tolerance)
-    _save(result, out, {"mirrored": True, "tolerance": tolerance}, demos=file)
+    _save(
+        mirrored(demos, symmetries, tolerance=tolerance),
+        out,
+        {"mirrored": True, "tolerance": tolerance},
+        demos=file,
+    )
 
 
 def add_noise(

@@ -48,12 +48,22 @@ def retarget(
     if max_per_object is not None:
         chosen = chosen.select(max_per_object=max_per_object)
     show_notes(doubts(chosen))
+    if left := np.count_nonzero(chosen.hand_side == "left"):
+        show_notes(
+            [
+                f"{left} of {len(chosen)} sequences are of left hands. For a right hand: xreset demos mirror"
+            ]
+        )
     specs = demo_objects(chosen, objects)
     config = RetargetConfig(hand=hand, arm=arm)
     with Progress() as bar:
-        count = bar.count("sequences")
         result = retarget_demos(
-            chosen, spec, list(specs.values()), config, progress=count, device=device
+            chosen,
+            spec,
+            list(specs.values()),
+            config,
+            progress=bar.count("sequences"),
+            device=device,
         )
     write_retargeted(
         out,
@@ -64,11 +74,21 @@ def retarget(
     )
     accounts = result.accounts()
     write_accounts(accounts_path(out), of="frames", rows=accounts)
-    annotated = [row.without("not annotated") for row in accounts]
-    show_accounts(annotated, f"annotated frames retargeted to {result.robot}: those that are valid")
+    show_accounts(
+        [row.without("not annotated") for row in accounts],
+        f"annotated frames retargeted to {result.robot}: those that are valid",
+    )
     tips = result.hand_error[result.annotated]
     if len(tips):
         console.print(f"fingertips are {1e3 * tips.mean():.1f} mm from the human's on average")
+    if len(untouched := result.sequence_name[result.untouched]):
+        show_notes(
+            [
+                f"In {len(untouched)} of {len(chosen)} sequences the object moves while no hand touches it. Are both in"
+                " the same frame, and recorded at the same times? Repair them, or leave them out (xreset demos split)."
+                f" First: {untouched[0]}."
+            ]
+        )
     for index in np.flatnonzero(on_something(levelled(chosen), specs)):
         console.print(
             f"{chosen.sequence_name[index]}: the object starts on top of something that is not in the scene; "

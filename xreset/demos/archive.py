@@ -222,8 +222,10 @@ class Demos(ObjectMotions):
         wanted = list(wanted)
         known = np.unique(getattr(self, field)).tolist()
         if missing := [name for name in wanted if name not in known]:
+            what = field.removesuffix("_name").replace("_", " ")
+            names = ", ".join(map(shown, known[:8])) + ", ..." * (len(known) > 8)
             raise DemoError(
-                f"The demonstrations have no {field} {', '.join(missing)}. Choose from: {shown(known)}."
+                f"The demonstrations have no {what} {', '.join(missing)}. Choose from: {names}."
             )
         return wanted
 

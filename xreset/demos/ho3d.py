@@ -50,32 +50,27 @@ def read_ho3d(
         raise DemoError(
             f"There is no HO-3D sequence in {root}: expected train/SEQUENCE/meta/0000.pkl below it."
         )
-    poses = {}
+    parts = []
     for folder in folders:
         name = folder.parent.name
-        for path in (cameras / f"{name}.txt", cameras):
-            if path.is_file():
-                poses[folder] = read_transform(path)
-                break
-    if not poses:
-        raise DemoError(
-            f"{cameras} contains no camera pose for any sequence. Give one file for all, or a folder with"
-            f" {folders[0].parent.name}.txt."
-        )
-    parts = []
-    for folder, pose in poses.items():
-        name = folder.parent.name
+        path = cameras if cameras.is_file() else cameras / f"{name}.txt"
+        if not path.is_file():
+            continue
         convention = Convention(
             order="mano",
             units="m",
             frame="camera",
-            table_from_camera=pose,
+            table_from_camera=read_transform(path),
             fps=fps,
             side="right",
             subject=name.rstrip("0123456789"),
         )
         arrays = {"sequence": np.array(name), **_read_sequence(folder, fps)}
         parts.append(sequence_of(arrays, str(folder), convention))
+    if not parts:
+        raise DemoError(
+            f"{cameras} contains no camera pose for any sequence. Give one file for all, or a folder with {name}.txt."
+        )
     return merge_demos(parts)
 
 

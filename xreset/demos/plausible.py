@@ -21,6 +21,8 @@ _SAME_PLACE = 0.02
 """Distance from the start within which the goal counts as reached [m] (:data:`xreset.eval.metrics.GOAL_DISTANCE`)."""
 _SAME_TURN = np.radians(15.0)
 """The same for the angle [rad]."""
+_FASTEST = 5.0
+"""Speed of an object from frame to frame [m/s]: at most 1.7 in 599 of 600 sequences of DexYCB, 3.2 in the other."""
 
 
 def doubts(demos: Demos) -> list[str]:
@@ -50,21 +52,28 @@ def doubts(demos: Demos) -> list[str]:
             )
     height = demos.start_pose[0][:, 2]
     distance, angle = start_to_goal(demos)
+    owner = demos.sequence_of_frame
+    speed = demos.fps * np.linalg.norm(np.diff(demos.object_pos, axis=0), axis=1)
+    jumps = (speed > _FASTEST) & (np.diff(owner) == 0)
     for wrong, sentence in (
         (
             (height < _HEIGHTS[0]) | (height > _HEIGHTS[1]),
-            "far from the table's top, z = 0. Are these coordinates of a camera?",
+            "begin with the object far from the table's top, z = 0. Are these coordinates of a camera?",
         ),
         (
             (distance < _SAME_PLACE) & (angle < _SAME_TURN),
-            "at its goal already. A policy that leaves the object untouched solves such a demonstration.",
+            "begin with the object at its goal already. A policy that leaves the object untouched solves such a"
+            " demonstration.",
+        ),
+        (
+            np.bincount(owner[1:], jumps) > 0,
+            f"have an object that jumps from frame to frame, faster than {_FASTEST:g} m/s. Repair them, or leave them"
+            " out (xreset demos split).",
         ),
     ):
         if wrong.any():
             first = demos.sequence_name[np.argmax(wrong)]
-            found.append(
-                f"{wrong.sum()} of {len(demos)} sequences begin with the object {sentence} First: {first}."
-            )
+            found.append(f"{wrong.sum()} of {len(demos)} sequences {sentence} First: {first}.")
     return found
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -22,6 +22,7 @@ from xreset.checks import Checked, NotNegative, Positive, Rule, Share, from_dict
 from xreset.errors import PolicyError, RunError
 from xreset.files import read_json, read_typed, write_json
 from xreset.learning.config import TrainConfig
+from xreset.plugins import robot_names
 from xreset.policies import shipped
 from xreset.task.contract import Contract
 from xreset.text import shown
@@ -65,7 +66,8 @@ def write_run(folder: Path, info: RunInfo) -> None:
 
 
 def read_run(folder: str | Path) -> RunInfo:
-    """Read ``run.json``.
+    """Read ``run.json``. Robot, bank and objects whose paths do not exist here are looked for below the folders above
+    the run, from one of which the training was probably started.
 
     Raises:
         RunError: the folder is not a run.
@@ -78,7 +80,15 @@ def read_run(folder: str | Path) -> RunInfo:
         )
     data = read_json(folder / "run.json", SCHEMA, keep_version=True)
     where = f"{folder / 'run.json'} (of xreset {shown(data.pop('xreset', None))})"
-    return from_dict(RunInfo, data, where)
+    info = from_dict(RunInfo, data, where)
+    found = {}
+    for name in ("robot", "resets", "objects"):
+        path = getattr(info, name)
+        if path is None or path in robot_names() or os.path.exists(path):
+            continue
+        places = [above / path for above in folder.resolve().parents]
+        found[name] = str(next(filter(os.path.exists, places), path))
+    return replace(info, **found)
 
 
 def checkpoints(folder: Path) -> list[Path]:

@@ -76,7 +76,7 @@ def train(
         device: cpu or cuda; default: cuda if there is a GPU that the engine can use.
         num_envs: number of worlds, in each process.
         iterations: number of iterations; default: as configured.
-        minutes: most time to train now. The run can be continued later.
+        minutes: most time to train now; ``xreset.learning.train.resume`` continues the run.
         seed: seed of every random number.
         weights: another run's folder, whose networks are the start; default: new networks.
         teacher: policy whose actions the new one learns instead of learning from rewards; see :func:`distill`.
@@ -336,6 +336,9 @@ def _run(
                 info.contract,
                 checkpoint=latest_checkpoint(out),
             )
+            print(
+                f"policy after {runner.iteration} iterations in {out / 'policy.onnx'}", flush=True
+            )
 
 
 def _runner(
@@ -384,8 +387,11 @@ def _runner(
         write_run(out, info)
         if resumed:
             done = f"continuing after iteration {runner.iteration}"
-            print(
-                done if begin else "there is no checkpoint yet: starting from the beginning",
-                flush=True,
-            )
+            if begin is None:
+                done = "there is no checkpoint yet: starting from the beginning"
+            elif runner.iteration >= info.config.iterations:
+                done = (
+                    f"all {info.config.iterations} iterations are done: --iterations asks for more"
+                )
+            print(done, flush=True)
     return runner

@@ -279,7 +279,8 @@ def _resting_poses(
         own = rows[obj.name][at_rest[rows[obj.name]]]
         if not len(own):
             raise GoalError(
-                f"{obj.name} does not come to rest on the table: it rolls or falls over in MuJoCo."
+                f"{obj.name} does not come to rest on the table: it rolls or falls over in MuJoCo. Leave it"
+                " out, or make a side of its mesh flat."
             )
         turns = _turns(settled.start_quat_wxyz[own])
         heights = settled.start_pos[own, 2] + turns.apply(obj.com)[:, 2]

@@ -96,6 +96,15 @@ class Retargeted(ObjectMotions):
         first = self.first_contact[owner]
         return (first >= 0) & (np.arange(len(owner)) - self.frame_offsets[owner] >= first)
 
+    @property
+    def untouched(self) -> np.ndarray:
+        """[S] bool: whether the human mostly does not touch the object while it is 5 cm from its start. No sequence of
+        DexYCB is like that."""
+        owner = self.sequence_of_frame
+        moved = np.linalg.norm(self.object_pos - self.start_pose[0][owner], axis=1) > 0.05
+        touching = np.bincount(owner, moved & self.contact)
+        return 2 * touching < np.bincount(owner, moved & self.annotated)
+
     def accounts(self) -> list[Account]:
         """Count valid frames and the reasons of invalid ones, by object and phase."""
         reason = np.where(self.valid, "", np.asarray(self.reason_names)[self.reason])

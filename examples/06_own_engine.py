@@ -61,7 +61,7 @@ def main() -> None:
     make = lambda *scene, **options: KinematicBackend(*scene, workers=0, **options)  # noqa: E731 (in this process)
     checks = ("state_round_trip", "links_after_set", "free_fall")
     for result in conformance.run(make, only=checks):
-        print(f"{result.verdict:8} {result.check.name} {result.problem}")
+        print(f"{result.verdict:8} {result.check.statement}")
 
 
 if __name__ == "__main__":

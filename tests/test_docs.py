@@ -37,6 +37,7 @@ def help_of(words: tuple[str, ...]) -> str:
     """Return the help text of a command."""
     code, out, err = run(*words, "--help")
     assert code == 0, err
+    assert not re.search(r":[a-z]+:`", out), f"a reference that only the site shows: {out}"
     return out
 
 

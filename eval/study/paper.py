@@ -41,6 +41,13 @@ class PaperTable:
     metric: str = "task_progress"
     """The metric of all figures, where metrics are not an axis."""
 
+    @property
+    def objects(self) -> set[str]:
+        """The objects of the table's means."""
+        if "object" not in (self.rows, self.columns):
+            return paper_tables()["I"].objects
+        return {*(self.values if self.rows == "object" else self.names)} - {ALL}
+
     def figures(self) -> dict[tuple[str, str, str], tuple[float, str]]:
         """Return method, object and metric -> figure, percent, and its text with the standard error if it is stated."""
         found = {}

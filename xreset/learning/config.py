@@ -41,8 +41,8 @@ class ModelConfig(Checked):
     initial_std: Positive[float] = 1.0
     """Initial standard deviation of the Gaussian policy, which does not depend on the state. Not in the paper."""
     normalize_returns: bool = False
-    """Whether the critic learns returns in units of their running standard deviation
-    (:class:`xreset.learning.model.ReturnCritic`), as the paper's library can."""
+    """Whether the critic learns returns in units of their running standard deviation, as the
+    paper's library can."""
 
     @property
     def layers(self) -> dict[str, Any]:

@@ -195,7 +195,7 @@ class RewardConfig(Checked):
     own: Annotated[
         dict[str, float], Rule("module:function and a finite number", _are_own_terms)
     ] = field(default_factory=dict)
-    """Reward terms of the user: ``module:function`` -> weight (:func:`xreset.task.rewards.own_term`)."""
+    """Reward terms of the user: ``module:function`` -> weight (docs/own-reward.md)."""
     scale: Positive[Finite[float]] = 0.01
     """Factor on the total (Table VIII)."""
 
@@ -436,7 +436,7 @@ class TaskConfig(Checked):
     object_frame: Literal["mesh", "center"] = "mesh"
     """Origin of the object in observations, rewards, ends of episodes, perturbed starts and goals, and the draft's
     metrics. ``mesh``: the origin of the mesh file (the paper), so that it matters where somebody put it. ``center``:
-    :func:`xreset.objects.sampling.center`, the same point of the object whatever the file's origin and axes. With
+    the center of volume of the convex hull, the same point of the object whatever the file's origin and axes. With
     ``observation.rotation="to_goal"`` and ``observation.cloud="paired"`` the file's axes have no effect either."""
     distance_points: Positive[int] = 256
     """Surface points per object for fingertip distances."""

@@ -14,7 +14,7 @@ class HandConfig(Checked):
 
     jaw: Literal["fingertips", "analytic"] = "fingertips"
     """What a parallel jaw follows. ``fingertips``: the human's, like every hand. ``analytic``: the published paper's
-    map (:mod:`xreset.retarget.hand.jaw`), without the costs below. Other hands ignore it."""
+    map, without the costs below. Other hands ignore it."""
     local_weight: NotNegative[float] = 10.0
     """Bone vectors and bone directions, averaged over the pairs of keypoints."""
     global_weight: NotNegative[float] = 1.0

@@ -61,10 +61,10 @@ class Curve:
         values = [value for value in (self.lower, self.upper) if value is not None]
         if not values:
             return "none that was tried"
-        chance = "" if all(self.is_certain(value) for value in values) else ", or chance"
+        chance = "" if all(self.loses_beyond(value) for value in values) else ", or chance"
         return " and ".join(amount(self.unit, float(f"{value:.2g}")) for value in values) + chance
 
-    def is_certain(self, limit: float) -> bool:
+    def loses_beyond(self, limit: float) -> bool:
         """Whether the loss at the first value beyond a limit is more than chance."""
         if limit < self.nominal:
             beyond = [p for p in self.points if p.value <= limit]

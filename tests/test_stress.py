@@ -105,7 +105,7 @@ class CurveTest(unittest.TestCase):
         scattered = swept("force-gain", **{"v2.0": [-0.6, -0.6, 0.2, 0.2]})
         assert scattered.upper is not None
         self.assertEqual(
-            (scattered.is_certain(scattered.upper), stiffness.is_certain(stiffness.lower)),
+            (scattered.loses_beyond(scattered.upper), stiffness.loses_beyond(stiffness.lower)),
             (False, True),
         )
         self.assertEqual(scattered.costs(), "x 1.5, or chance")

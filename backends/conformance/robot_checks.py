@@ -17,7 +17,6 @@ from torch import Tensor
 from xreset.backends.conformance.harness import Bench, Worlds, finite_limits, named, replace_fields
 from xreset.backends.conformance.results import Measured, Skipped
 from xreset.backends.rigid import mechanism, object_inertia
-from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import robot_tree
 from xreset.physics import State
 from xreset.spec import GRAVITY, DriveSpec, SceneSpec
@@ -66,7 +65,7 @@ def joint_tracking(bench: Bench) -> Measured:
 def effort_limit(bench: Bench) -> Measured:
     """Step every joint with an effort limit of 30 % of what its drive asks for; compare with the reference engine."""
     scene = bench.free_scene
-    _, way = _alone(bench, scene)
+    _, way = _alone(bench)
     weak = []
     for joint, distance in zip(scene.robot.joints, way.tolist(), strict=True):
         drive = joint.drive
@@ -75,19 +74,17 @@ def effort_limit(bench: Bench) -> Measured:
     return _against_reference(bench, _with_drives(scene, weak), {"weak step": step})
 
 
-def _alone(bench: Bench, scene: SceneSpec) -> tuple[State, Tensor]:
+def _alone(bench: Bench) -> tuple[State, Tensor]:
     """[J] worlds: in world i joint i has room for its way on both sides, the others are at home; and each way [J]."""
-    kinematics = Kinematics(scene.robot)
-    tree = robot_tree(scene.robot)
-    slides = torch.tensor(
-        [tree.joint(joint.name).type == "prismatic" for joint in scene.robot.joints]
-    )
-    lower = kinematics.lower
-    upper = kinematics.upper
+    robot = bench.scene.robot
+    tree = robot_tree(robot)
+    slides = torch.tensor([tree.joint(name).type == "prismatic" for name in robot.joint_names])
+    lower = bench.kinematics.lower
+    upper = bench.kinematics.upper
     way = torch.where(slides, _SLIDE_WAY, _WAY).double().minimum(0.3 * (upper - lower))
-    home = torch.as_tensor(scene.robot.home)
+    home = torch.as_tensor(robot.home)
     middle = torch.minimum(torch.maximum(home, lower + 1.5 * way), upper - 1.5 * way)
-    start = bench.initial(scene, [0] * len(slides))
+    start = bench.initial(bench.scene, [0] * len(slides))
     start.joint_pos.diagonal().copy_(middle.float())
     return replace_fields(start, joint_target=start.joint_pos), way.float()
 
@@ -97,7 +94,7 @@ def _against_reference(bench: Bench, scene: SceneSpec, signals: dict[str, Tensor
 
     A slide's path counts in proportion to its way, as if that were 0.2 rad.
     """
-    start, way = _alone(bench, scene)
+    start, way = _alone(bench)
     which = [0] * len(way)
 
     def paths(worlds: Worlds) -> list[Tensor]:
@@ -175,7 +172,7 @@ def drive_scale(bench: Bench) -> Measured:
     scene = bench.free_scene
     scales = torch.tensor(_DRIVE_SCALES)
     which = [0] * len(scales)
-    _, way = _alone(bench, scene)
+    _, way = _alone(bench)
     start = bench.initial(scene, which)
     limits = bench.kinematics
     target = (start.joint_pos + way).minimum(limits.upper.float()).maximum(limits.lower.float())
@@ -218,13 +215,12 @@ def _with_drives(scene: SceneSpec, drives: Sequence[DriveSpec]) -> SceneSpec:
 def joint_limits(bench: Bench) -> Measured:
     """Send every joint beyond its limits: it must come to rest there."""
     scene = bench.free_scene
-    kinematics = Kinematics(scene.robot)
     names = scene.robot.joint_names
-    start, way = _alone(bench, scene)
+    start, way = _alone(bench)
     errors = {}
     with bench.other(scene, [0] * len(way)) as worlds:
         for name, side in (("upper", 1.0), ("lower", -1.0)):
-            limit = getattr(kinematics, name).float()
+            limit = getattr(bench.kinematics, name).float()
             limited = limit.isfinite()
             if not limited.any():
                 continue

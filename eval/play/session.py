@@ -216,7 +216,7 @@ class Session:
         )
         self.terms: tuple[str, ...] = ()
         self.history: deque[Moment] = deque(maxlen=round(KEPT_SECONDS / self.control_dt))
-        self._begin()
+        self._clear()
 
     # Playing ----------------------------------------------------------------------------------------------------------
 
@@ -236,9 +236,9 @@ class Session:
         if keep_goal:
             self.env.goal_pos[0], self.env.goal_quat[0] = goal
         self._player.begin(self.env)
-        self._begin()
+        self._clear()
 
-    def _begin(self) -> None:
+    def _clear(self) -> None:
         self.away = False
         self._taken = False
         self._touched = self.time

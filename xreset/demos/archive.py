@@ -42,7 +42,7 @@ _ON_TABLE = 0.020
 one are within 12 mm; that one is 44 mm up."""
 _HAND = 0.5
 """Largest distance of a keypoint from its wrist [m]; the longest hand on record has 0.33 m."""
-Text = Annotated[str, Field((), "U")]
+OneText = Annotated[str, Field((), "U")]
 SequenceTexts = Annotated[np.ndarray, Field(("S",), "U")]
 SequencePositions = Annotated[np.ndarray, Field(("S", 3), "f", within=POSITION)]
 SequenceQuaternions = Annotated[np.ndarray, Field(("S", 4), "f", unit=True)]

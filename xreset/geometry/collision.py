@@ -133,7 +133,7 @@ class SelfCollision:
             import coal
         self._coal = coal
         self._link: list[str] = []
-        self._geometry: list = []
+        self._geometry = []
         local = []
         centers = []
         radii = []

@@ -18,10 +18,10 @@ import numpy as np
 from xreset.accounts import Account, accounts
 from xreset.demos.archive import (
     ObjectMotions,
+    OneText,
     SequencePositions,
     SequenceQuaternions,
     SequenceTexts,
-    Text,
 )
 from xreset.errors import FileFormatError, XResetError
 from xreset.geometry.urdf import joint_limits
@@ -58,8 +58,8 @@ class ResetBank(Brief):
     of the frame ``frame_index`` [L] of the demonstration ``sequence_index`` [L].
     """
 
-    robot: Text
-    robot_fingerprint: Text
+    robot: OneText
+    robot_fingerprint: OneText
     """:attr:`xreset.spec.RobotSpec.fingerprint` of the robot that the bank was made for."""
     backends: Annotated[tuple[str, ...], Field(("B",), "U")]
     """Engines in which every state was stable."""

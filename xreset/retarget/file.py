@@ -19,10 +19,10 @@ from xreset.demos.archive import (
     FramePositions,
     FrameQuaternions,
     ObjectMotions,
+    OneText,
     SequencePositions,
     SequenceQuaternions,
     SequenceTexts,
-    Text,
     sequences_problem,
 )
 from xreset.records import (
@@ -49,8 +49,8 @@ class Retargeted(ObjectMotions):
     ``palm_pos`` [F, 3], ``palm_quat_wxyz`` [F, 4] and ``fingertip_pos`` [F, E, 3] follow from ``joint_pos``.
     """
 
-    robot: Text
-    robot_fingerprint: Text
+    robot: OneText
+    robot_fingerprint: OneText
     """:attr:`xreset.spec.RobotSpec.fingerprint` of the robot."""
     sequence_name: SequenceTexts
     object_name: SequenceTexts

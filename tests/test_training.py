@@ -183,7 +183,9 @@ class TrainingTest(unittest.TestCase):
             any(not torch.equal(x, changed[name]) for name, x in one.actor_state_dict.items())
         )
         said = self.resume(out)
-        self.assertIn("all 2 iterations are done: --iterations asks for more", said)
+        self.assertIn(
+            "continuing after iteration 2, the last one: --iterations asks for more", said
+        )
         said = self.resume(out, iterations=3)
         self.assertIn(f"policy after 3 iterations in {out / 'policy.onnx'}", said)
         after = newest(out)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from xreset.cli._terminal import console, show_table
-from xreset.objects.catalogue import object_names
 from xreset.policies import card, shipped
 
 
@@ -35,6 +34,8 @@ def list_() -> None:
 
 def _objects(trained: tuple[str, ...]) -> str:
     """Name the objects of the catalogue, and count the shapes that have names of one training only."""
+    from xreset.objects.catalogue import object_names
+
     known = [name for name in trained if name in object_names()]
     others = len(trained) - len(known)
     return ", ".join([*known, f"{others} other shapes"] if others else known)

@@ -223,7 +223,7 @@ class Demos(ObjectMotions):
         known = np.unique(getattr(self, field)).tolist()
         if missing := [name for name in wanted if name not in known]:
             what = field.removesuffix("_name").replace("_", " ")
-            names = ", ".join(map(shown, known[:8])) + ", ..." * (len(known) > 8)
+            names = ", ".join(map(shown, known[:8])) + " and more" * (len(known) > 8)
             raise DemoError(
                 f"The demonstrations have no {what} {', '.join(missing)}. Choose from: {names}."
             )

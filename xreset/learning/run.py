@@ -84,10 +84,9 @@ def read_run(folder: str | Path) -> RunInfo:
     found = {}
     for name in ("robot", "resets", "objects"):
         path = getattr(info, name)
-        if path is None or path in robot_names() or os.path.exists(path):
-            continue
-        places = [above / path for above in folder.resolve().parents]
-        found[name] = str(next(filter(os.path.exists, places), path))
+        if path and path not in robot_names():
+            places = (above / path for above in (Path(), *folder.resolve().parents))
+            found[name] = str(next(filter(os.path.exists, places), path))
     return replace(info, **found)
 
 

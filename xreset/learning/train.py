@@ -390,8 +390,6 @@ def _runner(
             if begin is None:
                 done = "there is no checkpoint yet: starting from the beginning"
             elif runner.iteration >= info.config.iterations:
-                done = (
-                    f"all {info.config.iterations} iterations are done: --iterations asks for more"
-                )
+                done += ", the last one: --iterations asks for more"
             print(done, flush=True)
     return runner

@@ -21,6 +21,7 @@ from xreset.eval.report import figures
 from xreset.eval.report.clips import (
     Clip,
     best_everywhere,
+    camera_for,
     draw_clips,
     encode_mp4,
     make_film,
@@ -33,6 +34,8 @@ from xreset.eval.results import Episode, TaskProgress, episode_table, recorded
 from xreset.files import claim_folder, write_json
 from xreset.learning.config import TrainConfig
 from xreset.learning.run import Candidate, Choice, write_choice
+from xreset.objects.catalogue import load_object
+from xreset.pictures.render import pose_matrix
 
 VOID = {"meta", "br", "link", "img", "input", "hr"}
 
@@ -252,6 +255,22 @@ class ClipTest(Reported):
             for f in clip.frames[:2].astype(int)
         ]
         self.assertLess(orange[1], orange[0] - 3, "the object rises in the picture")
+
+    def test_the_camera_does_not_depend_on_the_origin_of_the_mesh(self):
+        trace = toy_rollouts().traces[0]
+        obj = load_object(SOUP)
+        shift = np.array([0.4, -0.3, 0.9, 0.0])
+        turns = map(pose_matrix, trace.object_pos, trace.object_quat)
+        goal_shift = pose_matrix(trace.goal_pos, trace.goal_quat) @ shift
+        moved = replace(
+            trace,
+            object_pos=trace.object_pos - [(turn @ shift)[:3] for turn in turns],
+            goal_pos=trace.goal_pos - goal_shift[:3],
+        )
+        camera = camera_for(trace, obj)
+        other = camera_for(moved, replace(obj, com=obj.com + shift[:3]))
+        np.testing.assert_allclose(other.eye, camera.eye, atol=1e-6)
+        np.testing.assert_allclose(other.target, camera.target, atol=1e-6)
 
     def test_a_clip_stands_still_once_a_state_is_not_finite(self):
         def broken(pos: np.ndarray) -> np.ndarray:

@@ -92,14 +92,15 @@ def worst_episodes(shown: Table, count: int) -> Table:
 # Drawing --------------------------------------------------------------------------------------------------------------
 
 
-def camera_for(trace: Trace, *, distance: float = 1.0) -> Camera:
+def camera_for(trace: Trace, obj: ObjectSpec, *, distance: float = 1.0) -> Camera:
     """Return a camera that shows the table between the object's start and its goal, and the hand above them.
 
     Args:
         distance: factor on the camera's distance.
     """
-    start = trace.object_pos[0].astype(float)
-    goal = trace.goal_pos.astype(float)
+    com = (*obj.com, 1.0)
+    start = (pose_matrix(trace.object_pos[0], trace.object_quat[0]) @ com)[:3]
+    goal = (pose_matrix(trace.goal_pos, trace.goal_quat) @ com)[:3]
     center = (start + goal) / 2 + (0.0, 0.0, 0.06)
     default = Camera()
     away = np.subtract(default.eye, default.target)
@@ -108,9 +109,7 @@ def camera_for(trace: Trace, *, distance: float = 1.0) -> Camera:
         * np.clip(0.75 + 1.2 * np.linalg.norm(goal - start), 0.85, 1.3)
         / np.linalg.norm(away)
     )
-    return Camera(
-        eye=tuple((center + away).tolist()), target=tuple(center.tolist()), fov=default.fov
-    )
+    return Camera(eye=tuple((center + away).tolist()), target=tuple(center.tolist()))
 
 
 def draw_state(
@@ -176,9 +175,9 @@ def draw_clips(
     for episode in rows:
         obj = load_object(episode.object, meshes)
         if strips:
-            camera = camera_for(episode.trace, distance=0.7)
+            camera = camera_for(episode.trace, obj, distance=0.7)
         else:
-            camera = camera_for(rows[0].trace)
+            camera = camera_for(rows[0].trace, obj)
         eyes = policy_cameras(robot, obj, vision)
         scene = SceneSpec(robot=robot, objects=(obj,))
         clips.append(_draw(episode, scene, camera, eyes, strips))

@@ -416,6 +416,10 @@ class FairnessTest(Compared):
                     text,
                     rf"(?m)^> \*\*Note:\*\* These results are (perhaps )?not comparable: not the same {expected}",
                 )
+        with self.subTest("the same meshes, named from here and in full"):
+            for name, folder in (("here", "meshes"), ("full", str(Path("meshes").resolve()))):
+                self.write_results(name, objects_folder=folder)
+            self.assertNotIn("object meshes", self.compare("here", "full"))
         self.write_results("a", engines=("sapien",), seed=9)
         self.assertRegex(
             self.compare("a"), r"seed of the evaluation \(3: a in mujoco; 9: a in sapien\)"

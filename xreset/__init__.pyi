@@ -23,6 +23,7 @@ from xreset.eval.results import Evaluation as Evaluation
 from xreset.eval.rollout import Engine as Engine
 from xreset.learning.config import TrainConfig as TrainConfig
 from xreset.learning.train import distill as distill
+from xreset.learning.train import resume as resume
 from xreset.learning.train import train as train
 from xreset.objects.catalogue import load_object as load_object
 from xreset.physics import Backend as Backend

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
@@ -55,7 +56,7 @@ def _condition_table(trainings: Sequence[Training]) -> Table:
                 "policy file": result.inputs.get("policy", "")[:12],
                 "robot": result.robot,
                 "objects": ", ".join(sorted(map(short_name, episodes["object"].unique()))),
-                "object meshes": result.objects_folder or "stand-ins",
+                "object meshes": _mesh_folder(result.objects_folder),
                 "demonstrations": result.inputs.get("demos", "")[:12],
                 "sequences": tuple(
                     sorted(set(episodes["object"] + "/" + episodes["sequence_name"]))
@@ -68,6 +69,11 @@ def _condition_table(trainings: Sequence[Training]) -> Table:
                     row[name] = text
             rows.append(row)
     return pd.DataFrame(rows)
+
+
+def _mesh_folder(folder: str | None) -> str:
+    """Return one path for a folder of meshes, whether it was given from here or in full."""
+    return str(Path(folder).resolve()) if folder else "stand-ins"
 
 
 def _difference(table: Table, column: str, what: str, advice: str = "") -> list[str]:

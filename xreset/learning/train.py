@@ -76,7 +76,7 @@ def train(
         device: cpu or cuda; default: cuda if there is a GPU that the engine can use.
         num_envs: number of worlds, in each process.
         iterations: number of iterations; default: as configured.
-        minutes: most time to train now; ``xreset.learning.train.resume`` continues the run.
+        minutes: most time to train now; ``xreset.resume`` continues the run.
         seed: seed of every random number.
         weights: another run's folder, whose networks are the start; default: new networks.
         teacher: policy whose actions the new one learns instead of learning from rewards; see :func:`distill`.

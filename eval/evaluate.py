@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
 from xreset.errors import XResetError
 from xreset.eval.policy_spec import PolicySpec, load_policy
-from xreset.eval.results import Evaluation, episode_table, summarize, write_results
+from xreset.eval.results import (
+    Evaluation,
+    episode_table,
+    read_result,
+    summarize,
+    write_results,
+)
 from xreset.eval.rollout import Engine, chosen_engines, load_trial, roll_out
 from xreset.files import claim_folder
 from xreset.inputs import Data
@@ -64,6 +71,7 @@ def evaluate(
     results = []
     tables = []
     with claim_folder(folder):
+        _tell_what_is_replaced([folder / f"{engine.name}.json" for engine in chosen], trial.inputs)
         for engine in chosen:
             player = policy.start(trial.motion)
             rollouts = roll_out(
@@ -84,3 +92,21 @@ def evaluate(
             results.append(result)
             tables.append(episode_table(result, rollouts.episodes))
     return Evaluation(results, tables)
+
+
+def _tell_what_is_replaced(files: Sequence[Path], inputs: dict[str, str]) -> None:
+    """Name the results of other demonstrations that an evaluation will replace, while it can still be stopped."""
+    others = []
+    for file in files:
+        try:
+            known = read_result(file).inputs
+        except XResetError:  # there is none, or it is damaged
+            continue
+        if known.get("demos") != inputs.get("demos"):
+            others.append(str(file))
+    if others:
+        print(
+            f"{', '.join(others)}: results of other demonstrations, which this evaluation replaces. "
+            "To keep them, stop it now and name another folder (--out).",
+            file=sys.stderr,
+        )

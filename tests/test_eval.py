@@ -1,5 +1,7 @@
 """Metrics on constructed trajectories, confidence intervals, result files."""
 
+import contextlib
+import io
 import json
 import math
 import tempfile
@@ -401,6 +403,27 @@ class ResultsTest(unittest.TestCase):
             with claim_folder(self.folder), self.assertRaisesRegex(XResetError, "writing"):
                 evaluate(policy, "demos.npz", [])
             self.assertEqual(evaluate(policy, "demos.npz", []), [])
+
+    def test_results_of_other_demonstrations_are_named_before_they_are_replaced(self):
+        rollouts = toy_rollouts()
+        write_results(self.folder, toy_summary(inputs={"demos": "ab"}), rollouts, self.JOINTS)
+        before = (self.folder / "mujoco.json").read_bytes()
+        policy = PolicySpec(
+            name="zero", start=mock.Mock(), robot=mock.Mock(), task=TaskConfig(), folder=self.folder
+        )
+        for demos, told in (("ab", ""), ("cd", f"{self.folder / 'mujoco.json'}: results of other")):
+            errors = io.StringIO()
+            with (
+                self.subTest(demos),
+                mock.patch("xreset.eval.evaluate.load_trial") as load_trial,
+                mock.patch("xreset.eval.evaluate.roll_out", side_effect=KeyboardInterrupt),
+                contextlib.redirect_stderr(errors),
+                self.assertRaises(KeyboardInterrupt),
+            ):
+                load_trial.return_value.inputs = {"demos": demos}
+                evaluate(policy, "demos.npz", "mujoco")
+            self.assertEqual(errors.getvalue()[: len(told) or None], told)
+        self.assertEqual((self.folder / "mujoco.json").read_bytes(), before)
 
     def test_a_result_that_is_not_a_number_is_not_written(self):
         rollouts = toy_rollouts()

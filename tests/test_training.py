@@ -145,6 +145,9 @@ class TrainingTest(unittest.TestCase):
         )
         (moved / "run.json").write_text(json.dumps(data | {"objects": "gone"}))
         self.assertEqual(read_run(moved).objects, "gone")
+        here = os.path.relpath(meshes, Path.cwd()) + "/"
+        (moved / "run.json").write_text(json.dumps(data | {"objects": here}))
+        self.assertEqual(read_run(moved).objects, here, "as stated, where it exists")
 
     def test_goals_need_no_demonstrations(self):
         """Every episode begins at home; fine-tuning goes on with the run's networks and configuration; a bank keeps its

@@ -84,8 +84,8 @@ def read_run(folder: str | Path) -> RunInfo:
     found = {}
     for name in ("robot", "resets", "objects"):
         path = getattr(info, name)
-        if path and path not in robot_names():
-            places = (above / path for above in (Path(), *folder.resolve().parents))
+        if path and path not in robot_names() and not os.path.exists(path):
+            places = (above / path for above in folder.resolve().parents)
             found[name] = str(next(filter(os.path.exists, places), path))
     return replace(info, **found)
 

@@ -314,6 +314,20 @@ class CommandTest(unittest.TestCase):
             words = "made with other meshes of brick. Give the same --objects folder"
             self.assertEqual(self.resets()[2].count(words), told)
 
+    def test_a_file_that_is_not_motion_is_refused(self):
+        self.resets()
+        (self.folder / "text").write_text("text")
+        out = self.folder / "c.npz"
+        for name, message in (
+            ("b.npz", "states schema 'xreset-resets/1', expected 'xreset-retargeted/1'"),
+            ("text", "text is not a file of xreset retarget"),
+            ("none.npz", r"none.npz \(a file of xreset retarget\). Check the path"),
+        ):
+            code, _, err = run("resets", str(self.folder / name), "--out", str(out))
+            self.assertEqual(code, 1)
+            self.assertRegex(err, message)
+        self.assertFalse(out.exists())
+
     def test_a_squeeze_that_an_engine_does_not_accept_is_left_out(self):
         still = lambda robot, fingers, joints, config: joints - (np.arange(2) == 1)[:, None]  # noqa: E731
         with mock.patch(

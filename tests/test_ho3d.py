@@ -80,7 +80,7 @@ class Ho3d(InFolder):
         options = ("--fps", 10, "--cameras", self.cameras, "--out", self.folder / "out.npz")
         code, out, _ = run("demos", "import", "ho3d", self.folder / "ho3d", *options)
         self.assertEqual(code, 0)
-        self.assertRegex(out, "left out for want of a camera's pose in .*: MC1\n")
+        self.assertRegex(out, "left out, because .* has no camera's pose: MC1\n")
 
     def test_frames_that_are_missing_or_not_annotated(self):
         last = self.demos.num_frames - 1

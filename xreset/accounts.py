@@ -81,5 +81,5 @@ def accounts_path(path: Path) -> Path:
 
 def write_accounts(path: Path, *, of: str, rows: Sequence[Account], **more: Any) -> None:
     """Write accounts as JSON: ``of`` what (such as ``frames``), and ``more`` by name."""
-    written = [{"total": row.total} | asdict(row) for row in rows]
+    written = [asdict(row) | {"total": row.total} for row in rows]
     write_json(path, {"schema": SCHEMA, "of": of, "rows": written} | more)

@@ -175,7 +175,8 @@ def load_inputs(
 
 
 def _read(path: Path, accept: tuple[Kind, ...]) -> Data:
-    stated = npz_schema(path)
+    commands = " or ".join(_KINDS[kind][2] for kind in accept)
+    stated = npz_schema(path, what=f"a file of {commands}")
     expected = []
     for schema, read, command in (_KINDS[kind] for kind in accept):
         if stated == schema:

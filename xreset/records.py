@@ -152,20 +152,20 @@ def read_npz(
     return arrays
 
 
-def npz_schema(path: str | Path) -> str:
+def npz_schema(path: str | Path, *, what: str = "one of xreset's npz files") -> str:
     """Return the schema that an npz file states; its reader checks all the rest.
+
+    Args:
+        what: what the file ought to be, for messages.
 
     Raises:
         FileFormatError: it is no npz file, or states none.
     """
     path = Path(path)
-    what = "one of xreset's npz files"
     with _opened(path, what, f"is not {what}") as (archive, packed):
         stated = _stated_schema(archive, packed)
     if stated is None:
-        raise FileFormatError(
-            f"{path} is not one of xreset's npz files: it states no schema. Is it the right file?"
-        )
+        raise FileFormatError(f"{path} is not {what}: it states no schema. Is it the right file?")
     return stated
 
 

@@ -51,7 +51,7 @@ def import_ho3d(folder: Source, *, out: Path, fps: float, cameras: Path) -> None
     _save(demos, out, {"dataset": "ho3d", "fps": fps})
     every = {path.parent.name for path in folder.glob("train/*/meta")}
     if without := sorted(every.difference(demos.sequence_name)):
-        show_notes([f"left out for want of a camera's pose in {cameras}: {', '.join(without)}"])
+        show_notes([f"left out, because {cameras} has no camera's pose: {', '.join(without)}"])
 
 
 def import_keypoints(

@@ -98,8 +98,8 @@ class Retargeted(ObjectMotions):
 
     @property
     def untouched(self) -> np.ndarray:
-        """[S] bool: whether the human mostly does not touch the object while it is 5 cm from its start. No sequence of
-        DexYCB is like that."""
+        """[S] bool: whether the human mostly does not touch the object while it is more than 5 cm from its start. No
+        sequence of DexYCB is like that."""
         owner = self.sequence_of_frame
         moved = np.linalg.norm(self.object_pos - self.start_pose[0][owner], axis=1) > 0.05
         touching = np.bincount(owner, moved & self.contact)

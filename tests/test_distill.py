@@ -157,6 +157,13 @@ class DistillTest(unittest.TestCase):
             self.distill("clock")  # the teacher acts in the first of two iterations
         self.assertEqual(clocked, [2])
 
+    def test_students_see_points_and_the_goal_by_default(self):
+        with mock.patch("xreset.learning.train.train") as train:
+            distill("many-objects", self.bank, out=self.folder / "unused")
+        vision = train.call_args.kwargs["config"].task.vision
+        self.assertEqual((vision.view, vision.goal_image), ("points", True))
+        self.assertEqual(vision.cameras, (FRONT,))
+
     def test_refusals(self):
         away = replace(IMAGES, cameras=(replace(FRONT, target=(3.0, 0.2, 0.5)),))
         two = {"teacher": self.teacher, "bank": self.bank, "out": self.folder / "refused"}

@@ -185,7 +185,10 @@ class TrainingTest(unittest.TestCase):
         self.assertTrue(
             any(not torch.equal(x, changed[name]) for name, x in one.actor_state_dict.items())
         )
+        run = json.loads((out / "run.json").read_text())
+        (out / "run.json").write_text(json.dumps(run | {"resets": "bank.npz"}))
         said = self.resume(out)
+        self.assertEqual(read_run(out, as_stated=True).resets, "bank.npz", "not the path from here")
         self.assertIn(
             "continuing after iteration 2, the last one: --iterations asks for more", said
         )

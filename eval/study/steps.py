@@ -156,7 +156,7 @@ class Run:
         """Refuse a folder with a run of another configuration. The length may differ: a run can be continued."""
         if self.config is None or not (self.folder / "run.json").is_file():
             return
-        info = read_run(self.folder)
+        info = read_run(self.folder, as_stated=True)
         found: dict[str, Any] = {"seed": info.seed, "config": _without_length(info.config)}
         wanted: dict[str, Any] = {"seed": self.seed, "config": _without_length(self.config)}
         for name in ("robot", "backend", "num_envs"):

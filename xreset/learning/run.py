@@ -65,9 +65,9 @@ def write_run(folder: Path, info: RunInfo) -> None:
     write_json(folder / "run.json", {"schema": SCHEMA} | asdict(info))
 
 
-def read_run(folder: str | Path) -> RunInfo:
+def read_run(folder: str | Path, *, as_stated: bool = False) -> RunInfo:
     """Read ``run.json``. Robot, bank and objects whose paths do not exist here are looked for below the folders above
-    the run, from one of which the training was probably started.
+    the run, from one of which the training was probably started, unless ``as_stated``.
 
     Raises:
         RunError: the folder is not a run.
@@ -81,6 +81,8 @@ def read_run(folder: str | Path) -> RunInfo:
     data = read_json(folder / "run.json", SCHEMA, keep_version=True)
     where = f"{folder / 'run.json'} (of xreset {shown(data.pop('xreset', None))})"
     info = from_dict(RunInfo, data, where)
+    if as_stated:
+        return info
     found = {}
     for name in ("robot", "resets", "objects"):
         path = getattr(info, name)

@@ -170,7 +170,7 @@ def distill(
     *,
     out: str | Path,
     cameras: Sequence[str | CameraConfig] = ("front",),
-    vision: VisionConfig = STUDENT_VISION,
+    vision: VisionConfig | None = None,
     config: TrainConfig | None = None,
     **options: Any,
 ) -> Path:
@@ -184,6 +184,7 @@ def distill(
         out: run folder to make.
         cameras: names of :data:`xreset.cameras.config.CAMERAS`, or cameras.
         vision: images, their timing and what the student gets of them; its cameras are replaced by ``cameras``.
+            Default: points, and the object at its goal.
         config: the whole configuration, cameras included; default: :func:`xreset.learning.recipes.student_config`.
         options: keywords of :func:`train`: robot, objects, engine, device, num_envs, iterations, minutes and seed.
 
@@ -203,7 +204,7 @@ def distill(
             )
         chosen = tuple(CAMERAS[camera] if isinstance(camera, str) else camera for camera in cameras)
         told = OnnxPolicy(policy_file(teacher)).contract.task
-        config = student_config(told, replace(vision, cameras=chosen))
+        config = student_config(told, replace(vision or STUDENT_VISION, cameras=chosen))
     if not config.task.vision.cameras:
         raise XResetError(
             "A student needs a camera. Give one or two of: " + ", ".join(CAMERAS) + "."
@@ -384,7 +385,8 @@ def _runner(
         if begin is None and (out / "run.json").is_file():
             for events in out.glob("events.out.tfevents.*"):
                 events.unlink()
-        write_run(out, info)
+        stated = read_run(out, as_stated=True) if resumed else info
+        write_run(out, replace(stated, config=info.config))
         if resumed:
             done = f"continuing after iteration {runner.iteration}"
             if begin is None:

@@ -158,7 +158,8 @@ def sweep(
     out: Path,
     progress: NamedProgress,
 ) -> Card:
-    """Play episodes with each value of the properties that an engine can set, and write the card after each property.
+    """Play episodes with each value of the properties that an engine can set, and write the card before the first and
+    after each property.
 
     Args:
         card_type: type of the card.
@@ -191,6 +192,8 @@ def sweep(
         curves=(),
         left_out=tuple(prop.option for prop in properties if prop not in usable),
     )
+    file = out / f"{engine.name}.json"
+    write_json(file, asdict(card))
     for prop in usable:
         swept = {}
         for value in prop.values:
@@ -198,7 +201,7 @@ def sweep(
             done += 1
             progress(engine.name, done, total)
         card = replace(card, curves=(*card.curves, curve(prop, nominal, swept)))
-        write_json(out / f"{engine.name}.json", asdict(card))
+        write_json(file, asdict(card))
     return card
 
 
@@ -271,8 +274,10 @@ def plot_size(found: Sequence[Stress]) -> tuple[float, float]:
 
 
 def draw_curves(figure: Figure, found: Sequence[Stress]) -> None:
-    """Draw task progress against each property, a line for each engine."""
+    """Draw task progress against each property, a line for each engine; nothing if no engine can set any of them."""
     curves = by_property(found)
+    if not curves:
+        return
     columns = min(_COLUMNS, len(curves))
     axes = figure.subplots(math.ceil(len(curves) / columns), columns, squeeze=False, sharey=True)
     for ax in axes.flat[len(curves) :]:

@@ -147,13 +147,17 @@ class CommandTest(unittest.TestCase):
         folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
         demos = folder / "demos.npz"
         xreset("demos", "synth", "--objects", SOUP, "--per-object", 1, "--out", demos)
-        options = ("--robot", "openarm", "--demos", demos, "--episodes", 1, "--out", folder)
+        options = ("--robot", "openarm", "--demos", demos, "--episodes", 1)
         sweeps = ("--property", "arm-stiffness=0.5", "--property", "action-latency=1")
         sweeps += ("--property", "camera-latency=33")  # of cameras, which the policy does not have
         with mock.patch.object(
             MujocoBackend, "capabilities", MujocoBackend.capabilities - {"drives"}
         ):
-            _, out, _ = xreset("stress", "zero", *options, *sweeps)
+            _, out, _ = xreset("stress", "zero", *options, "--out", folder, *sweeps)
+            options += ("--out", folder / "none", "--property", "arm-stiffness=0.5")
+            _, left_out, _ = xreset("stress", "zero", *options)
+        self.assertIn("cannot be set", left_out)
+        self.assertEqual([c.curves for c in read_stress(folder / "none")], [()])
         (card,) = read_stress(folder)
         self.assertEqual((card.schema, card.policy, card.episodes), ("xreset-stress/1", "zero", 1))
         self.assertEqual(card.left_out, ("arm-stiffness",))

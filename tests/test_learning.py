@@ -12,6 +12,7 @@ import torch
 from tensordict import TensorDict
 from torch.testing import assert_close
 
+from tests.toy_bank import SOUP, SPAM, toy_bank
 from xreset import robots
 from xreset.checks import from_dict
 from xreset.errors import FileFormatError
@@ -22,10 +23,12 @@ from xreset.learning.model import PointNetLstmModel, ReturnCritic, embed_sequenc
 from xreset.learning.ppo import SequencePpo, first_steps, piece_states
 from xreset.learning.runner import TrainingRunner
 from xreset.policy import OnnxPolicy, policy_contract
+from xreset.resets.distribution import ResetDistribution
 from xreset.task.config import (
     ObservationConfig,
     PushConfig,
     RandomizationConfig,
+    ResetConfig,
     TaskConfig,
     TerminationConfig,
     TrackerConfig,
@@ -374,12 +377,15 @@ class ChangingSettings(unittest.TestCase):
             ):
                 ScheduleConfig(faults=points)
 
-    def test_a_training_moves_its_limit_of_success_and_its_faults(self):
+    def test_a_training_moves_its_limit_of_success_its_faults_and_its_starts(self):
         """On straight lines between the points."""
         env = mock.Mock(success_position=torch.zeros(()))
         env.drawn.fault_scale = torch.zeros(())
+        env.resets.demo_probability = torch.zeros(())
         schedule = ScheduleConfig(
-            success_position=((0.2, 0.05), (1.0, 0.01)), faults=((0.0, 0.0), (0.5, 1.0))
+            success_position=((0.2, 0.05), (1.0, 0.01)),
+            faults=((0.0, 0.0), (0.5, 1.0)),
+            demo_probability=((0.0, 1.0), (1.0, 0.0)),
         )
         runner = mock.Mock(env=env, config=TrainConfig(schedule=schedule))
         for progress, limit, scale in (
@@ -391,6 +397,25 @@ class ChangingSettings(unittest.TestCase):
             TrainingRunner._follow_schedule(runner, progress)
             self.assertAlmostEqual(float(env.success_position), limit)
             self.assertAlmostEqual(float(env.drawn.fault_scale), scale)
+            share = float(env.resets.demo_probability)
+            self.assertAlmostEqual(share, max(0.0, 1 - progress), places=6)
+
+    def test_states_are_needed_where_episodes_ever_begin_in_one(self):
+        home = TaskConfig(reset=ResetConfig(demo_probability=0.0))
+        later = ScheduleConfig(demo_probability=((0.0, 0.0), (1.0, 0.5)))
+        never = ScheduleConfig(demo_probability=((0.0, 0.0),))
+        self.assertTrue(TrainConfig().uses_states)
+        self.assertFalse(TrainConfig(task=home).uses_states)
+        self.assertTrue(TrainConfig(task=home, schedule=later).uses_states)
+        self.assertFalse(TrainConfig(schedule=never).uses_states)
+
+    def test_resets_follow_the_share_of_demonstrated_states(self):
+        robot = robots.load("openarm")
+        resets = ResetDistribution(toy_bank(robot), robot, (SOUP, SPAM), ResetConfig())
+        for share in (1.0, 0.0):
+            resets.demo_probability.fill_(share)
+            drawn = resets.sample(torch.zeros(50, dtype=torch.long), torch.Generator())
+            self.assertEqual(float(drawn.from_bank.float().mean()), share)
 
 
 if __name__ == "__main__":

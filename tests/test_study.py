@@ -192,6 +192,7 @@ class PlanTest(InFolder):
 
     def test_changes_of_the_recipe_are_flags(self):
         changes = "task.reset = { random_gravity = false, demo_probability = 0.25 }\nmodel.pointnet = [8, 6]\ntask.action.hand_zero = 'middle'\n"
+        changes += "schedule.success_position = [[0, 0.05], [1, 0.01]]\n"
         plan = self.plan(
             HEAD + DATA + RUN + "[runs.a]\nsteps = 1e6\nnum_envs = 64\n[runs.a.config]\n" + changes
         )

@@ -252,6 +252,15 @@ class TrainingTest(unittest.TestCase):
         self.resume(out, iterations=done + 1)
         self.assertEqual(newest(out).iteration, done + 1)
 
+    def test_a_schedule_continues_where_a_stopped_run_was(self):
+        """Stopped after two of many iterations, then resumed for as much time as it had taken."""
+        out = self.train("scheduled")
+        progress: list[float] = []
+        with mock.patch.object(TrainingRunner, "_follow_schedule", lambda _, x: progress.append(x)):
+            self.resume(out, iterations=1000, minutes=newest(out).elapsed / 60)
+        self.assertGreaterEqual(progress[0], 0.5)
+        self.assertEqual(progress, sorted(progress))
+
     def test_a_configuration_starts_from_a_recipe_or_from_another_run(self):
         def parsed(*arguments: str) -> TrainConfig:
             with mock.patch("xreset.learning.train.train") as started:
@@ -282,6 +291,7 @@ class TrainingTest(unittest.TestCase):
             (("--like", str(self.folder)), "is not a run folder"),
             (("--like", "minutes", "--resume"), "Omit --like"),
             (("--weights", str(self.out), "--resume"), "Omit --weights"),
+            (("--resume", "--config.ppo.entropy", "0.001"), "Omit --config, or start another run"),
         ):
             with (
                 self.subTest(arguments),

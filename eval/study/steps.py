@@ -17,6 +17,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from xreset.demos.archive import read_demos, write_demos
 from xreset.demos.synth import synthesize
 from xreset.errors import RunError
@@ -296,4 +298,4 @@ def flags(values: dict[str, Any], prefix: str = "--") -> Iterator[str]:
             yield f"{prefix}{flag}" if value else f"{prefix}no-{flag}"
         elif value is not None:
             yield prefix + flag
-            yield from map(str, value if isinstance(value, list | tuple) else [value])
+            yield from map(str, np.array(value, dtype=object).ravel())  # a schedule holds pairs

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from argparse import ArgumentParser
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -66,10 +67,15 @@ def train(
         raise RunError(
             "--resume continues with the run's own networks. Omit --weights, or start another run with it."
         )
-    if resume:
-        training.resume(
-            out, iterations=iterations, minutes=minutes, own=config.task.reward.own, wandb=wandb
+    own = config.task.reward.own
+    reward = replace(config.task.reward, own={})
+    if resume and replace(config, task=replace(config.task, reward=reward)) != TrainConfig():
+        raise RunError(
+            "--resume continues with the run's own configuration. Omit --config, or start another run with this run's "
+            f"networks: --weights {out} --like {out}"
         )
+    if resume:
+        training.resume(out, iterations=iterations, minutes=minutes, own=own, wandb=wandb)
         return
     if goals is None and resets is None:
         raise RunError(

@@ -122,13 +122,14 @@ class ScheduleConfig(Checked):
 
     A schedule is a list of points: a share of the run and the setting's value there, such as ``0 0.9 1 0.25``. Values
     between two points lie on a straight line. The share of the run counts iterations, or minutes if the run is limited
-    to some and more of them have passed.
+    to some and more of them have passed. A run that is resumed continues where it stopped, not at share 0.
     """
-
-    REMOVED: ClassVar[dict[str, Any]] = {"demo_probability": []}
 
     teacher: ShareSchedule = ()
     """Share of the worlds in which the teacher acts during a distillation. Empty: none."""
+    demo_probability: ShareSchedule = ()
+    """Replaces ``task.reset.demo_probability``, such as ``0 0.5 1 0.25``: demonstrated states teach the first grasp,
+    and starts from home are what is evaluated."""
     success_position: ShareSchedule = ()
     """Replaces ``task.reward.success_position`` [m], such as ``0 0.05 1 0.01``: what counts as success becomes
     stricter. Evaluations keep their own limits."""
@@ -157,3 +158,9 @@ class TrainConfig(Checked):
     iterations: Positive[int] = 10000
     save_interval: Positive[int] = 50
     """Iterations between checkpoints."""
+
+    @property
+    def uses_states(self) -> bool:
+        """Whether episodes ever begin in states of the bank."""
+        points = self.schedule.demo_probability
+        return max(value for _, value in points or ((0.0, self.task.reset.demo_probability),)) > 0

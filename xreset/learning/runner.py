@@ -108,13 +108,15 @@ class TrainingRunner:
             )
         saved_at = self.iteration
         steps = self.config.ppo.horizon * env.num_envs * self.processes.count
+        earlier = self.elapsed
         begin = time.perf_counter()
         with _stop_on_interrupt() as requests:
             while self.iteration < total:
                 if self._agreed(bool(requests) or time.perf_counter() - begin > seconds):
                     break
                 start = time.perf_counter()
-                self._follow_schedule(max(self.iteration / total, (start - begin) / seconds))
+                share_of_time = (earlier + start - begin) / (earlier + seconds)
+                self._follow_schedule(max(self.iteration / total, share_of_time))
                 with torch.no_grad():
                     obs = self._roll_out(obs, log)
                     self._check_finite(obs)
@@ -159,6 +161,9 @@ class TrainingRunner:
     def _follow_schedule(self, progress: float) -> None:
         """Set what changes during a run to its values at a share of the run."""
         schedule = self.config.schedule
+        if schedule.demo_probability:
+            share = value_at(schedule.demo_probability, progress)
+            self.env.resets.demo_probability.fill_(share)
         if schedule.success_position:
             self.env.success_position.fill_(value_at(schedule.success_position, progress))
         if schedule.faults:

@@ -114,8 +114,10 @@ def train(
     inputs = load_inputs(file, robot=robot, objects=objects, accept=("bank", "goals"))
     if isinstance(inputs.data, GoalSet):
         reset = replace(config.task.reset, demo_probability=0.0)
-        config = replace(config, task=replace(config.task, reset=reset))
-    if config.task.reset.demo_probability and not inputs.bank.num_states:
+        task = replace(config.task, reset=reset)
+        schedule = replace(config.schedule, demo_probability=())
+        config = replace(config, task=task, schedule=schedule)
+    if config.uses_states and not inputs.bank.num_states:
         raise RunError(
             f"{file} holds no state to reset to: every candidate was rejected. Look at its reasons (xreset resets), "
             "or train without it: --config.task.reset.demo-probability 0"

@@ -110,7 +110,11 @@ class _Grouped:
 
 class ResetDistribution:
     """Draws resets for worlds of given objects from a bank. All tensors live on one device; a draw copies nothing to
-    it."""
+    it.
+
+    Attributes:
+        demo_probability: [] share of resets from the bank, ``demo_probability`` unless it is filled with another.
+    """
 
     def __init__(
         self,
@@ -136,6 +140,7 @@ class ResetDistribution:
             DemoError: an object of the scene has no demonstration in the bank.
         """
         self.config = config
+        self.demo_probability = torch.tensor(float(config.demo_probability), device=device)
         missing = [name for name in object_names if name not in bank.sequence_object]
         if missing:
             raise DemoError(
@@ -181,7 +186,7 @@ class ResetDistribution:
         home = self.home(sequence, generator)
         if not len(self._states.state):
             return home
-        from_bank = (uniform[:, 0] < self.config.demo_probability) & (
+        from_bank = (uniform[:, 0] < self.demo_probability) & (
             self._grouped_states.count[object_index] > 0
         )
         row = self._grouped_states.draw(object_index, uniform[:, 1])

@@ -172,10 +172,28 @@ class RefusalTest(WithEnv):
         with self.assertRaisesRegex(XResetError, "The motion is .* joints are not those of"):
             make_bank(motion, self.robot, self.objects)
 
+    def test_shares_of_worlds_that_cannot_be_are_refused(self):
+        for words, share, num_envs in (
+            ("object_share names mug, but the objects are", {"mug": 2.0}, 8),
+            ("gets no world", {SOUP: 100.0}, 8),
+        ):
+            task = replace(TASK, reset=replace(TASK.reset, object_share=share))
+            with self.subTest(words), self.assertRaisesRegex(XResetError, words):
+                make_env(self.robot, self.objects, self.bank, task, num_envs=num_envs)
+        with self.assertRaisesRegex(ValueError, "object_share .*numbers above 0"):
+            ResetConfig(object_share={SOUP: 0.0})
+
     def test_starts_and_goals_do_not_depend_on_the_robot(self):
         rows = np.zeros(self.bank.num_states, dtype=bool)
         bank = replace(self.bank.with_states(rows), joint_names=("other",))
         make_env(self.robot, self.objects, bank, num_envs=1).close()
+
+    def test_an_object_gets_its_share_of_the_worlds(self):
+        task = replace(TASK, reset=replace(TASK.reset, object_share={SPAM: 3.0}))
+        with make_env(self.robot, self.objects, self.bank, task, num_envs=7) as env:
+            # 7 worlds in the ratio 1:3 are 1.75 and 5.25
+            self.assertEqual(env.backend.object_index.tolist(), [0, 0, 1, 1, 1, 1, 1])
+        self.assertEqual(evaluation_task(task).reset.object_share, {})
 
     def test_an_action_is_not_broadcast(self):
         env = self.make()

@@ -6,7 +6,7 @@ policy is trained. Evaluations run in the same class with another configuration.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Self
 
@@ -77,7 +77,8 @@ def make_env(
 
     Args:
         robot: the robot of the bank.
-        objects: the objects of the bank; world i holds object i modulo their number.
+        objects: the objects of the bank; world i holds object i modulo their number, unless
+            ``task.reset.object_share`` gives some objects more worlds.
         bank: where episodes begin, and their goals.
         task: what to observe, reward and end on; None: the paper's task.
         engine: name of the engine, as ``xreset engines list`` prints it.
@@ -88,19 +89,55 @@ def make_env(
     Raises:
         FileFormatError: the bank's states are for another robot or other meshes.
         DemoError: the bank has no demonstration of an object.
+        XResetError: ``task.reset.object_share`` names an object that is not there, or an object gets no world.
     """
     task = task or TaskConfig()
     objects = checked_objects(robot, objects)
     check_states(bank, robot, objects)
-    backend = make_backend(engine, make_scene(robot, objects, task), num_envs, device=device)
+    names = tuple(o.name for o in objects)
+    scene = make_scene(robot, objects, task)
+    object_index = shared_worlds(names, num_envs, task.reset.object_share)
+    backend = make_backend(engine, scene, num_envs, object_index=object_index, device=device)
     try:
-        names = tuple(o.name for o in objects)
         pivots = object_origins(objects, task)
         resets = ResetDistribution(bank, robot, names, task.reset, backend.device, pivots)
         return ManipulationEnv(backend, task, resets, seed=seed)
     except BaseException:
         backend.close()
         raise
+
+
+def shared_worlds(
+    names: Sequence[str], num_envs: int, share: Mapping[str, float]
+) -> Tensor | None:
+    """Return the object [N] of each world; None: world i holds object i modulo their number.
+
+    Args:
+        names: the objects.
+        num_envs: N.
+        share: ``task.reset.object_share``. Fractions of worlds go to the objects that miss most.
+
+    Raises:
+        XResetError: an unknown name, or too few worlds.
+    """
+    if not share:
+        return None
+    unknown = sorted(set(share) - set(names))
+    if unknown:
+        raise XResetError(
+            f"object_share names {', '.join(unknown)}, but the objects are {', '.join(names)}."
+        )
+    wanted = np.array([share.get(name, 1.0) for name in names])
+    exact = num_envs * wanted / wanted.sum()
+    worlds = np.floor(exact).astype(int)
+    by_remainder = np.argsort(worlds - exact, kind="stable")
+    worlds[by_remainder[: num_envs - worlds.sum()]] += 1
+    if not worlds.all():
+        raise XResetError(
+            f"With {num_envs} worlds and this object_share, {names[worlds.argmin()]} gets no world. "
+            "Take more worlds (--num-envs)."
+        )
+    return torch.as_tensor(np.repeat(np.arange(len(names)), worlds))
 
 
 def object_origins(objects: Sequence[ObjectSpec], task: TaskConfig) -> dict[str, np.ndarray] | None:

@@ -22,6 +22,12 @@ def _are_own_terms(own: dict[str, float]) -> bool:
     )
 
 
+def _are_shares(shares: dict[str, float]) -> bool:
+    return isinstance(shares, dict) and all(
+        isinstance(name, str) and isfinite(share) and share > 0 for name, share in shares.items()
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class ActionConfig(Checked):
     """How a policy's output in [-1, 1] becomes joint targets.
@@ -256,6 +262,11 @@ class ResetConfig(Checked):
     """Home resets: the goal is moved by U(-z, z) upwards [m], but not below the height at which the object starts."""
     goal_yaw: NotNegative[float] = 0.0
     """Home resets: the goal is turned about the vertical by U(-y, y) [rad]."""
+    object_share: Annotated[
+        dict[str, float], Rule("names of objects and numbers above 0", _are_shares)
+    ] = field(default_factory=dict)
+    """Trainings: name of an object -> how many times as many worlds it has as an object that is not named. It gives
+    more practice with objects that are learned late."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -493,6 +504,7 @@ def evaluation_task(task: TaskConfig) -> TaskConfig:
             goal_xy=0.0,
             goal_z=0.0,
             goal_yaw=0.0,
+            object_share={},
         ),
         randomization=replace(task.randomization, enabled=False),
     )

@@ -107,9 +107,7 @@ def make_env(
         raise
 
 
-def shared_worlds(
-    names: Sequence[str], num_envs: int, share: Mapping[str, float]
-) -> Tensor | None:
+def shared_worlds(names: Sequence[str], num_envs: int, share: Mapping[str, float]) -> Tensor | None:
     """Return the object [N] of each world; None: world i holds object i modulo their number.
 
     Args:

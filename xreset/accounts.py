@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
+from xreset.checks import frozen
 from xreset.files import write_json
 
 SCHEMA = "xreset-accounts/1"
@@ -21,7 +22,7 @@ Phase = Literal["pre-contact", "post-contact", "both"]
 """Before the human hand first touches the object, and from then on."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Account:
     """What became of some frames or states."""
 

@@ -13,12 +13,28 @@ from dataclasses import MISSING, dataclass, fields, is_dataclass
 from difflib import get_close_matches
 from functools import cache
 from math import inf, isfinite
-from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    TypeVar,
+    dataclass_transform,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 
 from xreset.errors import FileFormatError
-from xreset.text import shown
+from xreset.text import Brief, shown
+
+T = TypeVar("T")
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True)
+def frozen(cls: type[T]) -> type[T]:
+    """Make a data class whose objects do not change, and whose fields are named where one is made."""
+    return dataclass(frozen=True, kw_only=True, repr=not issubclass(cls, Brief))(cls)
 
 
 @dataclass(frozen=True)
@@ -29,7 +45,6 @@ class Rule:
     holds: Callable[[Any], bool]
 
 
-T = TypeVar("T")
 Positive = Annotated[T, Rule("a number above 0", lambda x: 0 < x <= inf)]
 """Infinity is allowed, and means no limit; otherwise write ``Positive[Finite[float]]``."""
 NotNegative = Annotated[T, Rule("a number from 0 to 1e15", lambda x: 0 <= x <= 1e15)]

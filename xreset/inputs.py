@@ -4,11 +4,12 @@ objects."""
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
+from xreset.checks import frozen
 from xreset.demos.archive import SCHEMA_NAME as DEMOS
 from xreset.demos.archive import Demos, demo_objects, read_demos
 from xreset.description import load_robot
@@ -46,7 +47,7 @@ _KINDS = {
 """Schema, reader, and the command that writes such files."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Inputs:
     """Demonstrations, motion, a bank or a goal set, with robot and objects; all checked against one another."""
 

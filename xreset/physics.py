@@ -8,12 +8,12 @@ of ``scene.robot.joints``.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from typing import ClassVar, Literal, Self, get_args
 
 import torch
 from torch import Tensor
 
+from xreset.checks import frozen
 from xreset.errors import BackendUnavailableError, CapabilityError
 from xreset.spec import SceneSpec, lowest_point
 from xreset.tensors import Tensors
@@ -33,7 +33,7 @@ Capability = Literal[Parameter, "object_wrench", "overflow", "mass_properties"]
 of mass and inertias."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class State(Tensors):
     """The full state of worlds. Setting it removes everything else: warm starts, old targets, external forces."""
 
@@ -87,7 +87,7 @@ class State(Tensors):
         return cls.at_rest(home, places[object_index.cpu()], upright)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Parameters(Tensors):
     """Physical parameters of worlds, as their setters take them; None: unchanged."""
 
@@ -131,7 +131,7 @@ class Parameters(Tensors):
         }
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Links(Tensors):
     """Poses and velocities of the tracked links (palm, then fingertips)."""
 
@@ -145,7 +145,7 @@ class Links(Tensors):
     """[N, K, 3]"""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Contacts(Tensors):
     """Contact forces *on the object*, world frame, of the last physics step (zero right after a state is set)."""
 
@@ -157,7 +157,7 @@ class Contacts(Tensors):
     """[N, 3] net force of the table on the object [N]; a resting object reads +m g along z."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Health(Tensors):
     """What went wrong in a world since its state was last set."""
 
@@ -167,7 +167,7 @@ class Health(Tensors):
     """[N] bool: contacts or constraints were dropped because a buffer was full."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class MassProperties(Tensors):
     """What the engine itself holds of the bodies that move: B of the robot (links fixed to one another are one), then
     the object.
@@ -183,7 +183,7 @@ class MassProperties(Tensors):
     """[N, B + 1, 3, 3] about the centre of mass, along the body frame's axes [kg m^2]."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class KnownDifference:
     """A tolerance of the conformance suite that an engine is known to miss, by how much at most, and why.
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
+from xreset.checks import frozen
 
-@dataclass(frozen=True, kw_only=True)
+
+@frozen
 class Schedule:
     """Which world processes which item in which round."""
 

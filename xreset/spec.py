@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from xreset.checks import NotNegative, Number, Positive, Rule, Text
+from xreset.checks import NotNegative, Number, Positive, Rule, Text, frozen
 from xreset.errors import DemoError, XResetError
 from xreset.text import Brief, shown
 
@@ -30,7 +30,7 @@ Keypoint = Annotated[str, Rule(f"one of {', '.join(KEYPOINTS)}", KEYPOINTS.__con
 """One of :data:`KEYPOINTS`."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Geometry:
     """A convex shape in its own frame."""
 
@@ -45,7 +45,7 @@ class Geometry:
     """[F, 3] triangles over ``vertices``, outward (``hull`` only)."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Shape:
     """A geometry placed in the frame of a link or of an object."""
 
@@ -54,7 +54,7 @@ class Shape:
     """[4, 4] pose of the shape in the body's frame."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class DriveSpec:
     """An implicit PD position drive: torque = kp (target - q) - kd qd, limited to the effort limit."""
 
@@ -70,7 +70,7 @@ class DriveSpec:
     """Dry friction [N m] ([N])."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class JointSpec:
     """One actuated joint."""
 
@@ -83,7 +83,7 @@ class JointSpec:
     """Home position [rad or m]."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class MimicSpec:
     """A joint that follows an actuated one: q = multiplier * q_source + offset."""
 
@@ -93,7 +93,7 @@ class MimicSpec:
     offset: Number = 0.0
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class FingertipSpec:
     """A fingertip: a frame at the pad, and the links whose contact counts as this finger's."""
 
@@ -107,7 +107,7 @@ class FingertipSpec:
     """The human keypoint that it follows."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class KeypointSpec:
     """Which robot link follows a human keypoint during retargeting."""
 
@@ -116,7 +116,7 @@ class KeypointSpec:
     """URDF link whose origin follows it."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class RobotSpec:
     """A robot: a URDF and one small typed description. See :func:`xreset.load_robot`."""
 
@@ -211,7 +211,7 @@ class RobotSpec:
         return fingerprint in (self.fingerprint, replace(self, meshes=()).fingerprint)
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
+@frozen
 class ObjectSpec(Brief):
     """A rigid object in the frame of its mesh, which is the frame of the demonstrations' object poses."""
 
@@ -235,7 +235,7 @@ class ObjectSpec(Brief):
     """Coefficient of its material: the middle of what the task draws for it. None: as the task draws."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class TableSpec:
     """A fixed box whose top is at z = 0."""
 
@@ -245,7 +245,7 @@ class TableSpec:
     """Half extents [m]."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class PairFriction:
     """Coulomb friction of the *pairs* that touch the object; each engine solves for its own per-body coefficients."""
 
@@ -259,7 +259,7 @@ class PairFriction:
     """Torsional friction of every pair, as a length [m]: torque <= torsional * normal force."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class SceneSpec:
     """Everything that a backend may read."""
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Annotated, Literal
 
-from xreset.checks import Checked, Finite, NotNegative, Positive, Rule, Share
+from xreset.checks import Checked, Finite, NotNegative, Positive, Rule, Share, frozen
 
 Point = tuple[Finite[float], Finite[float], Finite[float]]
 Pixels = Annotated[int, Rule("a number from 8 to 1024", lambda n: 8 <= n <= 1024)]
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class DepthNoise(Checked):
     """Errors of depth images.
 
@@ -32,7 +32,7 @@ class DepthNoise(Checked):
     """Step in depth that counts as an edge [m]. A plane has none, however steeply the camera sees it."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class CameraConfig(Checked):
     """A depth camera, fixed in the world or on a link of the robot."""
 
@@ -61,7 +61,7 @@ class CameraConfig(Checked):
             raise ValueError(f"target is {self.target}, expected another point than pos")
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class VisionConfig(Checked):
     """What a policy sees of the object. Without cameras it is told pose and shape."""
 

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xreset.checks import is_rigid
+from xreset.checks import frozen, is_rigid
 from xreset.errors import DemoError, ObjectError
 from xreset.objects.catalogue import canonical_names, load_object, object_names, official_name
 from xreset.objects.rest import rest_height
@@ -91,7 +91,7 @@ class ObjectMotions(Brief):
         return self.object_pos[last], self.object_quat_wxyz[last]
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
+@frozen
 class Demos(ObjectMotions):
     """Demonstrations of one or several objects; the attributes are the arrays of the file."""
 

@@ -11,12 +11,11 @@ Everything is in a frame with z up and the table at z = 0; the object is its con
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from xreset.checks import frozen
 from xreset.demos import hand
 from xreset.geometry.shapes import half_spaces, plane_heights
 from xreset.spec import ObjectSpec
@@ -43,7 +42,7 @@ _LOW_OBJECT = 0.07  # objects up to this height are grasped from above [m]
 _TOUCH = 1e-4  # pieces of an object that are this close are one part [m]
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Solid:
     """An object's convex pieces at a pose."""
 
@@ -107,7 +106,7 @@ class Solid:
         return np.array(enter), np.array(leave), np.array(normal_in), np.array(normal_out)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Contacts:
     """Planned contacts of the fingertips with the object."""
 
@@ -121,7 +120,7 @@ class Contacts:
     """Smaller is better."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Grasp:
     """A hand that grasps."""
 

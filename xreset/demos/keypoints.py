@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import Literal
@@ -19,7 +18,7 @@ import numpy as np
 from scipy.interpolate import interp1d
 from scipy.spatial.transform import Rotation, Slerp
 
-from xreset.checks import is_rigid
+from xreset.checks import frozen, is_rigid
 from xreset.demos import hand
 from xreset.demos.archive import SIDES, Demos, merge_demos, one_sequence
 from xreset.errors import DemoError
@@ -87,7 +86,7 @@ _COLUMNS = {
 """Columns of a CSV that hold the numbers of an array, row by row of the array."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Convention:
     """Meaning of a tracker's numbers; None: as the file says, or refuse."""
 

@@ -10,12 +10,13 @@ the collision pieces, which are what physics touches.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
+from xreset.checks import frozen
 from xreset.demos.archive import Demos, levelled
 from xreset.errors import DemoError
 from xreset.spec import ObjectSpec, TableSpec
@@ -25,7 +26,7 @@ _SAMPLES = 600
 _ACROSS = np.array([-1.0, 1.0, 1.0])
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Symmetry:
     """The plane in which an object is most nearly its own mirror image: normal . x = offset, in the mesh frame."""
 

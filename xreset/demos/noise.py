@@ -7,12 +7,13 @@ offset, and its fingers wander around their places, slower than from frame to fr
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+from xreset.checks import frozen
 from xreset.demos.archive import Demos
 from xreset.demos.hand import PARENTS
 
@@ -20,7 +21,7 @@ MEMORY = math.exp(-1 / 8)
 """Correlation of a finger's error with that of the frame before."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class HandNoise:
     """How wrong a hand tracker is."""
 

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from xreset.checks import frozen
 from xreset.demos import hand
 from xreset.demos.archive import Demos, merge_demos, one_sequence
 from xreset.demos.grasp import Contacts, Grasp, Solid, fit_hand, handedness, plan_contacts
@@ -212,7 +213,7 @@ def _best_of(
 # Motion ---------------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class _Timing:
     """Events of a demonstration, as numbers of frames."""
 
@@ -228,7 +229,7 @@ class _Timing:
     """The object is at the goal."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class _HandPath:
     """A hand's motion up to the grasp, [T] frames; the grasp holds to the end."""
 

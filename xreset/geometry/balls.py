@@ -10,7 +10,6 @@ Shape letters: Q balls, G links with balls, R guards, H pairs of links.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from itertools import pairwise, product
 
 import numpy as np
@@ -18,6 +17,7 @@ import torch
 from scipy.spatial import ConvexHull
 from torch import Tensor
 
+from xreset.checks import frozen
 from xreset.geometry.collision import SelfCollision, bounding_ball, support_points
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics
@@ -43,7 +43,7 @@ _INWARD_STEPS = 8
 """Steps that move a point of a surface inwards from one face after the other."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Balls(Tensors):
     """Balls fixed to the links of a hand, and those links as solids that the balls of other links stay out of."""
 

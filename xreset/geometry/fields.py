@@ -6,16 +6,17 @@ Shape letters: M objects, N points, A points that are near.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from xreset.checks import frozen
 from xreset.tensors import Tensors
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class DistanceFields(Tensors):
     """Signed distances to M objects at the nodes of one grid per object, in the objects' mesh frames [m]."""
 

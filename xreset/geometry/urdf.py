@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import math
 import os
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -18,6 +18,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from xreset.checks import frozen
 from xreset.errors import ObjectError, RobotError
 from xreset.files import max_bytes
 from xreset.geometry.shapes import hull, load_mesh, shape_mesh
@@ -42,7 +43,7 @@ _FOLDERS_ABOVE = 3
 """Folders above the URDF's own in which meshes may lie: those of a ROS package and of its workspace, never the root."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Link:
     """A link, its inertia and its shapes."""
 
@@ -57,7 +58,7 @@ class Link:
     """Convex collision shapes in the link frame; a mesh is its convex hull, within :data:`HULL_TOLERANCE`."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Joint:
     """A joint between two links."""
 
@@ -85,7 +86,7 @@ class Joint:
     """Inertia of its drive's rotor [kg m^2 or kg]; 0 where none is given, as in a URDF."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class RobotTree:
     """The links and joints of a URDF, parents before children."""
 

@@ -11,12 +11,12 @@ from __future__ import annotations
 import heapq
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
 
+from xreset.checks import frozen
 from xreset.errors import ObjectError, needs
 from xreset.geometry.shapes import (
     half_spaces,
@@ -65,7 +65,7 @@ _TOUCH = 2e-4
 """Pieces whose bounding boxes are closer than this may be joined [m]."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Settings:
     """Settings of a decomposition; the same on every machine."""
 
@@ -85,7 +85,7 @@ class Settings:
     and not a time, so that the pieces of a mesh, and with them its physics, are the same on every machine."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Pieces:
     """Convex pieces that stand for a mesh in physics."""
 

@@ -6,13 +6,14 @@ import logging
 import os
 import re
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import QhullError
 
+from xreset.checks import frozen
 from xreset.errors import ObjectError
 from xreset.files import file_hash, write_whole
 from xreset.geometry.shapes import load_mesh, shell_properties
@@ -41,7 +42,7 @@ _FEW_MM = 0.002
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Import:
     """An imported object, and how it was made."""
 

@@ -3,11 +3,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from xreset.checks import Checked, Rule, from_dict
+from xreset.checks import Checked, Rule, from_dict, frozen
 from xreset.errors import ObjectError
 from xreset.files import read_toml
 
@@ -16,7 +15,7 @@ def _within(low: float, high: float) -> Rule:
     return Rule(f"a number from {low:g} to {high:g}", lambda value: low <= value <= high)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Properties(Checked):
     """None: unknown."""
 

@@ -8,7 +8,7 @@ goal (the paper's appendix D.c). Shape letters: L states, C rejected candidates,
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import inf
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from xreset.accounts import Account, accounts
+from xreset.checks import frozen
 from xreset.demos.archive import (
     ObjectMotions,
     OneText,
@@ -49,7 +50,7 @@ ObjectTexts = Annotated[tuple[str, ...], Field(("O",), "U")]
 RejectedIndices = Annotated[np.ndarray, Field(("C",), "i", within=(0, inf))]
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
+@frozen
 class ResetBank(Brief):
     """Contents of a reset bank: starts and goals of demonstrations [S], stable states [L] and rejected candidates
     [C].

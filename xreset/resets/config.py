@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-from xreset.checks import Checked, Finite, NotNegative, Positive
+from xreset.checks import Checked, Finite, NotNegative, Positive, frozen
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class FilterConfig(Checked):
     """Limits of the physics filter (:mod:`xreset.resets.filter`); the velocities are those after the last step."""
 
@@ -21,7 +19,7 @@ class FilterConfig(Checked):
     """Largest joint speed [rad/s or m/s]; published 10."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class ClosingConfig(Checked):
     """More states where a hand closes in on an object (:mod:`xreset.resets.closing`)."""
 
@@ -31,7 +29,7 @@ class ClosingConfig(Checked):
     """Only between frames of which one has a finger nearer than this to the object [m]."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class SqueezeConfig(Checked):
     """Drive targets that press (:func:`xreset.resets.fingers.squeeze_targets`)."""
 
@@ -41,7 +39,7 @@ class SqueezeConfig(Checked):
     """A finger nearer than this to the object is at it [m]."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class GoalConfig(Checked):
     """How a goal set is drawn (:mod:`xreset.resets.goals`). Offsets are those of the published paper's evaluation of
     objects without demonstrations (its table A3); the height of a lift is not in the paper."""

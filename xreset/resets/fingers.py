@@ -6,12 +6,12 @@ Shape letters: M states, J joints, E fingers, G contact links of all fingers.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from xreset.checks import frozen
 from xreset.geometry.balls import link_balls
 from xreset.geometry.dynamics import drive_values
 from xreset.geometry.fields import DistanceFields
@@ -22,7 +22,7 @@ from xreset.resets.config import SqueezeConfig
 from xreset.spec import ObjectSpec, RobotSpec
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Fingers:
     """Where each finger's contact links come nearest to the object."""
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
 from typing import Annotated
@@ -22,6 +22,7 @@ from typing import Annotated
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from xreset.checks import frozen
 from xreset.demos.synth import LIFT, WORKSPACE
 from xreset.description import load_robot
 from xreset.errors import FileFormatError, GoalError
@@ -57,7 +58,7 @@ _INSIDE = 0.005
 """A goal is inside the table if its lowest point is deeper than this [m]."""
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
+@frozen
 class GoalSet(ResetBank):
     """Contents of a goal set: starts and goals [S]. It has no states."""
 
@@ -65,7 +66,7 @@ class GoalSet(ResetBank):
     """[S] one of :data:`FAMILIES` or :data:`OWN`."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class _Episode:
     """A start and a goal of one object."""
 

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 
 from xreset.accounts import Account, accounts
+from xreset.checks import frozen
 from xreset.demos.archive import (
     FrameFlags,
     FramePositions,
@@ -42,7 +42,7 @@ ReasonNames = Annotated[tuple[str, ...], Field(("R",), "U")]
 FrameDistances = Annotated[np.ndarray, Field(("F",), "f", within=None)]
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
+@frozen
 class Retargeted(ObjectMotions):
     """Robot trajectories of demonstrations, in the table frame.
 

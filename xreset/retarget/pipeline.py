@@ -6,12 +6,13 @@ Shape letters: F frames of all sequences, S sequences of a batch padded to T fra
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from xreset.checks import frozen
 from xreset.demos.archive import Demos, grounded, levelled
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.rotations import matrix_to_quat
@@ -37,7 +38,7 @@ _FINGERS = slice(5, None)
 """Keypoints of the other fingers."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class RetargetConfig:
     """Everything that decides the result, besides robot, objects and demonstrations."""
 

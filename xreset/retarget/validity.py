@@ -7,10 +7,10 @@ reason, the first that applies.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
+
+from xreset.checks import frozen
 
 REASONS = (
     "valid",
@@ -27,7 +27,7 @@ REASONS = (
 its limit."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Thresholds:
     """Limits of a valid frame."""
 
@@ -45,7 +45,7 @@ class Thresholds:
     """Depth of the robot's shapes in one another [m]."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Measures:
     """Measures of frames; every tensor has the same shape."""
 

@@ -3,12 +3,10 @@ quickly."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-from xreset.checks import Checked, Finite, NotNegative, Positive
+from xreset.checks import Checked, Finite, NotNegative, Positive, frozen
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class ArmConfig(Checked):
     """Weights and effort of the arm's inverse kinematics; the first two weights are the paper's."""
 

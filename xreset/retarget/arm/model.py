@@ -6,13 +6,13 @@ links with support points.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from xreset.checks import frozen
 from xreset.errors import RobotError
 from xreset.geometry.balls import bounding_balls
 from xreset.geometry.collision import SelfCollision, height_above_table, table_points
@@ -29,7 +29,7 @@ _AT_LIMIT = 1e-6
 """A joint this near its limit is at it [rad or m]."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class ArmTargets(Tensors):
     """The path that the arm should follow."""
 
@@ -65,7 +65,7 @@ class ArmTargets(Tensors):
         return self.map(lambda x: x.flip(1))
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class LowPoints(Tensors):
     """Points of the robot that are low above the table (length A)."""
 
@@ -187,7 +187,7 @@ class ArmModel:
         return q
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class ArmProblem(ArmTargets):
     """Targets that paths are searched for. An index selects sequences, or some of their frames."""
 

@@ -8,12 +8,12 @@ variables.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from xreset.checks import frozen
 from xreset.geometry.balls import STAND_IN
 from xreset.geometry.collision import height_above_table
 from xreset.geometry.fields import DistanceFields
@@ -23,7 +23,7 @@ from xreset.retarget.hand.model import HandModel
 from xreset.tensors import Tensors
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Distances(Tensors):
     """Signed distances and how they change with the variables."""
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
-from xreset.checks import Checked, Finite, NotNegative, Positive
+from xreset.checks import Checked, Finite, NotNegative, Positive, frozen
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class HandConfig(Checked):
     """Weights and limits of hand retargeting; weights are the paper's (appendix D.b) unless a field says otherwise."""
 

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from xreset.checks import frozen
 from xreset.errors import RobotError
 from xreset.geometry.balls import hand_balls
 from xreset.geometry.collision import SelfCollision
@@ -28,7 +29,7 @@ _PAD_DEPTH = 1e-3
 """A finger's pad are its balls that come within this of the foremost one, towards the other finger [m]."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class HandTargets(Tensors):
     """Human motion that the hand follows; all tensors on one device."""
 

@@ -1,0 +1,11 @@
+"""The reference's signatures of classes that are ``@xreset.checks.frozen``: to griffe they are data classes."""
+
+import griffe
+
+
+class Frozen(griffe.Extension):
+    def on_class_instance(self, *, cls: griffe.Class, **_):
+        for decorator in cls.decorators:
+            if getattr(decorator.value, "canonical_path", "") == "xreset.checks.frozen":
+                keyword = griffe.ExprKeyword("kw_only", "True")
+                decorator.value = griffe.ExprCall(griffe.ExprName("dataclasses.dataclass"), [keyword])

@@ -102,6 +102,13 @@ class TargetNotResetWithTheState(_Stepping):
             super().set_joint_targets(targets)
 
 
+@breaks("state_round_trip", "same_pixels")
+class ObjectReadOneCentimetreTooHigh(MujocoWorld):
+    def get_state(self):
+        state = super().get_state()
+        return {**state, "object_pos": state["object_pos"] + (0.0, 0.0, 0.01)}
+
+
 @breaks("links_after_set")
 class StaleKinematics(_Stepping):
     def links(self):

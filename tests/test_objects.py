@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.data import InFolder, data_dir, run
 from xreset.errors import ObjectError, XResetError
-from xreset.geometry.shapes import half_spaces, hull, shape_mesh
+from xreset.geometry.shapes import half_spaces, hull, shape_mesh, winding_number
 from xreset.objects.catalogue import (
     canonical_name,
     canonical_names,
@@ -35,7 +35,7 @@ from xreset.objects.meshes import (
 from xreset.objects.procedural import make_shapes
 from xreset.objects.properties import Properties
 from xreset.objects.rest import rest_height, resting_orientation
-from xreset.objects.sampling import bounding_box, keypoints, surface_points, winding_number
+from xreset.objects.sampling import bounding_box, keypoints, surface_points
 from xreset.task.config import RandomizationConfig
 from xreset.task.randomization import own_friction
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,11 +16,19 @@ from xreset.backends.conformance.harness import (
 )
 from xreset.backends.conformance.results import Measured, Skipped
 from xreset.backends.conformance.scene import reorder_joints
+from xreset.cameras.config import CameraConfig, VisionConfig
+from xreset.errors import XResetError
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matrix_to_quat, quat_angle
 from xreset.geometry.urdf import robot_tree
 from xreset.physics import Links, State
 from xreset.spec import SceneSpec
+
+if TYPE_CHECKING:
+    from xreset.cameras.sensor import Cameras
+
+_SAME_DEPTH = 2e-4
+"""Difference between two depths of one pixel that counts as none [m]."""
 
 
 def state_round_trip(bench: Bench) -> Measured:
@@ -26,6 +37,26 @@ def state_round_trip(bench: Bench) -> Measured:
     state = bench.random_state(seed=1)
     worlds.set(state)
     return state_errors(worlds.state(), state)
+
+
+def same_pixels(bench: Bench) -> Measured:
+    """Draw with the project's own renderer, from the states that the engine gives back, and from those that were
+    set."""
+    try:
+        from xreset.cameras.sensor import Cameras
+    except XResetError as error:  # Warp cannot be imported
+        raise Skipped(str(error)) from error
+    worlds = bench.worlds()
+    vision = VisionConfig(cameras=(_view_of_object(bench), _view_of_hand(bench)))
+    cameras = Cameras(bench.scene, torch.tensor(bench.which), vision)
+    differing = []
+    for seed in range(3):
+        state = bench.random_state(seed)
+        expected = _depths(cameras, state)
+        worlds.set(state)
+        differs = (_depths(cameras, worlds.state()) - expected).abs() > _SAME_DEPTH
+        differing.append(differs.float().mean(dim=(-2, -1)))
+    return {"pixels that differ": torch.stack(differing)}
 
 
 def links_after_set(bench: Bench) -> Measured:
@@ -80,6 +111,31 @@ def joint_order(bench: Bench) -> Measured:
         "way missing of the joint named": wrong.diagonal(),
         "way of others": wrong - torch.diag(wrong.diagonal()),
     }
+
+
+def _view_of_object(bench: Bench) -> CameraConfig:
+    """Return a camera that looks at the object of random states, from above the table."""
+    x, y = bench.place
+    return CameraConfig(pos=(x + 0.4, y + 0.4, 1.8), target=(x, y, 1.5))
+
+
+def _view_of_hand(bench: Bench) -> CameraConfig:
+    """Return a camera that looks at the palm at home, from beyond what the robot reaches."""
+    robot = bench.scene.robot
+    home = torch.as_tensor(robot.home)
+    palm = bench.kinematics.link_poses(home, [robot.palm])[0, :3, 3].numpy()
+    ahead = palm[:2] - robot.base_pos[:2]
+    ahead /= max(float(np.linalg.norm(ahead)), 1e-6)
+    away = (*0.8 * ahead, 0.4) if ahead.any() else (0.8, 0.0, 0.4)
+    return CameraConfig(pos=tuple((palm + away).tolist()), target=tuple(palm.tolist()))
+
+
+def _depths(cameras: Cameras, state: State) -> Tensor:
+    """Return the depths [N, C, H, W] that cameras would measure without errors."""
+    everywhere = torch.ones(len(state.joint_pos), dtype=torch.bool)
+    cameras.aim(state, state.object_pos, state.object_quat, everywhere)
+    cameras.cast()
+    return cameras.rays.depth.clone()
 
 
 def _link_errors(kinematics: Kinematics, state: State, links: Links) -> dict[str, Tensor]:

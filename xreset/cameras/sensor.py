@@ -20,8 +20,8 @@ from xreset.cameras.rays import RayCaster
 from xreset.errors import XResetError
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_from_axis_angle, quat_to_matrix
+from xreset.geometry.shapes import winding_number
 from xreset.geometry.urdf import link_meshes
-from xreset.objects.sampling import winding_number
 from xreset.physics import State
 from xreset.spec import SceneSpec, TableSpec
 from xreset.tensors import where
@@ -73,13 +73,14 @@ class Cameras:
         home = self._kinematics.link_poses(
             torch.as_tensor(robot.home, dtype=torch.float32, device=device), self._links
         )
-        self._check_outside(home.cpu().numpy(), bodies)
+        table = _table(scene.table)
+        self._check_outside(home.cpu().numpy(), bodies, table)
         worlds = len(object_index)
         fixed = torch.arange(first_object, device=device).expand(worlds, -1)
         held = first_object + object_index[:, None]
         size = (config.height, config.width)
         count = len(config.cameras)
-        surfaces = [*bodies.values(), _table(scene.table), *objects]
+        surfaces = [*bodies.values(), table, *objects]
         self.pose = torch.eye(4, device=device).repeat(worlds, count, 1, 1)
         self._tangent = torch.ones(worlds, count, device=device)
         self._due = torch.ones(worlds, dtype=torch.bool, device=device)
@@ -188,19 +189,24 @@ class Cameras:
         """[N] bool: whether the newest images show the object, if they had no errors."""
         return (self._on_object() & (self._in_range(self.rays.depth) > 0)).flatten(1).any(dim=1)
 
-    def _check_outside(self, poses: np.ndarray, bodies: dict[str, trimesh.Trimesh]) -> None:
-        """Refuse cameras inside a link of the robot at home; poses [L, 4, 4] of the bodies, then of the cameras'
-        links."""
+    def _check_outside(
+        self, poses: np.ndarray, bodies: dict[str, trimesh.Trimesh], table: trimesh.Trimesh
+    ) -> None:
+        """Refuse cameras inside the table or a link of the robot at home; poses [L, 4, 4] of the bodies, then of the
+        cameras' links."""
+        solids = {f"the robot's link {name!r}": mesh for name, mesh in bodies.items()}
+        solids["the table"] = table
+        places = [*poses[: len(bodies)], np.eye(4)]
         for i, camera in enumerate(self.config.cameras):
             mount = self._mounts[i]
             eye = mounted_pose(camera)[:, 3]
             if mount is not None:
                 eye = poses[mount] @ eye
-            for (name, mesh), pose in zip(bodies.items(), poses, strict=False):
+            for (name, mesh), pose in zip(solids.items(), places, strict=True):
                 local = np.linalg.inv(pose) @ eye
                 if winding_number(local[None, :3], mesh.vertices, mesh.faces)[0] > 0.5:
                     raise XResetError(
-                        f"Camera {i + 1} at {camera.pos} is inside the robot's link {name!r} and sees nothing else. "
+                        f"Camera {i + 1} at {camera.pos} is inside {name} and sees nothing else. "
                         "Move it out (pos)."
                     )
 

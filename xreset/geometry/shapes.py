@@ -1,4 +1,4 @@
-"""Convex shapes: constructors, meshes, half spaces, and the mass properties of triangle meshes.
+"""Convex shapes: constructors, meshes, half spaces; mass properties and inside of triangle meshes.
 
 Lengths in meters, coordinates in the object's mesh frame.
 """
@@ -32,6 +32,8 @@ _PER_VERTEX_BYTE = 8
 _GLTF_NUMBERS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 CYLINDER_SECTIONS = 48
 """Sides of the prism that stands for a cylinder in a surface mesh."""
+_PAIRS = 2_000_000
+"""Pairs of a point and a triangle that are handled at once: bounds memory."""
 
 
 def transform(R: ArrayLike, position: ArrayLike) -> np.ndarray:
@@ -285,3 +287,29 @@ def shell_properties(
 def triangle_normals(corners: np.ndarray) -> np.ndarray:
     """[F, 3] normals of triangles [F, 3, 3], twice as long as the area."""
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def winding_number(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """[n] how often the triangles enclose each of the points [n, 3]: about 0 outside, 1 inside, 2 where two closed
+    parts overlap.
+
+    The sum of the triangles' solid angles over 4 pi (Jacobson et al. 2013), each by the formula of Van Oosterom and
+    Strackee (1983). Holes in the mesh change it smoothly, so 0.5 still separates in from out.
+    """
+    corners = vertices[faces]
+    block = max(1, _PAIRS // len(faces))
+    numbers = [np.empty(0)]
+    for begin in range(0, len(points), block):
+        away = corners[None] - points[begin : begin + block, None, None]
+        a, b, c = np.moveaxis(away, 2, 0)
+        la, lb, lc = (np.sqrt(_dot(v, v)) for v in (a, b, c))
+        volume = _dot(a, np.cross(b, c))
+        angle = np.arctan2(
+            volume, la * lb * lc + _dot(a, b) * lc + _dot(b, c) * la + _dot(c, a) * lb
+        )
+        numbers.append(angle.sum(axis=1) / (2 * np.pi))
+    return np.concatenate(numbers)
+
+
+def _dot(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    return np.einsum("ijk,ijk->ij", u, v)

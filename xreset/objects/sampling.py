@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import ConvexHull
 
+from xreset.geometry.shapes import winding_number
 from xreset.spec import ObjectSpec
 
 METRIC_POINTS = 64
@@ -14,8 +15,6 @@ METRIC_POINTS = 64
 _CANDIDATES_PER_POINT = 8
 _PROBE = 2e-4
 """Distance from the surface at which a sample is tested [m]: above rounding, below any feature."""
-_PAIRS = 2_000_000
-"""Pairs of a point and a triangle that are handled at once: bounds memory."""
 
 
 def surface_points(obj: ObjectSpec, count: int = 64, seed: int = 0) -> np.ndarray:
@@ -66,32 +65,6 @@ def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
         distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
         chosen.append(np.argmax(distance))
     return points[chosen]
-
-
-def winding_number(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """[n] how often the triangles enclose each of the points [n, 3]: about 0 outside, 1 inside, 2 where two closed
-    parts overlap.
-
-    The sum of the triangles' solid angles over 4 pi (Jacobson et al. 2013), each by the formula of Van Oosterom and
-    Strackee (1983). Holes in the mesh change it smoothly, so 0.5 still separates in from out.
-    """
-    corners = vertices[faces]
-    block = max(1, _PAIRS // len(faces))
-    numbers = [np.empty(0)]
-    for begin in range(0, len(points), block):
-        away = corners[None] - points[begin : begin + block, None, None]
-        a, b, c = np.moveaxis(away, 2, 0)
-        la, lb, lc = (np.sqrt(_dot(v, v)) for v in (a, b, c))
-        volume = _dot(a, np.cross(b, c))
-        angle = np.arctan2(
-            volume, la * lb * lc + _dot(a, b) * lc + _dot(b, c) * la + _dot(c, a) * lb
-        )
-        numbers.append(angle.sum(axis=1) / (2 * np.pi))
-    return np.concatenate(numbers)
-
-
-def _dot(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    return np.einsum("ijk,ijk->ij", u, v)
 
 
 def bounding_box(obj: ObjectSpec) -> tuple[np.ndarray, np.ndarray]:

@@ -87,6 +87,7 @@ def evaluate(
                 inputs=trial.inputs,
                 objects_folder=str(trial.objects_folder) if trial.objects_folder else None,
                 unseen=policy.unseen(trial.names),
+                vision=trial.task.vision if trial.task.vision.cameras else None,
             )
             write_results(folder, result, rollouts, trial.robot.joint_names)
             results.append(result)

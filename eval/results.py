@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import pandas as pd
 
+from xreset.cameras.config import VisionConfig
 from xreset.checks import Checked, NotNegative, Positive, Range, Rule, Share, from_dict
 from xreset.errors import FileFormatError
 from xreset.eval.stats import Interval, bootstrap_ci95
@@ -215,6 +216,8 @@ class EvalResult(Checked):
     """SHA-256 of the policy and the demonstrations."""
     unseen: tuple[str, ...] = ()
     """Objects that the policy was not trained with, sorted; empty for a baseline."""
+    vision: VisionConfig | None = None
+    """Cameras of the policy. None: it has none, or an earlier version did not state them."""
     published_success_rate: Share[float] | None = None
     """Share of episodes that succeed in the sense of the published paper. None, as in the next two fields: an earlier
     version did not measure it."""

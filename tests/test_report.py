@@ -5,6 +5,7 @@ import subprocess
 import unittest
 from dataclasses import replace
 from html.parser import HTMLParser
+from importlib.util import find_spec
 from typing import Any
 from unittest import mock
 
@@ -16,6 +17,7 @@ from tests.toy_bank import SOUP, SPAM
 from tests.toy_results import ENGINES, InFolder, toy_rollouts, toy_summary
 from tests.toy_robot import toy_hand_arm
 from xreset import robots
+from xreset.cameras.config import FRONT, VisionConfig
 from xreset.errors import FileFormatError, RunError
 from xreset.eval.report import figures
 from xreset.eval.report.clips import (
@@ -30,7 +32,13 @@ from xreset.eval.report.clips import (
 from xreset.eval.report.make import make_report
 from xreset.eval.report.page import count_failures, headline, page
 from xreset.eval.report.read import collect
-from xreset.eval.results import Episode, TaskProgress, episode_table, recorded
+from xreset.eval.results import (
+    Episode,
+    TaskProgress,
+    episode_table,
+    recorded,
+    write_results,
+)
 from xreset.files import claim_folder, write_json
 from xreset.learning.config import TrainConfig
 from xreset.learning.run import Candidate, Choice, write_choice
@@ -38,6 +46,9 @@ from xreset.objects.catalogue import load_object
 from xreset.pictures.render import pose_matrix
 
 VOID = {"meta", "br", "link", "img", "input", "hr"}
+
+
+SEEING = VisionConfig(cameras=(FRONT,), width=16, height=16)
 
 
 class Reported(InFolder):
@@ -115,6 +126,16 @@ class CollectTest(Reported):
         data = collect(self.folder)
         self.assertEqual((data.training.label, data.run.num_envs, data.notes), ("soup", 4096, ()))
         self.assertEqual(tuple(data.training.results), ENGINES)
+
+    def test_a_policy_that_sees_needs_no_run(self):
+        self.write(vision=SEEING)
+        self.assertEqual(collect(self.folder).vision, SEEING)
+        self.assertEqual(collect(self.folder).notes, ())
+        write_results(self.folder / "teacher", toy_summary(), toy_rollouts(), ("a", "b", "c"))
+        [note] = collect(self.folder).notes
+        self.assertIn("that the teacher ends at the goal, the student misses 0", note)
+        self.write_soup()
+        self.assertIsNone(collect(self.folder).vision, "the run's configuration has no camera")
 
     def test_nothing_to_report(self):
         self.folder.mkdir()
@@ -312,23 +333,32 @@ class ClipTest(Reported):
         found = np.frombuffer(decoded.stdout, np.uint8).reshape(-1, 48, 64, 3).mean(axis=(1, 2))
         np.testing.assert_allclose(found, colors, atol=12)
 
-    def test_a_film_of_all_objects_in_all_engines(self):
+    def film_height(self, vision: VisionConfig | None) -> int:
+        """Make a film of all objects in all engines; return the height of a picture without its label."""
         self.folder.mkdir()
         robot = toy_hand_arm(self.folder)
         rollouts = toy_rollouts(robot.home)
-        self.write(rollouts=rollouts, joints=robot.joint_names)
-        out = self.folder / "film.mp4"
+        self.write(rollouts=rollouts, joints=robot.joint_names, vision=vision)
         with (
             mock.patch("xreset.eval.report.clips.load_robot", lambda _: robot),
-            mock.patch(
-                "xreset.eval.report.clips.encode_mp4",
-                lambda frames, fps: repr((frames.shape, round(fps))).encode(),
-            ),
+            mock.patch("xreset.eval.report.clips.encode_mp4") as encode,
         ):
-            engines, objects = make_film(self.folder, out)
+            encode.return_value = b"film"
+            engines, objects = make_film(self.folder, self.folder / "film.mp4")
+        frames, fps = encode.call_args.args
         names = tuple(sorted({trace.object for trace in rollouts.traces}))
         self.assertEqual((set(engines), objects), (set(ENGINES), names))
-        self.assertEqual(out.read_text(), repr(((3, 4 * (150 + 24), len(names) * 200, 3), 10)))
+        self.assertEqual((len(frames), *frames.shape[2:]), (3, len(names) * 200, 3))
+        self.assertEqual(round(fps), 10)
+        self.assertEqual(frames.shape[1] % 4, 0)
+        return frames.shape[1] // 4 - 24
+
+    def test_a_film_of_all_objects_in_all_engines(self):
+        self.assertEqual(self.film_height(None), 150)
+
+    @unittest.skipUnless(find_spec("warp"), "Warp draws what a policy sees")
+    def test_a_film_shows_what_the_policy_sees(self):
+        self.assertEqual(self.film_height(SEEING), 150 + 200)
 
 
 class FailureTest(Reported):
@@ -449,6 +479,13 @@ class PageTest(Reported):
         ):  # fmt: skip
             with self.subTest(expected):
                 self.assertIn(expected, outline.text)
+
+    def test_the_page_tells_what_the_cameras_see(self):
+        words = "the depth that the cameras see"
+        self.assertNotIn(words, page(self.data(), self.clips))
+        self.write(vision=SEEING)
+        (self.folder / "run.json").unlink()
+        self.assertIn(words, page(collect(self.folder), self.clips))
 
     def test_without_clips_curves_and_run(self):
         self.write(engines=("pybullet",))

@@ -223,15 +223,14 @@ def draw_report(
     """
     spec = load_robot(robot or data.robot)
     meshes = data.training.first.meshes(objects)
-    vision = data.run.config.task.vision if data.run else None
     shown = data.training.recorded(spec)
-    clips = draw_clips(best_everywhere(shown), spec, meshes, vision)
+    clips = draw_clips(best_everywhere(shown), spec, meshes, data.vision)
     if not clips:
         raise XResetError(
             "no demonstration was recorded in every engine. Evaluate all engines in one command."
         )
     worst = worst_episodes(shown[shown["engine"] == data.training.first.backend], FAILURES)
-    return clips, draw_clips(worst, spec, meshes, vision, strips=True)
+    return clips, draw_clips(worst, spec, meshes, data.vision, strips=True)
 
 
 def make_film(
@@ -257,7 +256,7 @@ def make_film(
     meshes = data.training.first.meshes(objects)
     columns = {}
     for name, own in data.training.recorded(spec).groupby("object"):
-        if clips := draw_clips(best_everywhere(own), spec, meshes):
+        if clips := draw_clips(best_everywhere(own), spec, meshes, data.vision):
             columns[str(name)] = clips
     if not columns:
         raise RunError(

@@ -10,6 +10,7 @@ from typing import Any
 
 import pandas as pd
 
+from xreset.cameras.config import VisionConfig
 from xreset.errors import FileFormatError, RunError, needs
 from xreset.eval.report.fairness import missed_by_student, uneven
 from xreset.eval.results import EvalResult, Table, read_evaluation, read_traces, recorded
@@ -83,6 +84,14 @@ class ReportData:
         """Name or folder of the robot."""
         return self.training.first.robot if self.run is None else self.run.robot
 
+    @property
+    def vision(self) -> VisionConfig | None:
+        """Cameras of the policy; None: it has none, or the results do not state them."""
+        if self.run is None:
+            return self.training.first.vision
+        vision = self.run.config.task.vision
+        return vision if vision.cameras else None
+
 
 def collect(folder: Path) -> ReportData:
     """Read everything that a report shows.
@@ -111,14 +120,13 @@ def collect(folder: Path) -> ReportData:
         choice = None
     stress = read_stress(place / "stress", training.first.inputs.get("policy"))
     notes = uneven([training]) + not_described
-    if run is not None and run.teacher is not None:
-        if taught := read_evaluation(folder / "teacher"):
-            notes.append(missed_by_student(training.episodes, taught.to_frame()))
-        else:
-            notes.append(
-                "The teacher was not evaluated from the same starts. Make its results first: "
-                f"xreset eval {folder / TEACHER} --out {folder / 'teacher'} --demos DEMOS"
-            )
+    if taught := read_evaluation(folder / "teacher"):
+        notes.append(missed_by_student(training.episodes, taught.to_frame()))
+    elif run is not None and run.teacher is not None:
+        notes.append(
+            "The teacher was not evaluated from the same starts. Make its results first: "
+            f"xreset eval {folder / TEACHER} --out {folder / 'teacher'} --demos DEMOS"
+        )
     return ReportData(training=training, run=run, choice=choice, stress=stress, notes=tuple(notes))
 
 

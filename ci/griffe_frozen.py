@@ -8,4 +8,6 @@ class Frozen(griffe.Extension):
         for decorator in cls.decorators:
             if getattr(decorator.value, "canonical_path", "") == "xreset.checks.frozen":
                 keyword = griffe.ExprKeyword("kw_only", "True")
-                decorator.value = griffe.ExprCall(griffe.ExprName("dataclasses.dataclass"), [keyword])
+                decorator.value = griffe.ExprCall(
+                    griffe.ExprName("dataclasses.dataclass"), [keyword]
+                )

@@ -80,10 +80,12 @@ def resets(
     counts = accounts_path(out)
     write_accounts(counts, of="states tried in physics", rows=accounts, pressing=bank.num_pressing)
     show_accounts(accounts, f"{bank.robot}: {title}")
-    if squeeze.force > 0:
-        console.print(
-            f"{bank.num_pressing} of {bank.post_contact.sum()} states after contact press with {squeeze.force:g} N"
-        )
+    if squeeze.presses:
+        force = f"{squeeze.force:g} N"
+        if squeeze.weight:
+            force += f" and {squeeze.weight:g} times the object's weight"
+        pressing = f"{bank.num_pressing} of {bank.post_contact.sum()} states after contact"
+        console.print(f"{pressing} press with {force}")
     tried = bank.num_states + len(bank.rejected_reason)
     share = accounts[-1].kept / max(motion.annotated.sum(), 1)
     console.print(f"{share:.0%} of the annotated frames are kept")

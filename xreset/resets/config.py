@@ -35,8 +35,19 @@ class SqueezeConfig(Checked):
 
     force: NotNegative[float] = 0.0
     """Normal force of each finger that is at the object [N]. 0: targets are the joints' positions."""
+    weight: NotNegative[float] = 0.0
+    """Further force, as a share of the object's weight, such as 1: heavy objects slip out of a grasp that tilts light
+    ones."""
+    balanced: bool = False
+    """Whether the forces on an object nearly cancel, with the same mean: the thumb presses as hard as the fingers that
+    oppose it."""
     reach: Positive[Finite[float]] = 0.005
     """A finger nearer than this to the object is at it [m]."""
+
+    @property
+    def presses(self) -> bool:
+        """Whether there is any force."""
+        return self.force > 0 or self.weight > 0
 
 
 @frozen

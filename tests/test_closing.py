@@ -188,6 +188,8 @@ class FingersTest(unittest.TestCase):
         by_weight = squeeze_targets(ROBOT, fingers, joints, SqueezeConfig(force=1.0, weight=2.0))
         np.testing.assert_allclose(by_weight, by_force, atol=1e-9)
         self.assertTrue(SqueezeConfig(weight=1.0).presses)
+        with self.assertRaisesRegex(ValueError, "no force to balance"):
+            SqueezeConfig(balanced=True)
 
     def test_levers_lead_from_the_centre_of_mass_to_the_finger(self):
         fingers, joints = self.fingers(0.0201)

@@ -44,6 +44,13 @@ class SqueezeConfig(Checked):
     reach: Positive[Finite[float]] = 0.005
     """A finger nearer than this to the object is at it [m]."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.balanced and not self.presses:
+            raise ValueError(
+                "balanced is True and there is no force to balance. Set force or weight"
+            )
+
     @property
     def presses(self) -> bool:
         """Whether there is any force."""

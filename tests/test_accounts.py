@@ -1,13 +1,10 @@
 """Accounts of what is kept and lost."""
 
-import json
-import tempfile
 import unittest
-from pathlib import Path
 
 import numpy as np
 
-from xreset.accounts import accounts, accounts_path, described, write_accounts
+from xreset.accounts import accounts, described
 
 
 class AccountsTest(unittest.TestCase):
@@ -39,17 +36,6 @@ class AccountsTest(unittest.TestCase):
         annotated = rows[-1].without("not annotated")
         self.assertEqual(annotated.total, (self.reason != "not annotated").sum())
         self.assertRegex(described(rows[-1].lost), r"^jump \d+, ")
-
-    def test_file(self):
-        with tempfile.TemporaryDirectory() as folder:
-            path = accounts_path(Path(folder) / "resets.npz")
-            write_accounts(path, of="states", rows=self.rows)
-            data = json.loads(path.read_text())
-        self.assertEqual(path.name, "resets.accounts.json")
-        self.assertEqual(
-            (data["schema"], data["of"], len(data["rows"])), ("xreset-accounts/1", "states", 7)
-        )
-        self.assertEqual(data["rows"][-1]["kept"], int((self.reason == "").sum()))
 
 
 if __name__ == "__main__":

@@ -10,12 +10,10 @@ from unittest import mock
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 
 from tests import toy_grasp
 from tests.test_cli import run
 from tests.toy_bank import toy_bank, toy_retargeted
-from xreset.accounts import accounts_path
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_rotate
 from xreset.plugins import make_backend
@@ -23,7 +21,7 @@ from xreset.resets.bank import read_bank, write_bank
 from xreset.resets.closing import closing_states, positions_between, rotations_between
 from xreset.resets.config import ClosingConfig, SqueezeConfig
 from xreset.resets.distribution import ResetDistribution, bank_starts
-from xreset.resets.fingers import Fingers, _balance, fingers_of, squeeze_targets
+from xreset.resets.fingers import Fingers, fingers_of, squeeze_targets
 from xreset.retarget.file import Retargeted, object_sources, write_retargeted
 from xreset.task.config import ResetConfig
 
@@ -87,8 +85,6 @@ class ClosingTest(unittest.TestCase):
             gap=torch.as_tensor(self.gap),
             point=none,
             inward=none,
-            lever=none,
-            weight=torch.zeros(10),
         )
         with mock.patch("xreset.resets.closing.fingers_of", lambda *_: fingers):
             return closing_states(
@@ -180,52 +176,6 @@ class FingersTest(unittest.TestCase):
         torch.testing.assert_close(fingers.inward[:, 1], wrist, atol=0.02, rtol=0)
         # the jaw's inner side
         np.testing.assert_allclose(fingers.point[:, 0, 0], -0.005, atol=1e-3)
-
-    def test_a_squeeze_by_weight_is_one_with_that_force(self):
-        fingers, joints = self.fingers(0.0201)
-        weight = 9.81 * toy_grasp.brick().mass
-        by_force = squeeze_targets(ROBOT, fingers, joints, SqueezeConfig(force=1.0 + 2 * weight))
-        by_weight = squeeze_targets(ROBOT, fingers, joints, SqueezeConfig(force=1.0, weight=2.0))
-        np.testing.assert_allclose(by_weight, by_force, atol=1e-9)
-        self.assertTrue(SqueezeConfig(weight=1.0).presses)
-        with self.assertRaisesRegex(ValueError, "no force to balance"):
-            SqueezeConfig(balanced=True)
-
-    def test_levers_lead_from_the_centre_of_mass_to_the_finger(self):
-        fingers, joints = self.fingers(0.0201)
-        wrist = Kinematics(ROBOT).link_poses(torch.as_tensor(joints), ["wrist"])[0, 0, :3, 0]
-        brick = toy_grasp.brick()
-        off_center = brick.com - brick.pieces[0].T_body_shape[:3, 3]
-        turn = Rotation.from_quat(toy_grasp.brick_pose()[1], scalar_first=True)
-        shift = turn.apply(off_center) @ wrist.numpy()
-        sideways = (fingers.lever[0] @ wrist).numpy()
-        np.testing.assert_allclose(sideways[:2], [0.0201 - shift, -0.0201 - shift], atol=3e-4)
-
-    def test_balanced_forces_nearly_cancel(self):
-        """A thumb against four fingers; and a thumb that nothing opposes."""
-        x = torch.tensor([1.0, 0, 0], dtype=torch.float64)
-        inward = torch.stack((x, -x, -x, -x, -x)).expand(2, 5, 3)
-        height = torch.tensor([0.0, 0.03, 0.01, -0.01, -0.03], dtype=torch.float64)
-        lever = -0.04 * inward
-        lever[..., 2] = height
-        none = torch.zeros(2, 5, 3)
-        fingers = Fingers(
-            links=tuple("abcde"),
-            finger=torch.arange(5),
-            gap=none[..., 0],
-            point=none,
-            inward=inward,
-            lever=lever,
-            weight=torch.ones(2),
-        )
-        pressing = torch.ones(2, 5, dtype=torch.bool)
-        pressing[1, 1:] = False
-        factor = _balance(fingers, pressing)
-        thumb, others = float(factor[0, 0]), factor[0, 1:]
-        self.assertAlmostEqual(float(factor[0].mean()), 1.0)
-        self.assertAlmostEqual(thumb, float(others.sum()), delta=0.1)
-        np.testing.assert_allclose(others, others.mean().expand(4), atol=1e-6)
-        self.assertEqual(factor[1].tolist(), [1, 0, 0, 0, 0])
 
     def test_a_squeeze_is_as_far_beyond_as_its_force_takes(self):
         fingers, joints = self.fingers(0.0201, 0.0501)
@@ -320,30 +270,24 @@ class CommandTest(unittest.TestCase):
             "resets", str(self.folder / "r.npz"), "--out", str(self.folder / "b.npz"), *options
         )
         self.assertEqual(code, 0, out + err)
-        return (
-            read_bank(self.folder / "b.npz"),
-            json.loads(accounts_path(self.folder / "b.npz").read_text()),
-            out,
-        )
+        return read_bank(self.folder / "b.npz"), out
 
     def test_everything_at_once(self):
         """Jaws close by 30 mm (33 mm on one side): five states between; held by 2.5 N a side, and not without."""
-        plain, account, _ = self.resets()
+        plain, _ = self.resets()
         self.assertEqual(
-            (plain.num_states, plain.joint_target, plain.frame_part, account["pressing"]),
+            (plain.num_states, plain.joint_target, plain.frame_part, plain.num_pressing),
             (3, None, None, 0),
         )
-        bank, account, out = self.resets("--closing.spacing", "0.0056", "--squeeze.force", "2.5")
+        bank, out = self.resets("--closing.spacing", "0.0056", "--squeeze.force", "2.5")
         assert bank.frame_part is not None
         np.testing.assert_allclose(bank.frame_part * 6, [0, 1, 2, 3, 4, 5, 0, 0], atol=1e-5)
         self.assertEqual(bank.frame_index.tolist(), [0] * 6 + [1, 2])
         self.assertEqual(
             (bank.targets != bank.joint_pos).any(axis=1).tolist(), [False] * 6 + [True] * 2
         )
-        self.assertEqual(
-            sum(row["total"] for row in account["rows"] if row["phase"] == "both"), 3, "frames only"
-        )
-        self.assertEqual(account["pressing"], 2)
+        self.assertEqual(bank.accounts()[-1].total, 3, "frames only")
+        self.assertEqual(bank.num_pressing, 2)
         for words in ("2 of 2 states after contact press with 2.5 N", "8 states of 8"):
             self.assertIn(words, out)
         with np.load(self.folder / "b.npz") as file:
@@ -361,7 +305,7 @@ class CommandTest(unittest.TestCase):
             )
             self.assertEqual(object_sources(self.folder / "r.npz")["robot"], "a toy")
             words = "made with other meshes of brick. Give the same --objects folder"
-            self.assertEqual(self.resets()[2].count(words), told)
+            self.assertEqual(self.resets()[1].count(words), told)
 
     def test_a_file_that_is_not_motion_is_refused(self):
         self.resets()
@@ -382,8 +326,8 @@ class CommandTest(unittest.TestCase):
         with mock.patch(
             "xreset.resets.filter.squeeze_targets", still
         ):  # the last state's targets are 1 rad (m) away
-            bank, account, _ = self.resets("--squeeze.force", "2.5")
-        self.assertEqual((bank.num_states, account["pressing"]), (3, 0))
+            bank, _ = self.resets("--squeeze.force", "2.5")
+        self.assertEqual((bank.num_states, bank.num_pressing), (3, 0))
         np.testing.assert_array_equal(bank.targets, bank.joint_pos)
 
 

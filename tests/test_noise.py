@@ -5,7 +5,7 @@ import unittest
 import numpy as np
 
 from xreset.demos.hand import PARENTS
-from xreset.demos.noise import MEMORY, TIERS, HandNoise, with_noise
+from xreset.demos.noise import MEMORY, TIERS, with_noise
 from xreset.demos.synth import synthesize
 
 
@@ -20,7 +20,7 @@ class NoiseTest(unittest.TestCase):
         cls.seen = cls.demos.hand_valid
 
     def test_a_demonstration_is_shifted_as_a_whole_within_the_bound(self):
-        shifted = with_noise(self.demos, HandNoise(wrist=0.04, finger=0.0, cap=0.0))
+        shifted = with_noise(self.demos, wrist=0.04, finger=0.0, cap=0.0)
         shifts = []
         for sequence in range(self.demos.num_sequences):
             frames = self.demos.frames(sequence)
@@ -31,8 +31,7 @@ class NoiseTest(unittest.TestCase):
         self.assertGreater(np.ptp(shifts, axis=0).min(), 0.01)
 
     def test_fingers_wander_and_keep_their_bones(self):
-        noise = HandNoise(wrist=0.0, finger=0.006, cap=0.012)
-        noisy = with_noise(self.demos, noise)
+        noisy = with_noise(self.demos, wrist=0.0, finger=0.006, cap=0.012)
         before = self.demos.hand_keypoints[self.seen].astype(float)
         after = noisy.hand_keypoints[self.seen].astype(float)
         np.testing.assert_allclose(bones(after), bones(before), atol=1e-6)
@@ -45,9 +44,9 @@ class NoiseTest(unittest.TestCase):
         self.assertGreater(still, MEMORY - 0.3)
 
     def test_objects_stay_and_a_seed_repeats(self):
-        noisy = with_noise(self.demos, TIERS["low"], seed=3)
-        again = with_noise(self.demos, TIERS["low"], seed=3)
-        other = with_noise(self.demos, TIERS["low"], seed=4)
+        noisy = with_noise(self.demos, **TIERS["low"], seed=3)
+        again = with_noise(self.demos, **TIERS["low"], seed=3)
+        other = with_noise(self.demos, **TIERS["low"], seed=4)
         np.testing.assert_array_equal(noisy.object_pos, self.demos.object_pos)
         np.testing.assert_array_equal(noisy.hand_keypoints, again.hand_keypoints)
         self.assertGreater(np.nanmax(np.abs(noisy.hand_keypoints - other.hand_keypoints)), 1e-3)

@@ -6,17 +6,12 @@ Nothing is lost without a reason: ``total == kept + sum(lost.values())`` in ever
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import asdict, replace
-from pathlib import Path
-from typing import Any, Literal
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
 from xreset.checks import frozen
-from xreset.files import write_json
-
-SCHEMA = "xreset-accounts/1"
 
 Phase = Literal["pre-contact", "post-contact", "both"]
 """Before the human hand first touches the object, and from then on."""
@@ -55,12 +50,11 @@ def accounts(
         reason: [N] text: why it is lost, empty where it is kept.
     """
     phases: dict[Phase, np.ndarray] = {"pre-contact": ~post_contact, "post-contact": post_contact}
+    owners = {name: object_name == name for name in np.unique(object_name).tolist()}
+    owners["all"] = np.ones_like(post_contact)
     rows = []
-    for name in np.unique(object_name).tolist():
-        for phase, chosen in phases.items():
-            rows.append(_account(name, phase, reason[chosen & (object_name == name)]))
-    for phase, chosen in phases.items():
-        rows.append(_account("all", phase, reason[chosen]))
+    for name, own in owners.items():
+        rows += [_account(name, phase, reason[own & chosen]) for phase, chosen in phases.items()]
     return [*rows, _account("all", "both", reason)]
 
 
@@ -73,14 +67,3 @@ def _account(name: str, phase: Phase, reason: np.ndarray) -> Account:
 def described(lost: dict[str, int]) -> str:
     """Return the reasons as text, such as ``arm jump 12, hand error 3``."""
     return ", ".join(f"{reason} {n}" for reason, n in lost.items())
-
-
-def accounts_path(path: Path) -> Path:
-    """Return the path of a file's accounts, next to it."""
-    return path.with_name(f"{path.stem}.accounts.json")
-
-
-def write_accounts(path: Path, *, of: str, rows: Sequence[Account], **more: Any) -> None:
-    """Write accounts as JSON: ``of`` what (such as ``frames``), and ``more`` by name."""
-    written = [asdict(row) | {"total": row.total} for row in rows]
-    write_json(path, {"schema": SCHEMA, "of": of, "rows": written} | more)

@@ -1,6 +1,6 @@
 """Typed dataclasses: rules for the values of their fields, and strict reading from JSON and TOML.
 
-A rule is part of a field's annotation, as in ``width: Positive[float] = 0.1``. A number that makes no sense is refused
+A rule is part of a field's annotation, as in ``width: PositiveFloat = 0.1``. A number that makes no sense is refused
 when a configuration is made, instead of turning into NaN some minutes later.
 """
 
@@ -46,11 +46,17 @@ class Rule:
 
 
 Positive = Annotated[T, Rule("a number above 0", lambda x: 0 < x <= inf)]
-"""Infinity is allowed, and means no limit; otherwise write ``Positive[Finite[float]]``."""
+"""Infinity is allowed, and means no limit; otherwise write :data:`PositiveFinite`."""
 NotNegative = Annotated[T, Rule("a number from 0 to 1e15", lambda x: 0 <= x <= 1e15)]
 """No time, number of steps or distance is larger: such a number in a file is damage."""
 Finite = Annotated[T, Rule("a finite number", isfinite)]
-Share = Annotated[T, Rule("a number from 0 to 1", lambda x: 0 <= x <= 1)]
+PositiveFloat = Positive[float]
+PositiveInt = Positive[int]
+PositiveFinite = Positive[Finite[float]]
+NonNegativeFloat = NotNegative[float]
+NonNegativeInt = NotNegative[int]
+FiniteFloat = Finite[float]
+Share = Annotated[float, Rule("a number from 0 to 1", lambda x: 0 <= x <= 1)]
 Range = Annotated[
     tuple[float, float],
     Rule("two finite numbers, 0 or more, the lower one first", lambda x: 0 <= x[0] <= x[1] < inf),

@@ -54,6 +54,8 @@ class Field:
 
 
 Schema = Mapping[str, Field]
+Arrays = dict[str, np.ndarray]
+"""Arrays by name."""
 POSITION = (-100.0, 100.0)
 """[m] Range of positions: a tabletop scene is smaller by far, and float32 knows millimetres there."""
 JOINT = (-100.0, 100.0)
@@ -103,8 +105,8 @@ def read_npz(
     schema: Schema,
     *,
     what: str,
-    check: Callable[[dict[str, np.ndarray]], str | None] | None = None,
-) -> dict[str, np.ndarray]:
+    check: Callable[[Arrays], str | None] | None = None,
+) -> Arrays:
     """Read an npz file and check its size before anything is unpacked, and its content before anything is used.
 
     Args:
@@ -233,7 +235,7 @@ def _native(path: Path, name: str, array: np.ndarray) -> np.ndarray:
     return array.astype(array.dtype.newbyteorder("="))
 
 
-def _wrong_shape(arrays: Mapping[str, np.ndarray], schema: Schema) -> str | None:
+def _wrong_shape(arrays: Arrays, schema: Schema) -> str | None:
     lengths: dict[str, tuple[int, str]] = {}
     for name, array in arrays.items():
         field = schema[name]
@@ -259,7 +261,7 @@ def _wrong_shape(arrays: Mapping[str, np.ndarray], schema: Schema) -> str | None
 _KINDS = {"f": "floating-point", "i": "integer", "b": "bool", "U": "text"}
 
 
-def wrong_value(arrays: Mapping[str, np.ndarray], schema: Schema) -> str | None:
+def wrong_value(arrays: Arrays, schema: Schema) -> str | None:
     """Return what is wrong with the values of arrays whose types and shapes are right, or None."""
     for name, field in schema.items():
         array = arrays.get(name)
@@ -287,7 +289,7 @@ def wrong_value(arrays: Mapping[str, np.ndarray], schema: Schema) -> str | None:
     return None
 
 
-def offsets_problem(arrays: Mapping[str, np.ndarray], frames: int) -> str | None:
+def offsets_problem(arrays: Arrays, frames: int) -> str | None:
     """Return what is wrong with ``frame_offsets``, which say where each of the sequences ``sequence_name`` begins and
     ends; or with the names."""
     offsets = arrays["frame_offsets"]
@@ -337,7 +339,7 @@ def write_record(path: str | Path, schema_name: str, record: Any, **provenance: 
     write_npz(path, schema_name, arrays_of(record), **provenance)
 
 
-def arrays_of(record: Any) -> dict[str, np.ndarray]:
+def arrays_of(record: Any) -> Arrays:
     """Return the arrays of a dataclass of :func:`schema_of`'s kind, as they are written."""
     arrays = {}
     for name, field in schema_of(type(record)).items():
@@ -354,7 +356,7 @@ def read_record(
     schema_name: str,
     *,
     what: str,
-    check: Callable[[dict[str, np.ndarray]], str | None],
+    check: Callable[[Arrays], str | None],
 ) -> T:
     """Read a dataclass of :func:`schema_of`'s kind; arguments and errors as of :func:`read_npz`."""
     arrays: dict[str, Any] = read_npz(path, schema_name, schema_of(cls), what=what, check=check)

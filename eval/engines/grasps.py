@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -19,6 +19,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from xreset.checks import frozen
 from xreset.errors import DemoError
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_rotate_inverse
@@ -40,7 +41,7 @@ NEAR = 0.025
 """A fingertip nearer than this [m] to the object's collision surface may touch it once the hand closes."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Grasps(Tensors):
     """G grasps: how a hand is about to hold an object."""
 
@@ -140,7 +141,9 @@ def _at_hand(
     pos = torch.as_tensor(motion.object_pos[rows], dtype=torch.float64)[:, None]
     quat = torch.as_tensor(motion.object_quat_wxyz[rows], dtype=torch.float64)[:, None]
     local = quat_rotate_inverse(quat.expand(-1, len(links), -1), tips - pos)
-    distance, _ = Surface(thing).signed_distance(local.flatten(0, 1))
+    points = local.flatten(0, 1)
+    only = torch.zeros(len(points), dtype=torch.long)
+    distance, _ = Surface(thing).field.signed_distance(points, only)
     near = (distance < NEAR).view(len(rows), len(links)).numpy()
     return rows[near[:, 0] & near[:, 1:].any(axis=1)]
 

@@ -6,9 +6,19 @@ import math
 from dataclasses import field
 from typing import Annotated, Literal
 
-from xreset.checks import Checked, Finite, NotNegative, Positive, Rule, Share, frozen
+from xreset.checks import (
+    Checked,
+    FiniteFloat,
+    NonNegativeFloat,
+    PositiveFinite,
+    PositiveFloat,
+    PositiveInt,
+    Rule,
+    Share,
+    frozen,
+)
 
-Point = tuple[Finite[float], Finite[float], Finite[float]]
+Point = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Pixels = Annotated[int, Rule("a number from 8 to 1024", lambda n: 8 <= n <= 1024)]
 
 
@@ -20,15 +30,15 @@ class DepthNoise(Checked):
     and Elberink 2012, Accuracy and Resolution of Kinect Depth Data).
     """
 
-    spread: NotNegative[float] = 0.002
+    spread: NonNegativeFloat = 0.002
     """Standard deviation of the depth at 1 m [m]."""
-    step: NotNegative[float] = 0.002
+    step: NonNegativeFloat = 0.002
     """Distance between two depths that the camera can tell apart at 1 m [m]."""
-    holes: Share[float] = 0.01
+    holes: Share = 0.01
     """Share of the pixels that see nothing."""
-    edges: Share[float] = 0.2
+    edges: Share = 0.2
     """Share of the pixels next to an edge that see nothing."""
-    edge: Positive[float] = 0.03
+    edge: PositiveFloat = 0.03
     """Step in depth that counts as an edge [m]. A plane has none, however steeply the camera sees it."""
 
 
@@ -47,9 +57,9 @@ class CameraConfig(Checked):
         math.radians(52.0)
     )
     """Vertical field of view [rad]."""
-    near: NotNegative[float] = 0.1
+    near: NonNegativeFloat = 0.1
     """Least depth that the camera measures [m]."""
-    far: Positive[Finite[float]] = 2.0
+    far: PositiveFinite = 2.0
     """Largest depth that the camera measures [m]."""
     noise: DepthNoise = field(default_factory=DepthNoise)
 
@@ -69,29 +79,25 @@ class VisionConfig(Checked):
     width: Pixels = 64
     """Pixels of an image, the same for all cameras."""
     height: Pixels = 64
-    interval: Positive[int] = 2
+    interval: PositiveInt = 2
     """Control steps from one image to the next: 2 is 30 Hz where control runs at 60 Hz."""
-    latency: NotNegative[float] = 0.0
+    latency: NonNegativeFloat = 0.0
     """Age of an image when the policy gets it [control steps], rounded to whole steps."""
     view: Literal["depth", "points"] = "depth"
     """``depth``: the images. ``points``: points of the images in the world, without those of the table and the robot,
     whose geometry is known."""
-    points: Positive[int] = 128
+    points: PositiveInt = 128
     """Points of the view ``points``, drawn at random from the pixels."""
     goal_image: bool = False
     """Whether the policy also sees the object at its goal: another image for each camera, or as many points."""
 
     @property
-    def channels(self) -> int:
-        """Images that the policy gets at a time."""
-        return len(self.cameras) * (2 if self.goal_image else 1)
-
-    @property
     def view_shape(self) -> tuple[int, int, int]:
         """Shape of one world's view: images, height, width; or clouds, points, coordinates and 1 (0: no point)."""
+        views = 2 if self.goal_image else 1
         if self.view == "depth":
-            return self.channels, self.height, self.width
-        return 2 if self.goal_image else 1, self.points, 4
+            return views * len(self.cameras), self.height, self.width
+        return views, self.points, 4
 
 
 STUDENT_VISION = VisionConfig(view="points", goal_image=True)

@@ -18,6 +18,7 @@ import trimesh
 from torch import Tensor
 
 from xreset.errors import XResetError, needs
+from xreset.geometry.collision import bounding_ball
 
 with needs("warp", "cameras"):
     import warp as wp
@@ -106,8 +107,9 @@ class RayCaster:
         self.pose = torch.eye(4, device=device).repeat(*bodies.shape, 1, 1)
         self.depth = torch.zeros(*shape, *size, device=device)
         self.body = torch.zeros(*shape, *size, dtype=torch.int8, device=device)
-        balls = torch.tensor([_ball(mesh) for mesh in meshes], dtype=torch.float32)
-        self._sphere = balls[bodies.cpu()].to(device)
+        balls = [bounding_ball(mesh.vertices) for mesh in meshes]
+        spheres = torch.tensor([(*center, radius) for center, radius in balls], dtype=torch.float32)
+        self._sphere = spheres[bodies.cpu()].to(device)
         try:
             with quiet():
                 self._on_stream = TorchStream(device)
@@ -139,12 +141,6 @@ class RayCaster:
         """Draw the images of the worlds that are due. Nothing waits for a GPU."""
         with self._on_stream():
             self._launch.launch()
-
-
-def _ball(mesh: trimesh.Trimesh) -> list[float]:
-    """Return center and radius of a sphere around a mesh."""
-    center = mesh.bounds.mean(axis=0)
-    return [*center, float(np.linalg.norm(mesh.vertices - center, axis=1).max())]
 
 
 def _warp_mesh(mesh: trimesh.Trimesh) -> Any:

@@ -19,11 +19,11 @@ from xreset.cameras.pose import mounted_pose
 from xreset.cameras.rays import RayCaster
 from xreset.errors import XResetError
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.rotations import quat_from_axis_angle, quat_to_matrix
-from xreset.geometry.shapes import winding_number
+from xreset.geometry.rotations import pose_matrix, quat_from_axis_angle, quat_to_matrix
+from xreset.geometry.shapes import box, shape_mesh, winding_number
 from xreset.geometry.urdf import link_meshes
 from xreset.physics import State
-from xreset.spec import SceneSpec, TableSpec
+from xreset.spec import SceneSpec
 from xreset.tensors import where
 
 _GOAL_COLOR = (0.3, 1.0, 0.3)
@@ -73,7 +73,8 @@ class Cameras:
         home = self._kinematics.link_poses(
             torch.as_tensor(robot.home, dtype=torch.float32, device=device), self._links
         )
-        table = _table(scene.table)
+        x, y, z = scene.table.half_size
+        table = shape_mesh(box((*scene.table.center, -z), (2 * x, 2 * y, 2 * z)))
         self._check_outside(home.cpu().numpy(), bodies, table)
         worlds = len(object_index)
         fixed = torch.arange(first_object, device=device).expand(worlds, -1)
@@ -124,20 +125,17 @@ class Cameras:
         rays = self.rays
         links = self._kinematics.link_poses(state.joint_pos, self._links)
         rays.pose[:, : self._num_links] = links[:, : self._num_links]
-        _set_pose(rays.pose[:, -1], state.object_pos, state.object_quat)
+        rays.pose[:, -1] = pose_matrix(quat_to_matrix(state.object_quat), state.object_pos)
         for i, mount in enumerate(self._mounts):
             self._believed[:, i] = (
                 self._mounted[i] if mount is None else links[:, mount] @ self._mounted[i]
             )
-        moved = torch.zeros_like(self._believed)
-        moved[..., :3, 3] = self.shift
-        moved[..., :3, :3] = quat_to_matrix(quat_from_axis_angle(self.turn))
-        moved[..., 3, 3] = 1.0
+        moved = pose_matrix(quat_to_matrix(quat_from_axis_angle(self.turn)), self.shift)
         self.pose.copy_(self._believed @ moved)
         self._tangent.copy_((self.fov_scale * self._half_fov).tan())
         self._due.copy_(due)
         if self._goal_rays is not None:
-            _set_pose(self._goal_rays.pose[:, 0], goal_pos, goal_quat)
+            self._goal_rays.pose[:, 0] = pose_matrix(quat_to_matrix(goal_quat), goal_pos)
 
     def cast(self) -> None:
         """Draw the images of the worlds that are due."""
@@ -264,15 +262,3 @@ def _bend(inverse: Tensor) -> Tensor:
     bend[..., 1:-1] = inverse.diff(n=2).abs()
     bend[..., 1:-1, :] = bend[..., 1:-1, :].maximum(inverse.diff(n=2, dim=-2).abs())
     return bend
-
-
-def _set_pose(pose: Tensor, pos: Tensor, quat: Tensor) -> None:
-    """Write positions [N, 3] and quaternions [N, 4] into poses [N, 4, 4]."""
-    pose[:, :3, :3] = quat_to_matrix(quat)
-    pose[:, :3, 3] = pos
-
-
-def _table(table: TableSpec) -> trimesh.Trimesh:
-    mesh = trimesh.creation.box(2 * np.array(table.half_size))
-    mesh.apply_translation((*table.center, -table.half_size[2]))
-    return mesh

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from xreset.checks import Options
+from xreset.checks import Options, frozen
 from xreset.cli._common import Flat, Source, Sources
 from xreset.cli._terminal import Progress, console, show_notes, show_table
 from xreset.errors import DemoError
@@ -154,7 +154,7 @@ def synth(
     _save(merge_demos(parts), out, config)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Selection(Options):
     """Conditions that a sequence must meet, all of them, and how many sequences of each object are kept."""
 
@@ -282,7 +282,10 @@ def add_noise(
     from xreset.demos.noise import TIERS, with_noise
 
     _save(
-        with_noise(_read(file), TIERS[tier], seed), out, {"noise": tier, "seed": seed}, demos=file
+        with_noise(_read(file), **TIERS[tier], seed=seed),
+        out,
+        {"noise": tier, "seed": seed},
+        demos=file,
     )
 
 

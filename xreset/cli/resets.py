@@ -8,7 +8,6 @@ from typing import Annotated
 
 from tyro.conf import arg
 
-from xreset.accounts import accounts_path, write_accounts
 from xreset.cli._common import Device, Objects, Several, Source, show_accounts
 from xreset.cli._terminal import Progress, console, show_notes
 from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
@@ -77,19 +76,15 @@ def resets(
     }
     write_bank(out, bank, config=config, inputs={"retargeted": str(inputs.hash)})
     accounts = bank.accounts()
-    counts = accounts_path(out)
-    write_accounts(counts, of="states tried in physics", rows=accounts, pressing=bank.num_pressing)
     show_accounts(accounts, f"{bank.robot}: {title}")
-    if squeeze.presses:
-        force = f"{squeeze.force:g} N"
-        if squeeze.weight:
-            force += f" and {squeeze.weight:g} times the object's weight"
-        pressing = f"{bank.num_pressing} of {bank.post_contact.sum()} states after contact"
-        console.print(f"{pressing} press with {force}")
+    if squeeze.force > 0:
+        console.print(
+            f"{bank.num_pressing} of {bank.post_contact.sum()} states after contact press with {squeeze.force:g} N"
+        )
     tried = bank.num_states + len(bank.rejected_reason)
     share = accounts[-1].kept / max(motion.annotated.sum(), 1)
     console.print(f"{share:.0%} of the annotated frames are kept")
-    console.print(f"{bank.num_states} states of {tried} kept in {out}; counts in {counts}")
+    console.print(f"{bank.num_states} states of {tried} kept in {out}")
 
 
 COMMAND = resets

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from xreset.accounts import accounts_path, write_accounts
 from xreset.cli._common import Objects, Source, show_accounts
 from xreset.cli._terminal import Progress, console, show_notes
 from xreset.files import file_hash
@@ -72,10 +71,8 @@ def retarget(
         inputs={"demos": file_hash(demos), "robot": spec.fingerprint}
         | {f"object {s.name}": s.source for s in specs.values()},
     )
-    accounts = result.accounts()
-    write_accounts(accounts_path(out), of="frames", rows=accounts)
     show_accounts(
-        [row.without("not annotated") for row in accounts],
+        [row.without("not annotated") for row in result.accounts()],
         f"annotated frames retargeted to {result.robot}: those that are valid",
     )
     tips = result.hand_error[result.annotated]
@@ -94,9 +91,7 @@ def retarget(
             f"{chosen.sequence_name[index]}: the object starts on top of something that is not in the scene; "
             "it was not lowered to the table."
         )
-    console.print(
-        f"{int(result.valid.sum())} valid frames of {len(result.valid)} in {out}; counts in {accounts_path(out)}"
-    )
+    console.print(f"{int(result.valid.sum())} valid frames of {len(result.valid)} in {out}")
 
 
 COMMAND = retarget

@@ -23,6 +23,7 @@ from xreset.records import (
     POSITION,
     RATE,
     UNIT_TOLERANCE,
+    Arrays,
     Field,
     arrays_of,
     offsets_problem,
@@ -197,7 +198,7 @@ class Demos(ObjectMotions):
             chosen = self._few_per_object(chosen, max_per_object, share, spread, seed)
         if not len(chosen):
             raise DemoError("No sequence meets all conditions of the selection. Relax one of them.")
-        frames = [np.arange(self.frame_offsets[i], self.frame_offsets[i + 1]) for i in chosen]
+        frames = [np.r_[self.frames(i)] for i in chosen.tolist()]
         rows = np.concatenate(frames)
         changes = {name: getattr(self, name)[chosen] for name in _PER_SEQUENCE}
         changes |= {name: getattr(self, name)[rows] for name in _PER_FRAME}
@@ -442,7 +443,7 @@ def _offsets(lengths: Sequence[int] | np.ndarray) -> np.ndarray:
     return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
 
 
-def sequences_problem(arrays: Mapping[str, Any]) -> str | None:
+def sequences_problem(arrays: Arrays) -> str | None:
     """Return what is wrong with the sequences of motions: their frames, their names, or the sides of the hands [S]."""
     if problem := offsets_problem(arrays, len(arrays["object_pos"])):
         return problem
@@ -460,7 +461,7 @@ def _check(demos: Demos) -> None:
         raise DemoError(f"The demonstrations cannot be used: {problem}")
 
 
-def _problem(arrays: Mapping[str, Any]) -> str | None:
+def _problem(arrays: Arrays) -> str | None:
     """Return the first contradiction, or None. Types, shapes and the fields' own ranges have been checked."""
     offsets = arrays["frame_offsets"]
     names = arrays["sequence_name"]

@@ -19,6 +19,7 @@ from xreset.demos.archive import Demos, merge_demos
 from xreset.demos.keypoints import Convention, read_transform, sequence_of
 from xreset.demos.pickles import array_of, read_pickle
 from xreset.errors import DemoError
+from xreset.records import Arrays
 from xreset.text import shown
 
 _FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -74,7 +75,7 @@ def read_ho3d(
     return merge_demos(parts)
 
 
-def _read_sequence(folder: Path, fps: float) -> dict[str, np.ndarray]:
+def _read_sequence(folder: Path, fps: float) -> Arrays:
     """Return the arrays of a sequence for :func:`sequence_of`, from its first to its last known object pose."""
     paths = {}
     for path in sorted(folder.glob("*.pkl")):

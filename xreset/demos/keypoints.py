@@ -25,7 +25,7 @@ from xreset.errors import DemoError
 from xreset.files import max_bytes
 from xreset.geometry.shapes import transformed
 from xreset.objects.catalogue import official_name
-from xreset.records import RATE, UNIT_TOLERANCE, Field, read_npz
+from xreset.records import RATE, UNIT_TOLERANCE, Arrays, Field, read_npz
 from xreset.text import is_plain, shown
 
 Order = Literal["mano", "mediapipe", "openpose"]
@@ -180,10 +180,10 @@ def read_transform(path: str | Path) -> np.ndarray:
 # Files
 
 
-def _read_csv(path: Path, name: str) -> Iterator[dict[str, np.ndarray]]:
+def _read_csv(path: Path, name: str) -> Iterator[Arrays]:
     """Yield the arrays of each sequence of a table with one row for each frame, as an npz would hold them; an empty
     cell is NaN. The frames of a sequence stand together."""
-    arrays: dict[str, np.ndarray] = {}
+    arrays = {}
     try:
         if path.stat().st_size > max_bytes():
             raise ValueError(
@@ -234,7 +234,7 @@ def _numbers(cells: Sequence[str]) -> np.ndarray:
 # One sequence
 
 
-def sequence_of(arrays: Mapping[str, np.ndarray], what: str, convention: Convention) -> Demos:
+def sequence_of(arrays: Arrays, what: str, convention: Convention) -> Demos:
     """Return one sequence from the arrays of a file; see :func:`read_keypoints` for errors, in which ``what`` names the
     sequence."""
     try:
@@ -243,7 +243,7 @@ def sequence_of(arrays: Mapping[str, np.ndarray], what: str, convention: Convent
         raise DemoError(f"{what}: {error}") from None
 
 
-def _sequence(arrays: Mapping[str, np.ndarray], convention: Convention) -> Demos:
+def _sequence(arrays: Arrays, convention: Convention) -> Demos:
     scale = 1e-3 if convention.units == "mm" else 1.0
     points = np.asarray(arrays["keypoints"], dtype=float) * scale
     valid = np.isfinite(points).all(axis=(1, 2))
@@ -281,7 +281,7 @@ def _sequence(arrays: Mapping[str, np.ndarray], convention: Convention) -> Demos
     )
 
 
-def _text(arrays: Mapping[str, np.ndarray], field: str, option: str | None) -> str:
+def _text(arrays: Arrays, field: str, option: str | None) -> str:
     """Return a text of the file or of the command line, which must not contradict each other."""
     if field not in arrays and option is None:
         raise DemoError(f"the {field} is neither in the file nor given. Add --{field}.")
@@ -341,7 +341,7 @@ def _check_hand(points: np.ndarray, convention: Convention, side: str) -> None:
         )
 
 
-def _object_pose(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray, Rotation]:
+def _object_pose(arrays: Arrays) -> tuple[np.ndarray, Rotation]:
     """Return position [F, 3] and orientation of the object, in the file's unit and frame."""
     given = [name for name in _FILE if name.startswith("object_") and name in arrays]
     if given not in (
@@ -375,9 +375,7 @@ def _object_pose(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray, Rotation
     return pos, Rotation.from_quat(values, scalar_first=name == "object_quat_wxyz")
 
 
-def _evenly(
-    arrays: Mapping[str, np.ndarray], convention: Convention, motion: Motion
-) -> tuple[float, Motion]:
+def _evenly(arrays: Arrays, convention: Convention, motion: Motion) -> tuple[float, Motion]:
     """Return the rate, and the motion at that rate: as it is, or interpolated between its own times."""
     if "time" not in arrays:
         rate = float(arrays["fps"]) if "fps" in arrays else convention.fps

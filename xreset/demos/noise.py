@@ -13,7 +13,6 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from xreset.checks import frozen
 from xreset.demos.archive import Demos
 from xreset.demos.hand import PARENTS
 
@@ -21,33 +20,23 @@ MEMORY = math.exp(-1 / 8)
 """Correlation of a finger's error with that of the frame before."""
 
 
-@frozen
-class HandNoise:
-    """How wrong a hand tracker is."""
-
-    wrist: float
-    """The offset of a demonstration is uniform within this bound along each axis of the table frame [m]."""
-    finger: float
-    """Standard deviation of a keypoint's error along each axis of the palm [m]."""
-    cap: float
-    """Largest error of a keypoint [m], before the bones get their lengths back. A fingertip moves with the bones before
-    it, so it may end up farther away."""
-
-
 TIERS = {
-    "low": HandNoise(wrist=0.010, finger=0.0015, cap=0.003),
-    "medium": HandNoise(wrist=0.020, finger=0.003, cap=0.006),
-    "high": HandNoise(wrist=0.040, finger=0.006, cap=0.012),
+    "low": {"wrist": 0.010, "finger": 0.0015, "cap": 0.003},
+    "medium": {"wrist": 0.020, "finger": 0.003, "cap": 0.006},
+    "high": {"wrist": 0.040, "finger": 0.006, "cap": 0.012},
 }
 """The paper's tiers."""
 
 
-def with_noise(demos: Demos, noise: HandNoise, seed: int = 0) -> Demos:
+def with_noise(demos: Demos, *, wrist: float, finger: float, cap: float, seed: int = 0) -> Demos:
     """Return demonstrations with errors of the hand's keypoints [F, 21, 3]; bones keep their lengths.
 
     Args:
         demos: demonstrations of right or left hands.
-        noise: how large the errors are, for example one of :data:`TIERS`.
+        wrist: the offset of a demonstration is uniform within this bound along each axis of the table frame [m].
+        finger: standard deviation of a keypoint's error along each axis of the palm [m].
+        cap: largest error of a keypoint [m], before the bones get their lengths back. A fingertip moves with the bones
+            before it, so it may end up farther away.
         seed: chooses the errors.
     """
     random = np.random.default_rng(seed)
@@ -55,10 +44,10 @@ def with_noise(demos: Demos, noise: HandNoise, seed: int = 0) -> Demos:
     for sequence in range(demos.num_sequences):
         frames = demos.frames(sequence)
         count = frames.stop - frames.start
-        offset = random.uniform(-noise.wrist, noise.wrist, 3)
-        errors = _wandering(random.normal(0.0, noise.finger, (count, 20, 3)))
+        offset = random.uniform(-wrist, wrist, 3)
+        errors = _wandering(random.normal(0.0, finger, (count, 20, 3)))
         size = np.linalg.norm(errors, axis=-1, keepdims=True)
-        errors *= np.minimum(1.0, noise.cap / np.maximum(size, 1e-12))
+        errors *= np.minimum(1.0, cap / np.maximum(size, 1e-12))
         seen = demos.hand_valid[frames]
         hand = keypoints[frames][seen]
         palm = Rotation.from_quat(

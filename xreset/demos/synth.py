@@ -17,14 +17,13 @@ from typing import Literal, TypeVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xreset.checks import frozen
 from xreset.demos import hand
 from xreset.demos.archive import Demos, merge_demos, one_sequence
 from xreset.demos.grasp import Contacts, Grasp, Solid, fit_hand, handedness, plan_contacts
 from xreset.errors import DemoError
 from xreset.objects.catalogue import load_objects, object_names
 from xreset.objects.rest import rest_height, resting_orientation
-from xreset.progress import unseen
+from xreset.progress import Progress, unseen
 from xreset.spec import ObjectSpec
 
 T = TypeVar("T")
@@ -69,7 +68,7 @@ def synthesize(
     fps: float = 30.0,
     side: Literal["right", "left"] = "right",
     meshes: str | Path | None = None,
-    progress: Callable[[float, int], None] = unseen,
+    progress: Progress = unseen,
 ) -> Demos:
     """Make synthetic demonstrations of the built-in stand-ins, or of the objects of a folder of meshes, which stand
     with z up.
@@ -122,19 +121,18 @@ def _sequence(
     path = _best_of(
         _GRASP_TRIES,
         lambda: _clear_approach(_grasp(obj, resting, plans, side, rng), timing, rng),
-        is_good=lambda path: path.gap > 0,
-        cost=lambda path: -path.gap,
+        is_good=lambda path: path[0] > 0,
+        cost=lambda path: -path[0],
     )
-    grasp = path.grasp
+    _, grasp, wrist_pos, wrist_rot, angles = path
     solid = grasp.solid
     object_pos, object_rot = _object_path(solid.pos, solid.rotation, timing, rng)
     # From the lift on, the hand moves with the object.
     moved = object_rot * solid.rotation.inv()
-    held = (np.arange(timing.frames) >= timing.lift)[:, None]
-    wrist_pos = np.where(
-        held, moved.apply(grasp.wrist_pos - solid.pos) + object_pos, path.wrist_pos
-    )
-    wrist_quat = np.where(held, (moved * grasp.wrist_rot).as_quat(), path.wrist_rot.as_quat())
+    held = (np.arange(len(angles)) >= timing[2])[:, None]
+    carried = moved.apply(grasp.wrist_pos - solid.pos) + object_pos
+    wrist_pos = np.where(held, carried, wrist_pos)
+    wrist_quat = np.where(held, (moved * grasp.wrist_rot).as_quat(), wrist_rot.as_quat())
     wrist_rot = Rotation.from_quat(wrist_quat)
     return one_sequence(
         name=name,
@@ -142,7 +140,7 @@ def _sequence(
         object_name=obj.name,
         side=side,
         fps=fps,
-        keypoints=_placed_hand(wrist_pos, wrist_rot, path.angles, side),
+        keypoints=_placed_hand(wrist_pos, wrist_rot, angles, side),
         wrist=wrist_rot,
         object_pos=object_pos,
         object_rot=object_rot,
@@ -213,47 +211,19 @@ def _best_of(
 # Motion ---------------------------------------------------------------------------------------------------------------
 
 
-@frozen
-class _Timing:
-    """Events of a demonstration, as numbers of frames."""
-
-    frames: int
-    """T, all frames."""
-    reach: int
-    """The hand has arrived."""
-    close: int
-    """The fingers are on the object."""
-    lift: int
-    """The object begins to move."""
-    end: int
-    """The object is at the goal."""
-
-
-@frozen
-class _HandPath:
-    """A hand's motion up to the grasp, [T] frames; the grasp holds to the end."""
-
-    grasp: Grasp
-    wrist_pos: np.ndarray
-    """[T, 3]"""
-    wrist_rot: Rotation
-    """T orientations."""
-    angles: np.ndarray
-    """[T, 17] joint angles."""
-    gap: float
-    """Smallest distance of a keypoint to object and table until the lift [m]."""
+_Timing = tuple[int, ...]
+"""Events of a demonstration, as numbers of frames: the hand has arrived, the fingers are on the object, the object
+begins to move, it is at the goal, and the last frame."""
+_HandPath = tuple[float, Grasp, np.ndarray, Rotation, np.ndarray]
+"""A hand's motion up to the grasp, which holds to the end: the smallest distance of a keypoint to object and table
+until the lift [m], the grasp, positions [T, 3] and T orientations of the wrist, and joint angles [T, 17]."""
 
 
 def _random_timing(fps: float, rng: np.random.Generator) -> _Timing:
     """Draw the timing of a demonstration of about 2.4 s whose object leaves the table after about 1.15 s."""
-    durations = [
-        rng.uniform(*span)
-        for span in ((0.75, 0.95), (0.15, 0.25), (0.05, 0.1), (0.8, 1.0), (0.25, 0.45))
-    ]
-    reach, close, lift, end, last = (
-        round(float(seconds) * fps) for seconds in np.cumsum(durations)
-    )
-    return _Timing(frames=last + 1, reach=reach, close=close, lift=lift, end=end)
+    spans = ((0.75, 0.95), (0.15, 0.25), (0.05, 0.1), (0.8, 1.0), (0.25, 0.45))
+    seconds = np.cumsum([rng.uniform(*span) for span in spans])
+    return tuple(round(second * fps) for second in seconds.tolist())
 
 
 def _object_path(
@@ -274,10 +244,10 @@ def _object_path(
     turn = Rotation.from_rotvec(tilt) * Rotation.from_euler(
         "z", np.radians(rng.uniform(-45.0, 45.0))
     )
-    frame = np.arange(timing.frames)
-    rise = _minimum_jerk(frame, timing.lift, timing.end)
-    clear_of_table = timing.lift + 0.2 * (timing.end - timing.lift)
-    turned = _minimum_jerk(frame, clear_of_table, timing.end)
+    _, _, lift, end, last = timing
+    frame = np.arange(last + 1)
+    rise = _minimum_jerk(frame, lift, end)
+    turned = _minimum_jerk(frame, lift + 0.2 * (end - lift), end)  # clear of the table
     object_rot = Rotation.from_rotvec(turned[:, None] * turn.as_rotvec()) * rest
     return pos + rise[:, None] * (goal - pos), object_rot
 
@@ -288,8 +258,8 @@ def _clear_approach(grasp: Grasp, timing: _Timing, rng: np.random.Generator) -> 
     return _best_of(
         _TRIES,
         lambda: _approach(grasp, timing, rng),
-        is_good=lambda path: path.gap > _CLEAR,
-        cost=lambda path: -path.gap,
+        is_good=lambda path: path[0] > _CLEAR,
+        cost=lambda path: -path[0],
     )
 
 
@@ -303,7 +273,8 @@ def _placed_hand(pos: np.ndarray, rotation: Rotation, angles: np.ndarray, side: 
 def _approach(grasp: Grasp, timing: _Timing, rng: np.random.Generator) -> _HandPath:
     """Move to a place before the object while the hand opens, then forward, then close: minimum-jerk motions that
     overlap."""
-    frame = np.arange(timing.frames)
+    reach, close, lift, _, last = timing
+    frame = np.arange(last + 1)
     mirror = handedness(grasp.side)
     x = grasp.solid.pos[0] - mirror * rng.uniform(-0.05, 0.20)
     y = rng.uniform(0.60, 0.80)
@@ -316,24 +287,22 @@ def _approach(grasp: Grasp, timing: _Timing, rng: np.random.Generator) -> _HandP
     before = grasp.wrist_pos - rng.uniform(0.07, 0.10) * inward / np.linalg.norm(inward)
     before[2] = max(before[2], grasp.wrist_pos[2])
 
-    coming = _minimum_jerk(frame, 0, 0.75 * timing.reach)[:, None]
-    entering = _minimum_jerk(frame, 0.5 * timing.reach, timing.close)[:, None]
+    coming = _minimum_jerk(frame, 0, 0.75 * reach)[:, None]
+    entering = _minimum_jerk(frame, 0.5 * reach, close)[:, None]
     wrist_pos = start + coming * (before - start) + entering * (grasp.wrist_pos - before)
-    turning = _minimum_jerk(frame, 0, 0.85 * timing.reach)[:, None]
+    turning = _minimum_jerk(frame, 0, 0.85 * reach)[:, None]
     wrist_rot = (
         Rotation.from_rotvec((1 - turning) * (start_rot * grasp.wrist_rot.inv()).as_rotvec())
         * grasp.wrist_rot
     )
 
     opened = np.clip(grasp.angles - _OPENING, hand.LOWER, hand.UPPER)
-    opening = _minimum_jerk(frame, 0.1 * timing.reach, 0.65 * timing.reach)[:, None]
-    closing = _minimum_jerk(frame, 0.8 * timing.reach, timing.close)[:, None]
+    opening = _minimum_jerk(frame, 0.1 * reach, 0.65 * reach)[:, None]
+    closing = _minimum_jerk(frame, 0.8 * reach, close)[:, None]
     angles = hand.RELAXED + opening * (opened - hand.RELAXED) + closing * (grasp.angles - opened)
-    points = _placed_hand(wrist_pos, wrist_rot, angles, grasp.side)[: timing.lift]
+    points = _placed_hand(wrist_pos, wrist_rot, angles, grasp.side)[:lift]
     gap = min(grasp.solid.distance(points).min(), points[..., 2].min())
-    return _HandPath(
-        grasp=grasp, wrist_pos=wrist_pos, wrist_rot=wrist_rot, angles=angles, gap=float(gap)
-    )
+    return float(gap), grasp, wrist_pos, wrist_rot, angles
 
 
 def _minimum_jerk(frame: np.ndarray, start: float, end: float) -> np.ndarray:

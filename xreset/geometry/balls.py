@@ -100,12 +100,12 @@ def hand_balls(hand: Kinematics, collision: SelfCollision) -> Balls:
         links=links,
         slices=slices,
         link=torch.as_tensor(np.repeat(np.arange(len(links)), [len(own) for own in radii])),
-        centers=_joined(centers, 3),
-        radii=_joined(radii),
+        centers=joined(centers, 3),
+        radii=joined(radii),
         bound_centers=bound_centers,
         bound_radii=bound_radii,
-        guards=_joined(guards).long(),
-        guard_radii=_joined(guard_radii),
+        guards=joined(guards).long(),
+        guard_radii=joined(guard_radii),
         guard_slices=_slices(guard_radii),
         fields=DistanceFields.join([link_field(shapes) for shapes in solids.values()]),
         link_pairs=torch.as_tensor(both_ways.reshape(-1, 2)),
@@ -118,7 +118,7 @@ def _slices(parts: Sequence[np.ndarray]) -> tuple[slice, ...]:
     return tuple(slice(first, end) for first, end in pairwise(ends))
 
 
-def _joined(parts: Sequence[np.ndarray], *shape: int) -> Tensor:
+def joined(parts: Sequence[np.ndarray], *shape: int) -> Tensor:
     """[n, *shape] all parts in one tensor, even if there is none."""
     return torch.as_tensor(np.concatenate([np.zeros((0, *shape)), *parts]))
 

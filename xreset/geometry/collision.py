@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from itertools import combinations
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -62,31 +61,17 @@ def bounding_ball(points: np.ndarray, radii: ArrayLike = 0.0) -> tuple[np.ndarra
     return center, float((np.linalg.norm(points - center, axis=1) + radii).max())
 
 
-class SupportPoints(NamedTuple):
-    """Support points of a robot's shapes."""
-
-    links: tuple[str, ...]
-    """Link of each point (length H)."""
-    points: np.ndarray
-    """[H, 3] in the link's frame."""
-    radii: np.ndarray
-    """[H] radius of the ball around each."""
-
-
-def table_points(kinematics: Kinematics) -> SupportPoints:
-    """Return the support points of every link of a robot that may not touch the table."""
-    links = []
-    points = [np.zeros((0, 3))]
-    radii = []
+def table_points(kinematics: Kinematics) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return the support points [H, 3] of every link of a robot that may not touch the table, in the link's frame, and
+    the radii [H] of the balls around them."""
+    found = {}
     for name in kinematics.link_names:
-        if name in kinematics.robot.table_exclude:
-            continue
-        for shape in kinematics.tree.link(name).collisions:
-            own, radius = support_points(shape)
-            points.append(own)
-            links += [name] * len(own)
-            radii += [radius] * len(own)
-    return SupportPoints(links=tuple(links), points=np.concatenate(points), radii=np.array(radii))
+        shapes = kinematics.tree.link(name).collisions
+        if shapes and name not in kinematics.robot.table_exclude:
+            points, radii = zip(*map(support_points, shapes), strict=True)
+            radii = np.repeat(radii, [len(own) for own in points])
+            found[name] = np.concatenate(points), radii
+    return found
 
 
 def height_above_table(points: Tensor, radii: Tensor, table: TableSpec) -> Tensor:
@@ -101,8 +86,10 @@ def height_above_table(points: Tensor, radii: Tensor, table: TableSpec) -> Tenso
 def table_clearance(kinematics: Kinematics, q: Tensor, table: TableSpec) -> Tensor:
     """[B] lowest height of the robot's moving shapes above the table [m], at joint positions [B, J]."""
     support = table_points(kinematics)
-    points = kinematics.points(q, support.links, q.new_tensor(support.points))
-    return height_above_table(points, q.new_tensor(support.radii), table).amin(dim=-1)
+    points, radii = map(np.concatenate, zip(*support.values(), strict=True))
+    links = np.repeat([*support], [len(own) for own, _ in support.values()])
+    centers = kinematics.points(q, links.tolist(), q.new_tensor(points))
+    return height_above_table(centers, q.new_tensor(radii), table).amin(dim=-1)
 
 
 class SelfCollision:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from xreset.errors import RobotError
-from xreset.geometry.rotations import matvec, quat_to_matrix
+from xreset.geometry.rotations import matvec, pose_matrix, quat_to_matrix
 from xreset.geometry.urdf import Joint, robot_tree
 from xreset.spec import MimicSpec, RobotSpec
 
@@ -117,8 +117,8 @@ class Kinematics:
         self.base = torch.eye(4, dtype=dtype, device=self.device)
         """[4, 4] default pose of the root: the robot's base in the world, or the identity below another root."""
         if self.root == tree.root:
-            self.base[:3, :3] = quat_to_matrix(self._tensor(robot.base_quat))
-            self.base[:3, 3] = self._tensor(robot.base_pos)
+            turn = quat_to_matrix(self._tensor(robot.base_quat))
+            self.base = pose_matrix(turn, self._tensor(robot.base_pos))
 
     def _couple(self, moving: Sequence[Joint], mimics: Mapping[str, MimicSpec]) -> None:
         """Set how the moving joints follow from the actuated ones, and the limits that result."""
@@ -212,11 +212,7 @@ class Kinematics:
         indices = [self.link_index(name) for name in (self.link_names if links is None else links)]
         rot, pos, _, _ = self._forward(q, base, indices)
         shape = (*q.shape[:-1], len(indices))
-        poses = q.new_zeros(*shape, 4, 4)
-        poses[..., :3, :3] = rot.view(*shape, 3, 3)
-        poses[..., :3, 3] = pos.view(*shape, 3)
-        poses[..., 3, 3] = 1.0
-        return poses
+        return pose_matrix(rot.view(*shape, 3, 3), pos.view(*shape, 3))
 
     def points(
         self,

@@ -95,6 +95,15 @@ def matrix_to_quat(R: Tensor) -> Tensor:
     return quat_normalize(candidates.gather(-2, best).squeeze(-2))
 
 
+def pose_matrix(R: Tensor, pos: Tensor) -> Tensor:
+    """[..., 4, 4] pose of a rotation matrix [..., 3, 3] and a position [..., 3]."""
+    T = pos.new_zeros(*pos.shape[:-1], 4, 4)
+    T[..., :3, :3] = R
+    T[..., :3, 3] = pos
+    T[..., 3, 3] = 1.0
+    return T
+
+
 def matvec(matrix: Tensor, vector: Tensor) -> Tensor:
     """[..., n] product of matrices [..., n, m] and vectors [..., m]; both broadcast."""
     return (matrix @ vector[..., None])[..., 0]

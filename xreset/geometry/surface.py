@@ -8,10 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.shapes import half_spaces, plane_heights, surface_of
@@ -98,10 +96,6 @@ class Surface:
         rows = np.arange(len(points))
         best = distances.argmin(axis=1)
         return candidates[rows, best], distances[rows, best]
-
-    def signed_distance(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance [N] and its gradient [N, 3] at points [N, 3]: see :meth:`DistanceFields.signed_distance`."""
-        return self.field.signed_distance(points, torch.zeros(len(points), dtype=torch.long))
 
     def contacts(
         self,

@@ -29,6 +29,7 @@ from xreset.geometry.urdf import joint_limits
 from xreset.records import (
     JOINT,
     POSITION,
+    Arrays,
     Field,
     read_record,
     schema_of,
@@ -150,14 +151,14 @@ def no_states(robot: RobotSpec) -> dict[str, Any]:
         "robot": robot.name,
         "robot_fingerprint": robot.fingerprint,
         "joint_names": robot.joint_names,
-        "joint_pos": np.zeros((0, len(robot.joints)), np.float32),
         "backends": (),
         "reason_names": (),
     }
+    lengths: dict[Any, Any] = {"L": 0, "C": 0, "J": len(robot.joints)}
     for name, schema in schema_of(ResetBank).items():
-        if schema.required and name != "joint_pos" and schema.shape[:1] in (("L",), ("C",)):
-            columns = [int(size) for size in schema.shape[1:]]
-            empty[name] = np.zeros((0, *columns), _KINDS[schema.kind])
+        if schema.required and schema.shape[:1] in (("L",), ("C",)):
+            shape = [lengths.get(size, size) for size in schema.shape]
+            empty[name] = np.zeros(shape, _KINDS[schema.kind])
     return empty
 
 
@@ -278,7 +279,7 @@ def _described(source: str) -> str:
     return "the built-in stand-in" if source == "stand-in" else "an imported mesh"
 
 
-def bank_problem(arrays: dict[str, np.ndarray]) -> str | None:
+def bank_problem(arrays: Arrays) -> str | None:
     """Return what contradicts itself between the arrays of a bank, or None."""
     if problem := unique_problem(arrays["sequence_name"]):
         return problem

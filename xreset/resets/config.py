@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
-from xreset.checks import Checked, Finite, NotNegative, Positive, frozen
+from xreset.checks import (
+    Checked,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFinite,
+    PositiveInt,
+    frozen,
+)
 
 
 @frozen
 class FilterConfig(Checked):
     """Limits of the physics filter (:mod:`xreset.resets.filter`); the velocities are those after the last step."""
 
-    steps: Positive[int] = 8
+    steps: PositiveInt = 8
     """Control steps of 1/60 s with the drives holding. The published paper holds 48, a parallel jaw 240."""
-    linear_velocity: Positive[Finite[float]] = 0.10
+    linear_velocity: PositiveFinite = 0.10
     """Largest speed of the object's origin [m/s]; published 0.5."""
-    angular_velocity: Positive[Finite[float]] = 1.0
+    angular_velocity: PositiveFinite = 1.0
     """Largest angular speed of the object [rad/s]; published 15."""
-    joint_velocity: Positive[Finite[float]] = 2.0
+    joint_velocity: PositiveFinite = 2.0
     """Largest joint speed [rad/s or m/s]; published 10."""
 
 
@@ -23,9 +30,9 @@ class FilterConfig(Checked):
 class ClosingConfig(Checked):
     """More states where a hand closes in on an object (:mod:`xreset.resets.closing`)."""
 
-    spacing: Positive[Finite[float]] | None = None
+    spacing: PositiveFinite | None = None
     """Farthest that any fingertip moves from one state to the next [m], such as 0.005. None: no states are added."""
-    within: Positive[Finite[float]] = 0.10
+    within: PositiveFinite = 0.10
     """Only between frames of which one has a finger nearer than this to the object [m]."""
 
 
@@ -33,28 +40,10 @@ class ClosingConfig(Checked):
 class SqueezeConfig(Checked):
     """Drive targets that press (:func:`xreset.resets.fingers.squeeze_targets`)."""
 
-    force: NotNegative[float] = 0.0
+    force: NonNegativeFloat = 0.0
     """Normal force of each finger that is at the object [N]. 0: targets are the joints' positions."""
-    weight: NotNegative[float] = 0.0
-    """Further force, as a share of the object's weight, such as 1: heavy objects slip out of a grasp that tilts light
-    ones."""
-    balanced: bool = False
-    """Whether the forces on an object nearly cancel, with the same mean: the thumb presses as hard as the fingers that
-    oppose it."""
-    reach: Positive[Finite[float]] = 0.005
+    reach: PositiveFinite = 0.005
     """A finger nearer than this to the object is at it [m]."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.balanced and not self.presses:
-            raise ValueError(
-                "balanced is True and there is no force to balance. Set force or weight"
-            )
-
-    @property
-    def presses(self) -> bool:
-        """Whether there is any force."""
-        return self.force > 0 or self.weight > 0
 
 
 @frozen
@@ -62,24 +51,24 @@ class GoalConfig(Checked):
     """How a goal set is drawn (:mod:`xreset.resets.goals`). Offsets are those of the published paper's evaluation of
     objects without demonstrations (its table A3); the height of a lift is not in the paper."""
 
-    per_family: Positive[int] = 20
+    per_family: PositiveInt = 20
     """Goals of each object and family."""
-    lift: Positive[Finite[float]] = 0.20
+    lift: PositiveFinite = 0.20
     """Height of the goal above the start [m]."""
-    angle: NotNegative[float] = 60.0
+    angle: NonNegativeFloat = 60.0
     """Angle of the families ``yaw``, ``tilt-x`` and ``tilt-y`` [degrees]."""
-    start_xy: NotNegative[float] = 0.02
+    start_xy: NonNegativeFloat = 0.02
     """Starts are moved by U(-x, x) in both directions [m]."""
-    start_yaw: NotNegative[float] = 25.0
+    start_yaw: NonNegativeFloat = 25.0
     """Starts are turned about the vertical by U(-y, y) [degrees]."""
-    goal_xy: NotNegative[float] = 0.03
+    goal_xy: NonNegativeFloat = 0.03
     """Goals are moved by U(-x, x) in both directions [m]."""
-    goal_z: NotNegative[float] = 0.05
+    goal_z: NonNegativeFloat = 0.05
     """Goals are moved up or down by U(-z, z) [m]."""
-    goal_yaw: NotNegative[float] = 30.0
+    goal_yaw: NonNegativeFloat = 30.0
     """Goals are turned about the vertical by U(-y, y) [degrees]."""
     upright: bool = False
     """Whether objects start in the resting pose whose mesh direction z points up. Otherwise they start in any of
     theirs, a broad face more often than a narrow one."""
-    seed: NotNegative[int] = 0
+    seed: NonNegativeInt = 0
     """The same seed gives the same goals."""

@@ -7,13 +7,14 @@ restores a demonstrated hand-object state. The goal is the last object pose of t
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from xreset.checks import frozen
 from xreset.errors import DemoError
 from xreset.geometry.rotations import quat_from_axis_angle, quat_multiply, quat_rotate
 from xreset.geometry.urdf import joint_limits
@@ -23,7 +24,7 @@ from xreset.task.config import ResetConfig
 from xreset.tensors import Tensors, where
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Reset(Tensors):
     """Start of M episodes."""
 
@@ -48,7 +49,7 @@ class Reset(Tensors):
         return self.state >= 0
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class _Demonstrations(Tensors):
     """Starts and goals of demonstrations [S]."""
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from xreset.errors import DemoError
 from xreset.physics import Backend, State
-from xreset.progress import unseen
+from xreset.progress import Progress, unseen
 from xreset.resets.bank import ResetBank, check_joints, starts_and_goals
 from xreset.resets.closing import closing_states, positions_between, rotations_between
 from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
@@ -69,7 +69,7 @@ def make_bank(
     limits: FilterConfig | None = None,
     closing: ClosingConfig | None = None,
     squeeze: SqueezeConfig | None = None,
-    progress: Callable[[float, int], None] = unseen,
+    progress: Progress = unseen,
 ) -> ResetBank:
     """Try every valid frame in every engine and keep those that all engines accept.
 
@@ -149,7 +149,7 @@ def make_bank(
 
     work = len(engines) * len(frame)
     reason = try_candidates(np.arange(len(frame)), lambda done: progress(done, work))
-    if squeeze.presses:
+    if squeeze.force > 0:
         rows = np.flatnonzero((reason < 0) & post_contact)
         fingers = fingers_of(
             robot, used, object_name[rows], joint_pos[rows], object_pos[rows], object_quat[rows]
@@ -173,7 +173,7 @@ def make_bank(
         starts_and_goals(retargeted, robot, {o.name: o.source for o in objects}),
         backends=engines,
         joint_pos=joint_pos[keep].astype(np.float32),
-        joint_target=target[keep] if squeeze.presses else None,
+        joint_target=target[keep] if squeeze.force > 0 else None,
         object_pos=object_pos[keep].astype(np.float32),
         object_quat_wxyz=object_quat[keep].astype(np.float32),
         object_name=object_name[keep],

@@ -16,17 +16,15 @@ from torch import Tensor
 from xreset.physics import Backend, State
 from xreset.progress import Progress, unseen
 from xreset.resets.bank import ResetBank
+from xreset.resets.config import FilterConfig
+from xreset.resets.filter import rejection
 from xreset.resets.probe import probe
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
-from xreset.task.config import TerminationConfig
-from xreset.task.terminations import out_of_bounds
 
 SECONDS = 3.0
 """Time that an object is given to come to rest [s]."""
-LINEAR_VELOCITY = 0.01
-"""Largest speed of an object at rest [m/s]."""
-ANGULAR_VELOCITY = 0.1
-"""Largest angular speed of an object at rest [rad/s]."""
+AT_REST = FilterConfig(linear_velocity=0.01, angular_velocity=0.1)
+"""Speeds of an object at rest."""
 
 
 def settle_starts(
@@ -82,9 +80,5 @@ def settle_starts(
 def rest_pose(backend: Backend, start: State) -> Tensor:
     """Return the objects' poses and whether they are at rest on the table: [N, 3 + 4 + 1]."""
     state = backend.state()
-    health = backend.health()
-    still = state.object_linvel.norm(dim=-1) < LINEAR_VELOCITY
-    still &= state.object_angvel.norm(dim=-1) < ANGULAR_VELOCITY
-    lost = out_of_bounds(state.object_pos, backend.scene.table, TerminationConfig())
-    at_rest = still & ~lost & ~health.nonfinite & ~health.overflow
+    at_rest = rejection(backend, start, AT_REST) < 0
     return torch.cat((state.object_pos, state.object_quat, at_rest[:, None]), dim=-1)

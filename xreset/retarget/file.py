@@ -29,6 +29,7 @@ from xreset.records import (
     JOINT,
     POSITION,
     RATE,
+    Arrays,
     Field,
     read_npz,
     read_record,
@@ -142,7 +143,7 @@ def object_sources(path: str | Path) -> dict[str, str]:
         return {}
 
 
-def _check(arrays: dict[str, np.ndarray]) -> str | None:
+def _check(arrays: Arrays) -> str | None:
     offsets = arrays["frame_offsets"]
     if problem := sequences_problem(arrays):
         return problem

@@ -3,42 +3,49 @@ quickly."""
 
 from __future__ import annotations
 
-from xreset.checks import Checked, Finite, NotNegative, Positive, frozen
+from xreset.checks import (
+    Checked,
+    FiniteFloat,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveInt,
+    frozen,
+)
 
 
 @frozen
 class ArmConfig(Checked):
     """Weights and effort of the arm's inverse kinematics; the first two weights are the paper's."""
 
-    position_weight: NotNegative[float] = 50.0
+    position_weight: NonNegativeFloat = 50.0
     """Squared distance of the hand root [1/m^2]."""
-    orientation_weight: NotNegative[float] = 10.0
+    orientation_weight: NonNegativeFloat = 10.0
     """Squared angle of the hand root [1/rad^2]."""
-    smoothness_weight: NotNegative[float] = 0.02
+    smoothness_weight: NonNegativeFloat = 0.02
     """Squared change of the joints since the frame before [1/rad^2]; the paper's lambda_s, whose value it does not
     give."""
-    collision_weight: NotNegative[float] = 1000.0
+    collision_weight: NonNegativeFloat = 1000.0
     """Squared intrusion into the margin above the table [1/m^2]."""
-    table_margin: Finite[float] = 0.002
+    table_margin: FiniteFloat = 0.002
     """Height that the robot keeps above the table [m]."""
-    restarts: Positive[int] = 32
+    restarts: PositiveInt = 32
     """Starts of the first and of the last frame: the home configuration, then random ones."""
-    branches: Positive[int] = 4
+    branches: PositiveInt = 4
     """Distinct solutions of the first and of the last frame that are followed; the one that home leads to is always one
     of them."""
-    detour_cost: NotNegative[float] = 1.0
+    detour_cost: NonNegativeFloat = 1.0
     """Valid frames that a path loses per rad^2 of its mean squared distance from home. A policy starts at home: it
     cannot use states in another branch of the arm's solutions, because the way there leads through half a turn of the
     shoulder."""
-    reseeds: NotNegative[int] = 2
+    reseeds: NonNegativeInt = 2
     """Frames of a sequence whose wrist is still missed that are solved like a first frame and followed both ways."""
-    switch_cost: NotNegative[float] = 0.5
+    switch_cost: NonNegativeFloat = 0.5
     """Valid frames that each change from one of the followed paths to another must gain."""
-    first_iterations: NotNegative[int] = 60
+    first_iterations: NonNegativeInt = 60
     """Most steps for the frame that a path starts from."""
-    iterations: NotNegative[int] = 12
+    iterations: NonNegativeInt = 12
     """Most steps for every other frame."""
-    seed: NotNegative[int] = 0
+    seed: NonNegativeInt = 0
     """Seed of the random starts."""
 
 

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from typing import Self
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from xreset.checks import frozen
 from xreset.errors import RobotError
-from xreset.geometry.balls import bounding_balls
+from xreset.geometry.balls import bounding_balls, joined
 from xreset.geometry.collision import SelfCollision, height_above_table, table_points
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matrix_to_quat, matvec, quat_angle
@@ -115,19 +114,18 @@ class ArmModel:
         self._hand_collision = SelfCollision(robot, self.hand, only=robot.self_collision_links)
 
         support = table_points(self.kinematics)
-        links = sorted(dict.fromkeys(support.links), key=lambda link: link not in in_hand)
+        links = sorted(support, key=lambda link: link not in in_hand)
         self._supported_in_hand = [link for link in links if link in in_hand]
         """Links with support points; those of the hand come first."""
         self._carrier = torch.tensor([carrier_of[link] for link in links], dtype=torch.long)
         """[G] carrier of each link with support points."""
-        rows = [(np.array(support.links) == link).nonzero()[0] for link in links]
-        self._count = torch.tensor([len(own) for own in rows], dtype=torch.long)
+        points = [support[link][0] for link in links]
+        radii = [support[link][1] for link in links]
+        self._count = torch.tensor([len(own) for own in radii], dtype=torch.long)
         """[G] number of support points of each link; those of one link follow one another."""
-        order = np.concatenate([np.zeros(0, dtype=int), *rows])
-        self._points = torch.as_tensor(support.points[order])
-        self._radii = torch.as_tensor(support.radii[order])
-        centers = [support.points[part] for part in rows]
-        self._middles, self._reach = bounding_balls(centers, [support.radii[part] for part in rows])
+        self._points = joined(points, 3)
+        self._radii = joined(radii)
+        self._middles, self._reach = bounding_balls(points, radii)
         """A ball around the support points of each link, in the link's frame."""
 
     def hand_poses(self, hand_joints: Tensor) -> Tensor:

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from typing import Literal
 
-from xreset.checks import Checked, Finite, NotNegative, Positive, frozen
+from xreset.checks import (
+    Checked,
+    FiniteFloat,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    frozen,
+)
 
 
 @frozen
@@ -14,40 +21,40 @@ class HandConfig(Checked):
     jaw: Literal["fingertips", "analytic"] = "fingertips"
     """What a parallel jaw follows. ``fingertips``: the human's, like every hand. ``analytic``: the published paper's
     map, without the costs below. Other hands ignore it."""
-    local_weight: NotNegative[float] = 10.0
+    local_weight: NonNegativeFloat = 10.0
     """Bone vectors and bone directions, averaged over the pairs of keypoints."""
-    global_weight: NotNegative[float] = 1.0
+    global_weight: NonNegativeFloat = 1.0
     """Positions of the keypoints, per keypoint."""
-    tip_factor: NotNegative[float] = 10.0
+    tip_factor: NonNegativeFloat = 10.0
     """Factor on the weight of a fingertip's position (not the paper's)."""
-    contact_weight: NotNegative[float] = 5.0
+    contact_weight: NonNegativeFloat = 5.0
     """Contact points, per keypoint in contact."""
-    contact_margin: NotNegative[float] = 0.01
+    contact_margin: NonNegativeFloat = 0.01
     """Distance between contact link and contact point that costs nothing [m]."""
-    contact_knee: Positive[float] = 0.002
+    contact_knee: PositiveFloat = 0.002
     """Excess over the margin below which the contact cost is quadratic [m]."""
-    clearance_weight: NotNegative[float] = 2000.0
+    clearance_weight: NonNegativeFloat = 2000.0
     """Depth of the hand in the object, the table and itself beyond the allowed one (not the paper's)."""
-    object_clearance: Finite[float] = 0.0005
+    object_clearance: FiniteFloat = 0.0005
     """Distance that the hand keeps from the object [m]. Physics pushes deeper grasps apart."""
-    self_depth: Finite[float] = 0.002
+    self_depth: FiniteFloat = 0.002
     """Allowed depth of the hand's links in one another [m]."""
-    pad_weight: NotNegative[float] = 1000.0
+    pad_weight: NonNegativeFloat = 1000.0
     """Distance of a jaw's pads from the held object, averaged over each pad (not the paper's). Other hands have no
     pads."""
-    pad_reach: Positive[float] = 0.015
+    pad_reach: PositiveFloat = 0.015
     """Distance from the object beyond which a point of a pad is not attracted [m]."""
-    smoothness_weight: Positive[float] = 2.0
+    smoothness_weight: PositiveFloat = 2.0
     """Change of joints and root between neighboring frames. It must be positive, because it alone determines what no
     keypoint does."""
-    jump_limit: Positive[float] = 0.17
+    jump_limit: PositiveFloat = 0.17
     """Change of a hand joint between neighboring frames beyond which ``jump_weight`` applies [rad or m] (not the
     paper's)."""
-    jump_weight: NotNegative[float] = 1000.0
+    jump_weight: NonNegativeFloat = 1000.0
     """Change of a hand joint between neighboring frames beyond ``jump_limit``."""
-    length_scale: Positive[float] = 0.10
+    length_scale: PositiveFloat = 0.10
     """Length that counts as much as one radian [m]: about a finger's length."""
-    iterations: NotNegative[int] = 40
+    iterations: NonNegativeInt = 40
     """Most Levenberg-Marquardt steps with the full weight."""
-    tolerance: NotNegative[float] = 1e-3
+    tolerance: NonNegativeFloat = 1e-3
     """A sequence is done when a step lowers its cost by less than this fraction."""

@@ -145,12 +145,10 @@ def _keypoint_terms(
 
 def _by_frame(distances: Distances, frames: int) -> tuple[Tensor, Tensor]:
     """Return distances [B, W] and slopes [B, W, n] by frame, padded with zeros to the most that one frame has."""
-    frame = distances.frame
-    count = torch.bincount(frame, minlength=frames)
-    slot = torch.arange(len(frame), device=frame.device) - (count.cumsum(0) - count)[frame]
-    width = int(count.max()) if len(frame) else 0
-    value = distances.value.new_zeros(frames, width)
-    slope = value.new_zeros(frames, width, distances.slope.shape[-1])
-    value[frame, slot] = distances.value
-    slope[frame, slot] = distances.slope
+    count = torch.bincount(distances.frame, minlength=frames)
+    taken = torch.arange(int(count.max()), device=count.device) < count[:, None]
+    value = distances.value.new_zeros(taken.shape)
+    slope = value.new_zeros(*taken.shape, distances.slope.shape[-1])
+    value[taken] = distances.value
+    slope[taken] = distances.slope
     return value, slope

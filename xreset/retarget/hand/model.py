@@ -21,7 +21,7 @@ from xreset.geometry.balls import hand_balls
 from xreset.geometry.collision import SelfCollision
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics, PointJacobian
-from xreset.geometry.rotations import matvec, quat_to_matrix
+from xreset.geometry.rotations import matvec, pose_matrix, quat_to_matrix
 from xreset.spec import FINGERS, KEYPOINTS, RobotSpec, TableSpec
 from xreset.tensors import Tensors
 
@@ -161,7 +161,9 @@ class HandModel:
 
     def keypoints(self, joints: Tensor, root_pos: Tensor, root_quat: Tensor) -> Tensor:
         """[..., P, 3] positions of the keypoint links."""
-        return self.kinematics.points(joints, self.links, base=_pose(root_pos, root_quat))
+        return self.kinematics.points(
+            joints, self.links, base=pose_matrix(quat_to_matrix(root_quat), root_pos)
+        )
 
     def bodies(self, joints: Tensor, root_pos: Tensor, root_quat: Tensor) -> PointJacobian:
         """Compute the links of the hand at joints [B, J] and root poses, and their Jacobians.
@@ -169,7 +171,9 @@ class HandModel:
         Variables: joints, then translation of the root, then rotation of the root about its origin (both along the
         world's axes).
         """
-        links = self.kinematics.jacobian(joints, self._bodies, base=_pose(root_pos, root_quat))
+        links = self.kinematics.jacobian(
+            joints, self._bodies, base=pose_matrix(quat_to_matrix(root_quat), root_pos)
+        )
         identity = torch.eye(3, dtype=links.pos.dtype, device=links.pos.device).expand(
             *links.pos.shape[:-1], 3, 3
         )
@@ -236,11 +240,3 @@ def keypoint_pairs(names: Sequence[str], links: Sequence[str]) -> list[tuple[int
     if thumb:
         pairs += [(thumb[-1], finger[-1]) for finger in others]
     return [(a, b) for a, b in dict.fromkeys(pairs) if links[a] != links[b]]
-
-
-def _pose(pos: Tensor, quat: Tensor) -> Tensor:
-    T = pos.new_zeros(*pos.shape[:-1], 4, 4)
-    T[..., :3, :3] = quat_to_matrix(quat)
-    T[..., :3, 3] = pos
-    T[..., 3, 3] = 1.0
-    return T

@@ -6,19 +6,19 @@ They are written here from the fused bodies, so every mass and inertia is the sa
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from xreset.backends.rigid import OTHER_LINK, Inertia, Mechanism, rotate
+from xreset.checks import frozen
 from xreset.geometry.shapes import transform
 from xreset.geometry.urdf import Joint
 from xreset.spec import Shape
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Part:
     """A link of a robot's Bullet model: a moving body, or a fixed piece of one."""
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import mujoco
 import numpy as np
 
 from xreset.backends.rigid import OTHER_LINK, TABLE, Body, Mechanism, MovingJoints, matrix_to_quat
+from xreset.checks import frozen
 from xreset.spec import SceneSpec
 
 OBJECT = -3
@@ -17,7 +16,7 @@ MIN_FRICTION = 1e-4
 """Sliding friction of the object's own geoms, and the smallest of any pair."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class SceneModel:
     """A compiled model and where the scene's parts are in it.
 

@@ -8,13 +8,14 @@ need every step.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from itertools import chain
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from xreset.checks import frozen
 from xreset.errors import ObjectError, RobotError, XResetError
 from xreset.geometry.dynamics import drive_shares
 from xreset.geometry.urdf import Joint, Link, RobotTree, robot_tree
@@ -32,7 +33,7 @@ Frames = dict[str, tuple[int, np.ndarray]]
 """Link -> index of its body, and its pose [4, 4] in that body's frame."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Inertia:
     """Mass properties along principal axes."""
 
@@ -70,7 +71,7 @@ class Inertia:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class LinkShape:
     """A collision shape in the frame of the body that its link belongs to."""
 
@@ -79,7 +80,7 @@ class LinkShape:
     shape: Shape
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Body:
     """A moving rigid body, or the robot's fixed base."""
 
@@ -96,7 +97,7 @@ class Body:
     shapes: tuple[LinkShape, ...]
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Mechanism:
     """The bodies of a robot, the base first and parents before children. Joint i moves body i + 1."""
 

@@ -12,13 +12,13 @@ of the goal at the episode's end). Task progress is 0, 0.33, 0.66 or 1 for the h
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from xreset.checks import frozen
 from xreset.geometry.rotations import quat_angle
 from xreset.objects.sampling import center, keypoints, metric_points
 from xreset.spec import ObjectSpec
@@ -44,7 +44,7 @@ GOAL_ANGLE = 0.2617993877991494
 """[rad], 15 degrees."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class MetricPoints(Tensors):
     """Points of N objects, in their frames of the task."""
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from xreset.checks import frozen
 from xreset.description import load_robot
 from xreset.env import ManipulationEnv, make_env
 from xreset.errors import PolicyError
@@ -33,7 +33,7 @@ LEAD_IN = 1.0
 """Time in which the baseline ``ik`` moves from home to the first frame [s]."""
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
+@frozen
 class PolicySpec(Brief):
     """A policy, the robot and the task that it was trained for, and where its results go."""
 

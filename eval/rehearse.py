@@ -9,10 +9,11 @@ from __future__ import annotations
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, field, replace
 from pathlib import Path
 from typing import Any
 
+from xreset.checks import frozen
 from xreset.demos.synth import synthesize
 from xreset.eval.pages import render
 from xreset.eval.plots import COLORS, svg
@@ -42,7 +43,7 @@ PROPERTIES: tuple[Property, ...] = (
 force gain of 0 is a robot that does not measure forces."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Rehearsal(Stress):
     """Contents of ``rehearsal/BACKEND.json``."""
 

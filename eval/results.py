@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,7 +16,18 @@ import numpy as np
 import pandas as pd
 
 from xreset.cameras.config import VisionConfig
-from xreset.checks import Checked, NotNegative, Positive, Range, Rule, Share, from_dict
+from xreset.checks import (
+    Checked,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    Range,
+    Rule,
+    Share,
+    from_dict,
+    frozen,
+)
 from xreset.errors import FileFormatError
 from xreset.eval.stats import Interval, bootstrap_ci95
 from xreset.eval.table import table_text
@@ -57,23 +68,23 @@ else:
     Table = pd.DataFrame
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Episode:
     """Result of one episode."""
 
-    sequence: NotNegative[int]
+    sequence: NonNegativeInt
     """Index of the demonstration."""
     sequence_name: str
     object: str
-    repetition: NotNegative[int]
+    repetition: NonNegativeInt
     """Number of the perturbation of the demonstration's start."""
     approach: bool
     grasp: bool
     reorient: bool
     reorient_once: bool
     """Whether the object was at the goal at any time."""
-    reorientation_progress: Share[float]
-    task_progress: Share[float]
+    reorientation_progress: Share
+    task_progress: Share
     out_of_bounds: bool
     nonfinite: bool
     overflow: bool
@@ -81,17 +92,17 @@ class Episode:
     published_success: bool | None = None
     """Whether ``least_distance`` is at most 2 cm: the success of the published paper. None, as in the fields below:
     recorded by an earlier version, which did not measure it."""
-    least_distance: NotNegative[float] | None = None
+    least_distance: NonNegativeFloat | None = None
     """Least mean distance of 64 surface points to the goal over the episode [m]."""
-    final_distance: NotNegative[float] | None = None
+    final_distance: NonNegativeFloat | None = None
     """This distance at the end; of an episode that ended early, before its end [m]."""
-    final_position_error: NotNegative[float] | None = None
+    final_position_error: NonNegativeFloat | None = None
     """Distance of the object's origin from its place at the goal, likewise [m]."""
-    final_angle: NotNegative[float] | None = None
+    final_angle: NonNegativeFloat | None = None
     """Angle between the object and the goal, likewise [rad]."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Trace:
     """States of one episode, for pictures, and the drives' targets, for replays."""
 
@@ -138,7 +149,7 @@ class Trace:
         return self.joint_target, every
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Rollouts:
     """All episodes of one policy in one engine."""
 
@@ -149,46 +160,46 @@ class Rollouts:
     """World steps per second of wall time, policy and observations included."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class TaskProgress(Checked):
     """Mean score of the highest stage of the episodes."""
 
-    mean: Share[float]
+    mean: Share
     ci95: Range
     """95 % bootstrap interval over demonstrations."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class DemoResult(Checked):
     """Means over the episodes of one demonstration."""
 
     sequence: str
     object: str
-    episodes: Positive[int]
-    task_progress: Share[float]
-    approach_rate: Share[float]
-    grasp_rate: Share[float]
-    reorient_rate: Share[float]
-    reorientation_progress: Share[float]
-    published_success_rate: Share[float] | None = None
+    episodes: PositiveInt
+    task_progress: Share
+    approach_rate: Share
+    grasp_rate: Share
+    reorient_rate: Share
+    reorientation_progress: Share
+    published_success_rate: Share | None = None
     """None, as in the next field: an earlier version did not measure it."""
-    least_distance: NotNegative[float] | None = None
+    least_distance: NonNegativeFloat | None = None
     """Mean of :attr:`Episode.least_distance` [m]."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class EpisodeFaults(Checked):
     """Numbers of episodes with a fault."""
 
-    nonfinite: NotNegative[int]
+    nonfinite: NonNegativeInt
     """A number was not finite: the engine broke down, or the policy's action was not finite."""
-    overflow: NotNegative[int]
+    overflow: NonNegativeInt
     """The engine dropped contacts or constraints."""
-    out_of_bounds: NotNegative[int]
+    out_of_bounds: NonNegativeInt
     """The object left the scene."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class EvalResult(Checked):
     """Contents of ``eval/ENGINE.json``: one policy in one engine."""
 
@@ -200,30 +211,30 @@ class EvalResult(Checked):
     objects_folder: str | None
     """Folder of meshes; None: the stand-ins."""
     policy: str
-    episodes: Positive[int]
-    episodes_per_demo: Positive[int]
-    seed: NotNegative[int]
+    episodes: PositiveInt
+    episodes_per_demo: PositiveInt
+    seed: NonNegativeInt
     task_progress: TaskProgress
-    approach_rate: Share[float]
-    grasp_rate: Share[float]
-    reorient_rate: Share[float]
-    reorient_once_rate: Share[float]
-    reorientation_progress: Share[float]
+    approach_rate: Share
+    grasp_rate: Share
+    reorient_rate: Share
+    reorient_once_rate: Share
+    reorientation_progress: Share
     per_demo: Annotated[tuple[DemoResult, ...], Rule("one demonstration or more", bool)]
     health: EpisodeFaults
-    control_steps_per_second: Positive[float]
+    control_steps_per_second: PositiveFloat
     inputs: dict[str, str]
     """SHA-256 of the policy and the demonstrations."""
     unseen: tuple[str, ...] = ()
     """Objects that the policy was not trained with, sorted; empty for a baseline."""
     vision: VisionConfig | None = None
     """Cameras of the policy. None: it has none, or an earlier version did not state them."""
-    published_success_rate: Share[float] | None = None
+    published_success_rate: Share | None = None
     """Share of episodes that succeed in the sense of the published paper. None, as in the next two fields: an earlier
     version did not measure it."""
     published_success_ci95: Range | None = None
     """95 % bootstrap interval over demonstrations."""
-    least_distance: NotNegative[float] | None = None
+    least_distance: NonNegativeFloat | None = None
     """Mean of :attr:`Episode.least_distance` [m]."""
 
     def meshes(self, given: Path | None) -> Path | None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from xreset.checks import frozen
 from xreset.env import ManipulationEnv, make_scene, object_origins
 from xreset.eval.metrics import EpisodeMetrics, MetricPoints
 from xreset.eval.policy_spec import PolicySpec
@@ -47,7 +48,7 @@ SLOW_ON_CPU = frozenset({"mujoco-warp"})
 """Backends that need a GPU to play many episodes."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Engine:
     """An engine to play in."""
 
@@ -93,7 +94,7 @@ def chosen_engines(engines: str | Iterable[str | Engine], device: str) -> list[E
     ]
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Trial:
     """Everything that decides how an episode goes, except the policy and the engine."""
 
@@ -238,7 +239,7 @@ def roll_out(
     )
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Round:
     """Worlds that were just reset, each to play one episode."""
 

@@ -9,12 +9,13 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from xreset.checks import frozen
 from xreset.errors import XResetError
 from xreset.eval.results import Episode
 from xreset.eval.stats import Interval, bootstrap_ci95, mean_of_known
@@ -22,7 +23,7 @@ from xreset.physics import Capability
 from xreset.task.config import RandomizationConfig, TaskConfig
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Effect:
     """Task progress of some episodes, and its difference to the same episodes as they are; intervals of 95 %."""
 
@@ -55,7 +56,7 @@ class Effect:
         return low > 0 or high < 0
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Property:
     """One physical property, or a fault of a rehearsal. The fields are explained in ``properties.toml``."""
 

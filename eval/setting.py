@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
-from xreset.checks import Options
+from xreset.checks import Options, frozen
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Place(Options):
     """Robot, meshes, seed and device."""
 
@@ -22,7 +21,7 @@ class Place(Options):
     """Where GPU engines run: cpu or cuda."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Setting(Place):
     """Robot, meshes, seed, device and worlds."""
 

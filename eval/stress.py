@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
+from xreset.checks import frozen
 from xreset.errors import XResetError
 from xreset.eval.plots import COLORS, picture
 from xreset.eval.policy_spec import PolicySpec
@@ -35,14 +36,14 @@ COSTLY = 0.10
 """Loss of task progress that limits the range in which a policy counts as robust."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Point(Effect):
     """Task progress with one property at one value."""
 
     value: float
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Curve:
     """Task progress against one property in one engine."""
 
@@ -74,7 +75,7 @@ class Curve:
         return nearest.difference_ci95[1] < 0
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Stress:
     """Contents of ``stress/BACKEND.json``: a policy's curves in one engine."""
 

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from torch import Tensor
 
+from xreset.checks import frozen
 from xreset.physics import Capability, KnownDifference
 
 if TYPE_CHECKING:
@@ -84,7 +85,7 @@ class Measure:
         }
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Check:
     """A contract and how to test it; the fields are explained in ``checks.toml``."""
 
@@ -118,7 +119,7 @@ class Skipped(Exception):
     """A check cannot be done with this robot, on this device or on this machine. The message says why."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class CheckResult:
     """Outcome of a check."""
 

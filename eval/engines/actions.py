@@ -9,13 +9,14 @@ joints.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import torch
 
+from xreset.checks import frozen
 from xreset.description import load_robot
 from xreset.errors import DemoError, FileFormatError
 from xreset.eval.engines.grasps import Grasps, closing_episode, find_grasps
@@ -61,7 +62,7 @@ _FIELDS: Schema = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Actions:
     """One action sequence from one state."""
 

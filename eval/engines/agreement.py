@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from xreset.checks import frozen
 from xreset.eval.engines.grasps import (
     LIFT_HEIGHT,
     Grasps,
@@ -52,7 +53,7 @@ PRESS_TIME = 0.25
 _METRICS = tomllib.loads(Path(__file__).with_name("metrics.toml").read_text())
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Metric:
     """One row of the table. The first fields are explained in ``metrics.toml``."""
 
@@ -91,7 +92,7 @@ class Metric:
         return self.verdict == "met"
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class CommonStates:
     """States from which every engine lifts and shakes."""
 
@@ -164,7 +165,7 @@ def common_states(
     return CommonStates(label=tuple(labels), object_index=torch.cat(index), start=State.cat(states))
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class EngineParity:
     """Results of one engine."""
 
@@ -188,7 +189,7 @@ class EngineParity:
         }
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Parity:
     """Results of a comparison."""
 

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 from rich.table import Table
 
+from xreset.checks import frozen
 from xreset.errors import XResetError
 from xreset.eval.engines.measure import Measured, measure
 from xreset.eval.policy_spec import PolicySpec
@@ -41,7 +42,7 @@ _METRICS = (
 Kind = Literal["as it is", "towards", "all", "other"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Row:
     """One run of the policy."""
 
@@ -58,7 +59,7 @@ class Row:
         return float(np.mean([float(getattr(e, metric)) for e in self.episodes]))
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Attribution:
     """The outcome of :func:`attribute`."""
 

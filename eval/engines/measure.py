@@ -7,7 +7,7 @@ rests on the table.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from torch import Tensor
 
 from xreset.backends.conformance.harness import Worlds, free_place
 from xreset.backends.conformance.scene import shape, solid
+from xreset.checks import frozen
 from xreset.errors import XResetError
 from xreset.eval.rollout import Engine
 from xreset.geometry.dynamics import mass_matrix
@@ -28,7 +29,7 @@ from xreset.physics import State
 from xreset.spec import GRAVITY, ObjectSpec, SceneSpec, Shape
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Measured:
     """Measured properties of an engine. A share of 1 means that the engine does what the scene states."""
 

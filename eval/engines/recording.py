@@ -6,16 +6,16 @@ Shape letters: G worlds, J joints, E fingertips, T control steps, P surface poin
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from xreset.checks import frozen
 from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
 from xreset.physics import Backend, State
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Recording:
     """What an engine did with an episode, after each control step, on the CPU."""
 

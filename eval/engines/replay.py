@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from rich.table import Table
 from rich.text import Text
 from scipy.ndimage import binary_opening
 
+from xreset.checks import frozen
 from xreset.errors import XResetError
 from xreset.eval.engines.actions import Actions
 from xreset.eval.engines.recording import Recording, play
@@ -51,7 +52,7 @@ CONTACT_TIME = 0.05
 """How long other fingers than in the reference must touch for the contacts to have diverged [s]."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Divergence:
     """How one quantity of :data:`THRESHOLDS` diverges from the reference."""
 
@@ -66,7 +67,7 @@ class Divergence:
     """Largest difference."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class EngineTrace:
     """What one engine did, and how it differs from the reference."""
 
@@ -164,7 +165,7 @@ def _averaged(force: np.ndarray, dt: float) -> np.ndarray:
     return pd.DataFrame(force).rolling(steps, min_periods=1).mean().to_numpy()
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class TraceResult:
     """The outcome of :func:`trace`."""
 

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
+from xreset.checks import frozen
 from xreset.description import load_robot
 from xreset.errors import RunError
 from xreset.eval.report.read import results_in
@@ -39,7 +39,7 @@ _COLUMNS = {
 """Array of the npz file -> column of the table of episodes."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class RecordedEpisodes:
     """Recorded episodes of one robot at one rate."""
 

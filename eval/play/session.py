@@ -15,6 +15,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from xreset.checks import frozen
 from xreset.demos.synth import synthesize
 from xreset.env import ManipulationEnv
 from xreset.errors import XResetError
@@ -52,7 +53,7 @@ DROPPED_DISTANCE = 0.05
 """[m]"""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Moment:
     """What happened in one control step. Poses in the world frame, quaternions (w, x, y, z)."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +11,7 @@ import numpy as np
 import torch
 
 from xreset.cameras.config import VisionConfig
+from xreset.checks import frozen
 from xreset.description import load_robot
 from xreset.errors import RunError, XResetError, needs
 from xreset.eval.report.read import ReportData, collect
@@ -37,7 +37,7 @@ MOMENTS = 6
 """Pictures in a strip, evenly over the episode, first and last state included."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Clip:
     """One episode in one engine, drawn."""
 

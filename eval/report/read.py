@@ -4,13 +4,13 @@ results."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from xreset.cameras.config import VisionConfig
+from xreset.checks import frozen
 from xreset.errors import FileFormatError, RunError, needs
 from xreset.eval.report.fairness import missed_by_student, uneven
 from xreset.eval.results import EvalResult, Table, read_evaluation, read_traces, recorded
@@ -24,7 +24,7 @@ from xreset.spec import RobotSpec
 from xreset.text import short_name
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Training:
     """A training or a baseline, as comparisons read it."""
 
@@ -64,7 +64,7 @@ def versions(trainings: Iterable[Training], engine: str) -> str:
     return ", ".join(sorted(found))
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class ReportData:
     """Results of one policy in several engines, and how it was trained."""
 

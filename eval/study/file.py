@@ -32,11 +32,11 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Collection
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from xreset.checks import Checked, Finite, Positive, Rule, from_dict, merged
+from xreset.checks import Checked, PositiveFinite, PositiveInt, Rule, from_dict, frozen, merged
 from xreset.errors import FileFormatError, RunError
 from xreset.eval.study.paper import paper_tables
 from xreset.eval.table import METRICS
@@ -72,13 +72,13 @@ def _options(*allowed: str) -> Rule:
     return Rule(f"options that begin with {', '.join(allowed)}", holds)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Data(Checked):
     """Demonstrations, and the options with which reset states are made of them."""
 
     demos: str | None = None
     """An archive (``xreset demos``), relative to ``--data``. None: synthetic ones of the stand-ins."""
-    synthetic_per_object: Positive[int] = 4
+    synthetic_per_object: PositiveInt = 4
     synthetic_seed: Seed = 0
     meshes: str | None = None
     """Folder of meshes, relative to ``--data``; None: the stand-ins."""
@@ -86,20 +86,12 @@ class Data(Checked):
     """Further options of ``xreset retarget``."""
     resets: Annotated[
         tuple[str, ...],
-        _options(
-            "--closing.",
-            "--filter.",
-            "--squeeze.",
-            "--settle",
-            "--backend",
-            "--device",
-            "--num-envs",
-        ),
+        _options("--closing.", "--filter.", "--squeeze.", "--backend", "--device", "--num-envs"),
     ] = ()
     """Further options of ``xreset resets``."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Evaluation(Checked):
     """Starts, number of episodes and engines of an evaluation."""
 
@@ -109,17 +101,17 @@ class Evaluation(Checked):
     """Only these objects, where a run has them; empty: all objects of the run."""
     unseen: bool = False
     """Whether the objects are played by every run, also by those that have not trained with them."""
-    per_object: Positive[int] | None = None
+    per_object: PositiveInt | None = None
     """Largest number of demonstrations of each object; None: all (of the run's own data: as many as in training)."""
-    episodes: Positive[int] = 5
+    episodes: PositiveInt = 5
     """Episodes of each demonstration, each with a perturbed start."""
     seed: Seed = 0
     engines: tuple[str, ...] = ("mujoco", "mujoco-warp", "pybullet", "sapien")
     """Engines that are not installed are left out, with a note."""
-    num_envs: Positive[int] = 64
+    num_envs: PositiveInt = 64
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Runs(Checked):
     """Trainings that differ in seed (and, with ``alone``, object), or a baseline."""
 
@@ -130,7 +122,7 @@ class Runs(Checked):
     """Empty: all objects of the data."""
     alone: bool = False
     """Train a policy for each object, not one for all."""
-    per_object: Positive[int] | None = None
+    per_object: PositiveInt | None = None
     """Largest number of demonstrations of each object."""
     policy: Literal["ik", "zero", "random"] | None = None
     """A baseline, which is evaluated and not trained."""
@@ -140,9 +132,9 @@ class Runs(Checked):
     seeds: Annotated[
         tuple[Seed, ...], Rule("one or more, each once", lambda x: 0 < len(x) == len(set(x)))
     ] = (0,)
-    minutes: Positive[Finite[float]] | None = None
+    minutes: PositiveFinite | None = None
     """Minutes of training, without compiling."""
-    steps: Positive[Finite[float]] | None = None
+    steps: PositiveFinite | None = None
     """Environment steps of all worlds. With minutes and steps, the first limit ends the training; with neither, the
     recipe's iterations."""
     weights: str | None = None
@@ -150,12 +142,12 @@ class Runs(Checked):
     both train alone."""
     backend: str = "mujoco-warp"
     device: Literal["cuda", "cpu"] = "cuda"
-    num_envs: Positive[int] = 4096
+    num_envs: PositiveInt = 4096
     evaluations: tuple[str, ...] = ()
     """Names of the evaluations; empty: all."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class TableSpec:
     """A table of the study's page: one for each engine, and a picture."""
 
@@ -173,7 +165,7 @@ class TableSpec:
     metric: str = "task_progress"
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Study:
     """Contents of a study file."""
 

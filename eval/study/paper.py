@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cache
 from pathlib import Path
 from typing import Literal
 
-from xreset.checks import from_dict
+from xreset.checks import from_dict, frozen
 
 FILE = Path(__file__).parent / "paper.toml"
 ALL = "all"
@@ -20,7 +20,7 @@ TRAINING = "10,000 iterations of 16 steps in 4,096 worlds on four GPUs (Table VI
 Axis = Literal["object", "method", "metric"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class PaperTable:
     """A table of the paper; or, without figures, one of a study.
 

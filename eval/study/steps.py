@@ -19,6 +19,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from xreset.checks import frozen
 from xreset.demos.archive import read_demos, write_demos
 from xreset.demos.synth import synthesize
 from xreset.errors import RunError
@@ -61,7 +62,7 @@ class Step:
         return any(map(is_claimed, (self.folder, *self.folder.glob(".*.lock"))))
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Subset:
     """Demonstrations of some objects of a study's data."""
 
@@ -129,7 +130,7 @@ class Subset:
         write_json(self.folder / "subset.json", {"schema": SUBSET_SCHEMA} | self.definition)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Run:
     """One training, or one baseline."""
 

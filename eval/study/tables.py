@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import chain, product
 from math import nan
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 
 import pandas as pd
 
+from xreset.checks import frozen
 from xreset.eval.plots import picture
 from xreset.eval.report.figures import draw_bars
 from xreset.eval.report.groups import COUNTED, counted, estimate
@@ -26,7 +26,7 @@ from xreset.text import short_name
 _CELL = ["row", "column", "mean", "low", "high", "paper", "text"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class FilledTable:
     """A table of the study with its figures."""
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import field, fields
 from pathlib import Path
 from typing import Annotated, Any
 
 import torch
 
-from xreset.checks import NotNegative, Rule, from_dict
+from xreset.checks import NonNegativeFloat, NonNegativeInt, Rule, from_dict, frozen
 from xreset.errors import FileFormatError, RunError
 from xreset.files import atomic_write
 from xreset.text import shown
@@ -34,7 +34,7 @@ def _is_optimizer(values: dict[str, Any]) -> bool:
 _Networks = Annotated[dict[str, Any], Rule("tensors of finite numbers", _are_tensors)]
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Checkpoint:
     """State of a training."""
 
@@ -44,13 +44,13 @@ class Checkpoint:
     optimizer_state_dict: Annotated[
         dict[str, Any], Rule("the state of an optimizer", _is_optimizer)
     ]
-    iteration: NotNegative[int]
+    iteration: NonNegativeInt
     """Iterations done."""
-    env_steps: NotNegative[int]
+    env_steps: NonNegativeInt
     """Control steps of all worlds of all processes."""
-    elapsed: NotNegative[float]
+    elapsed: NonNegativeFloat
     """Time of all iterations [s]."""
-    learning_rate: NotNegative[float]
+    learning_rate: NonNegativeFloat
 
 
 def write_checkpoint(path: Path, content: Checkpoint) -> None:

@@ -6,10 +6,10 @@ within minutes. So trainings are compared by this time.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
-from xreset.checks import NotNegative, Share
+from xreset.checks import NonNegativeFloat, NonNegativeInt, Share, frozen
 from xreset.files import read_typed, write_json
 
 SCHEMA = "xreset-lift/1"
@@ -19,29 +19,29 @@ SHARES = (0.01, 0.1, 0.5)
 """Shares of the home worlds' steps spent at the goal whose first passing is noted."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Passing:
     """The first iteration in which at least ``share`` of the steps of worlds that started at home were at the goal."""
 
-    share: Share[float]
-    iteration: NotNegative[int]
-    env_steps: NotNegative[int]
+    share: Share
+    iteration: NonNegativeInt
+    env_steps: NonNegativeInt
     """Control steps of all worlds until then."""
-    minutes: NotNegative[float]
+    minutes: NonNegativeFloat
     """Minutes of training until then, without compiling."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Lift:
     """Contents of ``lift.json``."""
 
     passed: tuple[Passing, ...] = ()
     """In the order of :data:`SHARES`."""
-    iteration: NotNegative[int] = 0
+    iteration: NonNegativeInt = 0
     """Iterations done."""
-    env_steps: NotNegative[int] = 0
-    minutes: NotNegative[float] = 0.0
-    success_from_home: Share[float] = 0.0
+    env_steps: NonNegativeInt = 0
+    minutes: NonNegativeFloat = 0.0
+    success_from_home: Share = 0.0
     """Share in the last iteration."""
 
     def up_to(self, iteration: int) -> Lift:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, field
 from itertools import pairwise
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
-from xreset.checks import Checked, NotNegative, Positive, Rule, Share
+from xreset.checks import Checked, NonNegativeFloat, PositiveFloat, PositiveInt, Rule, Share, frozen
 from xreset.task.config import TaskConfig
 
 Widths = Annotated[
@@ -17,7 +17,7 @@ Widths = Annotated[
 ]
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class ModelConfig(Checked):
     """Actor and critic: PointNet per cloud frame, LSTM with layer norm on its output, MLP."""
 
@@ -33,12 +33,12 @@ class ModelConfig(Checked):
     conv: Widths = (16, 32, 32)
     """Channels of the convolutions for depth images, each of which halves the image; the last width of ``pointnet`` is
     the images' embedding."""
-    lstm: Positive[int] = 512
+    lstm: PositiveInt = 512
     """Units of the LSTM."""
     mlp: Widths = (512, 256, 128)
     critic_mlp: Widths | None = None
     """Widths of the critic's MLP; None: those of the actor."""
-    initial_std: Positive[float] = 1.0
+    initial_std: PositiveFloat = 1.0
     """Initial standard deviation of the Gaussian policy, which does not depend on the state. Not in the paper."""
     normalize_returns: bool = False
     """Whether the critic learns returns in units of their running standard deviation, as the
@@ -50,7 +50,7 @@ class ModelConfig(Checked):
         return {name: value for name, value in asdict(self).items() if name != "initial_std"}
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class PpoConfig(Checked):
     """Proximal policy optimization."""
 
@@ -58,28 +58,28 @@ class PpoConfig(Checked):
 
     horizon: Annotated[int, Rule("a number above 1", lambda steps: steps > 1)] = 16
     """Control steps per world and iteration. Not 1: rsl-rl stores LSTM states from a run's second step on."""
-    sequence_length: Positive[int] = 4
+    sequence_length: PositiveInt = 4
     """Length of truncated back-propagation through time; divides the horizon."""
-    mini_epochs: Positive[int] = 5
-    minibatch_size: Positive[int] = 32768
+    mini_epochs: PositiveInt = 5
+    minibatch_size: PositiveInt = 32768
     """Transitions per minibatch. With fewer transitions per iteration than two of these, an iteration is one
     minibatch."""
-    discount: Share[float] = 0.99
-    gae_lambda: Share[float] = 0.95
-    learning_rate: Positive[float] = 1e-3
+    discount: Share = 0.99
+    gae_lambda: Share = 0.95
+    learning_rate: PositiveFloat = 1e-3
     """Learning rate of actor and critic; with an adaptive schedule the initial one."""
     schedule: Literal["adaptive", "fixed"] = "adaptive"
     """``adaptive``: the rate is divided (multiplied) by 1.5 where the policy moved more than twice (less than half)
     ``desired_kl``."""
-    desired_kl: Positive[float] = 0.01
-    clip: Positive[float] = 0.2
-    entropy: NotNegative[float] = 0.005
-    bounds_loss: NotNegative[float] = 0.0
+    desired_kl: PositiveFloat = 0.01
+    clip: PositiveFloat = 0.2
+    entropy: NonNegativeFloat = 0.005
+    bounds_loss: NonNegativeFloat = 0.0
     """Weight of the squared excess of the actions' means over +-1.1, summed over actions: beyond the limit, noise
     explores nothing. The paper's library uses 1e-4."""
-    value_loss: NotNegative[float] = 1.0
+    value_loss: NonNegativeFloat = 1.0
     """Weight of the value loss. Not in the paper."""
-    grad_norm: Positive[float] = 1.0
+    grad_norm: PositiveFloat = 1.0
     precision: Literal["float32", "tf32", "bfloat16"] = "tf32"
     """Arithmetic of matrix products on a GPU. ``bfloat16``: factors of point-cloud encoder and LSTM in bfloat16 (sums
     in float32), the rest in TF32. The CPU and the exported policy use float32. Not in the paper."""
@@ -114,12 +114,9 @@ ShareSchedule = Annotated[
         is_schedule,
     ),
 ]
-PositiveSchedule = Annotated[
-    ShareSchedule, Rule("values above 0", lambda points: all(value > 0 for _, value in points))
-]
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class ScheduleConfig(Checked):
     """Settings that change during a run.
 
@@ -133,7 +130,7 @@ class ScheduleConfig(Checked):
     demo_probability: ShareSchedule = ()
     """Replaces ``task.reset.demo_probability``, such as ``0 0.5 1 0.25``: demonstrated states teach the first grasp,
     and starts from home are what is evaluated."""
-    success_position: PositiveSchedule = ()
+    success_position: ShareSchedule = ()
     """Replaces ``task.reward.success_position`` [m], such as ``0 0.05 1 0.01``: what counts as success becomes
     stricter. Evaluations keep their own limits."""
     faults: ShareSchedule = ()
@@ -148,7 +145,7 @@ def value_at(points: Points, progress: float) -> float:
     return float(np.interp(progress, shares, values))
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class TrainConfig(Checked):
     """Configuration of a training run, as saved in the run folder."""
 
@@ -158,8 +155,8 @@ class TrainConfig(Checked):
     model: ModelConfig = field(default_factory=ModelConfig)
     ppo: PpoConfig = field(default_factory=PpoConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
-    iterations: Positive[int] = 10000
-    save_interval: Positive[int] = 50
+    iterations: PositiveInt = 10000
+    save_interval: PositiveInt = 50
     """Iterations between checkpoints."""
 
     @property

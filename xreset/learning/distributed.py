@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 
 import torch
+
+from xreset.checks import frozen
 
 SEED_STRIDE = 7919
 """Difference between the seeds of two processes, so that each simulates other episodes."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Processes:
     """This process among those that train together."""
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import shlex
 import sys
 import tomllib
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from xreset.cameras.config import VisionConfig
-from xreset.checks import from_dict, merged
+from xreset.checks import from_dict, frozen, merged
 from xreset.errors import RunError
 from xreset.learning.config import TrainConfig
 from xreset.learning.run import read_run
@@ -17,7 +17,7 @@ from xreset.task.config import TaskConfig
 from xreset.text import plain
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Recipe:
     """A configuration and what it is for."""
 

@@ -14,11 +14,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
 
-from xreset.checks import Checked, NotNegative, Positive, Rule, Share, from_dict
+from xreset.checks import Checked, NonNegativeInt, PositiveInt, Rule, Share, from_dict, frozen
 from xreset.errors import PolicyError, RunError
 from xreset.files import read_json, read_typed, write_json
 from xreset.learning.config import TrainConfig
@@ -32,7 +32,7 @@ TEACHER = "teacher.onnx"
 """File of the teacher's policy in the run folder of a distillation."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class RunInfo(Checked):
     """Contents of ``run.json``."""
 
@@ -47,8 +47,8 @@ class RunInfo(Checked):
     backend: str
     backend_version: str
     device: str
-    num_envs: Positive[int]
-    seed: NotNegative[int]
+    num_envs: PositiveInt
+    seed: NonNegativeInt
     config: TrainConfig
     contract: Contract
     """:func:`xreset.policy.policy_contract`."""
@@ -159,13 +159,13 @@ CHOICE_FILE = "choice.json"
 CHOICE_SCHEMA = "xreset-choice/1"
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Candidate(Checked):
     """One checkpoint."""
 
     name: str
     """File name of the checkpoint or policy."""
-    task_progress: Annotated[dict[str, Share[float]], Rule("an engine at least", bool)]
+    task_progress: Annotated[dict[str, Share], Rule("an engine at least", bool)]
     """Engine -> mean over the episodes; without engines in which it was not played because it could no longer be
     chosen."""
 
@@ -175,7 +175,7 @@ class Candidate(Checked):
         return min(self.task_progress.values())
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Choice(Checked):
     """The candidates that were played, and the one that is best in its worst engine."""
 
@@ -187,9 +187,9 @@ class Choice(Checked):
     """The newest first."""
     engines: dict[str, str]
     """Name -> version."""
-    seed: NotNegative[int]
+    seed: NonNegativeInt
     """Seed of the starts that were played; results with another seed are of other starts."""
-    episodes_per_demo: Positive[int]
+    episodes_per_demo: PositiveInt
     demos: str
     """SHA-256 of the demonstrations."""
 

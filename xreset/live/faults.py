@@ -6,14 +6,14 @@ Shape letters: N worlds, C control steps, J joints.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from xreset.checks import Checked, NotNegative, Share
+from xreset.checks import Checked, NonNegativeFloat, Share, frozen
 from xreset.env import ManipulationEnv
 from xreset.live.engine import EngineDriver
 from xreset.runtime import Reading
@@ -21,7 +21,7 @@ from xreset.runtime import Reading
 _NEVER = np.iinfo(np.int64).max
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Faults(Checked):
     """Faults of one robot and its tracker; all are off by default.
 
@@ -35,31 +35,31 @@ class Faults(Checked):
     PUSH_PERIOD: ClassVar[float] = 1.5
     """There is one push in every such time [s]."""
 
-    tracker_interval: NotNegative[float] = 0.0
+    tracker_interval: NonNegativeFloat = 0.0
     """Time from one pose to the next [s], rounded to control steps; 0: every control step."""
-    pose_delay: NotNegative[float] = 0.0
+    pose_delay: NonNegativeFloat = 0.0
     """Time from the moment of a pose to its arrival [s]."""
-    pose_jitter: NotNegative[float] = 0.0
+    pose_jitter: NonNegativeFloat = 0.0
     """The delay of each pose differs by up to this [s]. Poses may therefore overtake each other."""
-    position_noise: NotNegative[float] = 0.0
+    position_noise: NonNegativeFloat = 0.0
     """Largest error of each pose, along each axis [m]."""
-    position_bias: NotNegative[float] = 0.0
+    position_bias: NonNegativeFloat = 0.0
     """Largest error that lasts for the episode, along each axis [m]."""
-    angle_noise: NotNegative[float] = 0.0
+    angle_noise: NonNegativeFloat = 0.0
     """Largest error of each pose about each axis [rad]."""
-    angle_bias: NotNegative[float] = 0.0
+    angle_bias: NonNegativeFloat = 0.0
     """Largest error that lasts for the episode, about each axis [rad]."""
-    lost_frames: NotNegative[float] = 0.0
+    lost_frames: NonNegativeFloat = 0.0
     """How long the tracker loses the object each time [s]."""
-    arm_delay: NotNegative[float] = 0.0
+    arm_delay: NonNegativeFloat = 0.0
     """Time from sending the arm's targets to their effect [s], rounded to physics steps."""
-    hand_delay: NotNegative[float] = 0.0
+    hand_delay: NonNegativeFloat = 0.0
     """The same for the hand [s]."""
-    missed_deadlines: Share[float] = 0.0
+    missed_deadlines: Share = 0.0
     """Share of the targets that come too late to be used, so that the drives keep the ones before."""
-    object_push: NotNegative[float] = 0.0
+    object_push: NonNegativeFloat = 0.0
     """Change of the object's velocity by each push [m/s]: a force in a random direction for one control step."""
-    arm_push: NotNegative[float] = 0.0
+    arm_push: NonNegativeFloat = 0.0
     """Torque of each push on every joint of the arm for one control step, at most this share of the drive's limit."""
     drawn_delays: bool = False
     """Whether each episode draws its delays between 0 and those above."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
 from xreset.cameras.pose import look_at
+from xreset.checks import frozen
 from xreset.errors import XResetError
 from xreset.files import write_whole
 from xreset.geometry.kinematics import Kinematics
@@ -64,7 +64,7 @@ _LINE = 16
 """Height of a line of a caption [pixels]."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Camera:
     """A pinhole camera. Pixel (0, 0) is the picture's top left; its center is at (0.5, 0.5)."""
 
@@ -102,7 +102,7 @@ class Camera:
         return pixels, local[:, 2]
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Points:
     """Dots drawn over the picture, visible through everything."""
 

@@ -5,10 +5,9 @@ The command line knows such a policy as NAME.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
-from xreset.checks import from_dict
+from xreset.checks import from_dict, frozen
 from xreset.files import read_toml
 
 FOLDER = Path(__file__).parent
@@ -16,7 +15,7 @@ FOLDER = Path(__file__).parent
 SCHEMA = "xreset-policy-card/1"
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Card:
     """Description of a policy, with measured results."""
 

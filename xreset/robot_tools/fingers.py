@@ -5,11 +5,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from xreset.checks import frozen
 from xreset.errors import RobotError
 from xreset.geometry.collision import bounding_ball
 from xreset.geometry.shapes import surface_of, transform, transformed
@@ -44,7 +45,7 @@ _BEND = 0.15
 """Share of its range by which a finger's joint is bent at home."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Finger:
     """A chain of moving links from the palm to a tip."""
 

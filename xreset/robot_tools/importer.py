@@ -8,12 +8,13 @@ finger, where the palm looks, which links follow which human keypoint, drives, h
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from xreset.checks import frozen
 from xreset.description import DESCRIPTION, load_robot
 from xreset.errors import RobotError
 from xreset.files import atomic_folder
@@ -54,7 +55,7 @@ _TO_SAY = (
 """What no file and no geometry says."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Imported:
     """What an import made."""
 

@@ -10,7 +10,7 @@ Shape letters: M states, N worlds, J joints, n arm joints, P phases.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from typing import Any
 
@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from xreset.checks import frozen
 from xreset.errors import RobotError
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import (
@@ -63,7 +64,7 @@ _REACHED = (0.02, 0.15)
 _TILE = (224, 176)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Judged:
     """What became of the tried states of one object in one engine."""
 
@@ -81,7 +82,7 @@ class Judged:
     """States in which the arm cannot raise or turn the hand so far; they count as not lifted or not turned."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Judgement:
     """Result of :func:`judge`."""
 

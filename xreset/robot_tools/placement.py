@@ -5,15 +5,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
+from xreset.checks import frozen
 from xreset.errors import RobotError
 from xreset.files import write_whole
 from xreset.spec import RobotSpec
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class PlaceConfig:
     """What is searched, and how hard."""
 
@@ -38,7 +38,7 @@ class PlaceConfig:
     seed: int = 0
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Finalist:
     """A placement that was also tried on whole motions."""
 

@@ -5,12 +5,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from math import isfinite
 from typing import Annotated, Any, ClassVar, Literal
 
 from xreset.cameras.config import VisionConfig
-from xreset.checks import Checked, Finite, NotNegative, Positive, Range, Rule, Share
+from xreset.checks import (
+    Checked,
+    FiniteFloat,
+    NonNegativeFloat,
+    PositiveFinite,
+    PositiveFloat,
+    PositiveInt,
+    Range,
+    Rule,
+    Share,
+    frozen,
+)
 
 PositiveRange = Annotated[Range, Rule("factors above 0", lambda x: x[0] > 0)]
 
@@ -28,7 +39,7 @@ def _are_shares(shares: dict[str, float]) -> bool:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class ActionConfig(Checked):
     """How a policy's output in [-1, 1] becomes joint targets.
 
@@ -37,9 +48,9 @@ class ActionConfig(Checked):
 
     REMOVED: ClassVar[dict[str, Any]] = {"hand_smoothing": 1.0}
 
-    arm_step: Positive[float] = 0.03
+    arm_step: PositiveFloat = 0.03
     """Largest change of an arm joint's target per control step [rad]: 1.8 rad/s at 60 Hz. Not in the paper."""
-    arm_lead: Positive[float] = 0.15
+    arm_lead: PositiveFloat = 0.15
     """Largest distance from an arm joint to its target [rad], so that a blocked arm does not wind up. Not in the
     paper."""
     hand: Literal["absolute", "relative"] = "absolute"
@@ -47,10 +58,10 @@ class ActionConfig(Checked):
     target, as for the arm, so that a policy that does nothing keeps a grasp. With absolute targets a new policy opens
     the hand in every demonstrated grasp, and learns to hold before it can learn to lift. In-hand manipulation is
     commonly learned with relative targets (Qi et al. 2022, In-Hand Object Rotation via Rapid Motor Adaptation)."""
-    hand_step: Positive[float] = 0.05
+    hand_step: PositiveFloat = 0.05
     """Largest change of a hand joint's target per control step [rad]: 3 rad/s at 60 Hz. Joints that slide move 4 cm
     for every radian."""
-    hand_lead: Positive[float] = 0.4
+    hand_lead: PositiveFloat = 0.4
     """Largest distance from a hand joint to its target [rad]. It limits how hard the joint presses: drives of the
     Sharpa hand reach their effort limits at 0.3 to 0.7."""
     hand_zero: Literal["middle", "home"] = "middle"
@@ -59,37 +70,37 @@ class ActionConfig(Checked):
     meets the object with its knuckles. Not in the paper."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class NoiseConfig(Checked):
     """Standard deviations of the observation noise. The paper says what is noisy, not how much."""
 
-    joint_pos: NotNegative[float] = 0.005
+    joint_pos: NonNegativeFloat = 0.005
     """[rad]"""
-    joint_vel: NotNegative[float] = 0.05
+    joint_vel: NonNegativeFloat = 0.05
     """[rad/s]"""
-    object_pos: NotNegative[float] = 0.003
+    object_pos: NonNegativeFloat = 0.003
     """[m]"""
-    object_rot: NotNegative[float] = 0.02
+    object_rot: NonNegativeFloat = 0.02
     """[rad], about a random axis."""
-    cloud: NotNegative[float] = 0.002
+    cloud: NonNegativeFloat = 0.002
     """[m], per point."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class ObservationConfig(Checked):
     """What the policy observes (appendix C): the groups ``policy``, ``proprio`` and ``perception``.
 
     The critic also observes the group ``privileged``.
     """
 
-    cloud_points: Positive[int] = 64
+    cloud_points: PositiveInt = 64
     """Points per cloud (P)."""
     cloud: Literal["history", "paired"] = "history"
     """What the policy observes of the object's surface points. ``history``: their positions in the last
     ``cloud_history`` frames (the draft of the paper). ``paired``: the position of every point, its position at the
     goal, and the goal's minus the present one, in this frame only (the published paper). It shows the pose error point
     by point."""
-    cloud_history: Positive[int] = 5
+    cloud_history: PositiveInt = 5
     """Frames of cloud history, oldest first."""
     rotation: Literal["quaternion", "matrix", "to_goal"] = "quaternion"
     """``quaternion``: a quaternion with w >= 0, which jumps where w is 0. ``matrix``: the first two columns of the
@@ -97,14 +108,14 @@ class ObservationConfig(Checked):
     place of the orientations of object and goal, the columns of the rotation that leads from one to the other, along
     the world's axes. It does not depend on the axes in which a mesh was drawn. A policy with cameras observes the
     rotation from the start of the episode to the goal."""
-    cloud_scale: Positive[Finite[float]] = 1.0
+    cloud_scale: PositiveFinite = 1.0
     """Factor on the clouds' coordinates [1/m]."""
-    contact_force_scale: NotNegative[float] = 0.1
+    contact_force_scale: NonNegativeFloat = 0.1
     """Factor on fingertip forces [1/N] before they are limited to [-1, 1]."""
     joint_target: bool = False
     """Whether the policy observes the distance from each joint to its drive's target [rad]. With relative hand targets
     no other observation contains it."""
-    joint_vel_scale: NotNegative[float] = 0.1
+    joint_vel_scale: NonNegativeFloat = 0.1
     """Factor on joint velocities [s/rad]."""
     content: Literal["draft", "published"] = "draft"
     """What the policy observes besides the points. ``draft``: poses of object and goal, previous action, joints and
@@ -121,7 +132,7 @@ class ObservationConfig(Checked):
         return self.cloud_history, self.cloud_points, 3
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class RewardConfig(Checked):
     """Weights and widths of the reward (appendix D.d)."""
 
@@ -134,65 +145,65 @@ class RewardConfig(Checked):
         "rotation_near_width": 0.3,
     }
 
-    reach: Finite[float] = 1.0
-    reach_width: Positive[float] = 0.1
+    reach: FiniteFloat = 1.0
+    reach_width: PositiveFloat = 0.1
     """Distance [m] at which 1 - tanh(d / width) falls to 0.24. Not in the paper."""
-    reach_near: Finite[float] = 0.0
+    reach_near: FiniteFloat = 0.0
     """Weight of a second reach term with its own width. A width of 0.1 m pays nothing at home, 36 cm away. With 0.4 m
     the last centimetres, in which fingers wrap around the object, are worth less than moving costs."""
-    reach_near_width: Positive[float] = 0.05
+    reach_near_width: PositiveFloat = 0.05
     """[m]"""
     reach_distance: Literal["best", "present"] = "best"
     """Distance that both reach terms pay for. ``best``: the smallest of the episode (the paper), so that a hand that
     moves away is still paid. ``present``: the present one (as in Isaac Lab's dexterous lift), so that a hand that has
     missed stays near and tries again."""
-    grasp: Finite[float] = 1.0
-    position: Finite[float] = 4.0
-    position_width: Positive[float] = 0.2
+    grasp: FiniteFloat = 1.0
+    position: FiniteFloat = 4.0
+    position_width: PositiveFloat = 0.2
     """[m]"""
-    rotation: Finite[float] = 4.0
-    rotation_width: Positive[float] = 1.5
+    rotation: FiniteFloat = 4.0
+    rotation_width: PositiveFloat = 1.5
     """[rad]"""
-    proximity: Finite[float] = 0.0
+    proximity: FiniteFloat = 0.0
     """Weight of the sum over fingertips of their distances to the object's surface points [m], at most
     ``proximity_cap``. The published paper has -2.5."""
-    proximity_cap: Positive[float] = 3.0
+    proximity_cap: PositiveFloat = 3.0
     """[m] (the published paper)"""
-    palm_proximity: Finite[float] = 0.0
+    palm_proximity: FiniteFloat = 0.0
     """Weight of the palm's distance to the object's surface points [m], at most ``palm_proximity_cap``. The published
     paper has -2.5."""
-    palm_proximity_cap: Positive[float] = 0.5
+    palm_proximity_cap: PositiveFloat = 0.5
     """[m] (the published paper)"""
-    points: Finite[float] = 0.0
+    points: FiniteFloat = 0.0
     """Weight of 1 - d / ``points_zero``, gated, with d the mean distance of 64 surface points to the goal. The
     published paper's 3 (1.4 - 3 d) is 4.2 with ``points_zero`` 1.4 / 3."""
-    points_zero: Positive[Finite[float]] = 1.4 / 3
+    points_zero: PositiveFinite = 1.4 / 3
     """Distance d beyond which ``points`` is negative [m]."""
-    success: Finite[float] = 10.0
+    success: FiniteFloat = 10.0
     success_shape: Literal["pose", "points"] = "pose"
     """``pose``: paid while position and rotation are within the next two limits (the draft). ``points``: paid times
     1 / (1 + 10 d) while d, the mean distance of 64 surface points to the goal [m], is at most ``success_position`` (the
     published paper)."""
-    success_position: Positive[float] = 0.02
+    success_position: PositiveFloat = 0.02
     """[m] (section V)"""
-    success_rotation: Positive[float] = 0.2617993877991494
+    success_rotation: PositiveFloat = 0.2617993877991494
     """[rad], 15 degrees (section V)"""
-    action: Finite[float] = -0.005
-    action_rate: Finite[float] = -0.005
-    action_rate_arm: Finite[float] | None = None
+    action: FiniteFloat = -0.005
+    action_rate: FiniteFloat = -0.005
+    action_rate_arm: FiniteFloat | None = None
     """Weight of the arm's part of ``action_rate``; None: the same. The published paper has -0.05."""
-    out_of_bounds: Finite[float] = -500.0
+    out_of_bounds: FiniteFloat = -500.0
     contact: Literal["any", "opposing", "near"] = "any"
     """What opens the gate of ``position``, ``rotation``, ``points`` and ``success``. ``any``: the thumb and another
     finger press (the paper). ``opposing``: their forces on the object are more than 90 degrees apart. A hand that
     presses an object down from above pushes with both in one direction; a hand that holds it does not. ``near``:
     fingertips and palm are near the object, whether or not they touch it (the published paper). ``grasp`` is paid for
     ``any``."""
-    near_tips: Positive[float] = 0.6
+    near_tips: PositiveFloat = 0.6
     """Largest sum of the fingertips' distances to the object [m] (the published paper)."""
-    near_palm: Positive[float] = 0.2
+    near_palm: PositiveFloat = 0.2
     """Largest distance of the palm to the object [m] (the published paper)."""
-    contact_threshold: NotNegative[float] = 0.1
+    contact_threshold: NonNegativeFloat = 0.1
     """Force [N] from which a finger counts as in contact. Not in the paper."""
     raw_actions: bool = False
     """Whether ``action`` and ``action_rate`` penalise actions as the policy gave them, instead of limited to [-1, 1].
@@ -202,21 +213,21 @@ class RewardConfig(Checked):
         dict[str, float], Rule("module:function and a finite number", _are_own_terms)
     ] = field(default_factory=dict)
     """Reward terms of the user: ``module:function`` -> weight (docs/own-reward.md)."""
-    scale: Positive[Finite[float]] = 0.01
+    scale: PositiveFinite = 0.01
     """Factor on the total (Table VIII)."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class TerminationConfig(Checked):
     """When an episode ends. The paper names the out-of-bounds termination, not its bounds."""
 
-    episode_seconds: Positive[Finite[float]] = 5.0
+    episode_seconds: PositiveFinite = 5.0
     """Time limit [s]; not a failure: its value is bootstrapped."""
-    object_low: Finite[float] = -0.05
+    object_low: FiniteFloat = -0.05
     """The object is out of bounds when its origin is below this height [m]: it has left the table."""
-    object_high: Finite[float] = 1.0
+    object_high: FiniteFloat = 1.0
     """... or above this height [m]."""
-    margin: Finite[float] = 0.10
+    margin: FiniteFloat = 0.10
     """... or farther than this outside the table's edges [m]."""
 
     def __post_init__(self) -> None:
@@ -227,7 +238,7 @@ class TerminationConfig(Checked):
             )
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class ResetConfig(Checked):
     """The reset mixture (sections IV-B, appendix D.c, D.e, Table IX)."""
 
@@ -238,29 +249,29 @@ class ResetConfig(Checked):
         "frontier_rate": 0.1,
     }
 
-    demo_probability: Share[float] = 0.5
+    demo_probability: Share = 0.5
     """p: share of resets from the bank; 0 is X-Sim."""
     pre_contact_only: bool = False
     """Use only bank states before first contact."""
     random_gravity: bool = True
     """Bank resets: gravity fraction U(0, 1); False: 1 (the fixed-gravity ablation)."""
-    home_gravity_std: NotNegative[float] = 1.0
+    home_gravity_std: NonNegativeFloat = 1.0
     """Home resets: standard deviation of the object's gravity [m/s^2] around 9.81; 0 is exactly full gravity."""
-    home_gravity_clip: NotNegative[float] = 0.3
+    home_gravity_clip: NonNegativeFloat = 0.3
     """Home resets: the gravity fraction stays within 1 +- this. The paper clips and does not say where."""
-    spawn_xy: NotNegative[float] = 0.02
+    spawn_xy: NonNegativeFloat = 0.02
     """Home resets: the object is moved by U(-x, x) in both directions [m]."""
-    spawn_yaw: NotNegative[float] = 0.4363323129985824
+    spawn_yaw: NonNegativeFloat = 0.4363323129985824
     """Home resets: the object is turned about the vertical by U(-y, y) [rad], 25 degrees."""
     home_noise: bool = True
     """Home resets: joints start around home with the robot's ``home_std``."""
-    training_xy: NotNegative[float] | None = None
+    training_xy: NonNegativeFloat | None = None
     """Replaces ``spawn_xy`` in trainings, so that starts are wider there than in evaluations [m]."""
-    goal_xy: NotNegative[float] = 0.0
+    goal_xy: NonNegativeFloat = 0.0
     """Home resets: the goal is moved by U(-x, x) in both directions [m]."""
-    goal_z: NotNegative[float] = 0.0
+    goal_z: NonNegativeFloat = 0.0
     """Home resets: the goal is moved by U(-z, z) upwards [m], but not below the height at which the object starts."""
-    goal_yaw: NotNegative[float] = 0.0
+    goal_yaw: NonNegativeFloat = 0.0
     """Home resets: the goal is turned about the vertical by U(-y, y) [rad]."""
     object_share: Annotated[
         dict[str, float], Rule("names of objects and numbers above 0", _are_shares)
@@ -269,7 +280,7 @@ class ResetConfig(Checked):
     more practice with objects that are learned late."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class TrackerConfig(Checked):
     """Faults of the tracker that observes the object's pose. They move the observed pose and points together.
 
@@ -279,18 +290,18 @@ class TrackerConfig(Checked):
     interval: Range = (1.0, 1.0)
     """Range of the time from one pose to the next [control steps], drawn for every pose and rounded. Until then the
     last pose is observed. With control at 60 Hz, 2 is a tracker of 30 Hz."""
-    jitter: NotNegative[float] = 0.0
+    jitter: NonNegativeFloat = 0.0
     """The delay of a pose differs from ``observation_latency`` by U(-j, j) [control steps], drawn at every step. It
     stays between 0 and the longest delay."""
-    position_bias: NotNegative[float] = 0.0
+    position_bias: NonNegativeFloat = 0.0
     """Error of the position during a whole episode: U(-b, b) along each axis [m]."""
-    rotation_bias: NotNegative[float] = 0.0
+    rotation_bias: NonNegativeFloat = 0.0
     """Error of the orientation during a whole episode: U(-b, b) about each axis [rad]."""
-    position_noise: NotNegative[float] = 0.0
+    position_noise: NonNegativeFloat = 0.0
     """Error of each pose's position: U(-n, n) along each axis [m]."""
-    rotation_noise: NotNegative[float] = 0.0
+    rotation_noise: NonNegativeFloat = 0.0
     """Error of each pose's orientation: U(-n, n) about each axis [rad]."""
-    loss: Share[float] = 0.0
+    loss: Share = 0.0
     """Probability that the tracker loses the object after a pose."""
     loss_steps: Range = (1.0, 1.0)
     """Range of the time that it takes to find the object again [control steps], in addition to ``interval``."""
@@ -309,7 +320,7 @@ class TrackerConfig(Checked):
         return self.interval[1] > 1 or self.loss > 0
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class PushConfig(Checked):
     """Pushes on object and arm, each during one control step. All are off by default."""
 
@@ -318,11 +329,11 @@ class PushConfig(Checked):
         Rule("two numbers above 0 and at most 1", lambda x: 0 < x[0] <= x[1] <= 1),
     ] = (0.001, 0.1)
     """Range of the probability of a push per control step. Each episode draws one, log-uniformly."""
-    object_velocity: NotNegative[float] = 0.0
+    object_velocity: NonNegativeFloat = 0.0
     """Largest change of the object's velocity [m/s], in any direction, by a force at its centre of mass."""
-    object_spin: NotNegative[float] = 0.0
+    object_spin: NonNegativeFloat = 0.0
     """Largest change of the object's angular velocity [rad/s], about any axis, by a torque."""
-    arm_torque: NotNegative[float] = 0.0
+    arm_torque: NonNegativeFloat = 0.0
     """Largest torque on each joint of the arm, as a share of the joint's effort limit. The joint's target is moved by
     torque / stiffness, which a drive feels like the torque itself until it reaches its effort limit."""
     when: Literal["always", "gated"] = "always"
@@ -335,7 +346,7 @@ class PushConfig(Checked):
         return self.object_velocity > 0 or self.object_spin > 0
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class RandomizationConfig(Checked):
     """Physical parameters, delays and faults drawn at each reset.
 
@@ -346,14 +357,14 @@ class RandomizationConfig(Checked):
     enabled: bool = True
     friction: Range = (0.5, 1.0)
     """Range of the object material's coefficient."""
-    friction_buckets: Positive[int] = 250
+    friction_buckets: PositiveInt = 250
     """Number of distinct materials."""
-    elastomer: NotNegative[float] = 0.8
+    elastomer: NonNegativeFloat = 0.8
     """Coefficient of the fingertips' material. The friction of a pair is the mean of its two materials, as in the
     paper's simulator."""
-    metal: NotNegative[float] = 0.1
+    metal: NonNegativeFloat = 0.1
     """Coefficient of every other link's material."""
-    table: NotNegative[float] = 0.5
+    table: NonNegativeFloat = 0.5
     """Coefficient of the table's material. Not in the paper."""
     mass_scale: PositiveRange = (0.7, 1.3)
     """Range of the factor on the object's mass."""
@@ -419,20 +430,6 @@ class RandomizationConfig(Checked):
         return (getattr(self, name) or (0.0, 0.0))[1] if self.enabled else 0.0
 
     @property
-    def has_faults(self) -> bool:
-        """Whether there is a fault of a real loop: something late, lost, wrong or pushed."""
-        late = ("action_latency", "hand_latency", "observation_latency", "proprio_latency")
-        tracker = self.tracker
-        push = self.push
-        return self.enabled and (
-            any(self.longest(name) > 0 for name in (*late, "lost_actions"))
-            or tracker.has_errors
-            or tracker.loss > 0
-            or push.moves_object
-            or push.arm_torque > 0
-        )
-
-    @property
     def scales_drives(self) -> bool:
         """Whether drives differ from what the robot spec says."""
         return self.draws(
@@ -443,7 +440,7 @@ class RandomizationConfig(Checked):
 _AS_STATED = RandomizationConfig()
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class TaskConfig(Checked):
     """Everything that defines the task apart from robot, objects and reset bank."""
 
@@ -454,16 +451,16 @@ class TaskConfig(Checked):
     reset: ResetConfig = field(default_factory=ResetConfig)
     randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
     vision: VisionConfig = field(default_factory=VisionConfig)
-    timestep: Positive[Finite[float]] = 1.0 / 240.0
+    timestep: PositiveFinite = 1.0 / 240.0
     """Physics timestep [s]."""
-    substeps: Positive[int] = 4
+    substeps: PositiveInt = 4
     """Physics steps per control step: control at 60 Hz. Not in the paper."""
     object_frame: Literal["mesh", "center"] = "mesh"
     """Origin of the object in observations, rewards, ends of episodes, perturbed starts and goals, and the draft's
     metrics. ``mesh``: the origin of the mesh file (the paper), so that it matters where somebody put it. ``center``:
     the center of volume of the convex hull, the same point of the object whatever the file's origin and axes. With
     ``observation.rotation="to_goal"`` and ``observation.cloud="paired"`` the file's axes have no effect either."""
-    distance_points: Positive[int] = 256
+    distance_points: PositiveInt = 256
     """Surface points per object for fingertip distances."""
 
     @property

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
-from xreset.checks import Positive
+from xreset.checks import PositiveFloat, PositiveInt, frozen
 from xreset.task.config import TaskConfig
 
 SCHEMA = "xreset-policy/1"
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Contract:
     """What must agree between training and evaluation."""
 
@@ -21,6 +20,6 @@ class Contract:
     joint_names: tuple[str, ...]
     fingertip_names: tuple[str, ...]
     objects: tuple[str, ...]
-    observation_layout: dict[str, dict[str, Positive[int]]]
-    control_dt: Positive[float]
+    observation_layout: dict[str, dict[str, PositiveInt]]
+    control_dt: PositiveFloat
     task: TaskConfig

@@ -8,13 +8,13 @@ Shape letters: N worlds, J joints, E fingertips, P points, K numbers per point, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import prod
 
 import torch
 from torch import Tensor
 
 from xreset.cameras.config import VisionConfig
+from xreset.checks import frozen
 from xreset.geometry.rotations import (
     quat_conjugate,
     quat_from_axis_angle,
@@ -27,7 +27,7 @@ from xreset.physics import Links, State
 from xreset.task.config import ObservationConfig
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class ObservationInput:
     """Quantities that observations are made of: world frame, quaternions (w, x, y, z)."""
 

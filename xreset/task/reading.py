@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Self
 
 import torch
 from torch import Tensor
 
+from xreset.checks import frozen
 from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
 from xreset.physics import Backend, Contacts, Health, Links, State
 from xreset.task.rewards import Reward
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Reading:
     """State and contacts after a control step, and what follows from them."""
 

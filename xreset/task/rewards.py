@@ -12,7 +12,6 @@ r = -2.5 min(P, 3) - 2.5 min(M, 0.5) + G 3 (1.4 - 3 d) + G [d <= 0.02] 15 / (1 +
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from typing import Any, cast
@@ -20,13 +19,14 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
+from xreset.checks import frozen
 from xreset.errors import RunError
 from xreset.geometry.rotations import quat_angle, quat_rotate
 from xreset.physics import State
 from xreset.task.config import RewardConfig
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class RewardInput:
     """What the reward looks at; N worlds, E fingertips with the thumb first."""
 
@@ -68,7 +68,7 @@ class RewardInput:
         return self.state.object_quat
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Reward:
     """Weighted terms and what they rest on."""
 

@@ -5,11 +5,11 @@ Shape letters: N rows (frames of trajectories, or states of a bank), S sequences
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
+from xreset.checks import frozen
 from xreset.demos.hand import PARENTS
 from xreset.errors import XResetError
 from xreset.spec import ObjectSpec, RobotSpec
@@ -26,7 +26,7 @@ BONES = np.column_stack((PARENTS, np.arange(1, 21)))
 """[20, 2] keypoints at the ends of each bone of the human hand."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class View:
     """Everything that is shown of a file, in the table frame."""
 

@@ -376,6 +376,8 @@ class ChangingSettings(unittest.TestCase):
                 self.assertRaisesRegex(ValueError, "each share greater than the one before"),
             ):
                 ScheduleConfig(faults=points)
+        with self.assertRaisesRegex(ValueError, "success_position is .*, expected values above 0"):
+            ScheduleConfig(success_position=((0.0, 0.05), (1.0, 0.0)))
 
     def test_a_training_moves_its_limit_of_success_its_faults_and_its_starts(self):
         """On straight lines between the points."""

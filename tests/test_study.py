@@ -119,6 +119,7 @@ class FileTest(InFolder):
                 True,
             ),
             ("resets", "--closing.spacing 0.005 --num-envs 8 --backend mujoco", True),
+            ("resets", "--settle", True),
         ):
             options = text.split()
             file = self.file(
@@ -488,6 +489,9 @@ class WholeTest(unittest.TestCase):
         text = (self.out / "reports" / "seconds" / "study.md").read_text()
         self.assertRegex(text, r"\| tomato soup can \| \d.* paper 33\.0 .* \| \d.* paper 90\.8 ")
         self.assertIn("one seed only of x-reset", text)
+        for unit in ("minutes of training", "million environment steps"):
+            _, _, after = text.partition(f"## First success from home, in {unit}\n")
+            self.assertIn("| x-reset | 1 | 0% (0-79); \\>0.0 |", after)
         self.assertTrue(
             (self.out / "reports" / "seconds" / "compare-tomato_soup_can" / "compare.png").is_file()
         )

@@ -27,7 +27,7 @@ from xreset.cli import main
 from xreset.errors import FileFormatError, PolicyError, RunError, XResetError
 from xreset.files import claim, file_hash
 from xreset.learning.checkpoint import Checkpoint, load_moments, read_checkpoint
-from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
+from xreset.learning.config import ModelConfig, PpoConfig, ScheduleConfig, TrainConfig
 from xreset.learning.recipes import RECIPES
 from xreset.learning.run import (
     Candidate,
@@ -300,6 +300,17 @@ class TrainingTest(unittest.TestCase):
             ):
                 parsed(*arguments)
             self.assertRegex(said.getvalue(), problem)
+
+    def test_a_schedule_without_effect_is_refused(self):
+        for schedule, problem in (
+            (ScheduleConfig(teacher=((0.0, 1.0),)), "this training has no teacher"),
+            (ScheduleConfig(faults=((0.0, 0.0), (1.0, 1.0))), "task.randomization has none"),
+        ):
+            with self.subTest(problem), self.assertRaisesRegex(RunError, problem):
+                self.train("idle", config=replace(CONFIG, schedule=schedule))
+        self.assertFalse(RandomizationConfig().has_faults)
+        for name in ("robust", "live", "published"):
+            self.assertTrue(RECIPES[name].config.task.randomization.has_faults)
 
     def test_a_recipe_is_not_ignored(self):
         with self.assertRaisesRegex(XResetError, "Both recipe and config"):

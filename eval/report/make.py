@@ -78,7 +78,9 @@ def compare(
     found = scores(groups)
     notes = [*reasons, *fairness.uneven(trainings), *fairness.begun(trainings)]
     policies = []
+    clocks = {}
     for label, members in groups.items():
+        clocks[label] = [member.lift for member in members]
         notes += fairness.health(label, by_engine(members))
         policies += [result.policy for result in members[0].results.values()]
     content = render(
@@ -88,7 +90,7 @@ def compare(
         versions=caption(policies),
         results=tables.results(groups, found),
         x=AXES[x][0],
-        lifted=tables.lifted(groups, x),
+        lifted=tables.lifted(clocks, x),
         different=tables.different(groups),
     )
     write_picture(out / "compare.png", groups, tags, found, x)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain
 
 import pandas as pd
@@ -53,15 +53,20 @@ def results(groups: Groups, found: Table) -> Rows:
     return rows
 
 
-def lifted(groups: Groups, x: X) -> Rows:
-    """Return one row for each group, one column for each share of success: how many of its trainings passed it, and
-    when each did."""
+def lifted(clocks: Mapping[str, Sequence[Lift]], x: X) -> Rows:
+    """Return one row for each group of trainings, one column for each share of success: how many of its trainings
+    passed it, and when each did.
+
+    Args:
+        clocks: label -> the lift clock of each training; one without iterations has none.
+        x: unit of the times.
+    """
     rows = [["", "runs", *(f"{100 * share:g} %" for share in SHARES)]]
-    for label, members in groups.items():
-        clocks = [m.lift for m in members if m.lift.iteration]
-        if clocks:
-            cells = [_lifted(clocks, share, x) for share in SHARES]
-            rows.append([label, str(len(members)), *cells])
+    for label, every in clocks.items():
+        begun = [clock for clock in every if clock.iteration]
+        if begun:
+            cells = [_lifted(begun, share, x) for share in SHARES]
+            rows.append([label, str(len(every)), *cells])
     return rows
 
 

@@ -86,7 +86,15 @@ class Data(Checked):
     """Further options of ``xreset retarget``."""
     resets: Annotated[
         tuple[str, ...],
-        _options("--closing.", "--filter.", "--squeeze.", "--backend", "--device", "--num-envs"),
+        _options(
+            "--closing.",
+            "--filter.",
+            "--squeeze.",
+            "--settle",
+            "--backend",
+            "--device",
+            "--num-envs",
+        ),
     ] = ()
     """Further options of ``xreset resets``."""
 

@@ -11,14 +11,16 @@ import pandas as pd
 
 from xreset.eval.pages import render
 from xreset.eval.report import fairness
+from xreset.eval.report.curves import AXES
 from xreset.eval.report.make import compare
+from xreset.eval.report.tables import lifted
 from xreset.eval.study.file import TableSpec
 from xreset.eval.study.paper import TRAINING
 from xreset.eval.study.plan import Plan
 from xreset.eval.study.tables import FilledTable, draw, fill
 from xreset.eval.table import caption
 from xreset.files import write_whole
-from xreset.learning.clock import read_lift
+from xreset.learning.clock import Lift, read_lift
 from xreset.text import short_name
 
 _ALIKE = 0.05
@@ -56,6 +58,9 @@ def write_page(plan: Plan, out: Path) -> tuple[Path, list[str]]:
         metrics=[fill(plan, spec) for spec in metrics],
         notes=notes,
         compared=_compare(plan, out),
+        lifted={
+            label: lifted(_clocks(plan), x) for x, (label, _) in AXES.items() if x != "iterations"
+        },
         versions=caption(run.spec.policy or "" for run in plan.runs),
     )
     write_whole(out / "study.md", content)
@@ -106,6 +111,19 @@ def _unfair(plan: Plan, table: FilledTable) -> Iterator[str]:
         yield f"not of equal length (million environment steps: {listing})."
     if table.paper:
         yield f"the paper's policies took {TRAINING}; ours as in the comparisons below."
+
+
+def _clocks(plan: Plan) -> dict[str, list[Lift]]:
+    """Return the lift clocks of each run's trainings; where a run trains objects alone, also those of each object."""
+    clocks: defaultdict[str, list[Lift]] = defaultdict(list)
+    for run in plan.runs:
+        if run.config is not None:
+            labels = [run.group]
+            if run.spec.alone:
+                labels.append(f"{run.group}: {short_name(run.objects[0])}")
+            for label in labels:
+                clocks[label].append(read_lift(run.folder))
+    return clocks
 
 
 def _compare(plan: Plan, out: Path) -> list[str]:

@@ -114,6 +114,9 @@ ShareSchedule = Annotated[
         is_schedule,
     ),
 ]
+PositiveSchedule = Annotated[
+    ShareSchedule, Rule("values above 0", lambda points: all(value > 0 for _, value in points))
+]
 
 
 @frozen
@@ -130,7 +133,7 @@ class ScheduleConfig(Checked):
     demo_probability: ShareSchedule = ()
     """Replaces ``task.reset.demo_probability``, such as ``0 0.5 1 0.25``: demonstrated states teach the first grasp,
     and starts from home are what is evaluated."""
-    success_position: ShareSchedule = ()
+    success_position: PositiveSchedule = ()
     """Replaces ``task.reward.success_position`` [m], such as ``0 0.05 1 0.01``: what counts as success becomes
     stricter. Evaluations keep their own limits."""
     faults: ShareSchedule = ()

@@ -117,6 +117,15 @@ def train(
         task = replace(config.task, reset=reset)
         schedule = replace(config.schedule, demo_probability=())
         config = replace(config, task=task, schedule=schedule)
+    if config.schedule.teacher and teacher is None:
+        raise RunError(
+            "schedule.teacher is for xreset distill, and this training has no teacher. Leave it empty."
+        )
+    if config.schedule.faults and not config.task.randomization.has_faults:
+        raise RunError(
+            "schedule.faults scales the faults of a real loop, and task.randomization has none. Set some, "
+            "or omit the schedule."
+        )
     if config.uses_states and not inputs.bank.num_states:
         raise RunError(
             f"{file} holds no state to reset to: every candidate was rejected. Look at its reasons (xreset resets), "

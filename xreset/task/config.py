@@ -430,6 +430,20 @@ class RandomizationConfig(Checked):
         return (getattr(self, name) or (0.0, 0.0))[1] if self.enabled else 0.0
 
     @property
+    def has_faults(self) -> bool:
+        """Whether there is a fault of a real loop: something late, lost, wrong or pushed."""
+        late = ("action_latency", "hand_latency", "observation_latency", "proprio_latency")
+        tracker = self.tracker
+        push = self.push
+        return self.enabled and (
+            any(self.longest(name) > 0 for name in (*late, "lost_actions"))
+            or tracker.has_errors
+            or tracker.loss > 0
+            or push.moves_object
+            or push.arm_torque > 0
+        )
+
+    @property
     def scales_drives(self) -> bool:
         """Whether drives differ from what the robot spec says."""
         return self.draws(

@@ -152,11 +152,18 @@ class TestCameras(unittest.TestCase):
         with (
             mock.patch("xreset.cameras.rays.wp.launch", side_effect=RuntimeError("no driver")),
             self.assertRaisesRegex(
-                XResetError, "renderer of depth images cannot start on cpu: no driver"
+                XResetError,
+                r"renderer of depth images cannot start on cpu: no driver. Use a policy without",
             ),
         ):
             self.cameras()
-        for changes in ({"near": 3.0}, {"fov": 4.0}, {"target": ABOVE.pos}):
+        for changes in (
+            {"near": 3.0},
+            {"fov": 4.0},
+            {"target": ABOVE.pos},
+            {"pos": (0.5, 0.2)},
+            {"pos": (0.5, 0.2, float("nan"))},
+        ):
             with self.subTest(changes), self.assertRaises(ValueError):
                 replace(ABOVE, **changes)
 

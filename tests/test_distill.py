@@ -163,6 +163,10 @@ class DistillTest(unittest.TestCase):
         vision = train.call_args.kwargs["config"].task.vision
         self.assertEqual((vision.view, vision.goal_image), ("points", True))
         self.assertEqual(vision.cameras, (FRONT,))
+        for cameras in ("wrist", WRIST, ("wrist",)):
+            with mock.patch("xreset.learning.train.train") as train:
+                distill("many-objects", self.bank, out=self.folder / "unused", cameras=cameras)
+            self.assertEqual(train.call_args.kwargs["config"].task.vision.cameras, (WRIST,))
 
     def test_refusals(self):
         away = replace(IMAGES, cameras=(replace(FRONT, target=(3.0, 0.2, 0.5)),))
@@ -170,9 +174,10 @@ class DistillTest(unittest.TestCase):
         for error, words, options in (
             (
                 XResetError,
-                "Unknown camera rear. Choose from: front, side, wrist",
-                {"cameras": ("rear",)},
+                "Unknown camera 'rear'. Choose from: front, side, wrist",
+                {"cameras": "rear"},
             ),
+            (XResetError, "Unknown camera 3", {"cameras": (FRONT, 3)}),
             (PolicyError, "Unknown policy 'nobody'", {"teacher": "nobody"}),
             (
                 PolicyError,
@@ -194,10 +199,17 @@ class DistillTest(unittest.TestCase):
             "object": ["can", "can", "box", "box"],
         }
         teacher = pd.DataFrame(common | {"reorient": [True, True, True, False]})
-        student = pd.DataFrame(common | {"reorient": [True, False, False, False]})
+        student = pd.DataFrame(
+            common
+            | {
+                "reorient": [True, False, False, False],
+                "final_position_error": [0.01, 0.019, 0.3, 0.01],
+            }
+        )
         self.assertEqual(
             missed_by_student(student, teacher),
-            "Of 3 episodes that the teacher ends at the goal, the student misses 2: can 1 of 2, box 1 of 1.",
+            "Of 3 episodes that the teacher ends at the goal, the student misses 2: can 1 of 2, box 1 of 1. "
+            "In 1 of these the object ends within 2 cm of its place, but is turned wrongly.",
         )
 
 

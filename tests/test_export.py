@@ -176,6 +176,7 @@ class LeRobot(Case):
             ("is there already", {"folder": self.folder / "eval"}),
             ("must be even", {"size": (321, 240)}),
             ("Unknown camera rear", {"cameras": ("rear",)}),
+            ("wanted and not wanted", {"cameras": ("front",), "video": False}),
         ):
             with self.subTest(words), self.assertRaisesRegex(XResetError, words):
                 write_lerobot(options.pop("folder", self.folder / "set"), recording, **options)

@@ -133,7 +133,7 @@ class CollectTest(Reported):
         self.assertEqual(collect(self.folder).notes, ())
         write_results(self.folder / "teacher", toy_summary(), toy_rollouts(), ("a", "b", "c"))
         [note] = collect(self.folder).notes
-        self.assertIn("that the teacher ends at the goal, the student misses 0", note)
+        self.assertIn("that the teacher ends at the goal, the student misses 0. In 0 of", note)
         self.write_soup()
         self.assertIsNone(collect(self.folder).vision, "the run's configuration has no camera")
 

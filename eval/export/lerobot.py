@@ -71,6 +71,10 @@ def write_lerobot(
         raise XResetError(
             f"Unknown camera {', '.join(sorted(unknown))}. Choose from: {', '.join(CAMERAS)}."
         )
+    if cameras and not video:
+        raise XResetError(
+            "Films of cameras are wanted and not wanted. Leave out --no-video or --camera."
+        )
     videos = (VIDEO, *(_DEPTH + name for name in cameras)) if video else ()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise XResetError(f"{folder} is there already. Nothing was changed; choose another --out.")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
+from xreset.eval.metrics import GOAL_DISTANCE
 from xreset.eval.results import Table
 from xreset.text import short_name
 
@@ -107,7 +108,8 @@ def begun(trainings: Sequence[Training]) -> list[str]:
 
 
 def missed_by_student(student: Table, teacher: Table) -> str:
-    """Return one sentence: which objects a policy misses in episodes that its teacher ends at the goal.
+    """Return in words which objects a policy misses in episodes that its teacher ends at the goal, and how often only
+    the rotation is wrong.
 
     Args:
         student: episodes of the policy.
@@ -121,7 +123,11 @@ def missed_by_student(student: Table, teacher: Table) -> str:
     for name, count in missed["object"].value_counts().items():
         parts.append(f"{name} {count} of {int((solved['object'] == name).sum())}")
     where = f": {', '.join(parts)}" if parts else ""
-    return f"Of {len(solved)} episodes that the teacher ends at the goal, the student misses {len(missed)}{where}."
+    turned = int((missed["final_position_error"] <= GOAL_DISTANCE).sum())
+    return (
+        f"Of {len(solved)} episodes that the teacher ends at the goal, the student misses {len(missed)}{where}. "
+        f"In {turned} of these the object ends within {100 * GOAL_DISTANCE:.0f} cm of its place, but is turned wrongly."
+    )
 
 
 def health(label: str, episodes: Iterable[tuple[Any, Table]]) -> list[str]:

@@ -8,7 +8,6 @@ from typing import Annotated, Literal
 
 from xreset.checks import (
     Checked,
-    FiniteFloat,
     NonNegativeFloat,
     PositiveFinite,
     PositiveFloat,
@@ -18,7 +17,10 @@ from xreset.checks import (
     frozen,
 )
 
-Point = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+Point = Annotated[
+    tuple[float, float, float],
+    Rule("three finite numbers", lambda p: len(p) == 3 and all(map(math.isfinite, p))),
+]
 Pixels = Annotated[int, Rule("a number from 8 to 1024", lambda n: 8 <= n <= 1024)]
 
 

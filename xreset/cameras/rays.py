@@ -132,9 +132,9 @@ class RayCaster:
                         _cast, (*shape, size[0] * size[1]), arrays, record_cmd=True
                     )
         except Exception as error:  # a missing compiler or driver may fail in any way
+            other = "--device cpu, or " if device.type != "cpu" else ""
             raise XResetError(
-                f"The renderer of depth images cannot start on {device}: {error}. Use --device cpu, or a policy "
-                "without cameras."
+                f"The renderer of depth images cannot start on {device}: {error}. Use {other}a policy without cameras."
             ) from error
 
     def cast(self) -> None:

@@ -36,6 +36,7 @@ from xreset.plugins import backend_class, device_for
 from xreset.policy import OnnxPolicy, check_contract, policy_contract
 from xreset.resets.bank import ResetBank, read_bank, write_bank
 from xreset.resets.goals import GoalSet, read_goals, with_goals, write_goals
+from xreset.text import shown
 
 
 def train(
@@ -180,7 +181,7 @@ def distill(
     bank: str | Path | ResetBank,
     *,
     out: str | Path,
-    cameras: Sequence[str | CameraConfig] = ("front",),
+    cameras: str | CameraConfig | Sequence[str | CameraConfig] = "front",
     vision: VisionConfig | None = None,
     config: TrainConfig | None = None,
     **options: Any,
@@ -193,7 +194,7 @@ def distill(
         teacher: run folder, exported policy (.onnx) or name of a policy that ships with xreset.
         bank: reset bank, or its file.
         out: run folder to make.
-        cameras: names of :data:`xreset.cameras.config.CAMERAS`, or cameras.
+        cameras: name of one of :data:`xreset.cameras.config.CAMERAS`, or a camera; or several.
         vision: images, their timing and what the student gets of them; its cameras are replaced by ``cameras``.
             Default: points, and the object at its goal.
         config: the whole configuration, cameras included; default: :func:`xreset.learning.recipes.student_config`.
@@ -208,12 +209,8 @@ def distill(
             start.
     """
     if config is None:
-        unknown = [name for name in cameras if isinstance(name, str) and name not in CAMERAS]
-        if unknown:
-            raise XResetError(
-                f"Unknown camera {', '.join(unknown)}. Choose from: {', '.join(CAMERAS)}."
-            )
-        chosen = tuple(CAMERAS[camera] if isinstance(camera, str) else camera for camera in cameras)
+        wanted = [cameras] if isinstance(cameras, str | CameraConfig) else cameras
+        chosen = tuple(_camera(each) for each in wanted)
         told = OnnxPolicy(policy_file(teacher)).contract.task
         config = student_config(told, replace(vision or STUDENT_VISION, cameras=chosen))
     if not config.task.vision.cameras:
@@ -221,6 +218,15 @@ def distill(
             "A student needs a camera. Give one or two of: " + ", ".join(CAMERAS) + "."
         )
     return train(bank, out=out, config=config, teacher=teacher, **options)
+
+
+def _camera(camera: str | CameraConfig) -> CameraConfig:
+    """Return a camera, or the one of a name."""
+    if isinstance(camera, CameraConfig):
+        return camera
+    if camera not in CAMERAS:
+        raise XResetError(f"Unknown camera {shown(camera)}. Choose from: {', '.join(CAMERAS)}.")
+    return CAMERAS[camera]
 
 
 def _copy_teacher(teacher: Path, out: Path, inputs: Inputs, config: TrainConfig) -> None:

@@ -24,7 +24,6 @@ from xreset.backends.workers import (
     Job,
     LocalWorlds,
     WorkerTeam,
-    WorldFailure,
     arrays_in,
     layout_of,
     usable_cores,
@@ -283,16 +282,12 @@ class PoolBackend(Backend):
         """Run a command in the workers."""
         self._must_be_open()
         try:
-            self._team.command(method, worlds, argument)
-        except WorldFailure as failure:
-            if failure.kind is not None:
-                raise failure.kind(f"world {failure.world}: {failure.message}") from failure
-            raise RuntimeError(
-                f"backend {self.name!r}, world {failure.world}, {method}: {failure.message}\n{failure.trace}"
-            ) from failure
+            failure = self._team.command(method, worlds, argument)
         except BaseException:  # after Ctrl-C or a worker's death, nobody knows what has been done
             self.close()
             raise
+        if failure is not None:
+            raise failure
 
     def _must_be_open(self) -> None:
         if not self._close.alive:

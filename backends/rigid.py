@@ -10,15 +10,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from itertools import chain
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xreset.checks import frozen
 from xreset.errors import ObjectError, RobotError, XResetError
-from xreset.geometry.dynamics import drive_shares
-from xreset.geometry.urdf import Joint, Link, RobotTree, robot_tree
+from xreset.geometry.dynamics import drive_shares, drive_values
+from xreset.geometry.urdf import Joint, Link, robot_tree
 from xreset.spec import ObjectSpec, RobotSpec, Shape
 
 StateArrays = Mapping[str, np.ndarray]
@@ -138,11 +137,9 @@ def mechanism(robot: RobotSpec) -> Mechanism:
     """Fuse the fixed links of a robot.
 
     Raises:
-        RobotError: the description names links or joints that the URDF lacks, a moving joint is neither driven nor a
-            mimic, a driven joint is fixed, or a moving body has impossible mass properties.
+        RobotError: see :func:`~xreset.geometry.urdf.robot_tree`; or a moving body has impossible mass properties.
     """
     tree = robot_tree(robot)
-    _check_names(robot, tree)
     frames: Frames = {}
     members: list[list[Link]] = []
     """Links of each body."""
@@ -231,14 +228,13 @@ class MovingJoints:
         """[Q] the actuated joint that it follows."""
         self.multiplier = np.array([mimic.multiplier for mimic in mimics])
         self.offset = np.array([mimic.offset for mimic in mimics])
-        drives = [joint.drive for joint in robot.joints]
         self.shares = np.zeros((len(robot.joints), self.count))
         """[J, D] how each drive's torque is shared: see :func:`drive_shares`."""
         self.shares[:, [*self.driven, *self.mimic]] = drive_shares(robot)
-        self.nominal = np.array([(drive.kp, drive.kd, drive.effort) for drive in drives]).T
+        self.nominal = np.stack([drive_values(robot, name) for name in ("kp", "kd", "effort")])
         """[3, J] stiffness, damping and effort limit."""
-        self.armature = np.array([drive.armature for drive in drives])
-        self.friction_loss = np.array([drive.friction_loss for drive in drives])
+        self.armature = drive_values(robot, "armature")
+        self.friction_loss = drive_values(robot, "friction_loss")
         self.has_dry_friction = bool(self.friction_loss.any())
 
     def spread(self, position: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -283,31 +279,6 @@ def principal(
         quat=matrix_to_quat(axes),
         moments=moments,
     )
-
-
-def _check_names(robot: RobotSpec, tree: RobotTree) -> None:
-    links = [*robot.tracked_links, *robot.self_collision_links, *robot.table_exclude]
-    links += chain.from_iterable(tip.contact_links for tip in robot.fingertips)
-    links += chain.from_iterable(robot.collision_exclude)
-    for link in links:
-        tree.link(link)
-    who = f"robot {robot.name!r}: the joint"
-    known = [*robot.joint_names, *(mimic.joint for mimic in robot.mimics)]
-    for name in (*known, *(mimic.source for mimic in robot.mimics)):
-        if tree.joint(name).type == "fixed":
-            raise RobotError(
-                f"{who} {name!r} is driven or mimics another, but it is fixed in the URDF."
-            )
-    for mimic in robot.mimics:
-        if mimic.source not in robot.joint_names:
-            raise RobotError(
-                f"{who} {mimic.joint!r} mimics {mimic.source!r}, expected a driven joint."
-            )
-    for joint in tree.joints:
-        if joint.type != "fixed" and joint.name not in known:
-            raise RobotError(
-                f"{who} {joint.name!r} moves, but is neither driven nor a mimic. Describe it, or make it fixed."
-            )
 
 
 def _fused_inertia(robot: RobotSpec, links: list[Link], frames: Frames) -> Inertia:

@@ -99,22 +99,8 @@ class Job:
         return self.first + len(self.object_index)
 
 
-@dataclass(eq=False)  # exceptions are hashable
-class WorldFailure(Exception):
-    """A world raised. The failure crosses process boundaries, so it holds text."""
-
-    world: int
-    kind: type[XResetError] | None
-    """Set for errors that the user can fix."""
-    message: str
-    trace: str
-
-
 _MOVING = ("build", "set_state", "step")
 """Commands after which a world reports something else than before."""
-
-_GIVEN = {"build": STATE_FIELDS, "set_state": STATE_FIELDS, "step": ("joint_target", "wrench")}
-"""Arrays that a command gives to the worlds, in double precision."""
 
 _INERTIA_ARGUMENT = {"object_mass": "mass", "object_inertia": "scale", "object_com": "offset"}
 """Parameters of the object's mass properties -> arguments of :meth:`Inertia.changed`."""
@@ -126,27 +112,23 @@ class LocalWorlds:
     def __init__(self, job: Job, arrays: Mapping[str, np.ndarray]) -> None:
         self._job = job
         self._arrays = {name: array[job.first : job.stop] for name, array in arrays.items()}
-        self._given: dict[str, np.ndarray] = {}
         self._worlds: list[World] = []
         self._inertia_changes: list[dict[str, Any]] = [{} for _ in job.object_index]
 
-    def command(self, method: str, worlds: np.ndarray | None, argument: Any) -> None:
+    def command(self, method: str, worlds: np.ndarray | None, argument: Any) -> Exception | None:
         """Run one of the methods below for the given worlds (all if None), then publish what they report.
 
         All worlds act before any is published: engine and Python code then take turns in the processor's caches once
         instead of once per world.
 
-        Raises:
-            WorldFailure: a world raised.
+        Returns:
+            What to raise because a world raised. It crosses process boundaries, so it holds the trace as text.
         """
         rows = (
             range(len(self._job.object_index))
             if worlds is None
             else (worlds - self._job.first).tolist()
         )
-        self._given = {
-            name: self._arrays[name].astype(np.float64) for name in _GIVEN.get(method, ())
-        }
         action = getattr(self, f"_{method}")
         row = 0
         try:
@@ -156,15 +138,23 @@ class LocalWorlds:
                 for row in rows:
                     self._publish(row)
         except Exception as error:
-            kind = type(error) if isinstance(error, XResetError) else None
-            message = str(error) if kind else f"{type(error).__name__}: {error}"
-            world = self._job.first + row
-            raise WorldFailure(world, kind, message, traceback.format_exc()) from error
+            world = f"world {self._job.first + row}"
+            if isinstance(error, XResetError):  # one that the user can fix
+                return type(error)(f"{world}: {error}")
+            return RuntimeError(
+                f"backend {self._job.backend!r}, {world}, {method}: {type(error).__name__}: {error}\n"
+                f"{traceback.format_exc()}"
+            )
+        return None
 
     def close(self) -> None:
         """Close the worlds."""
         while self._worlds:
             self._worlds.pop().close()
+
+    def _given(self, name: str, i: int) -> np.ndarray:
+        """Return what the parent wrote for a world, in double precision."""
+        return self._arrays[name][i].astype(np.float64)
 
     def _build(self, i: int, _) -> None:
         job = self._job
@@ -172,7 +162,7 @@ class LocalWorlds:
         self._set_state(i, _)
 
     def _set_state(self, i: int, _) -> None:
-        self._worlds[i].set_state({name: self._given[name][i] for name in STATE_FIELDS})
+        self._worlds[i].set_state({name: self._given(name, i) for name in STATE_FIELDS})
         self._arrays["nonfinite"][i] = False
         self._arrays["overflow"][i] = False
 
@@ -180,8 +170,8 @@ class LocalWorlds:
         if self._arrays["nonfinite"][i]:
             return
         world = self._worlds[i]
-        wrench = self._given["wrench"][i]
-        world.set_joint_targets(self._given["joint_target"][i])
+        wrench = self._given("wrench", i)
+        world.set_joint_targets(self._given("joint_target", i))
         world.set_object_wrench(wrench[:3], wrench[3:])
         world.step(n)
 
@@ -192,7 +182,7 @@ class LocalWorlds:
             self._arrays["body_inertia"][i, k] = body.matrix
 
     def _set_parameter(self, i: int, name: Parameter) -> None:
-        value = self._arrays[name][i].astype(np.float64)
+        value = self._given(name, i)
         if not value.ndim:
             value = float(value)
         if name not in _INERTIA_ARGUMENT:
@@ -245,13 +235,15 @@ class WorkerTeam:
             for worker in self._workers:
                 worker.send((layout, worker.job))
             for worker in self._workers:
-                worker.receive("start")
+                if failure := worker.receive("start"):
+                    raise failure
         except BaseException:
             self.close()
             raise
 
-    def command(self, method: str, worlds: np.ndarray | None, argument: Any) -> None:
-        """Have all workers concerned run a command at the same time, and wait for all of them."""
+    def command(self, method: str, worlds: np.ndarray | None, argument: Any) -> Exception | None:
+        """Have all workers concerned run a command at the same time, wait for all of them, and return the first
+        failure."""
         asked = []
         for worker in self._workers:
             mine = worlds
@@ -261,14 +253,8 @@ class WorkerTeam:
                     continue
             worker.send((method, mine, argument))
             asked.append(worker)
-        failures = []
-        for worker in asked:
-            try:
-                worker.receive(method)
-            except WorldFailure as failure:
-                failures.append(failure)
-        if failures:
-            raise failures[0]
+        failures = [worker.receive(method) for worker in asked]
+        return next(filter(None, failures), None)
 
     def close(self) -> None:
         """Close the pipes, which ends the workers; kill those that do not end in time."""
@@ -305,14 +291,12 @@ class _Worker:
         with contextlib.suppress(OSError):
             self.pipe.send_bytes(pickle.dumps(message))
 
-    def receive(self, command: str) -> None:
-        """Wait for the reply, and raise the failure that it holds."""
+    def receive(self, command: str) -> Exception | None:
+        """Wait for the reply, and return the failure that it holds."""
         try:
-            failure = self.pipe.recv_bytes()
+            return pickle.loads(self.pipe.recv_bytes())
         except (EOFError, OSError) as error:
             raise XResetError(self._cause_of_death(command)) from error
-        if failure:
-            raise pickle.loads(failure)
 
     def wait(self) -> None:
         """Wait for the end, and force it if need be."""
@@ -340,7 +324,7 @@ class _Worker:
 
 
 def serve(pipe: int, memory: int) -> None:
-    """Run a worker process: receive a job and then commands, and answer each with nothing or a failure, until the end.
+    """Run a worker process: receive a job and then commands, and answer each with None or a failure, until the end.
 
     Args:
         pipe: file descriptor of the pipe to the parent.
@@ -351,20 +335,16 @@ def serve(pipe: int, memory: int) -> None:
     worlds = None
     with contextlib.suppress(EOFError, OSError):  # the parent is gone, or done with this worker
         while True:
-            failure = b""
+            failure = None
             message = connection.recv_bytes()
             try:
                 if worlds is None:
                     layout, job = pickle.loads(message)
                     worlds = LocalWorlds(job, arrays_in(mmap.mmap(memory, layout.itemsize), layout))
                 else:
-                    worlds.command(*pickle.loads(message))
-            except WorldFailure as error:
-                failure = pickle.dumps(error)
+                    failure = worlds.command(*pickle.loads(message))
             except Exception:
-                failure = pickle.dumps(
-                    XResetError(f"A worker process failed:\n{traceback.format_exc()}")
-                )
-            connection.send_bytes(failure)
+                failure = XResetError(f"A worker process failed:\n{traceback.format_exc()}")
+            connection.send_bytes(pickle.dumps(failure))
             if worlds is None:
                 return

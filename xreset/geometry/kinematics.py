@@ -74,8 +74,7 @@ class Kinematics:
             device: device of all results.
 
         Raises:
-            RobotError: the description names a joint or link that is not in the URDF, a moving joint is neither
-                actuated nor a mimic, or a mimic follows a joint that is not actuated.
+            RobotError: see :func:`~xreset.geometry.urdf.robot_tree`.
         """
         tree = robot_tree(robot)
         self.robot = robot
@@ -90,21 +89,8 @@ class Kinematics:
 
         moving = [joint for joint in joints if joint.type != "fixed"]
         mimics = {mimic.joint: mimic for mimic in robot.mimics}
-        for name in [*robot.joint_names, *mimics]:
-            tree.joint(name)
-        driven = set()
-        for joint in moving:
-            if joint.name not in robot.joint_names and joint.name not in mimics:
-                raise RobotError(
-                    f"robot {robot.name!r}: the URDF's joint {joint.name!r} moves, but the description neither "
-                    "actuates it nor makes it a mimic joint. Add it to either, or make it fixed in the URDF."
-                )
-            driven.add(mimics[joint.name].source if joint.name in mimics else joint.name)
-        if passive := driven.difference(robot.joint_names):
-            raise RobotError(
-                f"robot {robot.name!r}: mimic joints follow {', '.join(sorted(passive))}, which the description does "
-                "not actuate. Let them follow an actuated joint."
-            )
+        driven = {joint.name for joint in moving}
+        driven |= {mimic.source for name, mimic in mimics.items() if name in driven}
         indices = [i for i, name in enumerate(robot.joint_names) if name in driven]
         self.joint_indices = np.array(indices, dtype=np.int64)
         """[J] indices of this kinematics' joints in the robot's joint order; all of them when the root is the

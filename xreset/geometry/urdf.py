@@ -11,6 +11,7 @@ import math
 import os
 from dataclasses import field
 from functools import cached_property, lru_cache
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 from xml.etree import ElementTree
@@ -149,8 +150,48 @@ class RobotTree:
 
 
 def robot_tree(robot: RobotSpec) -> RobotTree:
-    """Return the tree of a robot's URDF; the file is read again only after a change."""
-    return load_urdf(robot.urdf)
+    """Return the tree of a robot's URDF; the file is read again only after a change.
+
+    Raises:
+        RobotError: the URDF cannot be read, or it contradicts the robot's description.
+    """
+    tree = load_urdf(robot.urdf)
+    for problem in chain(*mismatches(robot, tree).values()):
+        raise RobotError(f"robot {robot.name!r}: {problem}")
+    return tree
+
+
+def mismatches(robot: RobotSpec, tree: RobotTree) -> dict[str, list[str]]:
+    """Return what is wrong with the joints and the links of a description, given the tree of its URDF."""
+    moving = [joint.name for joint in tree.moved_by.values()]
+    described = [*robot.joint_names, *(mimic.joint for mimic in robot.mimics)]
+    joints = []
+    for name in described:
+        if name not in moving:
+            joints.append(
+                f"{name!r} is not in the URDF, whose moving joints are {', '.join(moving)}."
+            )
+    for name in moving:
+        if name not in described:
+            joints.append(
+                f"the URDF's joint {name!r} moves, but the description neither actuates it nor makes it a mimic "
+                "joint. Add it to either, or make it fixed in the URDF."
+            )
+    for mimic in robot.mimics:
+        if mimic.source not in robot.joint_names:
+            joints.append(
+                f"mimic joints follow {mimic.source}, which the description does not actuate. Let them follow an "
+                "actuated joint."
+            )
+    named = [robot.hand_root, robot.palm, *robot.self_collision_links, *robot.table_exclude]
+    named += [point.link for point in robot.keypoints]
+    named += chain(*robot.collision_exclude)
+    for tip in robot.fingertips:
+        named += (tip.link, *tip.contact_links)
+    known = ", ".join(tree.link_names)
+    absent = [link for link in dict.fromkeys(named) if link not in tree.link_names]
+    links = [f"the URDF has no link {link!r}. Choose from: {known}." for link in absent]
+    return {"joints": joints, "links": links}
 
 
 def joint_limits(robot: RobotSpec) -> np.ndarray:

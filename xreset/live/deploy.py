@@ -20,7 +20,7 @@ from xreset.objects.sampling import center, surface_points
 from xreset.policy import policy_contract
 from xreset.runtime import check_contract
 from xreset.runtime import contract as files
-from xreset.spec import ObjectSpec, RobotSpec
+from xreset.spec import MimicSpec, ObjectSpec, RobotSpec
 from xreset.task.actions import ActionSpace
 from xreset.task.config import TaskConfig
 
@@ -121,29 +121,21 @@ def _number(value: Any) -> Any:
 def _chain(robot: RobotSpec) -> dict[str, Any]:
     """Return the joints from the root to the palm and the fingertips."""
     tree = robot_tree(robot)
-    by_child = {joint.child: joint for joint in tree.joints}
-    needed = set()
-    for link in robot.tracked_links:
-        name = link
-        while name in by_child:
-            needed.add(name)
-            name = by_child[name].parent
     mimics = {mimic.joint: mimic for mimic in robot.mimics}
     index = {tree.root: 0}
     steps = []
     for joint in tree.joints:
-        if joint.child not in needed:
+        if set(robot.tracked_links).isdisjoint(tree.below(joint.child)):
             continue
         index[joint.child] = len(index)
-        mimic = mimics.get(joint.name)
-        source = mimic.source if mimic else joint.name
+        mimic = mimics.get(joint.name, MimicSpec(joint=joint.name, source=joint.name))
         step = {
             "link": joint.child,
             "parent": index[joint.parent],
             "type": joint.type,
-            "joint": None if joint.type == "fixed" else robot.joint_names.index(source),
-            "multiplier": mimic.multiplier if mimic else 1.0,
-            "offset": mimic.offset if mimic else 0.0,
+            "joint": None if joint.type == "fixed" else robot.joint_names.index(mimic.source),
+            "multiplier": mimic.multiplier,
+            "offset": mimic.offset,
             "origin": joint.T_parent_joint.tolist(),
             "axis": np.asarray(joint.axis, dtype=float).tolist(),
         }

@@ -16,15 +16,14 @@ import numpy as np
 import torch
 import trimesh
 from PIL import Image, ImageDraw, ImageFont
-from scipy.spatial.transform import Rotation
 
 from xreset.cameras.pose import look_at
 from xreset.checks import frozen
 from xreset.errors import XResetError
 from xreset.files import write_whole
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.shapes import transform
 from xreset.geometry.urdf import link_meshes
+from xreset.geometry.urdf_writer import pose
 from xreset.pictures.meshes import (
     GOAL_COLOR,
     OBJECT_COLOR,
@@ -201,8 +200,8 @@ class Renderer:
     def _robot(self, joint_pos: np.ndarray, robot_tint: Color | None) -> list[Triangles]:
         poses = self._link_poses(joint_pos, list(self._links))
         parts = []
-        for (name, mesh), pose in zip(self._links.items(), poses, strict=True):
-            parts.append(place(mesh, tint(self._colors[name], robot_tint), pose))
+        for (name, mesh), T in zip(self._links.items(), poses, strict=True):
+            parts.append(place(mesh, tint(self._colors[name], robot_tint), T))
         return parts
 
 
@@ -221,8 +220,7 @@ def draw_bodies(
 
 def pose_matrix(pos: np.ndarray, quat: np.ndarray) -> np.ndarray:
     """[4, 4] pose from a position [3] and a quaternion [4] (w, x, y, z)."""
-    rotation = Rotation.from_quat(np.asarray(quat, dtype=float), scalar_first=True)
-    return transform(rotation.as_matrix(), pos)
+    return pose(pos, quat=quat)
 
 
 def add_caption(picture: np.ndarray, caption: Sequence[str], lines: int) -> np.ndarray:

@@ -16,7 +16,7 @@ from xreset.errors import XResetError
 from xreset.geometry.collision import SelfCollision, table_clearance
 from xreset.geometry.dynamics import damping_ratio, drive_inertia
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.urdf import RobotTree, robot_tree
+from xreset.geometry.urdf import RobotTree, load_urdf, mismatches
 from xreset.plugins import robot_folder
 from xreset.retarget.hand.model import HandModel, predicted_gigabytes
 from xreset.robot_tools.draft import link_places
@@ -68,23 +68,26 @@ def check(name_or_folder: str | Path) -> list[Finding]:
     counts = f"{joints}, {len(spec.fingertips)} fingertips"
     found = [Finding("ok", "description", f"{folder / DESCRIPTION}: {counts}")]
     try:
-        tree = robot_tree(spec)
+        tree = load_urdf(spec.urdf)
     except XResetError as error:
         return [*found, Finding("error", "URDF", str(error))]
     shapes = sum(len(link.collisions) for link in tree.links)
     mass = sum(link.mass for link in tree.links)
     content = f"{len(tree.links)} links, {len(tree.joints)} joints, {shapes} collision shapes, {mass:.1f} kg"
     found.append(Finding("ok", "URDF", content))
+    wrong = mismatches(spec, tree)
     found += _topic(
         "joints",
-        _joints(spec, tree),
+        _joints(spec, tree, wrong["joints"]),
         f"{len(spec.joints)} actuated joints are at home within limits",
     )
     found += _topic(
         "mimic joints", _mimics(spec, tree), f"{len(spec.mimics)} follow an actuated joint"
     )
     found += _topic(
-        "links", _links(spec, tree), "palm, fingertips, keypoints and collision links exist"
+        "links",
+        _links(spec, tree, wrong["links"]),
+        "palm, fingertips, keypoints and collision links exist",
     )
     found += _topic(
         "inertias", _inertias(tree), "masses are positive, inertias are those of solid bodies"
@@ -120,19 +123,17 @@ def _topic(topic: str, problems: Problems, otherwise: str = "") -> list[Finding]
 # Description against URDF ---------------------------------------------------------------------------------------------
 
 
-def _joints(spec: RobotSpec, tree: RobotTree) -> Problems:
-    known = {joint.name: joint for joint in tree.joints}
-    moving = [joint.name for joint in tree.moved_by.values()]
+def _joints(spec: RobotSpec, tree: RobotTree, wrong: list[str]) -> Problems:
+    for problem in wrong:
+        yield "error", problem
+    known = {joint.name: joint for joint in tree.moved_by.values()}
     inside = set(tree.below(spec.hand_root)[1:])
     for joint in spec.joints:
-        found = known.get(joint.name)
-        if found is None:
-            yield "error", f"{joint.name!r} is not in the URDF, which has {', '.join(moving)}."
+        if joint.name not in known:
             continue
+        found = known[joint.name]
         limits = f"{found.lower:g}..{found.upper:g}"
-        if found.type == "fixed":
-            yield "error", f"{joint.name!r} is fixed in the URDF; an actuated joint must move."
-        elif not np.isfinite((found.lower, found.upper)).all() or found.lower >= found.upper:
+        if not np.isfinite((found.lower, found.upper)).all() or found.lower >= found.upper:
             yield (
                 "error",
                 f"{joint.name!r} has the limits {limits}; expected finite ones, the lower one first.",
@@ -146,58 +147,36 @@ def _joints(spec: RobotSpec, tree: RobotTree) -> Problems:
             where = "below" if found.child in inside else "not below"
             text = f"{joint.name!r} is of group {joint.group!r} but lies {where} the hand's root {spec.hand_root!r}."
             yield "warning", text
-    moved = {*spec.joint_names, *(mimic.joint for mimic in spec.mimics)}
-    for name in moving:
-        if name not in moved:
-            text = "moves but is neither actuated nor a mimic joint; add it to either, or make it fixed."
-            yield "error", f"the URDF's {name!r} {text}"
 
 
 def _mimics(spec: RobotSpec, tree: RobotTree) -> Problems:
     known = {joint.name: joint for joint in tree.moved_by.values()}
     for mimic in spec.mimics:
-        own = known.get(mimic.joint)
-        source = known.get(mimic.source)
-        if own is None:
-            yield "error", f"{mimic.joint!r} is not a moving joint of the URDF."
-        elif source is not None:
-            low, high = sorted(
-                mimic.multiplier * limit + mimic.offset for limit in (source.lower, source.upper)
+        if not {mimic.joint, mimic.source} <= known.keys():
+            continue
+        own = known[mimic.joint]
+        source = known[mimic.source]
+        low, high = sorted(
+            mimic.multiplier * limit + mimic.offset for limit in (source.lower, source.upper)
+        )
+        if low < own.lower - _LIMIT_SLACK or high > own.upper + _LIMIT_SLACK:
+            yield (
+                "error",
+                f"{mimic.joint!r} goes from {low:.4g} to {high:.4g} with {mimic.source!r}, beyond its own limits "
+                f"{own.lower:.4g}..{own.upper:.4g}: the two would hold each other up. Widen its limits, or narrow "
+                "those of the source.",
             )
-            if low < own.lower - _LIMIT_SLACK or high > own.upper + _LIMIT_SLACK:
-                yield (
-                    "error",
-                    f"{mimic.joint!r} goes from {low:.4g} to {high:.4g} with {mimic.source!r}, beyond its own limits "
-                    f"{own.lower:.4g}..{own.upper:.4g}: the two would hold each other up. Widen its limits, or narrow "
-                    "those of the source.",
-                )
 
 
-def _links(spec: RobotSpec, tree: RobotTree) -> Problems:
-    wanted = {
-        "hand": [spec.hand_root, spec.palm],
-        "keypoints": [point.link for point in spec.keypoints],
-        "collision.self": spec.self_collision_links,
-        "collision.exclude": sum(spec.collision_exclude, ()),
-        "collision.table_exclude": spec.table_exclude,
-    }
-    for tip in spec.fingertips:
-        wanted[f"fingertip {tip.name!r}"] = [tip.link, *tip.contact_links]
-    known = {link.name: link for link in tree.links}
-    absent = False
-    for where, links in wanted.items():
-        for link in links:
-            if link not in known:
-                absent = True
-                yield (
-                    "error",
-                    f"{where}: the URDF has no link {link!r}. Choose from: {', '.join(known)}.",
-                )
-    if absent:
+def _links(spec: RobotSpec, tree: RobotTree, wrong: list[str]) -> Problems:
+    for problem in wrong:
+        yield "error", problem
+    if wrong:
         return
+    solid = {link.name for link in tree.links if link.collisions}
     inside = tree.below(spec.hand_root)[1:]
     for tip in spec.fingertips:
-        if not any(known[link].collisions for link in tip.contact_links):
+        if solid.isdisjoint(tip.contact_links):
             links = ", ".join(tip.contact_links)
             yield (
                 "error",
@@ -207,7 +186,7 @@ def _links(spec: RobotSpec, tree: RobotTree) -> Problems:
             text = f"{tip.link!r} does not lie below the hand's root {spec.hand_root!r}."
             yield "error", f"fingertip {tip.name!r}: {text}"
     for link in spec.self_collision_links:
-        if not known[link].collisions:
+        if link not in solid:
             yield "warning", f"collision.self: {link!r} has no collision shape."
 
 

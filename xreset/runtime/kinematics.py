@@ -75,14 +75,9 @@ def _quaternion(matrix: Array) -> Array:
     """[N, 4] quaternions of rotation matrices [N, 3, 3] (Shepperd's method)."""
     skew = matrix - matrix.transpose(0, 2, 1)
     vector = np.stack((skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]), axis=1)
-    trace = np.trace(matrix, axis1=1, axis2=2)
-    candidates = np.empty((len(matrix), 4, 4))
-    candidates[:, 0, 0] = 1.0 + trace
-    candidates[:, 0, 1:] = vector
-    candidates[:, 1:, 0] = vector
-    candidates[:, 1:, 1:] = (
-        matrix + matrix.transpose(0, 2, 1) + np.eye(3) * (1.0 - trace)[:, None, None]
-    )
+    trace = np.trace(matrix, axis1=1, axis2=2)[:, None, None]
+    square = matrix + matrix.transpose(0, 2, 1) + np.eye(3) * (1.0 - trace)
+    candidates = np.block([[1.0 + trace, vector[:, None]], [vector[:, :, None], square]])
     best = np.diagonal(candidates, axis1=1, axis2=2).argmax(axis=1)
     chosen = candidates[np.arange(len(matrix)), best]
     return chosen / np.linalg.norm(chosen, axis=1, keepdims=True)

@@ -232,8 +232,9 @@ class PybulletWorld(World):
             self.set_state(state)
             return
         self._inertia = inertia
-        self._p.changeDynamics(self._object, -1, mass=inertia.mass)  # also invents an inertia
-        self._p.changeDynamics(self._object, -1, localInertiaDiagonal=inertia.moments)
+        self._p.changeDynamics(
+            self._object, -1, mass=inertia.mass, localInertiaDiagonal=inertia.moments
+        )
 
     def set_friction(self, friction: np.ndarray) -> None:
         self._friction = friction
@@ -352,8 +353,14 @@ class PybulletWorld(World):
     def _remove_defaults(self, body: int, link: int, shapes: Sequence[Shape]) -> None:
         """Remove the damping, sleep and margins that Bullet gives every link."""
         p = self._p
-        p.changeDynamics(body, link, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0)
-        p.changeDynamics(body, link, activationState=p.ACTIVATION_STATE_DISABLE_SLEEPING)
+        p.changeDynamics(
+            body,
+            link,
+            linearDamping=0.0,
+            angularDamping=0.0,
+            jointDamping=0.0,
+            activationState=p.ACTIVATION_STATE_DISABLE_SLEEPING,
+        )
         if is_hull(shapes):
             p.changeDynamics(body, link, collisionMargin=0.0)
 

@@ -197,6 +197,17 @@ class PoolTest(unittest.TestCase):
                 pool.contacts().table_force[:, 2].tolist(), [-3.0, -3.0, -3.0, 0.0, -3.0]
             )
 
+    def test_targets_of_other_worlds_stay_when_a_state_is_set(self):
+        for pool in self.each():
+            targets = torch.arange(10.0).reshape(5, 2) / 100
+            pool.set_joint_targets(targets)
+            new = random_state(1, 1)
+            pool.set_state(new, torch.tensor([1]))
+            targets[1] = new.joint_target
+            torch.testing.assert_close(pool.state().joint_target, targets)
+            pool.step(1)
+            torch.testing.assert_close(pool.state().joint_pos, targets)
+
     def test_mass_of_some_worlds(self):
         for pool in self.each():
             pool.set_object_mass(torch.tensor([4.0, 8.0]), torch.tensor([4, 0]))

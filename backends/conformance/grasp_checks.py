@@ -9,13 +9,7 @@ from torch import Tensor
 
 from xreset.backends.conformance.harness import Bench, Worlds
 from xreset.backends.conformance.results import Measured
-from xreset.geometry.rotations import (
-    matrix_to_quat,
-    quat_angle,
-    quat_conjugate,
-    quat_multiply,
-    quat_rotate_inverse,
-)
+from xreset.geometry.rotations import matrix_to_quat, quat_angle, relative_pose
 from xreset.physics import State
 from xreset.spec import GRAVITY
 
@@ -69,9 +63,7 @@ def _in_palm(bench: Bench, worlds: Worlds) -> tuple[Tensor, Tensor]:
     """Position and orientation of the held objects in the palm's frame."""
     links = worlds.links()[bench.twins]
     now = worlds.state()[bench.twins]
-    palm = links.quat[:, 0]
-    pos = quat_rotate_inverse(palm, now.object_pos - links.pos[:, 0])
-    return pos, quat_multiply(quat_conjugate(palm), now.object_quat)
+    return relative_pose(now.object_pos, now.object_quat, links.pos[:, 0], links.quat[:, 0])
 
 
 def tip_friction(bench: Bench) -> Measured:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-
 import numpy as np
 import torch
 from scipy.integrate import solve_ivp
@@ -58,23 +56,25 @@ def free_spin(bench: Bench) -> Measured:
     )
     end = bench.worlds().advance(start, _STEPS).map(Tensor.double)
     t = _STEPS * bench.scene.timestep
-    errors = defaultdict(list)
-    for i, thing in enumerate(bench.objects):
-        turn, omega = _spin(thing, quat, angvel, t)
-        arm_at_start = Rotation.from_quat(quat, scalar_first=True).apply(thing.com)
-        arm = turn.apply(thing.com)
-        com_velocity = linvel + np.cross(angvel, arm_at_start)
-        com = start.object_pos[i].double().numpy() + arm_at_start + com_velocity * t
-        com = com - np.array([0.0, 0.0, GRAVITY * t * t / 2])
-        velocity = com_velocity - np.array([0.0, 0.0, GRAVITY * t]) - np.cross(omega, arm)
-        off = end.object_pos[i].numpy() - (com - arm)
-        orientation = Rotation.from_quat(end.object_quat[i].numpy(), scalar_first=True)
-        errors["pos, horizontal"].append(off[:2])
-        errors["pos, vertical"].append(off[2])
-        errors["linvel"].append(end.object_linvel[i].numpy() - velocity)
-        errors["orientation"].append((orientation * turn.inv()).magnitude())
-        errors["angvel"].append(end.object_angvel[i].numpy() - omega)
-    return {what: np.array(error) for what, error in errors.items()}
+    gravity = np.array([0.0, 0.0, -GRAVITY])
+    com = np.array([thing.com for thing in bench.objects])
+    spins = np.array([_spin(thing, quat, angvel, t) for thing in bench.objects])
+    turn = Rotation.from_quat(spins[:, :4], scalar_first=True)
+    omega = turn.apply(spins[:, 4:])
+    arm_at_start = Rotation.from_quat(quat, scalar_first=True).apply(com)
+    arm = turn.apply(com)
+    com_velocity = linvel + np.cross(angvel, arm_at_start)
+    moved = arm_at_start + com_velocity * t + gravity * t * t / 2 - arm
+    off = end.object_pos - start.object_pos - torch.tensor(moved)
+    velocity = com_velocity + gravity * t - np.cross(omega, arm)
+    orientation = Rotation.from_quat(end.object_quat.numpy(), scalar_first=True)
+    return {
+        "pos, horizontal": off[:, :2],
+        "pos, vertical": off[:, 2],
+        "linvel": end.object_linvel - torch.tensor(velocity),
+        "orientation": (orientation * turn.inv()).magnitude(),
+        "angvel": end.object_angvel - torch.tensor(omega),
+    }
 
 
 def object_gravity(bench: Bench) -> Measured:
@@ -123,10 +123,8 @@ def _share(found: Tensor, expected: Tensor) -> Tensor:
     return (found - expected).abs().amax(dim=1) / expected.abs().amax(dim=1)
 
 
-def _spin(
-    thing: ObjectSpec, quat: np.ndarray, angvel: np.ndarray, t: float
-) -> tuple[Rotation, np.ndarray]:
-    """Orientation and angular velocity (world) after a time t without torque: Euler's equations in the body's frame."""
+def _spin(thing: ObjectSpec, quat: np.ndarray, angvel: np.ndarray, t: float) -> np.ndarray:
+    """[7] orientation, and angular velocity in the body's frame, after a time t without torque: Euler's equations."""
     inertia = np.asarray(thing.inertia)
     body = Rotation.from_quat(quat, scalar_first=True)
 
@@ -138,6 +136,4 @@ def _spin(
         return np.concatenate((turn, np.linalg.solve(inertia, -np.cross(omega, inertia @ omega))))
 
     start = np.concatenate((quat, body.inv().apply(angvel)))
-    end = solve_ivp(motion, (0.0, t), start, rtol=1e-9, atol=1e-9).y[:, -1]
-    turned = Rotation.from_quat(end[:4], scalar_first=True)
-    return turned, turned.apply(end[4:])
+    return solve_ivp(motion, (0.0, t), start, rtol=1e-9, atol=1e-9).y[:, -1]

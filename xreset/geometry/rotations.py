@@ -38,6 +38,14 @@ def quat_rotate_inverse(q: Tensor, v: Tensor) -> Tensor:
     return quat_rotate(quat_conjugate(q), v)
 
 
+def relative_pose(
+    pos: Tensor, quat: Tensor, frame_pos: Tensor, frame_quat: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return poses [..., 3] and [..., 4] in the frames that have other poses."""
+    relative = quat_rotate_inverse(frame_quat, pos - frame_pos)
+    return relative, quat_multiply(quat_conjugate(frame_quat), quat)
+
+
 def quat_normalize(q: Tensor) -> Tensor:
     """[..., 4] unit quaternion with w >= 0."""
     q = q / q.norm(dim=-1, keepdim=True).clamp_min(1e-12)

@@ -28,8 +28,8 @@ from xreset.geometry.rotations import (
     quat_from_axis_angle,
     quat_multiply,
     quat_normalize,
-    quat_rotate_inverse,
     quat_to_axis_angle,
+    relative_pose,
 )
 from xreset.physics import Backend, State
 from xreset.pictures.render import Camera, Renderer, add_caption, pose_matrix
@@ -242,7 +242,7 @@ def _play(kinematics: Kinematics, backend: Backend, start: State) -> Tensor:
     left, left_error = arm_path(kinematics, up[-1], palm, rise=HEIGHT, turn=-TURN)
     turn = torch.where((turn_error <= left_error)[:, None], right, left)
     turn_error = turn_error.minimum(left_error)
-    pos, quat = _relative(
+    pos, quat = relative_pose(
         start.object_pos, start.object_quat, palm[:, :3, 3], matrix_to_quat(palm[:, :3, :3])
     )
     able = (up_error < 1) & (turn_error < 1)
@@ -264,7 +264,7 @@ def _play(kinematics: Kinematics, backend: Backend, start: State) -> Tensor:
         before = path[-1]
         now = backend.state().to("cpu").map(Tensor.double)
         links = backend.links().to("cpu").map(Tensor.double)
-        now_pos, now_quat = _relative(
+        now_pos, now_quat = relative_pose(
             now.object_pos, now.object_quat, links.pos[:, 0], links.quat[:, 0]
         )
         near = ((now_pos - pos).norm(dim=-1) < DISTANCE) & (quat_angle(now_quat, quat) < ANGLE)
@@ -274,14 +274,6 @@ def _play(kinematics: Kinematics, backend: Backend, start: State) -> Tensor:
     health = backend.health()
     sound = ~(health.nonfinite | health.overflow).cpu()
     return torch.cat((able[:, None], torch.stack(passed, dim=1) & sound[:, None], *moments), dim=1)
-
-
-def _relative(
-    pos: Tensor, quat: Tensor, frame_pos: Tensor, frame_quat: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return poses in the frame of others."""
-    relative = quat_rotate_inverse(frame_quat, pos - frame_pos)
-    return relative, quat_multiply(quat_conjugate(frame_quat), quat)
 
 
 def arm_path(

@@ -1,7 +1,5 @@
 """A headless Chromium that tests drive through its DevTools protocol."""
 
-from __future__ import annotations
-
 import base64
 import itertools
 import json
@@ -9,12 +7,10 @@ import shutil
 import subprocess
 import tempfile
 import time
-import unittest
 import urllib.request
-from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from unittest import SkipTest
 
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 _FLAGS = (
@@ -31,20 +27,20 @@ _OPTION = "[...document.querySelectorAll('[role=option]')].find(e => e.textConte
 _KEYS = {"ArrowRight": 39, "End": 35}
 
 
-def find_chromium() -> str:
+def find_chromium():
     """The browser's program; skips the test where there is none, or nothing to talk to it with."""
     program = next(filter(None, map(shutil.which, _NAMES)), None)
     if program is None:
-        raise unittest.SkipTest(f"no Chromium here (looked for {', '.join(_NAMES)})")
+        raise SkipTest(f"no Chromium here (looked for {', '.join(_NAMES)})")
     if not find_spec("websockets"):
-        raise unittest.SkipTest("websockets is not installed (it comes with viser)")
+        raise SkipTest("websockets is not installed (it comes with viser)")
     return program
 
 
 class Browser:
     """One tab. ``problems`` collects console errors and exceptions of its pages."""
 
-    def __init__(self, program: str) -> None:
+    def __init__(self, program):
         from websockets.sync.client import connect
 
         self.problems: list[str] = []
@@ -70,7 +66,7 @@ class Browser:
         for domain in ("Page", "Runtime", "Log"):
             self.send(f"{domain}.enable")
 
-    def close(self) -> None:
+    def close(self):
         self._socket.close()
         self._process.terminate()
         try:
@@ -80,7 +76,7 @@ class Browser:
             self._process.wait()
         self._profile.cleanup()
 
-    def send(self, method: str, **params: Any) -> dict[str, Any]:
+    def send(self, method, **params):
         """One command and its answer; what the page reports meanwhile is looked through for problems."""
         number = next(self._number)
         self._socket.send(json.dumps({"id": number, "method": method, "params": params}))
@@ -92,7 +88,7 @@ class Browser:
                 return message["result"]
             self._note(message.get("method"), message.get("params", {}))
 
-    def _note(self, event: str | None, params: dict[str, Any]) -> None:
+    def _note(self, event, params):
         if event == "Runtime.exceptionThrown":
             self.problems.append(json.dumps(params["exceptionDetails"])[:500])
         elif event == "Runtime.consoleAPICalled" and params["type"] in ("error", "assert"):
@@ -104,10 +100,10 @@ class Browser:
         elif event == "Log.entryAdded" and params["entry"]["level"] == "error":
             self.problems.append(f"{params['entry']['text']} ({params['entry'].get('url')})")
 
-    def open(self, url: str) -> None:
+    def open(self, url):
         self.send("Page.navigate", url=url)
 
-    def evaluate(self, expression: str) -> Any:
+    def evaluate(self, expression):
         result = self.send(
             "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
         )
@@ -115,7 +111,7 @@ class Browser:
             raise AssertionError(f"{expression}: {result['exceptionDetails']}")
         return result["result"].get("value")
 
-    def key(self, name: str) -> None:
+    def key(self, name):
         """Press a key where the focus is."""
         for kind in ("rawKeyDown", "keyUp"):
             self.send(
@@ -126,7 +122,7 @@ class Browser:
                 windowsVirtualKeyCode=_KEYS[name],
             )
 
-    def click(self, element: str) -> None:
+    def click(self, element):
         """Click the middle of a JavaScript expression's element, once it stays where it is and nothing covers it."""
         at = (
             f"(e => {{ e.scrollIntoView({{block: 'center'}}); const r = e.getBoundingClientRect();"
@@ -134,7 +130,7 @@ class Browser:
             f" return [x, y, !!top && (e.contains(top) || top.contains(e))]; }})({element})"
         )
 
-        def still() -> list[float] | None:
+        def still():
             try:
                 first = self.evaluate(at)
             except AssertionError:  # not there yet
@@ -154,20 +150,20 @@ class Browser:
                 clickCount=1,
             )
 
-    def press(self, button: str) -> None:
+    def press(self, button):
         """Click a button of viser."""
         self.click(_BUTTON.format(label=button))
 
-    def choose(self, label: str, option: str) -> None:
+    def choose(self, label, option):
         """Open a drop-down of viser and click one of its options."""
         self.click(INPUT.format(label=label))
         self.click(_OPTION.format(label=option))
 
-    def text(self) -> str:
+    def text(self):
         """The text of the page."""
         return self.evaluate("document.body?.innerText ?? ''")
 
-    def drag(self, start: tuple[float, float], end: tuple[float, float], steps: int = 5) -> None:
+    def drag(self, start, end, steps=5):
         """Move the mouse to a point, press it, and release it at another one, in pixels."""
         mouse = {"button": "left", "buttons": 1, "clickCount": 1}
         self.send("Input.dispatchMouseEvent", type="mouseMoved", x=start[0], y=start[1])
@@ -181,7 +177,7 @@ class Browser:
             time.sleep(0.2)
         self.send("Input.dispatchMouseEvent", type="mouseReleased", x=end[0], y=end[1], **mouse)
 
-    def resize(self, width: int, height: int, *, phone: bool = False) -> None:
+    def resize(self, width, height, *, phone=False):
         """Give the page a size [pixels]."""
         self.send(
             "Emulation.setDeviceMetricsOverride",
@@ -191,12 +187,12 @@ class Browser:
             mobile=phone,
         )
 
-    def screenshot(self) -> bytes:
+    def screenshot(self):
         """The page as PNG."""
         return base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"])
 
 
-def wait_until(condition: Callable[[], Any], what: str, seconds: float = 20.0) -> Any:
+def wait_until(condition, what, seconds=20.0):
     """Wait until a condition holds and return what it gave; ``AssertionError`` if it does not in time."""
     end = time.monotonic() + seconds
     while not (value := condition()):

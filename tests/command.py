@@ -6,7 +6,7 @@ import io
 from xreset.cli import main
 
 
-def xreset(*arguments: object) -> tuple[int, str, str]:
+def xreset(*arguments):
     """Run ``xreset ARGUMENTS``: its exit code, and what it prints as output and as errors."""
     code = 0
     out = io.StringIO()
@@ -17,3 +17,17 @@ def xreset(*arguments: object) -> tuple[int, str, str]:
         except SystemExit as end:
             code = int(end.code or 0)
     return code, out.getvalue(), err.getvalue()
+
+
+def succeeds(*arguments):
+    """All that a command prints, which ends well."""
+    code, out, err = xreset(*arguments)
+    assert code == 0, err
+    return out + err
+
+
+def refused(*arguments):
+    """All that a command prints, which ends with status 1."""
+    code, out, err = xreset(*arguments)
+    assert code == 1, f"exit status {code}: {err}"
+    return out + err

@@ -1,35 +1,29 @@
 """Temporary folders, and real demonstrations, which may not be part of the project."""
 
-from __future__ import annotations
-
-import contextlib
-import io
 import os
 import tempfile
-import unittest
 from importlib.util import find_spec
 from pathlib import Path
-
-from xreset.cli import main
+from unittest import SkipTest, TestCase, skipUnless
 
 DEFAULT = Path(__file__).resolve().parents[2] / "shared" / "data"
 
-PYBULLET = unittest.skipUnless(
+PYBULLET = skipUnless(
     find_spec("pybullet"), "PyBullet is not installed: it has wheels for Python 3.11 only"
 )
 
 
-def data_dir() -> Path:
+def data_dir():
     """The folder of real data: ``XRESET_DATA``, or its place next to a development checkout; skips without it."""
     folder = Path(os.environ.get("XRESET_DATA", DEFAULT))
     if not folder.is_dir():
-        raise unittest.SkipTest(
+        raise SkipTest(
             f"no real data at {folder}; set XRESET_DATA to the folder with the DexYCB archives"
         )
     return folder
 
 
-class InFolder(unittest.TestCase):
+class InFolder(TestCase):
     """A test with a temporary folder."""
 
     def setUp(self):
@@ -37,13 +31,10 @@ class InFolder(unittest.TestCase):
         self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
 
 
-def run(*arguments: object) -> tuple[int, str]:
-    """Run a command; return its exit code and all that it printed."""
-    out = io.StringIO()
-    code = 0
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
-        try:
-            main([str(argument) for argument in arguments])
-        except SystemExit as stop:
-            code = stop.code if isinstance(stop.code, int) else 1
-    return code, out.getvalue()
+class InOneFolder(TestCase):
+    """Tests that share a temporary folder."""
+
+    @classmethod
+    def setUpClass(cls):
+        super().setUpClass()
+        cls.folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))

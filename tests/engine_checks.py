@@ -1,9 +1,6 @@
 """What the CPU engines must do beyond the conformance suite, compared with closed forms; a mix-in for their tests."""
 
-from __future__ import annotations
-
 import sys
-import unittest
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import ClassVar
@@ -12,6 +9,7 @@ from unittest import mock
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
+from torch import tensor
 
 from xreset.backends.conformance.grasp_checks import grasp
 from xreset.backends.conformance.harness import Bench
@@ -20,14 +18,13 @@ from xreset.backends.pool import PoolBackend
 from xreset.errors import BackendUnavailableError
 from xreset.geometry.dynamics import mass_matrix
 from xreset.geometry.kinematics import Kinematics
-from xreset.physics import State
-from xreset.spec import GRAVITY, RobotSpec, SceneSpec
+from xreset.spec import GRAVITY
 
 JOINT = {name: i for i, name in enumerate(gripper().joint_names)}
 """Index of each joint of the suite's gripper."""
 
 
-def with_drive(robot: RobotSpec, name: str, **changes: float) -> RobotSpec:
+def with_drive(robot, name, **changes):
     joints = list(robot.joints)
     joint = joints[JOINT[name]]
     joints[JOINT[name]] = replace(joint, drive=replace(joint.drive, **changes))
@@ -35,7 +32,7 @@ def with_drive(robot: RobotSpec, name: str, **changes: float) -> RobotSpec:
 
 
 class EngineChecks:
-    """Mixed into a ``unittest.TestCase`` that names the backend."""
+    """Mixed into a ``TestCase`` that names the backend."""
 
     backend_class: ClassVar[type[PoolBackend]]
     module: ClassVar[str | None] = None
@@ -43,14 +40,12 @@ class EngineChecks:
     one_step: ClassVar[AbstractContextManager] = nullcontext()
     """Makes the engine take a single step per physics step, so that momentum can be balanced."""
 
-    def make(
-        self: unittest.TestCase, what: SceneSpec, num_worlds: int = 1, **options
-    ) -> PoolBackend:
+    def make(self, what, num_worlds=1, **options):
         backend = self.backend_class(what, num_worlds, workers=0, **options)  # pyright: ignore
         self.addCleanup(backend.close)
         return backend
 
-    def grasp(self, what: SceneSpec | None = None, **options) -> tuple[PoolBackend, State]:
+    def grasp(self, what=None, **options):
         """The suite's gripper with its jaws just around a brick in the air, about to close."""
         backend = self.make(what or scene(), 1, **options)
         state = grasp(Bench(self.backend_class, scene()))[0][[0]]
@@ -82,12 +77,12 @@ class EngineChecks:
         self.assertGreater(n, 5)
         backend.step(n)
         self.assertAlmostEqual(
-            float(backend.state().joint_vel[0, bend]), 2.0 - 0.005 / inertia * n / 240, delta=0.2
+            backend.state().joint_vel[0, bend], 2.0 - 0.005 / inertia * n / 240, delta=0.2
         )
         backend.step(n + 12)
         rest = float(backend.state().joint_pos[0, bend])
         backend.step(24)
-        self.assertAlmostEqual(float(backend.state().joint_pos[0, bend]), rest, delta=2e-4)
+        self.assertAlmostEqual(backend.state().joint_pos[0, bend], rest, delta=2e-4)
 
     def test_dry_friction_holds_against_a_weak_drive_only(self):
         backend = self.make(
@@ -125,10 +120,10 @@ class EngineChecks:
         self.enterContext(self.one_step)
         backend, _ = self.grasp()
         brick = objects()[0]
-        backend.set_object_wrench(torch.tensor([[0.5, 0.3, 0.2]]), torch.zeros(1, 3))
+        backend.set_object_wrench(tensor([[0.5, 0.3, 0.2]]), torch.zeros(1, 3))
         targets = backend.state().joint_target.clone()
 
-        def com_velocity() -> np.ndarray:
+        def com_velocity():
             state = backend.state()
             arm = Rotation.from_quat(state.object_quat[0].numpy(), scalar_first=True).apply(
                 brick.com
@@ -158,11 +153,11 @@ class EngineChecks:
         for links, blocked in ((("jaw_a", "pad_b"), True), ((), False)):
             backend = self.make(scene(replace(gripper(), self_collision_links=links)), 2)
             state = backend.state().clone()
-            state.object_pos[:] = torch.tensor([0.9, 0.5, 0.05])
+            state.object_pos[:] = tensor([0.9, 0.5, 0.05])
             state.joint_pos[:, jaw] = 0.05
             state.joint_target[:, jaw] = 0.005
             # to the other jaw, and away
-            state.joint_target[:, JOINT["finger_b_bend"]] = torch.tensor([0.6, -0.6])
+            state.joint_target[:, JOINT["finger_b_bend"]] = tensor([0.6, -0.6])
             backend.set_state(state)
             backend.step(240)
             free, other = backend.state().joint_pos[:, jaw].sort().values.tolist()
@@ -179,7 +174,7 @@ class EngineChecks:
                 scene(replace(gripper(), table_exclude=excluded, base_pos=(0.57, 0.05, -0.05)))
             )
             state = backend.state().clone()
-            state.object_pos[0] = torch.tensor([0.9, 0.6, 0.05])
+            state.object_pos[0] = tensor([0.9, 0.6, 0.05])
             heights = []
             for lift in (0.19, -0.19):  # one of them is down
                 state.joint_target[0, JOINT["lift"]] = lift

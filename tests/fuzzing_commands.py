@@ -1,7 +1,5 @@
 """Command lines of junk: every command, its own options, and what must hold for any value and any file name."""
 
-from __future__ import annotations
-
 import os
 import resource
 import signal
@@ -13,16 +11,15 @@ from importlib import import_module
 from io import BytesIO, TextIOWrapper
 from itertools import pairwise
 from pathlib import Path
-from random import Random
 from typing import Any
 from unittest import mock
 
 import tyro
 
 from tests.test_view import toy_demos
+from xreset import write_demos
 from xreset.cli import COMMANDS, main
 from xreset.cli._options import _WRITTEN, checked
-from xreset.demos.archive import write_demos
 
 SECONDS = 20.0
 """Most processor time of a command."""
@@ -58,11 +55,11 @@ class TooSlow(BaseException):
     """A command took more than its processor time; no handler of the library catches this."""
 
 
-def commands() -> dict[str, list[Action]]:
+def commands():
     """Return the options of each command, from its own parser, by the command's words."""
     found: dict[str, list[Action]] = {}
 
-    def add(words: str, table: dict[str, str]) -> None:
+    def add(words, table):
         for name in table:
             module = import_module(f"xreset.cli{words}.{name}".replace(" ", "."))
             path = f"{words} {name}"
@@ -80,7 +77,7 @@ def commands() -> dict[str, list[Action]]:
     return {words: actions for words, actions in found.items() if words not in WAIT_OR_WORK}
 
 
-def draw(random: Random, options: dict[str, list[Action]]) -> list[str]:
+def draw(random, options):
     """Draw a command line: mostly the required options, some others, values of junk."""
     words = random.choice(sorted(options))
     names = [*NAMES, *["demos.npz"] * 20] if words.startswith(READ_DEMOS) else NAMES
@@ -109,7 +106,7 @@ def draw(random: Random, options: dict[str, list[Action]]) -> list[str]:
     return line
 
 
-def outcome_of_command(line: list[str]) -> str:
+def outcome_of_command(line):
     """``refused`` or ``ran``; raises ``AssertionError`` if a command broke, took too much, or wrote what it must not.
 
     The command runs in this process, in a temporary folder that also has the home folder and the cache."""
@@ -144,7 +141,7 @@ def outcome_of_command(line: list[str]) -> str:
     return "refused" if code else "ran"
 
 
-def _fill(work: Path) -> None:
+def _fill(work):
     """Make the folder in which a command runs, with the files that :data:`NAMES` names."""
     work.mkdir()
     (work / "folder").mkdir()
@@ -153,7 +150,7 @@ def _fill(work: Path) -> None:
     write_demos(work / "demos.npz", toy_demos())
 
 
-def _called(line: list[str]) -> tuple[Any, str]:
+def _called(line):
     """Call a command; return its exit status and what it said on standard error."""
     streams = [TextIOWrapper(BytesIO(), encoding="utf-8") for _ in range(2)]
     signal.signal(signal.SIGVTALRM, _too_slow)
@@ -174,7 +171,7 @@ def _called(line: list[str]) -> tuple[Any, str]:
     return code, streams[1].buffer.getvalue().decode()
 
 
-def _files(folder: Path) -> dict[Path, bytes]:
+def _files(folder):
     """Return the content of every file below a folder, without the home folder."""
     paths = [
         path
@@ -184,11 +181,11 @@ def _files(folder: Path) -> dict[Path, bytes]:
     return {path.resolve(): path.read_bytes() for path in paths}
 
 
-def _too_slow(*_: object) -> None:
+def _too_slow(*_):
     raise TooSlow(f"more than {SECONDS:g} s")
 
 
-def _place(error: BaseException) -> str:
+def _place(error):
     own = [
         frame for frame in traceback.extract_tb(error.__traceback__) if "xreset" in frame.filename
     ]

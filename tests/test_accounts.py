@@ -36,7 +36,3 @@ class AccountsTest(unittest.TestCase):
         annotated = rows[-1].without("not annotated")
         self.assertEqual(annotated.total, (self.reason != "not annotated").sum())
         self.assertRegex(described(rows[-1].lost), r"^jump \d+, ")
-
-
-if __name__ == "__main__":
-    unittest.main()

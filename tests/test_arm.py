@@ -1,22 +1,21 @@
 """Base placement: wrist poses that are within reach by construction are found so, and a robot that stands wrong is
 moved."""
 
-import dataclasses
 import shutil
-import tempfile
-import unittest
+from dataclasses import replace
 from itertools import product
-from pathlib import Path
-from unittest import mock
+from unittest import SkipTest, TestCase
+from unittest.mock import patch
 
 import numpy as np
 import torch
+from numpy.testing import assert_allclose
+from torch import tensor
 
-from tests.command import xreset as run
-from tests.toy_retarget import FLOAT, arm_targets
-from xreset import robots
-from xreset.demos.archive import write_demos
-from xreset.demos.synth import synthesize
+from tests.command import xreset
+from tests.data import InFolder
+from tests.toy_retarget import FLOAT, arm_targets, double
+from xreset import robots, synthesize, write_demos
 from xreset.description import DESCRIPTION
 from xreset.description import load_robot as load
 from xreset.errors import RobotError
@@ -31,7 +30,7 @@ from xreset.robot_tools.placement import Finalist, PlaceConfig, write_placement
 try:
     from xreset.robot_tools import place as placing
 except ImportError as error:
-    raise unittest.SkipTest(str(error)) from error
+    raise SkipTest(str(error)) from error
 
 assert_close = torch.testing.assert_close
 CONFIG = PlaceConfig(
@@ -40,7 +39,7 @@ CONFIG = PlaceConfig(
 NOWHERE = np.zeros((0, 3))
 
 
-def wrists_around_home(robot, count: int) -> ArmTargets:
+def wrists_around_home(robot, count):
     """Hand root poses that the robot takes with arm joints near home: all of them within reach."""
     model = ArmModel(robot)
     generator = torch.Generator().manual_seed(0)
@@ -52,11 +51,11 @@ def wrists_around_home(robot, count: int) -> ArmTargets:
     return arm_targets(model, joints)
 
 
-class PlaceTest(unittest.TestCase):
+class PlaceTest(InFolder):
     @classmethod
     def setUpClass(cls):
         cls.robot = robots.load("openarm")
-        cls.lost = dataclasses.replace(cls.robot, base_pos=(0.45, 0.6, 3.0))
+        cls.lost = replace(cls.robot, base_pos=(0.45, 0.6, 3.0))
         cls.wrists = wrists_around_home(cls.robot, 40)
         cls.reached = placing.reach(cls.robot, cls.wrists)
 
@@ -68,13 +67,8 @@ class PlaceTest(unittest.TestCase):
     def test_a_robot_that_stands_wrong_is_moved_to_where_it_reaches(self):
         seen = []
         avoid = self.wrists.root_pos[:, 0].numpy()
-        best, own = placing.place(
-            self.lost,
-            [self.wrists],
-            avoid,
-            CONFIG,
-            lambda done, total: seen.append((done, total)),
-        )
+        told = lambda *at: seen.append(at)  # noqa: E731
+        best, own = placing.place(self.lost, [self.wrists], avoid, CONFIG, told)
         self.assertEqual((own.robot, own.reached, own.followed), (self.lost, 0.0, 0.0))
         self.assertGreater(best.reached, 0.2)
         # Every path is one frame long here.
@@ -90,10 +84,10 @@ class PlaceTest(unittest.TestCase):
 
     def test_a_placement_with_a_home_is_preferred(self):
         homes = [(self.lost, "as described"), (self.robot, "")]
-        few = dataclasses.replace(CONFIG, candidates=1, rounds=1, elite=1, clear=0.0)
+        few = replace(CONFIG, candidates=1, rounds=1, elite=1, clear=0.0)
         with (
-            mock.patch.object(placing, "_with_home", side_effect=homes),
-            mock.patch.object(placing, "_candidates", return_value=[self.robot]),
+            patch.object(placing, "_with_home", side_effect=homes),
+            patch.object(placing, "_candidates", return_value=[self.robot]),
         ):
             found = placing.place(self.lost, [self.wrists[:8]], NOWHERE, few)
         self.assertEqual([finalist.robot for finalist in found], [self.lost, self.robot])
@@ -106,28 +100,26 @@ class PlaceTest(unittest.TestCase):
         self.assertEqual(placing.reach(self.lost, self.wrists, least)[0], 1 - placing._FIRST / 40)
 
     def test_without_a_round_the_own_placement_is_measured(self):
-        found = placing.place(
-            self.robot, [self.wrists], NOWHERE, dataclasses.replace(CONFIG, rounds=0)
-        )
+        found = placing.place(self.robot, [self.wrists], NOWHERE, replace(CONFIG, rounds=0))
         self.assertEqual([finalist.robot for finalist in found], [self.robot])
 
     def test_home_holds_the_hand_where_it_did(self):
-        near = dataclasses.replace(self.robot, base_pos=(0.46, 0.61, 0.56))
+        near = replace(self.robot, base_pos=(0.46, 0.61, 0.56))
         placed, rule = placing._with_home(near, self.robot)
         self.assertEqual(rule, "the hand where it was")
         before, after = (
-            Kinematics(spec).link_poses(torch.tensor(spec.home), ["palm"])
+            Kinematics(spec).link_poses(tensor(spec.home), ["palm"])
             for spec in (self.robot, placed)
         )
         assert_close(after, before, atol=5e-3, rtol=0)
 
     def test_the_base_keeps_clear_of_demonstrations_that_are_not_tried(self):
         demos = synthesize(["soup"], 3, seed=0)
-        file = Path(self.enterContext(tempfile.TemporaryDirectory())) / "demos.npz"
+        file = self.folder / "demos.npz"
         write_demos(file, demos)
-        self.enterContext(mock.patch("xreset.retarget.pipeline.wrist_paths", return_value=[]))
-        with mock.patch.object(placing, "place", side_effect=RobotError("found")) as place:
-            run("robots", "place", "openarm", "--demos", file, "--max-per-object", "1")
+        self.enterContext(patch("xreset.retarget.pipeline.wrist_paths", return_value=[]))
+        with patch.object(placing, "place", side_effect=RobotError("found")) as place:
+            xreset("robots", "place", "openarm", "--demos", file, "--max-per-object", "1")
         frames = demos.hand_valid.sum() + len(demos.object_pos)
         self.assertEqual(place.call_args.args[2].shape, (frames, 3))
 
@@ -136,14 +128,14 @@ class PlaceTest(unittest.TestCase):
         with self.assertRaisesRegex(RobotError, "no frame to reach"):
             placing.place(self.robot, [none], NOWHERE, CONFIG)
         below = np.array([[0.45, 0.6, 0.0]])
-        narrow = dataclasses.replace(CONFIG, clear=0.35, tilt=(0.0, 0.0))
+        narrow = replace(CONFIG, clear=0.35, tilt=(0.0, 0.0))
         with self.assertRaisesRegex(RobotError, "no place .* 0.35 m away"):
             placing.place(self.robot, [self.wrists], below, narrow)
         avoid = self.wrists.root_pos.numpy().reshape(-1, 3)
         with self.assertRaisesRegex(
             RobotError, "no place in the searched ranges is 9 m away.*Lower --search.clear"
         ):
-            placing.place(self.robot, [self.wrists], avoid, dataclasses.replace(CONFIG, clear=9.0))
+            placing.place(self.robot, [self.wrists], avoid, replace(CONFIG, clear=9.0))
 
     def test_parameters_of_a_placement_come_back(self):
         for parameters in (
@@ -151,7 +143,7 @@ class PlaceTest(unittest.TestCase):
             (0.0, 0.5, 0.0, -20.0, 179.0, 3.0),
         ):
             placed = placing._placed(self.robot, np.array(parameters))
-            np.testing.assert_allclose(placing._parameters(placed), parameters, atol=1e-6)
+            assert_allclose(placing._parameters(placed), parameters, atol=1e-6)
 
     def test_single_frames_are_those_that_the_hand_follows(self):
         path = self.wrists.map(lambda x: x.view(2, 20, *x.shape[2:]))
@@ -162,7 +154,7 @@ class PlaceTest(unittest.TestCase):
         assert_close(frames.root_pos[3], self.wrists.root_pos[4])
 
 
-class DirectionTest(unittest.TestCase):
+class DirectionTest(TestCase):
     """Motions that the arm can follow from one of their ends, and not from the other."""
 
     @classmethod
@@ -171,15 +163,15 @@ class DirectionTest(unittest.TestCase):
         cls.model = ArmModel(robot)
         start = torch.as_tensor(robot.home)
         goal = start.clone()
-        goal[cls.model.arm] += torch.tensor([0.9, -0.5, 0.6, 0.7, -1.2, 0.5, 0.6], dtype=FLOAT)
+        goal[cls.model.arm] += double([0.9, -0.5, 0.6, 0.7, -1.2, 0.5, 0.6])
         joints = start + torch.linspace(0, 1, 16, dtype=FLOAT)[:, None] * (goal - start)
         joints[:, cls.model.arm] = joints[:, cls.model.arm].clamp(cls.model.lower, cls.model.upper)
         cls.targets = arm_targets(cls.model, joints[None])
         # The first frames are out of reach, where the arm gets stuck at its limits.
-        cls.targets.root_pos[:, :6] += torch.tensor([0.0, 1.0, -1.5], dtype=FLOAT)
-        cls.targets.root_quat[:, :6] = torch.tensor([0.0, 0.0, 1.0, 0.0], dtype=FLOAT)
+        cls.targets.root_pos[:, :6] += double([0.0, 1.0, -1.5])
+        cls.targets.root_quat[:, :6] = double([0.0, 0.0, 1.0, 0.0])
 
-    def valid(self, targets: ArmTargets, **changes) -> torch.Tensor:
+    def valid(self, targets, **changes):
         """[T] which frames the arm follows."""
         thresholds = Thresholds(table_depth=1e9, self_depth=1e9)
         config = ArmConfig(restarts=4, branches=1, collision_weight=0.0, **changes)
@@ -187,17 +179,17 @@ class DirectionTest(unittest.TestCase):
 
     def test_both_ends_are_tried(self):
         for targets in (self.targets, self.targets.reversed()):  # forwards alone: none of the first
-            self.assertGreaterEqual(int(self.valid(targets).sum()), 8)
+            self.assertGreaterEqual(self.valid(targets).sum(), 8)
 
     def test_frames_between_two_bad_ends_are_found_from_the_middle(self):
         both = ArmTargets.cat((self.targets, self.targets.reversed()), dim=1)
         self.assertFalse(self.valid(both, reseeds=0).any())
         found = self.valid(both, reseeds=2)
-        self.assertGreaterEqual(int(found.sum()), 16)
-        self.assertTrue(bool(found[12:20].all()))
+        self.assertGreaterEqual(found.sum(), 16)
+        self.assertTrue(found[12:20].all())
 
 
-class SpliceTest(unittest.TestCase):
+class SpliceTest(TestCase):
     def test_against_all_combinations(self):
         generator = torch.Generator().manual_seed(0)
         paths = torch.rand(1, 3, 5, 2, generator=generator, dtype=FLOAT)
@@ -208,8 +200,8 @@ class SpliceTest(unittest.TestCase):
             paths, worth=worth, cost=cost, annotated=annotated, jump=0.5, switch_cost=0.2
         )
 
-        def value(chosen: tuple[int, ...]) -> float:
-            way = torch.tensor(chosen)
+        def value(chosen):
+            way = tensor(chosen)
             frames = torch.arange(5)
             jumps = (paths[0, way, frames].diff(dim=0).abs().amax(-1) > 0.5) & annotated[0, :-1]
             switches = 0.2 * (way.diff() != 0).sum()
@@ -219,7 +211,7 @@ class SpliceTest(unittest.TestCase):
                 - (worth[0, way, frames][1:] * jumps).sum()
             )
 
-        best = torch.tensor(max(product(range(3), repeat=5), key=value))
+        best = tensor(max(product(range(3), repeat=5), key=value))
         assert_close(found[0], paths[0, best, torch.arange(5)], atol=0, rtol=0)
 
     def test_chosen_frames_are_spread_over_those_that_are_set(self):
@@ -230,76 +222,49 @@ class SpliceTest(unittest.TestCase):
         self.assertEqual((rows.tolist(), frames.tolist()), ([0, 0, 2], [6, 11, 7]))
 
 
-class WritePlacementTest(unittest.TestCase):
+class WritePlacementTest(InFolder):
     def setUp(self):
-        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory())) / "arm"
+        super().setUp()
+        self.folder /= "arm"
         shutil.copytree(robot_folder("openarm"), self.folder)
         self.file = self.folder / DESCRIPTION
         self.robot = load(self.folder)
         joints = list(self.robot.joints)
         for index, home in enumerate(np.linspace(-0.3, 0.4, 7)):
-            joints[index] = dataclasses.replace(joints[index], home=float(home))
-        moved = dataclasses.replace(
-            self.robot,
-            base_pos=(0.1, 0.2, 0.3),
-            base_quat=(0.6, 0.0, 0.8, 0.0),
-            joints=tuple(joints),
-        )
-        self.best = Finalist(
-            robot=moved,
-            reached=0.9123,
-            dexterity=0.5,
-            followed=0.8765,
-            frames=321,
-            home_rule="the hand where it was",
-        )
-        self.own = dataclasses.replace(
-            self.best, robot=self.robot, followed=0.75, home_rule="as described"
-        )
+            joints[index] = replace(joints[index], home=float(home))
+        place = {"base_pos": (0.1, 0.2, 0.3), "base_quat": (0.6, 0.0, 0.8, 0.0)}
+        moved = replace(self.robot, joints=tuple(joints), **place)
+        shares = {"reached": 0.9123, "dexterity": 0.5, "followed": 0.8765}
+        rule = "the hand where it was"
+        self.best = Finalist(robot=moved, frames=321, home_rule=rule, **shares)
+        self.own = replace(self.best, robot=self.robot, followed=0.75, home_rule="as described")
 
-    def write(self, best: Finalist, command: str = "x") -> None:
+    def write(self, best, command="x"):
         write_placement(self.file, self.robot, best, command)
 
-    def lines(self) -> list[str]:
-        """Lines of the description without the figure of its placement."""
-        return [
-            line
-            for line in self.file.read_text().splitlines()
-            if not line.startswith("# Placement")
-        ]
-
-    def placements(self) -> list[str]:
-        return [
-            line for line in self.file.read_text().splitlines() if line.startswith("# Placement")
-        ]
+    def lines(self, of_placement):
+        """Lines of the description that are the figure of its placement, or those that are not."""
+        lines = self.file.read_text().splitlines()
+        return [line for line in lines if line.startswith("# Placement") == of_placement]
 
     def test_the_description_reads_back(self):
         for _ in range(2):  # the second one replaces the first
             self.write(self.best, 'xreset robots place openarm --demos "my demos.npz"')
-            after = load(self.folder)
-            self.assertEqual(after.base_pos, self.best.robot.base_pos)
-            self.assertEqual(after.base_quat, self.best.robot.base_quat)
-            np.testing.assert_allclose(after.home, self.best.robot.home, atol=1e-3)
-        self.assertEqual(
-            self.placements(),
-            [
-                '# Placement: reaches 91.2 % and follows 87.6 % of 321 frames: xreset robots place openarm --demos "my demos.npz"'
-            ],
-        )
-        self.assertEqual(
-            [joint.drive for joint in after.joints], [joint.drive for joint in self.robot.joints]
-        )
+            after, best = load(self.folder), self.best.robot
+            self.assertEqual((after.base_pos, after.base_quat), (best.base_pos, best.base_quat))
+            assert_allclose(after.home, best.home, atol=1e-3)
+        line = '# Placement: reaches 91.2 % and follows 87.6 % of 321 frames: xreset robots place openarm --demos "my demos.npz"'
+        self.assertEqual(self.lines(True), [line])
+        drives = ([joint.drive for joint in robot.joints] for robot in (after, self.robot))
+        self.assertEqual(*drives)
 
     def test_where_the_own_placement_is_best_only_its_figure_is_written(self):
-        lines = self.lines()
+        lines = self.lines(False)
         self.write(self.own, r"a \\g<1> \b")
-        after = load(self.folder)
-        self.assertEqual(after.fingerprint, self.robot.fingerprint)
-        self.assertEqual(self.lines(), lines)
-        self.assertIn(
-            r"# Placement: reaches 91.2 % and follows 75.0 % of 321 frames: a \\g<1> \b",
-            self.placements(),
-        )
+        self.assertEqual(load(self.folder).fingerprint, self.robot.fingerprint)
+        self.assertEqual(self.lines(False), lines)
+        line = r"# Placement: reaches 91.2 % and follows 75.0 % of 321 frames: a \\g<1> \b"
+        self.assertIn(line, self.lines(True))
 
     def test_a_placement_of_an_earlier_version_is_ignored_and_replaced(self):
         stated = 'placement = { reached = 0.9, followed = 0.8, frames = 3, command = "x" }'
@@ -312,11 +277,6 @@ class WritePlacementTest(unittest.TestCase):
         with self.assertRaisesRegex(
             RobotError, r"no placement has a home. Put base.pos = \[0.1, 0.2, 0.3\]"
         ):
-            self.write(dataclasses.replace(self.best, home_rule=""))
+            self.write(replace(self.best, home_rule=""))
         self.file.write_text(self.file.read_text().replace("pos = [", "position = ["))
-        with self.assertRaisesRegex(RobotError, "edit it by hand"):
-            self.write(self.best)
-
-
-if __name__ == "__main__":
-    unittest.main()
+        self.assertRaisesRegex(RobotError, "edit it by hand", self.write, self.best)

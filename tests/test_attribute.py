@@ -3,16 +3,16 @@
 import io
 import json
 import math
-import unittest
 from dataclasses import fields, replace
+from unittest import TestCase
 
 import torch
 from rich.console import Console
 
 from tests import toy_grasp
-from tests.command import xreset
+from tests.command import refused
 from tests.toy_results import episodes
-from xreset.errors import XResetError
+from xreset import SceneSpec, XResetError
 from xreset.eval.engines.attribution import (
     Attribution,
     Row,
@@ -23,9 +23,8 @@ from xreset.eval.engines.attribution import (
     verdict,
 )
 from xreset.eval.engines.measure import Measured, measure
-from xreset.eval.rollout import Engine, engine
+from xreset.eval.rollout import engine
 from xreset.eval.sensitivity import COMPARED, Effect, nominal_task
-from xreset.spec import SceneSpec
 from xreset.task.config import RandomizationConfig, TaskConfig, TerminationConfig
 from xreset.task.randomization import pair_friction
 
@@ -48,16 +47,14 @@ STATED = Measured(
 )  # fmt: skip
 
 
-def mujoco() -> Engine:
+def mujoco():
     return engine("mujoco", workers=0)
 
 
-def altered(
-    base: Engine, *, friction: float = 1.0, stiffness: float = 1.0, **scene: float
-) -> Engine:
+def altered(base, *, friction=1.0, stiffness=1.0, **scene):
     """The engine with some mistakes: factors on friction and drives, and finer steps."""
 
-    def change(asked: SceneSpec) -> SceneSpec:
+    def change(asked):
         joints = []
         for joint in asked.robot.joints:
             kp = stiffness if joint.group == "hand" else scene.get("arm_stiffness", 1.0)
@@ -78,7 +75,7 @@ def altered(
             substeps=asked.substeps * finer,
         )
 
-    def make(asked: SceneSpec, num_worlds: int, object_index):
+    def make(asked, num_worlds, object_index):
         backend = base.make(change(asked), num_worlds, object_index)
         set_friction = backend.set_friction
         step = backend.step
@@ -98,8 +95,8 @@ def altered(
     return replace(base, name="other", make=make)
 
 
-class ProbesTest(unittest.TestCase):
-    def assert_measured(self, found: Measured, **expected: float):
+class ProbesTest(TestCase):
+    def assert_measured(self, found, **expected):
         for name, value in (vars(STATED) | expected).items():
             # Numerical damping is part of what is measured. So is what the coupling of the jaws gives way in a step: 1 to 4 % of their
             # drive's stiffness with the steps used here, 0.3 % with a 16th of them.
@@ -120,18 +117,16 @@ class ProbesTest(unittest.TestCase):
         )  # fmt: skip
 
 
-class ChangeTest(unittest.TestCase):
+class ChangeTest(TestCase):
     TASK = nominal_task(TASK)
 
-    def change(
-        self, name: str, b: float, a: float | None = None, engine: str = "mujoco"
-    ) -> TaskConfig | str:
+    def change(self, name, b, a=None, engine="mujoco"):
         prop = COMPARED[name]
         return change_towards(
             prop, getattr(STATED, prop.measured) if a is None else a, b, self.TASK, engine
         )
 
-    def drawn(self, name: str, b: float, a: float | None = None) -> RandomizationConfig:
+    def drawn(self, name, b, a=None):
         found = self.change(name, b, a)
         assert not isinstance(found, str), found
         return found.randomization
@@ -169,10 +164,10 @@ class ChangeTest(unittest.TestCase):
                 self.assertIn(why, str(self.change(name, b, a)))
 
 
-class AttributeTest(unittest.TestCase):
+class AttributeTest(TestCase):
     """A grasp that just holds, and engines with one deliberate mistake each."""
 
-    def attribute(self, b: Engine, **options) -> Attribution:
+    def attribute(self, b, **options):
         return attribute(
             toy_grasp.policy(),
             mujoco(),
@@ -226,7 +221,7 @@ class AttributeTest(unittest.TestCase):
             self.attribute(mujoco(), only=["colour"])
 
 
-def row(kind: str, name: str, *scores: float) -> Row:
+def row(kind, name, *scores):
     """A run of two episodes of each demonstration; in A as it is, every score is 0.66."""
     effect = Effect.of(episodes(list(scores)), episodes([0.66] * len(scores)))
     return Row(kind=kind, name=name, episodes=episodes(list(scores)), effect=effect)  # pyright: ignore[reportArgumentType]
@@ -236,8 +231,8 @@ A = row("as it is", "mujoco", *[0.66] * 8)
 B = row("other", "sapien", *[0.33] * 8)
 
 
-class OutcomeTest(unittest.TestCase):
-    def found(self, *rows: Row) -> Attribution:
+class OutcomeTest(TestCase):
+    def found(self, *rows):
         return Attribution(
             a="mujoco",
             b="sapien",
@@ -264,7 +259,7 @@ class OutcomeTest(unittest.TestCase):
         self.assertIsNone(found.costs())
 
 
-class CommandTest(unittest.TestCase):
+class CommandTest(TestCase):
     def test_bad_input(self):
         options = ("--demos", "none.npz", "--robot", "ur7e-sharpa", "--towards")
         for message, policy, other in (
@@ -273,10 +268,4 @@ class CommandTest(unittest.TestCase):
             ("there is no none.npz", "zero", "sapien"),
         ):
             with self.subTest(message):
-                code, _, err = xreset("engines", "attribute", policy, *options, other)
-                self.assertEqual(code, 1)
-                self.assertIn(message, err)
-
-
-if __name__ == "__main__":
-    unittest.main()
+                self.assertIn(message, refused("engines", "attribute", policy, *options, other))

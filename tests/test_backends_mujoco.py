@@ -1,22 +1,21 @@
 """The MuJoCo model of a scene, and what the two MuJoCo backends do beyond the conformance suite."""
 
-from __future__ import annotations
-
 import gc
-import tempfile
-import unittest
 import weakref
 from dataclasses import fields, replace
 from functools import partial
 from itertools import product
-from pathlib import Path
-from unittest import mock
+from unittest import TestCase, skipIf
+from unittest.mock import patch
 
 import mujoco
 import mujoco_warp
 import numpy as np
 import torch
+from torch import tensor
+from torch.testing import assert_close
 
+from tests.data import InFolder
 from tests.engine_checks import EngineChecks
 from xreset.backends import mujoco_warp as mujoco_warp_backend
 from xreset.backends.conformance.grasp_checks import grasp
@@ -29,12 +28,11 @@ from xreset.backends.mujoco_warp import MujocoWarpBackend
 from xreset.backends.mujoco_warp_setup import contact_room, differing_fields
 from xreset.backends.mujoco_warp_step import constraints, finish, forked_step, smooth_dynamics
 from xreset.errors import BackendUnavailableError, ObjectError, RobotError, XResetError
-from xreset.physics import Backend
 from xreset.plugins import device_for
 from xreset.spec import FingertipSpec
 
 
-def colliding_geoms(model: mujoco.MjModel) -> set[frozenset[str]]:
+def colliding_geoms(model):
     """Pairs of geoms that the engine lets touch, after all were made into large spheres that overlap."""
     model.geom_type[:] = mujoco.mjtGeom.mjGEOM_SPHERE
     model.geom_size[:, 0] = model.geom_rbound[:] = model.geom_aabb[:, 3:] = 10.0
@@ -44,12 +42,12 @@ def colliding_geoms(model: mujoco.MjModel) -> set[frozenset[str]]:
     return {frozenset((model.geom(a).name, model.geom(b).name)) for a, b in data.contact.geom}
 
 
-def worlds(backend: MujocoBackend) -> list[MujocoWorld]:
+def worlds(backend):
     """The worlds of a backend without worker processes."""
     return backend._team._worlds
 
 
-def everything(backend: Backend) -> list[torch.Tensor]:
+def everything(backend):
     """Copies of all readings; the table's forces are the last."""
     tensors = []
     for bundle in (backend.state(), backend.links(), backend.contacts()):
@@ -57,7 +55,7 @@ def everything(backend: Backend) -> list[torch.Tensor]:
     return tensors
 
 
-class Model(unittest.TestCase):
+class Model(InFolder):
     at: SceneModel
 
     @classmethod
@@ -80,11 +78,11 @@ class Model(unittest.TestCase):
             data.actuator_force, off * [joint.drive.kp for joint in robot.joints], atol=1e-9
         )
 
-    def collisions(self, **changes) -> set[frozenset[str]]:
+    def collisions(self, **changes):
         robot = replace(self.scene.robot, **changes)
         return colliding_geoms(compile_scene(replace(self.scene, robot=robot), 0).model)
 
-    def collisions_of_the_robot(self, **changes) -> set[frozenset[str]]:
+    def collisions_of_the_robot(self, **changes):
         pairs = self.collisions(**changes)
         return {pair for pair in pairs if "robot/" in min(pair) and "robot/" in max(pair)}
 
@@ -108,14 +106,13 @@ class Model(unittest.TestCase):
             .urdf.read_text()
             .replace('<link name="tip_b"/>', f'<link name="tip_b">{box}</link>')
         )
-        with tempfile.TemporaryDirectory() as folder:
-            urdf = Path(folder) / "robot.urdf"
-            urdf.write_text(text)
-            own = self.collisions_of_the_robot(
-                urdf=urdf,
-                self_collision_links=("jaw_a", "pad_b", "tip_b"),
-                collision_exclude=(("jaw_a", "tip_b"),),
-            )
+        urdf = self.folder / "robot.urdf"
+        urdf.write_text(text)
+        own = self.collisions_of_the_robot(
+            urdf=urdf,
+            self_collision_links=("jaw_a", "pad_b", "tip_b"),
+            collision_exclude=(("jaw_a", "tip_b"),),
+        )
         self.assertEqual(own, {frozenset(("robot/jaw_a/0", "robot/finger_b/0"))})
 
     def test_neighbours_of_a_base_that_stands_still_never_collide(self):
@@ -174,20 +171,20 @@ class Model(unittest.TestCase):
                 compile_scene(replace(self.scene, **changes), 0)
 
 
-class MujocoTest(EngineChecks, unittest.TestCase):
+class MujocoTest(EngineChecks, TestCase):
     backend_class = MujocoBackend
     # MuJoCo's dry friction is soft: a joint that it holds creeps.
     test_dry_friction_stops_and_holds = None
     test_dry_friction_holds_against_a_weak_drive_only = None
 
 
-class BothBackends(unittest.TestCase):
+class BothBackends(TestCase):
     """MuJoCo C is the reference for MuJoCo-Warp. The worlds are built once: compiling kernels takes about a minute."""
 
     @classmethod
     def setUpClass(cls):
         cls.scene = scene()
-        index = torch.tensor([0, 1, 2, 0])
+        index = tensor([0, 1, 2, 0])
         cls.warp = MujocoWarpBackend(cls.scene, 4, object_index=index)
         cls.c = MujocoBackend(cls.scene, 4, object_index=index, workers=0)
         cls.bench = Bench(lambda *_, **__: cls.c, cls.scene)
@@ -197,7 +194,7 @@ class BothBackends(unittest.TestCase):
         cls.warp.close()
         cls.c.close()
 
-    def both(self) -> tuple[Backend, Backend]:
+    def both(self):
         return self.warp, self.c
 
     def test_held_forces_agree(self):
@@ -212,8 +209,8 @@ class BothBackends(unittest.TestCase):
                 backend.step()
                 forces.append(backend.contacts().tip_force.clone())
             means.append(torch.stack(forces).mean(dim=0)[[0, 3]])
-        torch.testing.assert_close(*means, atol=0.02, rtol=0.0)
-        torch.testing.assert_close(self.warp.contacts().tip_touch, self.c.contacts().tip_touch)
+        assert_close(*means, atol=0.02, rtol=0.0)
+        assert_close(self.warp.contacts().tip_touch, self.c.contacts().tip_touch)
 
     def test_bad_shapes_are_named(self):
         state = self.bench.start()
@@ -222,15 +219,14 @@ class BothBackends(unittest.TestCase):
                 backend.set_state(replace(state, joint_pos=state.joint_pos[:3]))
             with self.assertRaisesRegex(ValueError, "joint_target"):
                 backend.set_joint_targets(state.joint_pos[:, :2])
-            with self.assertRaisesRegex(ValueError, "substeps"):
-                backend.step(0)
+            self.assertRaisesRegex(ValueError, "substeps", backend.step, 0)
             with self.assertRaises(ValueError):
                 backend.set_object_mass(torch.ones(3))
             with self.assertRaises(ValueError):
                 backend.set_friction(torch.ones(4, 2))
 
 
-class Steps(unittest.TestCase):
+class Steps(TestCase):
     def test_the_forked_step_is_the_engine_s_in_either_order(self):
         """The two streams may end in either order."""
 
@@ -242,28 +238,26 @@ class Steps(unittest.TestCase):
         results = []
         for step in (mujoco_warp.step, partial(forked_step, None), reversed_step):
             with (
-                mock.patch.object(mujoco_warp_backend, "engine_step", return_value=step),
+                patch.object(mujoco_warp_backend, "engine_step", return_value=step),
                 MujocoWarpBackend(scene(), 8) as backend,
             ):
                 state = backend.state().clone()
                 backend.set_state(
-                    replace(
-                        state, object_linvel=state.object_linvel + torch.tensor([0.3, 0.0, -0.5])
-                    )
+                    replace(state, object_linvel=state.object_linvel + tensor([0.3, 0.0, -0.5]))
                 )
                 # A parameter that changes what positions lead to.
-                backend.set_object_com(torch.tensor([0.01, 0.0, 0.0]).expand(8, 3))
+                backend.set_object_com(tensor([0.01, 0.0, 0.0]).expand(8, 3))
                 for target in torch.linspace(0.0, 0.3, 40):
                     backend.set_joint_targets(state.joint_target + target)
                     backend.step(2)
                 results.append(everything(backend))
-        self.assertGreater(float(results[0][-1].abs().max()), 0.1, "something touches")
+        self.assertGreater(results[0][-1].abs().max(), 0.1, "something touches")
         for other in results[1:]:
             for a, b in zip(results[0], other, strict=True):
-                torch.testing.assert_close(a, b, rtol=0, atol=0)
+                assert_close(a, b, rtol=0, atol=0)
 
 
-class Limits(unittest.TestCase):
+class Limits(TestCase):
     def test_a_closed_backend_keeps_no_scene_alive(self):
         held = scene()
         seen = weakref.ref(held)
@@ -276,18 +270,18 @@ class Limits(unittest.TestCase):
         self.assertIsNone(seen())
 
     def test_warp_counts_contacts_that_found_no_room(self):
-        with mock.patch.object(mujoco_warp_backend, "contact_room", return_value=(1, 1, 220)):
+        with patch.object(mujoco_warp_backend, "contact_room", return_value=(1, 1, 220)):
             backend = MujocoWarpBackend(scene(), 4, object_index=torch.zeros(4, dtype=torch.long))
         backend.step(8)
-        self.assertTrue(bool(backend.health().overflow.all()))  # the pool is everyone's
+        self.assertTrue(backend.health().overflow.all())  # the pool is everyone's
         state = backend.state().clone()
         # no contacts
-        state = replace(state, object_pos=state.object_pos + torch.tensor([0.0, 0.0, 1.0]))
-        backend.set_state(state[[2]], torch.tensor([2]))
+        state = replace(state, object_pos=state.object_pos + tensor([0.0, 0.0, 1.0]))
+        backend.set_state(state[[2]], tensor([2]))
         self.assertEqual(backend.health().overflow.tolist(), [True, True, False, True])
         backend.set_state(state)
         backend.step(1)
-        self.assertFalse(bool(backend.health().overflow.any()))
+        self.assertFalse(backend.health().overflow.any())
 
     def test_an_object_of_many_pieces_has_room_for_its_contacts(self):
         """Sixteen feet on the table: 256 rows of constraints."""
@@ -295,7 +289,7 @@ class Limits(unittest.TestCase):
         feet = [shape("box", (0.002, 0.002, 0.005), (x, y, 0.0)) for x, y in places]
         standing = replace(scene(), objects=(solid("feet", 0.4, tuple(feet)),))
         for pieces, overflows in ((16, False), (1, True)):
-            room = mock.patch.object(
+            room = patch.object(
                 mujoco_warp_backend, "contact_room", return_value=contact_room(pieces)
             )
             with room, MujocoWarpBackend(standing, 2) as backend:
@@ -310,31 +304,30 @@ class Limits(unittest.TestCase):
             step(model, data)
             data.warning[int(mujoco.mjtWarning.mjWARN_CNSTRFULL)].number += 1
 
-        with mock.patch.object(mujoco, "mj_step2", full):
+        with patch.object(mujoco, "mj_step2", full):
             backend.step(1)
-        self.assertTrue(bool(backend.health().overflow[0]))
+        self.assertTrue(backend.health().overflow[0])
         backend.step(1)
-        self.assertTrue(bool(backend.health().overflow[0]), "it stays until the state is set")
+        self.assertTrue(backend.health().overflow[0], "it stays until the state is set")
         backend.set_state(backend.state().clone())
         backend.step(1)
-        self.assertFalse(bool(backend.health().overflow[0]))
+        self.assertFalse(backend.health().overflow[0])
 
     def test_closed(self):
         backend = MujocoWarpBackend(scene(), 1)
         backend.close()
         backend.close()
         for call in (backend.state, backend.step, backend.links, backend.contacts, backend.health):
-            with self.assertRaisesRegex(XResetError, "closed"):
-                call()
+            self.assertRaisesRegex(XResetError, "closed", call)
 
-    @unittest.skipIf(torch.cuda.is_available(), "there is a CUDA device")
+    @skipIf(torch.cuda.is_available(), "there is a CUDA device")
     def test_no_such_device(self):
         self.assertEqual(MujocoWarpBackend.devices(), ["cpu"])
         with self.assertRaisesRegex(BackendUnavailableError, "cpu"):
             MujocoWarpBackend(scene(), 1, device="cuda")
 
     def test_where_an_engine_runs(self):
-        with mock.patch.object(MujocoWarpBackend, "devices", return_value=["cuda", "cpu"]):
+        with patch.object(MujocoWarpBackend, "devices", return_value=["cuda", "cpu"]):
             for device in ("cpu", "cuda", "cuda:1"):
                 self.assertEqual(device_for("mujoco-warp", device), device)
                 self.assertEqual(device_for("mujoco", device), "cpu")
@@ -342,7 +335,3 @@ class Limits(unittest.TestCase):
                 BackendUnavailableError, "Unknown device 'gpu'. Expected cpu, cuda"
             ):
                 device_for("mujoco", "gpu")
-
-
-if __name__ == "__main__":
-    unittest.main()

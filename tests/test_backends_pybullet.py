@@ -1,12 +1,9 @@
 """The Bullet backend."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
-import unittest
 from dataclasses import replace
-from unittest import mock
+from unittest import TestCase, mock
 
 import numpy as np
 import torch
@@ -16,11 +13,11 @@ from tests.engine_checks import JOINT, EngineChecks
 from xreset.backends.conformance.scene import objects, scene, shape
 from xreset.backends.pybullet import PybulletBackend
 from xreset.backends.rigid import mechanism
-from xreset.spec import Geometry, Shape
+from xreset.spec import Geometry
 
 
 @PYBULLET
-class PybulletTest(EngineChecks, unittest.TestCase):
+class PybulletTest(EngineChecks, TestCase):
     backend_class = PybulletBackend
     module = "pybullet"
     one_step = mock.patch("xreset.backends.pybullet.INTERNAL_STEPS", 1)
@@ -41,10 +38,10 @@ class PybulletTest(EngineChecks, unittest.TestCase):
                 bodies.append(replace(body, shapes=tuple(shapes)))
             return replace(made, bodies=tuple(bodies))
 
-        def hull(size, T) -> Shape:
+        def hull(size, T):
             return replace(shape("hull", tuple(size)), T_body_shape=T)
 
-        def opening(*pieces: Shape) -> float:
+        def opening(*pieces):
             held = replace(brick, pieces=pieces)
             with mock.patch("xreset.backends.pybullet.mechanism", round_pads):
                 backend, _ = self.grasp(replace(scene(), objects=(held,)))
@@ -53,7 +50,7 @@ class PybulletTest(EngineChecks, unittest.TestCase):
             return float(backend.state().joint_pos[0, JOINT["jaw_a_slide"]])
 
         brick = objects()[0]
-        self.assertGreater(float(np.abs(brick.com).max()), 0.0)
+        self.assertGreater(np.abs(brick.com).max(), 0.0)
         (whole,) = brick.pieces
         T = whole.T_body_shape
         box = opening(whole)
@@ -78,7 +75,3 @@ class PybulletTest(EngineChecks, unittest.TestCase):
         )
         self.assertEqual((done.returncode, done.stderr), (0, ""))
         self.assertRegex(done.stdout, r"^[\d.]+\n$")
-
-
-if __name__ == "__main__":
-    unittest.main()

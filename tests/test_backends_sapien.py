@@ -1,11 +1,9 @@
 """The PhysX backend."""
 
-from __future__ import annotations
-
 import itertools
-import unittest
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest import TestCase
 
 import numpy as np
 
@@ -19,14 +17,14 @@ from xreset.errors import RobotError
 from xreset.spec import MimicSpec
 
 
-class SapienTest(EngineChecks, unittest.TestCase):
+class SapienTest(EngineChecks, TestCase):
     backend_class = SapienBackend
     module = "sapien"
 
     def test_the_configuration_of_the_process_stays_as_it_was(self):
         from sapien import physx
 
-        def configuration() -> tuple:
+        def configuration():
             scene_config = physx.get_scene_config()
             body = physx.get_body_config()
             shape = physx.get_shape_config()
@@ -73,7 +71,7 @@ class SapienTest(EngineChecks, unittest.TestCase):
             _couple(None, joints, MimicSpec(joint="b", source="a"))
 
 
-class CollisionBitsTest(unittest.TestCase):
+class CollisionBitsTest(TestCase):
     def test_exactly_the_pairs_of_the_rule(self):
         robot = replace(
             gripper(),
@@ -93,7 +91,7 @@ class CollisionBitsTest(unittest.TestCase):
         self.assertEqual(hits, {frozenset(pair) for pair in expected})
 
 
-class FrictionTest(unittest.TestCase):
+class FrictionTest(TestCase):
     def test_forces_of_known_contacts_are_found(self):
         rng = np.random.default_rng(0)
         arms = rng.normal(size=(3, 3)) * 0.03
@@ -104,7 +102,3 @@ class FrictionTest(unittest.TestCase):
         found = friction_forces(arms, normals, np.full(3, 0.8), force, torque)
         # three contacts: six unknowns, six equations
         np.testing.assert_allclose(found, tangential, atol=1e-6)
-
-
-if __name__ == "__main__":
-    unittest.main()

@@ -1,18 +1,16 @@
 """Depth cameras: what the rays hit, errors of the images, the same picture in every engine, timing, and refusals."""
 
-import tempfile
-import unittest
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from unittest import mock
+from unittest import SkipTest, TestCase, mock
 
 import numpy as np
 import torch
+from torch import tensor
 from torch.testing import assert_close
 
 from tests.toy_bank import SOUP, toy_bank
-from tests.toy_robot import toy_hand_arm
+from tests.toy_robot import toy_robot
 from xreset.cameras.config import CameraConfig, DepthNoise, VisionConfig
 from xreset.env import make_env, make_scene
 from xreset.errors import RobotError, XResetError
@@ -24,7 +22,7 @@ from xreset.task.config import ObservationConfig, RandomizationConfig, TaskConfi
 try:
     from xreset.cameras.sensor import Cameras
 except XResetError as error:
-    raise unittest.SkipTest(str(error)) from error
+    raise SkipTest(str(error)) from error
 
 IDEAL = DepthNoise(spread=0.0, step=0.0, holes=0.0, edges=0.0)
 ABOVE = CameraConfig(pos=(0.57, 0.3, 0.5), target=(0.57, 0.3, 0.0), noise=IDEAL)
@@ -33,23 +31,21 @@ SIZE = {"width": 32, "height": 24}
 VISION = VisionConfig(cameras=(ABOVE, replace(ABOVE, pos=(1.0, 0.2, 0.4))), interval=1, **SIZE)
 
 
-class TestCameras(unittest.TestCase):
+class TestCameras(TestCase):
     @classmethod
     def setUpClass(cls):
-        folder = tempfile.TemporaryDirectory()
-        cls.addClassCleanup(folder.cleanup)
-        cls.robot = toy_hand_arm(Path(folder.name))
+        cls.robot = toy_robot()
         cls.objects = tuple(load_objects([SOUP], None))
         cls.scene = make_scene(cls.robot, cls.objects, TaskConfig())
         cls.index = torch.zeros(2, dtype=torch.long)
         cls.state = State.initial(cls.scene, cls.index)
 
-    def cameras(self, vision: VisionConfig = VISION, **options) -> Cameras:
+    def cameras(self, vision=VISION, **options):
         return Cameras(self.scene, self.index, vision, **options)
 
-    def look(self, cameras: Cameras, state: State | None = None) -> torch.Tensor:
+    def look(self, cameras, state=None):
         state = state or self.state
-        goal = state.object_pos + torch.tensor([0.0, 0.0, 0.2])
+        goal = state.object_pos + tensor([0.0, 0.0, 0.2])
         cameras.aim(state, goal, state.object_quat, torch.ones(2, dtype=torch.bool))
         cameras.cast()
         return cameras.observe(torch.Generator().manual_seed(0))
@@ -63,18 +59,18 @@ class TestCameras(unittest.TestCase):
         on_table = depth[body == can - 1]
         assert_close(on_table, torch.full_like(on_table, 0.5))
         top = 0.5 - (self.objects[0].vertices[:, 2].max() + float(self.state.object_pos[0, 2]))
-        self.assertAlmostEqual(float(depth[12, 16]), top, places=4)
-        self.assertEqual(int(body[12, 16]), int(can))
+        self.assertAlmostEqual(depth[12, 16], top, delta=5e-5)
+        self.assertEqual(body[12, 16], can)
         # as many pixels as a disk of the can's size has at that depth
         radius = np.ptp(self.objects[0].vertices[:, 0]) / 2
         pixels_per_metre = 24 / 2 / np.tan(ABOVE.fov / 2) / top
         self.assertAlmostEqual(
-            float((body == can).sum()), np.pi * (radius * pixels_per_metre) ** 2, delta=12
+            (body == can).sum(), np.pi * (radius * pixels_per_metre) ** 2, delta=12
         )
         assert_close(view[0, 0], ((2.0 - depth) / 1.9).where(depth > 0, 0.0))
 
     def test_errors_of_depth(self):
-        def image(scale: float = 1.0, **noise: float) -> torch.Tensor:
+        def image(scale=1.0, **noise):
             camera = replace(ABOVE, noise=replace(IDEAL, **noise))
             cameras = self.cameras(
                 replace(VISION, cameras=(camera, replace(camera, pos=(1.0, 0.2, 0.4))))
@@ -90,13 +86,13 @@ class TestCameras(unittest.TestCase):
             2.0,
         ):  # the spread grows with the square of the depth, and with the scale
             error = (image(spread=0.002, scale=scale) - exact) / exact.square().clamp_min(1e-3)
-            self.assertAlmostEqual(float(error[seen].std()), 0.002 * scale, delta=2e-4 * scale)
+            self.assertAlmostEqual(error[seen].std(), 0.002 * scale, delta=2e-4 * scale)
         steps = 1 / image(step=0.01)[seen] / 0.01
-        self.assertLess(float((steps - steps.round()).abs().max()), 1e-3)
+        self.assertLess((steps - steps.round()).abs().max(), 1e-3)
         lost = (image(holes=0.2) == 0) & seen
-        self.assertAlmostEqual(float(lost.sum() / seen.sum()), 0.2, delta=0.04)
+        self.assertAlmostEqual(lost.sum() / seen.sum(), 0.2, delta=0.04)
         lost = (image(edges=1.0) == 0) & seen  # around the can, and not on the table
-        self.assertGreater(int(lost[0, 0].sum()), 10)
+        self.assertGreater(lost[0, 0].sum(), 10)
         self.assertFalse(lost[0, 0, :, :6].any())
 
     def test_points_are_on_the_object(self):
@@ -109,7 +105,7 @@ class TestCameras(unittest.TestCase):
         points = cloud[..., :3] / 2 - self.state.object_pos[:, None, None]
         points[:, 1, :, 2] -= 0.2  # the goal is higher
         low, high = (
-            torch.tensor(getattr(self.objects[0].vertices, end)(axis=0)) for end in ("min", "max")
+            tensor(getattr(self.objects[0].vertices, end)(axis=0)) for end in ("min", "max")
         )
         self.assertTrue(((points > low - 1e-3) & (points < high + 1e-3)).all())
 
@@ -137,7 +133,7 @@ class TestCameras(unittest.TestCase):
         joints[:, self.robot.joint_names.index("arm_3")] += 0.1
         self.look(cameras, replace(self.state, joint_pos=joints))
         moved = (cameras.pose - before)[0, 0, :3, 3].norm()
-        self.assertAlmostEqual(float(moved), 0.1, places=5)
+        self.assertAlmostEqual(moved, 0.1, delta=5e-6)
 
     def test_refusals(self):
         inside = CameraConfig(link="palm", pos=(0, 0, 0.001), target=(1, 0, 0))
@@ -168,21 +164,21 @@ class TestCameras(unittest.TestCase):
                 replace(ABOVE, **changes)
 
 
-class TestVisionInTheEnvironment(unittest.TestCase):
+class TestVisionInTheEnvironment(TestCase):
     @classmethod
     def setUpClass(cls):
-        cls.robot = toy_hand_arm(Path(cls.enterClassContext(tempfile.TemporaryDirectory())))
+        cls.robot = toy_robot()
         cls.bank = toy_bank(cls.robot)
         cls.objects = tuple(load_objects(list(cls.bank.object_names), None))
 
-    def make(self, vision: VisionConfig, **changes):
+    def make(self, vision, **changes):
         task = replace(evaluation_task(TASK), vision=vision, **changes)
         with mock.patch("xreset.env.make_backend", partial(make_backend, workers=0)):
             return self.enterContext(
                 make_env(self.robot, self.objects, self.bank, task, num_envs=2)
             )
 
-    def play(self, env, steps: int) -> list[torch.Tensor]:
+    def play(self, env, steps):
         views = [env.get_observations()["view"]]
         generator = torch.Generator().manual_seed(0)
         for _ in range(steps):
@@ -209,7 +205,7 @@ class TestVisionInTheEnvironment(unittest.TestCase):
         self.play(env, 4)
         before = env.get_observations()["view"]
         snapshot = env.snapshot()
-        env.reset(torch.tensor([1]))
+        env.reset(tensor([1]))
         after = env.get_observations()["view"]
         self.assertTrue(torch.equal(after[0], before[0]))
         self.assertFalse(torch.equal(after[1], before[1]))
@@ -224,7 +220,3 @@ class TestVisionInTheEnvironment(unittest.TestCase):
         assert_close(cameras.shift.norm(dim=-1), torch.full((2, 2), 0.03))
         assert_close(cameras.turn.norm(dim=-1), torch.full((2, 2), 0.05))
         self.assertEqual(len(cameras.fov_scale.unique()), 4)
-
-
-if __name__ == "__main__":
-    unittest.main()

@@ -1,28 +1,29 @@
 """Reset banks beyond the paper's filter: states between frames where a hand closes in, targets that press, grasps that hold."""
 
 import json
-import tempfile
-import unittest
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from unittest import mock
+from unittest import TestCase
+from unittest.mock import patch
 
 import numpy as np
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
+from torch import tensor
+from torch.testing import assert_close
 
 from tests import toy_grasp
-from tests.test_cli import run
+from tests.command import refused, succeeds
+from tests.data import InFolder
+from tests.engine_checks import with_drive
 from tests.toy_bank import toy_bank, toy_retargeted
+from xreset import ClosingConfig, SqueezeConfig, make_backend, read_bank, write_bank
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_rotate
-from xreset.plugins import make_backend
-from xreset.resets.bank import read_bank, write_bank
 from xreset.resets.closing import closing_states, positions_between, rotations_between
-from xreset.resets.config import ClosingConfig, SqueezeConfig
 from xreset.resets.distribution import ResetDistribution, bank_starts
 from xreset.resets.fingers import Fingers, fingers_of, squeeze_targets
-from xreset.retarget.file import Retargeted, object_sources, write_retargeted
+from xreset.retarget.file import object_sources, write_retargeted
 from xreset.task.config import ResetConfig
 
 ROBOT = toy_grasp.robot()
@@ -31,27 +32,21 @@ WIDE = toy_grasp.OPEN + 0.03
 """A jaw position 30.1 mm from the brick."""
 
 
-def retargeted(
-    joint_pos: np.ndarray, object_pos: np.ndarray, offsets=None, **changes
-) -> Retargeted:
+def retargeted(joint_pos, object_pos, offsets=None, **changes):
     """Trajectories of the gripper and the brick, given by joints [F, J] and the brick's positions [F, 3]."""
     frames = len(joint_pos)
     offsets = offsets or [0, frames]
-    tips = (
-        Kinematics(ROBOT)
-        .points(torch.as_tensor(joint_pos), [tip.link for tip in ROBOT.fingertips])
-        .numpy()
-    )
+    links = [tip.link for tip in ROBOT.fingertips]
     values = {
         "joint_pos": joint_pos,
-        "fingertip_pos": tips,
+        "fingertip_pos": Kinematics(ROBOT).points(torch.as_tensor(joint_pos), links).numpy(),
         "object_pos": object_pos,
         "object_quat_wxyz": np.tile(toy_grasp.brick_pose()[1], (frames, 1)),
     }
     return toy_retargeted(ROBOT, ["brick"] * (len(offsets) - 1), offsets, **(values | changes))
 
 
-def grasp_and_lift() -> Retargeted:
+def grasp_and_lift():
     """Three frames: jaws 30.1 mm from the brick; 0.1 mm from it; and that 4 cm higher."""
     joints = np.tile(ROBOT.home, (3, 1))
     joints[:, JAW] = WIDE, toy_grasp.OPEN, toy_grasp.OPEN
@@ -60,7 +55,7 @@ def grasp_and_lift() -> Retargeted:
     return retargeted(joints, pos, first_contact=np.array([1]))
 
 
-class ClosingTest(unittest.TestCase):
+class ClosingTest(TestCase):
     """Two demonstrations of five frames in which the first finger moves by 12 mm a frame and the second by 4."""
 
     def setUp(self):
@@ -77,28 +72,29 @@ class ClosingTest(unittest.TestCase):
         )  # fmt: skip
         self.gap = np.full((10, 2), 0.03)
 
-    def states(self, data: Retargeted | None = None, **config):
+    def states(self, data=None, **config):
         none = torch.zeros(10, 2, 3)
         fingers = Fingers(
             links=("a", "b"),
-            finger=torch.tensor([0, 1]),
+            finger=tensor([0, 1]),
             gap=torch.as_tensor(self.gap),
             point=none,
             inward=none,
         )
-        with mock.patch("xreset.resets.closing.fingers_of", lambda *_: fingers):
-            return closing_states(
-                data or self.data,
-                ROBOT,
-                (toy_grasp.brick(),),
-                ClosingConfig(**({"spacing": 0.005} | config)),
-            )
+        config = ClosingConfig(**({"spacing": 0.005} | config))
+        with patch("xreset.resets.closing.fingers_of", lambda *_: fingers):
+            return closing_states(data or self.data, ROBOT, (toy_grasp.brick(),), config)
+
+    def bridged(self, data=None, **config):
+        """Frames that states between follow."""
+        frame, part = self.states(data, **config)
+        return sorted(set(frame[part > 0].tolist()))
 
     def test_fingertips_move_by_no_more_than_the_spacing(self):
         frame, part = self.states()
         self.assertEqual(len(frame), 26, "12 mm are three steps of 4 mm")
         self.assertEqual(frame[:8].tolist(), [0, 0, 0, 1, 1, 1, 2, 2])
-        np.testing.assert_allclose(part[:5], [0, 1 / 3, 2 / 3, 0, 1 / 3])
+        assert_allclose(part[:5], [0, 1 / 3, 2 / 3, 0, 1 / 3])
         self.assertEqual(frame[part == 0].tolist(), list(range(10)))
 
     def test_between_two_frames_positions_are_straight_and_rotations_even(self):
@@ -106,52 +102,37 @@ class ClosingTest(unittest.TestCase):
         old = self.data.joint_pos
         found = positions_between(old, frame, part)
         following = old[np.minimum(frame + 1, 9)]
-        np.testing.assert_allclose(
-            found, old[frame] + part[:, None] * (following - old[frame]), atol=1e-12
-        )
+        assert_allclose(found, old[frame] + part[:, None] * (following - old[frame]), atol=1e-12)
         self.assertEqual(found[part == 0].tobytes(), old.tobytes())
         quat = rotations_between(self.data.object_quat_wxyz, frame, part)
-        np.testing.assert_allclose(
-            2 * np.arctan2(quat[:, 3], quat[:, 0]), 0.2 * (frame + part), atol=1e-9
-        )
+        assert_allclose(2 * np.arctan2(quat[:, 3], quat[:, 0]), 0.2 * (frame + part), atol=1e-9)
         self.assertEqual(quat[part == 0].tobytes(), self.data.object_quat_wxyz.tobytes())
 
     def test_sequences_are_not_mixed_and_nothing_invalid_is_bridged(self):
         valid = np.ones(10, dtype=bool)
         valid[[2, 7]] = False
-        frame, part = self.states(replace(self.data, valid=valid, reason=(~valid).astype(int)))
-        self.assertEqual(
-            sorted(set(frame[part > 0].tolist())),
-            [0, 3, 5, 8],
-            "not 1 and 6 to an invalid frame, 2 and 7 from it, 4 to 5",
-        )
+        invalid = replace(self.data, valid=valid, reason=(~valid).astype(int))
+        # not 1 and 6 to an invalid frame, 2 and 7 from it, 4 to 5
+        self.assertEqual(self.bridged(invalid), [0, 3, 5, 8])
 
     def test_only_near_the_object(self):
         self.gap[:, :] = np.array([0.3, 0.12, 0.09, 0.2, 0.2] * 2)[:, None]
-        frame, part = self.states()
-        self.assertEqual(sorted(set(frame[part > 0].tolist())), [1, 2, 6, 7])
-        frame, part = self.states(within=0.15)
-        self.assertEqual(sorted(set(frame[part > 0].tolist())), [0, 1, 2, 5, 6, 7])
+        self.assertEqual(self.bridged(), [1, 2, 6, 7])
+        self.assertEqual(self.bridged(within=0.15), [0, 1, 2, 5, 6, 7])
 
     def test_only_until_thumb_and_finger_touch_or_the_object_is_moved(self):
         self.gap[1:, 1] = 0.001  # a finger alone
         self.gap[2, 0], self.gap[8, 0] = 0.001, 0.001
-        frame, part = self.states()
-        self.assertEqual(
-            sorted(set(frame[part > 0].tolist())),
-            [0, 1, 5, 6, 7],
-            "also where the thumb lets go again",
-        )
+        self.assertEqual(self.bridged(), [0, 1, 5, 6, 7], "also where the thumb lets go again")
         pos = self.data.object_pos.copy()
         pos[6, 0] += 0.011
-        frame, part = self.states(replace(self.data, object_pos=pos))
-        self.assertEqual(sorted(set(frame[part > 0].tolist())), [0, 1, 5])
+        self.assertEqual(self.bridged(replace(self.data, object_pos=pos)), [0, 1, 5])
 
 
-class FingersTest(unittest.TestCase):
+class FingersTest(TestCase):
     """The gripper's jaws are flat, parallel to the brick's sides, and slide along their normal."""
 
-    def fingers(self, *jaw: float) -> tuple[Fingers, np.ndarray]:
+    def fingers(self, *jaw):
         joints = np.tile(ROBOT.home, (len(jaw), 1))
         joints[:, JAW] = jaw
         pos, quat = (np.tile(value, (len(jaw), 1)) for value in toy_grasp.brick_pose())
@@ -165,49 +146,45 @@ class FingersTest(unittest.TestCase):
         self.assertEqual(
             (fingers.links, fingers.finger.tolist()), (("jaw_a", "pad_b", "finger_b"), [0, 1, 1])
         )
-        np.testing.assert_allclose(fingers.gap[:, 0], jaws - 0.02, atol=3e-4)
-        np.testing.assert_allclose(fingers.gap[:, 1], 1.1 * jaws - 0.002 - 0.02, atol=3e-4)
-        np.testing.assert_allclose(fingers.gap.amin(dim=-1), jaws - 0.02, atol=3e-4)
+        assert_allclose(fingers.gap[:, 0], jaws - 0.02, atol=3e-4)
+        assert_allclose(fingers.gap[:, 1], 1.1 * jaws - 0.002 - 0.02, atol=3e-4)
+        assert_allclose(fingers.gap.amin(dim=-1), jaws - 0.02, atol=3e-4)
         self.assertEqual(
             fingers.leading.tolist(), [[True, True, False]] * 3, "finger_b has no shape of its own"
         )
         wrist = Kinematics(ROBOT).link_poses(torch.as_tensor(joints), ["wrist"])[:, 0, :3, 0]
-        torch.testing.assert_close(fingers.inward[:, 0], -wrist, atol=0.02, rtol=0)
-        torch.testing.assert_close(fingers.inward[:, 1], wrist, atol=0.02, rtol=0)
+        assert_close(fingers.inward[:, 0], -wrist, atol=0.02, rtol=0)
+        assert_close(fingers.inward[:, 1], wrist, atol=0.02, rtol=0)
         # the jaw's inner side
-        np.testing.assert_allclose(fingers.point[:, 0, 0], -0.005, atol=1e-3)
+        assert_allclose(fingers.point[:, 0, 0], -0.005, atol=1e-3)
 
     def test_a_squeeze_is_as_far_beyond_as_its_force_takes(self):
         fingers, joints = self.fingers(0.0201, 0.0501)
+
+        def squeezed(force, robot=ROBOT):
+            return squeeze_targets(robot, fingers, joints, SqueezeConfig(force=force))
+
         for force in (1.0, 2.5):
-            target = squeeze_targets(ROBOT, fingers, joints, SqueezeConfig(force=force))
+            target = squeezed(force)
             # jaw_b mimics jaw_a
             pressed = -(force + 1.1 * force) / 800
             self.assertAlmostEqual(target[0, JAW] - joints[0, JAW], pressed, delta=2e-5)
-            np.testing.assert_array_equal(target[1], joints[1], "30 mm away nothing is pressed on")
+            assert_array_equal(target[1], joints[1], "30 mm away nothing is pressed on")
             arm = ROBOT.arm_indices
-            np.testing.assert_array_equal(target[:, arm], joints[:, arm])
-        far = squeeze_targets(ROBOT, fingers, joints, SqueezeConfig(force=1e4))
+            assert_array_equal(target[:, arm], joints[:, arm])
+        far = squeezed(1e4)
         self.assertAlmostEqual(
             far[0, JAW], 0.002 / 1.1, places=9, msg="where jaw_b, which mimics it, has its limit"
         )
         bend = ROBOT.joint_names.index("finger_b_bend")
         self.assertLessEqual(abs(far[0, bend]), 0.8)
-        np.testing.assert_array_equal(
-            squeeze_targets(ROBOT, fingers, joints, SqueezeConfig(force=0.0)), joints
-        )
-        drives = list(ROBOT.joints)
-        drives[JAW] = replace(drives[JAW], drive=replace(drives[JAW].drive, effort=0.8))
-        weak = replace(ROBOT, joints=tuple(drives))
-        target = squeeze_targets(weak, fingers, joints, SqueezeConfig(force=50.0))
+        assert_array_equal(squeezed(0.0), joints)
+        target = squeezed(50.0, with_drive(ROBOT, "jaw_a_slide", effort=0.8))
         self.assertAlmostEqual(target[0, JAW] - joints[0, JAW], -0.8 / 800, places=9)
 
 
-class TargetsTest(unittest.TestCase):
+class TargetsTest(InFolder):
     """Episodes that begin with a bank state begin with its targets."""
-
-    def setUp(self):
-        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
 
     def pressing(self):
         bank = toy_bank(ROBOT)
@@ -216,18 +193,16 @@ class TargetsTest(unittest.TestCase):
         )
 
     def test_files(self):
-        write_bank(self.folder / "b.npz", self.pressing(), config={}, inputs={})
-        found = read_bank(self.folder / "b.npz")
-        np.testing.assert_array_equal(found.targets, found.joint_pos + 0.25)
-        np.testing.assert_array_equal(
-            found.with_states(~found.post_contact).targets, found.targets[[0, 2, 4]]
-        )
+        write_bank(f"{self.folder}/b.npz", self.pressing())
+        found = read_bank(f"{self.folder}/b.npz")
+        assert_array_equal(found.targets, found.joint_pos + 0.25)
+        assert_array_equal(found.with_states(~found.post_contact).targets, found.targets[[0, 2, 4]])
         self.assertEqual((found.num_pressing, found.rejected_frame_part), (6, None))
         old = toy_bank(ROBOT)
-        write_bank(self.folder / "old.npz", old, config={}, inputs={})
-        with np.load(self.folder / "old.npz") as file:
+        write_bank(f"{self.folder}/old.npz", old)
+        with np.load(f"{self.folder}/old.npz") as file:
             self.assertFalse({"joint_target", "frame_part"} & set(file.files))
-        found = read_bank(self.folder / "old.npz")
+        found = read_bank(f"{self.folder}/old.npz")
         self.assertIs(found.targets, found.joint_pos)
         self.assertEqual(found.num_pressing, 0)
 
@@ -236,52 +211,45 @@ class TargetsTest(unittest.TestCase):
         resets = ResetDistribution(
             bank, ROBOT, tuple(bank.object_names), ResetConfig(demo_probability=0.5)
         )
-        drawn = resets.sample(torch.tensor([0, 1] * 50), torch.Generator().manual_seed(0))
-        torch.testing.assert_close(
-            drawn.joint_target, drawn.joint_pos + 0.25 * drawn.from_bank[:, None]
-        )
-        pivot = torch.tensor([0.03, -0.01, 0.02])
+        drawn = resets.sample(tensor([0, 1] * 50), torch.Generator().manual_seed(0))
+        assert_close(drawn.joint_target, drawn.joint_pos + 0.25 * drawn.from_bank[:, None])
+        pivot = tensor([0.03, -0.01, 0.02])
         pivots = dict.fromkeys(bank.object_names, pivot.numpy())
         turned = ResetDistribution(
             bank, ROBOT, bank.object_names, ResetConfig(spawn_xy=0.0, spawn_yaw=1.0), pivots=pivots
-        ).home(torch.tensor([0, 1, 2]), torch.Generator().manual_seed(0))
+        ).home(tensor([0, 1, 2]), torch.Generator().manual_seed(0))
         still = turned.object_pos + quat_rotate(turned.object_quat, pivot.expand(3, 3))
-        torch.testing.assert_close(still, torch.as_tensor(bank.start_pos) + pivot)
-        self.assertGreater(turned.object_quat[:, 3].abs().max().item(), 0.1)
+        assert_close(still, torch.as_tensor(bank.start_pos) + pivot)
+        self.assertGreater(turned.object_quat[:, 3].abs().max(), 0.1)
         chosen = bank_starts(bank, np.array([4, 1]))
-        torch.testing.assert_close(chosen.joint_target, chosen.joint_pos + 0.25)
+        assert_close(chosen.joint_target, chosen.joint_pos + 0.25)
 
 
-class CommandTest(unittest.TestCase):
+class CommandTest(InFolder):
     def setUp(self):
         try:
             import mujoco  # noqa: F401  # pyright: ignore[reportMissingImports]
         except ImportError as error:
             self.skipTest(str(error))
-        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
-        self.enterContext(mock.patch("xreset.inputs.load_robot", lambda _: ROBOT))
+        super().setUp()
+        self.enterContext(patch("xreset.inputs.load_robot", lambda _: ROBOT))
         in_this_process = partial(make_backend, workers=0)
-        self.enterContext(mock.patch("xreset.resets.probe.make_backend", in_this_process))
-        self.enterContext(mock.patch("xreset.inputs.load_objects", lambda *_: (toy_grasp.brick(),)))
-        write_retargeted(self.folder / "r.npz", grasp_and_lift(), config={}, inputs={})
+        self.enterContext(patch("xreset.resets.probe.make_backend", in_this_process))
+        self.enterContext(patch("xreset.inputs.load_objects", lambda *_: (toy_grasp.brick(),)))
+        write_retargeted(f"{self.folder}/r.npz", grasp_and_lift())
 
-    def resets(self, *options: str):
-        code, out, err = run(
-            "resets", str(self.folder / "r.npz"), "--out", str(self.folder / "b.npz"), *options
-        )
-        self.assertEqual(code, 0, out + err)
-        return read_bank(self.folder / "b.npz"), out
+    def resets(self, *options):
+        out = succeeds("resets", f"{self.folder}/r.npz", "--out", f"{self.folder}/b.npz", *options)
+        return read_bank(f"{self.folder}/b.npz"), out
 
     def test_everything_at_once(self):
         """Jaws close by 30 mm (33 mm on one side): five states between; held by 2.5 N a side, and not without."""
         plain, _ = self.resets()
-        self.assertEqual(
-            (plain.num_states, plain.joint_target, plain.frame_part, plain.num_pressing),
-            (3, None, None, 0),
-        )
+        self.assertEqual((plain.num_states, plain.num_pressing), (3, 0))
+        self.assertEqual((plain.joint_target, plain.frame_part), (None, None))
         bank, out = self.resets("--closing.spacing", "0.0056", "--squeeze.force", "2.5")
         assert bank.frame_part is not None
-        np.testing.assert_allclose(bank.frame_part * 6, [0, 1, 2, 3, 4, 5, 0, 0], atol=1e-5)
+        assert_allclose(bank.frame_part * 6, [0, 1, 2, 3, 4, 5, 0, 0], atol=1e-5)
         self.assertEqual(bank.frame_index.tolist(), [0] * 6 + [1, 2])
         self.assertEqual(
             (bank.targets != bank.joint_pos).any(axis=1).tolist(), [False] * 6 + [True] * 2
@@ -290,20 +258,16 @@ class CommandTest(unittest.TestCase):
         self.assertEqual(bank.num_pressing, 2)
         for words in ("2 of 2 states after contact press with 2.5 N", "8 states of 8"):
             self.assertIn(words, out)
-        with np.load(self.folder / "b.npz") as file:
+        with np.load(f"{self.folder}/b.npz") as file:
             config = json.loads(str(file["meta"]))["config"]
         self.assertEqual(config["closing"], {"spacing": 0.0056, "within": 0.1})
         self.assertEqual(config["squeeze"]["force"], 2.5)
 
     def test_other_meshes_than_those_of_the_motion_are_told(self):
         for source, told in ((toy_grasp.brick().source, 0), ("another mesh", 1)):
-            write_retargeted(
-                self.folder / "r.npz",
-                grasp_and_lift(),
-                config={},
-                inputs={"object brick": source, "object robot": "a toy", "robot": "openarm"},
-            )
-            self.assertEqual(object_sources(self.folder / "r.npz")["robot"], "a toy")
+            inputs = {"object brick": source, "object robot": "a toy", "robot": "openarm"}
+            write_retargeted(f"{self.folder}/r.npz", grasp_and_lift(), inputs=inputs)
+            self.assertEqual(object_sources(f"{self.folder}/r.npz")["robot"], "a toy")
             words = "made with other meshes of brick. Give the same --objects folder"
             self.assertEqual(self.resets()[1].count(words), told)
 
@@ -316,20 +280,14 @@ class CommandTest(unittest.TestCase):
             ("text", "text is not a file of xreset retarget"),
             ("none.npz", r"none.npz \(a file of xreset retarget\). Check the path"),
         ):
-            code, _, err = run("resets", str(self.folder / name), "--out", str(out))
-            self.assertEqual(code, 1)
-            self.assertRegex(err, message)
+            self.assertRegex(refused("resets", self.folder / name, "--out", out), message)
         self.assertFalse(out.exists())
 
     def test_a_squeeze_that_an_engine_does_not_accept_is_left_out(self):
         still = lambda robot, fingers, joints, config: joints - (np.arange(2) == 1)[:, None]  # noqa: E731
-        with mock.patch(
+        with patch(
             "xreset.resets.filter.squeeze_targets", still
         ):  # the last state's targets are 1 rad (m) away
             bank, _ = self.resets("--squeeze.force", "2.5")
         self.assertEqual((bank.num_states, bank.num_pressing), (3, 0))
-        np.testing.assert_array_equal(bank.targets, bank.joint_pos)
-
-
-if __name__ == "__main__":
-    unittest.main()
+        assert_array_equal(bank.targets, bank.joint_pos)

@@ -1,17 +1,19 @@
 """Several trainings side by side: what is read, what is taken together, what is unfair, and what is written."""
 
 import re
-import unittest
 from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
 import numpy as np
 import pandas as pd
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from torch.utils.tensorboard import SummaryWriter
 
-from tests.test_cli import run
+from tests.command import refused, succeeds
 from tests.toy_results import ENGINES, InFolder, rollouts_with, toy_rollouts
+from xreset import TrainConfig
 from xreset.errors import FileFormatError, RunError, XResetError
 from xreset.eval.plots import COLORS, figure_style
 from xreset.eval.report.curves import amounts, line
@@ -21,16 +23,17 @@ from xreset.eval.report.make import compare
 from xreset.eval.report.read import read_curves, read_training, read_trainings
 from xreset.eval.stats import bootstrap_ci95, crossed_bootstrap_ci95, difference_ci95
 from xreset.learning.clock import Lift, Passing, write_lift
-from xreset.learning.config import TrainConfig
 from xreset.task.config import ResetConfig, TaskConfig, TerminationConfig
 
 STEPS = 1024
 """Environment steps of an iteration."""
 
 
-def curves_of(
-    seconds: tuple[float, ...], success: tuple[float, ...], first: int = 1
-) -> pd.DataFrame:
+def reset_config(**options):
+    return TrainConfig(task=TaskConfig(reset=ResetConfig(**options)))
+
+
+def curves_of(seconds, success, first=1):
     """Curves of a training whose iterations took that long."""
     time = np.array(seconds)
     columns = {
@@ -44,26 +47,24 @@ def curves_of(
 
 
 class Compared(InFolder):
-    def write_curves(self, name: str, curves: pd.DataFrame) -> Path:
+    def write_curves(self, name, curves):
         with SummaryWriter(log_dir=str(self.folder / name)) as writer:
             for tag in curves:
                 for iteration, value in curves[tag].items():
                     writer.add_scalar(tag, value, iteration)
         return self.folder / name
 
-    def training(self, name: str, curves: pd.DataFrame | None = None):
+    def training(self, name, curves=None):
         """What a folder holds, with curves that need not be written."""
-        return replace(
-            read_training(name, self.folder / name),
-            curves=pd.DataFrame() if curves is None else curves,
-        )
+        read = read_training(name, self.folder / name)
+        return replace(read, curves=pd.DataFrame() if curves is None else curves)
 
-    def run_and_results(self, name: str, results: dict | None = None, **changes) -> str:
+    def run_and_results(self, name, results=None, **changes):
         self.write_run(name, **changes)
         self.write_results(name, **(results or {}))
         return name
 
-    def compare(self, *names: str, **options) -> str:
+    def compare(self, *names, **options):
         """The page, without escapes, of a comparison without the picture, which takes a second."""
         with mock.patch("xreset.eval.report.make.write_picture"):
             page = compare([str(self.folder / n) for n in names], self.folder / "out", **options)
@@ -73,28 +74,22 @@ class Compared(InFolder):
 class ReadTest(Compared):
     def test_labels(self):
         a, b, odd = (str(self.write_results(name)) for name in ("a", "b", "p=0.5"))
-        for given, label in (
-            (a, "a"),
-            (f"X-RESET, 2={b}", "X-RESET, 2"),
-            (f"{a}/eval", "a"),
-            (odd, "p=0.5"),
-        ):
-            self.assertEqual(read_trainings([given])[0].label, label)
+        found = read_trainings([a, f"X-RESET, 2={b}", odd])
+        self.assertEqual([training.label for training in found], ["a", "X-RESET, 2", "p=0.5"])
+        self.assertEqual(read_trainings([f"{a}/eval"])[0].label, "a")
 
     def test_bad_arguments(self):
-        a = str(self.write_results("a"))
-        self.write_results("other/a")
-        self.write_run("bare")
+        a = self.write_results("a")
+        other = self.write_results("other/a")
+        bare = self.write_run("bare")
+        without = "neither learning curves .* nor evaluation results.*xreset eval .*/bare"
         for runs, message in (
             ([], "nothing to compare"),
-            ([a, f"{self.folder}/other/a"], f"(?s)both be called 'a'.*a-1={a} a-2=.*other/a"),
+            ([str(a), str(other)], f"(?s)both be called 'a'.*a-1={a} a-2=.*other/a"),
             ([f"={a}"], "a name is missing"),
             (["x="], "a folder is missing"),
             ([f"{self.folder}/nowhere"], "there is no folder .*nowhere"),
-            (
-                [f"{self.folder}/bare"],
-                "neither learning curves .* nor evaluation results.*xreset eval .*/bare",
-            ),
+            ([str(bare)], without),
         ):
             with self.subTest(message), self.assertRaisesRegex(RunError, message):
                 read_trainings(runs)
@@ -102,11 +97,9 @@ class ReadTest(Compared):
     def test_damaged_files(self):
         a = self.write_results("a")
         self.write_run("a")
-        (a / "lift.json").write_text("{")
-        with self.assertRaisesRegex(FileFormatError, "lift.json is not valid JSON"):
-            read_training("a", a)
-        (a / "lift.json").unlink()
+        write_lift(a, Lift())
         for name, old, new, message in (
+            ("lift.json", "}", "", "lift.json is not valid JSON"),
             ("run.json", "}", "", "run.json is not valid JSON"),
             ("run.json", '"config"', '"other"', "run.json lacks config"),
             ("eval/mujoco.json", '"episodes": 4', '"episodes": 5', "states 5 episodes, .* holds 4"),
@@ -132,27 +125,24 @@ class ReadTest(Compared):
         for at in (1, 100, len(whole) - 40):
             with self.subTest(at):
                 file.write_bytes(whole[at:])
-                with self.assertRaisesRegex(FileFormatError, "is damaged"):
-                    read_curves(a)
+                self.assertRaisesRegex(FileFormatError, "is damaged", read_curves, a)
                 file.write_bytes(whole[:-at])
                 for tag, values in read_curves(a).items():
                     known = values.dropna()
-                    np.testing.assert_array_equal(known, curves[tag][: len(known)])
+                    assert_array_equal(known, curves[tag][: len(known)])
         b = self.write_curves("b", curves_of((1.0,) * 40, (0.5,) * 40))
         (file,) = b.glob("events*")
         whole = file.read_bytes()
         middle = len(whole) // 2
         file.write_bytes(whole[:middle] + bytes(300) + whole[middle + 300 :])
-        with self.assertRaisesRegex(
-            FileFormatError, "is damaged.* up to step [0-9]+ and no farther"
-        ):
-            read_curves(b)
+        words = "is damaged.* up to step [0-9]+ and no farther"
+        self.assertRaisesRegex(FileFormatError, words, read_curves, b)
 
     def test_a_resumed_run_repeats_iterations(self):
         for values in ({1: 0.1, 2: 0.2, 3: 0.9}, {3: 0.3, 4: 0.4}):
             self.write_curves("a", pd.DataFrame({"task/grasped": values}))
         found = read_curves(self.folder / "a")["task/grasped"]
-        np.testing.assert_allclose(found, [0.1, 0.2, 0.3, 0.4], rtol=1e-6)
+        assert_allclose(found, [0.1, 0.2, 0.3, 0.4], rtol=1e-6)
 
     def test_configurations_of_other_versions_are_read(self):
         file = self.write_run("a") / "run.json"
@@ -170,13 +160,15 @@ class ProgressTest(Compared):
 
     def test_minutes_and_steps_are_sums_over_iterations(self):
         training = self.training("a", curves_of((60.0, 30.0, 30.0), (0.0, 0.1, 0.2)))
-        np.testing.assert_allclose(amounts(training, "minutes"), [1.0, 1.5, 2.0])
-        np.testing.assert_allclose(amounts(training, "steps"), np.array([1, 2, 3]) * STEPS * 1e-6)
-        np.testing.assert_allclose(amounts(training, "iterations"), [1, 2, 3])
+        # what was not logged is as the next
         late = self.training("a", curves_of((60.0, 30.0), (0.0, 0.1), first=3))
-        np.testing.assert_allclose(
-            amounts(late, "minutes"), [3.0, 3.5], err_msg="what was not logged is as the next"
-        )
+        for run, x, expected in (
+            (training, "minutes", [1.0, 1.5, 2.0]),
+            (training, "steps", np.array([1, 2, 3]) * STEPS * 1e-6),
+            (training, "iterations", [1, 2, 3]),
+            (late, "minutes", [3.0, 3.5]),
+        ):
+            assert_allclose(amounts(run, x), expected)
         without = self.training("a", training.curves.drop(columns="speed/learn_seconds"))
         with self.assertRaisesRegex(RunError, "a did not log speed/learn_seconds.*--x iterations"):
             line([without], "task/success", "minutes")
@@ -187,57 +179,43 @@ class ProgressTest(Compared):
         b = self.training("a", curves_of((120.0,) * 3, (0.2, 0.6, 0.8)))
         found = line([a, b], "task/success", "minutes")
         # the first has ended at 4 minutes, the second begins at 2
-        np.testing.assert_allclose(found.index, [2, 3, 4])
-        np.testing.assert_allclose(found["low"], [0.2, 0.4, 0.6])
-        np.testing.assert_allclose(found["high"], [0.2, 0.4, 0.6])
-        np.testing.assert_allclose(
-            line([a, b], "task/success", "iterations")["mean"], [0.1, 0.4, 0.6], atol=1e-12
-        )
+        assert_allclose(found.index, [2, 3, 4])
+        assert_allclose(found[["low", "high"]].T, [[0.2, 0.4, 0.6]] * 2)
+        mean = line([a, b], "task/success", "iterations")["mean"]
+        assert_allclose(mean, [0.1, 0.4, 0.6], atol=1e-12)
         self.assertIsNone(line([a, b], "task/other", "minutes"))
-        np.testing.assert_allclose(line([b], "task/success", "minutes").T, [[0.2, 0.6, 0.8]] * 3)
+        assert_allclose(line([b], "task/success", "minutes").T, [[0.2, 0.6, 0.8]] * 3)
 
 
 class LiftTest(Compared):
-    def lifted(self, name: str, end: float, *passed: tuple[float, float], **changes) -> str:
+    def lifted(self, name, end, *passed, **changes):
         """A run with ``lift.json``: minutes until its end and until each share that it passed."""
 
-        def at(minutes: float) -> dict:
-            return {
-                "iteration": round(10 * minutes),
-                "env_steps": round(1e6 * minutes),
-                "minutes": minutes,
-            }
+        def at(minutes):
+            iteration = round(10 * minutes)
+            return {"iteration": iteration, "env_steps": 100000 * iteration, "minutes": minutes}
 
-        folder = self.write_run(name, **changes)
-        write_lift(
-            folder, Lift(passed=tuple(Passing(share=s, **at(t)) for s, t in passed), **at(end))
-        )
+        passings = tuple(Passing(share=s, **at(t)) for s, t in passed)
+        write_lift(self.write_run(name, **changes), Lift(passed=passings, **at(end)))
         return name
 
     def test_seeds_are_one_row(self):
-        names = [
-            self.lifted("x-s0", 12.0, (0.01, 6.0), (0.1, 8.5)),
-            self.lifted("x-s1", 10.0, (0.01, 7.0), seed=1),
-        ]
-        names.append(self.lifted("other", 8.0, num_envs=128))
+        self.lifted("x-s0", 12.0, (0.01, 6.0), (0.1, 8.5))
+        self.lifted("x-s1", 10.0, (0.01, 7.0), seed=1)
+        self.lifted("other", 8.0, num_envs=128)
         self.write_curves("old", curves_of((60.0, 60.0), (0.0, 0.04)))
-        for x, first in (
-            (
-                "minutes",
-                "| x | 2 | 100% (34-100); 6.0, 7.0 | 50% (9-91); 8.5, >10.0 | 0% (0-66); >12.0, >10.0 |",
-            ),
-            (
-                "iterations",
-                "| x | 2 | 100% (34-100); 60, 70 | 50% (9-91); 85, >100 | 0% (0-66); >120, >100 |",
-            ),
+        for x, *times in (
+            ("minutes", "6.0, 7.0", "8.5, >10.0", ">12.0, >10.0"),
+            ("iterations", "60, 70", "85, >100", ">120, >100"),
         ):
-            text = self.compare(*names, "old", x=x)
-            self.assertIn(first, text)
-        self.assertIn("| other | 1 | 0% (0-79); >80 | 0% (0-79); >80 | 0% (0-79); >80 |", text)
+            text = self.compare("x-s0", "x-s1", "other", "old", x=x)
+            row = "| x | 2 | 100% (34-100); {} | 50% (9-91); {} | 0% (0-66); {} |"
+            self.assertIn(row.format(*times), text)
+        self.assertIn("| other | 1 |" + " 0% (0-79); >80 |" * 3, text)
 
 
 class GroupTest(Compared):
-    def groups(self, *names: str) -> tuple[list[tuple[str, int]], str]:
+    def groups(self, *names):
         groups, notes = grouped([self.training(name) for name in names])
         return [(label, len(members)) for label, members in groups.items()], " ".join(notes)
 
@@ -247,8 +225,7 @@ class GroupTest(Compared):
             config = TrainConfig(iterations=1000 * i)
             changes = {"seed": i, "device": f"cuda:{i}", "resets": f"/{i}/b.npz", "config": config}
             seeds.append(self.run_and_results(f"soup-seed{i}", **changes))
-        fixed = TrainConfig(task=TaskConfig(reset=ResetConfig(random_gravity=False)))
-        other = self.run_and_results("fixed", config=fixed)
+        other = self.run_and_results("fixed", config=reset_config(random_gravity=False))
         bank = self.run_and_results("bank", seed=3, resets_hash="aa" * 32)
         self.write_results("ik")
         found = self.groups(seeds[0], other, seeds[1], bank, seeds[2], "ik")
@@ -259,10 +236,8 @@ class GroupTest(Compared):
             (("X s0", "X s1"), "X"), (("run10", "run11"), "run"), (("first", "second"), "first + second"), (("seed0", "seed1"), "seed"),
         ):  # fmt: skip
             with self.subTest(expected):
-                found, _ = self.groups(
-                    *(self.run_and_results(name, seed=i) for i, name in enumerate(names))
-                )
-                self.assertEqual(found, [(expected, 2)])
+                made = [self.run_and_results(name, seed=i) for i, name in enumerate(names)]
+                self.assertEqual(self.groups(*made)[0], [(expected, 2)])
         names = [self.run_and_results(f"s-{i}", seed=i, num_envs=64 + i // 2) for i in range(4)]
         self.assertEqual(self.groups(*names)[0], [("s-0 + s-1", 2), ("s-2 + s-3", 2)], "told apart")
 
@@ -277,44 +252,40 @@ class GroupTest(Compared):
             self.run_and_results(name, results, **changes)
             found, notes = self.groups("a", name)
             self.assertEqual(found, [("a", 1), (name, 1)])
-            self.assertRegex(
-                notes, f"a, {name} have the same configuration and are not grouped. .*{reason}"
-            )
+            words = f"a, {name} have the same configuration and are not grouped. .*{reason}"
+            self.assertRegex(notes, words)
 
 
 class ScoreTest(Compared):
-    def scored(self, *progress: tuple[float, ...], engines=("mujoco",)) -> pd.DataFrame:
+    def scored(self, *progress, engines=("mujoco",)):
         """The scores of trainings with other seeds, by engine."""
+        trainings = []
         for i, values in enumerate(progress):
-            self.run_and_results(
-                f"s-{i}", {"rollouts": rollouts_with(*values), "engines": engines}, seed=i
-            )
-        groups, _ = grouped([self.training(f"s-{i}") for i in range(len(progress))])
-        return scores(groups).set_index(["engine", "metric"])
+            results = {"rollouts": rollouts_with(*values), "engines": engines}
+            trainings.append(self.training(self.run_and_results(f"s-{i}", results, seed=i)))
+        return scores(grouped(trainings)[0]).set_index(["engine", "metric"])
 
     def test_one_training_has_the_figures_of_its_evaluation(self):
         ours = self.scored((1.0, 0.33, 0.66, 0.0), engines=ENGINES).loc["pybullet"]
         summary = self.training("s-0").results["pybullet"]
-        self.assertEqual(ours.loc["task_progress", "mean"], summary.task_progress.mean)
-        np.testing.assert_allclose(
-            ours.loc["task_progress", ["low", "high"]], summary.task_progress.ci95, atol=1e-6
-        )
+        progress = ours.loc["task_progress"]
+        self.assertEqual(progress["mean"], summary.task_progress.mean)
+        ci95 = summary.task_progress.ci95
+        assert_allclose(progress[["low", "high"]].astype(float), ci95, atol=1e-6)
         for metric in ("approach", "grasp", "reorient", "reorient_once", "published_success"):
             self.assertEqual(ours.loc[metric, "mean"], getattr(summary, f"{metric}_rate"), metric)
 
     def test_seeds_widen_the_interval(self):
-        alike = self.scored((0.4, 0.6, 0.4, 0.6), (0.4, 0.6, 0.4, 0.6)).loc[
-            "mujoco", "task_progress"
-        ]
-        self.assertEqual(list(alike[["mean", "low", "high"]]), [0.5, 0.5, 0.5])
-        apart = self.scored((0.0, 0.2, 0.0, 0.2), (0.8, 1.0, 0.8, 1.0)).loc[
-            "mujoco", "task_progress"
-        ]
-        half = "one of the two seeds only is drawn in half of the resamples"
-        np.testing.assert_allclose(apart[["low", "high"]].astype(float), (0.1, 0.9), err_msg=half)
+        # one of the two seeds only is drawn in half of the resamples
+        for progress, *expected in (
+            (((0.4, 0.6, 0.4, 0.6), (0.4, 0.6, 0.4, 0.6)), 0.5, 0.5, 0.5),
+            (((0.0, 0.2, 0.0, 0.2), (0.8, 1.0, 0.8, 1.0)), 0.5, 0.1, 0.9),
+        ):
+            found = self.scored(*progress).loc["mujoco", "task_progress"]
+            assert_allclose(found[["mean", "low", "high"]].astype(float), expected)
 
     def test_the_crossed_bootstrap_has_the_variance_of_its_design(self):
-        rng = np.random.default_rng(1)
+        rng = default_rng(1)
         of_run, of_demo = rng.normal(size=8), 2 * rng.normal(size=30)
         values = (of_run[:, None] + of_demo).ravel()
         runs, demos = np.repeat(np.arange(8), 30), np.tile(np.arange(30), 8)
@@ -322,14 +293,13 @@ class ScoreTest(Compared):
             low, high = crossed_bootstrap_ci95(values, runs, demos)
         expected = 2 * 1.96 * np.sqrt(of_run.var() / 8 + of_demo.var() / 30)
         self.assertAlmostEqual(high - low, expected, delta=0.05 * expected)
-        self.assertEqual(
-            crossed_bootstrap_ci95(values, np.zeros(240), demos), bootstrap_ci95(values, demos)
-        )
+        one_run = crossed_bootstrap_ci95(values, np.zeros(240), demos)
+        self.assertEqual(one_run, bootstrap_ci95(values, demos))
         with self.assertRaisesRegex(ValueError, "every demonstration"):
             crossed_bootstrap_ci95(values[:4], np.array([0, 0, 0, 1]), np.array([0, 0, 1, 1]))
 
     def test_a_difference_is_of_the_same_demonstrations(self):
-        rng = np.random.default_rng(0)
+        rng = default_rng(0)
         hard = rng.normal(size=40)  # what is hard for one is hard for the other
         demos = np.tile(np.arange(40), 6)
         runs = np.arange(240) // 40
@@ -343,87 +313,50 @@ class ScoreTest(Compared):
         one = np.zeros(40, int)
         low, high = difference_ci95([hard, one, one], [hard + rng.normal(size=40), one, one])
         self.assertGreater(high - low, 0.3, "episodes of one demonstration are drawn")
-        with self.assertRaisesRegex(ValueError, "every training needs"):
-            difference_ci95(
-                [both[0][:3], runs[:3], demos[:3]], [both[1][:41], runs[:41], demos[:41]]
-            )
+        one, two = ([x[:n] for x in (both[0], runs, demos)] for n in (3, 41))
+        self.assertRaisesRegex(ValueError, "every training needs", difference_ci95, one, two)
 
 
 class FairnessTest(Compared):
     def test_alike(self):
         for name, share in (("a", 0.3), ("b", 0.6)):
-            self.write_run(
-                name, TrainConfig(task=TaskConfig(reset=ResetConfig(demo_probability=share)))
-            )
+            self.write_run(name, reset_config(demo_probability=share))
             self.write_results(name, inputs={"demos": "ab", "policy": name})
         text = self.compare("a", "b")
         self.assertNotIn("comparable", text)
-        self.assertIn(
-            "Note:** Of 4 episodes of a in mujoco, 1 stopped being finite and 1 dropped contacts",
-            text,
-        )
+        note = "Of 4 episodes of a in mujoco, 1 stopped being finite and 1 dropped contacts"
+        self.assertIn(f"Note:** {note}", text)
 
     def test_what_makes_results_incomparable_is_said(self):
         self.write_results("a", engines=("mujoco", "sapien"))
         base = toy_rollouts()
-        renamed = replace(
-            base,
-            episodes=tuple(replace(e, sequence_name=f"other_{e.sequence}") for e in base.episodes),
-        )
-        soups = replace(
-            base, episodes=tuple(replace(e, object="005_tomato_soup_can") for e in base.episodes)
-        )
+        renamed = [replace(e, sequence_name=f"other_{e.sequence}") for e in base.episodes]
+        soups = [replace(e, object="005_tomato_soup_can") for e in base.episodes]
         other = {"inputs": {"demos": "cd"}}
-        for what, rollouts, changes, expected in (
-            ("seed", None, {"seed": 4}, r"seed of the evaluation \(3: a; 4: seed\)"),
-            ("robot", None, {"robot": "other"}, r"robot \(toy: a; other: robot\)"),
-            (
-                "meshes",
-                None,
-                {"objects_folder": "/ycb"},
-                r"object meshes \(stand-ins: a; /ycb: meshes\)\.",
-            ),
-            (
-                "engine",
-                None,
-                {"backend_version": "5.1"},
-                r"version of mujoco \(4.0.0: a; 5.1: engine\)",
-            ),
+        same = "if one was made from the other"
+        both = "potted meat can, tomato soup can"
+        for what, episodes, changes, expected in (
+            ("seed", (), {"seed": 4}, r"seed of the evaluation \(3: a; 4: seed\)"),
+            ("robot", (), {"robot": "x"}, r"robot \(toy: a; x: robot\)"),
+            ("ycb", (), {"objects_folder": "/x"}, r"object meshes \(stand-ins: a; /x: ycb\)\."),
+            ("new", (), {"backend_version": "5"}, r"version of mujoco \(4.0.0: a; 5: new\)"),
             ("demos", renamed, other, r"demonstrations \(ab: a; cd: demos\)\.$"),
-            (
-                "file",
-                None,
-                other,
-                r"demonstrations \(ab: a; cd: file\)\. .* same names: if one was made from the other",
-            ),
-            (
-                "objects",
-                soups,
-                {},
-                r"objects \(potted meat can, tomato soup can: a; tomato soup can: ob",
-            ),
-            (
-                "fewer",
-                replace(base, episodes=base.episodes[::2]),
-                {},
-                r"number of episodes \(4: a; 2: fewer\)",
-            ),
+            ("file", (), other, rf"demonstrations \(ab: a; cd: file\)\. .* same names: {same}"),
+            ("objects", soups, {}, rf"objects \({both}: a; tomato soup can: ob"),
+            ("fewer", base.episodes[::2], {}, r"number of episodes \(4: a; 2: fewer\)"),
         ):
             with self.subTest(what):
+                rollouts = replace(base, episodes=tuple(episodes) or base.episodes)
                 self.write_results(what, rollouts, ("mujoco", "sapien"), **changes)
-                text = self.compare("a", what)
-                self.assertRegex(
-                    text,
-                    rf"(?m)^> \*\*Note:\*\* These results are (perhaps )?not comparable: not the same {expected}",
-                )
+                note = r"\*\*Note:\*\* These results are (perhaps )?not comparable: not the same"
+                self.assertRegex(self.compare("a", what), rf"(?m)^> {note} {expected}")
         with self.subTest("the same meshes, named from here and in full"):
             for name, folder in (("here", "meshes"), ("full", str(Path("meshes").resolve()))):
                 self.write_results(name, objects_folder=folder)
             self.assertNotIn("object meshes", self.compare("here", "full"))
         self.write_results("a", engines=("sapien",), seed=9)
-        self.assertRegex(
-            self.compare("a"), r"seed of the evaluation \(3: a in mujoco; 9: a in sapien\)"
-        )
+        words = r"seed of the evaluation \(3: a in mujoco; 9: a in sapien\)"
+        self.assertRegex(self.compare("a"), words)
 
     def test_policies_that_play_another_task(self):
         short = TrainConfig(task=TaskConfig(termination=TerminationConfig(episode_seconds=2.5)))
@@ -442,17 +375,13 @@ class FairnessTest(Compared):
 
 
 class WrittenTest(Compared):
-    def write_three(self) -> list[str]:
+    def write_three(self):
         for name, seed, gravity, success in (
             ("x-s0", 0, True, 0.2),
             ("x-s1", 1, True, 0.4),
             ("fixed", 0, False, 0.1),
         ):
-            self.write_run(
-                name,
-                TrainConfig(task=TaskConfig(reset=ResetConfig(random_gravity=gravity))),
-                seed=seed,
-            )
+            self.write_run(name, reset_config(random_gravity=gravity), seed=seed)
             self.write_results(name, rollouts_with(success, 0.33, 0.66, 0.0), ("mujoco", "sapien"))
             self.write_curves(name, curves_of((60.0, 60.0), (0.0, success)))
         self.write_results("ik")
@@ -484,13 +413,10 @@ class WrittenTest(Compared):
     def test_a_picture_of_the_right_size_with_everything_and_with_less(self):
         names = self.write_three()
         heights = []
-        for chosen, curves in (
-            (names[3:], ()),
-            (names, ("task/success", "task/success_from_home", *SPEED)),
-        ):
-            page = compare(
-                [str(self.folder / name) for name in chosen], self.folder / "drawn", curves=curves
-            )
+        every = ("task/success", "task/success_from_home", *SPEED)
+        for chosen, curves in ((names[3:], ()), (names, every)):
+            runs = [str(self.folder / name) for name in chosen]
+            page = compare(runs, self.folder / "drawn", curves=curves)
             content = page.with_name("compare.png").read_bytes()
             width, height = (int.from_bytes(content[i : i + 4], "big") for i in (16, 20))
             self.assertEqual((content[:4], width), (b"\x89PNG", 1200))
@@ -500,20 +426,13 @@ class WrittenTest(Compared):
     def test_curves_only(self):
         self.write_curves("a", curves_of((60.0, 60.0), (0.0, 0.5)))
         self.assertNotIn("## Evaluation", self.compare("a"))
-        for name, curves, words in (
-            (
-                "a",
-                ["task/sucess"],
-                r"no curve task/sucess; there are speed/.*task/success, task/success_from_home\. ",
-            ),
-            (
-                str(self.write_results("ik")),
-                ["task/success"],
-                "no curve task/success; there are none",
-            ),
+        self.write_results("ik")
+        for name, curve, words in (
+            ("a", "task/sucess", r"speed/.*task/success, task/success_from_home\. "),
+            ("ik", "task/success", "none"),
         ):
-            with self.assertRaisesRegex(RunError, words):
-                self.compare(name, curves=curves)
+            with self.assertRaisesRegex(RunError, f"no curve {curve}; there are {words}"):
+                self.compare(name, curves=[curve])
 
     def test_nothing_is_half_written(self):
         a = self.write_results("a")
@@ -537,34 +456,25 @@ class DrawTest(Compared):
     def test_lines_and_bands(self):
         mean = pd.DataFrame({"mean": [0.1, 0.3]}, index=[1.0, 3.0])
         alone = mean.assign(low=mean["mean"], high=mean["mean"])
-        lines = {
-            "0": alone,
-            "2": mean.assign(low=mean["mean"] - 0.1, high=mean["mean"] + 0.1),
-            "8": alone,
-        }
+        band = mean.assign(low=mean["mean"] - 0.1, high=mean["mean"] + 0.1)
+        lines = {"0": alone, "2": band, "8": alone}
         ax = self.draw(draw_lines, "task/success", lines, "steps", [str(i) for i in range(9)])
-        np.testing.assert_allclose(ax.lines[0].get_xydata(), [[1, 10], [3, 30]])
-        self.assertEqual(
-            [curve.get_color() for curve in ax.lines], [COLORS[0], COLORS[2], COLORS[0]]
-        )
-        self.assertNotEqual(
-            ax.lines[0].get_linestyle(), ax.lines[2].get_linestyle(), "the ninth has another line"
-        )
-        np.testing.assert_allclose(
-            ax.collections[0].get_datalim(ax.transData).intervaly, (0, 40), atol=1e-9
-        )
-        self.assertEqual(
-            (ax.get_xlabel(), ax.get_title(loc="left")),
-            ("million environment steps", "at the goal"),
-        )
+        assert_allclose(ax.lines[0].get_xydata(), [[1, 10], [3, 30]])
+        colors = [curve.get_color() for curve in ax.lines]
+        self.assertEqual(colors, [COLORS[0], COLORS[2], COLORS[0]])
+        first, _, ninth = (curve.get_linestyle() for curve in ax.lines)
+        self.assertNotEqual(first, ninth)
+        height = ax.collections[0].get_datalim(ax.transData).intervaly
+        assert_allclose(height, (0, 40), atol=1e-9)
+        words = (ax.get_xlabel(), ax.get_title(loc="left"))
+        self.assertEqual(words, ("million environment steps", "at the goal"))
 
     def test_bars_are_as_long_as_the_results(self):
         self.write_results("a", rollouts_with(1.0, 0.5, 0.5, 0.0), ("mujoco", "sapien"))
         self.write_results("b", rollouts_with(0.2, 0.2, 0.2, 0.2), ("sapien",))
-        ax = self.draw(
-            draw_scores, scores(grouped([self.training(n) for n in "ab"])[0]), ["a", "b"]
-        )
-        np.testing.assert_allclose([bar.get_height() for bar in ax.patches], [50, 50, np.nan, 20])
+        table = scores(grouped([self.training(n) for n in "ab"])[0])
+        ax = self.draw(draw_scores, table, ["a", "b"])
+        assert_allclose([bar.get_height() for bar in ax.patches], [50, 50, np.nan, 20])
         self.assertEqual([label.get_text() for label in ax.get_xticklabels()], ["mujoco", "sapien"])
 
 
@@ -573,29 +483,21 @@ class CommandTest(Compared):
         for name, seed in (("a", 3), ("b", 4)):
             self.run_and_results(name, {"engines": ENGINES, "seed": seed}, num_envs=64 + seed)
         out = self.folder / "made"
-        code, printed, _ = run(
-            "compare", f"[one]={self.folder}/a", str(self.folder / "b"), "--out", str(out)
-        )
-        self.assertEqual(code, 0, printed)
+        runs = (f"[one]={self.folder}/a", self.folder / "b")
+        printed = succeeds("compare", *runs, "--out", out)
         for expected in (*ENGINES, "[one]", "49.8", "num_envs", "These results are", "compare.md"):
             self.assertIn(expected, printed)
-        self.assertEqual(
-            sorted(f.name for f in out.iterdir()), ["compare.csv", "compare.md", "compare.png"]
-        )
+        written = {f.name for f in out.iterdir()}
+        self.assertEqual(written, {"compare.csv", "compare.md", "compare.png"})
         figures = pd.read_csv(out / "compare.csv")
-        self.assertEqual(
-            figures.columns.tolist(), ["group", "engine", "metric", "mean", "low", "high"]
-        )
+        self.assertEqual([*figures], ["group", "engine", "metric", "mean", "low", "high"])
         first = figures.iloc[0]
         self.assertEqual(first[["group", "metric"]].tolist(), ["[one]", "task_progress"])
         self.assertAlmostEqual(first["mean"], 0.4975)
         self.assertLess(first["low"], first["mean"])
 
     def test_mistakes_are_one_line(self):
-        code, _, printed = run("compare", str(self.folder / "x"))
-        self.assertEqual(code, 1)
-        self.assertRegex(printed.strip(), "^xreset compare: there is no folder[^\n]*$")
-
-
-if __name__ == "__main__":
-    unittest.main()
+        self.assertRegex(
+            refused("compare", f"{self.folder}/x").strip(),
+            "^xreset compare: there is no folder[^\n]*$",
+        )

@@ -1,17 +1,10 @@
 """The conformance suite can fail: engines with one deliberate defect each, and the checks that must notice it."""
 
-from __future__ import annotations
-
-import contextlib
-import io
 import json
-import tempfile
 import unittest
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from itertools import chain
-from pathlib import Path
 from typing import ClassVar
 from unittest import mock
 
@@ -19,11 +12,12 @@ import mujoco
 import numpy as np
 import torch
 
+from tests.command import refused, succeeds
+from tests.data import InFolder
 from xreset.backends.conformance import CHECKS, CheckResult, Measure, run
-from xreset.backends.mjcf_model import OBJECT, SceneModel
+from xreset.backends.mjcf_model import OBJECT
 from xreset.backends.mujoco import MujocoBackend, MujocoWorld
 from xreset.backends.rigid import conjugate, rotate
-from xreset.cli import main
 from xreset.errors import BackendUnavailableError, XResetError
 from xreset.physics import KnownDifference
 
@@ -31,17 +25,17 @@ Defect = type[MujocoWorld] | type[MujocoBackend]
 DEFECTS: list[tuple[Defect, tuple[str, ...]]] = []
 
 
-def breaks(*checks: str) -> Callable[[Defect], Defect]:
+def breaks(*checks):
     """Note which checks must go red with a defect."""
 
-    def note(defect: Defect) -> Defect:
+    def note(defect):
         DEFECTS.append((defect, checks))
         return defect
 
     return note
 
 
-def outcome(defect: Defect, *checks: str, **attributes) -> dict[str, CheckResult]:
+def outcome(defect, *checks, **attributes):
     """Results of some checks on a broken world or backend."""
     if issubclass(defect, MujocoBackend):
         broken = type("Broken", (defect,), attributes)
@@ -201,10 +195,10 @@ class HiddenBrokenWorld(MujocoWorld):
 # The robot ------------------------------------------------------------------------------------------------------------
 
 
-def remodelled(*checks: str) -> Callable[[Callable[[mujoco.MjModel, SceneModel], None]], None]:
+def remodelled(*checks):
     """Make a defect of a function that changes the engine's model once it is made."""
 
-    def note(change: Callable[[mujoco.MjModel, SceneModel], None]) -> None:
+    def note(change):
         class World(MujocoWorld):
             def __init__(self, scene, object_index):
                 super().__init__(scene, object_index)
@@ -449,7 +443,7 @@ class TheSuiteCanFail(unittest.TestCase):
         self.assertEqual(results["resting_weight"].verdict, "passed")
 
 
-class Harness(unittest.TestCase):
+class Harness(InFolder):
     def test_verdicts(self):
         known = KnownDifference(check="free_fall", measure="x", bound=2.0, reason="r")
         nan = float("nan")
@@ -479,8 +473,7 @@ class Harness(unittest.TestCase):
             self.assertEqual(result.verdict, verdict)
 
     def test_unknown_check(self):
-        with self.assertRaisesRegex(XResetError, "free_fall"):
-            run(MujocoBackend, only=["no_such_check"])
+        self.assertRaisesRegex(XResetError, "free_fall", run, MujocoBackend, only=["no_such_check"])
 
     def test_a_backend_that_cannot_be_built_is_not_a_failed_check(self):
         def make(scene, num_worlds, *, object_index=None):
@@ -490,43 +483,24 @@ class Harness(unittest.TestCase):
             run(make, only=["free_fall"])
 
     def test_command(self):
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "c.json"
-            command = [
-                "engines",
-                "check",
-                "--backend",
-                "mujoco",
-                "--check",
-                "free_fall",
-                "--json",
-                str(file),
-            ]
-            with contextlib.redirect_stdout(io.StringIO()) as out:
-                main(command)
-            self.assertIn("no check failed", out.getvalue())
-            data = json.loads(file.read_text())
-            self.assertEqual(data["schema"], "xreset-conformance/2")
-            self.assertEqual(
-                data["command"], "xreset engines check --backend mujoco --check free_fall"
-            )
-            self.assertEqual([c["verdict"] for c in data["runs"][0]["checks"]], ["passed"])
-            broken = Measure(what="x", measured=float("nan"), tolerance=1.0)
+        file = self.folder / "c.json"
+        words = "engines check --backend mujoco --check free_fall"
+        command = (*words.split(), "--json", file)
+        self.assertIn("no check failed", succeeds(*command))
+        data = json.loads(file.read_text())
+        self.assertEqual(data["schema"], "xreset-conformance/2")
+        self.assertEqual(data["command"], f"xreset {words}")
+        self.assertEqual([c["verdict"] for c in data["runs"][0]["checks"]], ["passed"])
+        broken = Measure(what="x", measured=float("nan"), tolerance=1.0)
 
-            def red(check, bench):
-                return CheckResult(check=check, verdict="failed", measures=(broken,))
+        def red(check, bench):
+            return CheckResult(check=check, verdict="failed", measures=(broken,))
 
-            with (
-                mock.patch("xreset.backends.conformance._run_one", red),
-                contextlib.redirect_stdout(io.StringIO()),
-                self.assertRaises(SystemExit) as raised,
-            ):
-                main(command)
-            self.assertEqual(raised.exception.code, 1)
-            self.assertEqual(
-                json.loads(file.read_text())["runs"][0]["checks"][0]["measures"][0]["measured"],
-                "nan",
-            )
+        with mock.patch("xreset.backends.conformance._run_one", red):
+            refused(*command)
+        self.assertEqual(
+            json.loads(file.read_text())["runs"][0]["checks"][0]["measures"][0]["measured"], "nan"
+        )
 
 
 if __name__ == "__main__":

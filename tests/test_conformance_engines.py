@@ -1,7 +1,5 @@
 """Every engine of the project keeps the contracts, with the suite's own robot and with another one."""
 
-from __future__ import annotations
-
 import unittest
 from dataclasses import replace
 from functools import cache
@@ -10,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from tests.data import PYBULLET
-from xreset.backends.conformance import CHECKS, CheckResult, run
+from xreset.backends.conformance import CHECKS, run
 from xreset.geometry.dynamics import drive_inertia
 from xreset.plugins import backend_status, make_backend
 from xreset.spec import DriveSpec, FingertipSpec, JointSpec, KeypointSpec, MimicSpec, RobotSpec
@@ -18,7 +16,7 @@ from xreset.spec import DriveSpec, FingertipSpec, JointSpec, KeypointSpec, Mimic
 BACKENDS = ("mujoco", "mujoco-warp", "pybullet", "sapien")
 
 
-def make_local(name: str):
+def make_local(name):
     """A maker of the backend with its worlds in this process, where it has a choice."""
     options = {"workers": 0} if name in ("mujoco", "pybullet", "sapien") else {}
     return lambda scene, num_worlds, *, object_index=None: make_backend(
@@ -26,7 +24,7 @@ def make_local(name: str):
     )
 
 
-def explain(result: CheckResult) -> str:
+def explain(result):
     wrong = []
     for m in result.measures:
         if m.verdict == "failed":
@@ -35,7 +33,7 @@ def explain(result: CheckResult) -> str:
 
 
 @cache
-def panda() -> RobotSpec:
+def panda():
     """The Franka Panda of the package ``pybullet_data``, standing beside the table, with critically damped drives."""
     import pybullet_data
 
@@ -72,7 +70,7 @@ def panda() -> RobotSpec:
 
 
 class EveryBackend(unittest.TestCase):
-    def passes(self, backend: str, **options) -> None:
+    def passes(self, backend, **options):
         status = backend_status(backend)
         if status.reason is not None:
             self.skipTest(f"{backend}: {status.reason}")
@@ -97,7 +95,3 @@ class EveryBackend(unittest.TestCase):
         own = [check.name for check in CHECKS if check.own_robot_only]
         results = run(make_local("mujoco"), robot=panda(), only=own)
         self.assertEqual({result.verdict for result in results}, {"skipped"})
-
-
-if __name__ == "__main__":
-    unittest.main()

@@ -1,15 +1,18 @@
 """Demonstrations: the archive, DexYCB's layout, synthetic ones, and the commands."""
 
 import importlib.util
-import unittest
 from dataclasses import fields, replace
+from unittest import TestCase, skipUnless
 
 import numpy as np
 import trimesh
 import yaml
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
-from tests.data import InFolder, data_dir, run
+from tests.command import refused, succeeds
+from tests.data import InFolder, data_dir
+from xreset import synthesize
 from xreset.demos import hand
 from xreset.demos.archive import (
     demo_objects,
@@ -24,7 +27,6 @@ from xreset.demos.dexycb import read_dexycb
 from xreset.demos.grasp import TIPS, Solid
 from xreset.demos.keypoints import ORDERS
 from xreset.demos.plausible import doubts
-from xreset.demos.synth import synthesize
 from xreset.errors import DemoError, FileFormatError
 from xreset.objects.rest import rest_height
 
@@ -51,10 +53,11 @@ class Archive(InFolder):
     def setUpClass(cls):
         cls.demos = synthesize(["soup", "banana"], per_object=2, seed=1, fps=10)
 
-    def changed(self, name, index, value):
-        array = getattr(self.demos, name).copy()
-        array[index] = value
-        return replace(self.demos, **{name: array})
+    def changed(self, index, **values):
+        arrays = {name: getattr(self.demos, name).copy() for name in values}
+        for name, value in values.items():
+            arrays[name][index] = value
+        return replace(self.demos, **arrays)
 
     def moved(self, by):
         """The demonstrations moved by [F, 3]."""
@@ -66,58 +69,50 @@ class Archive(InFolder):
 
     def assert_same(self, a, b):
         for field in fields(a):
-            np.testing.assert_array_equal(
-                getattr(a, field.name), getattr(b, field.name), field.name
-            )
+            assert_array_equal(getattr(a, field.name), getattr(b, field.name), field.name)
 
     def test_round_trip_is_exact(self):
-        first = self.folder / "a.npz"
-        second = self.folder / "b.npz"
-        unseen = {
-            name: getattr(self.demos, name).copy() for name in ("hand_keypoints", "wrist_quat_wxyz")
-        }
-        for array in unseen.values():
-            array[:2] = np.nan
-        rich = replace(
-            self.changed("hand_valid", [0, 1], False),
-            subjects=np.array(["synthetic"]),
-            T_level_from_table=np.eye(4)[None],
-            **unseen,
+        file = self.folder / "a.npz"
+        rich = self.changed(
+            range(2), hand_valid=False, hand_keypoints=np.nan, wrist_quat_wxyz=np.nan
         )
+        levels = np.eye(4)[None]
+        rich = replace(rich, subjects=np.array(["synthetic"]), T_level_from_table=levels)
         for demos in (self.demos, rich):
-            write_demos(first, demos, config={"seed": 1})
-            again = read_demos(first)
+            write_demos(file, demos, config={"seed": 1})
+            written = file.read_bytes()
+            again = read_demos(file)
             self.assert_same(again, demos)
-            write_demos(second, again, config={"seed": 1})
-            self.assertEqual(first.read_bytes(), second.read_bytes())
+            write_demos(file, again, config={"seed": 1})
+            self.assertEqual(file.read_bytes(), written)
 
     def test_bad_values_name_sequence_and_frame(self):
         begin = self.demos.frames(1).start
         where = "First in frame {} of sequence 1".format
         for demos, message in (
             (
-                self.changed("hand_keypoints", (begin + 3, 8, 1), np.nan),
+                self.changed((begin + 3, 8, 1), hand_keypoints=np.nan),
                 "hand_keypoints are not finite.*" + where(3),
             ),
             (
-                self.changed("wrist_quat_wxyz", begin + 4, np.nan),
+                self.changed(begin + 4, wrist_quat_wxyz=np.nan),
                 "wrist_quat_wxyz is not a unit .*" + where(4),
             ),
             (
                 replace(self.demos, hand_keypoints=self.demos.hand_keypoints + 200),
                 "hand_keypoints are far from the table",
             ),
-            (self.changed("object_pos", (begin, 2), 200), "object_pos' holds 200, expected"),
+            (self.changed((begin, 2), object_pos=200), "object_pos' holds 200, expected"),
             (
-                self.changed("object_quat_wxyz", begin + 1, (1, 1, 0, 0)),
+                self.changed(begin + 1, object_quat_wxyz=(1, 1, 0, 0)),
                 "quaternions that are not unit",
             ),
             (
-                self.changed("hand_side", 2, "Right"),
+                self.changed(2, hand_side="Right"),
                 r"sequence .* hand_side 'Right', expected 'right' or 'left'",
             ),
-            (self.changed("frame_offsets", 2, 0), "frame_offsets must increase"),
-            (self.changed("sequence_name", 1, self.demos.sequence_name[0]), "must be unique"),
+            (self.changed(2, frame_offsets=0), "frame_offsets must increase"),
+            (self.changed(1, sequence_name=self.demos.sequence_name[0]), "must be unique"),
             (
                 replace(self.demos, hand_keypoints=1000 * self.demos.hand_keypoints),
                 "Are these millimetres",
@@ -126,7 +121,7 @@ class Archive(InFolder):
             (replace(self.demos, subjects=np.array(["a"])), "belong together"),
         ):
             with self.subTest(message), self.assertRaisesRegex(DemoError, message):
-                write_demos(self.folder / "bad.npz", demos)
+                write_demos(f"{self.folder}/bad.npz", demos)
             self.assertEqual(list(self.folder.iterdir()), [])
         path = self.folder / "a.npz"
         write_demos(path, self.demos)
@@ -151,9 +146,7 @@ class Archive(InFolder):
                 self.demos.select(**options).sequence_name.tolist(), names[indices].tolist()
             )
         picked = self.demos.select(indices=[3, 0])
-        np.testing.assert_array_equal(
-            picked.goal_pose[0][1], self.demos.object_pos[self.demos.frames(0)][-1]
-        )
+        assert_array_equal(picked.goal_pose[0][1], self.demos.object_pos[self.demos.frames(0)][-1])
         for options, message in (
             ({"sides": ["left"]}, "no hand side left. Choose from: 'right'"),
             ({"indices": [4]}, "there are 4 sequences"),
@@ -163,8 +156,7 @@ class Archive(InFolder):
             ),
             ({"share": 0.0}, "share is 0, expected"),
         ):
-            with self.assertRaisesRegex(DemoError, message):
-                self.demos.select(**options)
+            self.assertRaisesRegex(DemoError, message, self.demos.select, **options)
 
     def test_split_by_share_spread_and_chance(self):
         parts = [
@@ -188,8 +180,7 @@ class Archive(InFolder):
                 self.assertFalse(set(kept.sequence_name) & set(rest.sequence_name))
                 self.assertEqual(kept.select(objects=["soup"]).sequence_name.tolist(), soup)
         self.assertNotEqual(alone.select(max_per_object=3, seed=2).sequence_name.tolist(), soup)
-        with self.assertRaisesRegex(DemoError, "none is left"):
-            demos.split(share=1.0)
+        self.assertRaisesRegex(DemoError, "none is left", demos.split, share=1.0)
 
     def test_merge_demos(self):
         parts = [self.demos.select(indices=[i]) for i in range(4)]
@@ -202,21 +193,18 @@ class Archive(InFolder):
             ([*parts, parts[2]], "names must be unique"),
             ([parts[0], replace(parts[1], fps=25.0)], "rates"),
         ):
-            with self.assertRaisesRegex(DemoError, message):
-                merge_demos(wrong)
+            self.assertRaisesRegex(DemoError, message, merge_demos, wrong)
 
     def test_unknown_object(self):
         file = self.folder / "a.npz"
         # the archive may hold any object
-        write_demos(file, self.changed("object_name", 3, "055_baseball"))
+        write_demos(file, self.changed(3, object_name="055_baseball"))
         with self.assertRaisesRegex(
             DemoError, r"Unknown object '055_baseball'. Choose from: 003_cracker_box"
         ):
             demo_objects(read_demos(file))
-        write_demos(file, self.changed("object_name", 3, "banana"))  # the paper's name
-        self.assertEqual(
-            list(demo_objects(read_demos(file))), ["005_tomato_soup_can", "011_banana"]
-        )
+        write_demos(file, self.changed(3, object_name="banana"))  # the paper's name
+        self.assertEqual([*demo_objects(read_demos(file))], ["005_tomato_soup_can", "011_banana"])
 
     def test_levelled_applies_the_subjects_transform_once(self):
         T = np.eye(4)
@@ -229,10 +217,8 @@ class Archive(InFolder):
         level = levelled(demos)
         for name in ("object_pos", "hand_keypoints"):
             expected = getattr(demos, name) @ T[:3, :3].T + T[:3, 3]
-            np.testing.assert_allclose(getattr(level, name), expected, atol=1e-6)
-        np.testing.assert_allclose(
-            angles(demos.object_quat_wxyz, level.object_quat_wxyz), 0.02, atol=1e-5
-        )
+            assert_allclose(getattr(level, name), expected, atol=1e-6)
+        assert_allclose(angles(demos.object_quat_wxyz, level.object_quat_wxyz), 0.02, atol=1e-5)
         self.assertIs(levelled(level), level)
         self.assertIs(levelled(self.demos), self.demos)
         with self.assertRaisesRegex(DemoError, "not for synthetic"):
@@ -252,10 +238,8 @@ class Archive(InFolder):
             after = grounded(raised, objects)
             expected = np.zeros_like(up)
             expected[first, 2] = stays
-            np.testing.assert_allclose(after.object_pos, self.moved(expected).object_pos, atol=1e-6)
-            np.testing.assert_allclose(
-                after.hand_keypoints, self.moved(expected).hand_keypoints, atol=1e-6
-            )
+            assert_allclose(after.object_pos, self.moved(expected).object_pos, atol=1e-6)
+            assert_allclose(after.hand_keypoints, self.moved(expected).hand_keypoints, atol=1e-6)
 
 
 class DexYCB(InFolder):
@@ -333,10 +317,8 @@ class DexYCB(InFolder):
         self.assertTrue(
             np.isnan(read.hand_keypoints[0]).all() and np.isnan(read.wrist_quat_wxyz[0]).all()
         )
-        np.testing.assert_allclose(
-            read.hand_keypoints[1:], self.demos.hand_keypoints[1:], atol=1e-5
-        )
-        np.testing.assert_allclose(read.object_pos, self.demos.object_pos, atol=1e-5)
+        assert_allclose(read.hand_keypoints[1:], self.demos.hand_keypoints[1:], atol=1e-5)
+        assert_allclose(read.object_pos, self.demos.object_pos, atol=1e-5)
         self.assertLess(angles(read.object_quat_wxyz, self.demos.object_quat_wxyz).max(), 1e-5)
         self.assertLess(
             angles(read.wrist_quat_wxyz[1:], self.demos.wrist_quat_wxyz[1:]).max(), 1e-5
@@ -387,7 +369,7 @@ class DexYCB(InFolder):
         self.refused("not valid YAML")
 
 
-class RealData(unittest.TestCase):
+class RealData(TestCase):
     def test_official_layout_agrees_with_the_archives(self):
         layout = read_dexycb(data_dir() / "dexycb_layout")
         self.assertEqual(sorted(layout.hand_side.tolist()), ["left", "right", "right"])
@@ -400,9 +382,9 @@ class RealData(unittest.TestCase):
                 compared += 1
                 a, b = (demos.select(names=[sequence]) for demos in (archive, layout))
                 for field in ("hand_side", "hand_valid"):
-                    np.testing.assert_array_equal(getattr(a, field), getattr(b, field))
-                np.testing.assert_allclose(a.hand_keypoints, b.hand_keypoints, atol=1e-5)
-                np.testing.assert_allclose(a.object_pos, b.object_pos, atol=1e-5)
+                    assert_array_equal(getattr(a, field), getattr(b, field))
+                assert_allclose(a.hand_keypoints, b.hand_keypoints, atol=1e-5)
+                assert_allclose(a.object_pos, b.object_pos, atol=1e-5)
                 self.assertLess(
                     angles(a.wrist_quat_wxyz[a.hand_valid], b.wrist_quat_wxyz[a.hand_valid]).max(),
                     1e-4,
@@ -418,9 +400,9 @@ class RealData(unittest.TestCase):
                 axis=0
             )
             model = hand.keypoints(hand.RELAXED, side)
-            np.testing.assert_allclose(local[KNUCKLES], model[KNUCKLES], atol=0.01)
+            assert_allclose(local[KNUCKLES], model[KNUCKLES], atol=0.01)
             # real fingers are bent more or less
-            np.testing.assert_allclose(local, model, atol=0.04)
+            assert_allclose(local, model, atol=0.04)
 
     def test_recorded_demonstrations_are_not_doubted(self):
         for name, _ in ARCHIVES:
@@ -440,9 +422,6 @@ class Synthetic(InFolder):
             demos.object_pos, demos.object_quat_wxyz, demos.hand_keypoints.astype(float)
         )
 
-    def test_one_object_may_be_a_name(self):
-        self.assertEqual(synthesize("soup", 1).object_name.tolist(), ["005_tomato_soup_can"])
-
     def test_the_same_seed_gives_the_same_bits(self):
         again = synthesize(["banana", "soup"], per_object=1, seed=0)  # another order, fewer objects
         for name in ("banana", "soup"):
@@ -452,7 +431,7 @@ class Synthetic(InFolder):
                 self.assertEqual(getattr(a, array).tobytes(), getattr(b, array).tobytes())
         self.assertNotEqual(synthesize(["soup"], 1, seed=1).object_pos[0, 0], b.object_pos[0, 0])
 
-    @unittest.skipUnless(importlib.util.find_spec("manifold3d"), "manifold3d is not installed")
+    @skipUnless(importlib.util.find_spec("manifold3d"), "manifold3d is not installed")
     def test_a_wall_of_ones_own_mesh_is_held_from_both_sides(self):
         trimesh.creation.annulus(0.0365, 0.04, 0.09, sections=16).export(self.folder / "tube.obj")
         demos = synthesize(None, per_object=1, seed=0, meshes=self.folder)
@@ -471,7 +450,7 @@ class Synthetic(InFolder):
             points = one.hand_keypoints.astype(float)
             local = self.hand_in_object(one)
             with self.subTest(name):
-                np.testing.assert_array_equal(pos[1:lifted], pos[: lifted - 1])
+                assert_array_equal(pos[1:lifted], pos[: lifted - 1])
                 height = pos[:, 2] - rest_height(obj, one.object_quat_wxyz)
                 self.assertAlmostEqual(height[0], 0, delta=1e-4)
                 self.assertGreater(height.min(), -1e-4)
@@ -498,21 +477,19 @@ class Synthetic(InFolder):
             ("per_object is 1000000000 .* 1 to 100000", {"per_object": 10**9}),
             ("fps is 1", {"fps": 1}),
         ):
-            with self.assertRaisesRegex(DemoError, words):
-                synthesize(["soup"], **options)
+            self.assertRaisesRegex(DemoError, words, synthesize, ["soup"], **options)
 
 
-class Plausible(unittest.TestCase):
+class Plausible(TestCase):
     def test_other_conventions_are_doubted_and_right_ones_are_not(self):
         for side in ("right", "left"):
-            demos = synthesize(["soup"], 1, side=side)
+            demos = synthesize("soup", 1, side=side)
+            self.assertEqual(demos.object_name.tolist(), ["005_tomato_soup_can"])
             self.assertEqual(doubts(demos), [])
             mano = np.empty_like(demos.hand_keypoints)
             mano[:, ORDERS["mano"]] = demos.hand_keypoints
-            pos = demos.object_pos.copy()
-            pos[:] = pos[0]
-            quat = demos.object_quat_wxyz.copy()
-            quat[:] = quat[0]
+            pos = np.zeros_like(demos.object_pos) + demos.object_pos[0]
+            quat = np.zeros_like(demos.object_quat_wxyz) + demos.object_quat_wxyz[0]
             jump = demos.object_pos.copy()
             jump[20] += [0, 0, 0.5]
             for words, changes in (
@@ -538,43 +515,37 @@ class Commands(InFolder):
         file = self.folder / "demos.npz"
         options = "--objects soup --per-object 1 --side both --fps 10"
         synth = ("demos", "synth", "--out", file, *options.split())
-        code, out = run(*synth)
-        self.assertEqual(code, 0, out)
+        out = succeeds(*synth)
         first = file.read_bytes()
         self.assertEqual(read_demos(file).hand_side.tolist(), ["right", "left"])
-        code, info = run("demos", "info", file)
-        self.assertEqual(code, 0)
+        info = succeeds("demos", "info", file)
         self.assertIn(info, out)
         self.assertRegex(info, r"005_tomato_soup_can\W+1\W+1\W+\d+\W+100%")
-        run(*synth)
+        succeeds(*synth)
         self.assertEqual(file.read_bytes(), first)
 
     def test_split_and_merge(self):
-        file = self.folder / "demos.npz"
+        file, left, rest, both = (
+            f"{self.folder}/{name}.npz" for name in ("demos", "a", "b", "both")
+        )
         write_demos(file, synthesize(["soup"], 2, fps=10))
-        left = self.folder / "a.npz"
-        rest = self.folder / "b.npz"
-        both = self.folder / "both.npz"
         for command in (
             ("split", file, "--out", left, "--rest", rest, "--share", 0.5),
             ("merge", left, rest, "--out", both),
-            ("select", both, "--out", left, *["--per-object", "1", "--pick", "spread"]),
+            ("select", both, "--out", left, "--per-object", "1", "--pick", "spread"),
         ):
-            code, out = run("demos", *command)
-            self.assertEqual(code, 0, out)
+            succeeds("demos", *command)
         names = read_demos(both).sequence_name.tolist()
         self.assertEqual(names, read_demos(file).sequence_name.tolist())
         self.assertEqual(read_demos(left).sequence_name.tolist(), names[1:])
-        code, out = run("demos", "split", file, "--out", left, "--rest", left, "--share", 0.5)
-        self.assertEqual(code, 1)
-        self.assertIn("Nothing was overwritten", out)
+        self.assertIn(
+            "Nothing was overwritten",
+            refused("demos", "split", file, "--out", left, "--rest", left, "--share", 0.5),
+        )
 
     def test_import(self):
         file = self.folder / "demos.npz"
-        code, out = run("demos", "import", "dexycb", self.folder, "--out", file)
-        self.assertEqual((code, file.exists()), (1, False))
-        self.assertIn("no DexYCB sequence", out)
-
-
-if __name__ == "__main__":
-    unittest.main()
+        self.assertIn(
+            "no DexYCB sequence", refused("demos", "import", "dexycb", self.folder, "--out", file)
+        )
+        self.assertFalse(file.exists())

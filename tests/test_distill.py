@@ -1,22 +1,20 @@
 """Distillation: the teacher's network from its file, a student's training, resumed and exported, and refusals."""
 
 import io
-import tempfile
-import unittest
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from unittest import mock
+from unittest import SkipTest
+from unittest.mock import patch
 
 import numpy as np
 import pandas as pd
 import torch
 
+from tests.data import InOneFolder
 from tests.toy_bank import toy_bank
-from xreset import robots
+from xreset import distill, make_backend, make_env, resume, robots, train, write_bank
 from xreset.cameras.config import FRONT, WRIST, VisionConfig
-from xreset.env import make_env
 from xreset.errors import PolicyError, XResetError
 from xreset.eval.report.fairness import missed_by_student
 from xreset.learning.checkpoint import read_checkpoint
@@ -24,19 +22,16 @@ from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.recipes import student_config
 from xreset.learning.run import TEACHER, latest_checkpoint, read_run
 from xreset.learning.teacher import load_teacher
-from xreset.learning.train import distill, resume, train
 from xreset.objects.catalogue import load_objects
-from xreset.plugins import make_backend
 from xreset.policies import shipped
 from xreset.policy import OnnxPolicy, check_contract
-from xreset.resets.bank import write_bank
 from xreset.task.config import ObservationConfig, TaskConfig, evaluation_task
 
 try:
     import xreset.backends.mujoco
     import xreset.cameras.rays  # noqa: F401
 except (ImportError, XResetError) as error:
-    raise unittest.SkipTest(str(error)) from error
+    raise SkipTest(str(error)) from error
 
 TASK = TaskConfig(
     observation=ObservationConfig(cloud_points=16, cloud="paired"), distance_points=64
@@ -46,19 +41,17 @@ IMAGES = VisionConfig(cameras=(FRONT, WRIST), width=16, height=12)
 POINTS = replace(IMAGES, view="points", points=8, goal_image=True)
 
 
-class DistillTest(unittest.TestCase):
+class DistillTest(InOneFolder):
     @classmethod
     def setUpClass(cls):
-        cls.folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
-        cls.enterClassContext(
-            mock.patch("xreset.env.make_backend", partial(make_backend, workers=0))
-        )
+        super().setUpClass()
+        cls.enterClassContext(patch("xreset.env.make_backend", partial(make_backend, workers=0)))
         cls.robot = robots.load("openarm")
         cls.bank_of_robot = toy_bank(
             cls.robot, joint_pos=np.tile(cls.robot.home, (6, 1)).astype(np.float32)
         )
         cls.bank = cls.folder / "bank.npz"
-        write_bank(cls.bank, cls.bank_of_robot, config={}, inputs={})
+        write_bank(cls.bank, cls.bank_of_robot)
         cls.teacher = cls.folder / "teacher"
         config = TrainConfig(
             task=TASK, model=SMALL, ppo=PpoConfig(horizon=8, mini_epochs=1), iterations=1
@@ -68,11 +61,11 @@ class DistillTest(unittest.TestCase):
             cls.run_folder = cls.distill("images")
 
     @staticmethod
-    def options() -> dict:
+    def options():
         return {"engine": "mujoco", "device": "cpu", "num_envs": 4, "seed": 3}
 
     @classmethod
-    def distill(cls, name: str, vision: VisionConfig = IMAGES, **changes) -> Path:
+    def distill(cls, name, vision=IMAGES, **changes):
         config = student_config(TASK, vision)
         ppo = replace(
             config.ppo, horizon=8, sequence_length=4, minibatch_size=16, learning_rate=3e-3
@@ -82,10 +75,10 @@ class DistillTest(unittest.TestCase):
 
     @contextmanager
     def without_export(self):
-        with mock.patch("xreset.learning.train.export_onnx"), redirect_stdout(io.StringIO()):
+        with patch("xreset.learning.train.export_onnx"), redirect_stdout(io.StringIO()):
             yield
 
-    def env(self, vision: VisionConfig):
+    def env(self, vision):
         objects = load_objects(list(self.bank_of_robot.object_names), None)
         task = replace(evaluation_task(TASK), vision=vision)
         env = make_env(self.robot, objects, self.bank_of_robot, task, engine="mujoco", num_envs=2)
@@ -133,7 +126,7 @@ class DistillTest(unittest.TestCase):
         def note(_log, _iteration, _steps, _elapsed, scalars):
             errors.append(scalars["loss/behavior"])
 
-        with self.without_export(), mock.patch("xreset.learning.runner.TrainingLog.write", note):
+        with self.without_export(), patch("xreset.learning.runner.TrainingLog.write", note):
             out = self.distill("points", POINTS, iterations=15, save_interval=100)
             before = read_checkpoint(latest_checkpoint(out))
             resume(out, iterations=20)
@@ -153,12 +146,12 @@ class DistillTest(unittest.TestCase):
             clocked.append(iteration)
             return lift
 
-        with self.without_export(), mock.patch("xreset.learning.clock.Lift.after", note):
+        with self.without_export(), patch("xreset.learning.clock.Lift.after", note):
             self.distill("clock")  # the teacher acts in the first of two iterations
         self.assertEqual(clocked, [2])
 
     def test_students_see_points_and_the_goal_by_default(self):
-        with mock.patch("xreset.learning.train.train") as train:
+        with patch("xreset.learning.train.train") as train:
             distill("many-objects", self.bank, out=self.folder / "unused")
         vision = train.call_args.kwargs["config"].task.vision
         self.assertEqual((vision.view, vision.goal_image), ("points", True))
@@ -211,7 +204,3 @@ class DistillTest(unittest.TestCase):
             "Of 3 episodes that the teacher ends at the goal, the student misses 2: can 1 of 2, box 1 of 1. "
             "In 1 of these the object ends within 2 cm of its place, but is turned wrongly.",
         )
-
-
-if __name__ == "__main__":
-    unittest.main()

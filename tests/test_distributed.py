@@ -3,24 +3,23 @@
 import os
 import subprocess
 import sys
-import tempfile
-import unittest
 from pathlib import Path
-from unittest import mock
+from unittest import SkipTest, TestCase, mock
 
 import numpy as np
 import torch
+from torch.testing import assert_close
 
+from tests.data import InOneFolder
 from tests.toy_bank import toy_bank
-from xreset import robots
+from xreset import robots, write_bank
 from xreset.learning.distributed import Processes
 from xreset.learning.run import checkpoints
-from xreset.resets.bank import write_bank
 
 try:
     import xreset.backends.mujoco  # noqa: F401
 except ImportError as error:
-    raise unittest.SkipTest(str(error)) from error
+    raise SkipTest(str(error)) from error
 
 ROOT = Path(__file__).resolve().parents[1]
 SMALL = (
@@ -30,14 +29,14 @@ SMALL = (
 )
 
 
-class TwoProcesses(unittest.TestCase):
+class TwoProcesses(InOneFolder):
     @classmethod
     def setUpClass(cls):
-        cls.folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
+        super().setUpClass()
         robot = robots.load("openarm")
         cls.bank = cls.folder / "bank.npz"
         home = np.tile(robot.home, (6, 1)).astype(np.float32)
-        write_bank(cls.bank, toy_bank(robot, joint_pos=home), config={}, inputs={})
+        write_bank(cls.bank, toy_bank(robot, joint_pos=home))
         cls.out = cls.folder / "run"
         new = f"--robot openarm --resets {cls.bank} --backend mujoco --device cpu --num-envs 8 --seed 3"
         cls.first = cls.train(f"--out {cls.out} --iterations 2 {new} {SMALL}")
@@ -45,7 +44,7 @@ class TwoProcesses(unittest.TestCase):
         cls.second = cls.train(f"--out {cls.out} --iterations 3 --resume")
 
     @classmethod
-    def train(cls, arguments: str) -> list[dict]:
+    def train(cls, arguments):
         """What the two processes end with."""
         torchrun = "-m torch.distributed.run --standalone --nproc-per-node 2 tests/train_worker.py"
         command = [sys.executable, *torchrun.split(), str(cls.folder), *arguments.split()]
@@ -66,7 +65,7 @@ class TwoProcesses(unittest.TestCase):
                 "actor",
                 "critic",
             ):  # weights, and the normalisers' mean, variance and count
-                torch.testing.assert_close(one[model], two[model], rtol=0, atol=0, msg=model)
+                assert_close(one[model], two[model], rtol=0, atol=0, msg=model)
             self.assertEqual(one["learning_rate"], two["learning_rate"])
             self.assertFalse(torch.equal(one["policy_obs"], two["policy_obs"]))
             self.assertFalse(torch.equal(one["random"], two["random"]))
@@ -74,13 +73,13 @@ class TwoProcesses(unittest.TestCase):
         count = next(
             value for name, value in self.first[0]["actor"].items() if name.endswith("count")
         )
-        self.assertEqual(int(count), 2 * steps)
+        self.assertEqual(count, 2 * steps)
         self.assertEqual(
             [end["env_steps"] for end in (*self.first, *self.second)],
             [2 * steps] * 2 + [3 * steps] * 2,
         )
         for before, after in zip(self.first, self.second, strict=True):
-            torch.testing.assert_close(before["actor"], after["start_actor"], rtol=0, atol=0)
+            assert_close(before["actor"], after["start_actor"], rtol=0, atol=0)
 
     def test_the_main_process_alone_writes(self):
         self.assertEqual(self.made.count("run.json"), 1)
@@ -92,7 +91,7 @@ class TwoProcesses(unittest.TestCase):
         self.assertEqual(self.output.count("continuing after iteration 2"), 1)
 
 
-class Environment(unittest.TestCase):
+class Environment(TestCase):
     def test_what_a_process_knows(self):
         alone = Processes.of_environment()
         self.assertEqual(
@@ -105,7 +104,3 @@ class Environment(unittest.TestCase):
             (fifth.is_main, fifth.device("cuda:0"), fifth.device("cpu")), (False, "cuda:1", "cpu")
         )
         self.assertNotEqual(fifth.seed(0), alone.seed(0))
-
-
-if __name__ == "__main__":
-    unittest.main()

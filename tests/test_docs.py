@@ -2,11 +2,11 @@
 
 import re
 import shlex
-import unittest
 from functools import cache
 from pathlib import Path
+from unittest import TestCase
 
-from tests.test_cli import run
+from tests.command import succeeds
 from xreset.cli import COMMANDS
 from xreset.cli.engines import COMMAND as ENGINES
 
@@ -17,13 +17,13 @@ GROUPS = ("demos", "objects", "robots", "policies", "export")
 """Commands whose second word is a verb."""
 
 
-def blocks(page: Path) -> list[str]:
+def blocks(page):
     """Return the lines of the page's code blocks, without the indentation that makes them one; continued lines are joined."""
     lines = [line[4:] for line in page.read_text().splitlines() if line.startswith("    ")]
     return re.sub(r"\\\n *", " ", "\n".join(lines)).splitlines()
 
 
-def commands(page: Path) -> list[list[str]]:
+def commands(page):
     """Return the words of the page's `xreset` commands: in code blocks, and in running text."""
     text = page.read_text()
     found = [line.strip() for line in blocks(page)]
@@ -33,22 +33,21 @@ def commands(page: Path) -> list[list[str]]:
 
 
 @cache
-def help_of(words: tuple[str, ...]) -> str:
+def help_of(words):
     """Return the help text of a command."""
-    code, out, err = run(*words, "--help")
-    assert code == 0, err
+    out = succeeds(*words, "--help")
     assert not re.search(r":[a-z]+:`", out), f"a reference that only the site shows: {out}"
     return out
 
 
-def command_of(words: list[str]) -> tuple[str, ...]:
+def command_of(words):
     """Return the words that name a command: one, or two or three in a group."""
     if words[0] in GROUPS:
         return tuple(words[:3] if words[:2] == ["demos", "import"] else words[:2])
     return tuple(words[:2] if words[0] == "engines" else words[:1])
 
 
-class DocumentedCommandsTest(unittest.TestCase):
+class DocumentedCommandsTest(TestCase):
     def test_every_command_and_option_exists(self):
         seen = 0
         for page in PAGES:
@@ -78,7 +77,7 @@ class DocumentedCommandsTest(unittest.TestCase):
         self.assertGreater(seen, 100)
 
 
-class PageTest(unittest.TestCase):
+class PageTest(TestCase):
     def test_code_blocks_fit_on_the_page(self):
         for page in PAGES:
             for line in page.read_text().splitlines():
@@ -122,7 +121,3 @@ class PageTest(unittest.TestCase):
             )
         )
         self.assertEqual(headings, {*xreset.__all__})
-
-
-if __name__ == "__main__":
-    unittest.main()

@@ -1,16 +1,13 @@
 """The support matrix: what the page says of given results, and the page in docs/."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import io
 import json
-import tempfile
-import unittest
 from pathlib import Path
 from typing import Any
 
+from tests.data import InFolder
 from xreset.backends.conformance import SCHEMA
 from xreset.cli import main
 from xreset.errors import FileFormatError, XResetError
@@ -20,23 +17,20 @@ STORED = Path(__file__).with_name("engines")
 CONFORMANCE: dict[str, Any] = json.loads((STORED / "conformance.json").read_text())
 
 
-class PageTest(unittest.TestCase):
-    def setUp(self):
-        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
-
-    def page_of(self, *files: dict[str, Any]) -> str:
+class PageTest(InFolder):
+    def page_of(self, *files):
         paths = [self.folder / f"{i}.json" for i in range(len(files))]
         for path, data in zip(paths, files, strict=True):
             path.write_text(json.dumps(data))
         return page(read(paths))
 
-    def changed(self, **run: Any) -> dict[str, Any]:
+    def changed(self, **run):
         """The stored results of another engine, device or robot."""
         data = copy.deepcopy(CONFORMANCE)
         data["runs"][0] |= run
         return data
 
-    def row(self, text: str, start: str) -> list[str]:
+    def row(self, text, start):
         """Cells of the first line of a table that begins so."""
         line = next(line for line in text.splitlines() if line.startswith(f"| {start}"))
         return [cell.strip() for cell in line.strip("|").split(" | ")]
@@ -104,9 +98,4 @@ class PageTest(unittest.TestCase):
         ):
             with self.subTest(message), self.assertRaisesRegex(FileFormatError, message):
                 self.page_of(data)
-        with self.assertRaisesRegex(XResetError, "nothing to make a page of"):
-            self.page_of()
-
-
-if __name__ == "__main__":
-    unittest.main()
+        self.assertRaisesRegex(XResetError, "nothing to make a page of", self.page_of)

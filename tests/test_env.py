@@ -1,23 +1,25 @@
 """The environment and the rollouts on the MuJoCo C engine: episodes begin and end as they should, world by world."""
 
-import tempfile
-import unittest
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 from types import SimpleNamespace
-from unittest import mock
+from unittest import SkipTest, TestCase
+from unittest.mock import patch
 
 import numpy as np
 import torch
 import trimesh
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
+from torch import tensor
 from torch.testing import assert_close
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from tests.data import InFolder
 from tests.toy_bank import SOUP, SPAM, toy_bank, toy_retargeted
-from tests.toy_robot import toy_hand_arm
+from tests.toy_robot import toy_robot
+from xreset import make_bank
 from xreset.env import ManipulationEnv, make_env, make_scene, object_origins
 from xreset.errors import CapabilityError, XResetError
 from xreset.eval.metrics import EpisodeMetrics, MetricPoints
@@ -28,7 +30,6 @@ from xreset.objects.catalogue import load_object, load_objects
 from xreset.physics import State
 from xreset.policy import ZeroPolicy
 from xreset.resets.distribution import ResetDistribution
-from xreset.resets.filter import make_bank
 from xreset.task.config import (
     ActionConfig,
     ObservationConfig,
@@ -47,7 +48,7 @@ from xreset.task.tracker import Tracker
 try:
     from xreset.backends.mujoco import MujocoBackend
 except ImportError as error:
-    raise unittest.SkipTest(str(error)) from error
+    raise SkipTest(str(error)) from error
 
 N = 3
 TASK = TaskConfig(
@@ -75,20 +76,16 @@ class BreakableBackend(MujocoBackend):
 
     def state(self):
         state = super().state()
-        bad = self.broken[:, None]
+        names = ("object_pos", "joint_pos")
+        broken = self.broken[:, None]
         return replace(
-            state,
-            object_pos=torch.where(bad, torch.nan, state.object_pos),
-            joint_pos=torch.where(bad, torch.nan, state.joint_pos),
+            state, **{n: torch.where(broken, torch.nan, getattr(state, n)) for n in names}
         )
 
     def health(self):
         health = super().health()
-        return replace(
-            health,
-            nonfinite=health.nonfinite | self.broken,
-            overflow=health.overflow | self.overflow,
-        )
+        nonfinite = health.nonfinite | self.broken
+        return replace(health, nonfinite=nonfinite, overflow=health.overflow | self.overflow)
 
 
 class Waiting(TorchDispatchMode):
@@ -96,7 +93,7 @@ class Waiting(TorchDispatchMode):
 
     NAMES = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "is_nonzero")
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.operations = 0
         self.found = []
@@ -114,34 +111,26 @@ class Waiting(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-class WithEnv(unittest.TestCase):
-    @classmethod
-    def setUpClass(cls):
-        cls.robot = toy_hand_arm(Path(cls.enterClassContext(tempfile.TemporaryDirectory())))
-        cls.objects = load_objects((SOUP, SPAM))
-        cls.bank = toy_bank(cls.robot)
+class WithEnv(TestCase):
+    robot = toy_robot()
+    objects = load_objects((SOUP, SPAM))
+    bank = toy_bank(robot)
 
-    def make(
-        self, task: TaskConfig = TASK, seed: int = 0, kind: type[MujocoBackend] = MujocoBackend
-    ) -> ManipulationEnv:
-        backend = kind(
-            make_scene(self.robot, self.objects, task),
-            N,
-            object_index=torch.tensor([0, 1, 0]),
-            workers=0,
-        )
+    def make(self, task=TASK, seed=0, kind=MujocoBackend):
+        scene = make_scene(self.robot, self.objects, task)
+        backend = kind(scene, N, object_index=tensor([0, 1, 0]), workers=0)
         self.addCleanup(backend.close)
-        return ManipulationEnv(
-            backend,
-            task,
-            ResetDistribution(self.bank, self.robot, (SOUP, SPAM), task.reset),
-            seed=seed,
-        )
+        resets = ResetDistribution(self.bank, self.robot, (SOUP, SPAM), task.reset)
+        return ManipulationEnv(backend, task, resets, seed=seed)
 
-    def actions(self, steps: int, seed: int = 0) -> torch.Tensor:
+    def play(self, env, steps, seed=0):
+        """Observations of every step with random actions."""
+        return [env.step(action)[0] for action in self.actions(steps, seed)]
+
+    def actions(self, steps, seed=0):
         return 2 * torch.rand(steps, N, 7, generator=torch.Generator().manual_seed(seed)) - 1
 
-    def assert_same(self, found, expected, worlds=slice(None)) -> None:
+    def assert_same(self, found, expected, worlds=slice(None)):
         """Every tensor of two states or observations is equal in these worlds."""
         found, expected = (
             dict(vars(x) if isinstance(x, State) else x.items()) for x in (found, expected)
@@ -149,28 +138,28 @@ class WithEnv(unittest.TestCase):
         for name, value in found.items():
             self.assertTrue(torch.equal(value[worlds], expected[name][worlds]), name)
 
-    def assert_finite(self, observations) -> None:
+    def assert_finite(self, observations):
         for group, value in observations.items():
             self.assertTrue(value.isfinite().all(), group)
 
 
 class RefusalTest(WithEnv):
     def test_what_does_not_belong_together_is_refused(self):
-        names = tuple(f"other_{name}" for name in self.robot.joint_names)
-        meshes = tuple(replace(obj, source="0" * 64) for obj in self.objects)
-        for words, given in {
-            "joints are not those of": {"bank": replace(self.bank, joint_names=names)},
-            "was made with": {"objects": meshes},
-            "load_robot": {"robot": self.robot.name},
-            "'soup'.*load_object": {"objects": ["soup"]},
-            "read_bank": {"bank": "bank.npz"},
-        }.items():
-            parts = {"robot": self.robot, "objects": self.objects, "bank": self.bank} | given
+        robot, objects, bank = self.robot, self.objects, self.bank
+        names = tuple(f"other_{name}" for name in robot.joint_names)
+        meshes = [replace(obj, source="0" * 64) for obj in objects]
+        for words, *parts in (
+            ("joints are not those of", robot, objects, replace(bank, joint_names=names)),
+            ("was made with", robot, meshes, bank),
+            ("load_robot", robot.name, objects, bank),
+            ("'soup'.*load_object", robot, ["soup"], bank),
+            ("read_bank", robot, objects, "bank.npz"),
+        ):
             with self.subTest(words), self.assertRaisesRegex(XResetError, words):
-                make_env(**parts, num_envs=1)
-        motion = toy_retargeted(self.robot, [SOUP], [0, 2], joint_names=names)
+                make_env(*parts, num_envs=1)
+        motion = toy_retargeted(robot, [SOUP], [0, 2], joint_names=names)
         with self.assertRaisesRegex(XResetError, "The motion is .* joints are not those of"):
-            make_bank(motion, self.robot, self.objects)
+            make_bank(motion, robot, objects)
 
     def test_shares_of_worlds_that_cannot_be_are_refused(self):
         for words, share, num_envs in (
@@ -212,8 +201,7 @@ class RefusalTest(WithEnv):
 class StepTest(WithEnv):
     def test_observations_state_the_world(self):
         env = self.make(QUIET)
-        for action in self.actions(5):
-            observations, *_ = env.step(action)
+        observations = self.play(env, 5)[-1]
         widths = layout(7, 2, TASK.observation)
         shapes = {name: tuple(value.shape[1:]) for name, value in observations.items()}
         flat = {name: (sum(widths[name].values()),) for name in ("policy", "proprio")}
@@ -225,9 +213,8 @@ class StepTest(WithEnv):
         assert_close(policy[:, 7:10], env.goal_pos)
         assert_close(policy[:, 14], env.gravity_fraction)
         assert_close(policy[:, 15:], self.actions(5)[-1])
-        assert_close(
-            observations["proprio"][:, 3:7], env.actions.within_limits(state.joint_pos)[:, 3:]
-        )
+        scaled = env.actions.within_limits(state.joint_pos)
+        assert_close(observations["proprio"][:, 3:7], scaled[:, 3:])
         cloud = quat_rotate(state.object_quat[:, None], env._cloud_points)
         assert_close(observations["perception"][:, -1], cloud + state.object_pos[:, None])
 
@@ -247,28 +234,25 @@ class StepTest(WithEnv):
         env = self.make(replace(QUIET, action=ActionConfig(arm_step=0.3, arm_lead=1.0)))
         env.advance(torch.ones(N, 7))
         env.reset()
-        distance, reach = [env.reading().tip_distance.mean(dim=-1)], []
-        for step in range(20):
-            reading, reward = env.advance(torch.full((N, 7), 1.0 if step % 10 < 5 else -1.0))
-            reach.append(reward.terms["reach"])
-            distance.append(reading.tip_distance.mean(dim=-1))
-        best = torch.stack(distance).cummin(dim=0).values[1:]
-        assert_close(torch.stack(reach), 1 - torch.tanh(best / TASK.reward.reach_width))
-        self.assertTrue(
-            (torch.stack(distance)[1:] > best + 1e-3).any(), "the hand moved away at times"
-        )
+        readings, reach = [env.reading()], []
+        for action in [1.0, -1.0, 1.0, -1.0]:
+            for _ in range(5):
+                reading, reward = env.advance(torch.full((N, 7), action))
+                reach.append(reward.terms["reach"])
+                readings.append(reading)
+        distance = torch.stack([reading.tip_distance.mean(dim=-1) for reading in readings])
+        best = distance.cummin(dim=0).values
+        assert_close(torch.stack(reach), 1 - torch.tanh(best[1:] / TASK.reward.reach_width))
+        self.assertTrue((distance > best + 1e-3).any(), "the hand moved away at times")
 
     def test_a_reset_of_one_world_leaves_the_others_as_they_are(self):
         env = self.make()
-        for action in self.actions(3):
-            env.step(action)
-        before = env.get_observations()
-        length = env.episode_length_buf.clone()
-        env.reset(torch.tensor([1]))
+        before = self.play(env, 3)[-1]
+        env.reset(tensor([1]))
         after = env.get_observations()
         self.assert_same(after, before, [0, 2])
         self.assertFalse(torch.equal(after["policy"][1], before["policy"][1]))
-        self.assertEqual(env.episode_length_buf.tolist(), [int(length[0]), 0, int(length[2])])
+        self.assertEqual(env.episode_length_buf.tolist(), [3, 0, 3])
 
     def test_the_same_seed_gives_the_same_episodes(self):
         runs = [self.make(seed=seed) for seed in (3, 3, 4)]
@@ -281,12 +265,10 @@ class StepTest(WithEnv):
 
 class ResetTest(WithEnv):
     def test_only_the_finished_world_begins_anew(self):
-        env = self.make(QUIET)
-        other = self.make(QUIET)
+        env, other = self.make(QUIET), self.make(QUIET)
         began = env.backend.state().object_quat.clone()
-        for action in self.actions(8):
-            env.step(action)
-            other.step(action)
+        for each in (env, other):
+            self.play(each, 8)
         self.assertTrue(torch.equal(env.start_quat, began))
         env.episode_length_buf[1] = env.max_episode_length - 1
         action = self.actions(1, seed=5)[0]
@@ -305,12 +287,13 @@ class ResetTest(WithEnv):
         assert_close(cloud[[0, 2], :-1], last_cloud[[0, 2], 1:])
         # the new episode's history is its first frame, without previous action and reward
         assert_close(cloud[1], cloud[1, :1].expand_as(cloud[1]))
-        self.assertEqual(float(observations["policy"][1, 15:].abs().max()), 0.0)
-        self.assertEqual(float(observations["privileged"][1, -1]), 0.0)
+        self.assertEqual(observations["policy"][1, 15:].abs().max(), 0.0)
+        self.assertEqual(observations["privileged"][1, -1], 0.0)
         self.assertTrue(torch.equal(env.start_quat[[0, 2]], began[[0, 2]]))
-        torch.testing.assert_close(env.start_quat[1], env.backend.state().object_quat[1])
+        state = env.backend.state()
+        assert_close(env.start_quat[1], state.object_quat[1])
         # the drives hold the new joint positions
-        self.assertTrue(torch.equal(env.joint_target[1], env.backend.state().joint_pos[1]))
+        self.assertTrue(torch.equal(env.joint_target[1], state.joint_pos[1]))
 
     def test_starts_come_from_the_distribution_and_may_press(self):
         """Drives begin with the bank's targets; from home they hold the joints."""
@@ -329,25 +312,20 @@ class ResetTest(WithEnv):
 
 
 class RobustnessTest(WithEnv):
-    def task(self, **ranges) -> TaskConfig:
+    def task(self, **ranges):
         return replace(QUIET, randomization=RandomizationConfig(**ranges))
 
     def test_pose_joints_and_forces_are_observed_late(self):
-        env = self.make(self.task(observation_latency=(2.0, 2.0), proprio_latency=(2.0, 2.0)))
-        same = self.make(self.task())
-        late = []
-        present = []
-        for action in self.actions(6):
-            late.append(env.step(action)[0])
-            present.append(same.step(action)[0])
-        for now, before in zip(late[2:], present, strict=False):
+        late = self.task(observation_latency=(2.0, 2.0), proprio_latency=(2.0, 2.0))
+        found, present = (self.play(self.make(task), 6) for task in (late, self.task()))
+        for now, before in zip(found[2:], present, strict=False):
             assert_close(now["policy"][:, :3], before["policy"][:, :3])
             assert_close(now["proprio"], before["proprio"])
 
     def test_arm_and_hand_may_be_late_apart(self):
         env = self.make(self.task(action_latency=(0.0, 0.0), hand_latency=(1.0, 1.0)))
         last = env.joint_target.clone()
-        with mock.patch.object(env.backend, "set_joint_targets") as sent:
+        with patch.object(env.backend, "set_joint_targets") as sent:
             for action in self.actions(3):
                 env.step(action)
                 arm, hand = sent.call_args.args[0].split((3, 4), dim=-1)
@@ -367,21 +345,17 @@ class RobustnessTest(WithEnv):
         self.assertEqual(all_lost, 1.0)
         self.assertTrue(0.25 < half_lost < 0.75, half_lost)
 
-    def observed(
-        self, tracker: TrackerConfig, steps: int = 12, **ranges
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def observed(self, tracker):
         """Errors of the observed positions [steps, N, 3], and errors of the cloud's middle that follow from them."""
-        env = self.make(self.task(tracker=tracker, **ranges))
+        env = self.make(self.task(tracker=tracker))
         errors, cloud_errors = [], []
-        for action in self.actions(steps):
+        for action in self.actions(12):
             observations, *_ = env.step(action)
             state = env.backend.state()
-            cloud = (
-                quat_rotate(state.object_quat[:, None], env._cloud_points)
-                + state.object_pos[:, None]
-            )
+            cloud = quat_rotate(state.object_quat[:, None], env._cloud_points)
             errors.append(observations["policy"][:, :3] - state.object_pos)
-            cloud_errors.append((observations["perception"][:, -1] - cloud).mean(dim=1))
+            seen = observations["perception"][:, -1] - state.object_pos[:, None]
+            cloud_errors.append((seen - cloud).mean(dim=1))
         return torch.stack(errors), torch.stack(cloud_errors)
 
     def test_a_tracker_errs_by_the_same_in_an_episode_and_anew_in_every_pose(self):
@@ -390,77 +364,65 @@ class RobustnessTest(WithEnv):
         assert_close(bias, bias[:1].expand_as(bias))
         assert_close(bias, cloud_bias)
         noise, _ = self.observed(TrackerConfig(position_noise=0.01))
-        self.assertTrue(
-            bool((noise.abs() <= 0.01001).all()) and bool((noise[1:] != noise[:-1]).all())
-        )
+        self.assertTrue((noise.abs() <= 0.01001).all() and (noise[1:] != noise[:-1]).all())
         position, cloud = self.observed(TrackerConfig(rotation_noise=0.1, rotation_bias=0.1))
-        self.assertLess(float(position.abs().max()), 1e-6)
-        self.assertGreater(float(cloud.abs().max()), 1e-4)
+        self.assertLess(position.abs().max(), 1e-6)
+        self.assertGreater(cloud.abs().max(), 1e-4)
 
     def test_poses_may_come_seldom_and_go_missing(self):
         """The error of each pose is another one, so the same error is the same pose."""
-        cases = (
-            (TrackerConfig(interval=(3.0, 3.0)), 3),
-            (TrackerConfig(loss=1.0, loss_steps=(4.0, 4.0)), 5),
-        )
-        for tracker, period in cases:
-            env = self.make(self.task(tracker=replace(tracker, position_noise=0.01)))
-            poses = [env.step(action)[0]["policy"][:, :3] for action in self.actions(12)]
+        for period, options in (
+            (3, {"interval": (3.0, 3.0)}),
+            (5, {"loss": 1.0, "loss_steps": (4.0, 4.0)}),
+        ):
+            env = self.make(self.task(tracker=TrackerConfig(position_noise=0.01, **options)))
+            poses = [seen["policy"][:, :3] for seen in self.play(env, 12)]
             # the first pose came with the reset
             same = [torch.equal(a, b) for a, b in pairwise(poses)]
             self.assertEqual(same, [(step + 2) % period != 0 for step in range(11)])
 
     def test_a_schedule_scales_all_faults(self):
-        live = RECIPES["live"].config.task
-        tracker = replace(live.randomization.tracker, interval=(1.0, 1.0))
-        faulty = replace(
-            QUIET,
-            randomization=replace(live.randomization, tracker=tracker, hand_latency=(0.0, 4.0)),
-        )
+        live = RECIPES["live"].config.task.randomization
+        tracker = replace(live.tracker, interval=(1.0, 1.0))
+        faults = replace(live, tracker=tracker, hand_latency=(0.0, 4.0))
+        faulty = replace(QUIET, randomization=faults)
         for scale in (0.0, 0.5):
             env = self.make(faulty)
             env.drawn.fault_scale.fill_(scale)
             env.reset()
             kept = env.drawn.lasting
-            for name in (
-                "commands.delay",
-                "poses.delay",
-                "proprio.delay",
-                "lost_actions",
-                "tracker.bias",
-            ):
-                self.assertEqual(bool(kept[name].any()), scale > 0, name)
-            self.assertLessEqual(float(kept["poses.delay"].max()), scale * 6.0)
-            self.assertLessEqual(float(kept["pushes.probability"].max()), scale * 0.02)
+            names = "commands.delay poses.delay proprio.delay lost_actions tracker.bias"
+            for name in names.split():
+                self.assertEqual(kept[name].any(), scale > 0, name)
+            self.assertLessEqual(kept["poses.delay"].max(), scale * 6.0)
+            self.assertLessEqual(kept["pushes.probability"].max(), scale * 0.02)
             if not scale:
                 for action in self.actions(6):
                     seen = env.step(action)[0]["policy"][:, :3]
-                    pos = env.backend.state().object_pos
-                    self.assertLess(float((seen - pos).norm(dim=-1).max()), 1e-6)
+                    assert_close(seen, env.backend.state().object_pos, atol=1e-6, rtol=0)
 
     def test_a_delay_jitters_within_its_range(self):
         drawn = Drawn(200, torch.device("cpu"))
-        config = RandomizationConfig(
-            observation_latency=(2.0, 2.0), tracker=TrackerConfig(jitter=3.0)
+        jitter = TrackerConfig(jitter=3.0)
+        tracker = Tracker(
+            drawn, RandomizationConfig(observation_latency=(2.0, 2.0), tracker=jitter)
         )
-        tracker = Tracker(drawn, config)
         generator = torch.Generator().manual_seed(0)
         drawn.draw(torch.ones(200, dtype=torch.bool), generator)
-        upright = torch.tensor([1.0, 0, 0, 0]).expand(200, 4)
+        upright = tensor([1.0, 0, 0, 0]).expand(200, 4)
         for step in range(4):
             now = torch.full((200, 3), float(step))
             seen, _ = tracker.observe(now, upright, torch.full((200,), step == 0), generator)
         low, high = (now - seen).aminmax()
-        self.assertTrue(float(low) < 0.5 and float(high) == 2.0)
+        self.assertTrue(low < 0.5 and high == 2.0)
 
     def test_pushes_change_velocities_by_what_they_say(self):
         push = PushConfig(probability=(1.0, 1.0), object_velocity=0.5, object_spin=4.0)
         env, same = self.make(self.task(push=push)), self.make(self.task())
         for each in (env, same):
             state = each.backend.state()
-            each.backend.set_state(
-                replace(state, object_pos=state.object_pos + torch.tensor([0.0, 0.0, 0.3]))
-            )
+            raised = state.object_pos + tensor([0.0, 0.0, 0.3])
+            each.backend.set_state(replace(state, object_pos=raised))
             each.step(torch.zeros(N, 7))
         pushes, pushed, free = env.variation.pushes, env.backend.state(), same.backend.state()
         mass = env.variation.parameters["object_mass"][:, None]
@@ -468,59 +430,51 @@ class RobustnessTest(WithEnv):
         self.assertTrue(((expected.norm(dim=-1) > 0) & (expected.norm(dim=-1) <= 0.5)).all())
         spin = pushed.object_angvel - free.object_angvel
         self.assertTrue(((spin.norm(dim=-1) > 0) & (spin.norm(dim=-1) <= 4.2)).all())
-        com = torch.as_tensor(np.stack([o.com for o in self.objects]), dtype=torch.float32)[
-            env.backend.object_index
-        ]
+        com = tensor([self.objects[i].com.tolist() for i in env.backend.object_index])
         arm = quat_rotate(pushed.object_quat, com)
-        velocity = (
-            pushed.object_linvel
-            + torch.linalg.cross(pushed.object_angvel, arm)
-            - free.object_linvel
-        )
+        turning = torch.linalg.cross(pushed.object_angvel, arm)
+        velocity = pushed.object_linvel + turning - free.object_linvel
         assert_close(velocity, expected, atol=0.01, rtol=0.02)
 
     def test_pushes_wait_for_the_gate_and_move_the_arms_targets(self):
         push = PushConfig(probability=(1.0, 1.0), object_velocity=0.5, arm_torque=0.5, when="gated")
         env = self.make(self.task(push=push))
-        with mock.patch.object(env.backend, "set_joint_targets") as sent:
+        with patch.object(env.backend, "set_joint_targets") as sent:
             env.step(torch.zeros(N, 7))
-        self.assertEqual(float(env.variation.pushes.force.abs().max()), 0.0)
-        offset = sent.call_args.args[0] - env.joint_target
-        drives = [joint.drive for joint in self.robot.joints]
-        torque = (
-            offset
-            * torch.tensor([drive.kp for drive in drives])
-            / torch.tensor([d.effort for d in drives])
-        )
+        pushes = env.variation.pushes
+        self.assertFalse(pushes.force.any())
+        share = tensor([joint.drive.kp / joint.drive.effort for joint in self.robot.joints])
+        torque = (sent.call_args.args[0] - env.joint_target) * share
         self.assertTrue((torque[:, :3].abs() <= 0.5001).all() and (torque[:, :3] != 0).all())
-        self.assertEqual(float(torque[:, 3:].abs().max()), 0.0)
-        env.variation.pushes.gate.fill_(True)
+        self.assertFalse(torque[:, 3:].any())
+        pushes.gate.fill_(True)
         env.step(torch.zeros(N, 7))
-        self.assertGreater(float(env.variation.pushes.force.norm(dim=-1).min()), 0.0)
+        self.assertGreater(pushes.force.norm(dim=-1).min(), 0.0)
 
     def test_parameters_are_drawn_for_the_worlds_that_begin(self):
-        ranges = {
-            "arm_stiffness": (0.5, 0.6),
-            "hand_damping": (2.0, 3.0),
-            "object_com": (0.01, 0.01),
-        }
-        env = self.make(
-            self.task(torsional_friction=(0.5, 2.0), object_inertia=(0.5, 2.0), **ranges)
+        wide = (0.5, 2.0)
+        task = self.task(
+            arm_stiffness=(0.5, 0.6),
+            hand_damping=(2.0, 3.0),
+            object_com=(0.01, 0.01),
+            torsional_friction=wide,
+            object_inertia=wide,
         )
+        env = self.make(task)
         before = {name: value.clone() for name, value in env.variation.parameters.items()}
-        with mock.patch.object(env.backend, "set_where") as set_where:
-            env.reset(torch.tensor([2, 0]))
+        with patch.object(env.backend, "set_where") as set_where:
+            env.reset(tensor([2, 0]))
         mask, _, found = set_where.call_args.args
         self.assertEqual(mask.tolist(), [True, False, True])
         for name, value in before.items():
             same = (getattr(found, name) == value).view(N, -1).all(dim=1)
             self.assertEqual(same.tolist(), [False, True, False], name)
         self.assertTrue(torch.equal(found.object_gravity, env.gravity_fraction))
-        mass = torch.tensor([self.objects[i].mass for i in env.backend.object_index])
+        mass = tensor([self.objects[i].mass for i in env.backend.object_index])
         for factor, low, high in (
             (found.object_mass / mass, 0.7, 1.3),
-            (found.torsional_friction / env.backend.scene.friction.torsional, 0.5, 2.0),
-            (found.object_inertia, 0.5, 2.0),
+            (found.torsional_friction / env.backend.scene.friction.torsional, *wide),
+            (found.object_inertia, *wide),
             (found.drives[:, 0, :3], 0.5, 0.6),
             (found.drives[:, 1, 3:], 2.0, 3.0),
             (found.drives[:, 2], 1.0, 1.0),
@@ -532,31 +486,20 @@ class RobustnessTest(WithEnv):
     def test_an_engine_that_cannot_do_it_is_named(self):
         able = MujocoBackend.capabilities - {"drives", "object_com"}
         task = self.task(effort=(0.5, 1.0), object_com=(0.0, 0.01))
-        with mock.patch.object(MujocoBackend, "capabilities", able):
+        with patch.object(MujocoBackend, "capabilities", able):
             self.make()
-            with self.assertRaisesRegex(
-                CapabilityError,
-                "'mujoco' cannot set drives, object com in each world, which this task draws",
-            ):
-                self.make(task)
+            words = "'mujoco' cannot set drives, object com in each world, which this task draws"
+            self.assertRaisesRegex(CapabilityError, words, self.make, task)
 
     def test_a_snapshot_holds_what_is_late_and_scaled(self):
-        task = replace(
-            QUIET,
-            randomization=replace(
-                RECIPES["live"].config.task.randomization, hand_latency=(0.0, 2.0)
-            ),
-        )
-        env = self.make(task)
-        other = self.make(task, seed=1)
-        for action in self.actions(5):
-            env.step(action)
+        live = RECIPES["live"].config.task.randomization
+        task = replace(QUIET, randomization=replace(live, hand_latency=(0.0, 2.0)))
+        env, other = self.make(task), self.make(task, seed=1)
+        self.play(env, 5)
         other.restore(env.snapshot())
         other.generator.set_state(env.generator.get_state())
-        for action in self.actions(5, seed=1):
-            one, *_ = env.step(action)
-            two, *_ = other.step(action)
-        assert_close(one["policy"], two["policy"], atol=1e-4, rtol=0)
+        one, two = (self.play(each, 5, seed=1)[-1]["policy"] for each in (env, other))
+        assert_close(one, two, atol=1e-4, rtol=0)
         assert_close(env.variation.parameters, other.variation.parameters)
 
     def test_a_step_with_all_of_it_never_waits_for_the_device(self):
@@ -564,72 +507,50 @@ class RobustnessTest(WithEnv):
         for recipe in ("live", "published"):
             env = self.make(RECIPES[recipe].config.task)
             waiting = Waiting()
-            with (
-                mock.patch.object(env._graphs, "active", True),
-                mock.patch.object(env._graphs, "run", lambda part: part()),
-            ):
-                with mock.patch.object(env.backend, "set_where"), waiting:
-                    env.step(self.actions(1)[0])
+            with patch.multiple(env._graphs, active=True, run=lambda part: part()):
+                with patch.object(env.backend, "set_where"), waiting:
+                    self.play(env, 1)
                 self.assertGreater(waiting.operations, 500)
                 self.assertEqual(waiting.found, [])
                 with waiting:
                     # an engine on the CPU asks which worlds begin anew: that must show
-                    env.step(self.actions(1)[0])
+                    self.play(env, 1)
                 self.assertEqual(waiting.found, ["aten.nonzero.default"])
 
 
-class ObjectFrameTest(WithEnv):
+class ObjectFrameTest(WithEnv, InFolder):
     """The same thing, drawn in another place and along other axes of its file."""
 
     TURN = Rotation.from_euler("xyz", (100, -35, 160), degrees=True)
     SHIFT = np.array([0.03, -0.12, 0.2])
 
-    @classmethod
-    def setUpClass(cls):
-        super().setUpClass()
-        folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
-        corners = np.random.default_rng(2).normal(size=(14, 3)) * (0.02, 0.03, 0.05)
-        mesh = trimesh.convex.convex_hull(corners + np.array([0.0, 0.01, 0.05]))
-        cls.specs = []
-        for name, vertices in (
-            ("drawn", mesh.vertices),
-            ("moved", cls.TURN.apply(mesh.vertices) + cls.SHIFT),
-        ):
-            (folder / name).mkdir()
-            trimesh.Trimesh(vertices, mesh.faces, process=False).export(
-                folder / name / f"{SOUP}.obj", digits=12
-            )
-            cls.specs.append(load_object(SOUP, folder / name))
+    def loaded(self, mesh):
+        path = self.folder / f"{SOUP}.obj"
+        mesh.export(path, digits=12)
+        return load_object(SOUP, self.folder)
 
     def moved_bank(self):
         """The bank with the poses that the moved mesh has where the other one was."""
         poses = {}
-        bank = toy_bank(self.robot)
-        for pos, quat in (
-            ("start_pos", "start_quat_wxyz"),
-            ("goal_pos", "goal_quat_wxyz"),
-            ("object_pos", "object_quat_wxyz"),
-        ):
-            turn = Rotation.from_quat(getattr(bank, quat), scalar_first=True) * self.TURN.inv()
+        for name in ("start", "goal", "object"):
+            pos, quat = (f"{name}_{part}" for part in ("pos", "quat_wxyz"))
+            turn = Rotation.from_quat(getattr(self.bank, quat), scalar_first=True)
+            turn *= self.TURN.inv()
             poses[quat] = turn.as_quat(scalar_first=True).astype(np.float32)
-            poses[pos] = (getattr(bank, pos) - turn.apply(self.SHIFT)).astype(np.float32)
-        return toy_bank(self.robot, **poses)
+            poses[pos] = (getattr(self.bank, pos) - turn.apply(self.SHIFT)).astype(np.float32)
+        return replace(self.bank, **poses)
 
-    def played(self, spec, bank, task: TaskConfig) -> list[torch.Tensor]:
+    def played(self, spec, bank, task):
         """Observations, rewards and actions of every step; the action is a function of the observations."""
         backend = MujocoBackend(make_scene(self.robot, (spec,), task), N, workers=0)
         self.addCleanup(backend.close)
         pivots = object_origins((spec,), task)
-        env = ManipulationEnv(
-            backend,
-            task,
-            ResetDistribution(bank, self.robot, (spec.name,), task.reset, "cpu", pivots),
-        )
+        resets = ResetDistribution(bank, self.robot, (spec.name,), task.reset, "cpu", pivots)
+        env = ManipulationEnv(backend, task, resets)
         found = []
         for _ in range(5):  # contact makes rounding grow from the seventh step on
-            flat = torch.cat(
-                [value.flatten(1) for _, value in sorted(env.get_observations().items())], dim=-1
-            )
+            groups = sorted(env.get_observations().items())
+            flat = torch.cat([value.flatten(1) for _, value in groups], dim=-1)
             weights = torch.randn(flat.shape[1], 7, generator=torch.Generator().manual_seed(0))
             action = torch.tanh(0.1 * flat @ weights)
             _, reward, *_ = env.step(action)
@@ -645,18 +566,24 @@ class ObjectFrameTest(WithEnv):
         ]
 
     def test_the_frame_of_a_mesh_does_not_matter(self):
+        live = RECIPES["live"].config.task
         task = replace(
-            RECIPES["live"].config.task, distance_points=64, randomization=RandomizationConfig()
+            live,
+            distance_points=64,
+            randomization=RandomizationConfig(),
+            reset=replace(live.reset, training_xy=0.05),
         )
-        task = replace(task, reset=replace(task.reset, training_xy=0.05))
-        one = self.played(self.specs[0], toy_bank(self.robot), task)
-        other = self.played(self.specs[1], self.moved_bank(), task)
+        corners = default_rng(2).normal(size=(14, 3)) * (0.02, 0.03, 0.05)
+        mesh = trimesh.convex.convex_hull(corners + np.array([0.0, 0.01, 0.05]))
+        drawn = self.loaded(mesh)
+        vertices = self.TURN.apply(mesh.vertices) + self.SHIFT
+        moved = self.loaded(trimesh.Trimesh(vertices, mesh.faces, process=False))
+        one = self.played(drawn, self.bank, task)
+        other = self.played(moved, self.moved_bank(), task)
         for step, (a, b) in enumerate(zip(one, other, strict=True)):
             assert_close(a, b, atol=1e-4, rtol=1e-4, msg=lambda text, step=step: f"{step}: {text}")
-        away = self.played(self.specs[0], toy_bank(self.robot), replace(task, object_frame="mesh"))[
-            0
-        ]
-        self.assertGreater(float((one[0] - away).abs().max()), 0.01)
+        away, *_ = self.played(drawn, self.bank, replace(task, object_frame="mesh"))
+        self.assertGreater((one[0] - away).abs().max(), 0.01)
 
 
 class FailureTest(WithEnv):
@@ -669,54 +596,43 @@ class FailureTest(WithEnv):
         env.backend.set_state(replace(state, object_pos=pos))
         _, reward, done, extras = env.step(torch.zeros(N, 7))
         self.assertEqual((done.tolist(), extras["time_outs"].tolist()), ([1] * N, [0.0, 1.0, 1.0]))
-        self.assertAlmostEqual(float(reward[0]), -5.0, delta=0.02)
-        self.assertGreater(float(reward[1:].min()), -0.02)
+        self.assertAlmostEqual(reward[0], -5.0, delta=0.02)
+        self.assertGreater(reward[1:].min(), -0.02)
 
     def test_a_world_that_is_not_finite_ends_teaches_nothing_and_is_counted(self):
         """Whether its simulation breaks or its action is not finite; the other worlds go on."""
         env = self.make(kind=BreakableBackend)
         same = self.make()
         action = self.actions(1)[0]
-        for i, value in enumerate((0.0, torch.nan, torch.inf)):
+        for count, value in enumerate((0.0, torch.nan, torch.inf), 1):
             bad = action.clone()
-            if i:
-                bad[1, 3] = value
-            else:
-                env.backend.broken[1] = True
+            bad[1, 3] = value
+            env.backend.broken[1] = value == 0.0
             observations, reward, done, extras = env.step(bad)
             same.step(action)
-            self.assertEqual(
-                (done.tolist(), extras["faulty"].tolist()), ([0, 1, 0], [False, True, False])
-            )
-            self.assertEqual(extras["time_outs"].tolist(), [0.0, 1.0, 0.0])
-            self.assertEqual(float(reward[1]), 0.0)
+            for told in (done, extras["faulty"], extras["time_outs"]):
+                self.assertEqual(told.tolist(), [0, 1, 0])
+            self.assertEqual(reward[1], 0.0)
             self.assertTrue(reward.isfinite().all())
             self.assert_finite(observations)
             self.assert_finite(extras["log"])
-            self.assertEqual(float(extras["log"]["health/nonfinite_total"]), i + 1)
+            self.assertEqual(extras["log"]["health/nonfinite_total"], count)
             self.assert_same(env.backend.state(), same.backend.state(), [0, 2])
-        _, reward, done, extras = env.step(action)
+        _, reward, done, _ = env.step(action)
         self.assertEqual((int(env.nonfinite_count), done.tolist()), (3, [0] * N))
-        self.assertNotEqual(float(reward[1]), 0.0)
+        self.assertNotEqual(reward[1], 0.0)
 
 
 class RolloutTest(WithEnv):
     TASK = evaluation_task(TASK)
 
-    def roll_out(
-        self, policy, num_envs: int, backend: type[MujocoBackend] = MujocoBackend, **options
-    ):
+    def roll_out(self, policy, num_envs, backend=MujocoBackend, **options):
         def make(scene, num_worlds, object_index):
             return backend(scene, num_worlds, workers=0, object_index=object_index)
 
-        trial = Trial(
-            robot=self.robot,
-            objects=tuple(self.objects),
-            bank=self.bank,
-            task=self.TASK,
-            num_envs=num_envs,
-            **options,
-        )
+        objects = tuple(self.objects)
+        parts = {"robot": self.robot, "objects": objects, "bank": self.bank, "task": self.TASK}
+        trial = Trial(**parts, num_envs=num_envs, **options)
         return roll_out(policy, Engine(name="mujoco", make=make, version=""), trial, repetitions=2)
 
     def test_every_demonstration_is_played_and_the_number_of_worlds_changes_nothing(self):
@@ -727,9 +643,8 @@ class RolloutTest(WithEnv):
         )
         self.assertEqual([e.object for e in found.episodes], [SOUP, SOUP, SPAM, SPAM, SOUP, SOUP])
         self.assertEqual(found.episodes[2].sequence_name, "demo_b")
-        self.assertEqual(
-            [(t.sequence, t.object) for t in found.traces], [(0, SOUP), (1, SPAM), (2, SOUP)]
-        )
+        shown = [(t.sequence, t.object) for t in found.traces]
+        self.assertEqual(shown, [(0, SOUP), (1, SPAM), (2, SOUP)])
         trace = found.traces[0]
         self.assertEqual((trace.joint_pos.shape, trace.object_pos.shape), ((11, 7), (11, 3)))
         assert_allclose(np.diff(trace.time), 0.05)
@@ -742,23 +657,20 @@ class RolloutTest(WithEnv):
 
     def test_each_repetition_has_a_start_of_its_own_and_the_seed_decides(self):
         class Watching(ZeroPolicy):
-            def begin(self, env: ManipulationEnv) -> None:
+            def begin(self, env):
                 # worlds: soup, soup, soup, soup, spam, spam
                 self.seen = env.backend.state().object_pos.numpy().copy()
 
-        def starts(**options) -> np.ndarray:
+        def starts(**options):
             policy = Watching(7)
             self.roll_out(policy, 6, **options)
             return policy.seen
 
         found = starts()
         assert_array_equal(found, starts())
-        self.assertGreater(np.abs(found - starts(seed=1)).max(axis=1).min(), 1e-4)
-        self.assertGreater(
-            np.abs(found[0::2] - found[1::2]).max(axis=1).min(),
-            1e-4,
-            "the repetitions of a demonstration differ",
-        )
+        # another seed, and the other repetition of each demonstration
+        for difference in (found - starts(seed=1), found[0::2] - found[1::2]):
+            self.assertGreater(np.abs(difference).max(axis=1).min(), 1e-4)
         away = np.abs(found - self.bank.start_pos[[0, 0, 2, 2, 1, 1]])
         self.assertTrue(0 < away[:, :2].max() <= 0.02 and away[:, 2].max() < 1e-6)
 
@@ -786,19 +698,16 @@ class KinematicRetargetingTest(WithEnv):
         )
         env = self.make(task)
         lengths = [7, 5, 6]
-        rng = np.random.default_rng(0)
-        low = env.actions.lower.numpy()
-        high = env.actions.upper.numpy()
-        paths = [
-            low + (high - low) * (0.5 + 0.02 * np.cumsum(rng.random((n, 7)), axis=0))
-            for n in lengths
-        ]
+        rng = default_rng(0)
+        low, high = env.actions.lower.numpy(), env.actions.upper.numpy()
+        shares = [0.5 + 0.02 * np.cumsum(rng.random((n, 7)), axis=0) for n in lengths]
+        paths = [low + (high - low) * share for share in shares]
         for path in paths:
             path[:, :3] = 0.01 * path[:, :3] + 0.01  # the arm can follow
         retargeted = SimpleNamespace(
             joint_pos=np.concatenate(paths), frame_offsets=np.cumsum([0, *lengths]), fps=30.0
         )
-        self.enterContext(mock.patch("xreset.eval.policy_spec.LEAD_IN", 0.1))  # 6 control steps
+        self.enterContext(patch("xreset.eval.policy_spec.LEAD_IN", 0.1))  # 6 control steps
         policy = KinematicRetargeting(retargeted)
         policy.begin(env)
         targets = []
@@ -806,15 +715,12 @@ class KinematicRetargetingTest(WithEnv):
             env.advance(policy.act(env.get_observations()))
             targets.append(env.joint_target.numpy().copy())
         for world in range(N):
-            path = paths[int(env.sequence[world])]
+            path = paths[env.sequence[world]]
             found = np.stack(targets)[:, world]
             played = found[6 : 6 + 2 * len(path) : 2]  # 30 Hz frames at 60 Hz control
-            assert_allclose(played, path, atol=1e-4)
-            assert_allclose(found[-1], path[-1], atol=1e-4, err_msg="it holds the last frame")
-            assert_allclose(
-                found[2], 0.5 * (0.01 + path[0]), atol=1e-4, err_msg="half of the lead-in"
-            )
-
-
-if __name__ == "__main__":
-    unittest.main()
+            for name, a, b in (
+                ("path", played, path),
+                ("it holds the last frame", found[-1], path[-1]),
+                ("half of the lead-in", found[2], 0.5 * (0.01 + path[0])),
+            ):
+                assert_allclose(a, b, atol=1e-4, err_msg=name)

@@ -1,23 +1,21 @@
 """Engine plugins: how they are found and what goes wrong; and the examples, where their engines are installed."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import io
 import re
 import sys
-import tempfile
 import tomllib
 import unittest
 from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import ClassVar
-from unittest import mock
+from unittest.mock import patch
 
 import torch
 
+from tests.data import InFolder
 from xreset import plugins
 from xreset.backends.conformance import CHECKS, run
 from xreset.backends.conformance.scene import scene
@@ -29,28 +27,27 @@ EXAMPLES = {"drake": "pydrake", "newton": "newton"}
 """What each example's engine is imported as."""
 
 
-def folder_of(engine: str) -> Path:
+def folder_of(engine):
     return Path(__file__).resolve().parents[1] / "examples" / f"xreset-{engine}"
 
 
-def declared(engine: str) -> EntryPoint:
+def declared(engine):
     """The entry point of an example, as its pyproject.toml states it."""
     project = tomllib.loads((folder_of(engine) / "pyproject.toml").read_text())["project"]
     [(name, value)] = project["entry-points"][plugins.ENGINES].items()
     return EntryPoint(name=name, value=value, group=plugins.ENGINES)
 
 
-class PluginTest(unittest.TestCase):
+class PluginTest(InFolder):
     """Without any foreign engine: a package in a folder of its own, made known by an entry point."""
 
-    def plugin(self, source: str, value: str = "someones_engine:SomeonesBackend") -> None:
-        folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
-        (folder / "someones_engine.py").write_text(source)
-        self.enterContext(mock.patch.object(sys, "path", [str(folder), *sys.path]))
-        self.enterContext(mock.patch.dict(sys.modules))
+    def plugin(self, source, value="someones_engine:SomeonesBackend"):
+        (self.folder / "someones_engine.py").write_text(source)
+        self.enterContext(patch.object(sys, "path", [str(self.folder), *sys.path]))
+        self.enterContext(patch.dict(sys.modules))
         sys.modules.pop("someones_engine", None)
         entry = EntryPoint(name="someones", value=value, group=plugins.ENGINES)
-        self.enterContext(mock.patch.object(plugins, "entry_points", lambda group: [entry]))
+        self.enterContext(patch.object(plugins, "entry_points", lambda group: [entry]))
 
     def test_a_plugin_is_found_built_and_tested_like_any_engine(self):
         self.plugin(
@@ -68,7 +65,7 @@ class PluginTest(unittest.TestCase):
         self.assertIn("someones 7.1", out.getvalue())
         self.assertIn("no check failed", out.getvalue())
 
-    def assert_unavailable(self, pattern: str) -> None:
+    def assert_unavailable(self, pattern):
         with self.assertRaisesRegex(BackendUnavailableError, pattern):
             make_backend("someones", scene(), 1)
         self.assertRegex(backend_status("someones").reason or "", pattern)
@@ -121,9 +118,9 @@ class ExampleTest(unittest.TestCase):
             }
             with (
                 self.subTest(engine),
-                mock.patch.object(sys, "path", [str(folder_of(engine)), *sys.path]),
-                mock.patch.dict(sys.modules, kept | absent, clear=True),
-                mock.patch.object(
+                patch.object(sys, "path", [str(folder_of(engine)), *sys.path]),
+                patch.dict(sys.modules, kept | absent, clear=True),
+                patch.object(
                     plugins, "entry_points", lambda group, engine=engine: [declared(engine)]
                 ),
             ):
@@ -162,15 +159,13 @@ class EngineTest:
             raise unittest.SkipTest(
                 f"{cls.engine} is not installed: pip install -e examples/xreset-{cls.engine}"
             ) from None
-        cls.enterClassContext(
-            mock.patch.object(sys, "path", [str(folder_of(cls.engine)), *sys.path])
-        )
+        cls.enterClassContext(patch.object(sys, "path", [str(folder_of(cls.engine)), *sys.path]))
         cls.backend = declared(cls.engine).load()
 
     def make(self, scene, num_worlds, *, object_index=None):
         return self.backend(scene, num_worlds, object_index=object_index, workers=0)
 
-    def test_checks_of_the_suite(self: unittest.TestCase):  # pyright: ignore[reportGeneralTypeIssues]
+    def test_checks_of_the_suite(self):  # pyright: ignore[reportGeneralTypeIssues]
         for result in run(self.make, only=self.checks.split()):
             with self.subTest(result.name):
                 self.assertEqual(result.verdict, "passed", f"{result.worst} {result.problem}")
@@ -217,7 +212,7 @@ class DrakeTest(EngineTest, unittest.TestCase):
             good = type(good)(**{name: value.clone() for name, value in vars(good).items()})
             [world] = backend._team._worlds
             with (
-                mock.patch.object(world, "_simulator") as simulator,
+                patch.object(world, "_simulator") as simulator,
                 self.assertWarnsRegex(
                     UserWarning,
                     "gives up on a world, which counts as not finite from now on: too much",
@@ -225,11 +220,11 @@ class DrakeTest(EngineTest, unittest.TestCase):
             ):
                 simulator.AdvanceTo.side_effect = RuntimeError("too much")
                 backend.step()
-            self.assertTrue(bool(backend.health().nonfinite[0]))
-            self.assertTrue(bool(backend.links().pos.isnan().all()))
+            self.assertTrue(backend.health().nonfinite[0])
+            self.assertTrue(backend.links().pos.isnan().all())
             backend.set_state(good)
             backend.step()
-            self.assertFalse(bool(backend.health().nonfinite[0]))
+            self.assertFalse(backend.health().nonfinite[0])
             torch.testing.assert_close(
                 backend.state().object_pos, good.object_pos, atol=1e-3, rtol=0
             )

@@ -7,20 +7,19 @@ import os
 import re
 import subprocess
 import sys
-import tempfile
-import unittest
 from pathlib import Path
-from unittest import mock
+from unittest import TestCase, mock, skipUnless
 
 import trimesh
 
 import xreset
+from tests.data import InFolder, InOneFolder
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 NUMBERED = sorted(EXAMPLES.glob("[0-9]*.py"))
 
 
-def run(name: str, *arguments) -> str:
+def run(name, *arguments):
     with (
         mock.patch.object(sys, "path", [str(EXAMPLES), *sys.path]),
         contextlib.redirect_stdout(io.StringIO()) as out,
@@ -29,11 +28,11 @@ def run(name: str, *arguments) -> str:
     return out.getvalue()
 
 
-def has(*packages: str) -> bool:
+def has(*packages):
     return all(importlib.util.find_spec(package) for package in packages)
 
 
-class FaceTest(unittest.TestCase):
+class FaceTest(TestCase):
     def test_every_name_is_there_and_documented(self):
         for name in xreset.__all__:
             if name == "VectorEnv" and not has("gymnasium"):
@@ -73,7 +72,7 @@ class FaceTest(unittest.TestCase):
             self.assertLessEqual({*re.findall(r"\bxreset\.(\w+)", program)}, {*xreset.__all__})
 
 
-class ShelfTest(unittest.TestCase):
+class ShelfTest(InFolder):
     def test_they_are_numbered_and_short(self):
         self.assertEqual(
             [file.name[:2] for file in NUMBERED], [f"{number:02}" for number in range(13)]
@@ -94,29 +93,27 @@ class ShelfTest(unittest.TestCase):
         lines = run("06_own_engine").splitlines()
         self.assertEqual([line.split()[0] for line in lines], ["passed", "passed", "failed"], lines)
 
-    @unittest.skipUnless(
+    @skipUnless(
         has("coal", "pybullet", "onnxruntime", "imageio_ffmpeg"),
         "an engine or a codec is not installed",
     )
     def test_a_shipped_policy_is_filmed_with_an_unseen_object(self):
-        with tempfile.TemporaryDirectory() as folder:
-            trimesh.creation.cylinder(radius=0.035, height=0.09).export(Path(folder) / "beaker.obj")
-            run("00_film_a_policy", folder, "beaker", f"{folder}/film.mp4")
-            self.assertGreater((Path(folder) / "film.mp4").stat().st_size, 10_000)
+        trimesh.creation.cylinder(radius=0.035, height=0.09).export(self.folder / "beaker.obj")
+        run("00_film_a_policy", self.folder, "beaker", f"{self.folder}/film.mp4")
+        self.assertGreater((self.folder / "film.mp4").stat().st_size, 10_000)
 
     def test_a_robot_is_checked(self):
-        with tempfile.TemporaryDirectory() as folder:
-            self.assertIn("my-robot: 0 errors", run("05_own_robot", Path(folder)))
-            self.assertTrue((Path(folder) / "my-robot" / "robot.png").is_file())
+        self.assertIn("my-robot: 0 errors", run("05_own_robot", self.folder))
+        self.assertTrue((self.folder / "my-robot" / "robot.png").is_file())
 
 
-@unittest.skipUnless(has("coal"), "coal is not installed")
-class FromABankTest(unittest.TestCase):
+@skipUnless(has("coal"), "coal is not installed")
+class FromABankTest(InOneFolder):
     """Those that need the files of the first two."""
 
     @classmethod
     def setUpClass(cls):
-        cls.folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
+        super().setUpClass()
         cls.said = run("01_load_and_view", cls.folder), run("02_retarget_own_keypoints", cls.folder)
         cls.bank = cls.folder / "bank.npz"
 
@@ -147,22 +144,20 @@ class FromABankTest(unittest.TestCase):
             run("04_own_reward", self.bank), r"upright pays 0\.[0-4]\d*[1-9]\d* per step"
         )
 
-    @unittest.skipUnless(has("rsl_rl", "onnx"), "rsl-rl-lib or onnx is not installed")
+    @skipUnless(has("rsl_rl", "onnx"), "rsl-rl-lib or onnx is not installed")
     def test_a_policy_is_trained(self):
         said = run("07_train", self.bank, self.folder / "run")
         self.assertIn("trained run for 2 iterations, on 005_tomato_soup_can", said)
         self.assertTrue((self.folder / "run" / "policy.onnx").is_file())
 
-    @unittest.skipUnless(
-        has("onnxruntime", "matplotlib"), "onnxruntime or matplotlib is not installed"
-    )
+    @skipUnless(has("onnxruntime", "matplotlib"), "onnxruntime or matplotlib is not installed")
     def test_a_policy_is_evaluated(self):
         self.assertRegex(
             run("08_evaluate_and_plot", self.folder, ("mujoco",)), r"task progress [1-9]\d*%"
         )
         self.assertTrue((self.folder / "progress.png").is_file())
 
-    @unittest.skipUnless(has("onnxruntime"), "onnxruntime is not installed")
+    @skipUnless(has("onnxruntime"), "onnxruntime is not installed")
     def test_a_policy_plays_where_nothing_can_train(self):
         hidden = "import sys; sys.modules.update(dict.fromkeys(('rsl_rl', 'warp', 'mujoco_warp', 'onnx', 'tensorboard')))"
         program = f"{hidden}; sys.path.insert(0, {str(EXAMPLES)!r}); __import__('09_play_a_policy').main(sys.argv[1])"
@@ -172,12 +167,10 @@ class FromABankTest(unittest.TestCase):
         )  # fmt: skip
         self.assertEqual(done.returncode, 0, done.stderr)
         self.assertLess(
-            float(done.stdout.partition("the object ends ")[2].partition(" cm")[0]),
-            5.0,
-            done.stdout,
+            done.stdout.partition("the object ends ")[2].partition(" cm")[0], 5.0, done.stdout
         )
 
-    @unittest.skipUnless(has("onnxruntime"), "onnxruntime is not installed")
+    @skipUnless(has("onnxruntime"), "onnxruntime is not installed")
     def test_a_policy_says_where_it_cannot_play(self):
         bank = xreset.read_bank(self.bank)
         objects = [xreset.load_object(name) for name in bank.object_names]
@@ -194,10 +187,6 @@ class FromABankTest(unittest.TestCase):
             with self.assertRaisesRegex(xreset.XResetError, "World 1 does not exist"):
                 xreset.film("soup-can", env, "film.mp4", world=1)
 
-    @unittest.skipUnless(has("gymnasium"), "gymnasium is not installed")
+    @skipUnless(has("gymnasium"), "gymnasium is not installed")
     def test_other_learning_code_trains(self):
         self.assertRegex(run("10_gymnasium", self.bank), r"iteration 3: reward per step -?\d")
-
-
-if __name__ == "__main__":
-    unittest.main()

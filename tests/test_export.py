@@ -1,14 +1,15 @@
 """Episodes for others: a LeRobot data set, which that package reads back, and plain arrays."""
 
-import importlib.util
 import json
-import tempfile
-import unittest
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
+from unittest import skipUnless
 
 import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
 
+from tests.data import InFolder
 from tests.toy_results import toy_rollouts, toy_summary
 from xreset.description import load_robot
 from xreset.errors import FileFormatError, RunError, XResetError
@@ -17,30 +18,19 @@ from xreset.eval.export.recorded import read_recorded, write_arrays
 from xreset.eval.results import write_results
 from xreset.files import file_hash
 
-PARQUET = importlib.util.find_spec("pyarrow") is not None
-FILMS = PARQUET and importlib.util.find_spec("imageio_ffmpeg") is not None
-LEROBOT = importlib.util.find_spec("lerobot") is not None
+PARQUET = find_spec("pyarrow") is not None
+FILMS = PARQUET and find_spec("imageio_ffmpeg") is not None
+LEROBOT = find_spec("lerobot") is not None
 
 
-class Case(unittest.TestCase):
-    @classmethod
-    def setUpClass(cls):
-        cls.robot = load_robot("ur7e-sharpa")
-
-    def setUp(self):
-        folder = tempfile.TemporaryDirectory()
-        self.addCleanup(folder.cleanup)
-        self.folder = Path(folder.name)
+class Case(InFolder):
+    robot = load_robot("ur7e-sharpa")
 
     def evaluate(self, name="eval", engines=("mujoco", "sapien"), change=lambda rollouts: rollouts):
         rollouts = change(toy_rollouts(np.array([joint.home for joint in self.robot.joints])))
         for engine in engines:
-            write_results(
-                self.folder / name,
-                toy_summary(engine, rollouts, robot="ur7e-sharpa"),
-                rollouts,
-                self.robot.joint_names,
-            )
+            summary = toy_summary(engine, rollouts, robot="ur7e-sharpa")
+            write_results(self.folder / name, summary, rollouts, self.robot.joint_names)
         return self.folder / name
 
     def change_first(self, **changes):
@@ -56,11 +46,11 @@ class Episodes(Case):
         self.assertEqual(
             list(recording.episodes["engine"]), ["mujoco", "mujoco", "sapien", "sapien"]
         )
-        np.testing.assert_array_equal(recording.offsets, [0, 5, 10, 15, 20])
+        assert_array_equal(recording.offsets, [0, 5, 10, 15, 20])
         steps = (recording.episodes["action"][0] - recording.robot.home)[
             :, 0
         ] / 0.01  # 12 control steps between 5 states
-        np.testing.assert_allclose(steps, [2, 5, 8, 11, 11], atol=1e-4)
+        assert_allclose(steps, [2, 5, 8, 11, 11], atol=1e-4)
         self.assertEqual(
             recording.episodes["task"][0],
             "Grasp the tomato soup can and bring it to the goal pose.",
@@ -83,7 +73,7 @@ class Episodes(Case):
         self.assertEqual(list(map(len, recording.episodes["action"])), [5])
 
     def test_refusals(self):
-        def changed(name: str, **changes):
+        def changed(name, **changes):
             return self.evaluate(
                 name,
                 change=lambda r: replace(r, traces=tuple(replace(t, **changes) for t in r.traces)),
@@ -113,8 +103,8 @@ class Episodes(Case):
 class Arrays(Case):
     def test_every_array_of_the_documentation(self):
         recording = read_recorded([self.evaluate()])
-        write_arrays(self.folder / "out.npz", recording)
-        with np.load(self.folder / "out.npz") as file:
+        write_arrays(f"{self.folder}/out.npz", recording)
+        with np.load(f"{self.folder}/out.npz") as file:
             arrays = dict(file)
         page = (Path(__file__).parents[1] / "docs/rollouts.md").read_text().split("## npz")[1]
         documented = {
@@ -125,16 +115,16 @@ class Arrays(Case):
         }
         self.assertEqual(documented, set(arrays))
         self.assertEqual(str(arrays["schema"]), "xreset-rollouts/1")
-        self.assertIn(file_hash(self.folder / "eval/sapien.trace.npz"), str(arrays["meta"]))
+        self.assertIn(file_hash(f"{self.folder}/eval/sapien.trace.npz"), str(arrays["meta"]))
         self.assertEqual(arrays["joint_pos"].shape, (20, len(self.robot.joints)))
-        np.testing.assert_allclose(
+        assert_allclose(
             arrays["object_pos"][5:10], recording.episodes["trace"][1].object_pos, atol=1e-7
         )
         self.assertEqual(arrays["engine"].tolist(), ["mujoco", "mujoco", "sapien", "sapien"])
         self.assertEqual(arrays["success"].tolist(), [True, False, True, False])
 
 
-@unittest.skipUnless(PARQUET, "pyarrow is not installed")
+@skipUnless(PARQUET, "pyarrow is not installed")
 class LeRobot(Case):
     def test_meta_agrees_with_the_data(self):
         import pyarrow.parquet as parquet
@@ -151,14 +141,12 @@ class LeRobot(Case):
         ).to_pydict()
         self.assertEqual(set(data), set(info["features"]))
         self.assertEqual(data["index"], list(range(20)))
-        np.testing.assert_allclose(data["action"][5], recording.episodes["action"][1][0], rtol=1e-6)
-        np.testing.assert_allclose(
+        assert_allclose(data["action"][5], recording.episodes["action"][1][0], rtol=1e-6)
+        assert_allclose(
             data["observation.environment_state"][19][7:], [0.5, 0.35, 0.15, 1, 0, 0, 0], rtol=1e-6
         )
         stats = json.loads((root / "meta/stats.json").read_text())
-        np.testing.assert_allclose(
-            stats["action"]["mean"], np.mean(data["action"], axis=0), rtol=1e-6
-        )
+        assert_allclose(stats["action"]["mean"], np.mean(data["action"], axis=0), rtol=1e-6)
         episodes = parquet.read_table(root / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
         self.assertEqual(
             [(e["dataset_from_index"], e["dataset_to_index"]) for e in episodes],
@@ -183,11 +171,10 @@ class LeRobot(Case):
         lost = replace(
             recording, episodes=recording.episodes.assign(meshes=self.folder / "nowhere")
         )
-        with self.assertRaisesRegex(XResetError, "no folder"):
-            write_lerobot(self.folder / "set", lost)
+        self.assertRaisesRegex(XResetError, "no folder", write_lerobot, self.folder / "set", lost)
         self.assertEqual([p.name for p in self.folder.iterdir()], ["eval"])
 
-    @unittest.skipUnless(FILMS, "there is no encoder of films")
+    @skipUnless(FILMS, "there is no encoder of films")
     def test_films_of_depth_cameras(self):
         recording = read_recorded([self.evaluate()], backends=["sapien"])
         root = self.folder / "set"
@@ -200,7 +187,7 @@ class LeRobot(Case):
         self.assertLess(stats["min"][0][0][0], 0.05)  # beyond the table
         self.assertGreater(stats["max"][0][0][0], 0.4)  # the table
 
-    @unittest.skipUnless(LEROBOT and FILMS, "the package lerobot is not installed")
+    @skipUnless(LEROBOT and FILMS, "the package lerobot is not installed")
     def test_the_package_reads_it_back(self):
         from lerobot.datasets.lerobot_dataset import LeRobotDataset  # pyright: ignore[reportMissingImports]
 
@@ -214,15 +201,9 @@ class LeRobot(Case):
         item = found[8]
         trace = recording.episodes["trace"][1]
         action = recording.episodes["action"][1]
-        np.testing.assert_allclose(item["observation.state"], trace.joint_pos[3], atol=1e-6)
-        np.testing.assert_allclose(item["action"], action[3:5], atol=1e-6)
-        np.testing.assert_allclose(
-            item["observation.environment_state"][:3], trace.object_pos[3], atol=1e-6
-        )
+        assert_allclose(item["observation.state"], trace.joint_pos[3], atol=1e-6)
+        assert_allclose(item["action"], action[3:5], atol=1e-6)
+        assert_allclose(item["observation.environment_state"][:3], trace.object_pos[3], atol=1e-6)
         self.assertEqual((item["task"], item["engine"]), (recording.episodes["task"][1], "sapien"))
         self.assertEqual(tuple(item["observation.images.front"].shape), (3, 48, 64))
         self.assertEqual(set(found.meta.stats), set(found.meta.features) - {"engine"})
-
-
-if __name__ == "__main__":
-    unittest.main()

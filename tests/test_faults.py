@@ -1,15 +1,13 @@
 """Worlds that break are counted and not learned from, and a run with too many of them ends."""
 
-import tempfile
-import unittest
 from collections import deque
 from contextlib import redirect_stdout
 from io import StringIO
-from pathlib import Path
-from unittest import mock
+from unittest import TestCase, mock
 
 import torch
 
+from tests.data import InFolder
 from tests.test_env import TASK, BreakableBackend, N, WithEnv
 from tests.test_learning import observations
 from xreset.errors import RunError
@@ -41,9 +39,9 @@ class PlannedBackend(BreakableBackend):
             getattr(self, kind)[world] = True
 
 
-class Budget(unittest.TestCase):
+class Budget(TestCase):
     def test_the_share_of_a_window(self):
-        def counted(*faults: tuple[int, int]) -> None:
+        def counted(*faults):
             env = mock.Mock(nonfinite_count=torch.tensor(0), overflow_count=torch.tensor(0))
             runner = mock.Mock(
                 env=env,
@@ -70,12 +68,12 @@ class Environment(WithEnv):
             _, reward, done, extras = env.step(torch.zeros(N, 7))
             self.assertEqual(done.tolist(), [0, int(world_ends), 0])
             self.assertEqual(extras["faulty"].tolist(), [False, world_ends, False])
-            self.assertTrue(bool(reward.isfinite().all()))
+            self.assertTrue(reward.isfinite().all())
         self.assertEqual((int(env.overflow_count), int(env.nonfinite_count)), (1, 0))
 
 
-class Learning(unittest.TestCase):
-    def updated(self, faulty_reward: float, *, marked: bool) -> dict[str, torch.Tensor]:
+class Learning(TestCase):
+    def updated(self, faulty_reward, *, marked):
         """Weights after one update in which world 1's step 2 had that reward, and was the last of its episode."""
         torch.manual_seed(0)
         alg = SequencePpo(observations(N), 3, CONFIG, "cpu", Processes())
@@ -111,8 +109,8 @@ class Learning(unittest.TestCase):
             )
 
 
-class Run(WithEnv):
-    def train(self, folder: Path, plan: dict[int, tuple[str, int]]) -> TrainingRunner:
+class Run(WithEnv, InFolder):
+    def train(self, folder, plan):
         env = self.make(kind=PlannedBackend)
         env.backend.plan = plan
         torch.manual_seed(0)
@@ -122,13 +120,13 @@ class Run(WithEnv):
         return runner
 
     def test_few_faults_do_no_harm_and_too_many_end_the_run(self):
-        folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
+        folder = self.folder
         runner = self.train(
             folder / "few", {5: ("broken", 0), 6: ("overflow", 2), 20: ("broken", 1)}
         )
         self.assertEqual(runner.iteration, 3)
         for name, value in runner.alg.actor.state_dict().items():
-            self.assertTrue(bool(value.isfinite().all()), name)
+            self.assertTrue(value.isfinite().all(), name)
         # all in the second iteration
         plan = {step: ("broken" if step % 2 else "overflow", step % N) for step in range(9, 17)}
         self.assertGreater(len(plan), MAX_SHARE * WINDOW * 8 * N)
@@ -137,7 +135,3 @@ class Run(WithEnv):
         ):
             self.train(folder / "many", plan)
         self.assertEqual([c.name for c in checkpoints(folder / "many")], ["000001.pt"])
-
-
-if __name__ == "__main__":
-    unittest.main()

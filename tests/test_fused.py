@@ -5,8 +5,7 @@ The interpreter is chosen when Triton is imported: ``TRITON_INTERPRET=1 python -
 
 import importlib.util
 import os
-import unittest
-from unittest import mock
+from unittest import TestCase, mock, skipUnless
 
 import torch
 
@@ -15,15 +14,15 @@ from xreset.learning.model import PointNet
 ON_GPU = torch.cuda.is_available()
 
 
-@unittest.skipUnless(
+@skipUnless(
     importlib.util.find_spec("triton"),
     "Triton is not installed (it comes with PyTorch's CUDA builds)",
 )
-@unittest.skipUnless(
+@skipUnless(
     ON_GPU or os.environ.get("TRITON_INTERPRET") == "1",
     "no GPU here, and TRITON_INTERPRET=1 is not set",
 )
-class FusedPointNetTest(unittest.TestCase):
+class FusedPointNetTest(TestCase):
     @classmethod
     def setUpClass(cls):
         from xreset.learning import fused
@@ -31,9 +30,7 @@ class FusedPointNetTest(unittest.TestCase):
         cls.fused = fused
         cls.device = "cuda" if ON_GPU else "cpu"
 
-    def compare(
-        self, clouds: tuple[int, ...], dims: list[int], points: int, width: int
-    ) -> dict[str, float]:
+    def compare(self, clouds, dims, points, width):
         """Relative differences of the embeddings and of every gradient."""
         torch.manual_seed(clouds[0])
         net = PointNet(dims, point_width=width).to(self.device)
@@ -74,7 +71,3 @@ class FusedPointNetTest(unittest.TestCase):
             (64, (64, 256, 64)),
         ):
             self.assertFalse(self.fused.supports(points, widths), (points, widths))
-
-
-if __name__ == "__main__":
-    unittest.main()

@@ -1,12 +1,14 @@
 """Surfaces, convex shapes, and the distances of a robot from itself and the table."""
 
-import unittest
+from unittest import TestCase
 
 import numpy as np
 import torch
 import trimesh
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 
-from tests.toy_retarget import FLOAT, UPRIGHT, box_object
+from tests.toy_retarget import FLOAT, UPRIGHT, box_object, double
 from xreset import robots
 from xreset.geometry.balls import BARE, SPACING, inscribed_balls, link_balls, sharp_points
 from xreset.geometry.collision import SelfCollision, bounding_ball, height_above_table
@@ -21,18 +23,18 @@ from xreset.retarget.hand.model import HandModel
 from xreset.spec import Geometry, Shape, TableSpec
 
 
-def distance_from_box(points: np.ndarray, half: np.ndarray) -> np.ndarray:
+def distance_from_box(points, half):
     """[n] signed distance of points [n, 3] from a box around the origin."""
     beyond = np.abs(points) - half
     return np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(axis=1), 0)
 
 
-class SurfaceTest(unittest.TestCase):
+class SurfaceTest(TestCase):
     @classmethod
     def setUpClass(cls):
         size = (0.06, 0.08, 0.10)
         cls.surface = Surface(box_object(((0, 0, 0), size)))
-        cls.points = np.random.default_rng(0).uniform(-0.065, 0.065, (500, 3))
+        cls.points = default_rng(0).uniform(-0.065, 0.065, (500, 3))
         cls.exact = distance_from_box(cls.points, np.array(size) / 2)
 
     def test_signed_distance_of_a_box(self):
@@ -41,16 +43,14 @@ class SurfaceTest(unittest.TestCase):
         distance = distance.numpy()
         near = self.exact < 0.01
         # The field is off by half a cell where it has an edge.
-        np.testing.assert_allclose(distance[near], self.exact[near], atol=2.1e-3)
-        np.testing.assert_allclose(distance, self.exact, atol=4e-3)
+        assert_allclose(distance[near], self.exact[near], atol=2.1e-3)
+        assert_allclose(distance, self.exact, atol=4e-3)
         self.assertLess(np.abs(distance - self.exact).mean(), 4e-4)
 
     def test_nearest_point_is_exact(self):
         nearest, distance = self.surface.nearest(self.points)
-        np.testing.assert_allclose(distance, np.abs(self.exact), atol=1e-9)
-        np.testing.assert_allclose(
-            np.linalg.norm(nearest - self.points, axis=1), distance, atol=1e-12
-        )
+        assert_allclose(distance, np.abs(self.exact), atol=1e-9)
+        assert_allclose(np.linalg.norm(nearest - self.points, axis=1), distance, atol=1e-12)
 
     def test_faces_inside_the_solid_do_not_count(self):
         two = Surface(
@@ -60,18 +60,18 @@ class SurfaceTest(unittest.TestCase):
             torch.zeros(1, 3, dtype=FLOAT), torch.zeros(1).long()
         )
         # To the outer faces, not to the ends of the boxes at x = +-0.02.
-        self.assertAlmostEqual(distance.item(), -0.03, delta=2.1e-3)
+        self.assertAlmostEqual(distance, -0.03, delta=2.1e-3)
 
     def test_contacts_need_annotation_and_nearness(self):
         quat = np.array([[np.sqrt(0.5), 0, 0, np.sqrt(0.5)]])  # x of the object is y of the world
         keypoints = np.array([[[1.0, 2.045, 3.0], [1.0, 2.060, 3.0], [np.nan] * 3]])
         points, contact = self.surface.contacts(keypoints, np.array([[1.0, 2.0, 3.0]]), quat, 0.02)
         self.assertEqual(contact.tolist(), [[True, False, False]])
-        np.testing.assert_allclose(points[0, 0], [1.0, 2.03, 3.0], atol=1e-9)
-        np.testing.assert_array_equal(points[0, 1:], 0.0)
+        assert_allclose(points[0, 0], [1.0, 2.03, 3.0], atol=1e-9)
+        assert_array_equal(points[0, 1:], 0.0)
 
 
-class ShapesTest(unittest.TestCase):
+class ShapesTest(TestCase):
     BOX = Geometry(kind="box", size=(0.02, 0.03, 0.01))
     SPHERE = Geometry(kind="sphere", size=(0.02,))
     CAPSULE = Geometry(kind="capsule", size=(0.01, 0.03))
@@ -111,7 +111,7 @@ class ShapesTest(unittest.TestCase):
     def test_near_points_of_several_solids_are_those_that_looking_at_all_of_them_finds(self):
         sizes = ((0.06, 0.04, 0.02), (0.02, 0.02, 0.1))
         fields = DistanceFields.join([link_field([box((0, 0, 0), size)]) for size in sizes])
-        rng = np.random.default_rng(0)
+        rng = default_rng(0)
         points = torch.as_tensor(rng.uniform(-0.06, 0.06, (5000, 3)))
         limit = torch.as_tensor(rng.uniform(-0.01, 0.03, 5000))
         which = torch.as_tensor(rng.integers(2, size=5000))
@@ -129,16 +129,16 @@ class ShapesTest(unittest.TestCase):
         walls = [box((0, 0, z), (0.06, 0.04, 0.001)) for z in (-0.0095, 0.0095)]
         walls += [box((0, y, 0), (0.06, 0.001, 0.02)) for y in (-0.0195, 0.0195)]
         half = np.array((0.03, 0.02, 0.01))
-        points = np.random.default_rng(0).uniform(-1.2 * half, 1.2 * half, (2000, 3))
+        points = default_rng(0).uniform(-1.2 * half, 1.2 * half, (2000, 3))
         which = torch.zeros(len(points), dtype=torch.long)
         found = link_field(walls).signed_distance(torch.as_tensor(points), which)[0].numpy()
         solid = distance_from_box(points, half)
         middle = np.abs(points[:, 0]) < 0.015  # at its open ends a ball of a gap's size looks in
-        np.testing.assert_allclose(found[middle], solid[middle], atol=1e-3)
+        assert_allclose(found[middle], solid[middle], atol=1e-3)
         self.assertGreater((found - solid).min(), -1e-3)
 
     def test_distances_to_every_kind_of_shape(self):
-        points = np.random.default_rng(0).uniform(-0.07, 0.07, (300, 3))
+        points = default_rng(0).uniform(-0.07, 0.07, (300, 3))
         turn = trimesh.transformations.euler_matrix(0.3, -0.4, 0.5)
         for geometry in (
             *self.PRIMITIVES,
@@ -147,7 +147,7 @@ class ShapesTest(unittest.TestCase):
             with self.subTest(kind=geometry.kind):
                 shape = Shape(geometry=geometry, T_body_shape=turn)
                 expected = -trimesh.proximity.signed_distance(shape_mesh(shape), points)
-                np.testing.assert_allclose(signed_distance(shape, points), expected, atol=5e-4)
+                assert_allclose(signed_distance(shape, points), expected, atol=5e-4)
 
     def test_a_ball_around_balls(self):
         center, radius = bounding_ball(np.diag((2.0, 0.0, 0.0)), np.array((1.0, 0.5, 0.5)))
@@ -155,22 +155,20 @@ class ShapesTest(unittest.TestCase):
 
     def test_height_counts_only_above_the_table(self):
         table = TableSpec(center=(0.0, 0.0), half_size=(0.5, 0.5, 0.02))
-        points = torch.tensor([[0.0, 0.0, 0.03], [0.0, 0.6, -1.0]], dtype=FLOAT)
-        heights = height_above_table(points, torch.tensor([0.01, 0.01], dtype=FLOAT), table)
+        points = double([[0.0, 0.0, 0.03], [0.0, 0.6, -1.0]])
+        heights = height_above_table(points, double([0.01, 0.01]), table)
         self.assertAlmostEqual(heights[0].item(), 0.02)
-        self.assertEqual(heights[1].item(), float("inf"))
+        self.assertEqual(heights[1], float("inf"))
 
 
-class SelfCollisionTest(unittest.TestCase):
+class SelfCollisionTest(TestCase):
     """The UR7e with the Sharpa hand: at home, and with fingers that cross."""
 
     CROSSED = (("right_middle_MCP_AA", 0.3), ("right_ring_MCP_AA", -0.3))
 
-    @classmethod
-    def setUpClass(cls):
-        cls.robot = robots.load("ur7e-sharpa")
+    robot = robots.load("ur7e-sharpa")
 
-    def home_and(self, *changes: tuple[str, float]) -> np.ndarray:
+    def home_and(self, *changes):
         """[2, J] joints at home, and with some changed."""
         joints = np.tile(self.robot.home, (2, 1))
         for name, value in changes:
@@ -202,14 +200,14 @@ class SelfCollisionTest(unittest.TestCase):
         joints = torch.as_tensor(self.home_and(*self.CROSSED)[:, self.robot.hand_indices])[
             [0, 1, 1]
         ]
-        above = torch.tensor([0.0, 0.0, 1.0], dtype=FLOAT).expand(3, 3)
+        above = double([0.0, 0.0, 1.0]).expand(3, 3)
         quat = UPRIGHT.expand(3, 4)
         field = link_field([box((0, 0, 0), (0.1, 0.1, 0.1))])
         nothing = Objects(
             above + 10.0, quat_to_matrix(quat), torch.zeros(3, dtype=torch.long), field
         )
 
-        def found(q: torch.Tensor):
+        def found(q):
             return too_near(
                 model,
                 model.bodies(q, above, quat),
@@ -221,13 +219,9 @@ class SelfCollisionTest(unittest.TestCase):
 
         here = found(joints)
         self.assertEqual(sorted(set(here.frame.tolist())), [1, 2])
-        self.assertLess(float(here.value.min()), -0.003)
+        self.assertLess(here.value.min(), -0.003)
         column = model.kinematics.joint_names.index("right_middle_MCP_AA")
         moved = joints.clone()
         moved[:, column] += 1e-5
         change = (found(moved).value - here.value) / 1e-5
         torch.testing.assert_close(change, here.slope[:, column], atol=2e-3, rtol=0.0)
-
-
-if __name__ == "__main__":
-    unittest.main()

@@ -1,38 +1,33 @@
 """Goal sets: starts at rest, goals of each family within reach, and what is refused."""
 
-import tempfile
-import unittest
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from unittest import mock
+from unittest import TestCase, mock
 
 import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
+from tests.data import InFolder
 from tests.toy_bank import SOUP
 from tests.toy_goals import toy_goals
-from xreset.description import load_robot
+from xreset import GoalConfig, load_object, load_policy, load_robot, make_backend
 from xreset.errors import DemoError, FileFormatError, GoalError
-from xreset.eval.policy_spec import load_policy
 from xreset.eval.rollout import engine, load_trial, roll_out
 from xreset.inputs import load_inputs
-from xreset.objects.catalogue import load_object
 from xreset.objects.rest import rest_height
-from xreset.plugins import make_backend
 from xreset.records import npz_schema
-from xreset.resets.config import GoalConfig
 from xreset.resets.goals import FAMILIES, SCHEMA, make_goals, read_goals, write_goals
 
 BANANA = "011_banana"
 EXACT = GoalConfig(per_family=1, start_xy=0.0, start_yaw=0.0, goal_xy=0.0, goal_z=0.0, goal_yaw=0.0)
 
 
-def rotations(quat: np.ndarray) -> Rotation:
+def rotations(quat):
     return Rotation.from_quat(quat, scalar_first=True)
 
 
-class MadeTest(unittest.TestCase):
+class MadeTest(TestCase):
     @classmethod
     def setUpClass(cls):
         in_this_process = mock.patch(
@@ -43,7 +38,7 @@ class MadeTest(unittest.TestCase):
         cls.banana = load_object(BANANA)
         cls.exact = make_goals(["banana"], robot=cls.robot, config=EXACT)
 
-    def centers(self, goals, which: str) -> np.ndarray:
+    def centers(self, goals, which):
         """[S, 3] centres of mass."""
         turn = rotations(getattr(goals, f"{which}_quat_wxyz"))
         return getattr(goals, f"{which}_pos") + turn.apply(self.banana.com)
@@ -54,7 +49,7 @@ class MadeTest(unittest.TestCase):
         self.assertEqual(
             (goals.num_states, goals.object_names, goals.robot), (0, (BANANA,), "ur7e-sharpa")
         )
-        np.testing.assert_allclose(
+        assert_allclose(
             goals.start_pos[:, 2], rest_height(self.banana, goals.start_quat_wxyz), atol=2e-3
         )
         self.assertTrue(
@@ -63,10 +58,10 @@ class MadeTest(unittest.TestCase):
         ups = rotations(goals.start_quat_wxyz).inv().apply([0.0, 0.0, 1.0])
         self.assertLess((ups @ ups.T).min(), 0.9, "the banana rests on one side only")
         shift = self.centers(goals, "goal") - self.centers(goals, "start")
-        np.testing.assert_allclose(shift[:4], np.tile([0.0, 0.0, 0.2], (4, 1)), atol=1e-5)
+        assert_allclose(shift[:4], np.tile([0.0, 0.0, 0.2], (4, 1)), atol=1e-5)
         turn = rotations(goals.goal_quat_wxyz) * rotations(goals.start_quat_wxyz).inv()
         expected = np.radians(60) * np.array([[0.0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0]])
-        np.testing.assert_allclose(np.abs(turn.as_rotvec()[:4]), expected, atol=1e-5)
+        assert_allclose(np.abs(turn.as_rotvec()[:4]), expected, atol=1e-5)
 
     def test_offsets_are_those_of_the_published_paper(self):
         goals = make_goals(
@@ -76,7 +71,7 @@ class MadeTest(unittest.TestCase):
         self.assertTrue((np.abs(shift) <= [0.05, 0.05, 0.05]).all(), shift)
         self.assertTrue((np.ptp(shift, axis=0) > 0.01).all(), shift)
         turn = rotations(goals.goal_quat_wxyz) * rotations(goals.start_quat_wxyz).inv()
-        np.testing.assert_allclose(turn.as_rotvec()[:, :2], 0.0, atol=1e-5)
+        assert_allclose(turn.as_rotvec()[:, :2], 0.0, atol=1e-5)
         self.assertTrue(10 < np.degrees(turn.magnitude()).max() <= 55)
 
     def test_what_cannot_be_is_refused(self):
@@ -107,24 +102,19 @@ class MadeTest(unittest.TestCase):
         self.assertEqual(
             (goals.family.tolist(), goals.sequence_name.tolist()), (["own"], [f"{BANANA}/own_000"])
         )
-        np.testing.assert_allclose(
+        assert_allclose(
             np.concatenate((goals.goal_pos[0], goals.goal_quat_wxyz[0])), pose, atol=1e-6
         )
 
 
-class UsedTest(unittest.TestCase):
-    @classmethod
-    def setUpClass(cls):
-        cls.robot = load_robot("ur7e-sharpa")
-
-    def setUp(self):
-        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
+class UsedTest(InFolder):
+    robot = load_robot("ur7e-sharpa")
 
     def test_an_evaluation_plays_the_starts_and_goals_of_the_file(self):
         goals = toy_goals(self.robot)
-        write_goals(self.folder / "goals.npz", goals)
-        self.assertEqual(npz_schema(self.folder / "goals.npz"), SCHEMA)
-        np.testing.assert_array_equal(read_goals(self.folder / "goals.npz").family, goals.family)
+        write_goals(f"{self.folder}/goals.npz", goals)
+        self.assertEqual(npz_schema(f"{self.folder}/goals.npz"), SCHEMA)
+        assert_array_equal(read_goals(f"{self.folder}/goals.npz").family, goals.family)
         policy = load_policy("zero", robot="ur7e-sharpa")
         policy = replace(
             policy,
@@ -136,9 +126,9 @@ class UsedTest(unittest.TestCase):
         rollouts = roll_out(policy.start(None), engine("mujoco", workers=0), trial, repetitions=1)
         self.assertEqual([e.sequence_name for e in rollouts.episodes], goals.sequence_name.tolist())
         for i, trace in enumerate(rollouts.traces):
-            np.testing.assert_allclose(trace.object_pos[0], goals.start_pos[i], atol=1e-6)
-            np.testing.assert_allclose(trace.goal_pos, goals.goal_pos[i], atol=1e-6)
-            np.testing.assert_allclose(
+            assert_allclose(trace.object_pos[0], goals.start_pos[i], atol=1e-6)
+            assert_allclose(trace.goal_pos, goals.goal_pos[i], atol=1e-6)
+            assert_allclose(
                 trace.object_pos[-1], goals.start_pos[i], atol=2e-3, err_msg="it is not at rest"
             )
         with self.assertRaisesRegex(DemoError, "is a goal set, which holds no motion"):
@@ -169,7 +159,3 @@ class UsedTest(unittest.TestCase):
         ):
             with self.subTest(message), self.assertRaisesRegex(error, message):
                 load_inputs(toy_goals(self.robot, **changes))
-
-
-if __name__ == "__main__":
-    unittest.main()

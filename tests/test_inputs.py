@@ -1,32 +1,25 @@
 """Loading of demonstrations, motion and banks, with the robot and the objects that they need."""
 
-import tempfile
-import unittest
-from pathlib import Path
-
 import numpy as np
 
+from tests.data import InOneFolder
 from tests.toy_bank import SOUP, SPAM, toy_bank
-from xreset import robots
-from xreset.demos.archive import write_demos
-from xreset.demos.synth import synthesize
+from xreset import Retargeted, robots, synthesize, write_bank, write_demos
 from xreset.errors import DemoError, FileFormatError
 from xreset.files import file_hash
 from xreset.inputs import load_inputs
-from xreset.resets.bank import write_bank
-from xreset.retarget.file import Retargeted
 
 
-class InputsTest(unittest.TestCase):
+class InputsTest(InOneFolder):
     @classmethod
     def setUpClass(cls):
-        folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
+        super().setUpClass()
         cls.robot = robots.load("ur7e-sharpa")
         cls.demos = synthesize([SPAM, SOUP], 1, seed=0, fps=8.0)
-        cls.demos_file = folder / "demos.npz"
+        cls.demos_file = cls.folder / "demos.npz"
         write_demos(cls.demos_file, cls.demos)
-        cls.bank_file = folder / "resets.npz"
-        write_bank(cls.bank_file, toy_bank(cls.robot), config={}, inputs={})
+        cls.bank_file = cls.folder / "resets.npz"
+        write_bank(cls.bank_file, toy_bank(cls.robot))
 
     def test_demonstrations(self):
         inputs = load_inputs(self.demos_file)
@@ -74,7 +67,3 @@ class InputsTest(unittest.TestCase):
             FileFormatError, "was made with an imported mesh of 005_tomato_soup_can"
         ):
             load_inputs(other)
-
-
-if __name__ == "__main__":
-    unittest.main()

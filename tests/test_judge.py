@@ -2,11 +2,8 @@
 
 import io
 import json
-import tempfile
-import unittest
 from contextlib import redirect_stdout
 from dataclasses import replace
-from pathlib import Path
 from unittest import mock
 
 import numpy as np
@@ -14,13 +11,12 @@ import torch
 from PIL import Image
 
 from tests import toy_grasp
+from tests.data import InFolder
 from tests.toy_grasp import OPEN, brick, brick_pose, robot
+from xreset import SqueezeConfig, load_robot, write_bank
 from xreset.cli import main
-from xreset.description import load_robot
 from xreset.errors import DemoError, RobotError
 from xreset.geometry.kinematics import Kinematics
-from xreset.resets.bank import write_bank
-from xreset.resets.config import SqueezeConfig
 from xreset.robot_tools import judge as judging
 
 
@@ -37,7 +33,7 @@ def bank():
     )
 
 
-class Judge(unittest.TestCase):
+class Judge(InFolder):
     def test_a_firm_grip_holds_and_lifts(self):
         squeeze = SqueezeConfig(force=4.0, reach=0.01)
         found = judging.judge(bank(), robot(), (brick(),), squeeze=squeeze, num_envs=1)
@@ -59,14 +55,12 @@ class Judge(unittest.TestCase):
                 path, error = judging.arm_path(
                     kinematics, home, palm, rise=judging.HEIGHT, turn=turn
                 )
-                self.assertLess(float(error), 1.0)
+                self.assertLess(error, 1.0)
                 end = kinematics.link_poses(path[-1], ["palm"])[:, 0]
                 relative = torch.linalg.inv(palm[0]) @ end[0]
+                self.assertAlmostEqual(end[0, 2, 3] - palm[0, 2, 3], judging.HEIGHT, delta=0.005)
                 self.assertAlmostEqual(
-                    float(end[0, 2, 3] - palm[0, 2, 3]), judging.HEIGHT, delta=0.005
-                )
-                self.assertAlmostEqual(
-                    float(torch.atan2(relative[2, 1], relative[2, 2])), turn, delta=0.03
+                    torch.atan2(relative[2, 1], relative[2, 2]), turn, delta=0.03
                 )
 
     def test_a_bank_without_grasps_in_the_air_is_refused(self):
@@ -83,17 +77,14 @@ class Judge(unittest.TestCase):
             judging.judge(bank(), robot(), ())
 
     def test_a_weak_grip_drops_in_the_command(self):
-        folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
         self.enterContext(mock.patch("xreset.inputs.load_robot", return_value=robot()))
         self.enterContext(mock.patch("xreset.inputs.load_objects", return_value=(brick(),)))
-        write_bank(folder / "bank.npz", bank(), config={}, inputs={})
-        words = f"--robot gripper --backend mujoco --squeeze.force 0.2 --json {folder}/judge.json --picture {folder}/judge.png"
+        write_bank(f"{self.folder}/bank.npz", bank())
+        words = f"--robot gripper --backend mujoco --squeeze.force 0.2 --json {self.folder}/judge.json --picture {self.folder}/judge.png"
         with redirect_stdout(io.StringIO()) as output:
-            main(["robots", "judge", str(folder / "bank.npz"), *words.split()])
+            main(["robots", "judge", f"{self.folder}/bank.npz", *words.split()])
         self.assertRegex(output.getvalue(), r"brick +│ +3 +│ 0, 0, 0")
-        self.assertEqual(json.loads((folder / "judge.json").read_text())["rows"][0]["arm_fails"], 3)
-        self.assertEqual(Image.open(folder / "judge.png").size[0], 4 * judging._TILE[0])
-
-
-if __name__ == "__main__":
-    unittest.main()
+        self.assertEqual(
+            json.loads((self.folder / "judge.json").read_text())["rows"][0]["arm_fails"], 3
+        )
+        self.assertEqual(Image.open(self.folder / "judge.png").size[0], 4 * judging._TILE[0])

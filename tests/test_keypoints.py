@@ -3,19 +3,18 @@
 import csv
 import itertools
 import re
-import tempfile
-import unittest
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
-from tests.data import InFolder, data_dir, run
-from xreset.demos.archive import read_demos
+from tests.command import succeeds, xreset
+from tests.data import InFolder, data_dir
+from xreset import read_demos, synthesize
 from xreset.demos.keypoints import ORDERS, Convention, read_keypoints
-from xreset.demos.synth import synthesize
 from xreset.errors import DemoError, FileFormatError
 
 CAMERA = np.eye(4)
@@ -23,6 +22,12 @@ CAMERA[:3, :3] = Rotation.from_euler("xyz", [2.2, 0.1, 3.0]).as_matrix()
 CAMERA[:3, 3] = (0.4, 1.3, 0.9)
 """Pose of a camera that looks down at the table."""
 PLAIN = Convention(order="mediapipe", units="m", frame="table", fps=10.0)
+
+
+def turned(a, b, field):
+    """[F] angles [rad] between orientations of two archives."""
+    one, two = (Rotation.from_quat(getattr(d, field), scalar_first=True) for d in (a, b))
+    return (one.inv() * two).magnitude()
 
 
 def written(points, order):
@@ -78,17 +83,13 @@ class Synthetic(InFolder):
         return path
 
     def same(self, found, tolerance=2e-6):
-        np.testing.assert_allclose(found.hand_keypoints, self.demos.hand_keypoints, atol=tolerance)
-        np.testing.assert_allclose(found.object_pos, self.demos.object_pos, atol=tolerance)
+        assert_allclose(found.hand_keypoints, self.demos.hand_keypoints, atol=tolerance)
+        assert_allclose(found.object_pos, self.demos.object_pos, atol=tolerance)
         for field in (
             "object_quat_wxyz",
             "wrist_quat_wxyz",
         ):  # synthetic hands are the average hand
-            turn, own = (
-                Rotation.from_quat(getattr(d, field), scalar_first=True)
-                for d in (found, self.demos)
-            )
-            self.assertLess((turn.inv() * own).magnitude().max(), 1e-3)
+            self.assertLess(turned(found, self.demos, field).max(), 1e-3)
         self.assertEqual(found.object_name.tolist(), self.demos.object_name.tolist())
 
     def refused(self, message, convention=PLAIN, **changes):
@@ -114,18 +115,14 @@ class Synthetic(InFolder):
         xyzw = np.roll(wxyz, -1, axis=1)
         self.same(read_keypoints(self.npz(object_quat_wxyz=None, object_quat_xyzw=xyzw), PLAIN))
         self.refused("must be given once", object_quat_xyzw=xyzw)
-        self.refused(
-            "object_pos and object_quat_wxyz of frame 0 should be a position and a unit quaternion",
-            object_quat_wxyz=2 * wxyz,
-        )
-
+        words = "object_pos and .* of frame {} should be a position and a unit quaternion"
+        self.refused(words.format(0), object_quat_wxyz=2 * wxyz)
         pos = self.demos.object_pos.copy()
         pos[3] = np.nan
         path = self.folder / "a.csv"
         columns = {"object": "soup", "side": "right"}
         write_csv(path, self.points, pos, self.turn, columns=columns)
-        with self.assertRaisesRegex(DemoError, "object_pos and .* of frame 3 should be a position"):
-            read_keypoints(path, PLAIN)
+        self.assertRaisesRegex(DemoError, words.format(3), read_keypoints, path, PLAIN)
 
     def test_what_is_not_known_is_asked_for(self):
         self.refused("--table-from-camera FILE", replace(PLAIN, frame="camera"))
@@ -135,29 +132,28 @@ class Synthetic(InFolder):
         self.refused("Add --fps", replace(PLAIN, fps=None))
 
     def test_what_contradicts_the_numbers_is_refused(self):
-        self.refused("Is --units m right", keypoints=1e3 * self.points)
-        self.refused("Is --units mm right", replace(PLAIN, units="mm"))
-        self.refused("Use --order mano", keypoints=written(self.points, "mano"))
-        self.refused("Use --order (mediapipe|openpose)", replace(PLAIN, order="mano"))
-        self.refused(
-            "It is the other hand .*or the coordinates are left-handed", side=np.array("left")
-        )
-        self.refused("file says side 'right', but --side says 'left'", replace(PLAIN, side="left"))
+        points = self.points
+        from_wrist = points - points[:, :1]
+        swelling = np.linspace(0.4, 2.5, len(points))[:, None, None]
+        for words, changed in (
+            ("Is --units m right", 1e3 * points),
+            ("Use --order mano", written(points, "mano")),
+            ("centred on the hand", points - points.mean(axis=1, keepdims=True)),
+            ("so the keypoints are not metric", points[:, :1] + swelling * from_wrist),
+        ):
+            self.refused(words, keypoints=changed)
+        other = "It is the other hand .*or the coordinates are left-handed"
+        self.refused(other, side=np.array("left"))
         self.refused("file says 20 frames per second, but --fps says 10", fps=np.array(20.0))
-        self.refused(
-            "centred on the hand", keypoints=self.points - self.points.mean(axis=1, keepdims=True)
-        )
-        wrist = self.points[:, :1]
-        swelling = np.linspace(0.4, 2.5, len(self.points))[:, None, None]
-        self.refused(
-            "so the keypoints are not metric", keypoints=wrist + swelling * (self.points - wrist)
-        )
+        for words, changes in (
+            ("Is --units mm right", {"units": "mm"}),
+            ("Use --order (mediapipe|openpose)", {"order": "mano"}),
+            ("file says side 'right', but --side says 'left'", {"side": "left"}),
+        ):
+            self.refused(words, replace(PLAIN, **changes))
         points, pos, turn = seen_from(CAMERA, self.demos)
-        seen = {
-            "keypoints": points,
-            "object_pos": pos,
-            "object_quat_wxyz": turn.as_quat(scalar_first=True),
-        }
+        seen = {"keypoints": points, "object_pos": pos}
+        seen["object_quat_wxyz"] = turn.as_quat(scalar_first=True)
         self.refused("Are these the camera's coordinates", **seen)
         inverse = replace(PLAIN, frame="camera", table_from_camera=np.linalg.inv(CAMERA))
         self.refused("or is that matrix the inverse", inverse, **seen)
@@ -172,7 +168,7 @@ class Synthetic(InFolder):
                 read_keypoints(self.npz(**changes), PLAIN)
         (self.folder / "empty").mkdir()
         with self.assertRaisesRegex(DemoError, "no .npz and no .csv"):
-            read_keypoints(self.folder / "empty", PLAIN)
+            read_keypoints(f"{self.folder}/empty", PLAIN)
 
     def test_times_are_resampled(self):
         frames = len(self.points)
@@ -180,9 +176,9 @@ class Synthetic(InFolder):
         self.assertEqual(read_keypoints(self.npz(time=time), replace(PLAIN, fps=None)).fps, 10.0)
         found = read_keypoints(self.npz(time=time), replace(PLAIN, fps=30.0))
         self.assertEqual((found.fps, found.num_frames), (30.0, 3 * (frames - 1) + 1))
-        np.testing.assert_allclose(found.hand_keypoints[::3], self.demos.hand_keypoints, atol=1e-6)
+        assert_allclose(found.hand_keypoints[::3], self.demos.hand_keypoints, atol=1e-6)
         half = (self.demos.object_pos[1:] + 2 * self.demos.object_pos[:-1]) / 3
-        np.testing.assert_allclose(found.object_pos[1::3], half, atol=1e-6)
+        assert_allclose(found.object_pos[1::3], half, atol=1e-6)
         time[5:] += 0.07
         self.refused("--fps to resample", replace(PLAIN, fps=None), time=time)
         self.refused("must be in seconds", replace(PLAIN, fps=None), time=1e3 * (time - 5.0))
@@ -199,12 +195,7 @@ class Synthetic(InFolder):
 
     def test_a_csv_of_several_sequences(self):
         path = self.folder / "two.csv"
-        columns = {
-            "sequence": "a",
-            "object": str(self.demos.object_name[0]),
-            "side": "right",
-            "confidence": 0.9,
-        }
+        columns = {"sequence": "a", "object": "soup", "side": "right", "confidence": 0.9}
         write_csv(path, self.points, self.demos.object_pos, self.turn, columns=columns, quat="xyzw")
         first = path.read_text()
         path.write_text(first + re.sub("(?m)^a,", "b,", first.split("\n", 1)[1]))
@@ -235,40 +226,32 @@ class Synthetic(InFolder):
         np.savetxt(self.folder / "T.txt", np.eye(4))
         out = self.folder / "out.npz"
         command = ["demos", "import", "keypoints", source, "--out", out]
-        code, said = run(*command)
+        code, _, said = xreset(*command)
         self.assertNotEqual(code, 0)
         for option in ("--order", "--units", "--coordinates"):
             self.assertIn(option, said)
         self.assertFalse(out.exists())
         words = "--order mediapipe --units mm --coordinates camera --fps 10 --side right --object 005_tomato_soup_can"
-        code, said = run(*command, *words.split(), "--table-from-camera", self.folder / "T.txt")
-        self.assertEqual(code, 0, said)
-        self.assertIn("2 sequences", said)
+        self.assertIn(
+            "2 sequences",
+            succeeds(*command, *words.split(), "--table-from-camera", f"{self.folder}/T.txt"),
+        )
         self.assertEqual(read_demos(out).sequence_name.tolist(), ["one", "two"])
 
 
-class Real(unittest.TestCase):
+class Real(InFolder):
     def test_wrists_of_dexycb_are_those_of_mano(self):
         demos = read_demos(data_dir() / "dexycb_right_9x20.npz").select(indices=[0])
         seen = demos.hand_valid
-        with tempfile.TemporaryDirectory() as folder:
-            time = np.arange(demos.num_frames) / 30
-            columns = {"object": str(demos.object_name[0]), "side": "right", "time": time}
-            points, pos, turn = seen_from(CAMERA, demos)
-            write_csv(
-                Path(folder, "a.csv"), points, pos, turn, scale=1e3, columns=columns, quat="xyzw"
-            )
-            convention = replace(
-                PLAIN, units="mm", frame="camera", table_from_camera=CAMERA, fps=None
-            )
-            found = read_keypoints(folder, convention)
-        np.testing.assert_array_equal(found.hand_valid, seen)
+        time = np.arange(demos.num_frames) / 30
+        columns = {"object": str(demos.object_name[0]), "side": "right", "time": time}
+        points, pos, turn = seen_from(CAMERA, demos)
+        write_csv(
+            Path(self.folder, "a.csv"), points, pos, turn, scale=1e3, columns=columns, quat="xyzw"
+        )
+        convention = replace(PLAIN, units="mm", frame="camera", table_from_camera=CAMERA, fps=None)
+        found = read_keypoints(self.folder, convention)
+        assert_array_equal(found.hand_valid, seen)
         self.assertLess(np.abs(found.hand_keypoints - demos.hand_keypoints)[seen].max(), 1e-4)
-        wrists = [
-            Rotation.from_quat(d.wrist_quat_wxyz[seen], scalar_first=True) for d in (found, demos)
-        ]
-        self.assertLess((wrists[0].inv() * wrists[1]).magnitude().max(), np.radians(3.7))
-
-
-if __name__ == "__main__":
-    unittest.main()
+        wrists = [replace(d, wrist_quat_wxyz=d.wrist_quat_wxyz[seen]) for d in (found, demos)]
+        self.assertLess(turned(*wrists, "wrist_quat_wxyz").max(), np.radians(3.7))

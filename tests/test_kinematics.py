@@ -1,13 +1,13 @@
-import dataclasses
 import os
-import tempfile
 import unittest
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import torch
 import trimesh
+from numpy.testing import assert_allclose, assert_array_equal
 
+from tests.data import InFolder, InOneFolder
 from tests.toy_retarget import FLOAT, slope
 from tests.toy_robot import toy_hand_arm, write_urdf
 from xreset import robots
@@ -32,12 +32,11 @@ class DriveSharesTest(unittest.TestCase):
         (mimic,) = robot.mimics
         source = robot.joint_names.index(mimic.source)
         shares = drive_shares(robot)
-        rates = np.vstack(
-            (np.eye(len(robot.joints)), mimic.multiplier * np.eye(len(robot.joints))[source])
-        )
-        np.testing.assert_allclose(shares @ rates, np.eye(len(robot.joints)), atol=1e-9)
-        follower = dataclasses.replace(robot.joints[source], name=mimic.joint)
-        free = dataclasses.replace(robot, joints=(*robot.joints, follower), mimics=())
+        each = np.eye(len(robot.joints))
+        rates = np.vstack((each, mimic.multiplier * each[source]))
+        assert_allclose(shares @ rates, each, atol=1e-9)
+        follower = replace(robot.joints[source], name=mimic.joint)
+        free = replace(robot, joints=(*robot.joints, follower), mimics=())
         home = np.append(robot.home, mimic.multiplier * robot.home[source] + mimic.offset)
         armature = [joint.drive.armature for joint in robot.joints]
         M = mass_matrix(free, home) + np.diag([*armature, 0.0])
@@ -45,11 +44,8 @@ class DriveSharesTest(unittest.TestCase):
         self.assertAlmostEqual(acceleration[-1], mimic.multiplier * acceleration[source], places=9)
 
 
-class UrdfTest(unittest.TestCase):
-    def setUp(self):
-        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
-
-    def urdf(self, *parts: str) -> Path:
+class UrdfTest(InFolder):
+    def urdf(self, *parts):
         path = self.folder / "robot.urdf"
         path.write_text(f'<robot name="toy"><link name="base"/>{"".join(parts)}</robot>')
         return path
@@ -74,26 +70,25 @@ class UrdfTest(unittest.TestCase):
 
     def test_shapes_and_defaults(self):
         origin = f'<origin xyz="1 2 3" rpy="0 0 {np.pi / 2}"/>'
-        collisions = ""
-        for shape in (
-            'box size="2 4 6"',
-            'sphere radius="1"',
-            'cylinder radius="1" length="4"',
-            'capsule radius="1" length="4"',
-        ):
-            collisions += f"<collision>{origin}<geometry><{shape}/></geometry></collision>"
+        shapes = (
+            ('box size="2 4 6"', ("box", (1, 2, 3))),
+            ('sphere radius="1"', ("sphere", (1,))),
+            ('cylinder radius="1" length="4"', ("cylinder", (1, 2))),
+            ('capsule radius="1" length="4"', ("capsule", (1, 2))),
+        )
+        collisions = "".join(
+            f"<collision>{origin}<geometry><{shape}/></geometry></collision>" for shape, _ in shapes
+        )
         joint = FIXED.format(name="j", child="end").replace("fixed", "continuous")
         tree = load_urdf(self.urdf(f'<link name="end">{collisions}</link>', joint))
-        found = [
-            (shape.geometry.kind, shape.geometry.size) for shape in tree.link("end").collisions
-        ]
-        kinds = [("box", (1, 2, 3)), ("sphere", (1,)), ("cylinder", (1, 2)), ("capsule", (1, 2))]
-        self.assertEqual(found, kinds)
+        found = tree.link("end").collisions
+        for shape, (_, expected) in zip(found, shapes, strict=True):
+            self.assertEqual((shape.geometry.kind, shape.geometry.size), expected)
         turned = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
-        np.testing.assert_allclose(tree.link("end").collisions[0].T_body_shape, turned, atol=1e-12)
+        assert_allclose(found[0].T_body_shape, turned, atol=1e-12)
         joint = tree.joint("j")
         self.assertEqual((joint.type, joint.lower, joint.upper), ("revolute", -np.inf, np.inf))
-        np.testing.assert_array_equal(joint.axis, (1, 0, 0))
+        assert_array_equal(joint.axis, (1, 0, 0))
         self.assertEqual(tree.link("end").mass, 0)
 
     def test_what_is_written_reads_back(self):
@@ -101,7 +96,7 @@ class UrdfTest(unittest.TestCase):
         links = [frame("base")]
         for name, size in (("f/1", 0.1), ("f_1", 0.2)):
             shape = hull(size * np.vstack((np.zeros(3), np.eye(3))))
-            links.append(dataclasses.replace(frame(name), collisions=(shape,)))
+            links.append(replace(frame(name), collisions=(shape,)))
         joints = [
             fixed("base", link.name, pose((1, 2, 3), rpy=(0.1, 0.2, 0.3))) for link in links[1:]
         ]
@@ -111,18 +106,15 @@ class UrdfTest(unittest.TestCase):
         write_meshes(tree, self.folder)
         read = load_urdf(path)
         self.assertEqual(read.link_names, tree.link_names)
-        np.testing.assert_allclose(
-            read.joints[0].T_parent_joint, joints[0].T_parent_joint, atol=1e-8
-        )
+        assert_allclose(read.joints[0].T_parent_joint, joints[0].T_parent_joint, atol=1e-8)
         sizes = [float(np.max(link.collisions[0].geometry.vertices)) for link in read.links[1:]]
-        np.testing.assert_allclose(sizes, (0.1, 0.2))
+        assert_allclose(sizes, (0.1, 0.2))
 
     def test_meshes_that_are_archives_and_other_files_are_refused(self):
         (self.folder / "box.zip").write_bytes(b"PK")
         shape = '<collision><geometry><mesh filename="box.zip"/></geometry></collision>'
         path = self.urdf(f'<link name="end">{shape}</link>', FIXED.format(name="j", child="end"))
-        with self.assertRaisesRegex(RobotError, "is an archive. Unpack it"):
-            load_urdf(path)
+        self.assertRaisesRegex(RobotError, "is an archive. Unpack it", load_urdf, path)
         path.write_text("<mujocoinclude/>")
         with self.assertRaisesRegex(RobotError, "starts with <mujocoinclude>.*Expected <robot>"):
             load_urdf(path)
@@ -130,6 +122,7 @@ class UrdfTest(unittest.TestCase):
     def test_what_is_no_tree_of_links_is_refused(self):
         link = '<link name="end"/>'
         joint = FIXED.format(name="j", child="end")
+        revolute = joint.replace("fixed", "revolute").replace("<!---->", '<axis xyz="{}"/>')
         for parts, message in (
             ((link, link, joint), "occurs twice"),
             ((link,), "expected one root link, found 2"),
@@ -139,32 +132,23 @@ class UrdfTest(unittest.TestCase):
             ((link, '<joint name="j" type="fixed"/>'), "no parent link"),
             ((link, joint.replace('name="j"', "")), "KeyError"),
             ((link.replace("end", "e&#155;d"),), "control characters"),
-            (
-                (link, joint.replace("fixed", "revolute").replace("<!---->", '<axis xyz="1 0"/>')),
-                "expected 3 numbers",
-            ),
-            (
-                (
-                    link,
-                    joint.replace("fixed", "revolute").replace("<!---->", '<axis xyz="0 0 0"/>'),
-                ),
-                "expected a direction",
-            ),
+            ((link, revolute.format("1 0")), "expected 3 numbers"),
+            ((link, revolute.format("0 0 0")), "expected a direction"),
         ):
             with self.subTest(message), self.assertRaisesRegex(RobotError, message):
                 load_urdf(self.urdf(*parts))
 
 
-class KinematicsTest(unittest.TestCase):
+class KinematicsTest(InOneFolder):
     @classmethod
     def setUpClass(cls):
-        cls.folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
+        super().setUpClass()
         cls.robot = toy_hand_arm(cls.folder)
         cls.kinematics = Kinematics(cls.robot)
         cls.q = cls.drawn(cls.kinematics, 3, 5)
 
     @staticmethod
-    def drawn(kinematics: Kinematics, *shape: int) -> torch.Tensor:
+    def drawn(kinematics, *shape):
         """[*shape, J] joint positions within the limits."""
         low = kinematics.lower
         generator = torch.Generator().manual_seed(0)
@@ -174,26 +158,22 @@ class KinematicsTest(unittest.TestCase):
 
     def test_every_moving_joint_is_actuated_or_follows_one_that_is(self):
         lead = self.robot.mimics[0]
-        without = dataclasses.replace(self.robot, mimics=())
-        passive = dataclasses.replace(lead, source=lead.joint)
+        without = replace(self.robot, mimics=())
+        passive = replace(lead, source=lead.joint)
         for robot, words in (
             (without, f"{lead.joint!r} moves, but the description neither"),
             (
-                dataclasses.replace(self.robot, mimics=(passive,)),
+                replace(self.robot, mimics=(passive,)),
                 f"follow {lead.joint}, which the description does not actuate",
             ),
         ):
-            with self.assertRaisesRegex(RobotError, words):
-                Kinematics(robot)
+            self.assertRaisesRegex(RobotError, words, Kinematics, robot)
 
     def test_link_poses_agree_with_mujoco(self):
         import mujoco
 
-        for robot, atol in (
-            (self.robot, 1e-9),
-            (robots.load("ur7e-sharpa"), 1e-6),
-            (robots.load("openarm"), 1e-6),
-        ):
+        others = [(robots.load(name), 1e-6) for name in ("ur7e-sharpa", "openarm")]
+        for robot, atol in ((self.robot, 1e-9), *others):
             kinematics = Kinematics(robot)
             description = mujoco.MjSpec.from_file(str(robot.urdf))
             description.compiler.fusestatic = False
@@ -209,10 +189,8 @@ class KinematicsTest(unittest.TestCase):
                 mujoco.mj_kinematics(model, data)
                 poses = kinematics.link_poses(q, base=torch.eye(4, dtype=FLOAT)).numpy()
                 for name, T in zip(kinematics.link_names[1:], poses[1:], strict=True):
-                    np.testing.assert_allclose(
-                        T[:3, 3], data.body(name).xpos, atol=atol, err_msg=name
-                    )
-                    np.testing.assert_allclose(
+                    assert_allclose(T[:3, 3], data.body(name).xpos, atol=atol, err_msg=name)
+                    assert_allclose(
                         T[:3, :3].ravel(), data.body(name).xmat, atol=atol, err_msg=name
                     )
 
@@ -235,7 +213,7 @@ class KinematicsTest(unittest.TestCase):
     def test_base_places_the_robot_in_the_world(self):
         poses = self.kinematics.link_poses(self.q)
         root = poses[0, 0, self.kinematics.link_index(self.kinematics.root)]
-        np.testing.assert_allclose(root[:3, 3], self.robot.base_pos)
+        assert_allclose(root[:3, 3], self.robot.base_pos)
         shift = torch.eye(4, dtype=FLOAT)
         shift[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
         moved = self.kinematics.link_poses(self.q, base=shift @ self.kinematics.base)
@@ -266,8 +244,4 @@ class KinematicsTest(unittest.TestCase):
         renamed = write_urdf(self.folder / "other.urdf", rename={"arm_2": "arm_two"})
         for changes, cause in (({"mimics": ()}, "jaw_b"), ({"urdf": renamed}, "arm_two")):
             with self.assertRaisesRegex(RobotError, cause):
-                Kinematics(dataclasses.replace(self.robot, **changes))
-
-
-if __name__ == "__main__":
-    unittest.main()
+                Kinematics(replace(self.robot, **changes))

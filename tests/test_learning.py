@@ -1,17 +1,16 @@
 """The model, the sequence storage, the export and the run folder; no physics."""
 
 import json
-import tempfile
-import unittest
 from dataclasses import asdict, replace
-from pathlib import Path
 from types import SimpleNamespace
-from unittest import mock
+from unittest import TestCase, skipUnless
+from unittest.mock import Mock, patch
 
 import torch
 from tensordict import TensorDict
 from torch.testing import assert_close
 
+from tests.data import InFolder
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from xreset import robots
 from xreset.checks import from_dict
@@ -19,7 +18,7 @@ from xreset.errors import FileFormatError
 from xreset.learning.config import ModelConfig, PpoConfig, ScheduleConfig, TrainConfig
 from xreset.learning.distributed import Processes
 from xreset.learning.export import export_onnx
-from xreset.learning.model import PointNetLstmModel, ReturnCritic, embed_sequences
+from xreset.learning.model import PointNetLstmModel, ReturnCritic
 from xreset.learning.ppo import SequencePpo, first_steps, piece_states
 from xreset.learning.runner import TrainingRunner
 from xreset.policy import OnnxPolicy, policy_contract
@@ -39,7 +38,7 @@ GROUPS = ("policy", "proprio", "perception")
 SMALL = ModelConfig(pointnet=(8, 6), lstm=12, mlp=(16,))
 
 
-def observations(*batch: int, seed: int = 0) -> TensorDict:
+def observations(*batch, seed=0):
     g = torch.Generator().manual_seed(seed)
     widths = {"policy": (7,), "proprio": (9,), "perception": (5, 10, 3), "privileged": (4,)}
     return TensorDict(
@@ -47,12 +46,12 @@ def observations(*batch: int, seed: int = 0) -> TensorDict:
     )
 
 
-def make_model() -> PointNetLstmModel:
+def make_model():
     torch.manual_seed(0)
     return PointNetLstmModel(observations(N), GROUPS, A, SMALL, stochastic=True)
 
 
-def firsts(*steps: tuple[int, int]) -> torch.Tensor:
+def firsts(*steps):
     """[T, N] bool: True in given (step, world), which are the first of an episode."""
     first = torch.zeros(T, N, dtype=torch.bool)
     for step, world in steps:
@@ -60,7 +59,7 @@ def firsts(*steps: tuple[int, int]) -> torch.Tensor:
     return first
 
 
-def with_real_history(obs: TensorDict, first: torch.Tensor) -> TensorDict:
+def with_real_history(obs, first):
     """Observations [T, N] whose cloud histories are as an environment makes them: shifted by one per step, copies after a reset."""
     cloud = obs["perception"].clone()
     for t in range(len(cloud)):
@@ -72,18 +71,7 @@ def with_real_history(obs: TensorDict, first: torch.Tensor) -> TensorDict:
     return obs
 
 
-class ModelTest(unittest.TestCase):
-    def test_shared_frames_are_embedded_as_if_each_were_alone(self):
-        model = make_model()
-        first = torch.rand(T, N, generator=torch.Generator().manual_seed(1)) < 0.3
-        first[0, 0], first[0, 1] = True, False
-        cloud = with_real_history(observations(T, N), first)["perception"]
-        for begin in (0, 3):
-            piece, starts = cloud[begin : begin + L], first[begin : begin + L]
-            assert_close(
-                embed_sequences(model.trunk.pointnet, piece, starts), model.trunk.pointnet(piece)
-            )
-
+class ModelTest(TestCase):
     def test_update_sees_what_the_rollout_saw(self):
         """Step by step with resets at episode ends gives the same outputs as one sequence with masks, or as two pieces
         with their own states; no gradient crosses from one piece, or one episode, to the other."""
@@ -104,17 +92,17 @@ class ModelTest(unittest.TestCase):
         together = model(obs, masks=first, hidden_state=(zero, zero))
         assert_close(together, torch.stack(stepwise))
         together[3:, 0].sum().backward()
-        self.assertEqual(float(obs["policy"].grad[:3].abs().max()), 0.0)
-        self.assertGreater(float(obs["policy"].grad[3:, 0].abs().max()), 0.0)
+        self.assertEqual(obs["policy"].grad[:3].abs().max(), 0.0)
+        self.assertGreater(obs["policy"].grad[3:, 0].abs().max(), 0.0)
         carried = model(obs, masks=first, hidden_state=(zero + 1, zero + 1))
-        self.assertGreater(float((carried - together).detach()[:3, 0].abs().max()), 1e-4)
+        self.assertGreater((carried - together).detach()[:3, 0].abs().max(), 1e-4)
         assert_close(carried[3:, 0], together[3:, 0])
         obs["policy"].grad = None
         h, c = torch.cat(states, dim=2)
         pieces = model(obs, masks=first, hidden_state=(h.detach(), c.detach()))
         assert_close(pieces, torch.stack(stepwise))
         pieces[L:].sum().backward()
-        self.assertEqual(float(obs["policy"].grad[:L].abs().max()), 0.0)
+        self.assertEqual(obs["policy"].grad[:L].abs().max(), 0.0)
 
     def test_the_gpu_s_lstm_is_the_library_s(self):
         """Here with a stand-in for its kernel."""
@@ -134,9 +122,9 @@ class ModelTest(unittest.TestCase):
             pointnet = model.trunk.pointnet
             pointnet.use_bfloat16 = low
             with (
-                mock.patch.object(torch.Tensor, "is_cuda", on_gpu),
-                mock.patch.object(torch.ops.aten, "_thnn_fused_lstm_cell", cell),
-                mock.patch.object(
+                patch.object(torch.Tensor, "is_cuda", on_gpu),
+                patch.object(torch.ops.aten, "_thnn_fused_lstm_cell", cell),
+                patch.object(
                     pointnet, "forward", lambda cloud, mlp=pointnet.mlp: mlp(cloud).amax(dim=-2)
                 ),
             ):
@@ -149,7 +137,7 @@ class ModelTest(unittest.TestCase):
             self.assertTrue(0.0 < float((value - expected).norm()) < 0.01 * float(expected.norm()))
 
 
-def places(alg: SequencePpo) -> dict[str, int]:
+def places(alg):
     """Where in memory the tensors lie that an update reads: a captured one reads there for ever."""
     read = vars(alg.storage) | {"rate": alg._rate, "sums": alg._sums}
     tensors = {f"actor {name}": value for name, value in alg.actor.state_dict().items()}
@@ -166,7 +154,7 @@ def places(alg: SequencePpo) -> dict[str, int]:
     return {name: value.data_ptr() for name, value in tensors.items()}
 
 
-class StorageTest(unittest.TestCase):
+class StorageTest(TestCase):
     def test_sequences_begin_with_their_states(self):
         code = torch.arange(T * N, dtype=torch.float32).view(T, N)
         dones = torch.zeros(T, N, 1)
@@ -179,15 +167,7 @@ class StorageTest(unittest.TestCase):
         first = first_steps(SimpleNamespace(dones=dones), worlds)
         self.assertTrue(torch.equal(first, firsts((3, 0), (4, 1))[:, worlds]))
 
-    def bandit(
-        self,
-        target: float = 0.5,
-        iterations: int = 40,
-        bias: float = 0.0,
-        device: str = "cpu",
-        capture: bool = True,
-        **ppo,
-    ) -> tuple[SequencePpo, torch.Tensor, torch.Tensor]:
+    def bandit(self, target=0.5, iterations=40, bias=0.0, device="cpu", capture=True, **ppo):
         """The algorithm, and the mean actions before and after it, on an environment whose reward is -|action - target|.
 
         ``bias`` is added to the first policy's means; without ``capture`` a GPU is given every kernel of an update by itself.
@@ -232,7 +212,7 @@ class StorageTest(unittest.TestCase):
             self.assertEqual(self.places[1], self.places[0])
             self.assertEqual(self.places[2], self.places[0])
 
-    @unittest.skipUnless(
+    @skipUnless(
         torch.cuda.is_available(), "there is no CUDA device: updates are captured on GPUs only"
     )
     def test_a_captured_update_learns_what_a_plain_one_does(self):
@@ -250,17 +230,17 @@ class StorageTest(unittest.TestCase):
             )
             self.assertFalse(one._graphs._graphs)
             self.assertTrue(two._graphs._graphs)
-            self.assertGreater(float((plain - before).abs().mean()), 0.05)
+            self.assertGreater((plain - before).abs().mean(), 0.05)
             assert_close(captured, plain, rtol=0.0, atol=tolerance)
 
     def test_a_bounds_loss_pulls_means_back_from_beyond_the_limits(self):
         _, _, free = self.bandit(iterations=5, bias=3.0, target=3.0)
         self.assertGreater(self.losses["bounds"], 1.0)
         _, _, held = self.bandit(iterations=5, bias=3.0, target=3.0, bounds_loss=1.0)
-        self.assertLess(float(held.mean()), float(free.mean()) - 0.1)
+        self.assertLess(held.mean(), float(free.mean()) - 0.1)
 
 
-class ReturnCriticTest(unittest.TestCase):
+class ReturnCriticTest(TestCase):
     def test_values_stay_when_their_unit_changes(self):
         torch.manual_seed(0)
         critic = ReturnCritic(observations(N), GROUPS, 1, SMALL)
@@ -279,11 +259,11 @@ class ReturnCriticTest(unittest.TestCase):
             assert_close((critic.return_mean, critic.return_std), moments)
 
 
-class ExportTest(unittest.TestCase):
+class ExportTest(InFolder):
     def test_exported_equals_eager_over_50_steps(self):
         """With paired points, of which each has nine numbers; other tests export histories and images."""
 
-        def seen(seed: int) -> TensorDict:
+        def seen(seed):
             points = torch.randn(4, 1, 10, 9, generator=torch.Generator().manual_seed(seed))
             return observations(4, seed=seed).update({"perception": points})
 
@@ -296,23 +276,20 @@ class ExportTest(unittest.TestCase):
             "perception": {"paired_cloud": 10 * 9},
         }
         contract = policy_contract(robots.load("openarm"), task, ())
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "policy.onnx"
-            export_onnx(
-                model,
-                file,
-                replace(contract, observation_layout=layout, joint_names=tuple("abcde")),
-            )
-            self.assertNotIn(
-                b".py", file.read_bytes(), "nothing of the exporting machine is in the file"
-            )
-            policy = OnnxPolicy(file)
+        file = self.folder / "policy.onnx"
+        export_onnx(
+            model, file, replace(contract, observation_layout=layout, joint_names=tuple("abcde"))
+        )
+        self.assertNotIn(
+            b".py", file.read_bytes(), "nothing of the exporting machine is in the file"
+        )
+        policy = OnnxPolicy(file)
         with torch.no_grad():
             for t in range(50):
                 assert_close(policy.act(seen(t)), model(seen(t)).clamp(-1, 1), atol=1e-5, rtol=0)
 
 
-class ConfigTest(unittest.TestCase):
+class ConfigTest(TestCase):
     def test_table_viii(self):
         ppo = TrainConfig().ppo
         self.assertEqual((ppo.minibatches(4096), ppo.horizon, ppo.sequence_length), (2, 16, 4))
@@ -363,7 +340,7 @@ class ConfigTest(unittest.TestCase):
             from_dict(TrainConfig, data)
 
 
-class ChangingSettings(unittest.TestCase):
+class ChangingSettings(TestCase):
     def test_a_schedule_that_ends_before_it_begins_is_refused(self):
         for points in (
             ((0.5, 0.9), (0.2, 0.1)),
@@ -381,7 +358,7 @@ class ChangingSettings(unittest.TestCase):
 
     def test_a_training_moves_its_limit_of_success_its_faults_and_its_starts(self):
         """On straight lines between the points."""
-        env = mock.Mock(success_position=torch.zeros(()))
+        env = Mock(success_position=torch.zeros(()))
         env.drawn.fault_scale = torch.zeros(())
         env.resets.demo_probability = torch.zeros(())
         schedule = ScheduleConfig(
@@ -389,7 +366,7 @@ class ChangingSettings(unittest.TestCase):
             faults=((0.0, 0.0), (0.5, 1.0)),
             demo_probability=((0.0, 1.0), (1.0, 0.0)),
         )
-        runner = mock.Mock(env=env, config=TrainConfig(schedule=schedule))
+        runner = Mock(env=env, config=TrainConfig(schedule=schedule))
         for progress, limit, scale in (
             (0.1, 0.05, 0.2),
             (0.25, 0.0475, 0.5),
@@ -417,8 +394,4 @@ class ChangingSettings(unittest.TestCase):
         for share in (1.0, 0.0):
             resets.demo_probability.fill_(share)
             drawn = resets.sample(torch.zeros(50, dtype=torch.long), torch.Generator())
-            self.assertEqual(float(drawn.from_bank.float().mean()), share)
-
-
-if __name__ == "__main__":
-    unittest.main()
+            self.assertEqual(drawn.from_bank.float().mean(), share)

@@ -23,7 +23,3 @@ class Learns(unittest.TestCase):
             by_chance["grasped"] + MARGIN,
             f"a random policy: {by_chance}; trained: {learned}",
         )
-
-
-if __name__ == "__main__":
-    unittest.main()

@@ -1,25 +1,18 @@
 """The lift clock: when success from home first passed its marks, over restarts too. Curves that are sent elsewhere."""
 
-from __future__ import annotations
-
-import tempfile
-import unittest
-from pathlib import Path
 from unittest import mock
 
 import torch
 
+from tests.data import InFolder
 from xreset.errors import FileFormatError, XResetError
 from xreset.files import write_json
 from xreset.learning.clock import FILE, Lift, read_lift, write_lift
 from xreset.learning.log import TrainingLog
 
 
-class LiftTest(unittest.TestCase):
-    def setUp(self):
-        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
-
-    def after(self, lift: Lift, shares: list[float], begin: int = 0) -> Lift:
+class LiftTest(InFolder):
+    def after(self, lift, shares, begin=0):
         for i, share in enumerate(shares, begin + 1):
             lift = lift.after(share, iteration=i, env_steps=1000 * i, seconds=30.0 * i)
         return lift
@@ -47,7 +40,7 @@ class LiftTest(unittest.TestCase):
             read_lift(self.folder)
 
 
-class CurvesTest(unittest.TestCase):
+class CurvesTest(InFolder):
     def test_curves_are_sent_only_if_a_project_is_named(self):
         online = mock.Mock()
         log = {
@@ -55,12 +48,9 @@ class CurvesTest(unittest.TestCase):
             "task/grasped": torch.ones(()),
             "task/success": torch.ones(()),
         }
-        with (
-            tempfile.TemporaryDirectory() as name,
-            mock.patch.dict("sys.modules", {"wandb": online}),
-        ):
-            folder = Path(name)
-            write_json(folder / "run.json", {"a": 1})
+        folder = self.folder
+        with mock.patch.dict("sys.modules", {"wandb": online}):
+            write_json(f"{folder}/run.json", {"a": 1})
             for project in (None, "project"):
                 curves = TrainingLog(folder, 2, "cpu", 5, project)
                 curves.add(torch.ones(2), torch.zeros(2), log)
@@ -80,7 +70,3 @@ class CurvesTest(unittest.TestCase):
                 self.assertRaisesRegex(XResetError, r"xreset\[wandb\]"),
             ):
                 TrainingLog(folder, 2, "cpu", 5, "project")
-
-
-if __name__ == "__main__":
-    unittest.main()

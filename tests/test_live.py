@@ -1,21 +1,20 @@
 """The loop around a driver: it observes what the environment observes, and every fault ends in a soft stop and a sentence."""
 
-from __future__ import annotations
-
-import unittest
 from dataclasses import replace
 from importlib.util import find_spec
 from typing import ClassVar
+from unittest import TestCase, skipUnless
 
 import numpy as np
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 
 from tests import toy_grasp
 from xreset.eval.rollout import engine, episode_starts
 from xreset.learning.recipes import RECIPES
 from xreset.live.engine import EngineDriver, make_controller
 from xreset.runtime import Driver, Reading, Runner
-from xreset.task.config import TaskConfig, evaluation_task
+from xreset.task.config import evaluation_task
 
 STEPS = 12
 
@@ -89,7 +88,7 @@ def refuse(*_):
     raise ConnectionError("the cable is out")
 
 
-class FaultTest(unittest.TestCase):
+class FaultTest(TestCase):
     def stopped(self, driver, controller=None):
         """Run until the robot stops; returns the sentence. The targets must slow down and come to rest."""
         outcome = Runner(controller or Steady(), driver).run(seconds=30)
@@ -99,7 +98,7 @@ class FaultTest(unittest.TestCase):
         self.assertLessEqual(np.abs(moves).max(), 0.0101)
         self.assertTrue((np.diff(moves[-12:, 0]) <= 1e-6).all())
         self.assertLess(abs(moves[-1, 0]), 0.001)
-        np.testing.assert_array_equal(moves[-10:, 1], 0)  # a target that may jump stays
+        assert_array_equal(moves[-10:, 1], 0)  # a target that may jump stays
         return outcome.reason
 
     def test_data_that_stay_away_or_are_wrong(self):
@@ -211,14 +210,14 @@ class FaultTest(unittest.TestCase):
         self.assertEqual((len(driver.sent), driver.stops), (150, 1))
 
 
-@unittest.skipUnless(find_spec("mujoco"), "mujoco is not installed")
-class EngineTest(unittest.TestCase):
+@skipUnless(find_spec("mujoco"), "mujoco is not installed")
+class EngineTest(TestCase):
     def test_it_observes_and_acts_as_the_environment_bit_for_bit(self):
         for name in ("paper", "robust", "live", "published"):
             with self.subTest(name):
                 self._check(evaluation_task(RECIPES[name].config.task))
 
-    def _check(self, task: TaskConfig):
+    def _check(self, task):
         played = toy_grasp.trial(task)
         sequences = np.arange(2)
         start = episode_starts(played.starts(), sequences, sequences, seed=0)
@@ -235,22 +234,22 @@ class EngineTest(unittest.TestCase):
             moving = EngineDriver(env).read()
             found = make_controller(env, actor).kinematics.links(moving.joint_pos, moving.joint_vel)
             for name in ("palm_pos", "palm_linvel", "palm_angvel"):
-                np.testing.assert_allclose(
+                assert_allclose(
                     getattr(found, name), getattr(moving.links, name), atol=2e-4, err_msg=name
                 )
             env.reset(start=start)
             controller = make_controller(env, actor)
             driver = EngineDriver(env)
             links = controller.observe(replace(driver.read(), links=None))[0]
-            np.testing.assert_allclose(links, recorded[0][0], atol=1e-6)  # forward kinematics
+            assert_allclose(links, recorded[0][0], atol=1e-6)  # forward kinematics
             controller = make_controller(env, actor)
             outcome = Runner(controller, driver).run(STEPS * controller.dt)
         self.assertEqual(
             (outcome.reasons, outcome.steps, len(actor.seen)), ([None, None], STEPS, STEPS)
         )
         for expected, found in zip(recorded, actor.seen, strict=True):
-            np.testing.assert_array_equal(found[0], expected[0])
-            np.testing.assert_array_equal(found[1], expected[1])
+            assert_array_equal(found[0], expected[0])
+            assert_array_equal(found[1], expected[1])
 
 
 class Recorded:
@@ -266,7 +265,3 @@ class Recorded:
     def act(self, flat, cloud):
         self.seen.append((flat, cloud))
         return np.clip(self.actions[len(self.seen) - 1], -1, 1)
-
-
-if __name__ == "__main__":
-    unittest.main()

@@ -1,10 +1,8 @@
 """Contacts of MuJoCo-Warp against MuJoCo's: as many, and as deep, where shapes lie across an edge."""
 
-from __future__ import annotations
-
-import unittest
 import warnings
-from unittest import mock
+from unittest import TestCase
+from unittest.mock import Mock, patch
 
 import mujoco
 import mujoco_warp as mjw
@@ -22,7 +20,7 @@ from xreset.torch_warp import quiet
 WORLDS = 200
 
 
-def across_an_edge() -> mujoco.MjModel:
+def across_an_edge():
     """A free capsule, and a can as a mesh of 24 faces around, whose edges it can lie across."""
     can = trimesh.creation.cylinder(0.033, 0.1, sections=24)
     spec = mujoco.MjSpec()
@@ -39,7 +37,7 @@ def across_an_edge() -> mujoco.MjModel:
     return spec.compile()
 
 
-def poses(rng: np.random.Generator) -> np.ndarray:
+def poses(rng):
     """[N, 7] the capsule beside the can, up to 1 mm deep and inclined by some hundredths, as fingertips are."""
     out = np.zeros((WORLDS, 7), dtype=np.float32)
     azimuth = rng.uniform(0, 2 * np.pi, WORLDS)
@@ -53,7 +51,7 @@ def poses(rng: np.random.Generator) -> np.ndarray:
     return out
 
 
-class Depth(unittest.TestCase):
+class Depth(TestCase):
     def test_contacts_that_were_clipped_to_one_are_as_deep_as_in_mujoco(self):
         correct_engine()  # tested is the engine as the backend leaves it
         model = across_an_edge()
@@ -84,11 +82,11 @@ class Depth(unittest.TestCase):
         )
 
 
-class OtherVersions(unittest.TestCase):
+class OtherVersions(TestCase):
     def test_an_engine_that_finds_contacts_in_another_way_is_announced(self):
         with (
-            mock.patch.object(mujoco_warp_depth, "KNOWN_SOURCE", "another"),
-            mock.patch.object(mujoco_warp_depth, "correct_depths") as correct,
+            patch.object(mujoco_warp_depth, "KNOWN_SOURCE", "another"),
+            patch.object(mujoco_warp_depth, "correct_depths") as correct,
             self.assertWarnsRegex(
                 UserWarning, r"finds contacts in another way.*Install mujoco-warp==4\.0\.0"
             ),
@@ -97,9 +95,9 @@ class OtherVersions(unittest.TestCase):
         correct.assert_not_called()
 
     def test_what_is_corrected_depends_on_the_code_and_not_on_the_version(self):
-        model = mock.Mock()
+        model = Mock()
         model.opt.integrator = mjw.IntegratorType.IMPLICITFAST
-        with mock.patch.object(mjw, "__version__", "4.0.1"), warnings.catch_warnings():
+        with patch.object(mjw, "__version__", "4.0.1"), warnings.catch_warnings():
             warnings.simplefilter("error")
             correct_engine()
             self.assertIs(
@@ -108,11 +106,11 @@ class OtherVersions(unittest.TestCase):
         self.assertIs(collision_convex.multicontact, mujoco_warp_depth.multicontact_with_depth)
 
     def test_another_step_or_integrator_is_left_to_the_engine(self):
-        model = mock.Mock()
+        model = Mock()
         model.opt.integrator = mjw.IntegratorType.EULER
         self.assertIs(engine_step(wp.get_device("cpu"), model), mjw.step)
         model.opt.integrator = mjw.IntegratorType.IMPLICITFAST
-        with mock.patch.object(mujoco_warp_step, "KNOWN_SOURCE", "another"):
+        with patch.object(mujoco_warp_step, "KNOWN_SOURCE", "another"):
             self.assertIs(engine_step(wp.get_device("cpu"), model), mjw.step)
 
     def test_the_log_level_of_the_process_stays_as_it_was(self):
@@ -122,7 +120,3 @@ class OtherVersions(unittest.TestCase):
         self.assertEqual(wp.config.log_level, level)
         MujocoWarpBackend(scene(), 1).close()
         self.assertEqual(wp.config.log_level, level)
-
-
-if __name__ == "__main__":
-    unittest.main()

@@ -3,13 +3,14 @@
 import unittest
 
 import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
 
+from xreset import synthesize
 from xreset.demos.hand import PARENTS
 from xreset.demos.noise import MEMORY, TIERS, with_noise
-from xreset.demos.synth import synthesize
 
 
-def bones(points: np.ndarray) -> np.ndarray:
+def bones(points):
     return np.linalg.norm(points[:, 1:] - points[:, PARENTS], axis=-1)
 
 
@@ -25,7 +26,7 @@ class NoiseTest(unittest.TestCase):
         for sequence in range(self.demos.num_sequences):
             frames = self.demos.frames(sequence)
             shift = (shifted.hand_keypoints - self.demos.hand_keypoints)[frames][self.seen[frames]]
-            np.testing.assert_allclose(shift, np.broadcast_to(shift[0, 0], shift.shape), atol=1e-6)
+            assert_allclose(shift, np.broadcast_to(shift[0, 0], shift.shape), atol=1e-6)
             shifts.append(shift[0, 0])
         self.assertLessEqual(np.abs(shifts).max(), 0.04)
         self.assertGreater(np.ptp(shifts, axis=0).min(), 0.01)
@@ -34,8 +35,8 @@ class NoiseTest(unittest.TestCase):
         noisy = with_noise(self.demos, wrist=0.0, finger=0.006, cap=0.012)
         before = self.demos.hand_keypoints[self.seen].astype(float)
         after = noisy.hand_keypoints[self.seen].astype(float)
-        np.testing.assert_allclose(bones(after), bones(before), atol=1e-6)
-        np.testing.assert_array_equal(after[:, 0], before[:, 0])
+        assert_allclose(bones(after), bones(before), atol=1e-6)
+        assert_array_equal(after[:, 0], before[:, 0])
         moved = np.linalg.norm(after - before, axis=-1)[:, 1:]
         self.assertGreater(moved.mean(), 0.003)
         frames = self.demos.frames(0)
@@ -47,10 +48,6 @@ class NoiseTest(unittest.TestCase):
         noisy = with_noise(self.demos, **TIERS["low"], seed=3)
         again = with_noise(self.demos, **TIERS["low"], seed=3)
         other = with_noise(self.demos, **TIERS["low"], seed=4)
-        np.testing.assert_array_equal(noisy.object_pos, self.demos.object_pos)
-        np.testing.assert_array_equal(noisy.hand_keypoints, again.hand_keypoints)
+        assert_array_equal(noisy.object_pos, self.demos.object_pos)
+        assert_array_equal(noisy.hand_keypoints, again.hand_keypoints)
         self.assertGreater(np.nanmax(np.abs(noisy.hand_keypoints - other.hand_keypoints)), 1e-3)
-
-
-if __name__ == "__main__":
-    unittest.main()

@@ -2,29 +2,29 @@
 
 import dataclasses
 import math
-import unittest
+from unittest import TestCase
 
 import numpy as np
 import torch
+from torch.testing import assert_close
 
-from tests.toy_retarget import FLOAT, box_object, check_gradient, hand_targets
-from xreset import robots
+from tests.toy_retarget import FLOAT, box_object, check_gradient, double, hand_targets
+from xreset import robots, synthesize
 from xreset.demos.archive import demo_objects
-from xreset.demos.synth import synthesize
 from xreset.geometry.rotations import quat_from_axis_angle, quat_rotate
 from xreset.geometry.surface import Surface
 from xreset.retarget.hand.config import HandConfig
 from xreset.retarget.hand.cost import system
 from xreset.retarget.hand.jaw import jaw_keypoints, jaw_state
-from xreset.retarget.hand.model import HandModel, HandState, HandTargets
+from xreset.retarget.hand.model import HandModel, HandState
 from xreset.retarget.hand.solve import retarget_hand
 from xreset.retarget.pipeline import HandMotions, RetargetConfig
 from xreset.spec import KEYPOINTS
 
-UP = torch.tensor([0.0, 0.0, 1.0], dtype=FLOAT)
+UP = double([0.0, 0.0, 1.0])
 
 
-class PadsTest(unittest.TestCase):
+class PadsTest(TestCase):
     """The OpenArm's jaw around a box 5 cm thick, far above the table. It opens along its root's y axis, reaches along
     z."""
 
@@ -33,9 +33,7 @@ class PadsTest(unittest.TestCase):
         cls.model = HandModel(robots.load("openarm"))
         cls.box = Surface(box_object(((0, 0, 0), (0.05, 0.05, 0.1))))
 
-    def aslant(
-        self, angle: float, *, held: bool = True, frames: int = 6
-    ) -> tuple[HandState, HandTargets]:
+    def aslant(self, angle, *, held=True, frames=6):
         """A jaw turned by an angle [rad] about its axis of approach, its pads 2 mm from the box's edges, and its
         keypoints."""
         turn = quat_from_axis_angle(angle * UP).expand(1, frames, 4)
@@ -52,12 +50,10 @@ class PadsTest(unittest.TestCase):
             keypoints, self.box.field, held=flags, object_pos=UP.expand(1, frames, 3)
         )
 
-    def degrees_off(self, targets: HandTargets, config: HandConfig) -> float:
+    def degrees_off(self, targets, config):
         """Largest angle between the jaw's axis and the box's face."""
         motion = retarget_hand(self.model, targets, config)
-        axis = quat_rotate(
-            motion.root_quat, torch.tensor([0.0, 1.0, 0.0], dtype=FLOAT).expand_as(motion.root_pos)
-        )
+        axis = quat_rotate(motion.root_quat, double([0.0, 1.0, 0.0]).expand_as(motion.root_pos))
         return math.degrees(axis[..., 1].abs().clamp_max(1.0).acos().max().item())
 
     def test_pads_are_the_faces_that_meet(self):
@@ -66,9 +62,7 @@ class PadsTest(unittest.TestCase):
             mine = balls.link[self.model.pad_balls] == balls.links.index(link)
             own = self.model.pad_balls[mine]
             centers = balls.centers[own]
-            self.assertLess(
-                (side * centers[:, 1] + balls.radii[own] - 0.0055).abs().max().item(), 1.1e-3
-            )
+            self.assertLess((side * centers[:, 1] + balls.radii[own] - 0.0055).abs().max(), 1.1e-3)
             self.assertGreater(np.ptp(centers[:, 2].numpy()), 0.05)
             self.assertAlmostEqual(self.model.pad_shares[mine].sum().item(), 1.0)
         for name in ("ur7e-sharpa", "xarm7-leap"):
@@ -101,7 +95,7 @@ class PadsTest(unittest.TestCase):
         self.assertTrue(targets.held[0, -1])
 
 
-class AnalyticMapTest(unittest.TestCase):
+class AnalyticMapTest(TestCase):
     def test_a_jaw_s_own_keypoints_give_its_pose_back(self):
         generator = torch.Generator().manual_seed(0)
         for name in ("openarm", "ur7e-robotiq"):
@@ -115,7 +109,7 @@ class AnalyticMapTest(unittest.TestCase):
             followed = model.keypoints(joints, pos, quat)
             state = jaw_state(model, followed)
             again = model.keypoints(state.joints, state.root_pos, state.root_quat)
-            torch.testing.assert_close(again, followed, atol=5e-4, rtol=0, msg=name)
+            assert_close(again, followed, atol=5e-4, rtol=0, msg=name)
 
     def test_a_span_wider_than_the_jaw_keeps_its_middle_and_the_second_jaw_follows_two_fingers(
         self,
@@ -132,11 +126,5 @@ class AnalyticMapTest(unittest.TestCase):
         motion = retarget_hand(model, targets, HandConfig(jaw="analytic"))
         tips = model.keypoints(**vars(motion))[0, 0, model.is_tip]
         self.assertAlmostEqual(motion.joints.item(), 0.0)
-        torch.testing.assert_close(
-            tips[:, 0].abs(), torch.full((2,), 0.0425, dtype=FLOAT), atol=1e-3, rtol=0
-        )
-        torch.testing.assert_close(tips[:, 1:], torch.zeros(2, 2, dtype=FLOAT), atol=1e-3, rtol=0)
-
-
-if __name__ == "__main__":
-    unittest.main()
+        assert_close(tips[:, 0].abs(), torch.full((2,), 0.0425, dtype=FLOAT), atol=1e-3, rtol=0)
+        assert_close(tips[:, 1:], torch.zeros(2, 2, dtype=FLOAT), atol=1e-3, rtol=0)

@@ -39,7 +39,7 @@ class InTheBrowser(unittest.TestCase):
         self.until(self.shows_the_object, "the object to be drawn")
         self.addCleanup(self.browser.open, "about:blank")
 
-    def until(self, condition, what: str):
+    def until(self, condition, what):
         """Play until a condition holds; long, because frames drawn without a GPU can take seconds."""
 
         def holds():
@@ -48,14 +48,14 @@ class InTheBrowser(unittest.TestCase):
 
         return wait_until(holds, what, seconds=300)
 
-    def shows_the_object(self) -> bool:
+    def shows_the_object(self):
         """Whether the page has pixels of the object's color."""
         rgb = np.asarray(Image.open(io.BytesIO(self.browser.screenshot())).convert("RGB")).astype(
             int
         )
         return int(((rgb[150:, 40:640, 0] - rgb[150:, 40:640, 2]) > 60).sum()) > 50
 
-    def pixel_of(self, point: np.ndarray) -> tuple[float, float]:
+    def pixel_of(self, point):
         """Where the page shows a point of the world."""
         camera = max(self.page._server.get_clients().items())[1].camera
         x, y, z = (
@@ -66,7 +66,7 @@ class InTheBrowser(unittest.TestCase):
             camera.image_height / 2 + focal * y / z
         )
 
-    def pass_time(self, seconds: float):
+    def pass_time(self, seconds):
         """Let the session play, faster than the page would show it."""
         for _ in range(round(seconds / self.session.control_dt)):
             moment = self.session.step()
@@ -103,7 +103,3 @@ class InTheBrowser(unittest.TestCase):
         self.assertEqual(problems, [])
         self.browser.resize(390, 844, phone=True)
         self.assertLessEqual(self.browser.evaluate("document.documentElement.scrollWidth"), 390)
-
-
-if __name__ == "__main__":
-    unittest.main()

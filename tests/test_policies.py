@@ -4,22 +4,19 @@ import contextlib
 import json
 import os
 import tempfile
-import unittest
 from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
-from unittest import mock
+from unittest import mock, skipUnless
 
 import numpy as np
 
-from tests.test_cli import run
+from tests.command import refused, succeeds
+from tests.data import InOneFolder
 from tests.toy_bank import SOUP
 from tests.toy_policy import write_policy
-from xreset import policies, robots
-from xreset.demos.archive import write_demos
-from xreset.demos.synth import synthesize
+from xreset import load_policy, policies, robots, synthesize, write_demos
 from xreset.errors import PolicyError
-from xreset.eval.policy_spec import load_policy
 from xreset.learning.run import Candidate, Choice, write_choice
 from xreset.policy import OnnxPolicy, policy_contract
 from xreset.task.config import ObservationConfig, TaskConfig, TerminationConfig
@@ -31,12 +28,12 @@ TASK = TaskConfig(
 )
 
 
-class WithPolicy(unittest.TestCase):
+class WithPolicy(InOneFolder):
     """A policy of the OpenArm in a folder of its own."""
 
     @classmethod
     def setUpClass(cls):
-        cls.folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
+        super().setUpClass()
         cls.contract = asdict(policy_contract(robots.load("openarm"), TASK, (SOUP,)))
         cls.file = write_policy(cls.folder / "written.onnx", cls.contract)
 
@@ -91,17 +88,15 @@ class OnnxPolicyTest(WithPolicy):
         with self.assertRaisesRegex(PolicyError, "here is no policy file"):
             OnnxPolicy(self.folder / "none.onnx")
         path.write_bytes(b"hello")
-        with self.assertRaisesRegex(PolicyError, "cannot be read as an ONNX policy"):
-            OnnxPolicy(path)
+        self.assertRaisesRegex(PolicyError, "cannot be read as an ONNX policy", OnnxPolicy, path)
 
 
 class ShippedTest(WithPolicy):
     def setUp(self):
         """A folder of shipped policies with one in it, and another folder to work in."""
-        here = tempfile.TemporaryDirectory()
-        self.addCleanup(here.cleanup)
-        self.enterContext(contextlib.chdir(here.name))
-        ours = Path(here.name) / "site"
+        here = self.enterContext(tempfile.TemporaryDirectory())
+        self.enterContext(contextlib.chdir(here))
+        ours = Path(here, "site")
         ours.mkdir()
         (ours / "skilled.onnx").write_bytes(self.file.read_bytes())
         self.enterContext(mock.patch.object(policies, "FOLDER", ours))
@@ -135,17 +130,14 @@ class ShippedTest(WithPolicy):
             self.assertEqual(load_policy("skilled").selection_seed, seed)
 
     def test_the_list_is_of_cards(self):
-        code, _, err = run("policies", "list")
-        self.assertEqual(code, 1)
-        self.assertIn("the card of skilled.onnx", err)
+        self.assertIn("the card of skilled.onnx", refused("policies", "list"))
         card = policies.FOLDER / "skilled.toml"
         text = (
             'schema = "xreset-policy-card/1"\nabout = "Lifts."\ndata = "four demonstrations"\nrecipe = "one minute"\nlicence = "MIT"\n'
             '[results.seen]\nmujoco = "90 %"\n[results.others]\nsapien = "70 %"\n'
         )
         card.write_text(text)
-        code, out, err = run("policies", "list")
-        self.assertEqual((code, err), (0, ""))
+        out = succeeds("policies", "list")
         for part in (
             "skilled: Lifts.",
             "four demonstrations",
@@ -158,7 +150,7 @@ class ShippedTest(WithPolicy):
         ):
             self.assertIn(part, out)
         card.write_text(text.replace("card/1", "card/9"))
-        self.assertIn("states schema", run("policies", "list")[2])
+        self.assertIn("states schema", refused("policies", "list"))
 
     def test_it_knows_which_objects_it_was_not_trained_with(self):
         self.assertEqual(load_policy("skilled").unseen((SOUP, "mug", "bowl")), ("bowl", "mug"))
@@ -172,24 +164,18 @@ class ShippedTest(WithPolicy):
             (("eval",), ()),
             (("engines", "attribute"), ("--towards", "pybullet")),
         ):
-            code, _, err = run(*command, "skiled", "--demos", "x.npz", *options)
-            self.assertEqual(code, 1)
-            self.assertIn(f"{expected}, skilled.", err)
+            self.assertIn(
+                f"{expected}, skilled.", refused(*command, "skiled", "--demos", "x.npz", *options)
+            )
         next(policies.FOLDER.iterdir()).unlink()
-        with self.assertRaisesRegex(PolicyError, f"{expected}[.]"):
-            load_policy("skiled")
+        self.assertRaisesRegex(PolicyError, f"{expected}[.]", load_policy, "skiled")
 
-    @unittest.skipUnless(find_spec("mujoco"), "mujoco is not installed")
+    @skipUnless(find_spec("mujoco"), "mujoco is not installed")
     def test_it_is_evaluated_traced_and_reported_by_name(self):
         write_demos("demos.npz", synthesize([SOUP], 1))
-        self.assertEqual(run("eval", "skilled", "--demos", "demos.npz", "--episodes", "1")[0], 0)
+        succeeds("eval", "skilled", "--demos", "demos.npz", "--episodes", "1")
         self.assertEqual(
             json.loads(Path("runs/skilled/eval/mujoco.json").read_text())["policy"], "skilled"
         )
-        code, out, err = run("report", "skilled")
-        self.assertEqual((code, err), (0, ""))
+        out = succeeds("report", "skilled")
         self.assertTrue(Path("runs/skilled/report/index.html").is_file(), out)
-
-
-if __name__ == "__main__":
-    unittest.main()

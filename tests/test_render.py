@@ -1,13 +1,12 @@
-import tempfile
-import unittest
-from pathlib import Path
-from unittest import mock
+from unittest import TestCase, mock
 
 import numpy as np
 import torch
 import trimesh
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
+from tests.data import InFolder
 from xreset.description import load_robot as load
 from xreset.errors import RobotError, XResetError
 from xreset.geometry.kinematics import Kinematics
@@ -17,7 +16,7 @@ from xreset.pictures.render import Camera, Points, Renderer, pose_matrix, write_
 from xreset.spec import Geometry, ObjectSpec, SceneSpec, Shape
 
 
-def cube(half: float) -> ObjectSpec:
+def cube(half):
     mesh = trimesh.creation.box([2 * half] * 3)
     return ObjectSpec(
         name="cube",
@@ -30,11 +29,11 @@ def cube(half: float) -> ObjectSpec:
     )
 
 
-def at(x: float, y: float, z: float) -> np.ndarray:
+def at(x, y, z):
     return pose_matrix(np.array([x, y, z]), np.array([1.0, 0, 0, 0]))
 
 
-def pixel(camera: Camera, size: tuple[int, int], point) -> np.ndarray:
+def pixel(camera, size, point):
     """Where a world point appears, by the textbook: written apart from the module that is tested."""
     forward = np.subtract(camera.target, camera.eye)
     forward /= np.linalg.norm(forward)
@@ -46,7 +45,7 @@ def pixel(camera: Camera, size: tuple[int, int], point) -> np.ndarray:
     return np.array([size[0] / 2 + scale * (away @ right), size[1] / 2 - scale * (away @ up)])
 
 
-class Pictures(unittest.TestCase):
+class Pictures(TestCase):
     @classmethod
     def setUpClass(cls):
         cls.robot = load("openarm")
@@ -57,7 +56,7 @@ class Pictures(unittest.TestCase):
         cls.camera = Camera()
         cls.home = cls.robot.home
 
-    def changed(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    def changed(self, a, b):
         return np.abs(a.astype(int) - b).max(axis=-1) > 12
 
     def test_object_appears_where_it_is(self):
@@ -70,7 +69,7 @@ class Pictures(unittest.TestCase):
             orange = (picture[..., 0] > picture[..., 2] + 60) & self.changed(picture, empty)
             y, x = np.nonzero(orange)
             expected = pixel(self.camera, self.size, position)
-            np.testing.assert_allclose(
+            assert_allclose(
                 (x.min() / 2 + x.max() / 2 + 0.5, y.min() / 2 + y.max() / 2 + 0.5),
                 expected,
                 atol=2.0,
@@ -95,7 +94,7 @@ class Pictures(unittest.TestCase):
         x, y = pixel(self.camera, self.size, ground).astype(int)
         lit = self.renderer.draw(self.home)[y, x]
         dark = self.renderer.draw(self.home, at(*above))[y, x]
-        self.assertLess(int(dark.max()), 0.75 * int(lit.max()))
+        self.assertLess(dark.max(), 0.75 * int(lit.max()))
 
     def test_goal_is_translucent(self):
         T = at(0.4, 0.1, 0.3)
@@ -114,7 +113,7 @@ class Pictures(unittest.TestCase):
         points = Points(pos=np.array([inside, *outside]), color=color, radius=0.012)
         picture = self.renderer.draw(self.home, at(*inside), points=[points])
         y, x = np.nonzero((picture == (255, 0, 255)).all(axis=-1))
-        np.testing.assert_allclose(
+        assert_allclose(
             (x.mean() + 0.5, y.mean() + 0.5), pixel(self.camera, self.size, inside), atol=1.0
         )
 
@@ -134,7 +133,7 @@ class Pictures(unittest.TestCase):
         T = at(0.4, 0.1, 0.04)
         # the same, each time
         own = Renderer(self.renderer.scene, size=self.size, camera=near).draw(self.home, T)
-        np.testing.assert_array_equal(self.renderer.draw(self.home, T, camera=near), own)
+        assert_array_equal(self.renderer.draw(self.home, T, camera=near), own)
         self.assertGreater(self.changed(self.renderer.draw(self.home, T), own).mean(), 0.1)
         smooth = Renderer(self.renderer.scene, size=self.size, camera=near, smooth=True).draw(
             self.home, T
@@ -154,22 +153,18 @@ class Pictures(unittest.TestCase):
         self.assertEqual(colors["right_index_MP"], meshes.HAND_COLOR)
 
 
-class Png(unittest.TestCase):
+class Png(InFolder):
     def test_written_picture_reads_back(self):
         picture = np.random.default_rng(0).integers(0, 256, (7, 5, 3), dtype=np.uint8)
-        path = Path(self.enterContext(tempfile.TemporaryDirectory())) / "a.png"
+        path = self.folder / "a.png"
         write_png(path, picture)
-        np.testing.assert_array_equal(np.asarray(Image.open(path)), picture)
+        assert_array_equal(np.asarray(Image.open(path)), picture)
 
 
-class WithoutEmbree(unittest.TestCase):
+class WithoutEmbree(TestCase):
     def test_the_error_names_the_package(self):
         with (
             mock.patch.dict("sys.modules", {"embreex.mesh_construction": None}),
             self.assertRaisesRegex(XResetError, "pip install embreex"),
         ):
             render.draw_bodies([trimesh.creation.box()], [(1, 0, 0)], Camera(), (4, 4))
-
-
-if __name__ == "__main__":
-    unittest.main()

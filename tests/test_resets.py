@@ -1,34 +1,30 @@
 """The physics filter on the MuJoCo C engine: what stays put is kept, what moves is rejected, with its reason."""
 
-import unittest
 from dataclasses import replace
 from functools import partial
-from unittest import mock
+from unittest import SkipTest, TestCase, mock
 
 import numpy as np
 import torch
+from numpy.testing import assert_allclose
 
 from tests.toy_bank import SOUP, SPAM, toy_retargeted
-from xreset import robots
+from xreset import FilterConfig, SceneSpec, make_backend, robots
 from xreset.errors import DemoError
 from xreset.objects.catalogue import load_objects
 from xreset.objects.rest import rest_height
-from xreset.physics import Health, State
-from xreset.plugins import make_backend
-from xreset.resets.config import FilterConfig
+from xreset.physics import State
 from xreset.resets.filter import REASONS, make_bank, rejection
-from xreset.retarget.file import Retargeted
-from xreset.spec import SceneSpec
 
 try:
     from xreset.backends.mujoco import MujocoBackend
 except ImportError as error:
-    raise unittest.SkipTest(str(error)) from error
+    raise SkipTest(str(error)) from error
 
 UPRIGHT = np.array([1.0, 0, 0, 0])
 
 
-class FilterTest(unittest.TestCase):
+class FilterTest(TestCase):
     @classmethod
     def setUpClass(cls):
         in_this_process = mock.patch(
@@ -69,14 +65,14 @@ class FilterTest(unittest.TestCase):
         for field, reason in (("nonfinite", "not finite"), ("overflow", "overflow")):
 
             class Broken(MujocoBackend):
-                def health(self, field=field) -> Health:
+                def health(self, field=field):
                     return replace(
                         super().health(), **{field: torch.ones(self.num_worlds, dtype=torch.bool)}
                     )
 
             self.assertEqual(self.try_one([0.5, 0.3, self.height], backend_class=Broken), reason)
 
-    def retargeted(self, **changes) -> Retargeted:
+    def retargeted(self, **changes):
         """Two demonstrations of three frames: soup (at rest, inside the table, at rest) and spam (not valid, at rest, at rest)."""
         spam_height = float(rest_height(self.objects[1], UPRIGHT))
         heights = [
@@ -113,8 +109,8 @@ class FilterTest(unittest.TestCase):
             (bank.rejected_sequence_index.tolist(), bank.rejected_frame_index.tolist()), ([0], [1])
         )
         # frame 0 counts although it is not valid
-        np.testing.assert_allclose(bank.start_pos[1], self.retargeted().object_pos[3], atol=1e-6)
-        np.testing.assert_allclose(bank.goal_pos, self.retargeted().goal_pos, atol=1e-6)
+        assert_allclose(bank.start_pos[1], self.retargeted().object_pos[3], atol=1e-6)
+        assert_allclose(bank.goal_pos, self.retargeted().goal_pos, atol=1e-6)
         self.assertEqual(calls[-1], (5, 5))
 
     def test_accounts_by_object_and_phase(self):
@@ -173,7 +169,3 @@ class FilterTest(unittest.TestCase):
             make_bank(none, self.robot, self.objects, ["mujoco"])
         with self.assertRaisesRegex(DemoError, "objects that were not given"):
             make_bank(self.retargeted(), self.robot, self.objects[:0], ["mujoco"])
-
-
-if __name__ == "__main__":
-    unittest.main()

@@ -1,12 +1,10 @@
 """The table of episodes, and values in files of results that are impossible."""
 
 import json
-import tempfile
-import unittest
-from pathlib import Path
 
 import numpy as np
 
+from tests.data import InFolder
 from tests.toy_results import toy_rollouts, toy_summary
 from xreset.errors import FileFormatError
 from xreset.eval.report.groups import estimate
@@ -15,9 +13,9 @@ from xreset.files import write_json
 from xreset.learning.clock import read_lift
 
 
-class ResultsTest(unittest.TestCase):
+class ResultsTest(InFolder):
     def setUp(self):
-        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
+        super().setUp()
         for engine in ("mujoco", "sapien"):
             write_results(self.folder, toy_summary(engine), toy_rollouts(), ("a", "b", "c"))
 
@@ -87,11 +85,7 @@ class ResultsTest(unittest.TestCase):
         ):
             self.refuse("lift.json", lift | change, read_lift)
 
-    def refuse(self, name: str, content: dict, read):
+    def refuse(self, name, content, read):
         write_json(self.folder / name, content)
         with self.subTest(content), self.assertRaisesRegex(FileFormatError, "is .*, expected a"):
             read(self.folder)
-
-
-if __name__ == "__main__":
-    unittest.main()

@@ -1,16 +1,16 @@
 import shutil
-import unittest
 from dataclasses import replace
 from importlib.metadata import EntryPoint
 from importlib.util import find_spec
-from unittest import mock
+from unittest import TestCase, mock, skipUnless
 
 import numpy as np
 import trimesh
 
 from ci import build_robot
-from tests.data import InFolder, run
-from xreset import plugins
+from tests.command import refused, succeeds
+from tests.data import InFolder
+from xreset import TaskConfig, plugins
 from xreset.description import load_robot as load
 from xreset.errors import PolicyError, RobotError
 from xreset.geometry.dynamics import mass_matrix
@@ -18,7 +18,6 @@ from xreset.geometry.urdf import find_mesh
 from xreset.plugins import robot_folder, robot_names
 from xreset.policy import check_contract, policy_contract
 from xreset.robot_tools.check import check
-from xreset.task.config import TaskConfig
 
 BUILT_IN = {
     "ur7e-sharpa": "503f290c651dbc9d645a3113d96b9f9c51eecfe382a87fadbeaec8c8896e08d2",
@@ -38,14 +37,14 @@ class Copied(InFolder):
         super().setUp()
         shutil.copytree(robot_folder("openarm"), self.folder, dirs_exist_ok=True)
 
-    def edit(self, file: str, old: str, new: str) -> None:
+    def edit(self, file, old, new):
         path = self.folder / file
         text = path.read_text()
         self.assertIn(old, text)
         path.write_text(text.replace(old, new))
 
 
-class BuiltIn(unittest.TestCase):
+class BuiltIn(TestCase):
     def test_committed_urdf_is_what_build_writes(self):
         for name in BUILT_IN:
             with self.subTest(name):
@@ -87,8 +86,8 @@ class Fingerprint(Copied):
             check_contract("p.onnx", policy_contract(other, task, ()), robot, task)
 
 
-class Dynamics(unittest.TestCase):
-    @unittest.skipUnless(find_spec("mujoco"), "MuJoCo is not installed")
+class Dynamics(TestCase):
+    @skipUnless(find_spec("mujoco"), "MuJoCo is not installed")
     def test_mass_matrix_is_mujocos(self):
         import mujoco
 
@@ -112,14 +111,13 @@ class Dynamics(unittest.TestCase):
 
 
 class Registry(Copied):
-    def errors(self, level: str = "error") -> str:
+    def errors(self, level="error"):
         return "\n".join(f"{f.topic}: {f.message}" for f in check(self.folder) if f.level == level)
 
     def test_names_and_folders(self):
         self.assertLessEqual(set(BUILT_IN), set(robot_names()))
         self.assertEqual(load(self.folder).home.tolist(), load("openarm").home.tolist())
-        with self.assertRaisesRegex(RobotError, "ur7e-sharpa"):
-            load("no-such-robot")
+        self.assertRaisesRegex(RobotError, "ur7e-sharpa", load, "no-such-robot")
 
     def test_a_plugin_has_the_name_that_files_give_its_robot(self):
         entry = EntryPoint("mine", "xreset.robots.openarm", plugins.ROBOTS)
@@ -137,9 +135,8 @@ class Registry(Copied):
         with mock.patch.object(plugins, "entry_points", lambda group: entries):
             self.assertEqual(robot_names(), ["broken", "openarm"])
             self.assertEqual(load("openarm").name, "openarm")
-            with self.assertRaisesRegex(RobotError, "'broken'.*xreset_no_such_package"):
-                load("broken")
-            _, output = run("robots", "list")
+            self.assertRaisesRegex(RobotError, "'broken'.*xreset_no_such_package", load, "broken")
+            output = succeeds("robots", "list")
         self.assertRegex(output, r"broken[\s\S]*openarm")
 
     def test_every_mistake_in_a_description_is_listed(self):
@@ -176,11 +173,9 @@ class Registry(Copied):
     def test_not_toml_wrong_schema_no_file(self):
         for text, message in (("schema = ", "not valid TOML"), ('schema = "other/1"', "other/1")):
             (self.folder / "robot.toml").write_text(text)
-            with self.assertRaisesRegex(RobotError, message):
-                load(self.folder)
+            self.assertRaisesRegex(RobotError, message, load, self.folder)
         (self.folder / "robot.toml").unlink()
-        with self.assertRaisesRegex(RobotError, r"robot\.toml cannot be read"):
-            load(self.folder)
+        self.assertRaisesRegex(RobotError, r"robot\.toml cannot be read", load, self.folder)
 
     def test_check_tells_all_that_only_the_urdf_knows(self):
         self.edit("robot.toml", 'name = "joint7"', 'name = "joint9"')
@@ -225,7 +220,7 @@ class Registry(Copied):
             ),
             (
                 self.folder / "z.stl",
-                ("../../../../z.stl", str(self.folder / "z.stl"), "package://../../../../z.stl"),
+                ("../../../../z.stl", f"{self.folder}/z.stl", "package://../../../../z.stl"),
             ),
         )
         for i, (file, names) in enumerate(places):
@@ -247,12 +242,6 @@ class Registry(Copied):
         )
 
     def test_command_fails_on_errors_only(self):
-        self.assertEqual(run("robots", "check", self.folder)[0], 0)
+        succeeds("robots", "check", self.folder)
         self.edit("robot.toml", 'palm = "palm"', 'palm = "plam"')
-        code, output = run("robots", "check", self.folder)
-        self.assertEqual(code, 1)
-        self.assertIn("'plam'", output)
-
-
-if __name__ == "__main__":
-    unittest.main()
+        self.assertIn("'plam'", refused("robots", "check", self.folder))

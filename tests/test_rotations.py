@@ -1,12 +1,11 @@
 """Quaternions and rotations against scipy's."""
 
-from __future__ import annotations
-
 import unittest
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
+from torch.testing import assert_close
 
 from xreset.geometry.rotations import quat_angle, quat_multiply, quat_rotate, quat_to_matrix
 
@@ -24,7 +23,7 @@ class AgainstScipy(unittest.TestCase):
         for dtype, atol in ((torch.float64, 1e-15), (torch.float32, 2.4e-7)):
             with self.subTest(function.__name__, dtype=dtype):
                 found = function(*(torch.as_tensor(x, dtype=dtype) for x in arguments))
-                torch.testing.assert_close(
+                assert_close(
                     found.double(), torch.as_tensor(expected), rtol=4 * atol, atol=4 * atol
                 )
 
@@ -43,8 +42,4 @@ class AgainstScipy(unittest.TestCase):
         for function, other in ((quat_multiply, b), (quat_rotate, b[:, 1:])):
             every = function(a[:, None], other[None, :3])
             self.assertEqual(every.shape[:2], (5, 3))
-            torch.testing.assert_close(every[4, 1], function(a[4], other[1]))
-
-
-if __name__ == "__main__":
-    unittest.main()
+            assert_close(every[4, 1], function(a[4], other[1]))

@@ -42,7 +42,3 @@ class ScheduleTest(unittest.TestCase):
         plan = schedule(np.array([0, 0, 0]), 2)
         assert_array_equal(plan.rounds, [[0, 1], [2, 2]])
         assert_array_equal(plan.fresh, [[True, True], [True, False]])
-
-
-if __name__ == "__main__":
-    unittest.main()

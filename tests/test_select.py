@@ -1,25 +1,19 @@
 """Choosing among checkpoints: the best in its worst engine, what is played for it, and what the choice does afterwards."""
 
-from __future__ import annotations
-
 import json
-import tempfile
-import unittest
-from pathlib import Path
 from types import SimpleNamespace
-from unittest import mock
+from unittest.mock import Mock, patch
 
-from tests.command import xreset
+from tests.command import refused
+from tests.data import InFolder
 from tests.toy_results import episodes
+from xreset import PolicySpec, TaskConfig, evaluate
 from xreset.errors import FileFormatError, PolicyError, RunError
 from xreset.eval.engines.attribution import attribute
-from xreset.eval.evaluate import evaluate
-from xreset.eval.policy_spec import PolicySpec
 from xreset.eval.select import SEED, candidates_in, select
 from xreset.eval.setting import Setting
 from xreset.eval.stress import stress
-from xreset.learning.run import Choice, read_choice
-from xreset.task.config import TaskConfig
+from xreset.learning.run import read_choice
 
 SCORES = {
     "300.pt": {"a": 0.90, "b": 0.60, "c": 0.80},
@@ -29,9 +23,9 @@ SCORES = {
 }
 
 
-class SelectTest(unittest.TestCase):
+class SelectTest(InFolder):
     def setUp(self):
-        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
+        super().setUp()
         (self.folder / "checkpoints").mkdir()
         for name in SCORES:
             (self.folder / "checkpoints" / name).write_bytes(name.encode())
@@ -39,25 +33,25 @@ class SelectTest(unittest.TestCase):
         self.demos.write_bytes(b"demos")
         self.played: list[tuple[str, str, int]] = []
 
-    def choose(self, **options) -> Choice:
-        def load_policy(path: Path, robot: str | None):
+    def choose(self, **options):
+        def load_policy(path, robot):
             return SimpleNamespace(start=lambda motion: f"{path.stem}.pt")
 
-        def load_trial(policy, demos, seed: int, **_):
+        def load_trial(policy, demos, seed, **_):
             return SimpleNamespace(seed=seed)
 
         def rolled(policy, engine, trial, *, repetitions):
             self.played.append((policy, engine.name, trial.seed))
             return SimpleNamespace(episodes=episodes([SCORES[policy][engine.name]] * repetitions))
 
-        def export(folder: Path, checkpoint: Path, file: Path):
+        def export(folder, checkpoint, file):
             file.write_bytes(checkpoint.read_bytes())
 
         engines = [SimpleNamespace(name=name, version="1") for name in "abc"]
         run = SimpleNamespace(objects=None)
         patches = {"load_policy": load_policy, "load_trial": load_trial, "roll_out": rolled}
         patches |= {"export_checkpoint": export, "read_run": lambda folder: run}
-        with mock.patch.multiple("xreset.eval.select", **patches):
+        with patch.multiple("xreset.eval.select", **patches):
             return select(self.folder, engines, self.demos, Setting(seed=SEED), **options)  # pyright: ignore[reportArgumentType]
 
     def test_the_best_worst_engine_decides(self):
@@ -73,40 +67,38 @@ class SelectTest(unittest.TestCase):
         }
         # where the best is worst comes first; one that cannot win is given up
         self.assertEqual(order, {"300.pt": "abc", "200.pt": "bca", "100.pt": "bc", "050.pt": "b"})
-        with mock.patch.dict(SCORES, {"100.pt": SCORES["200.pt"]}):
+        with patch.dict(SCORES, {"100.pt": SCORES["200.pt"]}):
             self.assertEqual(self.choose().chosen, "200.pt", "of equals the newer one")
 
     def test_some_of_many_are_spread_over_all(self):
         names = [path.name for path in candidates_in(self.folder, 2)]
         self.assertEqual(names, ["300.pt", "050.pt"])
         self.assertEqual(len(candidates_in(self.folder, 9)), 4)
-        with self.assertRaisesRegex(RunError, "no checkpoint"):
-            candidates_in(self.folder / "nowhere", 2)
+        self.assertRaisesRegex(RunError, "no checkpoint", candidates_in, self.folder / "nowhere", 2)
 
     def test_the_starts_that_decided_are_not_reported(self):
         choice = self.choose()
         policy = PolicySpec(
             name="p",
-            start=mock.Mock(),
-            robot=mock.Mock(),
+            start=Mock(),
+            robot=Mock(),
             task=TaskConfig(),
             folder=self.folder / "eval",
             selection_seed=choice.seed,
         )
-        trial = mock.Mock(seed=SEED)
+        trial = Mock(seed=SEED)
         for measure in (
             lambda: evaluate(policy, self.demos, [], seed=SEED),
             lambda: stress(policy, trial, [], self.folder),
-            lambda: attribute(policy, mock.Mock(), mock.Mock(), trial, episodes=1),
+            lambda: attribute(policy, Mock(), Mock(), trial, episodes=1),
         ):
-            with self.assertRaisesRegex(PolicyError, f"Seed {SEED} chose this checkpoint"):
-                measure()
+            self.assertRaisesRegex(PolicyError, f"Seed {SEED} chose this checkpoint", measure)
         policy.check_seed(0)
 
     def test_the_choice_is_recorded_before_the_policy_is_replaced(self):
         policy = self.folder / "policy.onnx"
         policy.write_bytes(b"of the newest")
-        interrupted = mock.patch("xreset.eval.select.write_whole", side_effect=KeyboardInterrupt)
+        interrupted = patch("xreset.eval.select.write_whole", side_effect=KeyboardInterrupt)
         with interrupted, self.assertRaises(KeyboardInterrupt):
             self.choose()
         self.assertEqual(read_choice(self.folder).chosen, "200.pt")
@@ -123,13 +115,8 @@ class SelectTest(unittest.TestCase):
             ({"seed": -1}, "seed is -1"),
         ):
             file.write_text(json.dumps(content | changes))
-            with self.assertRaisesRegex(FileFormatError, problem):
-                read_choice(self.folder)
+            self.assertRaisesRegex(FileFormatError, problem, read_choice, self.folder)
         self.assertIn(
             "--most is 0, expected",
-            xreset("select", self.folder, "--demos", self.demos, "--most", "0")[2],
+            refused("select", self.folder, "--demos", self.demos, "--most", "0"),
         )
-
-
-if __name__ == "__main__":
-    unittest.main()

@@ -1,30 +1,26 @@
 """Starts at rest: recorded start poses come to rest on the table before episodes begin there."""
 
-import unittest
 from dataclasses import replace
 from functools import partial
-from unittest import mock
+from unittest import TestCase, mock
 
 import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from tests.toy_bank import SOUP, SPAM, toy_bank
-from xreset.demos.synth import synthesize
-from xreset.description import load_robot
-from xreset.eval.policy_spec import load_policy
+from xreset import load_object, load_policy, load_robot, make_backend, synthesize
 from xreset.eval.rollout import load_trial
-from xreset.objects.catalogue import load_object
-from xreset.plugins import make_backend
 from xreset.resets.settle import settle_starts
 
 
-def tilted(degrees: float) -> np.ndarray:
+def tilted(degrees):
     """Quaternion (w, x, y, z) of a turn about x."""
     half = np.radians(degrees) / 2
     return np.array([np.cos(half), np.sin(half), 0, 0], dtype=np.float32)
 
 
-class SettleTest(unittest.TestCase):
+class SettleTest(TestCase):
     @classmethod
     def setUpClass(cls):
         in_this_process = mock.patch(
@@ -42,12 +38,12 @@ class SettleTest(unittest.TestCase):
         bank = toy_bank(self.robot, start_pos=pos, start_quat_wxyz=quat)
         settled, at_rest = settle_starts(bank, self.robot, self.objects)
         self.assertEqual(at_rest.tolist(), [True, False, True])
-        np.testing.assert_array_equal(settled.start_pos[1], pos[1])  # it left the table
-        np.testing.assert_allclose(settled.start_pos[[0, 2], 2], z, atol=2e-3)
+        assert_array_equal(settled.start_pos[1], pos[1])  # it left the table
+        assert_allclose(settled.start_pos[[0, 2], 2], z, atol=2e-3)
         axis = Rotation.from_quat(settled.start_quat_wxyz[2], scalar_first=True).apply([0, 0, 1])
         self.assertLess(np.degrees(np.arccos(axis[2])), 1, "it leaned by 6 degrees")
-        np.testing.assert_array_equal(settled.goal_pos, bank.goal_pos)
-        np.testing.assert_array_equal(settled.joint_pos, bank.joint_pos)
+        assert_array_equal(settled.goal_pos, bank.goal_pos)
+        assert_array_equal(settled.joint_pos, bank.joint_pos)
 
     def test_an_evaluation_says_that_its_starts_were_settled(self):
         demos = synthesize([SOUP], 1, seed=0)
@@ -68,7 +64,3 @@ class SettleTest(unittest.TestCase):
             lean.append(np.degrees(np.arccos(axis[2])))
         self.assertAlmostEqual(lean[0], 6, delta=0.1)
         self.assertLess(lean[1], 1)
-
-
-if __name__ == "__main__":
-    unittest.main()

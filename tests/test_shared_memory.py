@@ -1,18 +1,15 @@
 """MuJoCo-Warp publishes the engine's own memory on every device: no copies, and nothing passes through the host."""
 
-from __future__ import annotations
-
 import unittest
 from dataclasses import fields
 
 import torch
-from torch import Tensor
 
 from xreset.backends.conformance.scene import scene
 from xreset.backends.mujoco_warp import MujocoWarpBackend
 
 
-def published(backend: MujocoWarpBackend) -> dict[str, Tensor]:
+def published(backend):
     """Every tensor of the getters that a control step writes, by name."""
     tensors = {"nonfinite": backend.health().nonfinite}
     for prefix, bundle in (
@@ -56,12 +53,12 @@ class SharedMemory(unittest.TestCase):
         self.addCleanup(backend.close)
         targets = backend.state().joint_target + 0.05
 
-        def control_step() -> None:
+        def control_step():
             backend.set_joint_targets(targets)
             backend.step()
             published(backend)
 
-        def device_work(action) -> str:
+        def device_work(action):
             with profile(activities=[ProfilerActivity.CUDA]) as trace:
                 action()
                 torch.cuda.synchronize()
@@ -72,7 +69,3 @@ class SharedMemory(unittest.TestCase):
         self.assertIn("read_state", names, "the profiler saw no kernel that publishes")
         self.assertNotRegex(names, "DtoH|HtoD")
         self.assertIn("DtoH", device_work(lambda: targets.cpu()), "a copy to the host must show")
-
-
-if __name__ == "__main__":
-    unittest.main()

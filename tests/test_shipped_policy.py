@@ -7,12 +7,10 @@ import tempfile
 import unittest
 from importlib.util import find_spec
 
-from xreset.demos.synth import synthesize
-from xreset.eval.evaluate import evaluate
+from xreset import OnnxPolicy, evaluate, synthesize
 from xreset.eval.policy_spec import BASELINES, load_policy
 from xreset.objects.catalogue import object_names
 from xreset.policies import card, shipped
-from xreset.policy import OnnxPolicy
 
 LARGEST = 5e6
 """What a policy may add to every download [bytes]."""
@@ -71,7 +69,3 @@ class ShippedPolicyTest(unittest.TestCase):
                 self.assertEqual(list(result.inputs), ["policy"])
                 self.assertEqual(result.episodes, 2)
                 self.assertGreaterEqual(result.task_progress.mean, FLOOR)
-
-
-if __name__ == "__main__":
-    unittest.main()

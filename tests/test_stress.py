@@ -1,26 +1,23 @@
 """Sweeps of one property at a time: what is swept, what is found, and what is refused. No physics but for one short run."""
 
-from __future__ import annotations
-
-import tempfile
-import unittest
 from dataclasses import asdict, replace
-from pathlib import Path
-from unittest import mock
+from unittest import TestCase, mock
 
 import numpy as np
+from numpy.testing import assert_allclose
 
-from tests.command import xreset
+from tests.command import succeeds
+from tests.data import InFolder
 from tests.toy_bank import SOUP
 from tests.toy_results import episodes
 from xreset.errors import XResetError
 from xreset.eval.sensitivity import SWEEPS, chosen, nominal_task
-from xreset.eval.stress import Curve, Stress, curve, read_stress
+from xreset.eval.stress import Stress, curve, read_stress
 from xreset.files import write_json
 from xreset.task.config import RandomizationConfig, TaskConfig, evaluation_task
 
 
-class StressedTest(unittest.TestCase):
+class StressedTest(TestCase):
     def test_nothing_is_random_and_one_thing_differs(self):
         task = evaluation_task(
             TaskConfig(
@@ -39,9 +36,7 @@ class StressedTest(unittest.TestCase):
             value = prop.values[0]
             found = prop.set_in(nominal_task(task), value)
             set_to = 3.0 if prop.unit == "ms" else value  # 50 ms are three control steps
-            np.testing.assert_allclose(
-                getattr(found.randomization, prop.changed_field), (set_to, set_to)
-            )
+            assert_allclose(getattr(found.randomization, prop.changed_field), (set_to, set_to))
             self.assertEqual(
                 replace(
                     found.randomization, **{prop.changed_field: getattr(plain, prop.changed_field)}
@@ -77,11 +72,11 @@ class StressedTest(unittest.TestCase):
             light.set_in(TaskConfig(), 0.0)
 
 
-class CurveTest(unittest.TestCase):
+class CurveTest(InFolder):
     def test_the_limit_lies_between_two_values_that_were_tried(self):
         base = [1.0, 0.6, 0.8, 0.8]
 
-        def swept(option: str, **changes: float | list[float]) -> Curve:
+        def swept(option, **changes):
             """The curve of a property; at each value every episode changes by so much."""
             (prop,) = chosen([f"{option}={','.join(value[1:] for value in changes)}"])
             found = {}
@@ -98,7 +93,7 @@ class CurveTest(unittest.TestCase):
         assert stiffness.lower is not None
         self.assertAlmostEqual(stiffness.lower, 0.8 - 0.3 * 0.05 / 0.25)
         self.assertIsNone(stiffness.upper)
-        np.testing.assert_allclose(stiffness.points[0].difference_ci95, (-0.3, -0.3), atol=1e-9)
+        assert_allclose(stiffness.points[0].difference_ci95, (-0.3, -0.3), atol=1e-9)
         self.assertEqual(stiffness.costs(), "x 0.74")
         late = swept("action-latency", **{"v1.0": -0.15, "v2.0": -0.3})
         harmless = swept("object-mass", **{"v0.5": 0.0, "v2.0": 0.0})
@@ -123,42 +118,38 @@ class CurveTest(unittest.TestCase):
             curves=(),
             left_out=(),
         )
-        with tempfile.TemporaryDirectory() as name:
-            for backend, inputs in (
-                ("mujoco", {"policy": "old"}),
-                ("sapien", {"policy": "new"}),
-                ("pybullet", {}),
-            ):
-                write_json(
-                    Path(name) / f"{backend}.json",
-                    asdict(replace(card, backend=backend, inputs=inputs)),
-                )
-            self.assertEqual(
-                [c.backend for c in read_stress(Path(name), "new")], ["pybullet", "sapien"]
-            )
-            self.assertEqual(len(read_stress(Path(name))), 3)
+        for backend, inputs in (
+            ("mujoco", {"policy": "old"}),
+            ("sapien", {"policy": "new"}),
+            ("pybullet", {}),
+        ):
+            changed = replace(card, backend=backend, inputs=inputs)
+            write_json(f"{self.folder}/{backend}.json", asdict(changed))
+        self.assertEqual(
+            [c.backend for c in read_stress(self.folder, "new")], ["pybullet", "sapien"]
+        )
+        self.assertEqual(len(read_stress(self.folder)), 3)
 
 
-class CommandTest(unittest.TestCase):
+class CommandTest(InFolder):
     def test_a_card_from_the_command_line(self):
         """A hand that does nothing, one demonstration and one value: files, table, picture; and an engine that cannot set drives."""
         from xreset.backends.mujoco import MujocoBackend
 
-        folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
-        demos = folder / "demos.npz"
-        xreset("demos", "synth", "--objects", SOUP, "--per-object", 1, "--out", demos)
+        demos = self.folder / "demos.npz"
+        succeeds("demos", "synth", "--objects", SOUP, "--per-object", 1, "--out", demos)
         options = ("--robot", "openarm", "--demos", demos, "--episodes", 1)
         sweeps = ("--property", "arm-stiffness=0.5", "--property", "action-latency=1")
         sweeps += ("--property", "camera-latency=33")  # of cameras, which the policy does not have
         with mock.patch.object(
             MujocoBackend, "capabilities", MujocoBackend.capabilities - {"drives"}
         ):
-            _, out, _ = xreset("stress", "zero", *options, "--out", folder, *sweeps)
-            options += ("--out", folder / "none", "--property", "arm-stiffness=0.5")
-            _, left_out, _ = xreset("stress", "zero", *options)
+            out = succeeds("stress", "zero", *options, "--out", self.folder, *sweeps)
+            options += ("--out", self.folder / "none", "--property", "arm-stiffness=0.5")
+            left_out = succeeds("stress", "zero", *options)
         self.assertIn("cannot be set", left_out)
-        self.assertEqual([c.curves for c in read_stress(folder / "none")], [()])
-        (card,) = read_stress(folder)
+        self.assertEqual([c.curves for c in read_stress(self.folder / "none")], [()])
+        (card,) = read_stress(self.folder)
         self.assertEqual((card.schema, card.policy, card.episodes), ("xreset-stress/1", "zero", 1))
         self.assertEqual(card.left_out, ("arm-stiffness",))
         (curve,) = card.curves
@@ -166,14 +157,10 @@ class CommandTest(unittest.TestCase):
             (curve.property, [p.value for p in curve.points]), ("action-latency", [0.0, 1.0])
         )
         self.assertEqual(curve.points[0].task_progress, card.task_progress)
-        self.assertTrue((folder / "stress.png").read_bytes().startswith(b"\x89PNG"))
+        self.assertTrue((self.folder / "stress.png").read_bytes().startswith(b"\x89PNG"))
         for expected in (
             "left out in mujoco, which cannot set them: arm-stiffness",
             "cannot be set",
         ):
             self.assertIn(expected, out)
         self.assertNotIn("camera", out)
-
-
-if __name__ == "__main__":
-    unittest.main()

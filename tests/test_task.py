@@ -2,17 +2,16 @@
 
 import json
 import math
-import tempfile
-import unittest
 from dataclasses import asdict, replace
-from pathlib import Path
+from unittest import TestCase
 
 import numpy as np
 import torch
+from torch import tensor
 from torch.testing import assert_close
 
 from tests.toy_bank import SOUP, SPAM, toy_bank
-from tests.toy_robot import toy_hand_arm
+from tests.toy_robot import toy_robot
 from xreset.cameras.config import FRONT, VisionConfig
 from xreset.checks import from_dict
 from xreset.errors import DemoError, PolicyError, RunError
@@ -26,7 +25,7 @@ from xreset.geometry.rotations import (
 from xreset.learning.recipes import RECIPES
 from xreset.physics import Links, State
 from xreset.policy import RandomPolicy, ZeroPolicy, check_contract, policy_contract, read_contract
-from xreset.resets.distribution import Reset, ResetDistribution
+from xreset.resets.distribution import ResetDistribution
 from xreset.spec import TableSpec
 from xreset.task import observations as obs
 from xreset.task.actions import ActionSpace
@@ -46,131 +45,117 @@ from xreset.task.randomization import Drawn, pair_friction, sample_friction
 from xreset.task.rewards import RewardInput, compute_reward, contact_gate
 from xreset.task.terminations import out_of_bounds
 
-IDENTITY = torch.tensor([1.0, 0, 0, 0])
-FAR = {"best_reach": torch.tensor(1e3)}
+IDENTITY = tensor([1.0, 0, 0, 0])
+FAR = {"best_reach": 1e3}
 
 
-def generator(seed: int = 0) -> torch.Generator:
+def generator(seed=0):
     return torch.Generator().manual_seed(seed)
 
 
-def turned(degrees: float, axis=(0.0, 0.0, 1.0)) -> torch.Tensor:
-    return quat_from_axis_angle(torch.tensor(axis) * math.radians(degrees))
+def turned(degrees, axis=(0.0, 0.0, 1.0)):
+    return quat_from_axis_angle(tensor(axis) * math.radians(degrees))
 
 
-def height(x: RewardInput) -> torch.Tensor:
+def assert_range(values, low, high, atol=1e-6):
+    """The least and the largest value are these."""
+    assert_close(torch.stack(values.aminmax()), tensor([low, high]), atol=atol, rtol=0)
+
+
+def height(x):
     return x.object_pos[:, 2] - x.state.object_linvel[:, 2]
 
 
-def one_number(x: RewardInput) -> torch.Tensor:
+def one_number(x):
     return x.object_pos[:, 2].mean()
 
 
-class WithRobot(unittest.TestCase):
-    @classmethod
-    def setUpClass(cls):
-        cls.robot = toy_hand_arm(Path(cls.enterClassContext(tempfile.TemporaryDirectory())))
-
-
-class RewardTest(unittest.TestCase):
-    def reward(self, config: RewardConfig | None = None, **changes):
+class RewardTest(TestCase):
+    def reward(self, config=None, **changes):
         """One world: three fingers that do not press, object at its goal, no action; ``changes`` replace inputs (without batch)."""
         x = {
-            "tip_distance": torch.full((3,), 0.2),
-            "best_reach": torch.tensor(0.2),
+            "tip_distance": [0.2] * 3,
+            "best_reach": 0.2,
             "tip_force": torch.zeros(3, 3),
-            "object_pos": torch.tensor([0.5, 0.3, 0.1]),
-            "object_quat": IDENTITY,
-            "goal_pos": torch.tensor([0.5, 0.3, 0.1]),
-            "goal_quat": IDENTITY,
-            "start_pos": torch.tensor([0.5, 0.3, 0.1]),
-            "start_quat": IDENTITY,
             "action": torch.zeros(4),
             "previous_action": torch.zeros(4),
-            "out_of_bounds": torch.tensor(False),
-            "palm_distance": torch.tensor(0.2),
+            "out_of_bounds": False,
+            "palm_distance": 0.2,
             "points": torch.zeros(4, 3),
-            "is_arm": torch.tensor([True, True, False, False]),
-            "success_position": torch.tensor(0.02),
-        } | changes
+            "is_arm": [True, True, False, False],
+            "success_position": 0.02,
+        }
+        for name in ("object", "goal", "start"):
+            x |= {f"{name}_pos": [0.5, 0.3, 0.1], f"{name}_quat": IDENTITY}
+        x = {name: torch.as_tensor(value) for name, value in (x | changes).items()}
         x = {k: v if k in ("is_arm", "success_position") else v[None] for k, v in x.items()}
         state = State.at_rest(torch.zeros(1, 4), x.pop("object_pos"), x.pop("object_quat"))
         return compute_reward(RewardInput(state=state, **x), config or RewardConfig())
 
-    PRESS = torch.tensor([[0.6, 0.0, 0.8], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    PRESS = tensor([[0.6, 0.0, 0.8], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
-    def assert_terms(self, reward, **expected: float):
+    def assert_terms(self, reward, **expected):
         """The named terms have these values, every other term is zero, and the total is a hundredth of the sum."""
-        for name, value in reward.terms.items():
-            self.assertAlmostEqual(float(value), expected.get(name, 0.0), places=5, msg=name)
-        self.assertLessEqual(set(expected), set(reward.terms))
-        self.assertAlmostEqual(float(reward.total), 0.01 * sum(expected.values()), places=5)
+        found = {name: float(value) for name, value in reward.terms.items()}
+        zeros = dict.fromkeys(found, 0.0)
+        assert_close(found, zeros | expected, atol=5e-6, rtol=0)
+        self.assertAlmostEqual(reward.total, 0.01 * sum(expected.values()), delta=5e-6)
 
     def test_terms(self):
         """At the goal with no contact nothing but reach is paid; with it, 1 + 4 + 4 + 10."""
-        gone = {"best_reach": torch.tensor(0.01), "tip_distance": torch.tensor([0.1, 0.2, 0.3])}
-        wide = RewardConfig(reach_width=0.4, reach_near=0.5, reach_near_width=0.1)
-        opposing = RewardConfig(contact="opposing")
-        squeeze = torch.tensor([[3.0, 0, 1], [0, 0, 0], [-3.0, 0, 1]])
-        held = {"grasp": 1, "position": 4, "rotation": 4, "success": 10}
-        away = {
-            "object_pos": torch.tensor([0.5, 0.36, 0.02]),
-            "object_quat": turned(60, (0.0, 0.6, 0.8)),
-        }
-        errors = {
-            "position": 4 * (1 - math.tanh(0.1 / 0.2)),
-            "rotation": 4 * (1 - math.tanh(math.pi / 3 / 1.5)),
-        }
-        action = torch.tensor([1.0, -0.5, 0, 0])
-        moving = {"action": action, "previous_action": torch.tensor([1.0, 0.5, 0.2, 0])}
+        gone = {"best_reach": 0.01, "tip_distance": [0.1, 0.2, 0.3]}
+        wide = {"reach_width": 0.4, "reach_near": 0.5, "reach_near_width": 0.1}
+        opposing = {"contact": "opposing"}
+        press = FAR | {"tip_force": self.PRESS}
+        squeeze = FAR | {"tip_force": [[3.0, 0, 1], [0, 0, 0], [-3.0, 0, 1]]}
+        held = {"grasp": 1.0, "position": 4.0, "rotation": 4.0, "success": 10.0}
+        away = {"object_pos": [0.5, 0.36, 0.02], "object_quat": turned(60, (0.0, 0.6, 0.8))}
+        moving = FAR | {"action": [1.0, -0.5, 0, 0], "previous_action": [1.0, 0.5, 0.2, 0]}
+
+        def near(x):
+            return 1 - math.tanh(x)
+
+        errors = {"position": 4 * near(0.1 / 0.2), "rotation": 4 * near(math.pi / 3 / 1.5)}
         for config, changes, expected in (
-            (None, gone, {"reach": 1 - math.tanh(0.1)}),
-            (RewardConfig(reach_distance="present"), gone, {"reach": 1 - math.tanh(2.0)}),
-            (wide, {}, {"reach": 1 - math.tanh(0.5), "reach_near": 0.5 * (1 - math.tanh(2.0))}),
-            (opposing, FAR | {"tip_force": self.PRESS}, {"grasp": 1}),
-            (opposing, FAR | {"tip_force": squeeze}, held),
-            (None, FAR, {}),
-            (None, FAR | {"tip_force": self.PRESS}, held),
-            (None, FAR | {"tip_force": self.PRESS} | away, {"grasp": 1} | errors),
-            (None, FAR | moving, {"action": -0.005 * 1.25, "action_rate": -0.005 * 1.04}),
+            ({}, gone, {"reach": near(0.1)}),
+            ({"reach_distance": "present"}, gone, {"reach": near(2.0)}),
+            (wide, {}, {"reach": near(0.5), "reach_near": 0.5 * near(2.0)}),
+            (opposing, press, {"grasp": 1.0}),
+            (opposing, squeeze, held),
+            ({}, FAR, {}),
+            ({}, press, held),
+            ({}, press | away, {"grasp": 1.0} | errors),
+            ({}, moving, {"action": -0.005 * 1.25, "action_rate": -0.005 * 1.04}),
         ):
             with self.subTest(config=config, changes=list(changes)):
-                self.assert_terms(self.reward(config, **changes), **expected)
+                self.assert_terms(self.reward(RewardConfig(**config), **changes), **expected)
 
     def test_the_published_reward(self):
         """Numbers from the published paper: -2.5 min(P, 3) - 2.5 min(M, 0.5) + G (3 (1.4 - 3 d) + [d <= 0.02] 15 / (1 + 10 d))."""
         config = RECIPES["published"].config.task.reward
-        points = torch.tensor([[0.05, 0, 0], [0, 0.05, 0], [0, 0, 0.05], [0, 0, -0.05]])
-        cases = (
+        for tips, palm, d, gate in (
             (0.15, 0.1, 0.0, True),
             (0.15, 0.1, 0.015, True),
             (0.15, 0.1, 0.1, True),
             (0.25, 0.1, 0.0, False),
             (0.15, 0.25, 0.0, False),
             (2.0, 0.9, 0.0, False),
-        )
-        for tips, palm, d, gate in cases:
+        ):
             reward = self.reward(
                 config,
-                tip_distance=torch.full((3,), tips),
-                palm_distance=torch.tensor(palm),
-                object_pos=torch.tensor([0.5, 0.3 + d, 0.1]),
-                points=points,
-                action=torch.tensor([0.5, 0, 0.5, 0]),
+                tip_distance=[tips] * 3,
+                palm_distance=palm,
+                object_pos=[0.5, 0.3 + d, 0.1],
+                points=[[0.05, 0, 0], [0, 0.05, 0], [0, 0, 0.05], [0, 0, -0.05]],
+                action=[0.5, 0, 0.5, 0],
             )
-            expected = (
-                -2.5 * min(3 * tips, 3)
-                - 2.5 * min(palm, 0.5)
-                - 0.005 * 0.5
-                - 0.05 * 0.25
-                - 0.005 * 0.25
-            )
-            expected += gate * 3 * (1.4 - 3 * d) + (gate and d <= 0.02) * 15 / (1 + 10 * d)
+            success = gate and d <= 0.02
+            actions = 0.005 * 0.5 + 0.05 * 0.25 + 0.005 * 0.25
+            expected = -2.5 * min(3 * tips, 3) - 2.5 * min(palm, 0.5) - actions
+            expected += gate * 3 * (1.4 - 3 * d) + success * 15 / (1 + 10 * d)
             with self.subTest(tips=tips, palm=palm, d=d):
-                self.assertEqual(
-                    (bool(reward.gate), bool(reward.success)), (gate, gate and d <= 0.02)
-                )
-                self.assertAlmostEqual(float(reward.total), 0.01 / 30 * expected, places=6)
+                self.assertEqual((reward.gate, reward.success), (gate, success))
+                self.assertAlmostEqual(reward.total, 0.01 / 30 * expected, delta=5e-7)
 
     def test_a_term_of_the_users_own_is_added(self):
         config = RewardConfig(own={f"{__name__}:height": 0.5})
@@ -188,11 +173,9 @@ class RewardTest(unittest.TestCase):
         ):
             with self.subTest(name), self.assertRaisesRegex(RunError, problem):
                 self.reward(RewardConfig(own={name: 1.0}))
+        words = "expected module:function and a finite number"
         for own in ({"height": 1.0}, {"module:": 1.0}, {"a:b": math.nan}, {math.sin: 1.0}, ["a:b"]):
-            with (
-                self.subTest(own),
-                self.assertRaisesRegex(ValueError, "expected module:function and a finite number"),
-            ):
+            with self.subTest(own), self.assertRaisesRegex(ValueError, words):
                 RewardConfig(own=own)
 
     def test_success_needs_two_centimetres_and_fifteen_degrees_and_contact(self):
@@ -201,117 +184,102 @@ class RewardTest(unittest.TestCase):
             (0.0205, 14.8, {}, False),
             (0.0195, 15.2, {}, False),
             (0.0, 0.0, {"tip_force": torch.zeros(3, 3)}, False),
-            (0.03, 0.0, {"success_position": torch.tensor(0.04)}, True),
-            (0.015, 0.0, {"success_position": torch.tensor(0.01)}, False),
+            (0.03, 0.0, {"success_position": 0.04}, True),
+            (0.015, 0.0, {"success_position": 0.01}, False),
         ):
-            where = torch.tensor([0.5, 0.3, 0.1 + distance])
-            inputs = {
-                "object_pos": where,
-                "object_quat": turned(degrees, (1.0, 0, 0)),
-                "tip_force": self.PRESS,
-            }
+            inputs = {"object_pos": [0.5, 0.3, 0.1 + distance], "tip_force": self.PRESS}
+            inputs["object_quat"] = turned(degrees, (1.0, 0, 0))
             reward = self.reward(**(inputs | changes))
-            self.assertEqual(bool(reward.success), expected, (distance, degrees, changes))
-            self.assertEqual(float(reward.terms["success"]), 10.0 * expected)
+            self.assertEqual(reward.success, expected, (distance, degrees, changes))
+            self.assertEqual(reward.terms["success"], 10.0 * expected)
 
     def test_the_contact_gate_needs_the_thumb_and_another_finger(self):
-        forces = torch.tensor(
-            [[1.0, 0, 0], [0, 1, 1], [1, 0, 1], [1, 1, 0], [0.09, 1, 1], [1, 0.1, 0.1], [0, 0, 0]]
-        )
-        forces = forces[..., None] * torch.tensor([0.6, 0.0, -0.8])
-        self.assertEqual(
-            contact_gate(forces, 0.1).tolist(), [False, False, True, True, False, False, False]
-        )
-        down = [0.0, 0, -5]
-        left = [-5.0, 0, -1]
-        right = [5.0, 0, -1]
-        none = [0.0, 0, 0]
-        hands = torch.tensor(
-            [
-                [down, down, down],
-                [left, right, none],
-                [left, none, right],
-                [left, left, down],
-                [none, left, right],
-            ]
-        )
-        self.assertEqual(contact_gate(hands, 0.1).tolist(), [True, True, True, True, False])
-        self.assertEqual(
-            contact_gate(hands, 0.1, opposing=True).tolist(), [False, True, True, False, False]
-        )
+        for forces, expected in (
+            ([1.0, 0, 0], False),
+            ([0, 1, 1], False),
+            ([1, 0, 1], True),
+            ([1, 1, 0], True),
+            ([0.09, 1, 1], False),
+            ([1, 0.1, 0.1], False),
+            ([0, 0, 0], False),
+        ):
+            pressed = tensor(forces)[None, :, None] * tensor([0.6, 0.0, -0.8])
+            self.assertEqual(contact_gate(pressed, 0.1), expected, forces)
+        down, left, right, none = [0.0, 0, -5], [-5.0, 0, -1], [5.0, 0, -1], [0.0, 0, 0]
+        for hand, touches, opposes in (
+            ((down, down, down), True, False),
+            ((left, right, none), True, True),
+            ((left, none, right), True, True),
+            ((left, left, down), True, False),
+            ((none, left, right), False, False),
+        ):
+            forces = tensor([hand])
+            self.assertEqual(contact_gate(forces, 0.1), touches, hand)
+            self.assertEqual(contact_gate(forces, 0.1, opposing=True), opposes, hand)
 
 
-class TerminationTest(unittest.TestCase):
+class TerminationTest(TestCase):
     def test_bounds(self):
         table, c = TableSpec(center=(0.5, 0.3), half_size=(0.7, 0.5, 0.02)), TerminationConfig()
-        limits = torch.tensor(
-            [
-                [1.3, 0.3, 0.1],
-                [-0.3, 0.3, 0.1],
-                [0.5, 0.9, 0.1],
-                [0.5, -0.3, 0.1],
-                [0.5, 0.3, 1.0],
-                [0.5, 0.3, -0.05],
-            ]
-        )
-        away = (limits - torch.tensor([0.5, 0.3, 0.1])).sign() * 0.01
-        self.assertFalse(out_of_bounds(limits - away, table, c).any())
-        self.assertTrue(out_of_bounds(limits + away, table, c).all())
+        middle = tensor([0.5, 0.3, 0.1])
+        for axis, limit in ((0, 1.3), (0, -0.3), (1, 0.9), (1, -0.3), (2, 1.0), (2, -0.05)):
+            for share, expected in ((0.99, False), (1.01, True)):
+                pos = middle.clone()
+                pos[axis] += share * (limit - middle[axis])
+                self.assertEqual(out_of_bounds(pos[None], table, c), expected, pos)
 
 
-class ActionTest(WithRobot):
-    def space(self, **changes) -> ActionSpace:
+class ActionTest(TestCase):
+    robot = toy_robot()
+
+    def space(self, **changes):
         return ActionSpace(self.robot, ActionConfig(**changes))
 
     def test_hand_is_absolute_and_arm_relative(self):
         space = self.space(arm_step=0.05)
-        target = torch.tensor([[0.1, 0.5, -0.5, 0.0, 0.0, 0.3, 0.01]])
+        target = tensor([[0.1, 0.5, -0.5, 0.0, 0.0, 0.3, 0.01]])
         still = space.targets(torch.zeros(1, 7), target, target - 0.02)
         # a loaded arm that sags would otherwise sink a little further at every step of zero action
         assert_close(still[:, :3], target[:, :3])
-        assert_close(still[:, 3:], torch.tensor([[-0.55, 0.55, 0.8, 0.02]]))
+        assert_close(still[:, 3:], tensor([[-0.55, 0.55, 0.8, 0.02]]))
         # actions are limited to [-1, 1]
         full = space.targets(torch.full((1, 7), 5.0), target, target)
-        assert_close(full, torch.tensor([[0.15, 0.55, -0.45, 0.5, 1.6, 1.6, 0.04]]))
+        assert_close(full, tensor([[0.15, 0.55, -0.45, 0.5, 1.6, 1.6, 0.04]]))
 
     def test_arm_targets_stay_near_the_joint_and_within_its_limits(self):
         space = self.space(arm_step=0.05, arm_lead=0.15)
         blocked = torch.zeros(1, 7)
         target = blocked.clone()
         for _ in range(10):
-            target = space.targets(torch.tensor([[0.0, 1, -1, 0, 0, 0, 0]]), target, blocked)
-        assert_close(target[:, 1:3], torch.tensor([[0.15, -0.15]]))
-        near = torch.tensor([[0.29, 2.99, -1.99, 0, 0, 0, 0]])
-        moved = space.targets(torch.tensor([[1.0, 1, -1, 0, 0, 0, 0]]), near, near)
-        assert_close(moved[:, :3], torch.tensor([[0.3, 3.0, -2.0]]))
+            target = space.targets(tensor([[0.0, 1, -1, 0, 0, 0, 0]]), target, blocked)
+        assert_close(target[:, 1:3], tensor([[0.15, -0.15]]))
+        near = tensor([[0.29, 2.99, -1.99, 0, 0, 0, 0]])
+        moved = space.targets(tensor([[1.0, 1, -1, 0, 0, 0, 0]]), near, near)
+        assert_close(moved[:, :3], tensor([[0.3, 3.0, -2.0]]))
 
     def test_action_zero_may_be_home(self):
         space = self.space(hand_zero="home")
         home = torch.as_tensor(self.robot.home, dtype=torch.float32)
-        target = torch.zeros(1, 7)
-        for action, expected in (
-            (0.0, home),
-            (1.0, space.upper),
-            (-1.0, space.lower),
-            (0.5, (home + space.upper) / 2),
-        ):
-            found = space.targets(torch.full((1, 7), action), target, target)
-            assert_close(found[0, 3:], expected[3:], msg=f"action {action}")
+        actions = tensor([[0.0], [1.0], [-1.0], [0.5]]).expand(4, 7)
+        target = torch.zeros(4, 7)
+        found = space.targets(actions, target, target)
+        expected = torch.stack((home, space.upper, space.lower, (home + space.upper) / 2))
+        assert_close(found[:, 3:], expected[:, 3:])
 
     def test_a_relative_hand_that_does_nothing_holds_its_targets(self):
         space = self.space(hand="relative", hand_step=0.05, hand_lead=0.4)
         # the last one slides, by 4 cm in all
-        target = torch.tensor([[0.1, 0.5, -0.5, -0.2, 0.4, 0.3, 0.01]])
+        target = tensor([[0.1, 0.5, -0.5, -0.2, 0.4, 0.3, 0.01]])
         # joints that an object keeps from following
-        pressed = target - torch.tensor([0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.004])
+        pressed = target - tensor([0.1] * 6 + [0.004])
         assert_close(space.targets(torch.zeros(1, 7), target, pressed)[:, 3:], target[:, 3:])
-        moved = space.targets(torch.tensor([[0.0, 0, 0, 1, -1, 0.5, 1]]), target, pressed)
-        assert_close(moved[:, 3:], torch.tensor([[-0.15, 0.35, 0.325, 0.012]]))
+        moved = space.targets(tensor([[0.0, 0, 0, 1, -1, 0.5, 1]]), target, pressed)
+        assert_close(moved[:, 3:], tensor([[-0.15, 0.35, 0.325, 0.012]]))
         for _ in range(20):
             moved = space.targets(torch.ones(1, 7), moved, pressed)
-        held = pressed[:, 3:] + torch.tensor([0.4, 0.4, 0.4, 0.016])
+        held = pressed[:, 3:] + tensor([0.4, 0.4, 0.4, 0.016])
         assert_close(moved[:, 3:], held, msg="it presses no harder than its lead allows")
-        action = space.action_for(target + torch.tensor([0.02] * 6 + [0.0008]), target)
+        action = space.action_for(target + tensor([0.02] * 6 + [0.0008]), target)
         assert_close(action[:, 3:], torch.full((1, 4), 0.4))
 
     def test_action_for_undoes_targets(self):
@@ -324,26 +292,31 @@ class ActionTest(WithRobot):
             assert_close(again, wanted, atol=1e-5, rtol=0)
 
 
-class LatencyTest(unittest.TestCase):
+class LatencyTest(TestCase):
     def test_values_come_late_and_are_mixed_between_whole_steps(self):
         drawn = Drawn(4, torch.device("cpu"))
-        line = DelayLine(drawn, "line", 1, 2.0, lambda _: torch.tensor([0.0, 1.0, 1.5, 2.0]))
+        line = DelayLine(drawn, "line", 1, 2.0, lambda _: tensor([0.0, 1.0, 1.5, 2.0]))
         drawn.draw(torch.ones(4, dtype=torch.bool), generator())
         line.fill(torch.ones(4, dtype=torch.bool), torch.zeros(4, 1))
-        heard = [
-            line.push(torch.full((4, 1), float(value)))[:, 0].tolist() for value in (10, 20, 30)
-        ]
-        self.assertEqual(heard, [[10, 0, 0, 0], [20, 10, 5, 0], [30, 20, 15, 10]])
-        line.fill(torch.tensor([False, True, False, False]), torch.full((4, 1), 7.0))
-        self.assertEqual(line.push(torch.full((4, 1), 40.0))[:, 0].tolist(), [40, 7, 25, 20])
+
+        def heard(value):
+            return line.push(torch.full((4, 1), value))[:, 0].tolist()
+
+        for value, expected in (
+            (10.0, [10, 0, 0, 0]),
+            (20.0, [20, 10, 5, 0]),
+            (30.0, [30, 20, 15, 10]),
+        ):
+            self.assertEqual(heard(value), expected)
+        line.fill(tensor([False, True, False, False]), torch.full((4, 1), 7.0))
+        self.assertEqual(heard(40.0), [40, 7, 25, 20])
 
 
-class RandomizationTest(unittest.TestCase):
+class RandomizationTest(TestCase):
     def test_a_pairs_friction_is_the_mean_of_its_materials(self):
         c = RandomizationConfig(elastomer=0.8, metal=0.1, table=0.5)
         assert_close(
-            pair_friction(torch.tensor([0.5, 1.0]), c),
-            torch.tensor([[0.65, 0.3, 0.5], [0.9, 0.55, 0.75]]),
+            pair_friction(tensor([0.5, 1.0]), c), tensor([[0.65, 0.3, 0.5], [0.9, 0.55, 0.75]])
         )
         nominal = sample_friction(3, RandomizationConfig(enabled=False), generator())
         assert_close(nominal, pair_friction(torch.full((3,), 0.75), c))
@@ -354,40 +327,45 @@ class RandomizationTest(unittest.TestCase):
         material = 2 * table - c.table
         drawn = 2 * link - (2 * tip - c.elastomer)
         for values in (material, drawn):
-            assert_close(torch.stack(values.aminmax()), torch.tensor([0.5, 1.0]), atol=2e-3, rtol=0)
-            self.assertAlmostEqual(float(values.mean()), 0.75, delta=0.005)
+            assert_range(values, 0.5, 1.0, atol=2e-3)
+            self.assertAlmostEqual(values.mean(), 0.75, delta=0.005)
         self.assertEqual(len(material.mul(1e5).round().unique()), 250)
 
 
-class ResetTest(WithRobot):
+class ResetTest(TestCase):
+    robot = toy_robot()
+    bank = toy_bank(robot)
     SOUPS = torch.zeros(4000, dtype=torch.long)
 
-    def sample(self, index=SOUPS, objects=(SOUP, SPAM), bank=None, **config) -> Reset:
+    def sample(self, index=SOUPS, objects=(SOUP, SPAM), bank=None, **config):
         """Draw starts; by default all at home, of the soup can."""
         config = ResetConfig(**({"demo_probability": 0.0} | config))
-        distribution = ResetDistribution(bank or toy_bank(self.robot), self.robot, objects, config)
+        distribution = ResetDistribution(bank or self.bank, self.robot, objects, config)
         return distribution.sample(index, generator())
+
+    def of(self, reset, name):
+        """What the bank states of the demonstrations that were drawn."""
+        return torch.as_tensor(getattr(self.bank, name))[reset.sequence]
 
     def test_share_of_bank_resets(self):
         for p in (0.0, 0.25, 0.5, 1.0):
-            share = float(self.sample(demo_probability=p).from_bank.float().mean())
+            share = self.sample(demo_probability=p).from_bank.float().mean()
             self.assertAlmostEqual(share, p, delta=0.03 * (0 < p < 1))
 
     def test_bank_resets_are_states_of_the_bank(self):
-        bank = toy_bank(self.robot)
-        reset = self.sample(torch.tensor([0, 1] * 500), demo_probability=1.0)
+        reset = self.sample(tensor([0, 1] * 500), demo_probability=1.0)
         # the toy bank numbers its states
         state = ((reset.object_pos[:, 0] - 0.6) * 100).round().long()
-        assert_close(reset.joint_pos, torch.as_tensor(bank.joint_pos)[state])
-        assert_close(reset.object_quat, torch.as_tensor(bank.object_quat_wxyz)[state])
-        self.assertEqual(reset.sequence.tolist(), bank.sequence_index[state].tolist())
-        assert_close(reset.goal_pos, torch.as_tensor(bank.goal_pos)[reset.sequence])
-        assert_close(reset.goal_quat, torch.as_tensor(bank.goal_quat_wxyz)[reset.sequence])
+        assert_close(reset.joint_pos, torch.as_tensor(self.bank.joint_pos)[state])
+        assert_close(reset.object_quat, torch.as_tensor(self.bank.object_quat_wxyz)[state])
+        self.assertEqual(reset.sequence.tolist(), self.bank.sequence_index[state].tolist())
+        assert_close(reset.goal_pos, self.of(reset, "goal_pos"))
+        assert_close(reset.goal_quat, self.of(reset, "goal_quat_wxyz"))
 
     def test_which_states_are_drawn(self):
         """Every state of the object, and of no other; home where there is none."""
-        some = toy_bank(self.robot).with_states(np.array([True, True, False, False, True, True]))
-        empty = toy_bank(self.robot).with_states(np.zeros(6, dtype=bool))
+        some = self.bank.with_states(self.bank.object_name == SOUP)
+        empty = self.bank.with_states(np.zeros(6, dtype=bool))
         for objects, index, options, states, sequences in (
             ((SOUP, SPAM), 0, {}, {0, 1, 4, 5}, {0, 2}),
             ((SOUP, SPAM), 1, {}, {2, 3}, {1}),
@@ -398,28 +376,25 @@ class ResetTest(WithRobot):
             ((SOUP, SPAM), 0, {"bank": empty}, set(), {0, 2}),
         ):
             with self.subTest(objects=objects, index=index, options=list(options)):
-                reset = self.sample(
-                    torch.full((200,), index), objects, demo_probability=1.0, **options
-                )
+                many = torch.full((200,), index)
+                reset = self.sample(many, objects, demo_probability=1.0, **options)
                 drawn = ((reset.object_pos[reset.from_bank, 0] - 0.6) * 100).round().int()
                 self.assertEqual(set(drawn.tolist()), states)
                 self.assertEqual(set(reset.sequence.tolist()), sequences)
         with self.assertRaisesRegex(
-            DemoError,
-            "no demonstration of 011_banana; it has 005_tomato_soup_can, 010_potted_meat_can",
+            DemoError, f"no demonstration of 011_banana; it has {SOUP}, {SPAM}"
         ):
             self.sample(objects=(SOUP, "011_banana"))
 
     def test_gravity(self):
         """Of bank resets uniform, of home resets alpha = 1 + eta / 9.81 with eta ~ N(0, 1), clipped."""
         gravity = self.sample(demo_probability=1.0).gravity_fraction
-        assert_close(torch.stack(gravity.aminmax()), torch.tensor([0.0, 1.0]), atol=0.01, rtol=0)
-        self.assertAlmostEqual(float(gravity.mean()), 0.5, delta=0.02)
+        assert_range(gravity, 0.0, 1.0, atol=0.01)
+        self.assertAlmostEqual(gravity.mean(), 0.5, delta=0.02)
         gravity = self.sample().gravity_fraction
-        self.assertAlmostEqual(float(gravity.mean()), 1.0, delta=0.01)
-        self.assertAlmostEqual(float(gravity.std()), 1 / 9.81, delta=0.005)
-        clipped = self.sample(home_gravity_clip=0.1).gravity_fraction
-        assert_close(torch.stack(clipped.aminmax()), torch.tensor([0.9, 1.1]))
+        self.assertAlmostEqual(gravity.mean(), 1.0, delta=0.01)
+        self.assertAlmostEqual(gravity.std(), 1 / 9.81, delta=0.005)
+        assert_range(self.sample(home_gravity_clip=0.1).gravity_fraction, 0.9, 1.1)
         for options in (
             {"demo_probability": 1.0, "random_gravity": False},
             {"home_gravity_std": 0.0},
@@ -427,47 +402,35 @@ class ResetTest(WithRobot):
             self.assertTrue((self.sample(**options).gravity_fraction == 1).all())
 
     def test_home_spawns_are_uniform_around_the_demonstrations_start(self):
-        start = torch.as_tensor(toy_bank(self.robot).start_pos)
+
+        def offset(reset):
+            return reset.object_pos - self.of(reset, "start_pos")
+
         reset = self.sample()
-        offset = reset.object_pos - start[reset.sequence]
-        extremes = torch.stack(torch.aminmax(offset, dim=0))
-        assert_close(
-            extremes, torch.tensor([[-0.02, -0.02, 0], [0.02, 0.02, 0]]), atol=2e-4, rtol=0
-        )
-        yaw = quat_angle(
-            reset.object_quat, torch.as_tensor(toy_bank(self.robot).start_quat_wxyz)[reset.sequence]
-        )
-        self.assertAlmostEqual(float(yaw.rad2deg().max()), 25.0, delta=0.1)
-        self.assertAlmostEqual(float(yaw.rad2deg().mean()), 12.5, delta=0.5)
-        unmoved = self.sample(spawn_xy=0.0, spawn_yaw=0.0)
-        assert_close(unmoved.object_pos, start[unmoved.sequence])
-        wide = self.sample(training_xy=0.1)
-        self.assertAlmostEqual(
-            float((wide.object_pos - start[wide.sequence]).max()), 0.1, delta=1e-3
-        )
-        lying = toy_bank(
-            self.robot, start_quat_wxyz=np.tile(turned(90, (1.0, 0, 0)).numpy(), (3, 1))
-        )
+        for axis, limit in enumerate((0.02, 0.02, 0.0)):
+            assert_range(offset(reset)[:, axis], -limit, limit, atol=2e-4)
+        yaw = quat_angle(reset.object_quat, self.of(reset, "start_quat_wxyz")).rad2deg()
+        self.assertAlmostEqual(yaw.max(), 25.0, delta=0.1)
+        self.assertAlmostEqual(yaw.mean(), 12.5, delta=0.5)
+        assert_range(offset(self.sample(spawn_xy=0.0, spawn_yaw=0.0)), 0.0, 0.0)
+        self.assertAlmostEqual(offset(self.sample(training_xy=0.1)).max(), 0.1, delta=1e-3)
+        lying = np.tile(turned(90, (1.0, 0, 0)).numpy(), (3, 1))
+        found = self.sample(bank=replace(self.bank, start_quat_wxyz=lying)).object_quat
         # y of the object stands up
-        axis = quat_rotate(self.sample(bank=lying).object_quat, torch.tensor([0.0, 1, 0]))
-        assert_close(axis, torch.tensor([0.0, 0, 1]).expand_as(axis), atol=1e-6, rtol=0)
+        axis = quat_rotate(found, tensor([0.0, 1, 0]))
+        assert_close(axis, tensor([0.0, 0, 1]).expand_as(axis), atol=1e-6, rtol=0)
 
     def test_goals_move_around_the_demonstrated_ones_and_never_below_the_start(self):
-        bank = toy_bank(self.robot)
         options = {"goal_xy": 0.03, "goal_z": 0.05, "goal_yaw": 0.5}
         reset = self.sample(demo_probability=0.5, **options)
-        goal = torch.as_tensor(bank.goal_pos, dtype=torch.float32)[reset.sequence]
-        offset = (reset.goal_pos - goal).masked_fill(reset.from_bank[:, None], 0)
-        angle = quat_angle(
-            reset.goal_quat,
-            torch.as_tensor(bank.goal_quat_wxyz, dtype=torch.float32)[reset.sequence],
-        )
-        assert_close(reset.goal_pos[reset.from_bank], goal[reset.from_bank])
-        largest = torch.cat((offset.abs().amax(dim=0), angle[~reset.from_bank].max()[None]))
-        assert_close(largest, torch.tensor([0.03, 0.03, 0.05, 0.5]), atol=2e-3, rtol=0)
-        reset = self.sample(bank=toy_bank(self.robot, goal_pos=bank.start_pos), **options)
-        start = torch.as_tensor(bank.start_pos, dtype=torch.float32)[reset.sequence]
-        self.assertGreaterEqual(float((reset.goal_pos - start)[:, 2].min()), 0.0)
+        offset = reset.goal_pos - self.of(reset, "goal_pos")
+        angle = quat_angle(reset.goal_quat, self.of(reset, "goal_quat_wxyz"))
+        assert_range(offset[reset.from_bank], 0.0, 0.0)
+        moved = torch.column_stack((offset.abs(), angle))[~reset.from_bank]
+        assert_close(moved.amax(dim=0), tensor([0.03, 0.03, 0.05, 0.5]), atol=2e-3, rtol=0)
+        reset = self.sample(bank=replace(self.bank, goal_pos=self.bank.start_pos), **options)
+        height = (reset.goal_pos - self.of(reset, "start_pos"))[:, 2]
+        self.assertGreaterEqual(height.min(), 0.0)
         task = evaluation_task(TaskConfig(reset=ResetConfig(training_xy=0.1, **options)))
         self.assertEqual(task.reset, evaluation_task(TaskConfig()).reset)
 
@@ -475,10 +438,10 @@ class ResetTest(WithRobot):
         joints = self.sample().joint_pos
         space = ActionSpace(self.robot, ActionConfig())
         self.assertTrue(((joints >= space.lower) & (joints <= space.upper)).all())
-        spread = (joints - torch.as_tensor(self.robot.home, dtype=torch.float32)).std(dim=0)
+        spread = joints.std(dim=0)
         # an arm joint far from its limits
-        self.assertAlmostEqual(float(spread[1]), 0.075, delta=0.004)
-        self.assertAlmostEqual(float(spread[4]), 0.10, delta=0.005)  # a finger joint
+        self.assertAlmostEqual(spread[1], 0.075, delta=0.004)
+        self.assertAlmostEqual(spread[4], 0.10, delta=0.005)  # a finger joint
         quiet = self.sample(self.SOUPS[:5], home_noise=False)
         assert_close(quiet.joint_pos, torch.full((5, 7), 0.01))
 
@@ -486,24 +449,23 @@ class ResetTest(WithRobot):
 QUIET = NoiseConfig(joint_pos=0.0, joint_vel=0.0, object_pos=0.0, object_rot=0.0, cloud=0.0)
 
 
-class ObservationTest(unittest.TestCase):
+class ObservationTest(TestCase):
     N, J, E = 5, 7, 2
 
     def setUp(self):
         g = generator()
 
-        def rand(*shape: int) -> torch.Tensor:
+        def rand(*shape):
             return torch.randn(self.N, *shape, generator=g)
 
-        def quat(*shape: int) -> torch.Tensor:
+        def quat(*shape):
             return torch.nn.functional.normalize(rand(*shape, 4), dim=-1)
 
         still = State.at_rest(rand(self.J), rand(3), quat())
+        moving = {"joint_vel": rand(self.J), "object_linvel": rand(3), "object_angvel": rand(3)}
         links = {name: rand(1 + self.E, 3) for name in ("pos", "linvel", "angvel")}
         self.x = obs.ObservationInput(
-            state=replace(
-                still, joint_vel=rand(self.J), object_linvel=rand(3), object_angvel=rand(3)
-            ),
+            state=replace(still, **moving),
             links=Links(quat=quat(1 + self.E), **links),
             joint_target=rand(self.J),
             joint_lower=torch.full((self.J,), -2.0),
@@ -520,27 +482,27 @@ class ObservationTest(unittest.TestCase):
             reward=rand(),
         )
         self.config = ObservationConfig(noise=QUIET, contact_force_scale=0.1, joint_vel_scale=0.2)
-        widths = obs.layout(self.J, self.E, self.config)
-        self.policy = self.split(
-            obs.policy_group(self.x, self.config, generator()), widths["policy"]
-        )
-        self.proprio = self.split(
-            obs.proprio_group(self.x, self.config, generator()), widths["proprio"]
-        )
+        self.shown = self.terms(self.x, self.config)
 
-    def split(self, group: torch.Tensor, widths: dict[str, int]) -> dict[str, torch.Tensor]:
+    def terms(self, x, config):
+        """The terms of policy and proprio by name."""
+        widths = obs.layout(self.J, self.E, config)
+        policy = self.split(obs.policy_group(x, config, generator()), widths["policy"])
+        return policy | self.split(obs.proprio_group(x, config, generator()), widths["proprio"])
+
+    def split(self, group, widths):
         self.assertEqual(tuple(group.shape), (self.N, sum(widths.values())))
         return dict(zip(widths, group.split(list(widths.values()), dim=-1), strict=True))
 
     def test_without_noise_the_proprio_group_is_exact(self):
         for name in ("pos", "linvel", "angvel"):
-            assert_close(self.proprio[f"palm_{name}"], getattr(self.x.links, name)[:, 0])
-        assert_close(self.proprio["tip_pos"], self.x.links.pos[:, 1:].reshape(self.N, -1))
-        assert_close(self.proprio["joint_vel"], 0.2 * self.x.state.joint_vel)
+            assert_close(self.shown[f"palm_{name}"], getattr(self.x.links, name)[:, 0])
+        assert_close(self.shown["tip_pos"], self.x.links.pos[:, 1:].flatten(1))
+        assert_close(self.shown["joint_vel"], 0.2 * self.x.state.joint_vel)
         # limits -2, 3 become -1, 1
-        assert_close(self.proprio["joint_pos"], (self.x.state.joint_pos - 0.5) / 2.5)
-        force = self.proprio["tip_force"]
-        self.assertEqual(float(force.abs().max()), 1.0)
+        assert_close(self.shown["joint_pos"], (self.x.state.joint_pos - 0.5) / 2.5)
+        force = self.shown["tip_force"]
+        self.assertEqual(force.abs().max(), 1.0)
         small = self.x.tip_force.abs() < 10
         assert_close(force.view(self.N, self.E, 3)[small], 0.1 * self.x.tip_force[small])
 
@@ -555,31 +517,30 @@ class ObservationTest(unittest.TestCase):
         )
         for rotation in ("quaternion", "matrix", "to_goal"):
             c = replace(self.config, rotation=rotation)
-            torch.testing.assert_close(obs.goal_group(negated, c), obs.goal_group(self.x, c))
-            for group in (obs.policy_group, obs.proprio_group):
-                assert_close(group(negated, c, generator()), group(self.x, c, generator()))
-        for name, quat, own in (
-            ("object_quat", self.policy, self.x.observed_quat),
-            ("palm_quat", self.proprio, self.x.links.quat[:, 0]),
+            assert_close(obs.goal_group(negated, c), obs.goal_group(self.x, c))
+            assert_close(self.terms(negated, c), self.terms(self.x, c))
+        for name, own in (
+            ("object_quat", self.x.observed_quat),
+            ("palm_quat", self.x.links.quat[:, 0]),
         ):
-            self.assertTrue((quat[name][:, 0] >= 0).all(), name)
-            assert_close(quat_angle(quat[name], own), torch.zeros(self.N), atol=1e-3, rtol=0)
+            quat = self.shown[name]
+            self.assertTrue((quat[:, 0] >= 0).all(), name)
+            assert_close(quat_angle(quat, own), torch.zeros(self.N), atol=1e-3, rtol=0)
 
     def test_with_cameras_a_goal_may_be_a_rotation_from_the_start(self):
         c = replace(self.config, rotation="to_goal")
         widths = obs.layout(self.J, self.E, c, VisionConfig(cameras=(FRONT,)))["goal"]
         self.assertEqual([*widths], ["goal_pos", "rotation_from_start", "previous_action"])
         drawn_otherwise = turned(100, (0.6, 0.0, 0.8)).expand(self.N, 4)
-        x = replace(
-            self.x,
-            start_quat=quat_multiply(self.x.start_quat, drawn_otherwise),
-            goal_quat=quat_multiply(self.x.goal_quat, drawn_otherwise),
-        )
-        torch.testing.assert_close(obs.goal_group(x, c), obs.goal_group(self.x, c))
-        columns = self.split(obs.goal_group(self.x, c), widths)["rotation_from_start"]
-        from_start = columns.unflatten(1, (2, 3))
-        axis = quat_rotate(quat_conjugate(self.x.start_quat), torch.tensor([1.0, 0.0, 0.0]))
-        torch.testing.assert_close(quat_rotate(self.x.goal_quat, axis), from_start[:, 0])
+        quats = {
+            n: quat_multiply(getattr(self.x, n), drawn_otherwise)
+            for n in ("start_quat", "goal_quat")
+        }
+        found = obs.goal_group(self.x, c)
+        assert_close(obs.goal_group(replace(self.x, **quats), c), found)
+        columns = self.split(found, widths)["rotation_from_start"]
+        axis = quat_rotate(quat_conjugate(self.x.start_quat), tensor([1.0, 0.0, 0.0]))
+        assert_close(quat_rotate(self.x.goal_quat, axis), columns[:, :3])
 
     def test_the_published_observation(self):
         c = RECIPES["published"].config.task.observation
@@ -587,7 +548,7 @@ class ObservationTest(unittest.TestCase):
         flat = sum(widths["policy"].values()) + sum(widths["proprio"].values())
         # the paper's 648 inputs
         self.assertEqual((flat, flat + widths["perception"]["paired_cloud"]), (72, 648))
-        points = torch.randn(len(self.x.observed_pos), 64, 3, generator=generator())
+        points = torch.randn(self.N, 64, 3, generator=generator())
         found = obs.policy_group(self.x, c, generator(), points)
         cloud = quat_rotate(self.x.observed_quat[:, None], points) + self.x.observed_pos[:, None]
         distance = (self.x.links.pos[:, :, None] - cloud[:, None]).norm(dim=-1).amin(dim=-1)
@@ -596,24 +557,22 @@ class ObservationTest(unittest.TestCase):
         assert_close(found[:, -1], distance[:, 0])
         ends = self.x.links.pos[:, 1:] + vectors
         gaps = (ends[:, :, None] - cloud[:, None]).norm(dim=-1).amin(dim=-1)
-        self.assertLess(float(gaps.max()), 1e-5)
+        self.assertLess(gaps.max(), 1e-5)
 
     def test_privileged_group(self):
         found = obs.privileged_group(self.x, ObservationConfig())
-        self.assertEqual(tuple(found.shape), (self.N, 15))
-        state = self.x.state
-        to_goal = self.x.goal_pos - state.object_pos
-        expected = torch.cat((state.object_linvel, state.object_angvel, to_goal), 1)
-        assert_close(found[:, :9], expected)
-        axis = torch.tensor([1.0, 0, 0]).expand(self.N, 3)
-        corrected = quat_rotate(
-            quat_from_axis_angle(found[:, 9:12]), quat_rotate(self.x.state.object_quat, axis)
+        x, state = self.x, self.x.state
+        turn = quat_from_axis_angle(found[:, 9:12])
+        axis = tensor([1.0, 0, 0]).expand(self.N, 3)
+        corrected = quat_rotate(turn, quat_rotate(state.object_quat, axis))
+        assert_close(corrected, quat_rotate(x.goal_quat, axis), atol=1e-5, rtol=0)
+        expected = torch.column_stack(
+            (
+                *(state.object_linvel, state.object_angvel, x.goal_pos - state.object_pos),
+                *(found[:, 9:12], x.tip_distance.amin(1), x.gravity_fraction, x.reward),
+            )
         )
-        assert_close(corrected, quat_rotate(self.x.goal_quat, axis), atol=1e-5, rtol=0)
-        assert_close(
-            found[:, 12:],
-            torch.stack((self.x.tip_distance.amin(1), self.x.gravity_fraction, self.x.reward), 1),
-        )
+        assert_close(found, expected)
 
     def test_clouds(self):
         points = torch.randn(self.N, 10, 3, generator=generator(1))
@@ -631,26 +590,19 @@ class ObservationTest(unittest.TestCase):
 
     def test_rotations_as_columns_of_the_matrix(self):
         c = replace(self.config, rotation="matrix", joint_target=True)
-        widths = obs.layout(self.J, self.E, c)
         x = replace(self.x, observed_quat=turned(90)[None].expand(self.N, 4))
-        shown = self.split(obs.policy_group(x, c, generator()), widths["policy"])
-        shown |= self.split(obs.proprio_group(x, c, generator()), widths["proprio"])
-        assert_close(
-            shown["object_rotation"], torch.tensor([0.0, 1, 0, -1, 0, 0]).expand(self.N, 6)
-        )
-        for axis, column in zip(
-            torch.eye(3), shown["palm_rotation"].split(3, dim=-1), strict=False
-        ):
+        shown = self.terms(x, c)
+        columns = tensor([0.0, 1, 0, -1, 0, 0]).expand(self.N, 6)
+        assert_close(shown["object_rotation"], columns)
+        for axis, column in zip(torch.eye(3), shown["palm_rotation"].split(3, dim=-1)):
             assert_close(column, quat_rotate(x.links.quat[:, 0], axis.expand(self.N, 3)))
         assert_close(shown["joint_target"], x.joint_target - x.state.joint_pos)
-        assert_close(shown["tip_force"], self.proprio["tip_force"])
+        assert_close(shown["tip_force"], self.shown["tip_force"])
 
     def test_noise_has_the_configured_spread_and_touches_only_what_is_measured(self):
         many = torch.zeros(4000, dtype=torch.long)
-        per_world = {
-            k: v[many] for k, v in vars(self.x).items() if k not in ("joint_lower", "joint_upper")
-        }
-        x = replace(self.x, **per_world)
+        same = ("joint_lower", "joint_upper")
+        x = replace(self.x, **{k: v[many] for k, v in vars(self.x).items() if k not in same})
         noise = NoiseConfig(
             joint_pos=0.01, joint_vel=0.1, object_pos=0.02, object_rot=0.05, cloud=0.03
         )
@@ -666,14 +618,12 @@ class ObservationTest(unittest.TestCase):
         spread[3:7] = 0.0
         assert_close(spread, expected, rtol=0.1, atol=1e-6)
         angle = quat_angle(rotation, x.observed_quat).square().mean().sqrt()
-        self.assertAlmostEqual(float(angle), 0.05 * math.sqrt(3), delta=0.005)
+        self.assertAlmostEqual(angle, 0.05 * math.sqrt(3), delta=0.005)
         cloud = obs.cloud_frame(torch.zeros(self.N, 1000, 3), self.x, c, generator())
-        self.assertAlmostEqual(
-            float((cloud - self.x.observed_pos[:, None]).std()), 0.03, delta=0.001
-        )
+        self.assertAlmostEqual((cloud - self.x.observed_pos[:, None]).std(), 0.03, delta=0.001)
 
 
-class EvaluationTaskTest(unittest.TestCase):
+class EvaluationTaskTest(TestCase):
     def test_only_what_evaluation_fixes_is_changed(self):
         task = TaskConfig(
             action=ActionConfig(arm_step=0.03),
@@ -686,19 +636,19 @@ class EvaluationTaskTest(unittest.TestCase):
         ):
             found = evaluation_task(replace(task, timestep=timestep, substeps=substeps))
             self.assertEqual((found.timestep, found.substeps), expected)
-        found = evaluation_task(task)
-        reset = replace(task.reset, demo_probability=0.0, home_gravity_std=0.0)
-        randomization = replace(task.randomization, enabled=False)
-        observation = replace(task.observation, noise=QUIET)
-        self.assertEqual(
-            found, replace(task, reset=reset, randomization=randomization, observation=observation)
-        )
+        fixed = {
+            "reset": replace(task.reset, demo_probability=0.0, home_gravity_std=0.0),
+            "randomization": replace(task.randomization, enabled=False),
+            "observation": replace(task.observation, noise=QUIET),
+        }
+        self.assertEqual(evaluation_task(task), replace(task, **fixed))
 
 
-class PolicyTest(WithRobot):
+class PolicyTest(TestCase):
+    robot = toy_robot()
     TASK = TaskConfig()
 
-    def refused(self, words: str, task: TaskConfig | None = None, **changes):
+    def refused(self, words, task=None, **changes):
         contract = asdict(policy_contract(self.robot, self.TASK, (SOUP,))) | changes
         with self.subTest(words), self.assertRaisesRegex(PolicyError, f"(?s)p.onnx.*{words}"):
             read = read_contract("p.onnx", contract)
@@ -712,42 +662,38 @@ class PolicyTest(WithRobot):
             check_contract("p.onnx", read_contract("p.onnx", contract), self.robot, task)
 
     def test_refusals_name_what_differs(self):
-        self.refused(
-            "another robot .robot: 'openarm', here 'toy'.*--robot openarm", robot="openarm"
+        layout = policy_contract(self.robot, self.TASK, ()).observation_layout
+        tactile = layout | {"policy": layout["policy"] | {"tactile": 4}}
+        robot = "another robot .robot: 'openarm', here 'toy'.*--robot openarm"
+        schema = "schema is 'xreset-policy/9', expected one of 'xreset-policy/1'"
+        for words, name, value in (
+            (robot, "robot", "openarm"),
+            (schema, "schema", "xreset-policy/9"),
+            ("another joint order", "joint_names", list(reversed(self.robot.joint_names))),
+            ("another fingertips", "fingertip_names", ["index", "thumb"]),
+            ("another version of the robot", "robot_fingerprint", "00"),
+            ("another version of the robot", "robot_fingerprint", ""),
+            ("policy.tactile: 4, here None", "observation_layout", tactile),
+        ):
+            self.refused(words, **{name: value})
+        fewer, scaled = (
+            {"observation": replace(self.TASK.observation, **change)}
+            for change in ({"cloud_history": 3}, {"cloud_scale": 5.0})
         )
-        self.refused(
-            "schema is 'xreset-policy/9', expected one of 'xreset-policy/1'",
-            schema="xreset-policy/9",
-        )
-        self.refused("another joint order", joint_names=list(reversed(self.robot.joint_names)))
-        self.refused("another fingertips", fingertip_names=["index", "thumb"])
-        self.refused("another version of the robot", robot_fingerprint="00")
-        self.refused("another version of the robot", robot_fingerprint="")
-        fewer = replace(self.TASK, observation=replace(self.TASK.observation, cloud_history=3))
-        self.refused("observation layout .perception.cloud: 960, here 576", task=fewer)
-        extra = policy_contract(self.robot, self.TASK, ()).observation_layout
-        self.refused(
-            r"policy.tactile: 4, here None",
-            observation_layout=extra | {"policy": extra["policy"] | {"tactile": 4}},
-        )
-        home = replace(self.TASK, action=ActionConfig(hand_zero="home"))
-        self.refused("another action mapping .hand_zero: 'middle', here 'home'", task=home)
-        scaled = replace(self.TASK, observation=replace(self.TASK.observation, cloud_scale=5.0))
-        self.refused("another scale of observations .cloud_scale: 1.0, here 5.0", task=scaled)
-        self.refused(
-            "another time between actions .control_dt: 0.01666.*, here 0.02083",
-            task=replace(self.TASK, substeps=5),
-        )
+        home = {"action": ActionConfig(hand_zero="home")}
+        for words, changes in (
+            ("observation layout .perception.cloud: 960, here 576", fewer),
+            ("another action mapping .hand_zero: 'middle', here 'home'", home),
+            ("another scale of observations .cloud_scale: 1.0, here 5.0", scaled),
+            ("another time between actions .control_dt: 0.01666.*, here 0.02083", {"substeps": 5}),
+        ):
+            self.refused(words, replace(self.TASK, **changes))
 
     def test_policies_without_training(self):
         observations = {"policy": torch.zeros(300, 22)}
-        self.assertEqual(float(ZeroPolicy(7).act(observations).abs().max()), 0.0)
+        self.assertFalse(ZeroPolicy(7).act(observations).any())
         one, same, other = (RandomPolicy(7, seed).act(observations) for seed in (1, 1, 2))
         self.assertTrue(torch.equal(one, same))
         self.assertFalse(torch.equal(one, other))
         self.assertEqual(tuple(one.shape), (300, 7))
-        self.assertTrue(-1 <= float(one.min()) < -0.97 and 0.97 < float(one.max()) <= 1)
-
-
-if __name__ == "__main__":
-    unittest.main()
+        self.assertTrue(-1 <= one.min() < -0.97 and 0.97 < one.max() <= 1)

@@ -7,26 +7,36 @@ import os
 import shutil
 import signal
 import sys
-import tempfile
 import threading
 import time
-import unittest
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from unittest import mock
+from unittest import SkipTest
+from unittest.mock import Mock, patch
 
 import numpy as np
 import torch
+from torch.testing import assert_close
 
+from tests.data import InOneFolder
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_goals import toy_goals
-from xreset import robots
+from xreset import (
+    OnnxPolicy,
+    make_backend,
+    read_bank,
+    resume,
+    robots,
+    train,
+    write_bank,
+    write_goals,
+)
 from xreset.cli import main
 from xreset.errors import FileFormatError, PolicyError, RunError, XResetError
 from xreset.files import claim, file_hash
-from xreset.learning.checkpoint import Checkpoint, load_moments, read_checkpoint
+from xreset.learning.checkpoint import load_moments, read_checkpoint
 from xreset.learning.config import ModelConfig, PpoConfig, ScheduleConfig, TrainConfig
 from xreset.learning.recipes import RECIPES
 from xreset.learning.run import (
@@ -39,17 +49,12 @@ from xreset.learning.run import (
     write_choice,
 )
 from xreset.learning.runner import TrainingRunner, _stop_on_interrupt
-from xreset.learning.train import resume, train
-from xreset.plugins import make_backend
-from xreset.policy import OnnxPolicy
-from xreset.resets.bank import read_bank, write_bank
-from xreset.resets.goals import write_goals
 from xreset.task.config import ObservationConfig, RandomizationConfig, TaskConfig
 
 try:
     import xreset.backends.mujoco  # noqa: F401
 except ImportError as error:
-    raise unittest.SkipTest(str(error)) from error
+    raise SkipTest(str(error)) from error
 
 CONFIG = TrainConfig(
     task=TaskConfig(observation=ObservationConfig(cloud_points=16), distance_points=64),
@@ -60,7 +65,7 @@ CONFIG = TrainConfig(
 )
 
 
-def newest(out: Path) -> Checkpoint:
+def newest(out):
     return read_checkpoint(latest_checkpoint(out))
 
 
@@ -68,46 +73,47 @@ def not_a_number(x):
     return x.tip_distance[:, 0] * float("nan")
 
 
-class TrainingTest(unittest.TestCase):
+class TrainingTest(InOneFolder):
     @classmethod
     def setUpClass(cls):
-        cls.folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
+        super().setUpClass()
         cls.robot = robots.load("openarm")
         home = np.tile(cls.robot.home, (6, 1)).astype(np.float32)
         cls.bank = cls.folder / "bank.npz"
-        write_bank(cls.bank, toy_bank(cls.robot, joint_pos=home), config={}, inputs={})
+        write_bank(cls.bank, toy_bank(cls.robot, joint_pos=home))
         cls.out = cls.folder / "run"
         train(cls.bank, out=cls.out, **cls.options())
 
     @classmethod
     def options(cls, **changes):
-        return {
-            "engine": "mujoco",
-            "device": "cpu",
-            "num_envs": 4,
-            "seed": 3,
-            "config": CONFIG,
-        } | changes
+        options = {"engine": "mujoco", "device": "cpu", "num_envs": 4, "seed": 3, "config": CONFIG}
+        return options | changes
 
     @contextmanager
     def quickly(self):
         """Leave out what takes longer than all the rest: processes for the engine, and the export at the end."""
-        in_this_process = mock.patch("xreset.env.make_backend", partial(make_backend, workers=0))
+        in_this_process = patch("xreset.env.make_backend", partial(make_backend, workers=0))
         with (
             in_this_process,
-            mock.patch("xreset.learning.train.export_onnx"),
+            patch("xreset.learning.train.export_onnx"),
             redirect_stdout(io.StringIO()) as said,
         ):
             yield said
 
-    def train(self, name: str, **changes) -> Path:
+    def changed_run(self, out, **changes):
+        """Change entries of run.json; returns the whole."""
+        data = json.loads((out / "run.json").read_text())
+        (out / "run.json").write_text(json.dumps(data | changes))
+        return data
+
+    def train(self, name, **changes):
         """Train a run of that name in the folder, without an export."""
         with self.quickly():
             return train(
                 changes.pop("bank", self.bank), out=self.folder / name, **self.options(**changes)
             )
 
-    def resume(self, out: Path, **options) -> str:
+    def resume(self, out, **options):
         """Continue a run without an export; returns what it printed."""
         with self.quickly() as said:
             resume(out, **options)
@@ -130,35 +136,27 @@ class TrainingTest(unittest.TestCase):
         self.assertEqual((content.iteration, content.env_steps), (2, 2 * 8 * 4))
 
     def test_paths_are_found_from_another_working_directory(self):
-        data = json.loads((self.out / "run.json").read_text())
         meshes = self.folder / "meshes"
-        meshes.mkdir()
         moved = self.folder / "runs" / "moved"
-        moved.mkdir(parents=True)
-        (self.folder / "openarm").mkdir()  # has the name of a robot
-        data |= {"resets": "bank.npz", "objects": "meshes"}
-        (moved / "run.json").write_text(json.dumps(data))
-        info = read_run(moved)
-        self.assertEqual(
-            (info.robot, info.resets, info.objects),
-            ("openarm", str(self.bank.resolve()), str(meshes.resolve())),
-        )
-        (moved / "run.json").write_text(json.dumps(data | {"objects": "gone"}))
-        self.assertEqual(read_run(moved).objects, "gone")
-        here = os.path.relpath(meshes, Path.cwd()) + "/"
-        (moved / "run.json").write_text(json.dumps(data | {"objects": here}))
-        self.assertEqual(read_run(moved).objects, here, "as stated, where it exists")
+        for folder in (meshes, moved, self.folder / "openarm"):  # has the name of a robot
+            folder.mkdir(parents=True)
+        shutil.copy(self.out / "run.json", moved)
+        self.changed_run(moved, resets="bank.npz")
+        here = os.path.relpath(meshes, Path.cwd()) + "/"  # as stated, where it exists
+        for stated, found in (("meshes", str(meshes.resolve())), ("gone", "gone"), (here, here)):
+            self.changed_run(moved, objects=stated)
+            info = read_run(moved)
+            expected = ("openarm", str(self.bank.resolve()), found)
+            self.assertEqual((info.robot, info.resets, info.objects), expected)
 
     def test_goals_need_no_demonstrations(self):
         """Every episode begins at home; fine-tuning goes on with the run's networks and configuration; a bank keeps its
         states and gets the goals in addition."""
         goals = toy_goals(self.robot)
-        write_goals(self.folder / "goals.npz", goals)
+        write_goals(f"{self.folder}/goals.npz", goals)
         options = {"bank": None, "num_envs": 8}
         info = read_run(self.train("goals", goals=goals, **options))
-        self.assertEqual(
-            (info.resets, info.robot), (str(self.folder / "goals" / "goals.npz"), "openarm")
-        )
+        self.assertEqual((info.resets, info.robot), (f"{self.folder}/goals/goals.npz", "openarm"))
         self.assertEqual(
             (CONFIG.task.reset.demo_probability, info.config.task.reset.demo_probability),
             (0.5, 0.0),
@@ -180,13 +178,12 @@ class TrainingTest(unittest.TestCase):
         one = newest(self.out)
         out = self.train("again")
         two = newest(out)
-        torch.testing.assert_close(one.actor_state_dict, two.actor_state_dict)
+        assert_close(one.actor_state_dict, two.actor_state_dict)
         changed = newest(self.train("other", seed=4)).actor_state_dict
         self.assertTrue(
             any(not torch.equal(x, changed[name]) for name, x in one.actor_state_dict.items())
         )
-        run = json.loads((out / "run.json").read_text())
-        (out / "run.json").write_text(json.dumps(run | {"resets": "bank.npz"}))
+        self.changed_run(out, resets="bank.npz")
         said = self.resume(out)
         self.assertEqual(read_run(out, as_stated=True).resets, "bank.npz", "not the path from here")
         self.assertIn(
@@ -255,15 +252,15 @@ class TrainingTest(unittest.TestCase):
     def test_a_schedule_continues_where_a_stopped_run_was(self):
         """Stopped after two of many iterations, then resumed for as much time as it had taken."""
         out = self.train("scheduled")
-        progress: list[float] = []
-        with mock.patch.object(TrainingRunner, "_follow_schedule", lambda _, x: progress.append(x)):
+        progress = []
+        with patch.object(TrainingRunner, "_follow_schedule", lambda _, x: progress.append(x)):
             self.resume(out, iterations=1000, minutes=newest(out).elapsed / 60)
         self.assertGreaterEqual(progress[0], 0.5)
         self.assertEqual(progress, sorted(progress))
 
     def test_a_configuration_starts_from_a_recipe_or_from_another_run(self):
-        def parsed(*arguments: str) -> TrainConfig:
-            with mock.patch("xreset.learning.train.train") as started:
+        def parsed(*arguments):
+            with patch("xreset.learning.train.train") as started:
                 new = "train --robot openarm --resets bank.npz --out run"
                 main([*new.split(), *arguments])
             return started.call_args.kwargs["config"]
@@ -333,9 +330,10 @@ class TrainingTest(unittest.TestCase):
         self.addCleanup(sys.path.remove, str(code))
         stranger = self.folder / "stranger"
         shutil.copytree(self.out, stranger)
-        data = json.loads((stranger / "run.json").read_text())
-        data["config"]["task"]["reward"]["own"] = {"strangers_term:zero": 1.0}
-        (stranger / "run.json").write_text(json.dumps(data))
+        own = {"strangers_term:zero": 1.0}
+        config = asdict(CONFIG)
+        config["task"]["reward"]["own"] = own
+        self.changed_run(stranger, config=config)
         like = (
             f"--like {stranger} --robot openarm --resets {self.bank} --backend mujoco --device cpu "
             f"--num-envs 4 --iterations 1 --out {self.folder}"
@@ -343,7 +341,7 @@ class TrainingTest(unittest.TestCase):
         resume = f"--resume --out {stranger} --iterations 3"
         naming = "--config.task.reward.own strangers_term:zero 1"
 
-        def said(arguments: str) -> str:
+        def said(arguments):
             with self.quickly(), redirect_stderr(io.StringIO()) as text, suppress(SystemExit):
                 main(["train", *arguments.split()])
             return text.getvalue()
@@ -357,9 +355,7 @@ class TrainingTest(unittest.TestCase):
         for arguments in (f"{like}/with", resume):
             said(f"{arguments} {naming}")
         self.assertIn("strangers_term", sys.modules)
-        self.assertEqual(
-            read_run(self.folder / "with").config.task.reward.own, {"strangers_term:zero": 1.0}
-        )
+        self.assertEqual(read_run(f"{self.folder}/with").config.task.reward.own, own)
         self.assertEqual(len(checkpoints(stranger)), 3)
 
     def test_a_run_begins_with_the_networks_of_another(self):
@@ -373,16 +369,16 @@ class TrainingTest(unittest.TestCase):
         content, before = newest(out), read_checkpoint(given)
         # counters start at zero
         self.assertEqual((content.iteration, content.env_steps), (1, 8 * 4))
-        runner = mock.Mock(config=CONFIG, _load=read_checkpoint)
+        runner = Mock(config=CONFIG, _load=read_checkpoint)
         TrainingRunner.load_networks(runner, given)
         self.assertEqual(runner.alg.learning_rate, before.learning_rate)  # an adaptive rate goes on
         for networks in ("actor_state_dict", "critic_state_dict"):
             for name, value in getattr(before, networks).items():
                 if "normalizer" not in name:  # which goes on to learn
-                    torch.testing.assert_close(getattr(content, networks)[name], value, msg=name)
+                    assert_close(getattr(content, networks)[name], value, msg=name)
         count = next(name for name in before.actor_state_dict if name.endswith("normalizer.count"))
         self.assertEqual(
-            int(content.actor_state_dict[count]), int(before.actor_state_dict[count]) + 8 * 4
+            content.actor_state_dict[count], int(before.actor_state_dict[count]) + 8 * 4
         )
 
     def test_the_policy_is_that_of_the_chosen_or_newest_checkpoint(self):
@@ -396,18 +392,10 @@ class TrainingTest(unittest.TestCase):
         names = ("000002.pt", "000001.pt")
         candidates = tuple(Candidate(name=name, task_progress={"mujoco": 0.5}) for name in names)
         choice = Choice(
-            chosen="000001.pt",
-            policy_hash="",
-            candidates=candidates,
-            engines={"mujoco": "3"},
-            seed=0,
-            episodes_per_demo=1,
-            demos="",
-        )
-        self.assertRegex(
-            choice.sentence(),
-            "000001.pt, .* of 2 checkpoints in 1 engines; the newest, 000002.pt, has 50",
-        )
+            chosen="000001.pt", policy_hash="", candidates=candidates, engines={"mujoco": "3"}, seed=0, episodes_per_demo=1, demos=""
+        )  # fmt: skip
+        words = "000001.pt, .* of 2 checkpoints in 1 engines; the newest, 000002.pt, has 50"
+        self.assertRegex(choice.sentence(), words)
         write_choice(out, choice)
         first = policy_file(out).read_bytes()
         self.assertNotEqual(first, newest_policy)
@@ -421,12 +409,8 @@ class TrainingTest(unittest.TestCase):
         )
 
     def test_what_cannot_be_trained_is_refused_and_leaves_no_run(self):
-        short = replace(
-            CONFIG,
-            task=replace(
-                CONFIG.task, observation=replace(CONFIG.task.observation, cloud_history=3)
-            ),
-        )
+        observation = replace(CONFIG.task.observation, cloud_history=3)
+        short = replace(CONFIG, task=replace(CONFIG.task, observation=observation))
         wide = replace(CONFIG, model=replace(CONFIG.model, lstm=16))
         empty = toy_bank(self.robot).with_states(np.zeros(6, dtype=bool))
         for words, options in (
@@ -454,21 +438,20 @@ class TrainingTest(unittest.TestCase):
         ):
             self.train("refused")
         self.assertFalse((self.folder / "refused" / "run.json").exists())
-        with self.assertRaisesRegex(RunError, "holds a run already.*--resume"):
-            self.train("run")
+        self.assertRaisesRegex(RunError, "holds a run already.*--resume", self.train, "run")
         bank = self.folder / "changing.npz"
-        write_bank(bank, toy_bank(self.robot), config={}, inputs={})
+        write_bank(bank, toy_bank(self.robot))
         out = self.train("changed", bank=bank, config=replace(CONFIG, iterations=1))
-        write_bank(bank, empty, config={}, inputs={})
+        write_bank(bank, empty)
         with self.assertRaisesRegex(RunError, "not the file that this run was started with"):
             self.resume(out)
 
     def test_a_run_whose_observations_meant_something_else_is_not_resumed(self):
         out = self.train("older", config=replace(CONFIG, iterations=1))
-        run = json.loads((out / "run.json").read_text())
-        terms = run["contract"]["observation_layout"]["policy"]
+        contract = self.changed_run(out)["contract"]
+        terms = contract["observation_layout"]["policy"]
         _, terms["older"] = terms.popitem()
-        (out / "run.json").write_text(json.dumps(run))
+        self.changed_run(out, contract=contract)
         with self.assertRaisesRegex(PolicyError, "another observation layout .policy.older"):
             self.resume(out, iterations=2)
 
@@ -489,7 +472,7 @@ class TrainingTest(unittest.TestCase):
             with self.subTest(is_resumed=is_resumed):
                 name = f"early-{is_resumed}"
                 with (
-                    mock.patch.object(TrainingRunner, "learn", side_effect=ZeroDivisionError),
+                    patch.object(TrainingRunner, "learn", side_effect=ZeroDivisionError),
                     self.assertRaises(ZeroDivisionError),
                 ):
                     self.train(name)
@@ -515,12 +498,12 @@ class TrainingTest(unittest.TestCase):
             (MemoryError(), RunError, few),
             (RuntimeError("cannot allocate a name"), RuntimeError, "a name"),
         ):
-            broken = mock.patch.object(TrainingRunner, "learn", side_effect=error)
+            broken = patch.object(TrainingRunner, "learn", side_effect=error)
             with self.subTest(error), broken, self.assertRaisesRegex(wanted, said):
                 self.train("memory")
 
     def test_many_worlds_on_a_cpu_are_warned_of(self):
-        stopped = mock.patch("xreset.learning.train._runner", side_effect=RunError("stopped"))
+        stopped = patch("xreset.learning.train._runner", side_effect=RunError("stopped"))
         for worlds, warned in ((300, True), (4, False)):
             said = io.StringIO()
             with stopped, redirect_stderr(said), self.assertRaisesRegex(RunError, "stopped"):
@@ -533,59 +516,45 @@ class TrainingTest(unittest.TestCase):
         with self.assertRaisesRegex(FileFormatError, "cannot be read as a checkpoint"):
             read_checkpoint(file)
         good = torch.load(latest_checkpoint(self.out), weights_only=True)
+        actor, critic, adam = (
+            good[f"{name}_state_dict"] for name in ("actor", "critic", "optimizer")
+        )
         for key, wrong in (
             ("iteration", "3"),
             ("iteration", -1),
             ("learning_rate", math.inf),
             ("actor_state_dict", []),
+            ("actor_state_dict", actor | {"mlp.0.bias": "x"}),
+            ("critic_state_dict", critic | {"later": torch.tensor(math.nan)}),
+            (
+                "optimizer_state_dict",
+                adam | {"state": {0: {"step": torch.ones(()), "exp_avg": None}}},
+            ),
+            ("optimizer_state_dict", adam | {"state": []}),
         ):
             torch.save(good | {key: wrong}, file)
-            with (
-                self.subTest(key),
-                self.assertRaisesRegex(FileFormatError, rf"{file.name}\.{key} is"),
-            ):
-                read_checkpoint(file)
-        for name, key, wrong in (
-            ("actor", "mlp.0.bias", "x"),
-            ("critic", "later", torch.tensor(math.nan)),
-            ("optimizer", "state", {0: {"step": torch.tensor(1.0), "exp_avg": None}}),
-            ("optimizer", "state", []),
-        ):
-            table = f"{name}_state_dict"
-            torch.save(good | {table: good[table] | {key: wrong}}, file)
-            with (
-                self.subTest(key),
-                self.assertRaisesRegex(FileFormatError, f"(?s){table} is .*, expected "),
-            ):
+            words = rf"(?s){file.name}\.{key} is .*, expected "
+            with self.subTest(key), self.assertRaisesRegex(FileFormatError, words):
                 read_checkpoint(file)
         optimizer = torch.optim.Adam([torch.zeros(2, requires_grad=True)])
-        moments = {
-            "step": torch.tensor(1.0),
-            "exp_avg": torch.zeros(3),
-            "exp_avg_sq": torch.zeros(3),
-        }
+        three = torch.zeros(3)
+        moments = {"step": torch.ones(()), "exp_avg": three, "exp_avg_sq": three}
         with self.assertRaisesRegex(ValueError, r"exp_avg has shape \(3,\), expected \(2,\)"):
             load_moments(optimizer, {0: moments})
 
     def test_a_run_of_another_configuration_is_named(self):
-        good = json.loads((self.out / "run.json").read_text())
-        config = json.loads(json.dumps(good["config"]))
-        config["task"]["action"]["gripper"] = 1.0
         out = self.folder / "foreign"
-        out.mkdir()
+        shutil.copytree(self.out, out)
+        good = self.changed_run(out)
+        config = asdict(CONFIG)
+        config["task"]["action"]["gripper"] = 1.0
+        contract = good["contract"] | {"joint_names": 3}
         for words, changes in (
             (r"config\.task\.action.*unknown: gripper", {"config": config}),
-            (r"\(of xreset '9.9'\).*unknown: later", {"later": 1, "xreset": "9.9"}),
             ("num_envs is -5", {"num_envs": -5}),
-            (
-                "contract.joint_names is 3",
-                {"contract": good["contract"] | {"joint_names": 3}},
-            ),
+            ("contract.joint_names is 3", {"contract": contract}),
+            (r"\(of xreset '9.9'\).*unknown: later", {"later": 1, "xreset": "9.9"}),
         ):
-            (out / "run.json").write_text(json.dumps(good | changes))
+            self.changed_run(out, **good | changes)
             with self.subTest(words), self.assertRaisesRegex(FileFormatError, words):
                 read_run(out)
-
-
-if __name__ == "__main__":
-    unittest.main()

@@ -1,39 +1,35 @@
 """xreset view in a real, headless browser: what the user moves there is what the server shows."""
 
 import io
-import tempfile
 import unittest
 from contextlib import redirect_stdout
 from importlib.util import find_spec
-from pathlib import Path
 
 import numpy as np
 
 from tests.browser import INPUT, Browser, find_chromium, wait_until
+from tests.data import InOneFolder
 from tests.test_view import toy_demos, toy_retargeted
-from xreset import robots
-from xreset.demos.archive import write_demos
+from xreset import robots, write_demos, write_retargeted
 from xreset.pictures.view.load import load_view
-from xreset.retarget.file import write_retargeted
 
 SLIDER = INPUT + ".querySelector('[role=slider]')"
 
 
 @unittest.skipUnless(find_spec("viser"), "viser is not installed")
-class InTheBrowser(unittest.TestCase):
+class InTheBrowser(InOneFolder):
     @classmethod
     def setUpClass(cls):
+        super().setUpClass()
         cls.browser = Browser(find_chromium())
         cls.addClassCleanup(cls.browser.close)
-        folder = tempfile.TemporaryDirectory()
-        cls.addClassCleanup(folder.cleanup)
         robot = robots.load("openarm")
-        cls.demos = Path(folder.name) / "demos.npz"
-        cls.retargeted = Path(folder.name) / "retargeted.npz"
+        cls.demos = cls.folder / "demos.npz"
+        cls.retargeted = cls.folder / "retargeted.npz"
         write_demos(cls.demos, toy_demos())
-        write_retargeted(cls.retargeted, toy_retargeted(robot), config={}, inputs={})
+        write_retargeted(cls.retargeted, toy_retargeted(robot))
 
-    def open(self, path: Path, **options):
+    def open(self, path, **options):
         """A page that the browser shows."""
         from xreset.pictures.view.page import Page
 
@@ -50,19 +46,19 @@ class InTheBrowser(unittest.TestCase):
         )
         return page
 
-    def until(self, condition, what: str):
+    def until(self, condition, what):
         """Wait; long, because frames drawn without a GPU can take seconds where other work has the cores."""
         try:
             wait_until(condition, what, seconds=60)
         except AssertionError as error:
             raise AssertionError(f"{error}; the page says: {self.browser.text()!r}") from None
 
-    def exists(self, element: str) -> bool:
+    def exists(self, element):
         return self.browser.evaluate(
             f"(() => {{ try {{ return !!{element} }} catch {{ return false }} }})()"
         )
 
-    def orange_pixels(self) -> int:
+    def orange_pixels(self):
         """How much of the page has the object's colour."""
         from PIL import Image
 
@@ -103,7 +99,3 @@ class InTheBrowser(unittest.TestCase):
         self.until(lambda: "sequence 1: demo_b" in self.browser.text(), "its name in the browser")
         self.assertGreater(self.orange_pixels(), 20, "the object is not to be seen")
         self.assert_no_problem()
-
-
-if __name__ == "__main__":
-    unittest.main()

@@ -1,19 +1,15 @@
 """A small reset bank for tests, with soup and spam, three demonstrations and six states, all numbers distinct; and trajectories."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 
-from xreset.resets.bank import ResetBank
-from xreset.retarget.file import Retargeted
-from xreset.spec import RobotSpec
+from xreset import ResetBank, Retargeted
 
 SOUP, SPAM = "005_tomato_soup_can", "010_potted_meat_can"
 
 
-def toy_bank(robot: RobotSpec, **changes: Any) -> ResetBank:
+def toy_bank(robot, **changes):
     """The bank; ``changes`` replace fields.
 
     Demonstrations 0 (soup), 1 (spam) and 2 (soup) start at x = 0.50, 0.51, 0.52 and end 0.2 higher, turned by 90 degrees about x. States:
@@ -53,9 +49,7 @@ def toy_bank(robot: RobotSpec, **changes: Any) -> ResetBank:
     return ResetBank(**(fields | changes))
 
 
-def toy_retargeted(
-    robot: RobotSpec, objects: list[str], offsets: list[int], **changes: Any
-) -> Retargeted:
+def toy_retargeted(robot, objects, offsets, **changes):
     """Trajectories of demonstrations with these objects; ``changes`` replace fields.
 
     Every frame is valid. The robot is at home, and an object stays at the origin, upright.

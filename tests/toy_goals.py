@@ -1,22 +1,16 @@
 """A small goal set for tests: soup and spam upright, two goals each, 0.2 m above the start and turned about z."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 
 from tests.toy_bank import SOUP, SPAM
-from xreset.objects.catalogue import load_object
+from xreset import GoalSet, load_object
 from xreset.objects.rest import rest_height
 from xreset.resets.bank import no_states
-from xreset.resets.goals import GoalSet
-from xreset.spec import RobotSpec
 
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-def toy_goals(robot: RobotSpec, **changes: Any) -> GoalSet:
+def toy_goals(robot, **changes):
     """Return the goal set; ``changes`` replace fields."""
     owners = [SOUP, SOUP, SPAM, SPAM]
     heights = [rest_height(load_object(name), UPRIGHT) for name in owners]

@@ -1,8 +1,6 @@
 """A grasp for tests: the conformance suite's gripper with its jaws just around a brick in the air. It closes and lifts; how hard it presses
 decides whether half the friction, or half the drive's stiffness, is still enough."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,14 +9,13 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from tests.toy_bank import toy_bank
+from xreset import PolicySpec
 from xreset.backends.conformance.scene import gripper, objects
 from xreset.eval.engines.recording import Recording
-from xreset.eval.policy_spec import PolicySpec
-from xreset.eval.rollout import Engine, Trial
+from xreset.eval.rollout import Trial
 from xreset.geometry.kinematics import Kinematics
 from xreset.physics import State
-from xreset.resets.bank import ResetBank
-from xreset.spec import ObjectSpec, PairFriction, RobotSpec, SceneSpec
+from xreset.spec import PairFriction
 from xreset.task.config import ResetConfig, TaskConfig
 
 FRICTION = PairFriction(tip=0.9, link=0.5, table=0.6, torsional=0.002)
@@ -32,7 +29,7 @@ RAISED = 0.04
 """How far the lift goes [m]."""
 
 
-def robot() -> RobotSpec:
+def robot():
     """The gripper, at home with its jaws around the brick."""
     spec = gripper()
     return replace(
@@ -41,11 +38,11 @@ def robot() -> RobotSpec:
     )
 
 
-def brick() -> ObjectSpec:
+def brick():
     return objects()[0]
 
 
-def brick_pose() -> tuple[np.ndarray, np.ndarray]:
+def brick_pose():
     """Where the brick is, between the pads of the robot at home: position [3], quaternion [4]."""
     spec = robot()
     T = Kinematics(spec).link_poses(torch.as_tensor(spec.home), ["wrist"])[0].numpy()
@@ -55,7 +52,7 @@ def brick_pose() -> tuple[np.ndarray, np.ndarray]:
     return T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
 
 
-def start() -> State:
+def start():
     """[1] the robot at home, the brick between its jaws, everything at rest."""
     pos, quat = brick_pose()
     return State.at_rest(
@@ -63,7 +60,7 @@ def start() -> State:
     )
 
 
-def targets(step: int) -> np.ndarray:
+def targets(step):
     """[J] what the drives are told: close at once, and lift from step 15 to 45."""
     spec = robot()
     wanted = spec.home.copy()
@@ -72,9 +69,7 @@ def targets(step: int) -> np.ndarray:
     return wanted
 
 
-def recording(
-    *, steps: int = 20, worlds: int = 1, joints: int = 5, **changes: torch.Tensor
-) -> Recording:
+def recording(*, steps=20, worlds=1, joints=5, **changes):
     """A recording with two fingertips in which everything stands still and touches nothing; ``changes`` replace fields."""
     upright = torch.tensor([1.0, 0, 0, 0])
     still = State.at_rest(
@@ -94,7 +89,7 @@ def recording(
     return Recording(start=still, **fields | changes)
 
 
-def bank() -> ResetBank:
+def bank():
     """Three demonstrations whose starts are millimetres apart, and whose goals are where the lift ends."""
     pos, quat = brick_pose()
     start_pos = pos + np.array([[0, 0, -1e-3], [0, 0, 0], [0, 0, 1e-3]])
@@ -111,11 +106,11 @@ def bank() -> ResetBank:
     )
 
 
-def trial(task: TaskConfig, **setting) -> Trial:
+def trial(task, **setting):
     return Trial(robot=robot(), objects=(brick(),), bank=bank(), task=task, **setting)
 
 
-def policy() -> PolicySpec:
+def policy():
     """The policy :class:`OpenLoop` by name."""
     return PolicySpec(
         name="open-loop",
@@ -131,10 +126,10 @@ class OpenLoop:
 
     name = "open-loop"
 
-    def begin(self, env) -> None:
+    def begin(self, env):
         self._env, self._step = env, 0
 
-    def act(self, observations) -> torch.Tensor:
+    def act(self, observations):
         wanted = torch.as_tensor(targets(self._step), dtype=torch.float32).expand(
             self._env.num_envs, -1
         )
@@ -142,14 +137,14 @@ class OpenLoop:
         return self._env.actions.action_for(wanted, self._env.joint_target)
 
 
-def with_scene(base: Engine, name: str, change) -> Engine:
+def with_scene(base, name, change):
     """The engine under another name, whose worlds are of ``change(scene)``: a deliberate mistake."""
 
-    def make(scene: SceneSpec, num_worlds: int, object_index: torch.Tensor):
+    def make(scene, num_worlds, object_index):
         return base.make(change(scene), num_worlds, object_index)
 
     return replace(base, name=name, make=make)
 
 
-def with_tip_friction(scene: SceneSpec, factor: float) -> SceneSpec:
+def with_tip_friction(scene, factor):
     return replace(scene, friction=replace(scene.friction, tip=scene.friction.tip * factor))

@@ -3,10 +3,7 @@
 Everything is as in real trainings but small: environment, resets from a bank, PPO on sequences, curves.
 """
 
-from __future__ import annotations
-
 import tempfile
-from collections.abc import Callable
 from contextlib import redirect_stdout
 from dataclasses import replace
 from io import StringIO
@@ -20,11 +17,8 @@ from xreset.env import ManipulationEnv, make_scene
 from xreset.eval.report.read import read_curves
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.runner import TrainingRunner
-from xreset.physics import Backend
 from xreset.policy import RandomPolicy
-from xreset.resets.bank import ResetBank
 from xreset.resets.distribution import ResetDistribution
-from xreset.spec import SceneSpec
 from xreset.task.config import (
     ActionConfig,
     ObservationConfig,
@@ -55,7 +49,7 @@ CONFIG = TrainConfig(
 )
 
 
-def shares(mean: Callable[[str], float]) -> dict[str, float]:
+def shares(mean):
     """Return the shares of all worlds' control steps with both fingers on the brick, and with the brick at the goal.
 
     Args:
@@ -64,13 +58,13 @@ def shares(mean: Callable[[str], float]) -> dict[str, float]:
     return {name: float(mean(f"task/{name}")) for name in ("grasped", "success")}
 
 
-def bank() -> ResetBank:
+def bank():
     """States in which the brick hangs between the jaws, which are told to close."""
     robot, (pos, quat) = toy_grasp.robot(), toy_grasp.brick_pose()
     closing = robot.home.copy()
     closing[robot.joint_names.index("jaw_a_slide")] = toy_grasp.CLOSED
 
-    def six(row: np.ndarray) -> np.ndarray:
+    def six(row):
         return np.tile(row, (6, 1)).astype(np.float32)
 
     return replace(
@@ -82,7 +76,7 @@ def bank() -> ResetBank:
     )
 
 
-def random_policy(seed: int, backend: Backend) -> dict[str, float]:
+def random_policy(seed, backend):
     """What uniform actions do in one episode."""
     env = environment(seed, backend)
     policy = RandomPolicy(env.num_actions, seed)
@@ -93,11 +87,7 @@ def random_policy(seed: int, backend: Backend) -> dict[str, float]:
     return shares(lambda name: np.mean([log[name] for log in logs]))
 
 
-def trained(
-    seed: int,
-    backend: Backend,
-    config: TrainConfig = CONFIG,
-) -> tuple[dict[str, float], int]:
+def trained(seed, backend, config=CONFIG):
     """What a training does in its last iterations in the backend's worlds of :func:`scene`, and its steps in all worlds."""
     torch.manual_seed(seed)
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(StringIO()):
@@ -107,12 +97,12 @@ def trained(
     return shares(lambda name: curves[name].iloc[-LAST:].mean()), runner.env_steps
 
 
-def scene() -> SceneSpec:
+def scene():
     """Gripper and brick."""
     return make_scene(toy_grasp.robot(), (toy_grasp.brick(),), CONFIG.task)
 
 
-def environment(seed: int, backend: Backend) -> ManipulationEnv:
+def environment(seed, backend):
     """The task in the backend's worlds."""
     resets = ResetDistribution(
         bank(), toy_grasp.robot(), (toy_grasp.brick().name,), CONFIG.task.reset, backend.device

@@ -1,29 +1,17 @@
 """A policy of one matrix, written as ONNX by hand: in every way that an exported one could be wrong."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from onnx import TensorProto, helper, numpy_helper
 
+from xreset import TaskConfig
 from xreset.checks import from_dict
-from xreset.task.config import TaskConfig
 
 
 def write_policy(
-    path: Path,
-    contract: dict[str, Any],
-    *,
-    lstm: int | str = 8,
-    actions: int | None = None,
-    outputs: int = 3,
-    value: float = 0.5,
-    state: str = "Identity",
-    metadata: str | None = None,
-) -> Path:
+    path, contract, *, lstm=8, actions=None, outputs=3, value=0.5, state="Identity", metadata=None
+):
     """Write it; without options it is sound.
 
     Args:

@@ -1,57 +1,38 @@
 """Evaluation results for tests: two demonstrations, two episodes each, of known outcome; and folders of runs."""
 
-from __future__ import annotations
-
-import tempfile
-import unittest
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from tests import data
 from tests.toy_bank import SOUP, SPAM
-from xreset.eval.results import Episode, EvalResult, Rollouts, Trace, summarize, write_results
-from xreset.learning.config import TrainConfig
+from xreset import TrainConfig
+from xreset.eval.results import Episode, Rollouts, Trace, summarize, write_results
 from xreset.learning.run import RunInfo, write_run
 
 OBJECTS = (SOUP, SPAM)
 ENGINES = ("mujoco", "mujoco-warp", "pybullet", "sapien")
 
 
-def toy_episode(
-    sequence: int, repetition: int, *reached: str, thing: str = "", **changes: Any
-) -> Episode:
+def toy_episode(sequence, repetition, *reached, thing="", **changes):
     """An episode of a demonstration that reached some stages; nothing else is special but for ``changes``."""
-    flags = (
-        "approach",
-        "grasp",
-        "reorient",
-        "reorient_once",
-        "out_of_bounds",
-        "nonfinite",
-        "overflow",
-    )
+    flags = "approach grasp reorient reorient_once out_of_bounds nonfinite overflow"
+    distances = "least_distance final_distance final_position_error final_angle"
     distance = 0.01 if "reorient_once" in reached else 0.1
-    values = {
-        "reorientation_progress": 0.0,
-        "task_progress": 0.0,
-        "published_success": distance < 0.02,
-    }
-    values |= dict.fromkeys(
-        ("least_distance", "final_distance", "final_position_error", "final_angle"), distance
-    )
+    values = {name: name in reached for name in flags.split()}
+    values |= dict.fromkeys(distances.split(), distance)
+    values |= dict.fromkeys(("reorientation_progress", "task_progress"), 0.0)
+    values |= {"published_success": distance < 0.02, "object": thing or OBJECTS[sequence]}
     return Episode(
         sequence=sequence,
         sequence_name=f"demo_{sequence}",
-        object=thing or OBJECTS[sequence],
         repetition=repetition,
-        **{name: name in reached for name in flags},
         **(values | changes),
     )
 
 
-def episodes(scores: list[float]) -> tuple[Episode, ...]:
+def episodes(scores):
     """Two episodes of each demonstration, with these task progresses; above 0.5 with a grasp."""
     found = []
     for i, score in enumerate(scores):
@@ -60,7 +41,7 @@ def episodes(scores: list[float]) -> tuple[Episode, ...]:
     return tuple(found)
 
 
-def toy_rollouts(joint_pos: np.ndarray | None = None) -> Rollouts:
+def toy_rollouts(joint_pos=None):
     """Return rollouts in which demonstration 0 (soup) reaches the goal once and the approach once, demonstration 1 (spam) a grasp and nothing.
 
     Args:
@@ -94,18 +75,14 @@ def toy_rollouts(joint_pos: np.ndarray | None = None) -> Rollouts:
     return Rollouts(episodes=episodes, traces=tuple(traces), control_steps_per_second=1234.56)
 
 
-def rollouts_with(*progress: float) -> Rollouts:
+def rollouts_with(*progress):
     """Return the toy's four episodes with other task progress."""
     rollouts = toy_rollouts()
-    episodes = [
-        replace(e, task_progress=p) for e, p in zip(rollouts.episodes, progress, strict=True)
-    ]
-    return replace(rollouts, episodes=tuple(episodes))
+    both = zip(rollouts.episodes, progress, strict=True)
+    return replace(rollouts, episodes=tuple(replace(e, task_progress=p) for e, p in both))
 
 
-def toy_summary(
-    backend: str = "mujoco", rollouts: Rollouts | None = None, **changes: Any
-) -> EvalResult:
+def toy_summary(backend="mujoco", rollouts=None, **changes):
     """Return ``BACKEND.json`` of the rollouts; ``changes`` replace arguments of :func:`xreset.eval.results.summarize`."""
     arguments: dict[str, Any] = {
         "backend_version": "4.0.0",
@@ -118,31 +95,19 @@ def toy_summary(
     return summarize(rollouts or toy_rollouts(), backend=backend, **(arguments | changes))
 
 
-class InFolder(unittest.TestCase):
+class InFolder(data.InFolder):
     """A test with a folder of runs and results."""
 
-    def setUp(self):
-        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
-
     def write_results(
-        self,
-        name: str,
-        rollouts: Rollouts | None = None,
-        engines=("mujoco",),
-        joints=("a", "b", "c"),
-        **changes: Any,
-    ) -> Path:
+        self, name, rollouts=None, engines=("mujoco",), joints=("a", "b", "c"), **changes
+    ):
         rollouts = rollouts or toy_rollouts()
         for engine in engines:
-            write_results(
-                self.folder / name / "eval",
-                toy_summary(engine, rollouts, **changes),
-                rollouts,
-                joints,
-            )
+            summary = toy_summary(engine, rollouts, **changes)
+            write_results(self.folder / name / "eval", summary, rollouts, joints)
         return self.folder / name
 
-    def write_run(self, name: str, config: TrainConfig | None = None, **changes: Any) -> Path:
+    def write_run(self, name, config=None, **changes):
         info = {
             "robot": "openarm",
             "resets": "resets.npz",

@@ -1,29 +1,29 @@
 """Targets for tests of retargeting, and derivatives by central differences."""
 
-from __future__ import annotations
-
 import dataclasses
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from xreset.geometry.fields import DistanceFields
 from xreset.geometry.rotations import matrix_to_quat, quat_from_axis_angle, quat_multiply
 from xreset.geometry.shapes import box, surface_of
-from xreset.retarget.arm.model import ArmModel, ArmTargets
-from xreset.retarget.hand.config import HandConfig
+from xreset.retarget.arm.model import ArmTargets
 from xreset.retarget.hand.cost import system
-from xreset.retarget.hand.model import HandModel, HandState, HandTargets
+from xreset.retarget.hand.model import HandState, HandTargets
 from xreset.spec import ObjectSpec
 
 FLOAT = torch.float64
-UPRIGHT = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=FLOAT)
 
 
-def box_object(*boxes: tuple[tuple[float, float, float], tuple[float, float, float]]) -> ObjectSpec:
+def double(values):
+    """A tensor of 64-bit numbers."""
+    return torch.tensor(values, dtype=FLOAT)
+
+
+UPRIGHT = double([1.0, 0.0, 0.0, 0.0])
+
+
+def box_object(*boxes):
     """An object made of boxes (center, size)."""
     pieces = tuple(box(center, size) for center, size in boxes)
     vertices, faces = surface_of(pieces)
@@ -38,7 +38,7 @@ def box_object(*boxes: tuple[tuple[float, float, float], tuple[float, float, flo
     )
 
 
-def hand_targets(keypoints: Tensor, fields: DistanceFields, **changes: Tensor) -> HandTargets:
+def hand_targets(keypoints, fields, **changes):
     """Keypoints [S, T, P, 3] that touch nothing, and an upright object far away."""
     shape = keypoints.shape[:2]
     targets = HandTargets(
@@ -55,7 +55,7 @@ def hand_targets(keypoints: Tensor, fields: DistanceFields, **changes: Tensor) -
     return dataclasses.replace(targets, **changes)
 
 
-def arm_targets(model: ArmModel, joints: Tensor) -> ArmTargets:
+def arm_targets(model, joints):
     """The path of the hand root along all joints [S, T, J], free of errors."""
     T = model.kinematics.link_poses(joints, [model.robot.hand_root])[:, :, 0]
     shape = joints.shape[:2]
@@ -69,25 +69,17 @@ def arm_targets(model: ArmModel, joints: Tensor) -> ArmTargets:
     )
 
 
-def slope(
-    function: Callable[[Tensor], Tensor], x: Tensor, index: Any, step: float = 1e-6
-) -> Tensor:
+def slope(function, x, index, step=1e-6):
     """Derivative of a function by the elements of x at an index, which is moved by a step both ways."""
     shift = torch.zeros_like(x)
     shift[index] = step
     return (function(x + shift) - function(x - shift)) / (2 * step)
 
 
-def check_gradient(
-    model: HandModel,
-    targets: HandTargets,
-    config: HandConfig,
-    state: HandState,
-    frames: tuple[int, ...],
-) -> None:
+def check_gradient(model, targets, config, state, frames):
     """Assert that the gradient of the hand's cost is its derivative by every variable of some frames."""
 
-    def cost(shift: Tensor) -> Tensor:
+    def cost(shift):
         joints, move, turn = shift.split((state.joints.shape[-1], 3, 3), dim=-1)
         moved = HandState(
             joints=state.joints + joints,

@@ -1,17 +1,14 @@
 """A small robot for tests: an arm of three joints, a hand of two fingers, and a pair of jaws that mimic one another."""
 
-from __future__ import annotations
-
+import atexit
+import tempfile
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 
 from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.spec import DriveSpec, FingertipSpec, JointSpec, KeypointSpec, MimicSpec, RobotSpec
-
-if TYPE_CHECKING:
-    from xreset.retarget.hand.model import HandModel, HandState
 
 _JOINTS = (
     # name, type, parent, child, xyz, rpy, axis, lower, upper
@@ -37,9 +34,17 @@ _JOINTS = (
     ("jaw_a", "prismatic", "palm", "jaw_a", "0 0.03 0", "0 0 0", "0 1 0", 0.0, 0.04),
     ("jaw_b", "prismatic", "palm", "jaw_b", "0 -0.03 0", "0 0 0", "0 -1 0", 0.0, 0.055),
 )
+_KEYPOINTS = {
+    "wrist": "palm",
+    "index1": "finger_a1",
+    "index2": "finger_a2",
+    "index4": "tip_a",
+    "thumb1": "finger_b1",
+    "thumb4": "tip_b",
+}
 
 
-def write_urdf(path: Path, rename: dict[str, str] | None = None) -> Path:
+def write_urdf(path, rename=None):
     """Write the test robot's URDF; ``rename`` changes joint names."""
     inertia = '<inertia ixx="1e-3" iyy="1e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/>'
     links = {"base", *(joint[3] for joint in _JOINTS)}
@@ -64,7 +69,15 @@ def write_urdf(path: Path, rename: dict[str, str] | None = None) -> Path:
     return path
 
 
-def toy_hand_arm(folder: Path) -> RobotSpec:
+@cache
+def toy_robot():
+    """The test robot, whose URDF stays until the process ends."""
+    folder = tempfile.TemporaryDirectory()
+    atexit.register(folder.cleanup)
+    return toy_hand_arm(Path(folder.name))
+
+
+def toy_hand_arm(folder):
     """The test robot; its URDF is written into ``folder``. Its joint order is not the URDF's."""
     drive = DriveSpec(kp=1.0, kd=0.1, effort=1.0)
     order = ("arm_3", "arm_1", "arm_2", "finger_b1", "finger_a1", "finger_a2", "jaw_a")
@@ -72,38 +85,28 @@ def toy_hand_arm(folder: Path) -> RobotSpec:
         name="toy",
         urdf=write_urdf(folder / "toy.urdf"),
         joints=tuple(
-            JointSpec(
-                name=n, group="arm" if n.startswith("arm") else "hand", drive=drive, home=0.01
-            )
+            JointSpec(name=n, group="arm" if "arm" in n else "hand", drive=drive, home=0.01)
             for n in order
         ),
         mimics=(MimicSpec(joint="jaw_b", source="jaw_a", multiplier=2.0, offset=0.005),),
         base_pos=(0.1, -0.2, 0.3),
         base_quat=(0.5, 0.5, 0.5, 0.5),
         palm="palm",
-        fingertips=(
-            FingertipSpec(
-                name="thumb", link="tip_b", contact_links=("finger_b1",), keypoint="thumb4"
-            ),
-            FingertipSpec(
-                name="index", link="tip_a", contact_links=("finger_a2",), keypoint="index4"
-            ),
+        fingertips=tuple(
+            FingertipSpec(name=name, link=tip, contact_links=(link,), keypoint=f"{name}4")
+            for name, tip, link in (
+                ("thumb", "tip_b", "finger_b1"),
+                ("index", "tip_a", "finger_a2"),
+            )
         ),
-        keypoints=(
-            KeypointSpec(keypoint="wrist", link="palm"),
-            KeypointSpec(keypoint="index1", link="finger_a1"),
-            KeypointSpec(keypoint="index2", link="finger_a2"),
-            KeypointSpec(keypoint="index4", link="tip_a"),
-            KeypointSpec(keypoint="thumb1", link="finger_b1"),
-            KeypointSpec(keypoint="thumb4", link="tip_b"),
+        keypoints=tuple(
+            KeypointSpec(keypoint=keypoint, link=link) for keypoint, link in _KEYPOINTS.items()
         ),
         hand_root="palm",
     )
 
 
-def toy_motion(
-    model: HandModel, generator: torch.Generator, *, margin: float, turn: float
-) -> HandState:
+def toy_motion(model, generator, *, margin, turn):
     """Three motions of 12 frames: the joints move between two postures, the root along a line while it turns.
 
     The postures keep a share ``margin`` of the joints' range from the limits. The root turns by ``turn`` [rad] about

@@ -1,16 +1,12 @@
 """Steps of a study that take no time: a shell command that writes a file."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
-from xreset.eval.study.steps import Step, Todo
+from xreset.eval.study.steps import Step
 
 
-def shell_step(name: str, writes: Path, command: str, *needs: str, gpu: bool = False) -> Step:
+def shell_step(name, writes, command, *needs, gpu=False):
     """Return a step that is done when its folder holds ``done``."""
 
-    def todo() -> Todo:
+    def todo():
         if (writes / "done").exists():
             return "", []
         return "to do", [["sh", "-c", f"mkdir -p {writes} && cd {writes} && {command}"]]

@@ -9,13 +9,11 @@ from xreset.cli import main
 from xreset.learning.runner import TrainingRunner
 
 
-def run(folder: Path, arguments: list[str]) -> None:
+def run(folder, arguments):
     learn = TrainingRunner.learn
 
-    def learn_and_tell(runner: TrainingRunner, *args, **options) -> None:
-        begin = {
-            "start_actor": {k: v.clone() for k, v in runner.alg.actor.state_dict().items()},
-        }
+    def learn_and_tell(runner, *args, **options):
+        begin = {"start_actor": {k: v.clone() for k, v in runner.alg.actor.state_dict().items()}}
         learn(runner, *args, **options)
         end = {
             "actor": runner.alg.actor.state_dict(),

@@ -148,12 +148,19 @@ class UsedTest(InFolder):
     def test_what_does_not_fit_is_refused(self):
         low = toy_goals(self.robot).goal_pos - np.float32([0, 0, 0.25])
         high = toy_goals(self.robot).start_pos + np.float32([0, 0, 0.03])
+        far = toy_goals(self.robot).goal_pos
+        far[1] = (1.9, 0.3, 0.3)
         for error, message, changes in (
             (GoalError, f"{SOUP}/lift_000: the goal is 5.0 cm inside the table", {"goal_pos": low}),
             (GoalError, "starts 3.0 cm above the table", {"start_pos": high}),
             (
+                GoalError,
+                f"1 of 2 goals of {SOUP} are out of the reach of ur7e-sharpa, such as .*lift_001",
+                {"goal_pos": far},
+            ),
+            (
                 FileFormatError,
-                "an imported mesh of 005_tomato_soup_can",
+                "an imported mesh of 005_tomato_soup_can, .* or make it again",
                 {"object_sources": ("abc", "stand-in")},
             ),
         ):

@@ -24,7 +24,8 @@ def play(
     Args:
         object: Object to begin with; default: the soup can, or else the first one.
         backend: Physics engine to begin with.
-        demos: Starts and goals: demonstrations, robot motion or reset states. Default: synthetic demonstrations.
+        demos: Starts and goals: demonstrations, robot motion, reset states or a goal set. Default: synthetic
+            demonstrations.
         seed: Chooses starts and goals.
     """
     from xreset.eval.play import run

@@ -271,7 +271,7 @@ def check_objects(path: str | Path, bank: ResetBank, objects: tuple[ObjectSpec, 
         if given.get(name, source) != source:
             raise FileFormatError(
                 f"{path} was made with {_described(source)} of {name}, but the given one is {_described(given[name])} "
-                "(or another mesh). Give the same --objects folder, or make the bank again."
+                "(or another mesh). Give the same --objects folder, or make it again."
             )
 
 

@@ -186,7 +186,8 @@ def with_goals(bank: ResetBank, goals: GoalSet) -> ResetBank:
 def checked_goals(
     where: str, goals: GoalSet, robot: RobotSpec, objects: Sequence[ObjectSpec]
 ) -> GoalSet:
-    """Return a goal set for a robot. If it was made for another one, the reach of this robot is tried here.
+    """Return a goal set for a robot. If it was made for another one, the reach of this robot is tried here; a file of
+    its own is only searched for goals where no arm of its length gets to.
 
     Args:
         where: what messages call the goal set.
@@ -199,7 +200,8 @@ def checked_goals(
         GoalError: a start is not on the table, or a goal is inside it or out of reach.
     """
     check_objects(where, goals, tuple(objects))
-    reach = None if robot.has_fingerprint(goals.robot_fingerprint) else Reach(robot)
+    is_own = robot.has_fingerprint(goals.robot_fingerprint)
+    reach = Reach(robot)
     for obj in objects:
         rows = np.flatnonzero(goals.sequence_object == obj.name)
         gaps = goals.start_pos[rows, 2] - rest_height(obj, goals.start_quat_wxyz[rows])
@@ -212,20 +214,23 @@ def checked_goals(
                     f"{name}: the object starts {100 * abs(gap):.1f} cm {side} the table, expected at rest."
                 )
             _check_above_table(name, depth)
-        if reach is None or not len(rows):
+        if not len(rows):
             continue
         start_turns = _turns(goals.start_quat_wxyz[rows])
         goal_turns = _turns(goals.goal_quat_wxyz[rows])
         start = goals.start_pos[rows] + start_turns.apply(obj.com)
         goal = goals.goal_pos[rows] + goal_turns.apply(obj.com)
-        held = reach.holds(start, goal, goal_turns * start_turns.inv())
+        if is_own:
+            held = reach.stretches_to(start) & reach.stretches_to(goal)
+        else:
+            held = reach.holds(start, goal, goal_turns * start_turns.inv())
         if not held.all():
             raise GoalError(
                 f"{where}: {int((~held).sum())} of {len(held)} goals of {obj.name} are out of the reach of "
                 f"{robot.name}, such as {goals.sequence_name[rows[held.argmin()]]}. Move them, or make a goal set for "
                 f"this robot: xreset goals --robot {robot.name}."
             )
-    return goals if reach is None else replace(goals, **no_states(robot))
+    return goals if is_own else replace(goals, **no_states(robot))
 
 
 # Drawing --------------------------------------------------------------------------------------------------------------

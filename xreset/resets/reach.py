@@ -47,6 +47,21 @@ class Reach:
         turns = np.radians(list(product(_TILTS, _YAWS)))
         tilted = Rotation.from_rotvec(turns[:, :1] * level) * at_home
         self._grasps = (Rotation.from_rotvec(turns[:, 1:] * (0.0, 0.0, 1.0)) * tilted).as_quat()
+        self._base = np.array(robot.base_pos)
+        self._stretch = float(np.linalg.norm(self._center)) + _THRESHOLDS.wrist_position
+        tree = self._model.kinematics.tree
+        link = robot.hand_root
+        while link != tree.root:
+            joint = tree.above[link]
+            self._stretch += float(np.linalg.norm(joint.T_parent_joint[:3, 3]))
+            if joint.type == "prismatic":
+                self._stretch += max(abs(joint.lower), abs(joint.upper))
+            link = joint.parent
+
+    def stretches_to(self, places: np.ndarray) -> np.ndarray:
+        """[N] bool: whether places [N, 3] in the world are no farther from the base than the stretched arm. Where it
+        cannot hold anything, this may be true."""
+        return np.linalg.norm(places - self._base, axis=1) <= self._stretch
 
     @one_thread()
     def holds(self, start: np.ndarray, goal: np.ndarray, turn: Rotation) -> np.ndarray:

@@ -179,6 +179,39 @@ class PlanTest(Studied):
         self.assertEqual(replace(given["config"], iterations=given["iterations"]), planned.config)
         self.assertEqual(list(flags({"config": {"a": {"b_c": True}}})), ["--config.a.b-c"])
 
+    def test_goals_need_no_demonstrations(self):
+        goals = "[data.goals]\ngoals = ['--family', 'lift', '--draw.per-family', '3']\n"
+        runs = (
+            "[runs.a]\nobjects = ['spam']\n[runs.tuned]\ndata = 'goals'\nobjects = ['soup']\nweights = 'a'\n"
+            "[evaluations.eval-goals]\ndata = 'goals'\nobjects = ['soup']\nunseen = true\n"
+            "[runs.ik]\npolicy = 'ik'\n"
+        )
+        plan = self.plan(HEAD + DATA + goals + RUN + runs)
+        folder = self.out / "data" / "goals-tomato_soup_can"
+        for subset in plan.subsets():
+            subset.make()
+        self.assertEqual([f.name for f in folder.iterdir()], ["subset.json"])
+        self.assertTrue(all(subset.is_made() for subset in plan.subsets()))
+        file = str(folder / "openarm" / "goals.npz")
+        (make,) = plan.steps["data goals-tomato_soup_can openarm"].todo()[1]
+        expected = ["goals", SOUP, "--robot", "openarm", "--out", file]
+        self.assertEqual(make[3:], [*expected, "--family", "lift", "--draw.per-family", "3"])
+        step = plan.steps["train tuned-seed0"]
+        self.assertEqual(step.needs, ["data goals-tomato_soup_can openarm", "train a-seed0"])
+        (train,) = step.todo()[1]
+        self.assertEqual(train[train.index("--goals") + 1], file)
+        self.assertNotIn("--resets", train)
+        (run,) = (run for run in plan.runs if run.group == "tuned")
+        self.assertEqual(run.config.task.reset.demo_probability, 0.0)
+        for name in ("a-seed0", "tuned-seed0"):
+            played = plan.steps[f"eval-goals {name}"]
+            self.assertIn("data goals-tomato_soup_can openarm", played.needs)
+            (command,) = played.todo()[1]
+            self.assertEqual(command[command.index("--demos") + 1], file)
+        self.assertNotIn("eval-goals ik", plan.steps, "goals have no motion to follow")
+        with self.assertRaisesRegex(FileFormatError, r"data\.both has both demos and goals"):
+            self.plan(HEAD + DATA + "[data.both]\ndemos = 'a.npz'\ngoals = []\n" + RUN)
+
     def test_what_does_not_fit_is_refused(self):
         own = "own = { 'module:term' = 1.0 }\n"
         gravity = r"runs\.a\.config\.task\.reset.*unknown: gravity"

@@ -74,7 +74,7 @@ def _options(*allowed: str) -> Rule:
 
 @frozen
 class Data(Checked):
-    """Demonstrations, and the options with which reset states are made of them."""
+    """Demonstrations, and the options with which reset states are made of them; or goals of objects."""
 
     demos: str | None = None
     """An archive (``xreset demos``), relative to ``--data``. None: synthetic ones of the stand-ins."""
@@ -97,6 +97,9 @@ class Data(Checked):
         ),
     ] = ()
     """Further options of ``xreset resets``."""
+    goals: Annotated[tuple[str, ...], _options("--family", "--draw.")] | None = None
+    """Options of ``xreset goals``, which may be none: the data are starts and goals of the meshes, without
+    demonstrations. Trainings with them begin every episode at home."""
 
 
 @frozen
@@ -235,6 +238,9 @@ def _check_names(study: Study) -> None:
                 f"the evaluation {name!r} is a folder in every run: call it 'eval', or begin its name with 'eval-'."
             )
         _expect(f"evaluations.{name}.data", study.data, evaluation.data)
+    for name, data in study.data.items():
+        if data.goals is not None and data.demos is not None:
+            raise ValueError(f"data.{name} has both demos and goals. Give one of them.")
     trained: list[str] = []
     for name, run in study.runs.items():
         _expect(f"runs.{name}.data", study.data, run.data)

@@ -61,10 +61,13 @@ class Plan:
         return [part for part in self.parts.values() if isinstance(part, Subset)]
 
     def subset(self, name: str, objects: Iterable[str], per_object: int | None) -> Subset:
-        """Return the demonstrations of some objects of the data."""
+        """Return the demonstrations, or goals, of some objects of the data."""
         data = self.study.data[name]
         chosen = tuple(sorted(objects))
-        if data.demos is not None and chosen == self.objects[name]:
+        if data.goals is not None:
+            per_object = None
+        given = data.demos is not None or data.goals is not None
+        if given and chosen == self.objects[name]:
             chosen = ()
         shown = "+".join(short_name(each, "_") for each in chosen).replace("/", "_")
         parts = filter(None, [name, shown, str(per_object or "")])
@@ -75,7 +78,7 @@ class Plan:
         return self.own(folder, made)
 
     def bank(self, subset: Subset, robot: str) -> str:
-        """Add the step to a reset bank, and return its name."""
+        """Add the step to a reset bank or goal set, and return its name."""
         folder = subset.robot(robot)
         self.own(folder, robot)
         name = f"data {subset.folder.name} {folder.name}"
@@ -98,6 +101,9 @@ class Plan:
         known = self.objects[data]
         wanted = canonical_names(spec.objects, known) or known
         objects = [name for name in wanted if spec.unseen or name in run.objects]
+        has_goals = self.study.data[data].goals is not None
+        if has_goals and run.spec.policy == "ik":  # there is no motion to follow
+            return
         engines = [engine for engine in spec.engines if engine not in self.unavailable]
         if not objects:
             return
@@ -109,8 +115,8 @@ class Plan:
             per_object = run.spec.per_object
         subset = self.subset(data, objects, per_object)
         needs = [] if run.spec.policy else [f"train {run.folder.name}"]
-        if run.spec.policy == "ik":
-            needs = [self.bank(subset, run.spec.robot)]
+        if has_goals or run.spec.policy == "ik":
+            needs.append(self.bank(subset, run.spec.robot))
         name = f"{key} {run.folder.name}"
         folder = run.folder / key
         todo = partial(eval_todo, run, folder, spec, subset, engines)
@@ -165,6 +171,8 @@ def make_plan(study: Study, name: str, *, given: Path, out: Path, only: Iterable
 
 def _objects_of(data: Data, given: Path) -> tuple[str, ...]:
     """Return the names of the objects of the data."""
+    if data.goals is not None:
+        return object_names(given / data.meshes if data.meshes else None)
     if data.demos is None:
         return object_names()
     return tuple(sorted(set(read_demos(given / data.demos).object_name.tolist())))
@@ -180,6 +188,8 @@ def _runs(plan: Plan, group: str) -> Iterator[Run]:
         yield Run(group=group, spec=spec, objects=objects, subset=subset, folder=plan.out / group)
         return
     changed = merged(asdict(starting_config(spec.recipe)), spec.config)
+    if plan.study.data[spec.data].goals is not None:  # as xreset train does without a bank
+        changed = merged(changed, {"task": {"reset": {"demo_probability": 0.0}}})
     config = from_dict(TrainConfig, changed, f"runs.{group}.config")
     if config.task.reward.own:
         raise RunError(

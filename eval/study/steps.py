@@ -2,6 +2,7 @@
 
     OUT/data/SUBSET/demos.npz               demonstrations of a subset of the data, and its definition (subset.json)
     OUT/data/SUBSET/ROBOT/resets.npz        reset bank, made by xreset retarget and xreset resets
+    OUT/data/SUBSET/ROBOT/goals.npz         or goal set, made by xreset goals
     OUT/RUN/                                run folder of xreset train
     OUT/RUN/EVALUATION/                     results of xreset eval
 
@@ -64,7 +65,7 @@ class Step:
 
 @frozen
 class Subset:
-    """Demonstrations of some objects of a study's data."""
+    """Demonstrations, or goals, of some objects of a study's data."""
 
     folder: Path
     data: Data
@@ -85,13 +86,27 @@ class Subset:
         return self.given / self.data.meshes if self.data.meshes else None
 
     def robot(self, name: str) -> Path:
-        """Return the folder with the motion and the reset bank of a robot, given by name or folder."""
+        """Return the folder with the files of a robot, given by name or folder."""
         return self.folder / Path(name).name
+
+    def bank(self, robot: str) -> Path:
+        """Return the reset bank or goal set of a robot."""
+        return self.robot(robot) / ("resets.npz" if self.data.goals is None else "goals.npz")
+
+    def starts(self, robot: str) -> Path:
+        """Return the file with starts and goals that a robot's policies play."""
+        return self.demos if self.data.goals is None else self.bank(robot)
 
     @cached_property
     def definition(self) -> dict[str, Any]:
         """Everything that the subset's files depend on."""
         data = self.data
+        if data.goals is not None:
+            return {
+                "goals": list(data.goals),
+                "objects": list(self.objects),
+                "meshes": data.meshes,
+            }
         if data.demos:
             source: dict[str, Any] = {"demos": file_hash(self.given / data.demos)}
         else:
@@ -113,12 +128,18 @@ class Subset:
         if file.is_file():
             made = read_json(file, SUBSET_SCHEMA)
             _refuse_other(f"{self.folder} was made otherwise", "data", made, self.definition)
-        return file.is_file() and self.demos.is_file()
+        return file.is_file() and (self.data.goals is not None or self.demos.is_file())
 
     def make(self) -> None:
-        """Write the archive, unless it exists."""
+        """Write the archive, unless it exists; a command writes goals."""
         if self.is_made():
             return
+        data = self.data
+        if data.goals is None:
+            self._write_demos()
+        write_json(self.folder / "subset.json", {"schema": SUBSET_SCHEMA} | self.definition)
+
+    def _write_demos(self) -> None:
         data = self.data
         objects = self.objects or None
         if data.demos:
@@ -127,7 +148,6 @@ class Subset:
             demos = synthesize(objects, data.synthetic_per_object, data.synthetic_seed)
         chosen = demos.select(objects=objects, max_per_object=self.per_object)
         write_demos(self.demos, chosen, config=self.definition)
-        write_json(self.folder / "subset.json", {"schema": SUBSET_SCHEMA} | self.definition)
 
 
 @frozen
@@ -152,8 +172,8 @@ class Run:
 
     @property
     def bank(self) -> Path:
-        """The run's reset bank."""
-        return self.subset.robot(self.spec.robot) / "resets.npz"
+        """The run's reset bank or goal set."""
+        return self.subset.bank(self.spec.robot)
 
     def check(self) -> None:
         """Refuse a folder with a run of another configuration. The length may differ: a run can be continued."""
@@ -199,12 +219,15 @@ def _refuse_other(problem: str, what: str, found: dict[str, Any], wanted: dict[s
 
 
 def bank_todo(subset: Subset, robot: str) -> Todo:
-    """Return what is left to do from demonstrations to the reset bank of a robot."""
+    """Return what is left to do from demonstrations to the reset bank of a robot, or to its goal set."""
     folder = subset.robot(robot)
     motion = folder / "retargeted.npz"
-    bank = folder / "resets.npz"
+    bank = subset.bank(robot)
     if bank.is_file():
         return "", []
+    if subset.data.goals is not None:
+        goals = _xreset("goals", *subset.objects, robot=robot, out=bank, objects=subset.meshes)
+        return "to do", [[*goals, *subset.data.goals]]
     commands = []
     if not motion.is_file():
         retarget = _xreset("retarget", subset.demos, robot=robot, out=motion, objects=subset.meshes)
@@ -236,7 +259,8 @@ def train_todo(run: Run) -> Todo:
         "train",
         **length,
         robot=spec.robot,
-        resets=run.bank,
+        resets=run.bank if run.subset.data.goals is None else None,
+        goals=run.bank if run.subset.data.goals is not None else None,
         backend=spec.backend,
         device=spec.device,
         num_envs=spec.num_envs,
@@ -252,7 +276,7 @@ def train_todo(run: Run) -> Todo:
 def eval_todo(run: Run, folder: Path, spec: Evaluation, subset: Subset, engines: list[str]) -> Todo:
     """Return in which engines an evaluation is missing: there is no result, or one of other episodes or files."""
     policy = run.spec.policy
-    demos = subset.demos
+    demos = subset.starts(run.spec.robot)
     if policy == "ik":
         demos = subset.robot(run.spec.robot) / "retargeted.npz"
     command = _xreset(

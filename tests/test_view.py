@@ -20,7 +20,8 @@ from tests import toy_bank
 from tests.command import refused, succeeds
 from tests.data import InOneFolder
 from tests.toy_bank import SOUP, SPAM
-from xreset import Demos, robots, write_bank, write_demos, write_retargeted
+from tests.toy_goals import toy_goals
+from xreset import Demos, robots, write_bank, write_demos, write_goals, write_retargeted
 from xreset.errors import FileFormatError, XResetError
 from xreset.geometry.kinematics import Kinematics
 from xreset.pictures.meshes import rgb, tint
@@ -101,6 +102,17 @@ class WithFiles(InOneFolder):
 
 
 class Data(WithFiles):
+    def test_a_goal_set_is_shown_as_starts_with_the_robot_at_home(self):
+        goals = toy_goals(self.robot)
+        write_goals(self.folder / "goals.npz", goals)
+        view = load_view(self.folder / "goals.npz")
+        self.assertEqual((view.kind, view.is_motion, len(view.choose())), ("starts", False, 4))
+        assert_allclose(view.joint_pos, np.tile(self.robot.home, (4, 1)))
+        assert_allclose(view.object_pos, goals.start_pos)
+        self.assertEqual(
+            view.text(2), ("start, at rest", SPAM, "sequence 2: 010_potted_meat_can/lift_002")
+        )
+
     def test_trajectories_beyond_the_joints_limits_are_refused(self):
         data = toy_retargeted(self.robot)
         data.joint_pos[1, 2] += 50.0  # in a frame that is not valid, and so is not used

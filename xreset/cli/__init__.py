@@ -21,7 +21,7 @@ COMMANDS = {
     "retarget": "Turn human demonstrations into robot motion.",
     "resets": "Test robot states in physics and keep the stable ones.",
     "goals": "Give any object goals, without demonstrations.",
-    "view": "Show demonstrations, robot motion or a reset bank in a browser, or as pictures.",
+    "view": "Show demonstrations, robot motion, resets or goals in a browser, or as pictures.",
     "play": "Play with a policy in a browser: drag the goal, push the robot, change the engine.",
     "train": "Train a policy.",
     "distill": "Train a policy that sees, by imitating one that is told the object's pose.",

@@ -27,7 +27,7 @@ def view(
     png: Path | None = None,
     mp4: Path | None = None,
 ) -> None:
-    """Show demonstrations, robot motion or a reset bank in a browser, or write pictures of them.
+    """Show demonstrations, robot motion, a reset bank or a goal set in a browser, or write pictures of them.
 
     In a frame that is not valid, the robot has the color of the reason. The object's goal is translucent. Human
     keypoints are pink, keypoints in contact yellow. The robot's fingertips are blue.
@@ -46,9 +46,7 @@ def view(
     if png is None and mp4 is None:
         _serve(shown, host, port, sequence, frame or 0)
         return
-    rows = shown.choose(
-        sequence=sequence if sequence is not None or shown.kind == "reset states" else 0
-    )
+    rows = shown.choose(sequence=sequence if sequence is not None or not shown.is_motion else 0)
     if png is not None:
         _write_png(png, shown, rows, frame)
     if mp4 is not None:

@@ -1,4 +1,4 @@
-"""Rows of states, the same for demonstrations, robot trajectories and reset banks, and how to choose among them.
+"""Rows of states, the same for demonstrations, robot trajectories, banks and goal sets, and how to choose among them.
 
 Shape letters: N rows (frames of trajectories, or states of a bank), S sequences, J joints, E fingertips, 21 keypoints.
 """
@@ -14,11 +14,12 @@ from xreset.demos.hand import PARENTS
 from xreset.errors import XResetError
 from xreset.spec import ObjectSpec, RobotSpec
 
-Kind = Literal["demonstrations", "robot trajectories", "reset states"]
+Kind = Literal["demonstrations", "robot trajectories", "reset states", "starts"]
 GOOD: dict[Kind, str] = {
     "demonstrations": "annotated",
     "robot trajectories": "valid",
     "reset states": "stable in physics",
+    "starts": "start, at rest",
 }
 """Name of a row without a reason against it."""
 PHASES = ("before contact", "after contact")
@@ -69,6 +70,11 @@ class View:
     human_touching: np.ndarray | None = None
     """[N, 21] bool: keypoints in contact with the object."""
 
+    @property
+    def is_motion(self) -> bool:
+        """Whether the rows of a sequence follow one another in time."""
+        return self.kind in ("demonstrations", "robot trajectories")
+
     def choose(self, *, sequence: int | None = None, reason: str | None = None) -> np.ndarray:
         """Return the indices of the rows of a sequence, or with a reason, in order; may be empty.
 
@@ -101,9 +107,9 @@ class View:
             state,
             self.objects[self.object_index[row]].name,
             f"sequence {sequence}: {self.sequence_name[sequence]}",
-            f"frame {int(self.frame[row])}",
-            PHASES[int(self.post_contact[row])],
         ]
+        if self.kind != "starts":
+            lines += [f"frame {int(self.frame[row])}", PHASES[int(self.post_contact[row])]]
         if (
             self.hand_error is not None
             and self.wrist_error is not None

@@ -54,7 +54,7 @@ def load_view(
     if isinstance(data, Retargeted):
         view = _retargeted_view(data, inputs)
     elif isinstance(data, GoalSet):
-        view = _bank_view(_at_home(data, inputs.robot), inputs)
+        view = replace(_bank_view(_at_home(data, inputs.robot), inputs), kind="starts")
     else:
         if not data.num_states:
             raise XResetError(f"{path} holds no state: physics rejected all of them.")

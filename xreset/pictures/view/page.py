@@ -44,7 +44,7 @@ class Page(WebPage):
             XResetError: viser is not installed, the server does not start, or the sequence or frame is unknown.
         """
         self.view = view
-        if sequence is None and view.kind != "reset states":
+        if sequence is None and view.is_motion:
             sequence = 0
         self._rows = view.choose(sequence=sequence)
         if not 0 <= frame < len(self._rows):
@@ -96,7 +96,7 @@ class Page(WebPage):
         first = _ALL if sequence is None else names[sequence]
         self._sequence = gui.add_dropdown("sequence", [_ALL, *names], initial_value=first)
         self._reason = gui.add_dropdown("state", [_ALL, *self._reasons], visible=any(view.reason))
-        label = "number" if view.kind == "reset states" else "frame"
+        label = "frame" if view.is_motion else "number"
         self._frame = gui.add_slider(label, 0, _slider_end(self._rows), 1, 0)
         gui.add_button("previous").on_click(lambda _: self._step(-1))
         gui.add_button("next").on_click(lambda _: self._step(1))

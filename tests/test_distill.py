@@ -157,7 +157,7 @@ class DistillTest(InOneFolder):
         self.assertEqual((vision.view, vision.goal_image), ("points", True))
         self.assertEqual(vision.cameras, (FRONT,))
         for cameras in ("wrist", WRIST, ("wrist",)):
-            with mock.patch("xreset.learning.train.train") as train:
+            with patch("xreset.learning.train.train") as train:
                 distill("many-objects", self.bank, out=self.folder / "unused", cameras=cameras)
             self.assertEqual(train.call_args.kwargs["config"].task.vision.cameras, (WRIST,))
 

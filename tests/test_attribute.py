@@ -182,7 +182,6 @@ class AttributeTest(TestCase):
         self.assertEqual((found.rows[0].mean("grasp"), found.rows[-1].mean("grasp")), (1.0, 0.0))
         self.assertEqual([row.name for row in found.rows], ["mujoco", "tip friction", "other"])
         worst = found.costs()
-        assert worst is not None
         self.assertEqual((worst.name, found.share(worst)), ("tip friction", 1.0))
         self.assertIn("'tip friction' alone brings about 100% of it", verdict(found))
         data = json.loads(json.dumps(found.as_dict(), allow_nan=False))
@@ -199,7 +198,6 @@ class AttributeTest(TestCase):
         names = ["mujoco", "torsional friction", "hand stiffness", "all 2 at once", "other"]
         self.assertEqual([row.name for row in found.rows], names)
         worst = found.costs()
-        assert worst is not None
         self.assertEqual(worst.name, "hand stiffness")
         self.assertEqual(found.rows[1].effect.difference_ci95, (0.0, 0.0))
 

@@ -140,7 +140,6 @@ class ClaimTest(InFolder):
                 with subprocess.Popen(
                     command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
                 ) as other:
-                    assert other.stdout is not None
                     self.assertEqual(other.stdout.readline(), "mine\n")
                     with (
                         self.assertRaisesRegex(XResetError, "another command is writing"),

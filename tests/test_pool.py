@@ -199,9 +199,9 @@ class PoolTest(TestCase):
             new = random_state(1, 1)
             pool.set_state(new, torch.tensor([1]))
             targets[1] = new.joint_target
-            torch.testing.assert_close(pool.state().joint_target, targets)
+            assert_close(pool.state().joint_target, targets)
             pool.step(1)
-            torch.testing.assert_close(pool.state().joint_pos, targets)
+            assert_close(pool.state().joint_pos, targets)
 
     def test_mass_of_some_worlds(self):
         for pool in self.each():

@@ -90,7 +90,6 @@ class CurveTest(InFolder):
             "arm-stiffness", **{"v0.5": -0.3, "v0.8": -0.05, "v1.5": -0.02, "v2.0": -0.08}
         )
         self.assertEqual([p.value for p in stiffness.points], [0.5, 0.8, 1.0, 1.5, 2.0])
-        assert stiffness.lower is not None
         self.assertAlmostEqual(stiffness.lower, 0.8 - 0.3 * 0.05 / 0.25)
         self.assertIsNone(stiffness.upper)
         assert_allclose(stiffness.points[0].difference_ci95, (-0.3, -0.3), atol=1e-9)
@@ -98,7 +97,6 @@ class CurveTest(InFolder):
         late = swept("action-latency", **{"v1.0": -0.15, "v2.0": -0.3})
         harmless = swept("object-mass", **{"v0.5": 0.0, "v2.0": 0.0})
         scattered = swept("force-gain", **{"v2.0": [-0.6, -0.6, 0.2, 0.2]})
-        assert scattered.upper is not None
         self.assertEqual(
             (scattered.loses_beyond(scattered.upper), stiffness.loses_beyond(stiffness.lower)),
             (False, True),

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from xreset.backends.rigid import OTHER_LINK, Inertia, Mechanism, rotate
+from xreset.backends.rigid import OTHER_LINK, Inertia, Mechanism
 from xreset.checks import frozen
 from xreset.geometry.shapes import transform
 from xreset.geometry.urdf import Joint
@@ -162,5 +162,4 @@ def _numbers(values: Any) -> str:
 
 def inertial_frame(inertia: Inertia) -> np.ndarray:
     """[4, 4] pose of the centre of mass and the principal axes in the body's frame."""
-    axes = np.stack([rotate(inertia.quat, axis) for axis in np.eye(3)], axis=1)
-    return transform(axes, inertia.com)
+    return transform(inertia.axes.T, inertia.com)

@@ -32,6 +32,7 @@ from xreset.backends.rigid import (
     Inertia,
     Mechanism,
     MovingJoints,
+    TrackedFrames,
     mechanism,
     object_inertia,
 )
@@ -127,7 +128,8 @@ def compile_scene(
     roles["table"] = TABLE
     parked = _add_object(spec, scene, object_index, slots_for)
     _add_drives(spec, scene, joints, names)
-    sensed = add_sensors(spec, robot, roles) if sensors else []
+    frames = TrackedFrames(robot)
+    sensed = add_sensors(spec, robot, frames, roles) if sensors else []
     try:
         model = spec.compile()
     except ValueError as error:
@@ -139,7 +141,6 @@ def compile_scene(
     model.body_gravcomp[model.body("object").id] = 0.0
     geoms = [model.geom(i).name for i in range(model.ngeom)]
     bodies = [model.body(body_name(body)).id for body in robot.bodies]
-    tracked = [robot.frames[link] for link in scene.robot.tracked_links]
     joint_ids = [model.joint(name).id for name in names]
     free = model.joint("object").id
     return SceneModel(
@@ -148,9 +149,9 @@ def compile_scene(
         joints=joints,
         qpos=model.jnt_qposadr[joint_ids].astype(np.int64),
         dof=model.jnt_dofadr[joint_ids].astype(np.int64),
-        link_body=np.array([bodies[i] for i, _ in tracked]),
-        link_pos=np.array([T[:3, 3] for _, T in tracked]),
-        link_quat=np.array([pos_quat(T)[1] for _, T in tracked]),
+        link_body=np.array([bodies[i] for i in frames.bodies]),
+        link_pos=frames.pos,
+        link_quat=frames.quat,
         moving_bodies=np.array(bodies[1:]),
         object_body=model.body("object").id,
         object_qpos=int(model.jnt_qposadr[free]),

@@ -5,7 +5,15 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from xreset.backends.rigid import OTHER_LINK, TABLE, Body, Mechanism, MovingJoints, matrix_to_quat
+from xreset.backends.rigid import (
+    OTHER_LINK,
+    TABLE,
+    Body,
+    Mechanism,
+    MovingJoints,
+    TrackedFrames,
+    matrix_to_quat,
+)
 from xreset.checks import frozen
 from xreset.spec import SceneSpec
 
@@ -76,14 +84,14 @@ _NET_FORCE = (1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1)
 """Parameters of a contact sensor: the force, reduced to the net force, once."""
 
 
-def add_sensors(spec: mujoco.MjSpec, robot: Mechanism, roles: dict[str, int]) -> list[int]:
+def add_sensors(
+    spec: mujoco.MjSpec, robot: Mechanism, frames: TrackedFrames, roles: dict[str, int]
+) -> list[int]:
     """Add the sensors that ``mjcf.compile_scene`` describes; return the fingertip of each geom that has one."""
     sites = []
-    for i, link in enumerate(robot.robot.tracked_links):
-        body, T = robot.frames[link]
-        pos, quat = pos_quat(T)
+    for i, body in enumerate(frames.bodies):
         site = spec.body(body_name(robot.bodies[body])).add_site(
-            name=f"link/{i}", pos=pos, quat=quat
+            name=f"link/{i}", pos=frames.pos[i], quat=frames.quat[i]
         )
         sites.append(site.name)
     kind = mujoco.mjtSensor

@@ -46,10 +46,14 @@ class Inertia:
     """[3] principal moments about the centre of mass [kg m^2]."""
 
     @cached_property
+    def axes(self) -> np.ndarray:
+        """[3, 3] the principal axes in the body's frame, as rows."""
+        return np.stack([rotate(self.quat, axis) for axis in np.eye(3)])
+
+    @cached_property
     def matrix(self) -> np.ndarray:
         """[3, 3] inertia about the centre of mass, along the axes of the body's frame [kg m^2]."""
-        axes = np.stack([rotate(self.quat, axis) for axis in np.eye(3)])
-        return axes.T @ (self.moments[:, None] * axes)
+        return self.axes.T @ (self.moments[:, None] * self.axes)
 
     def changed(
         self, *, mass: float | None = None, scale: float = 1.0, offset: np.ndarray | float = 0.0
@@ -186,11 +190,13 @@ class TrackedFrames:
         places = [robot.frames[link] for link in robot.robot.tracked_links]
         self.bodies = [body for body, _ in places]
         """[K] index of the body of each tracked link."""
-        self._pos = np.array([T[:3, 3] for _, T in places])
-        self._quat = np.array([matrix_to_quat(T[:3, :3]) for _, T in places])
+        self.pos = np.array([T[:3, 3] for _, T in places])
+        """[K, 3] position of each tracked link in that body's frame."""
+        self.quat = np.array([matrix_to_quat(T[:3, :3]) for _, T in places])
+        """[K, 4]"""
         inertias = [robot.bodies[body].inertia for body in self.bodies]
         com = [np.zeros(3) if inertia is None else inertia.com for inertia in inertias]
-        self._lever = self._pos - np.array(com)
+        self._lever = self.pos - np.array(com)
 
     def locate(
         self, pos: np.ndarray, quat: np.ndarray, com_velocity: np.ndarray, angvel: np.ndarray
@@ -204,7 +210,7 @@ class TrackedFrames:
             angvel: [K, 3] angular velocity of their bodies.
         """
         velocity = com_velocity + cross(angvel, rotate(quat, self._lever))
-        return pos + rotate(quat, self._pos), multiply(quat, self._quat), velocity, angvel
+        return pos + rotate(quat, self.pos), multiply(quat, self.quat), velocity, angvel
 
 
 class MovingJoints:

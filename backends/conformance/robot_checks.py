@@ -6,7 +6,6 @@ Joints move in free space here: the robot's links collide neither with one anoth
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,9 +16,10 @@ from torch import Tensor
 from xreset.backends.conformance.harness import Bench, Worlds, finite_limits, named, replace_fields
 from xreset.backends.conformance.results import Measured, Skipped
 from xreset.backends.rigid import mechanism, object_inertia
+from xreset.geometry.dynamics import drive_values
 from xreset.geometry.urdf import robot_tree
 from xreset.physics import State
-from xreset.spec import GRAVITY, DriveSpec, SceneSpec
+from xreset.spec import GRAVITY, SceneSpec
 
 _WAY = 0.2  # rad, of a joint's step and of the amplitude of its sine
 _SLIDE_WAY = 0.02  # m, the same of a prismatic joint
@@ -66,12 +66,10 @@ def effort_limit(bench: Bench) -> Measured:
     """Step every joint with an effort limit of 30 % of what its drive asks for; compare with the reference engine."""
     scene = bench.free_scene
     _, way = _alone(bench)
-    weak = []
-    for joint, distance in zip(scene.robot.joints, way.tolist(), strict=True):
-        drive = joint.drive
-        weak.append(replace(drive, effort=min(drive.effort, 0.3 * drive.kp * abs(distance))))
+    asked = 0.3 * drive_values(scene.robot, "kp") * way.abs().numpy()
+    weak = _with_drives(scene, effort=np.minimum(drive_values(scene.robot, "effort"), asked))
     step = torch.ones(round(_DURATION / scene.control_dt))
-    return _against_reference(bench, _with_drives(scene, weak), {"weak step": step})
+    return _against_reference(bench, weak, {"weak step": step})
 
 
 def _alone(bench: Bench) -> tuple[State, Tensor]:
@@ -187,14 +185,11 @@ def drive_scale(bench: Bench) -> Measured:
         return torch.stack(found, dim=1)
 
     expected = []
-    for i, (stiffness, damping, effort) in enumerate(_DRIVE_SCALES):
-        drives = []
-        for joint in scene.robot.joints:
-            d = joint.drive
-            drives.append(
-                replace(d, kp=stiffness * d.kp, kd=damping * d.kd, effort=effort * d.effort)
-            )
-        with bench.other(_with_drives(scene, drives)) as worlds:
+    for i, factors in enumerate(_DRIVE_SCALES):
+        drives = {}
+        for name, factor in zip(("kp", "kd", "effort"), factors, strict=True):
+            drives[name] = factor * drive_values(scene.robot, name)
+        with bench.other(_with_drives(scene, **drives)) as worlds:
             expected.append(path(worlds, slice(i, i + 1)))
     with bench.other(scene, which) as worlds:
         # What was set before must not matter.
@@ -203,10 +198,13 @@ def drive_scale(bench: Bench) -> Measured:
         return {"path": path(worlds, slice(None)) - torch.cat(expected)}
 
 
-def _with_drives(scene: SceneSpec, drives: Sequence[DriveSpec]) -> SceneSpec:
-    pairs = zip(scene.robot.joints, drives, strict=True)
-    joints = tuple(replace(joint, drive=drive) for joint, drive in pairs)
-    return replace(scene, robot=replace(scene.robot, joints=joints))
+def _with_drives(scene: SceneSpec, **values: np.ndarray) -> SceneSpec:
+    """Return the scene with other values [J] of its robot's drives."""
+    joints = []
+    for i, joint in enumerate(scene.robot.joints):
+        drive = {name: float(value[i]) for name, value in values.items()}
+        joints.append(replace(joint, drive=replace(joint.drive, **drive)))
+    return replace(scene, robot=replace(scene.robot, joints=tuple(joints)))
 
 
 # Limits and weight ----------------------------------------------------------------------------------------------------
@@ -272,7 +270,7 @@ def own_weight(bench: Bench) -> Measured:
     com = torch.tensor(np.stack([link.com for link in links]))
     mass = torch.tensor([link.mass for link in links], dtype=torch.float64)
     rise = kinematics.jacobian(q, kinematics.link_names, com).linear[:, :, 2]  # [N, L, J]
-    stiffness = torch.tensor([joint.drive.kp for joint in scene.robot.joints], dtype=torch.float64)
+    stiffness = torch.as_tensor(drive_values(scene.robot, "kp"))
     sag = GRAVITY * torch.einsum("l,nlj->nj", mass, rise) / stiffness
     return {
         "sag": start.joint_pos.double() - q - sag,

@@ -9,6 +9,7 @@ from unittest.mock import patch
 import numpy as np
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial.transform import Rotation
 from torch import tensor
 from torch.testing import assert_close
 
@@ -22,7 +23,7 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_rotate
 from xreset.resets.closing import closing_states, positions_between, rotations_between
 from xreset.resets.distribution import ResetDistribution, bank_starts
-from xreset.resets.fingers import Fingers, fingers_of, squeeze_targets
+from xreset.resets.fingers import Fingers, _balance, fingers_of, squeeze_targets
 from xreset.retarget.file import object_sources, write_retargeted
 from xreset.task.config import ResetConfig
 
@@ -80,6 +81,8 @@ class ClosingTest(TestCase):
             gap=torch.as_tensor(self.gap),
             point=none,
             inward=none,
+            lever=none,
+            weight=torch.zeros(10),
         )
         config = ClosingConfig(**({"spacing": 0.005} | config))
         with patch("xreset.resets.closing.fingers_of", lambda *_: fingers):
@@ -157,6 +160,52 @@ class FingersTest(TestCase):
         assert_close(fingers.inward[:, 1], wrist, atol=0.02, rtol=0)
         # the jaw's inner side
         assert_allclose(fingers.point[:, 0, 0], -0.005, atol=1e-3)
+
+    def test_a_squeeze_by_weight_is_one_with_that_force(self):
+        fingers, joints = self.fingers(0.0201)
+        weight = 9.81 * toy_grasp.brick().mass
+        by_force = squeeze_targets(ROBOT, fingers, joints, SqueezeConfig(force=1.0 + 2 * weight))
+        by_weight = squeeze_targets(ROBOT, fingers, joints, SqueezeConfig(force=1.0, weight=2.0))
+        np.testing.assert_allclose(by_weight, by_force, atol=1e-9)
+        self.assertTrue(SqueezeConfig(weight=1.0).presses)
+        with self.assertRaisesRegex(ValueError, "no force to balance"):
+            SqueezeConfig(balanced=True)
+
+    def test_levers_lead_from_the_centre_of_mass_to_the_finger(self):
+        fingers, joints = self.fingers(0.0201)
+        wrist = Kinematics(ROBOT).link_poses(torch.as_tensor(joints), ["wrist"])[0, 0, :3, 0]
+        brick = toy_grasp.brick()
+        off_center = brick.com - brick.pieces[0].T_body_shape[:3, 3]
+        turn = Rotation.from_quat(toy_grasp.brick_pose()[1], scalar_first=True)
+        shift = turn.apply(off_center) @ wrist.numpy()
+        sideways = (fingers.lever[0] @ wrist).numpy()
+        np.testing.assert_allclose(sideways[:2], [0.0201 - shift, -0.0201 - shift], atol=3e-4)
+
+    def test_balanced_forces_nearly_cancel(self):
+        """A thumb against four fingers; and a thumb that nothing opposes."""
+        x = torch.tensor([1.0, 0, 0], dtype=torch.float64)
+        inward = torch.stack((x, -x, -x, -x, -x)).expand(2, 5, 3)
+        height = torch.tensor([0.0, 0.03, 0.01, -0.01, -0.03], dtype=torch.float64)
+        lever = -0.04 * inward
+        lever[..., 2] = height
+        none = torch.zeros(2, 5, 3)
+        fingers = Fingers(
+            links=tuple("abcde"),
+            finger=torch.arange(5),
+            gap=none[..., 0],
+            point=none,
+            inward=inward,
+            lever=lever,
+            weight=torch.ones(2),
+        )
+        pressing = torch.ones(2, 5, dtype=torch.bool)
+        pressing[1, 1:] = False
+        factor = _balance(fingers, pressing)
+        thumb, others = float(factor[0, 0]), factor[0, 1:]
+        self.assertAlmostEqual(float(factor[0].mean()), 1.0)
+        self.assertAlmostEqual(thumb, float(others.sum()), delta=0.1)
+        np.testing.assert_allclose(others, others.mean().expand(4), atol=1e-6)
+        self.assertEqual(factor[1].tolist(), [1, 0, 0, 0, 0])
 
     def test_a_squeeze_is_as_far_beyond_as_its_force_takes(self):
         fingers, joints = self.fingers(0.0201, 0.0501)

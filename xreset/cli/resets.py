@@ -77,10 +77,12 @@ def resets(
     write_bank(out, bank, config=config, inputs={"retargeted": str(inputs.hash)})
     accounts = bank.accounts()
     show_accounts(accounts, f"{bank.robot}: {title}")
-    if squeeze.force > 0:
-        console.print(
-            f"{bank.num_pressing} of {bank.post_contact.sum()} states after contact press with {squeeze.force:g} N"
-        )
+    if squeeze.presses:
+        force = f"{squeeze.force:g} N"
+        if squeeze.weight:
+            force += f" and {squeeze.weight:g} times the object's weight"
+        pressing = f"{bank.num_pressing} of {bank.post_contact.sum()} states after contact"
+        console.print(f"{pressing} press with {force}")
     tried = bank.num_states + len(bank.rejected_reason)
     share = accounts[-1].kept / max(motion.annotated.sum(), 1)
     console.print(f"{share:.0%} of the annotated frames are kept")

@@ -42,8 +42,26 @@ class SqueezeConfig(Checked):
 
     force: NonNegativeFloat = 0.0
     """Normal force of each finger that is at the object [N]. 0: targets are the joints' positions."""
+    weight: NonNegativeFloat = 0.0
+    """Further force, as a share of the object's weight, such as 1: heavy objects slip out of a grasp that tilts light
+    ones."""
+    balanced: bool = False
+    """Whether the forces on an object nearly cancel, with the same mean: the thumb presses as hard as the fingers that
+    oppose it."""
     reach: PositiveFinite = 0.005
     """A finger nearer than this to the object is at it [m]."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.balanced and not self.presses:
+            raise ValueError(
+                "balanced is True and there is no force to balance. Set force or weight"
+            )
+
+    @property
+    def presses(self) -> bool:
+        """Whether there is any force."""
+        return self.force > 0 or self.weight > 0
 
 
 @frozen

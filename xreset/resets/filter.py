@@ -149,7 +149,7 @@ def make_bank(
 
     work = len(engines) * len(frame)
     reason = try_candidates(np.arange(len(frame)), lambda done: progress(done, work))
-    if squeeze.force > 0:
+    if squeeze.presses:
         rows = np.flatnonzero((reason < 0) & post_contact)
         fingers = fingers_of(
             robot, used, object_name[rows], joint_pos[rows], object_pos[rows], object_quat[rows]
@@ -173,7 +173,7 @@ def make_bank(
         starts_and_goals(retargeted, robot, {o.name: o.source for o in objects}),
         backends=engines,
         joint_pos=joint_pos[keep].astype(np.float32),
-        joint_target=target[keep] if squeeze.force > 0 else None,
+        joint_target=target[keep] if squeeze.presses else None,
         object_pos=object_pos[keep].astype(np.float32),
         object_quat_wxyz=object_quat[keep].astype(np.float32),
         object_name=object_name[keep],

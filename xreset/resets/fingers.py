@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from scipy.optimize import nnls
 from torch import Tensor
 
 from xreset.checks import frozen
@@ -19,7 +20,7 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matvec, quat_rotate, quat_rotate_inverse
 from xreset.geometry.surface import Surface
 from xreset.resets.config import SqueezeConfig
-from xreset.spec import ObjectSpec, RobotSpec
+from xreset.spec import GRAVITY, ObjectSpec, RobotSpec
 
 
 @frozen
@@ -37,6 +38,10 @@ class Fingers:
     """[M, G, 3] nearest point of the link, in the link's frame."""
     inward: Tensor
     """[M, G, 3] unit vector into the object there, world frame."""
+    lever: Tensor
+    """[M, G, 3] from the object's centre of mass to this point, world frame."""
+    weight: Tensor
+    """[M] weight of each state's object [N]."""
 
     @property
     def leading(self) -> Tensor:
@@ -83,6 +88,9 @@ def fingers_of(
     gap = q.new_zeros(len(q), len(links))
     point = q.new_zeros(len(q), len(links), 3)
     inward = torch.zeros_like(point)
+    lever = torch.zeros_like(point)
+    com = torch.as_tensor(np.stack([obj.com for obj in objects]))[which]
+    com_world = pos + quat_rotate(quat, com)
     for g, link in enumerate(links):
         shapes = kinematics.tree.link(link).collisions
         balls = link_balls(shapes) if shapes else (np.zeros((1, 3)), np.zeros(1))
@@ -97,8 +105,16 @@ def fingers_of(
         gradient = gradient.view(-1, len(centers), 3)[torch.arange(len(nearest)), nearest]
         inward[:, g] = -quat_rotate(quat, torch.nn.functional.normalize(gradient, dim=-1))
         point[:, g] = centers[nearest] + radii[nearest, None] * matvec(R.mT, inward[:, g])
+        lever[:, g] = matvec(R, point[:, g]) + poses[:, g, :3, 3] - com_world
+    weight = GRAVITY * torch.tensor([obj.mass for obj in objects], dtype=torch.float64)[which]
     return Fingers(
-        links=tuple(links), finger=torch.tensor(finger), gap=gap, point=point, inward=inward
+        links=tuple(links),
+        finger=torch.tensor(finger),
+        gap=gap,
+        point=point,
+        inward=inward,
+        lever=lever,
+        weight=weight,
     )
 
 
@@ -108,8 +124,9 @@ def squeeze_targets(
     """Return drive targets [M, J] with which the fingers press, within joint limits and the drives' largest torques.
 
     A finger that presses on the object with a normal force f needs joint torques J^T f. A drive gives them where its
-    target is J^T f / kp beyond the joint. Balance is left to the drives, which are soft: the object moves by
-    millimetres until what it rests against presses back. Targets of joints that do not press are the joints' positions.
+    target is J^T f / kp beyond the joint. The rest of the balance is left to the drives, which are soft: the object
+    moves by millimetres until what it rests against presses back. Targets of joints that do not press are the joints'
+    positions.
 
     Args:
         robot: its drives.
@@ -121,11 +138,40 @@ def squeeze_targets(
     kinematics = Kinematics(robot)
     jacobian = kinematics.jacobian(q, fingers.links, fingers.point).linear
     pressing = fingers.leading & (fingers.gap < config.reach)
-    torque = torch.einsum(
-        "mgi,mgij->mj", config.force * pressing[..., None] * fingers.inward, jacobian
-    )
+    force = config.force * pressing
+    if config.weight:
+        force = force + config.weight * fingers.weight[:, None] * pressing
+    if config.balanced:
+        force = force * _balance(fingers, pressing)
+    torque = torch.einsum("mgi,mgij->mj", force[..., None] * fingers.inward, jacobian)
     effort = torch.as_tensor(drive_values(robot, "effort"))
     kp = torch.as_tensor(drive_values(robot, "kp"))
     presses = torch.tensor(~robot.is_arm) & (kp > 0)
     beyond = torch.where(presses, torque.clamp(-effort, effort) / kp.clamp_min(1e-9), 0.0)
     return torch.where(beyond != 0, kinematics.clamp(q + beyond), q).numpy()
+
+
+_LEVER = 0.05
+"""Lever arm [m] with which a torque that is left counts as much as a force."""
+_EVEN = 0.1
+"""How much it counts that forces differ from one another, next to the forces and torques that are left."""
+
+
+def _balance(fingers: Fingers, pressing: Tensor) -> Tensor:
+    """Return a factor on the force of each pressing finger [M, G], with mean 1, so that all forces nearly cancel.
+
+    With equal forces four fingers push an object out past the one thumb that opposes them. The factors are the least
+    squares solution without negative ones: what is left of force and torque on the object, and the differences to 1.
+    """
+    arm = torch.linalg.cross(fingers.lever, fingers.inward) / _LEVER
+    wrench = torch.cat((fingers.inward, arm), dim=-1).numpy()
+    factor = pressing.double().numpy()
+    for state, presses in enumerate(pressing.numpy()):
+        count = presses.sum()
+        if count < 2:
+            continue
+        even = np.sqrt(_EVEN) * np.eye(count)
+        wanted = np.concatenate((np.zeros(6), np.full(count, np.sqrt(_EVEN))))
+        found, _ = nnls(np.concatenate((wrench[state, presses].T, even)), wanted)
+        factor[state, presses] = found / found.mean()
+    return torch.as_tensor(factor)

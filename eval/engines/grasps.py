@@ -16,13 +16,13 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from xreset.checks import frozen
 from xreset.errors import DemoError
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_rotate_inverse
+from xreset.geometry.shapes import turn_of
 from xreset.geometry.surface import Surface
 from xreset.physics import State
 from xreset.retarget.file import Retargeted
@@ -95,10 +95,8 @@ def find_grasps(
     start_pos, start_quat = (values[motion.sequence_of_frame[rows]] for values in motion.start_pose)
     moved = motion.object_pos[rows] - start_pos
     if where == "table":
-        start = Rotation.from_quat(start_quat, scalar_first=True)
-        turned = (
-            Rotation.from_quat(motion.object_quat_wxyz[rows], scalar_first=True) * start.inv()
-        ).magnitude()
+        start = turn_of(start_quat)
+        turned = (turn_of(motion.object_quat_wxyz[rows]) * start.inv()).magnitude()
         fits = (np.linalg.norm(moved, axis=1) < REST_DISTANCE) & (turned < REST_ANGLE)
     else:
         fits = moved[:, 2] > LIFTED
@@ -115,7 +113,7 @@ def find_grasps(
     object_index = [names.index(name) for name in motion.object_name[sequence].tolist()]
     object_quat = motion.object_quat_wxyz[chosen]
     object_pos = motion.object_pos[chosen].astype(np.float64)
-    turns = Rotation.from_quat(object_quat, scalar_first=True).as_matrix()
+    turns = turn_of(object_quat).as_matrix()
     for pos, i, turn in zip(object_pos, object_index, turns, strict=True):
         pos[2] = max(pos[2], CLEARANCE - lowest_point(objects[i].pieces, turn))
     return Grasps(

@@ -126,7 +126,7 @@ class Evaluation(Checked):
 class Runs(Checked):
     """Trainings that differ in seed (and, with ``alone``, object), or a baseline."""
 
-    REMOVED: ClassVar[dict[str, Any]] = {"gpus": 1}
+    REMOVED: ClassVar = {"gpus": 1}
     data: str
     robot: Robot = "ur7e-sharpa"
     objects: tuple[str, ...] = ()

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from xreset.checks import frozen, is_rigid
 from xreset.errors import DemoError, ObjectError
+from xreset.geometry.shapes import quat_of, turn_of
 from xreset.objects.catalogue import canonical_names, load_object, object_names, official_name
 from xreset.objects.rest import rest_height
 from xreset.records import (
@@ -275,7 +276,7 @@ def one_sequence(
     valid = np.asarray(np.isfinite(keypoints).all(axis=(1, 2)))
     wrist_quat = np.full((len(keypoints), 4), np.nan, dtype=np.float32)
     if wrist is not None:
-        wrist_quat[valid] = wrist.as_quat(canonical=True, scalar_first=True)
+        wrist_quat[valid] = quat_of(wrist)
     return Demos(
         sequence_name=np.array([name]),
         subject=np.array([subject]),
@@ -286,7 +287,7 @@ def one_sequence(
         hand_valid=valid,
         wrist_quat_wxyz=wrist_quat,
         object_pos=object_pos.astype(np.float32),
-        object_quat_wxyz=object_rot.as_quat(canonical=True, scalar_first=True).astype(np.float32),
+        object_quat_wxyz=quat_of(object_rot).astype(np.float32),
         fps=float(fps),
     )
 
@@ -355,7 +356,7 @@ def levelled(demos: Demos) -> Demos:
 
 def _turned(R: np.ndarray, quats: np.ndarray) -> np.ndarray:
     """[F, 4] orientations turned by rotation matrices [F, 3, 3]."""
-    turned = Rotation.from_matrix(R) * Rotation.from_quat(quats, scalar_first=True)
+    turned = Rotation.from_matrix(R) * turn_of(quats)
     return turned.as_quat(scalar_first=True).astype(quats.dtype)
 
 

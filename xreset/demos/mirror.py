@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from xreset.checks import frozen
 from xreset.demos.archive import Demos, levelled
 from xreset.errors import DemoError
+from xreset.geometry.shapes import turn_of
 from xreset.spec import ObjectSpec, TableSpec
 
 _SAMPLES = 600
@@ -95,7 +96,7 @@ def mirrored(demos: Demos, symmetries: Mapping[str, Symmetry], *, tolerance: flo
     ]
     normals = np.array([found.normal for found in symmetry_of_frame])
     offsets = np.array([found.offset for found in symmetry_of_frame])
-    turn = Rotation.from_quat(demos.object_quat_wxyz, scalar_first=True).as_matrix()
+    turn = turn_of(demos.object_quat_wxyz).as_matrix()
     reflection = np.eye(3) - 2.0 * normals[:, :, None] * normals[:, None, :]
     pos = demos.object_pos + np.einsum("fij,fj->fi", turn, 2.0 * offsets[:, None] * normals)
     quat = Rotation.from_matrix(_ACROSS[:, None] * turn @ reflection).as_quat(scalar_first=True)

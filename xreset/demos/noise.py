@@ -11,10 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.signal import lfilter
-from scipy.spatial.transform import Rotation
 
 from xreset.demos.archive import Demos
 from xreset.demos.hand import PARENTS
+from xreset.geometry.shapes import turn_of
 
 MEMORY = math.exp(-1 / 8)
 """Correlation of a finger's error with that of the frame before."""
@@ -50,9 +50,7 @@ def with_noise(demos: Demos, *, wrist: float, finger: float, cap: float, seed: i
         errors *= np.minimum(1.0, cap / np.maximum(size, 1e-12))
         seen = demos.hand_valid[frames]
         hand = keypoints[frames][seen]
-        palm = Rotation.from_quat(
-            demos.wrist_quat_wxyz[frames][seen], scalar_first=True
-        ).as_matrix()
+        palm = turn_of(demos.wrist_quat_wxyz[frames][seen]).as_matrix()
         moved = _with_bones(hand, np.einsum("fij,fkj->fki", palm, errors[seen]))
         keypoints[frames][seen] = moved + offset
     return replace(demos, hand_keypoints=keypoints.astype(demos.hand_keypoints.dtype))

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from xreset.demos.archive import Demos
 from xreset.demos.hand import bone_lengths
 from xreset.demos.keypoints import ORDERS
+from xreset.geometry.shapes import turn_of
 
 _SHORTER = 0.8
 """A skeleton that is shorter by this factor in another order is in that order: bones of a wrong order cross the
@@ -41,7 +41,7 @@ def doubts(demos: Demos) -> list[str]:
         # a right hand's fingers point along the wrist's -x axis, a left hand's along +x
         fingers = hand[:, [5, 9, 13, 17]].mean(axis=1) - hand[:, 0]
         fingers /= np.linalg.norm(fingers, axis=1, keepdims=True).clip(1e-9)
-        wrist = Rotation.from_quat(demos.wrist_quat_wxyz[valid], scalar_first=True)
+        wrist = turn_of(demos.wrist_quat_wxyz[valid])
         along = (wrist.apply([1.0, 0.0, 0.0]) * fingers).sum(axis=1)
         is_right = demos.hand_side[demos.sequence_of_frame][valid] == "right"
         cosine = np.median(np.where(is_right, -along, along))
@@ -81,8 +81,5 @@ def start_to_goal(demos: Demos) -> tuple[np.ndarray, np.ndarray]:
     """Return the distance [S] in metres and the angle [S] in radians from each object's first to its last pose."""
     start_pos, start_quat = demos.start_pose
     goal_pos, goal_quat = demos.goal_pose
-    turn = (
-        Rotation.from_quat(goal_quat, scalar_first=True)
-        * Rotation.from_quat(start_quat, scalar_first=True).inv()
-    )
+    turn = turn_of(goal_quat) * turn_of(start_quat).inv()
     return np.linalg.norm(goal_pos - start_pos, axis=1), turn.magnitude()

@@ -21,6 +21,7 @@ from xreset.demos import hand
 from xreset.demos.archive import Demos, merge_demos, one_sequence
 from xreset.demos.grasp import Contacts, Grasp, Solid, fit_hand, handedness, plan_contacts
 from xreset.errors import DemoError
+from xreset.geometry.shapes import turn_of
 from xreset.objects.catalogue import load_objects, object_names
 from xreset.objects.rest import rest_height, resting_orientation
 from xreset.progress import Progress, unseen
@@ -153,7 +154,7 @@ def _start(obj: ObjectSpec, up: np.ndarray, side: str) -> tuple[Solid, list[Cont
     solid = Solid.of(
         obj,
         np.array([0.0, 0.0, rest_height(obj, quat)]),
-        Rotation.from_quat(quat, scalar_first=True),
+        turn_of(quat),
     )
     plans = plan_contacts(solid, np.radians(np.arange(0.0, 360.0, 20.0)), side)
     if not plans:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.transform import Rotation
 
 from xreset.errors import ObjectError
 from xreset.files import max_bytes
@@ -42,6 +43,16 @@ def transform(R: ArrayLike, position: ArrayLike) -> np.ndarray:
     T[:3, :3] = np.reshape(R, (3, 3))
     T[:3, 3] = position
     return T
+
+
+def turn_of(quats: ArrayLike) -> Rotation:
+    """Return the rotations of quaternions [..., 4], (w, x, y, z)."""
+    return Rotation.from_quat(quats, scalar_first=True)
+
+
+def quat_of(turn: Rotation) -> np.ndarray:
+    """[..., 4] quaternions (w, x, y, z) of rotations, w not below 0."""
+    return turn.as_quat(canonical=True, scalar_first=True)
 
 
 def transformed(points: np.ndarray, T: np.ndarray) -> np.ndarray:

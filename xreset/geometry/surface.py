@@ -9,10 +9,9 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from xreset.geometry.fields import DistanceFields
-from xreset.geometry.shapes import half_spaces, plane_heights, surface_of
+from xreset.geometry.shapes import half_spaces, plane_heights, surface_of, turn_of
 from xreset.spec import ObjectSpec, Shape
 
 _SAMPLE_SPACING = 0.003
@@ -118,7 +117,7 @@ class Surface:
             Nearest surface points in the world frame [F, K, 3], zero where there is no contact, and whether there is
             one [F, K].
         """
-        rotation = Rotation.from_quat(object_quat, scalar_first=True).as_matrix()
+        rotation = turn_of(object_quat).as_matrix()
         local = np.einsum("fij,fki->fkj", rotation, keypoints - object_pos[:, None])
         with np.errstate(invalid="ignore"):  # comparisons with NaN are false
             close = ((local > self.low - distance) & (local < self.high + distance)).all(axis=-1)

@@ -17,7 +17,7 @@ import trimesh
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from xreset.geometry.shapes import transform
+from xreset.geometry.shapes import transform, turn_of
 from xreset.geometry.urdf import Joint, Link, RobotTree
 
 FRAME_MASS = 1e-4
@@ -37,7 +37,7 @@ def pose(
     if quat is None:
         rotation = Rotation.from_euler("xyz", rpy)
     else:
-        rotation = Rotation.from_quat(np.array(quat, dtype=float), scalar_first=True)
+        rotation = turn_of(np.array(quat, dtype=float))
     return transform(rotation.as_matrix(), xyz)
 
 

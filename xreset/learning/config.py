@@ -21,7 +21,7 @@ Widths = Annotated[
 class ModelConfig(Checked):
     """Actor and critic: PointNet per cloud frame, LSTM with layer norm on its output, MLP."""
 
-    REMOVED: ClassVar[dict[str, Any]] = {
+    REMOVED: ClassVar = {
         "initial_hand_std": None,
         "synergy_std": None,
         "activation": "elu",
@@ -54,7 +54,7 @@ class ModelConfig(Checked):
 class PpoConfig(Checked):
     """Proximal policy optimization."""
 
-    REMOVED: ClassVar[dict[str, Any]] = {"critic_learning_rate": None, "clip_values": True}
+    REMOVED: ClassVar = {"critic_learning_rate": None, "clip_values": True}
 
     horizon: Annotated[int, Rule("a number above 1", lambda steps: steps > 1)] = 16
     """Control steps per world and iteration. Not 1: rsl-rl stores LSTM states from a run's second step on."""
@@ -152,7 +152,7 @@ def value_at(points: Points, progress: float) -> float:
 class TrainConfig(Checked):
     """Configuration of a training run, as saved in the run folder."""
 
-    REMOVED: ClassVar[dict[str, Any]] = {"random_episode_start": True}
+    REMOVED: ClassVar = {"random_episode_start": True}
 
     task: TaskConfig = field(default_factory=TaskConfig)
     model: ModelConfig = field(default_factory=ModelConfig)

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from xreset.geometry.shapes import turn_of
 from xreset.resets.config import ClosingConfig
 from xreset.resets.fingers import Fingers, fingers_of
 from xreset.retarget.file import Retargeted
@@ -79,8 +80,8 @@ def positions_between(values: np.ndarray, frame: np.ndarray, part: np.ndarray) -
 
 def rotations_between(quats: np.ndarray, frame: np.ndarray, part: np.ndarray) -> np.ndarray:
     """[M, 4] quaternions that turn evenly between frames [F, 4]; frames stay the same bit for bit."""
-    first = Rotation.from_quat(quats[frame], scalar_first=True)
-    second = Rotation.from_quat(quats[np.minimum(frame + 1, len(quats) - 1)], scalar_first=True)
+    first = turn_of(quats[frame])
+    second = turn_of(quats[np.minimum(frame + 1, len(quats) - 1)])
     step = Rotation.from_rotvec(part[:, None] * (first.inv() * second).as_rotvec())
     between = (first * step).as_quat(scalar_first=True)
     return np.where(part[:, None] > 0, between, quats[frame])

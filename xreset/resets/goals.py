@@ -26,6 +26,7 @@ from xreset.checks import frozen
 from xreset.demos.synth import LIFT, WORKSPACE
 from xreset.description import load_robot
 from xreset.errors import FileFormatError, GoalError
+from xreset.geometry.shapes import quat_of, turn_of
 from xreset.objects.catalogue import load_objects, object_names
 from xreset.objects.rest import rest_height, resting_orientation
 from xreset.progress import Progress, unseen
@@ -216,8 +217,8 @@ def checked_goals(
             _check_above_table(name, depth)
         if not len(rows):
             continue
-        start_turns = _turns(goals.start_quat_wxyz[rows])
-        goal_turns = _turns(goals.goal_quat_wxyz[rows])
+        start_turns = turn_of(goals.start_quat_wxyz[rows])
+        goal_turns = turn_of(goals.goal_quat_wxyz[rows])
         start = goals.start_pos[rows] + start_turns.apply(obj.com)
         goal = goals.goal_pos[rows] + goal_turns.apply(obj.com)
         if is_own:
@@ -269,14 +270,14 @@ def _resting_poses(
         random = np.random.default_rng(zlib.crc32(obj.name.encode()))
         directions = np.array([_Z]) if upright else random.normal(size=(_DIRECTIONS, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        turns = _turns(np.array([resting_orientation(obj, up) for up in directions]))
+        turns = turn_of(np.array([resting_orientation(obj, up) for up in directions]))
         ups = turns.inv().apply(_Z)
         # of each direction, the first one that leads to the same pose
         poses, which = np.unique((ups @ ups.T > _SAME_POSE).argmax(axis=1), return_inverse=True)
         rows[obj.name] = len(episodes) + which
         for pose in poses:
             turn = turns[int(pose)]
-            center = np.array([*_MIDDLE, rest_height(obj, _quat(turn))]) + turn.apply(obj.com)
+            center = np.array([*_MIDDLE, rest_height(obj, quat_of(turn))]) + turn.apply(obj.com)
             place = {"start": center, "start_turn": turn, "goal": center, "goal_turn": turn}
             episodes.append(_Episode(obj=obj, family="rest", number=len(episodes), **place))
     settled, at_rest = settle_starts(_goal_set(robot, episodes), robot, objects)
@@ -288,7 +289,7 @@ def _resting_poses(
                 f"{obj.name} does not come to rest on the table: it rolls or falls over in MuJoCo. Leave it"
                 " out, or make a side of its mesh flat."
             )
-        turns = _turns(settled.start_quat_wxyz[own])
+        turns = turn_of(settled.start_quat_wxyz[own])
         heights = settled.start_pos[own, 2] + turns.apply(obj.com)[:, 2]
         rests[obj.name] = list(zip(heights, turns, strict=True))
     return rests
@@ -314,7 +315,7 @@ def _draw(
     at_goal = np.random.default_rng([_GOAL_SEED, *key]).uniform(-1.0, 1.0, 4)  # x, y, z, yaw
     if family == OWN:
         pos, quat = own[number]
-        goal_turn = _turns(quat)
+        goal_turn = turn_of(quat)
         goal = pos + goal_turn.apply(obj.com)
     else:
         goal = place + np.array([0.0, 0.0, config.lift])
@@ -350,7 +351,7 @@ def _reached(reach: Reach, drawn: Sequence[_Episode]) -> list[_Episode]:
     above = [
         e
         for e in drawn
-        if e.goal[2] >= rest_height(e.obj, _quat(e.goal_turn)) + e.goal_turn.apply(e.obj.com)[2]
+        if e.goal[2] >= rest_height(e.obj, quat_of(e.goal_turn)) + e.goal_turn.apply(e.obj.com)[2]
     ]
     if not above:
         return []
@@ -358,14 +359,6 @@ def _reached(reach: Reach, drawn: Sequence[_Episode]) -> list[_Episode]:
     starts = np.stack([e.start for e in above])
     held = reach.holds(starts, np.stack([e.goal for e in above]), turns)
     return [e for e, holds in zip(above, held, strict=True) if holds]
-
-
-def _turns(quats: np.ndarray) -> Rotation:
-    return Rotation.from_quat(quats, scalar_first=True)
-
-
-def _quat(turn: Rotation) -> np.ndarray:
-    return turn.as_quat(canonical=True, scalar_first=True)
 
 
 def _goal_set(robot: RobotSpec, episodes: Sequence[_Episode]) -> GoalSet:
@@ -378,9 +371,9 @@ def _goal_set(robot: RobotSpec, episodes: Sequence[_Episode]) -> GoalSet:
         sequence_object=np.array([e.obj.name for e in episodes]),
         family=np.array([e.family for e in episodes]),
         start_pos=np.array([e.start - e.start_turn.apply(e.obj.com) for e in episodes], np.float32),
-        start_quat_wxyz=np.array([_quat(e.start_turn) for e in episodes], np.float32),
+        start_quat_wxyz=np.array([quat_of(e.start_turn) for e in episodes], np.float32),
         goal_pos=np.array([e.goal - e.goal_turn.apply(e.obj.com) for e in episodes], np.float32),
-        goal_quat_wxyz=np.array([_quat(e.goal_turn) for e in episodes], np.float32),
+        goal_quat_wxyz=np.array([quat_of(e.goal_turn) for e in episodes], np.float32),
         object_names=names,
         object_sources=tuple(sources[name] for name in names),
     )

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from xreset.errors import RobotError
 from xreset.geometry.collision import table_clearance
 from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.shapes import quat_of, turn_of
 from xreset.progress import Progress, unseen
 from xreset.retarget.arm.config import QUICK
 from xreset.retarget.arm.model import ArmModel, ArmTargets
@@ -214,13 +215,13 @@ def _placed(robot: RobotSpec, parameters: np.ndarray) -> RobotSpec:
     """Return the robot with its base at (x, y, z, azimuth, tilt, spin): the base is spun about its z axis, which is
     tilted towards an azimuth; angles in degrees."""
     turn = Rotation.from_euler("ZYZ", parameters[3:], degrees=True)
-    quat = turn.as_quat(canonical=True, scalar_first=True)
+    quat = quat_of(turn)
     return replace(robot, base_pos=tuple(parameters[:3].tolist()), base_quat=tuple(quat.tolist()))
 
 
 def _parameters(robot: RobotSpec) -> np.ndarray:
     """The inverse of :func:`_placed`."""
-    turn = Rotation.from_quat(robot.base_quat, scalar_first=True)
+    turn = turn_of(robot.base_quat)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of an upright base, whose azimuth is 0
         spin, tilt, azimuth = turn.as_euler("zyz", degrees=True)

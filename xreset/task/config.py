@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import field, replace
 from math import isfinite
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from xreset.cameras.config import VisionConfig
 from xreset.checks import (
@@ -46,7 +46,7 @@ class ActionConfig(Checked):
     In the paper, arm commands are relative and hand targets absolute (Table VIII).
     """
 
-    REMOVED: ClassVar[dict[str, Any]] = {"hand_smoothing": 1.0}
+    REMOVED: ClassVar = {"hand_smoothing": 1.0}
 
     arm_step: PositiveFloat = 0.03
     """Largest change of an arm joint's target per control step [rad]: 1.8 rad/s at 60 Hz. Not in the paper."""
@@ -136,7 +136,7 @@ class ObservationConfig(Checked):
 class RewardConfig(Checked):
     """Weights and widths of the reward (appendix D.d)."""
 
-    REMOVED: ClassVar[dict[str, Any]] = {
+    REMOVED: ClassVar = {
         "tracking": "presence",
         "progress": 8.0,
         "progress_width": 0.15,
@@ -242,7 +242,7 @@ class TerminationConfig(Checked):
 class ResetConfig(Checked):
     """The reset mixture (sections IV-B, appendix D.c, D.e, Table IX)."""
 
-    REMOVED: ClassVar[dict[str, Any]] = {
+    REMOVED: ClassVar = {
         "frontier": 0.0,
         "frontier_over": "bank",
         "frontier_power": 1.0,

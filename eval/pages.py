@@ -7,7 +7,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from xreset.eval.table import escape, markdown
+from xreset.eval.table import cell, escape, markdown
 from xreset.files import code_version
 from xreset.text import short_name
 
@@ -27,7 +27,9 @@ def _environment() -> Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    made.filters |= {"percent": percent, "short_name": short_name, "md": escape, "table": markdown}
+    made.filters |= {
+        "percent": percent, "short_name": short_name, "md": escape, "table": markdown, "cell": cell,
+    }  # fmt: skip
     made.globals["version"] = code_version()
     return made
 

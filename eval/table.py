@@ -27,7 +27,12 @@ def escape(text: str) -> str:
     return " ".join(text.split())
 
 
-def markdown(rows: Rows, escape: Callable[[str], str] = escape) -> str:
+def cell(text: str) -> str:
+    """Return Markdown for a cell of a table, in one line."""
+    return " ".join(text.replace("|", "\\|").split())
+
+
+def markdown(rows: Rows) -> str:
     """Return a table in Markdown."""
     lines = ""
     for cells in (rows[0], ["---"] * len(rows[0]), *rows[1:]):
@@ -68,11 +73,6 @@ def success_text(share: float | None) -> str:
     return "missing" if share is None else f"{share:.1%}"
 
 
-def distance_text(distance: float | None) -> str:
-    """Return the published distance [m] as text; None: an earlier version did not measure it."""
-    return "missing" if distance is None else f"{100 * distance:.1f} cm"
-
-
 def estimate_text(metric: str, mean: float, low: float, high: float) -> str:
     """Return an estimate and its interval as percent, such as ``93.2 (88-98)``, or cm, such as ``0.6 (0.5-0.8)``; ``-``
     if it is not known."""
@@ -106,7 +106,9 @@ FIGURES = {
         lambda s: success_text(s.published_success_rate),
         interval=lambda s: s.published_success_ci95,
     ),
-    "published distance": Figure(lambda s: distance_text(s.least_distance)),
+    "published distance": Figure(
+        lambda s: "missing" if s.least_distance is None else f"{100 * s.least_distance:.1f} cm"
+    ),
     "not finite": Figure(lambda s: str(s.health.nonfinite), fault=True),
     "overflow": Figure(lambda s: str(s.health.overflow), fault=True),
     "left the scene": Figure(lambda s: str(s.health.out_of_bounds)),

@@ -28,8 +28,7 @@ from xreset.eval.report.clips import (
     make_film,
     worst_episodes,
 )
-from xreset.eval.report.make import make_report
-from xreset.eval.report.page import count_failures, headline, page
+from xreset.eval.report.make import count_failures, headline, make_report, page
 from xreset.eval.report.read import collect
 from xreset.eval.results import TaskProgress, episode_table, recorded, write_results
 from xreset.eval.stress import Curve, Point, Stress
@@ -293,10 +292,11 @@ class ClipTest(Reported):
             mock.patch("xreset.eval.report.clips.encode_mp4") as encode,
         ):
             encode.return_value = b"film"
-            engines, objects = make_film(self.folder, self.folder / "film.mp4")
+            data = collect(self.folder)
+            objects = make_film(data, self.folder / "film.mp4")
         frames, fps = encode.call_args.args
         names = tuple(sorted({trace.object for trace in rollouts.traces}))
-        self.assertEqual((set(engines), objects), (set(ENGINES), names))
+        self.assertEqual((set(data.training.results), objects), (set(ENGINES), names))
         self.assertEqual((len(frames), *frames.shape[2:]), (3, len(names) * 200, 3))
         self.assertEqual(round(fps), 10)
         self.assertEqual(frames.shape[1] % 4, 0)

@@ -14,7 +14,7 @@ from xreset.cameras.config import VisionConfig
 from xreset.checks import frozen
 from xreset.description import load_robot
 from xreset.errors import RunError, XResetError, needs
-from xreset.eval.report.read import ReportData, collect
+from xreset.eval.report.read import ReportData
 from xreset.eval.results import Table, Trace
 from xreset.files import write_whole
 from xreset.objects.catalogue import load_object
@@ -173,94 +173,70 @@ def draw_clips(
     rows = list(episodes.itertuples())
     clips = []
     for episode in rows:
+        trace = episode.trace
+        interval = float(trace.time[1] - trace.time[0])
+        every = max(1, round(1.0 / (FRAMES_PER_SECOND * interval)))
         obj = load_object(episode.object, meshes)
         if strips:
-            camera = camera_for(episode.trace, obj, distance=0.7)
+            size = STRIP_SIZE
+            camera = camera_for(trace, obj, distance=0.7)
+            shown = np.linspace(0, len(trace.time) - 1, MOMENTS).round().astype(int)
         else:
+            size = SIZE
             camera = camera_for(rows[0].trace, obj)
+            shown = np.arange(0, len(trace.time), every)
+        ends = np.flatnonzero(~trace.finite)
+        drawn = np.minimum(shown, ends[0] - 1 if len(ends) else len(trace.time)).tolist()
+        renderer = Renderer(SceneSpec(robot=robot, objects=(obj,)), size=size, camera=camera)
         eyes = policy_cameras(robot, obj, vision)
-        scene = SceneSpec(robot=robot, objects=(obj,))
-        clips.append(_draw(episode, scene, camera, eyes, strips))
+        pictures = {row: draw_state(renderer, trace, row, eyes) for row in set(drawn)}
+        clip = Clip(
+            episode=episode,
+            frames=np.stack([pictures[row] for row in drawn]),
+            times=trace.time[shown],
+            fps=1.0 / (every * interval),
+            finite=not len(ends),
+        )
+        clips.append(clip)
     return clips
 
 
-def _draw(
-    episode: Any, scene: SceneSpec, camera: Camera, eyes: Cameras | None, strip: bool
-) -> Clip:
-    trace = episode.trace
-    interval = float(trace.time[1] - trace.time[0])
-    every = max(1, round(1.0 / (FRAMES_PER_SECOND * interval)))
-    rows = np.arange(0, len(trace.time), every)
-    size = SIZE
-    if strip:
-        rows = np.linspace(0, len(trace.time) - 1, MOMENTS).round().astype(int)
-        size = STRIP_SIZE
-    finite = trace.finite
-    last = len(finite) - 1 if finite.all() else int(np.argmin(finite)) - 1
-    drawn = np.minimum(rows, last).tolist()
-    renderer = Renderer(scene, size=size, camera=camera)
-    pictures = {row: draw_state(renderer, trace, row, eyes) for row in set(drawn)}
-    return Clip(
-        episode=episode,
-        frames=np.stack([pictures[row] for row in drawn]),
-        times=trace.time[rows],
-        fps=1.0 / (every * interval),
-        finite=bool(finite.all()),
-    )
-
-
-def draw_report(
-    data: ReportData, robot: str | None, objects: Path | None
-) -> tuple[list[Clip], list[Clip]]:
+def draw_report(data: ReportData) -> tuple[list[Clip], list[Clip]]:
     """Draw one episode in every engine, and failures in the first engine as strips.
-
-    Args:
-        robot: name or folder of the robot; None: as the results name it.
-        objects: folder of meshes; None: as the results name it.
 
     Raises:
         XResetError: no demonstration was recorded in every engine, or the robot or an object cannot be loaded.
     """
-    spec = load_robot(robot or data.robot)
-    meshes = data.training.first.meshes(objects)
+    spec = load_robot(data.robot)
     shown = data.training.recorded(spec)
-    clips = draw_clips(best_everywhere(shown), spec, meshes, data.vision)
+    clips = draw_clips(best_everywhere(shown), spec, data.meshes, data.vision)
     if not clips:
         raise XResetError(
             "no demonstration was recorded in every engine. Evaluate all engines in one command."
         )
     worst = worst_episodes(shown[shown["engine"] == data.training.first.backend], FAILURES)
-    return clips, draw_clips(worst, spec, meshes, data.vision, strips=True)
+    return clips, draw_clips(worst, spec, data.meshes, data.vision, strips=True)
 
 
-def make_film(
-    folder: Path, out: Path, *, robot: str | None = None, objects: Path | None = None
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def make_film(data: ReportData, out: Path) -> tuple[str, ...]:
     """Write an mp4 with the episode of each object that went best over all engines, all at their own speed.
 
-    Args:
-        folder: a run folder, or a folder of results.
-        robot: name or folder of the robot; default: as the results name it.
-        objects: folder of meshes; default: as the results name it.
-
     Returns:
-        The engines, from above, and the objects, from the left.
+        The objects, from the left; the engines are in the order of the results, from above.
 
     Raises:
-        RunError: there are no results, or no object was recorded in every engine.
-        FileFormatError: a file of the results is damaged.
+        RunError: no object was recorded in every engine.
         XResetError: the film cannot be encoded or written.
     """
-    data = collect(folder)
-    spec = load_robot(robot or data.robot)
-    meshes = data.training.first.meshes(objects)
+    spec = load_robot(data.robot)
     columns = {}
     for name, own in data.training.recorded(spec).groupby("object"):
-        if clips := draw_clips(best_everywhere(own), spec, meshes, data.vision):
+        if clips := draw_clips(best_everywhere(own), spec, data.meshes, data.vision):
             columns[str(name)] = clips
     if not columns:
         raise RunError(
-            f"no demonstration in {folder} was recorded in every engine. Evaluate all engines in one command."
+            f"no demonstration in {data.training.results_folder} was recorded in every engine. "
+            "Evaluate all engines in one command."
         )
     every = list(chain(*columns.values()))
     length = max(len(clip.frames) for clip in every)
@@ -273,7 +249,7 @@ def make_film(
             column.append(np.stack([add_caption(picture, [label], 1) for picture in half]))
         films.append(np.concatenate(column, axis=1))
     write_whole(out, encode_mp4(np.concatenate(films, axis=2), every[-1].fps))
-    return tuple(data.training.results), tuple(columns)
+    return tuple(columns)
 
 
 def encode_mp4(frames: np.ndarray, fps: float, *, keyframes: int | None = None) -> bytes:

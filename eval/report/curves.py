@@ -20,12 +20,12 @@ from xreset.eval.results import Table
 
 X = Literal["minutes", "steps", "iterations"]
 """Horizontal axis of a learning curve."""
-AXES: dict[X, tuple[str, int]] = {
-    "minutes": ("minutes of training", 1),
-    "steps": ("million environment steps", 1),
-    "iterations": ("iterations of training", 0),
+AXES: dict[X, tuple[str, int, str, float]] = {
+    "minutes": ("minutes of training", 1, "minutes", 1.0),
+    "steps": ("million environment steps", 1, "env_steps", 1e-6),
+    "iterations": ("iterations of training", 0, "iteration", 1.0),
 }
-"""Label of an axis, and digits in tables."""
+"""Label of an axis, digits in tables, field of :class:`~xreset.learning.clock.Lift`, and factor to the axis's unit."""
 _SPEED = ["speed/collect_seconds", "speed/learn_seconds", "speed/env_steps_per_second"]
 
 

@@ -49,6 +49,7 @@ def _condition_table(trainings: Sequence[Training]) -> Table:
     for training in trainings:
         for engine, result in training.results.items():
             episodes = training.episodes[training.episodes["engine"] == engine]
+            folder = result.objects_folder
             row: dict[str, Any] = {
                 "run": training.label,
                 "engine": engine,
@@ -57,7 +58,8 @@ def _condition_table(trainings: Sequence[Training]) -> Table:
                 "policy file": result.inputs.get("policy", "")[:12],
                 "robot": result.robot,
                 "objects": ", ".join(sorted(map(short_name, episodes["object"].unique()))),
-                "object meshes": _mesh_folder(result.objects_folder),
+                # one path, whether it was given from here or in full
+                "object meshes": str(Path(folder).resolve()) if folder else "stand-ins",
                 "demonstrations": result.inputs.get("demos", "")[:12],
                 "sequences": tuple(
                     sorted(set(episodes["object"] + "/" + episodes["sequence_name"]))
@@ -70,11 +72,6 @@ def _condition_table(trainings: Sequence[Training]) -> Table:
                     row[name] = text
             rows.append(row)
     return pd.DataFrame(rows)
-
-
-def _mesh_folder(folder: str | None) -> str:
-    """Return one path for a folder of meshes, whether it was given from here or in full."""
-    return str(Path(folder).resolve()) if folder else "stand-ins"
 
 
 def _difference(table: Table, column: str, what: str, advice: str = "") -> list[str]:

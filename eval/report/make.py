@@ -1,22 +1,34 @@
-"""From folders to pages and pictures: the report of a run, and the comparison of several."""
+"""From folders to pages and pictures: the report of a run, and the comparison of several.
+
+A report is one HTML page that needs nothing else: no network, no other files.
+"""
 
 from __future__ import annotations
 
+import base64
+import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from xreset.errors import RunError, XResetError
-from xreset.eval.pages import render
+from xreset.eval.pages import percent, render
+from xreset.eval.plots import COLORS
 from xreset.eval.report import fairness, tables
-from xreset.eval.report.clips import draw_report
+from xreset.eval.report.clips import Clip, draw_report, encode_mp4
 from xreset.eval.report.curves import AXES, X
-from xreset.eval.report.figures import write_picture
+from xreset.eval.report.figures import draw_training, write_picture
 from xreset.eval.report.groups import by_engine, grouped, scores, singles
-from xreset.eval.report.page import page
-from xreset.eval.report.read import ReportData, Training, collect, read_trainings
-from xreset.eval.table import caption
+from xreset.eval.report.read import ReportData, Training, collect, read_trainings, versions
+from xreset.eval.results import Table
+from xreset.eval.stress import by_property
+from xreset.eval.table import FIGURES, caption
 from xreset.files import claim_folder, write_whole
+from xreset.pictures.render import encode_png
 
 DEFAULT_CURVES = ("task/success", "task/success_from_home")
 """Curves that a comparison draws by default."""
@@ -39,16 +51,78 @@ def make_report(
         XResetError: the page cannot be written, another command is writing it, or a package for plots is missing.
     """
     out = folder / "report" if out is None else out
-    data = collect(folder)
+    data = collect(folder, robot, objects)
     with claim_folder(out):
         clips = []
         strips = []
         try:
-            clips, strips = draw_report(data, robot, objects)
+            clips, strips = draw_report(data)
         except XResetError as error:  # numbers are worth a page without films; the page says why
             data = replace(data, notes=(*data.notes, f"There are no clips: {error}"))
         write_whole(out / "index.html", page(data, clips, strips))
     return out / "index.html", data
+
+
+def page(data: ReportData, clips: Sequence[Clip], strips: Sequence[Clip] = ()) -> str:
+    """Return the whole page; clips, and strips of failures, may be empty. The page runs no script but its own."""
+    script = render("report.js")
+    episodes = data.training.episodes
+    first = episodes[episodes["engine"] == data.training.first.backend]
+    results = list(data.training.results.values())
+    demonstrations: dict[str, list[Any]] = {}
+    for i, result in enumerate(results):
+        for row in result.per_demo:
+            demonstrations.setdefault(row.sequence, [None] * len(results))[i] = row
+    objects = episodes.pivot_table(index="object", columns="engine", values="task_progress")
+    return render(
+        "report.html.j2",
+        data=data,
+        results=results,
+        engines=list(data.training.results),
+        figures=FIGURES,
+        versions=caption(result.policy for result in results),
+        headline=headline(data),
+        colors=COLORS,
+        script=script,
+        script_hash=_base64(hashlib.sha256(script.encode()).digest()),
+        clips=clips,
+        strips=strips,
+        mp4=lambda clip: _base64(encode_mp4(clip.frames, clip.fps)),
+        png=lambda strip: _base64(encode_png(np.hstack(strip.frames))),
+        failed=len(first),
+        failures={what: count for what, count in count_failures(first).items() if count},
+        objects=objects,
+        curves=draw_training(data.training.curves),
+        stressed=by_property(data.stress),
+        demonstrations=demonstrations,
+    )
+
+
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode()
+
+
+def count_failures(episodes: Table) -> dict[str, int]:
+    """Return the number of episodes that ended below each stage, by what was missing."""
+    missed = {
+        "never near the object": ~episodes["approach"],
+        "near it, but no grasp": episodes["approach"] & ~episodes["grasp"],
+        "grasped, never at the goal": episodes["grasp"] & ~episodes["reorient_once"],
+        "at the goal, but not in the end": episodes["reorient_once"] & ~episodes["reorient"],
+    }
+    return {what: int(rows.sum()) for what, rows in missed.items()}
+
+
+def headline(data: ReportData) -> str:
+    """Return the result in one or two sentences."""
+    ranked = sorted(data.training.results.values(), key=lambda s: -s.task_progress.mean)
+    text = f"Task progress is {', '.join(f'{percent(s.task_progress.mean)} in {s.backend}' for s in ranked)}."
+    if data.run is not None and len(ranked) > 1:
+        text += f" The policy was trained in {data.run.backend}."
+    return text
+
+
+# Comparisons ----------------------------------------------------------------------------------------------------------
 
 
 def compare(
@@ -88,6 +162,8 @@ def compare(
         groups=groups,
         notes=notes,
         versions=caption(policies),
+        engines=sorted(found["engine"].unique()),
+        engine_versions=partial(versions, trainings),
         results=tables.results(groups, found),
         x=AXES[x][0],
         lifted=tables.lifted(clocks, x),

@@ -78,11 +78,10 @@ class ReportData:
     """Robustness of the policy in every engine in which it was measured."""
     notes: tuple[str, ...]
     """What the reader must know before comparing engines, or what is missing."""
-
-    @property
-    def robot(self) -> str:
-        """Name or folder of the robot."""
-        return self.training.first.robot if self.run is None else self.run.robot
+    robot: str
+    """Name or folder of the robot."""
+    meshes: Path | None
+    """Folder of object meshes; None: the stand-ins."""
 
     @property
     def vision(self) -> VisionConfig | None:
@@ -93,11 +92,13 @@ class ReportData:
         return vision if vision.cameras else None
 
 
-def collect(folder: Path) -> ReportData:
+def collect(folder: Path, robot: str | None = None, objects: Path | None = None) -> ReportData:
     """Read everything that a report shows.
 
     Args:
         folder: a run folder, or a folder that holds ``ENGINE.json`` files, itself or in ``eval/``.
+        robot: name or folder of the robot; default: as the run and the results name it.
+        objects: folder of meshes; default: as the results name it.
 
     Raises:
         RunError: the folder does not exist or holds no results.
@@ -127,7 +128,15 @@ def collect(folder: Path) -> ReportData:
             "The teacher was not evaluated from the same starts. Make its results first: "
             f"xreset eval {folder / TEACHER} --out {folder / 'teacher'} --demos DEMOS"
         )
-    return ReportData(training=training, run=run, choice=choice, stress=stress, notes=tuple(notes))
+    return ReportData(
+        training=training,
+        run=run,
+        choice=choice,
+        stress=stress,
+        notes=tuple(notes),
+        robot=robot or (run or training.first).robot,
+        meshes=training.first.meshes(objects),
+    )
 
 
 def results_in(folder: Path) -> Path:
@@ -226,7 +235,18 @@ def read_trainings(runs: Sequence[str]) -> tuple[Training, ...]:
         )
     folders: dict[str, Path] = {}
     for text in runs:
-        label, folder = _split(text)
+        label = ""
+        name = text
+        if "=" in text and not Path(text).is_dir():  # a folder's name may contain an equals sign
+            label, _, name = text.partition("=")
+            if not label or not name:
+                raise RunError(
+                    f"{text!r} is not NAME=FOLDER: a {'folder' if label else 'name'} is missing."
+                )
+        folder = Path(name)
+        if not folder.exists() and name in shipped():
+            folder = results_folder(name)
+        label = label or name_of(folder)
         if label in folders:
             raise RunError(
                 f"{folders[label]} and {folder} would both be called {label!r}. "
@@ -277,22 +297,6 @@ def _evaluate(folder: Path) -> str:
     if (folder / "run.json").is_file():
         return f"Make them first: xreset eval {folder} --demos DEMOS"
     return f"Make them first: xreset eval POLICY --demos DEMOS --out {folder}"
-
-
-def _split(text: str) -> tuple[str, Path]:
-    """Return label and folder of an argument. The name of a folder may contain an equals sign."""
-    label = ""
-    name = text
-    if "=" in text and not Path(text).is_dir():
-        label, _, name = text.partition("=")
-        if not label or not name:
-            raise RunError(
-                f"{text!r} is not NAME=FOLDER: a {'folder' if label else 'name'} is missing."
-            )
-    folder = Path(name)
-    if not folder.exists() and name in shipped():
-        folder = results_folder(name)
-    return label or name_of(folder), folder
 
 
 _RUN_TYPES = {

@@ -2,55 +2,44 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from itertools import chain
 
-import pandas as pd
 from scipy.stats import binomtest
 
 from xreset.errors import RunError
 from xreset.eval.report.curves import AXES, X, amounts
 from xreset.eval.report.fairness import uneven
 from xreset.eval.report.groups import COUNTED, Groups, by_engine, counted, difference
-from xreset.eval.report.read import Training, versions
+from xreset.eval.report.read import Training
 from xreset.eval.results import Table
 from xreset.eval.table import METRICS, Rows, estimate_text
 from xreset.learning.clock import SHARES, Lift
 
-_LIFT_FIELDS: dict[X, tuple[str, float]] = {
-    "minutes": ("minutes", 1.0),
-    "steps": ("env_steps", 1e-6),
-    "iterations": ("iteration", 1.0),
-}
-"""Field of a :class:`Lift` for each axis, and the factor to the axis's unit."""
 
-
-def results(groups: Groups, found: Table) -> Rows:
-    """Return rows of each group: how much was evaluated, every metric, and the difference to the first group where both
-    were evaluated alike. The columns are engines; ``-`` where it was not evaluated or measured.
+def results(groups: Groups, found: Table) -> dict[str, dict[str, dict[str, str]]]:
+    """Return group -> name of a row -> engine -> text: how much was evaluated, every metric, and the difference to the
+    first group where both were evaluated alike.
 
     Args:
         found: :func:`xreset.eval.report.groups.scores`.
     """
-    engines = sorted(found["engine"].unique())
-    every = list(chain(*groups.values()))
-    rows = [["", "", *(f"{engine} {versions(every, engine)}" for engine in engines)]]
     first, *_ = groups
     reference = dict(by_engine(groups[first]))
+    texts = {}
     for label, members in groups.items():
+        own = texts[label] = defaultdict(dict)
         alike = label != first and not uneven([*groups[first], *members])
-        columns = {}
         for engine, episodes in by_engine(members):
-            column = {COUNTED: counted(episodes)}
-            own = found[(found["group"] == label) & (found["engine"] == engine)]
-            for _, _, metric, *values in own.itertuples(index=False):
-                column[METRICS[metric]] = estimate_text(metric, *values)
+            own[COUNTED][engine] = counted(episodes)
+            scored = found[(found["group"] == label) & (found["engine"] == engine)]
+            for _, _, metric, *values in scored.itertuples(index=False):
+                own[METRICS[metric]][engine] = estimate_text(metric, *values)
             if alike and engine in reference:
-                column[f"task progress minus {first}"] = difference(reference[engine], episodes)
-            columns[engine] = column
-        for name, *texts in pd.DataFrame(columns, columns=engines).fillna("-").itertuples():
-            rows.append([label if name == COUNTED else "", name, *texts])
-    return rows
+                own[f"task progress minus {first}"][engine] = difference(
+                    reference[engine], episodes
+                )
+    return texts
 
 
 def lifted(clocks: Mapping[str, Sequence[Lift]], x: X) -> Rows:
@@ -71,8 +60,7 @@ def lifted(clocks: Mapping[str, Sequence[Lift]], x: X) -> Rows:
 
 
 def _lifted(clocks: Sequence[Lift], share: float, x: X) -> str:
-    _, digits = AXES[x]
-    field, scale = _LIFT_FIELDS[x]
+    _, digits, field, scale = AXES[x]
     times = []
     hits = 0
     for clock in clocks:
@@ -114,7 +102,7 @@ def different(groups: Groups) -> Rows:
 def _lengths(member: Training) -> dict[str, str]:
     """Return how long was trained; nothing that was not logged."""
     lengths = {}
-    for x, (label, digits) in AXES.items() if len(member.curves) else ():
+    for x, (label, digits, *_) in AXES.items() if len(member.curves) else ():
         try:
             lengths[label] = f"{amounts(member, x).iloc[-1]:,.{digits}f}"
         except RunError:

@@ -28,19 +28,19 @@ def report(
         objects: Folder of real meshes, for the clips; default: as the results name it.
         film: MP4 to write as well: every object in every engine, next to each other.
     """
-    from xreset.eval.report import clips, make, page
+    from xreset.eval.report import clips, make
 
     if not run.exists() and str(run) in shipped():
         run = results_folder(str(run))
     with console.status("drawing clips"):
         html, data = make.make_report(run, out, robot=robot, objects=objects)
     console.print(table.results_table(list(data.training.results.values())))
-    console.print(page.headline(data))
+    console.print(make.headline(data))
     show_notes(data.notes)
     if film is not None:
         with console.status("drawing the film"):
-            engines, shown = clips.make_film(run, film, robot=robot, objects=objects)
-        rows = ", ".join(engines)
+            shown = clips.make_film(data, film)
+        rows = ", ".join(data.training.results)
         columns = ", ".join(map(short_name, shown))
         console.print(f"film: {film}\n      from the top: {rows}; from the left: {columns}")
     console.print(f"page: {html}")

@@ -234,8 +234,7 @@ class OutcomeTest(TestCase):
         return Attribution(
             a="mujoco",
             b="sapien",
-            measured_a=STATED,
-            measured_b=replace(STATED, arm_stiffness=0.8),
+            measured={"arm stiffness": (1.0, 0.8)},
             rows=rows,
             skipped={},
         )

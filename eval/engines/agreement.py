@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -92,24 +91,12 @@ class Metric:
         return self.verdict == "met"
 
 
-@frozen
-class CommonStates:
-    """States from which every engine lifts and shakes."""
-
-    label: tuple[str, ...]
-    """Sequence, frame, and whether the demonstration shows it or which engine closed the hand."""
-    object_index: Tensor
-    """[G]"""
-    start: State
-    """[G, ...]"""
-
-
-def try_closings(tested: Engine, scene: SceneSpec, grasps: Grasps) -> tuple[Recording, Recording]:
+def try_closings(tested: Engine, scene: SceneSpec, grasps: Grasps) -> dict[str, Recording]:
     """Close each hand at the scene's frictions.
 
     Returns:
-        The closing around objects too heavy to move, up to the lift; and the whole try around objects at rest on the
-        table.
+        ``press``: the closing around objects too heavy to move, up to the lift; ``closing``: the whole try around
+        objects at rest on the table.
     """
     start, targets = closing_episode(scene, grasps)
     with tested.make(scene, len(grasps), grasps.object_index) as backend:
@@ -117,26 +104,27 @@ def try_closings(tested: Engine, scene: SceneSpec, grasps: Grasps) -> tuple[Reco
         mass = torch.tensor([thing.mass for thing in scene.objects])[grasps.object_index]
         backend.set_object_mass(PRESS_MASS * mass.to(backend.device))
         backend.set_object_gravity(torch.zeros_like(mass, device=backend.device))
-        return play(backend, start, targets[: closing_steps(scene.control_dt)]), whole
+        press = play(backend, start, targets[: closing_steps(scene.control_dt)])
+        return {"press": press, "closing": whole}
 
 
-def try_holds(tested: Engine, scene: SceneSpec, common: CommonStates) -> tuple[Recording, ...]:
+def try_holds(tested: Engine, scene: SceneSpec, common: Grasps) -> dict[str, Recording]:
     """Lift and shake, once with each of the frictions."""
     targets = lifting_targets(scene, common.start)
-    recordings = []
-    with tested.make(scene, len(common.object_index), common.object_index) as backend:
+    recordings = {}
+    with tested.make(scene, len(common), common.object_index) as backend:
         for mu in FRICTIONS:
             friction = torch.tensor([mu, mu, scene.friction.table], device=backend.device)
             backend.set_friction(friction.repeat(backend.num_worlds, 1))
-            recordings.append(play(backend, common.start, targets))
-    return tuple(recordings)
+            recordings[f"hold {mu:g}"] = play(backend, common.start, targets)
+    return recordings
 
 
 def common_states(
     scene: SceneSpec, table: Grasps, air: Grasps, closings: Mapping[str, Recording], count: int
-) -> CommonStates:
-    """Return states that favor no engine: some from demonstrations in the air, the others from the closings of all
-    engines in turn.
+) -> Grasps:
+    """Return grasps that favor no engine: some from demonstrations in the air, the others from the closings of all
+    engines in turn. Their labels say which.
 
     A closing counts if a fingertip touches the object when the hand has closed.
 
@@ -145,11 +133,12 @@ def common_states(
         table: grasps of the closings.
         air: grasps in the air.
         closings: whole closings, by engine.
-        count: largest number of states; there are fewer where hands have closed on nothing.
+        count: largest number of grasps; there are fewer where hands have closed on nothing.
     """
     shown = air[: round(count * IN_AIR)]
-    closed = squeezed(Kinematics(scene.robot), shown.joint_pos)
-    states = [State.at_rest(shown.joint_pos, shown.object_pos, shown.object_quat, closed)]
+    held = shown.start
+    closed = squeezed(Kinematics(scene.robot), held.joint_pos)
+    states = [State.at_rest(held.joint_pos, held.object_pos, held.object_quat, closed)]
     labels = [f"{label} as demonstrated" for label in shown.label]
     index = [shown.object_index]
     last = closing_steps(scene.control_dt) - 1
@@ -162,73 +151,47 @@ def common_states(
                 states.append(closings[name].state_after(last)[torch.tensor([g])])
                 index.append(table.object_index[[g]])
                 break
-    return CommonStates(label=tuple(labels), object_index=torch.cat(index), start=State.cat(states))
+    return Grasps(label=tuple(labels), object_index=torch.cat(index), start=State.cat(states))
 
 
 @frozen
 class EngineParity:
     """Results of one engine."""
 
-    engine: Engine
+    backend: str
+    version: str
+    device: str
     metrics: tuple[Metric, ...]
     """Against the reference; empty for the reference itself."""
     carried: dict[str, tuple[bool, ...]]
     """For each kind of try (``closing``, ``hold 0.5``, ...), which grasps carried their object."""
-    broken: int
+    broken_worlds: int
     """Worlds that were not finite or dropped contacts, over all tries."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return JSON-able content."""
-        return {
-            "backend": self.engine.name,
-            "version": self.engine.version,
-            "device": self.engine.device,
-            "metrics": [vars(metric) for metric in self.metrics],
-            "carried": self.carried,
-            "broken_worlds": self.broken,
-        }
 
 
 @frozen
 class Parity:
-    """Results of a comparison."""
+    """Results of a comparison, as they are written."""
 
-    robot: RobotSpec
-    objects: tuple[ObjectSpec, ...]
+    schema: str = SCHEMA
+    robot: str
+    robot_fingerprint: str
+    objects: list[dict[str, str]]
+    """Name and source of each object."""
     reference: EngineParity
     floor: EngineParity
     """The reference with half its timestep: how far two honest solutions of the same equations differ."""
     engines: tuple[EngineParity, ...]
-    closing: Grasps
-    hold: CommonStates
+    grasps: dict[str, list[dict[str, str]]]
+    """Label and object of each grasp, of the closings and of the holds."""
 
     @property
     def missed(self) -> list[str]:
         """Engine and name of every metric that misses its target."""
         names = []
         for tested in self.engines:
-            names += [f"{tested.engine.name}: {m.metric}" for m in tested.metrics if not m.ok]
+            names += [f"{tested.backend}: {m.metric}" for m in tested.metrics if not m.ok]
         return names
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return JSON-able content."""
-        grasps = {}
-        for name, tried in (("closing", self.closing), ("hold", self.hold)):
-            rows = []
-            for label, i in zip(tried.label, tried.object_index.tolist(), strict=True):
-                rows.append({"grasp": label, "object": self.objects[i].name})
-            grasps[name] = rows
-        return {
-            "schema": SCHEMA,
-            "robot": self.robot.name,
-            "robot_fingerprint": self.robot.fingerprint,
-            "objects": [{"name": o.name, "source": o.source} for o in self.objects],
-            "reference": self.reference.as_dict(),
-            "floor": self.floor.as_dict(),
-            "engines": [tested.as_dict() for tested in self.engines],
-            "grasps": grasps,
-            "ok": not self.missed,
-        }
 
 
 def compare(
@@ -262,53 +225,55 @@ def compare(
     scene = SceneSpec(robot=robot, objects=tuple(objects))
 
     table = find_grasps(motion, robot, objects, grasps, where="table")
-    closings: dict[Engine, tuple[Recording, Recording]] = {}
+    tries: dict[Engine, dict[str, Recording]] = {}
     for done, tested in enumerate(everyone):
         progress(f"{tested.name}: closing {len(table)} hands", done, total)
-        closings[tested] = try_closings(tested, scene, table)
+        tries[tested] = try_closings(tested, scene, table)
     air = find_grasps(motion, robot, objects, grasps, where="air")
-    closed = {tested.name: whole for tested, (_, whole) in closings.items() if tested is not floor}
+    closed = {tested.name: own["closing"] for tested, own in tries.items() if tested is not floor}
     common = common_states(scene, table, air, closed, grasps)
-    holds: dict[Engine, tuple[Recording, ...]] = {}
     for done, tested in enumerate(everyone, len(everyone)):
-        progress(f"{tested.name}: holding {len(common.label)} objects", done, total)
-        holds[tested] = try_holds(tested, scene, common)
+        progress(f"{tested.name}: holding {len(common)} objects", done, total)
+        tries[tested] |= try_holds(tested, scene, common)
     progress("", total, total)
 
     surfaces = [
         torch.as_tensor(surface_points(o, SURFACE_POINTS), dtype=torch.float32) for o in objects
     ]
     points = torch.stack(surfaces)[common.object_index]
-    window = round(PRESS_TIME / scene.control_dt)
-
-    def judged(tested: Engine) -> EngineParity:
-        press, closing = closings[tested]
+    results = []
+    for tested, own in tries.items():
         metrics: tuple[Metric, ...] = ()
         if tested is not reference:
-            press_there, closing_there = closings[reference]
-            metrics = (
-                *press_metrics(press, press_there, window),
-                *hold_metrics(holds[tested], holds[reference], points),
-                outcome_metric("closing, outcome", [closing], [closing_there]),
-            )
-        outcomes = {"closing": closing}
-        for mu, recording in zip(FRICTIONS, holds[tested], strict=True):
-            outcomes[f"hold {mu:g}"] = recording
-        return EngineParity(
-            engine=tested,
+            window = round(PRESS_TIME / scene.control_dt)
+            metrics = tuple(_metrics(own, tries[reference], points, window))
+        result = EngineParity(
+            backend=tested.name,
+            version=tested.version,
+            device=tested.device,
             metrics=metrics,
-            carried={name: tuple(carried(r).tolist()) for name, r in outcomes.items()},
-            broken=sum(int(r.broken.sum()) for r in (*outcomes.values(), press)),
+            carried={
+                name: tuple(carried(tried).tolist())
+                for name, tried in own.items()
+                if name != "press"
+            },
+            broken_worlds=sum(int(tried.broken.sum()) for tried in own.values()),
         )
-
+        results.append(result)
+    named = {}
+    for kind, tried in (("closing", table), ("hold", common)):
+        held = [objects[i].name for i in tried.object_index.tolist()]
+        named[kind] = [
+            {"grasp": label, "object": name} for label, name in zip(tried.label, held, strict=True)
+        ]
     return Parity(
-        robot=robot,
-        objects=tuple(objects),
-        reference=judged(reference),
-        floor=judged(floor),
-        engines=tuple(judged(tested) for tested in everyone[2:]),
-        closing=table,
-        hold=common,
+        robot=robot.name,
+        robot_fingerprint=robot.fingerprint,
+        objects=[{"name": o.name, "source": o.source} for o in objects],
+        reference=results[0],
+        floor=results[1],
+        engines=tuple(results[2:]),
+        grasps=named,
     )
 
 
@@ -321,6 +286,28 @@ def _at_half_timestep(base: Engine) -> Engine:
 
 
 # Metrics -------------------------------------------------------------------------------------------------------------
+
+
+def _metrics(
+    found: dict[str, Recording], reference: dict[str, Recording], points: Tensor, window: int
+) -> Iterator[Metric]:
+    """Yield the rows of the table.
+
+    Args:
+        found: tries of the tested engine, by kind.
+        reference: tries of the reference.
+        points: [G, P, 3] of the held objects' surfaces.
+        window: control steps over which forces of a press are averaged.
+    """
+    yield from press_metrics(found["press"], reference["press"], window)
+    holds = [name for name in found if name.startswith("hold")]
+    yield outcome_metric("hold, outcome", [(found[name], reference[name]) for name in holds])
+    distances = []
+    for name in holds:
+        both = carried(found[name]) & carried(reference[name])
+        distances.append(palm_distance(found[name], reference[name], points)[both])
+    yield Metric.of("hold, object in palm", 1e3 * torch.cat(distances))
+    yield outcome_metric("closing, outcome", [(found["closing"], reference["closing"])])
 
 
 def press_metrics(found: Recording, reference: Recording, steps: int) -> list[Metric]:
@@ -336,28 +323,14 @@ def press_metrics(found: Recording, reference: Recording, steps: int) -> list[Me
     return [Metric.of("press, total", total_error), Metric.of("press, fingertip", tip_error)]
 
 
-def hold_metrics(
-    found: Sequence[Recording], reference: Sequence[Recording], points: Tensor
-) -> list[Metric]:
-    """Compare outcome and object pose over all frictions together; points [G, P, 3] of the objects' surfaces."""
-    distances = []
-    for mine, other in zip(found, reference, strict=True):
-        both = carried(mine) & carried(other)
-        distances.append(palm_distance(mine, other, points)[both])
-    return [
-        outcome_metric("hold, outcome", found, reference),
-        Metric.of("hold, object in palm", 1e3 * torch.cat(distances)),
-    ]
-
-
 def carried(recording: Recording) -> Tensor:
     """[G] bool: whether the object ends at least half as far above its start as the palm was lifted."""
     return (recording.lifted > LIFT_HEIGHT / 2) & ~recording.broken
 
 
-def outcome_metric(name: str, found: Sequence[Recording], reference: Sequence[Recording]) -> Metric:
-    """Return the share of the tries that end alike, carried or not."""
-    same = [carried(a) == carried(b) for a, b in zip(found, reference, strict=True)]
+def outcome_metric(name: str, pairs: Iterable[tuple[Recording, Recording]]) -> Metric:
+    """Return the share of the tries that end alike in both of a pair, carried or not."""
+    same = [carried(a) == carried(b) for a, b in pairs]
     return Metric.of(name, torch.cat(same), mean=True)
 
 

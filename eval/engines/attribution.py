@@ -17,7 +17,7 @@ from rich.table import Table
 
 from xreset.checks import frozen
 from xreset.errors import XResetError
-from xreset.eval.engines.measure import Measured, measure
+from xreset.eval.engines.measure import measure
 from xreset.eval.policy_spec import PolicySpec
 from xreset.eval.results import Episode
 from xreset.eval.rollout import Engine, Trial, nominal_scene, roll_out
@@ -65,8 +65,8 @@ class Attribution:
 
     a: str
     b: str
-    measured_a: Measured
-    measured_b: Measured
+    measured: dict[str, tuple[float, float]]
+    """What was measured of each property in A and in B; NaN where that was impossible."""
     rows: tuple[Row, ...]
     """The first is A as it is, the last B."""
     skipped: dict[str, str]
@@ -76,11 +76,6 @@ class Attribution:
     def gap(self) -> Effect:
         """The difference between B and A."""
         return self.rows[-1].effect
-
-    def measured(self, name: str) -> tuple[float, float]:
-        """Return what was measured of a property in A and in B; NaN where that was impossible."""
-        field = COMPARED[name].measured
-        return getattr(self.measured_a, field), getattr(self.measured_b, field)
 
     def share(self, row: Row) -> float:
         """Return the share of the gap that a run brings about; NaN where A and B do not differ for sure."""
@@ -98,8 +93,8 @@ class Attribution:
     def as_dict(self) -> dict[str, Any]:
         """Return JSON-able content."""
         properties = []
-        for name in COMPARED:
-            a, b = map(_number, self.measured(name))
+        for name, values in self.measured.items():
+            a, b = map(_number, values)
             properties.append({"name": name, "a": a, "b": b, "not_tried": self.skipped.get(name)})
         costly = self.costs()
         return {
@@ -157,11 +152,15 @@ def attribute(
         raise XResetError(
             f"Unknown property {', '.join(unknown)}. Choose from: {', '.join(COMPARED)}."
         )
-    progress(f"measuring {a.name}", 0, 0)
     scene = nominal_scene(trial.robot, trial.objects, trial.task)
-    measured_a = measure(a, scene)
-    progress(f"measuring {b.name}", 0, 0)
-    measured_b = measure(b, scene)
+    found = []
+    for each in (a, b):
+        progress(f"measuring {each.name}", 0, 0)
+        found.append(measure(each, scene))
+    measured = {
+        name: (getattr(found[0], prop.measured), getattr(found[1], prop.measured))
+        for name, prop in COMPARED.items()
+    }
     rows: list[Row] = []
 
     def run(kind: Kind, name: str, engine: Engine, task: TaskConfig) -> None:
@@ -184,14 +183,12 @@ def attribute(
         if only and name not in only:
             skipped[name] = "not asked for"
             continue
-        x = getattr(measured_a, prop.measured)
-        y = getattr(measured_b, prop.measured)
-        change = change_towards(prop, x, y, nominal, a.name)
+        change = change_towards(prop, *measured[name], nominal, a.name)
         if isinstance(change, str):
             skipped[name] = change
             continue
         run("towards", name, a, change)
-        both = change_towards(prop, x, y, everything, a.name)
+        both = change_towards(prop, *measured[name], everything, a.name)
         assert not isinstance(both, str), "a property can be changed alone, but not with others"
         everything = both
     changed = len(rows) - 1
@@ -201,8 +198,7 @@ def attribute(
     return Attribution(
         a=a.name,
         b=b.name,
-        measured_a=measured_a,
-        measured_b=measured_b,
+        measured=measured,
         rows=tuple(rows),
         skipped=skipped,
     )
@@ -290,7 +286,7 @@ def rich_table(found: Attribution, title: str) -> Table:
 def _shown(name: str, found: Attribution) -> list[str]:
     """Return what was measured of a property in A and in B, in words."""
     shown = COMPARED[name].shown
-    return [shown(value) if math.isfinite(value) else "unknown" for value in found.measured(name)]
+    return [shown(value) if math.isfinite(value) else "unknown" for value in found.measured[name]]
 
 
 def not_tried(found: Attribution) -> Iterator[str]:

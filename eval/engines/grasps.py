@@ -20,6 +20,7 @@ from torch import Tensor
 
 from xreset.checks import frozen
 from xreset.errors import DemoError
+from xreset.geometry.dynamics import drive_values
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_rotate_inverse
 from xreset.geometry.shapes import turn_of
@@ -49,12 +50,8 @@ class Grasps(Tensors):
     """Sequence and frame."""
     object_index: Tensor
     """[G] index into the objects."""
-    joint_pos: Tensor
-    """[G, J] rad (m)"""
-    object_pos: Tensor
-    """[G, 3]"""
-    object_quat: Tensor
-    """[G, 4]"""
+    start: State
+    """[G, ...] of the hand and the object, at rest; joint positions in double precision."""
 
     def __len__(self) -> int:
         """G"""
@@ -62,7 +59,7 @@ class Grasps(Tensors):
 
     def __getitem__(self, rows: slice) -> Grasps:
         """Select grasps."""
-        return replace(super().__getitem__(rows), label=self.label[rows])
+        return replace(super().__getitem__(rows), label=self.label[rows], start=self.start[rows])
 
 
 def find_grasps(
@@ -116,12 +113,12 @@ def find_grasps(
     turns = turn_of(object_quat).as_matrix()
     for pos, i, turn in zip(object_pos, object_index, turns, strict=True):
         pos[2] = max(pos[2], CLEARANCE - lowest_point(objects[i].pieces, turn))
+    joint_pos = torch.as_tensor(motion.joint_pos[chosen], dtype=torch.float64)
+    poses = map(torch.as_tensor, (object_pos, object_quat))
     return Grasps(
         label=tuple(f"{motion.sequence_name[s]}:{f}" for s, f in zip(sequence, frame, strict=True)),
         object_index=torch.tensor(object_index, dtype=torch.long),
-        joint_pos=torch.as_tensor(motion.joint_pos[chosen], dtype=torch.float64),
-        object_pos=torch.as_tensor(object_pos),
-        object_quat=torch.as_tensor(object_quat, dtype=torch.float64),
+        start=replace(State.at_rest(joint_pos, *poses), joint_pos=joint_pos),
     )
 
 
@@ -198,7 +195,7 @@ def closing_episode(scene: SceneSpec, grasps: Grasps) -> tuple[State, Tensor]:
     and shakes."""
     kinematics = Kinematics(scene.robot)
     dt = scene.control_dt
-    held = grasps.joint_pos
+    held = grasps.start.joint_pos.double()
     opened = moved_fingertips(kinematics, held, -OPENING)
     closed = squeezed(kinematics, held)
     parts = (
@@ -208,7 +205,8 @@ def closing_episode(scene: SceneSpec, grasps: Grasps) -> tuple[State, Tensor]:
     )
     closing = opened + torch.cat(parts)[:, None, None] * (closed - opened)
     targets = torch.cat((closing, _carried(kinematics, closed, dt)))
-    return State.at_rest(opened, grasps.object_pos, grasps.object_quat), targets.float()
+    start = State.at_rest(opened, grasps.start.object_pos, grasps.start.object_quat)
+    return start, targets.float()
 
 
 def lifting_targets(scene: SceneSpec, start: State) -> Tensor:
@@ -279,9 +277,7 @@ def squeezed(kinematics: Kinematics, joint_pos: Tensor) -> Tensor:
     """
     robot = kinematics.robot
     hand = torch.as_tensor(robot.hand_indices)
-    stiffness = torch.tensor(
-        [robot.joints[i].drive.kp for i in robot.hand_indices], dtype=joint_pos.dtype
-    )
+    stiffness = torch.as_tensor(drive_values(robot, "kp"))[hand]
     q = moved_fingertips(kinematics, joint_pos, REACH)
     share = torch.full((len(robot.fingertips), 1), 1.0 / (len(robot.fingertips) - 1), dtype=q.dtype)
     share[0] = 1.0

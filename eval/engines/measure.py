@@ -21,10 +21,10 @@ from xreset.backends.conformance.scene import shape, solid
 from xreset.checks import frozen
 from xreset.errors import XResetError
 from xreset.eval.rollout import Engine
-from xreset.geometry.dynamics import mass_matrix
+from xreset.geometry.dynamics import drive_values, mass_matrix
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import hull, transformed
-from xreset.geometry.urdf import link_meshes, robot_tree
+from xreset.geometry.urdf import joint_limits, link_meshes
 from xreset.physics import State
 from xreset.spec import GRAVITY, ObjectSpec, SceneSpec, Shape
 
@@ -94,10 +94,6 @@ _WORLDS = {
 _AT = {name: i for i, name in enumerate(_WORLDS)}
 
 
-Log = dict[str, Tensor]
-"""States [T, N, ...] of the worlds after each physics step, the start first, by field."""
-
-
 def measure(engine: Engine, scene: SceneSpec) -> Measured:
     """Put an engine through the experiments.
 
@@ -152,24 +148,23 @@ class _Experiments:
         torsional = max(scene.friction.torsional, 1e-3)
         self._spin = 4.0 * torsional * _SLAB_MASS * GRAVITY / _TOP_INERTIA[2] * _TIME
 
-    def run(self, worlds: Worlds) -> Log:
-        """Play all experiments."""
+    def run(self, worlds: Worlds) -> State:
+        """Play all experiments; return states [T, N, ...] after each physics step, the start first."""
         start = self._start()
         grounded = [index in (_SLAB, _TOP) for index in _WORLDS.values()]
         worlds.set_parameter("object_gravity", torch.tensor(grounded))
         worlds.set(start)
         targets = start.joint_target.clone()
         targets[_AT["drives"]] += torch.as_tensor(self._drive_steps())
-        rows = {name: [value] for name, value in vars(start).items()}
+        states = []
         for step in range(round(_TIME / self._dt)):
             worlds.push(self._loads(step), torch.zeros(3))
             if step % self.scene.substeps == 0:
                 worlds.set_targets(targets)
             worlds.step(1)
-            for name, value in vars(worlds.state()).items():
-                rows[name].append(value)
-        log = {name: torch.stack(values).double() for name, values in rows.items()}
-        sound = torch.cat(list(log.values()), dim=-1).isfinite().all(-1).all(0)
+            states.append(worlds.state())
+        log = start.map(lambda *values: torch.stack(values).double(), *states)
+        sound = torch.cat(list(vars(log).values()), dim=-1).isfinite().all(-1).all(0)
         broken = [name for name, i in _AT.items() if not sound[i]]
         if broken:
             raise XResetError(
@@ -177,13 +172,13 @@ class _Experiments:
             )
         return log
 
-    def measured(self, log: Log) -> Measured:
+    def measured(self, log: State) -> Measured:
         """Return what the worlds' states say of the engine."""
         dt = self._dt
         t = _PUSH_STEPS * dt
         row = _AT["force"]
-        velocity = float(log["object_linvel"][_PUSH_STEPS, row, 0])
-        distance = float(log["object_pos"][_PUSH_STEPS, row, 0] - log["object_pos"][0, row, 0])
+        velocity = float(log.object_linvel[_PUSH_STEPS, row, 0])
+        distance = float(log.object_pos[_PUSH_STEPS, row, 0] - log.object_pos[0, row, 0])
         step = 2.0 * distance / velocity - t
         stiffness, damping = self._drives(log)
         arm = self._robot.arm_indices
@@ -200,37 +195,37 @@ class _Experiments:
             timestep=step,
         )
 
-    def _pulled(self, log: Log, name: str) -> float:
+    def _pulled(self, log: State, name: str) -> float:
         """Return the friction of a paddle, from the impulses that were missing along and across the link."""
         _, normal, along = self._presses[name]
         begin = round((_SETTLE + _PULL_WINDOW[0]) / self._dt)
         end = round((_SETTLE + _PULL_WINDOW[1]) / self._dt)
-        velocity = log["object_linvel"][:, _AT[name]]
+        velocity = log.object_linvel[:, _AT[name]]
         gained = _SLAB_MASS * (velocity[end] - velocity[begin]).numpy()
         time = (end - begin) * self._dt
         carried = self._pull[name] * time - float(gained @ along)
         pressed = _PRESS * time + float(gained @ normal)  # the press pushes against the normal
         return carried / pressed if pressed > 0.05 * _PRESS * time else float("nan")
 
-    def _slid(self, log: Log, step: float) -> float:
+    def _slid(self, log: State, step: float) -> float:
         """Return the friction from how far the slab has slid."""
         world = _AT["slide"]
-        end = log["object_linvel"][-1, world, :2].norm()
-        way = (log["object_pos"][-1, world, :2] - log["object_pos"][0, world, :2]).norm()
+        end = log.object_linvel[-1, world, :2].norm()
+        way = (log.object_pos[-1, world, :2] - log.object_pos[0, world, :2]).norm()
         return float((_SPEED**2 - end**2) / (2 * GRAVITY * (way + _SPEED * step / 2)))
 
-    def _torsion(self, log: Log) -> float:
+    def _torsion(self, log: State) -> float:
         """Return the torsional friction [m] from the spin that a top has lost.
 
         It is measured while the top has half of its spin; NaN if friction takes that in one step.
         """
         world = _AT["spin"]
-        spin = log["object_angvel"][:, world, 2]
+        spin = log.object_angvel[:, world, 2]
         steps = int((spin > spin[0] / 2).long().cumprod(0).sum()) - 1
         if steps < 1:
             return float("nan")
         # its impulse, for the mass
-        load = GRAVITY * steps * self._dt + float(log["object_linvel"][steps, world, 2])
+        load = GRAVITY * steps * self._dt + float(log.object_linvel[steps, world, 2])
         return _TOP_INERTIA[2] / _SLAB_MASS * float(spin[0] - spin[steps]) / load
 
     def _start(self) -> State:
@@ -260,36 +255,27 @@ class _Experiments:
 
     def _drive_steps(self) -> np.ndarray:
         """[J] change of each target, away from the nearer joint limit."""
-        tree = robot_tree(self._robot)
-        steps = np.zeros(len(self._robot.joints), dtype=np.float32)
-        for i, joint in enumerate(self._robot.joints):
-            limits = tree.joint(joint.name)
-            steps[i] = min(
-                _STEP,
-                0.4 * joint.drive.effort / joint.drive.kp,
-                0.2 * (limits.upper - limits.lower),
-            )
-            if limits.upper - joint.home < joint.home - limits.lower:
-                steps[i] *= -1
-        return steps
+        home = self._robot.home
+        lower, upper = joint_limits(self._robot)
+        effort = drive_values(self._robot, "effort") / drive_values(self._robot, "kp")
+        steps = np.minimum(0.4 * effort, 0.2 * (upper - lower)).clip(max=_STEP)
+        return np.where(upper - home < home - lower, -steps, steps).astype(np.float32)
 
-    def _drives(self, log: Log) -> np.ndarray:
+    def _drives(self, log: State) -> np.ndarray:
         """[2, J] shares of kp and kd, after a step of the targets."""
-        position = log["joint_pos"][:, _AT["drives"]].numpy()
-        velocity = log["joint_vel"][:, _AT["drives"]].numpy()
-        drives = [joint.drive for joint in self._robot.joints]
-        M = mass_matrix(self._robot, self._robot.home) + np.diag(
-            [drive.armature for drive in drives]
-        )
-        loss = np.array([drive.friction_loss for drive in drives])
+        position = log.joint_pos[:, _AT["drives"]].numpy()
+        velocity = log.joint_vel[:, _AT["drives"]].numpy()
+        armature = np.diag(drive_values(self._robot, "armature"))
+        M = mass_matrix(self._robot, self._robot.home) + armature
+        loss = drive_values(self._robot, "friction_loss")
         momentum = velocity @ M + np.cumsum(loss * np.sign(velocity), axis=0) * self._dt
         lag = position[0] + self._drive_steps() - position
         pulled = cumulative_trapezoid(lag, dx=self._dt, axis=0, initial=0)
         gains = []
-        for j, drive in enumerate(drives):
+        for j, joint in enumerate(self._robot.joints):
             columns = np.stack((pulled[:, j], position[0, j] - position[:, j]), axis=1)
             fit, *_ = np.linalg.lstsq(columns, momentum[:, j], rcond=None)
-            gains.append(fit / (drive.kp, drive.kd))
+            gains.append(fit / (joint.drive.kp, joint.drive.kd))
         return np.transpose(gains)
 
 
@@ -319,27 +305,25 @@ def _reachable(scene: SceneSpec, *, tip: bool) -> tuple[np.ndarray, np.ndarray, 
         points[name in contact_links].append(transformed(mesh.vertices, T))
     mine = np.concatenate(points[tip])
     others = np.concatenate(points[not tip])
-    best = None
-    best_margin = 0.002
-    for normal in _directions(400):
-        reach = mine @ normal
-        point = mine[reach.argmax()]
-        along = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-        along /= np.linalg.norm(along)
-        if along[2] < 0:
-            along = -along  # away from the table
-        below = min(0.0, 2 * _SLAB_HALF[2] * normal[2])
-        tilted = np.hypot(*_SLAB_HALF[:2]) * np.sqrt(max(0.0, 1 - normal[2] ** 2))
-        margin = float(reach.max() - (others @ normal).max())
-        if point[2] + below - tilted > 0.03 and margin > best_margin:
-            best_margin = margin
-            best = (point, normal, along)
-    if best is None:
+    normals = _directions(400)
+    reach = mine @ normals.T
+    margin = reach.max(axis=0) - (others @ normals.T).max(axis=0)
+    below = np.minimum(0.0, 2 * _SLAB_HALF[2] * normals[:, 2])
+    tilted = np.hypot(*_SLAB_HALF[:2]) * np.sqrt(np.maximum(0.0, 1 - normals[:, 2] ** 2))
+    lowest = mine[reach.argmax(axis=0), 2] + below - tilted
+    margin[lowest <= 0.03] = 0.0
+    best = margin.argmax()
+    if margin[best] <= 0.002:
         what = "fingertip" if tip else "link other than the fingertips"
         raise XResetError(
             f"no {what} of {robot.name!r} at home can be reached from outside, so its friction cannot be measured."
         )
-    return best
+    normal = normals[best]
+    along = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    along /= np.linalg.norm(along)
+    if along[2] < 0:
+        along = -along  # away from the table
+    return mine[reach[:, best].argmax()], normal, along
 
 
 def _directions(count: int) -> np.ndarray:

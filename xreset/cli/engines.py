@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -185,12 +186,12 @@ def compare(
         )
     _print(result)
     for tested in (result.reference, result.floor, *result.engines):
-        if tested.broken:
+        if tested.broken_worlds:
             console.print(
-                f"{tested.engine.name}: {tested.broken} worlds were not finite or dropped contacts",
+                f"{tested.backend}: {tested.broken_worlds} worlds were not finite or dropped contacts",
                 style="bold red",
             )
-    write_measured(json, result.as_dict() | {"inputs": inputs})
+    write_measured(json, asdict(result) | {"ok": not result.missed, "inputs": inputs})
     if result.missed:
         console.print(f"missed: {'; '.join(result.missed)}", style="bold red")
         raise SystemExit(1)
@@ -202,25 +203,22 @@ def _print(result: agreement.Parity) -> None:
     holds = [flags for name, flags in result.reference.carried.items() if name != "closing"]
     held = sum(map(sum, holds))
     tried = sum(map(len, holds))
-    reference = result.reference.engine.name
-    heads = [
-        f"{tested.engine.name}\n{tested.engine.version}, {tested.engine.device}"
-        for tested in columns
-    ]
+    reference = result.reference.backend
+    heads = [f"{tested.backend}\n{tested.version}, {tested.device}" for tested in columns]
     table: list[tuple[str | Text, ...]] = [(f"against {reference}", "target", *heads)]
     for i, row in enumerate(result.floor.metrics):
-        cells = [_cell(tested.metrics[i]) for tested in columns]
+        cells = []
+        for tested in columns:
+            metric = tested.metrics[i]
+            style = "green" if metric.ok else "bold red"
+            number = (_number(metric.measured, metric.unit), style)
+            cells.append(Text.assemble(number, f" (n = {metric.n})"))
         table.append((row.metric, f"{row.sense} {_number(row.target, row.unit)}", *cells))
-    grasps = f"{result.robot.name}, {len(result.objects)} objects: {len(result.closing)} closings, {tried} holds"
-    show_table(
-        table,
-        title=f"{grasps}, of which {reference} carries {sum(result.reference.carried['closing'])} and {held}",
+    closings = result.reference.carried["closing"]
+    grasps = (
+        f"{result.robot}, {len(result.objects)} objects: {len(closings)} closings, {tried} holds"
     )
-
-
-def _cell(metric: agreement.Metric) -> Text:
-    style = "green" if metric.ok else "bold red"
-    return Text.assemble((_number(metric.measured, metric.unit), style), f" (n = {metric.n})")
+    show_table(table, title=f"{grasps}, of which {reference} carries {sum(closings)} and {held}")
 
 
 def _number(value: float | None, unit: str) -> str:

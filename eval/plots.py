@@ -65,19 +65,7 @@ def svg(draw: Callable[[Figure], None], size: tuple[float, float], salt: str) ->
 def figure_style(more: dict[str, Any]) -> Iterator[type[Figure]]:
     """Yield matplotlib's ``Figure`` class; figures made in the block have the style of the project, and ``more``."""
     with needs("matplotlib", "eval"):
-        import matplotlib
+        from matplotlib import style
         from matplotlib.figure import Figure
-    style = {
-        "font.family": "sans-serif",
-        "font.sans-serif": ["DejaVu Sans"],
-        "font.size": 10.5,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.axisbelow": True,
-        "text.parse_math": False,  # a dollar sign in a name is one
-    }
-    style |= dict.fromkeys(
-        ("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), INK
-    )
-    with matplotlib.rc_context(style | more):  # pyright: ignore[reportArgumentType]
+    with style.context([Path(__file__).with_name("project.mplstyle"), more]):
         yield Figure

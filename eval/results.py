@@ -272,7 +272,6 @@ def episode_table(result: EvalResult, episodes: Sequence[Episode], run: str = ""
     least_distance, final_distance, final_position_error [m], final_angle [rad]. What an earlier version did not measure
     is NaN.
     """
-    table = _table(episodes)
     about = {
         "run": run or result.policy,
         "policy": result.policy,
@@ -280,16 +279,13 @@ def episode_table(result: EvalResult, episodes: Sequence[Episode], run: str = ""
         "robot": result.robot,
         "seed": result.seed,
     }
-    for place, (column, value) in enumerate(about.items()):
-        table.insert(place, column, value)
-    return table
+    return _table(episodes, about)
 
 
-def _table(episodes: Sequence[Episode]) -> Table:
-    """Return a row for each episode, with NaN for what was not measured."""
-    table: Table = pd.DataFrame(
-        [asdict(e) for e in episodes], columns=[f.name for f in fields(Episode)]
-    )
+def _table(episodes: Sequence[Episode], about: dict[str, Any]) -> Table:
+    """Return a row for each episode, with NaN for what was not measured; ``about``: columns before its own."""
+    columns = [*about, *(f.name for f in fields(Episode))]
+    table: Table = pd.DataFrame([about | asdict(e) for e in episodes], columns=columns)
     return table.astype({name: float for name in table if table[name].isna().any()})
 
 
@@ -310,7 +306,7 @@ def summarize(rollouts: Rollouts, **about: Any) -> EvalResult:
     Args:
         about: the fields of the result that do not follow from the episodes, such as ``backend`` and ``seed``.
     """
-    episodes = _table(rollouts.episodes)
+    episodes = _table(rollouts.episodes, {})
     rates = _rates(episodes)
     is_measured = rates["published_success_rate"] is not None
     per_demo = []

@@ -22,7 +22,7 @@ from xreset.eval.metrics import EpisodeMetrics, MetricPoints
 from xreset.eval.policy_spec import PolicySpec
 from xreset.eval.results import Episode, Rollouts, Trace
 from xreset.inputs import Data, load_inputs
-from xreset.physics import Backend
+from xreset.physics import Backend, State
 from xreset.plugins import backend_class, device_for, make_backend
 from xreset.policy import Policy
 from xreset.progress import Progress, unseen
@@ -217,20 +217,22 @@ def roll_out(
         nonlocal steps, seconds
         env = played.env
         length = env.max_episode_length
-        recorder = _Recorder(
-            env, [world for world in played.fresh if played.repetition[world] == 0]
-        )
+        every = max(1, round(TRACE_INTERVAL / env.backend.scene.control_dt))
+        shown = [world for world in played.fresh if played.repetition[world] == 0]
         policy.begin(env)
-        recorder.record(0, env.reading())
+        states = [env.reading().state[shown].to("cpu")]
+        targets = []
         for step in range(1, length + 1):
             before = time.perf_counter()
             reading, _ = env.advance(policy.act(env.get_observations()))
             played.update_metrics(reading)
             seconds += time.perf_counter() - before
-            recorder.record(step, reading)
+            targets.append(env.joint_target[shown].cpu())
+            if step % every == 0:
+                states.append(reading.state[shown].to("cpu"))
             progress(played.number * length + step, played.total * length)
         steps += length * env.num_envs
-        traces.extend(recorder.traces())
+        traces.extend(_traces(env, shown, every, states, targets))
 
     return Rollouts(
         episodes=play_rounds(engine, trial, repetitions, play),
@@ -331,54 +333,31 @@ def _episode(played: Round, world: int, bank: ResetBank) -> Episode:
     )
 
 
-_STATES = ("joint_pos", "object_pos", "object_quat")
+def _traces(
+    env: ManipulationEnv, worlds: list[int], every: int, states: list[State], targets: list[Tensor]
+) -> Iterator[Trace]:
+    """Yield the traces of some worlds.
 
-
-class _Recorder:
-    """Records the states of some worlds over an episode."""
-
-    def __init__(self, env: ManipulationEnv, worlds: list[int]) -> None:
-        self._env = env
-        self._worlds = worlds
-        self._every = max(1, round(TRACE_INTERVAL / env.backend.scene.control_dt))
-        self._frames: dict[str, list[np.ndarray]] = {name: [] for name in _STATES}
-        self._targets: list[np.ndarray] = []
-
-    def record(self, step: int, reading: Reading) -> None:
-        """Record a state every few steps, and the targets of every step."""
-        if not self._worlds:
-            return
-        if step % self._every == 0:
-            for name, frames in self._frames.items():
-                frames.append(self._rows(getattr(reading.state, name)))
-        if step:
-            self._targets.append(self._rows(self._env.joint_target))
-
-    def _rows(self, values: torch.Tensor) -> np.ndarray:
-        """A copy, because the environment writes the next values in place."""
-        return values[self._worlds].cpu().numpy().copy()
-
-    def traces(self) -> list[Trace]:
-        """One trace of each recorded world."""
-        if not self._worlds:
-            return []
-        env = self._env
-        frames = {name: np.stack(rows) for name, rows in self._frames.items()}
-        targets = np.stack(self._targets)
-        goal_pos = self._rows(env.goal_pos)
-        goal_quat = self._rows(env.goal_quat)
-        scene = env.backend.scene
-        steps = self._every * np.arange(len(frames["joint_pos"]))
-        traces = []
-        for i, world in enumerate(self._worlds):
-            trace = Trace(
-                sequence=int(env.sequence[world]),
-                object=scene.objects[int(env.backend.object_index[world])].name,
-                goal_pos=goal_pos[i],
-                goal_quat=goal_quat[i],
-                time=steps * scene.control_dt,
-                joint_target=targets[:, i],
-                **{name: values[:, i] for name, values in frames.items()},
-            )
-            traces.append(trace)
-        return traces
+    Args:
+        env: the environment.
+        worlds: indices of the worlds.
+        every: control steps from one state to the next.
+        states: states of these worlds.
+        targets: their drive targets in each control step.
+    """
+    scene = env.backend.scene
+    goal_pos = env.goal_pos[worlds].cpu().numpy()
+    goal_quat = env.goal_quat[worlds].cpu().numpy()
+    for i, world in enumerate(worlds):
+        path = State.cat([state[i : i + 1] for state in states])
+        yield Trace(
+            sequence=int(env.sequence[world]),
+            object=scene.objects[int(env.backend.object_index[world])].name,
+            goal_pos=goal_pos[i],
+            goal_quat=goal_quat[i],
+            time=every * np.arange(len(states)) * scene.control_dt,
+            joint_target=torch.stack(targets)[:, i].numpy(),
+            joint_pos=path.joint_pos.numpy(),
+            object_pos=path.object_pos.numpy(),
+            object_quat=path.object_quat.numpy(),
+        )

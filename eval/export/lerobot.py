@@ -7,6 +7,7 @@ Shape letters: T frames of an episode, J actuated joints.
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -26,18 +27,13 @@ from xreset.pictures.render import Renderer, Size
 from xreset.spec import RobotSpec, SceneSpec
 
 SCHEMA = "xreset-lerobot/1"
-VERSION = "v3.0"
+_FORMAT = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
 _IMAGES = "observation.images."
 VIDEO = _IMAGES + "front"
 _DEPTH = _IMAGES + "depth_"
 """Films of depth cameras, followed by the camera's name: near is bright, nothing is black."""
 Painter = Callable[[Trace, int], np.ndarray]
 """Draws one state of a trace, [H, W, 3]."""
-_POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
-_ENVIRONMENT = [f"object.{axis}" for axis in _POSE] + [f"goal.{axis}" for axis in _POSE]
-_INDICES = ("frame_index", "episode_index", "index", "task_index")
-_CHUNK = 1000
-"""Files of a folder."""
 _FIRST = "chunk-000/file-000.parquet"
 _KEYFRAMES = 2
 """Every second frame can be shown without the frames before it, as in films of LeRobot: training draws frames at
@@ -126,7 +122,7 @@ def _write(root: Path, recording: RecordedEpisodes, videos: tuple[str, ...], siz
             "meta/episodes/file_index": 0,
         }
         for video in videos:
-            chunk, file = divmod(i, _CHUNK)
+            chunk, file = divmod(i, _FORMAT["info"]["chunks_size"])
             film = _draw(recording.robot, episode, video, painters, size)
             path = root / f"videos/{video}/chunk-{chunk:03d}/file-{file:03d}.mp4"
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -167,56 +163,41 @@ def _write(root: Path, recording: RecordedEpisodes, videos: tuple[str, ...], siz
 
 
 def _info(recording: RecordedEpisodes, tasks: int, features: dict[str, Any]) -> dict[str, Any]:
-    file = "chunk-{chunk_index:03d}/file-{file_index:03d}"
     count = len(recording.episodes)
-    return {
-        "codebase_version": VERSION,
+    info = _FORMAT["info"] | {
         "robot_type": recording.robot.name,
         "total_episodes": count,
         "total_frames": int(recording.offsets[-1]),
         "total_tasks": tasks,
-        "chunks_size": _CHUNK,
-        "data_files_size_in_mb": 100,
-        "video_files_size_in_mb": 200,
         "fps": int(recording.fps) if recording.fps.is_integer() else recording.fps,
         "splits": {"train": f"0:{count}"},
-        "data_path": f"data/{file}.parquet",
-        "video_path": f"videos/{{video_key}}/{file}.mp4" if VIDEO in features else None,
         "features": features,
     }
+    if VIDEO not in features:
+        info["video_path"] = None
+    return info
 
 
 def _features(
     recording: RecordedEpisodes, videos: tuple[str, ...], size: Size
 ) -> dict[str, dict[str, Any]]:
     joints = list(recording.robot.joint_names)
-    vectors = {
-        "observation.state": joints,
-        "observation.environment_state": _ENVIRONMENT,
-        "action": joints,
+    vector = {"dtype": "float32", "shape": [len(joints)], "names": joints}
+    features = {
+        "observation.state": vector,
+        "observation.environment_state": _FORMAT["environment"],
+        "action": vector,
     }
-    features: dict[str, dict[str, Any]] = {}
-    for key, names in vectors.items():
-        features[key] = {"dtype": "float32", "shape": [len(names)], "names": names}
     width, height = size
+    about = {"video.height": height, "video.width": width, "video.fps": recording.fps}
     for video in videos:
         features[video] = {
             "dtype": "video",
             "shape": [height, width, 3],
             "names": ["height", "width", "channels"],
-            "info": {
-                "video.height": height,
-                "video.width": width,
-                "video.codec": "h264",
-                "video.pix_fmt": "yuv420p",
-                "video.is_depth_map": False,
-                "video.fps": recording.fps,
-                "video.channels": 3,
-                "has_audio": False,
-            },
+            "info": _FORMAT["video"] | about,
         }
-    scalars = {"engine": "string", "timestamp": "float32"} | dict.fromkeys(_INDICES, "int64")
-    for key, kind in scalars.items():
+    for key, kind in _FORMAT["scalars"].items():
         features[key] = {"dtype": kind, "shape": [1], "names": None}
     return features
 

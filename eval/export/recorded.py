@@ -66,7 +66,7 @@ def read_recorded(
     backends: Sequence[str] = (),
     robot: str | None = None,
     objects: Path | None = None,
-    task: str = TASK,
+    task: str | None = None,
 ) -> RecordedEpisodes:
     """Read the recorded episodes of evaluations: the first of each demonstration and engine.
 
@@ -77,13 +77,17 @@ def read_recorded(
         backends: only these engines; empty: all.
         robot: name or folder of the robot; None: as the results name it.
         objects: folder of meshes; None: as the results name it.
-        task: the task in words; ``{object}`` stands for the object's name.
+        task: the task in words, in which ``{object}`` stands for the object's name; default: :data:`TASK`.
 
     Raises:
-        RunError: a folder does not exist, or none holds episodes of the engines; or the episodes have two robots or
-            rates.
+        RunError: no folder is given, one does not exist, or none holds episodes of the engines; or the episodes have
+            two robots or rates.
         FileFormatError: a file is damaged, or older than recorded actions.
     """
+    if not folders:
+        raise RunError(
+            "Nothing to export. Give a run folder, or a folder that xreset eval wrote into."
+        )
     rows = []
     robots: dict[str, RobotSpec] = {}
     intervals: dict[float, Path] = {}
@@ -96,14 +100,13 @@ def read_recorded(
             if backends and engine not in backends:
                 continue
             name = robot or result.robot
-            if name not in robots:
-                robots[name] = load_robot(name)
-            traces = read_traces(results, engine, robots[name].joint_names)
+            spec = robots[name] = robots.get(name) or load_robot(name)
+            traces = read_traces(results, engine, spec.joint_names)
             file = results / f"{engine}.trace.npz"
             inputs[f"trace {len(inputs)}"] = file_hash(file)
             shown = recorded(evaluation.to_frame(), engine, traces)
             for episode in shown.to_dict("records"):
-                trace = episode.pop("trace")
+                trace = episode["trace"]
                 action = _actions(trace, file)
                 intervals.setdefault(round(float(np.median(np.diff(trace.time))), 6), results)
                 if not (trace.finite.all() and np.isfinite(action).all()):
@@ -114,12 +117,9 @@ def read_recorded(
                         trace.sequence,
                     )
                     continue
-                episode |= {
-                    "task": task.replace("{object}", short_name(trace.object)),
-                    "trace": trace,
-                    "action": action,
-                    "meshes": result.meshes(objects),
-                }
+                episode["task"] = (task or TASK).replace("{object}", short_name(trace.object))
+                episode["action"] = action
+                episode["meshes"] = result.meshes(objects)
                 rows.append(episode)
     if not rows:
         of = f" of {', '.join(backends)}" if backends else ""

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 from xreset import runtime
 from xreset.cli._common import Policy, Robot, Several, Sources, TrainedObjects
 from xreset.cli._terminal import console
-from xreset.errors import RunError
 
 if TYPE_CHECKING:
     from xreset.eval.export import recorded
@@ -40,8 +39,11 @@ def lerobot(
         camera: Also draw films of this depth camera: front, side or wrist; give it again for more.
     """
     from xreset.eval.export import lerobot as dataset
+    from xreset.eval.export import recorded
 
-    recording = _recording(folders, backend, robot, objects, task)
+    recording = recorded.read_recorded(
+        folders, backends=backend, robot=robot, objects=objects, task=task
+    )
     with console.status("writing episodes"):
         dataset.write_lerobot(out, recording, video=video, size=size, cameras=camera)
     _say(recording, out)
@@ -65,7 +67,7 @@ def npz(
     """
     from xreset.eval.export import recorded
 
-    recording = _recording(folders, backend, robot, None, task)
+    recording = recorded.read_recorded(folders, backends=backend, robot=robot, task=task)
     recorded.write_arrays(out, recording)
     _say(recording, out)
 
@@ -98,24 +100,6 @@ def deploy(
     )
     console.print(f"objects: {', '.join(named)}")
     console.print(f"Try it: cd {out} && python -m runtime")
-
-
-def _recording(
-    folders: tuple[Path, ...],
-    backends: tuple[str, ...],
-    robot: str | None,
-    objects: Path | None,
-    task: str | None,
-) -> recorded.RecordedEpisodes:
-    from xreset.eval.export import recorded
-
-    if not folders:
-        raise RunError(
-            "Nothing to export. Give a run folder, or a folder that xreset eval wrote into."
-        )
-    return recorded.read_recorded(
-        folders, backends=backends, robot=robot, objects=objects, task=task or recorded.TASK
-    )
 
 
 def _say(recording: recorded.RecordedEpisodes, out: Path) -> None:

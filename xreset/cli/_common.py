@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
@@ -12,10 +11,9 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from xreset.accounts import Account, described
 from xreset.cli import INVOCATION
-from xreset.cli._terminal import Progress, console, show_table
+from xreset.cli._terminal import console, show_table
 from xreset.files import code_version, write_json
 from xreset.plugins import backend_names, backend_status
-from xreset.progress import NamedProgress
 
 if TYPE_CHECKING:
     from xreset.eval import rollout
@@ -66,21 +64,6 @@ Host = Annotated[str, arg(help="Address to serve at; 0.0.0.0 allows other machin
 Port = Annotated[int, arg(help="Port to serve at; if it is taken, the next free one.")]
 
 
-@contextmanager
-def engine_bars(names: Sequence[str]) -> Iterator[NamedProgress]:
-    """Show a progress bar for each engine; yields the function that moves them: (engine, steps done, steps in all)."""
-    with Progress() as bar:
-        counts = {name: bar.count(name) for name in names}
-        yield lambda name, done, total: counts[name](done, total)
-
-
-def chosen_engines(names: Sequence[str], device: str) -> list[rollout.Engine]:
-    """Return the engines of these names, each once; without names, MuJoCo."""
-    from xreset.eval import rollout
-
-    return rollout.chosen_engines(names or "mujoco", device)
-
-
 def usable_engines() -> list[str]:
     """Return the names of the engines that can be used here, and print why others cannot."""
     statuses = [backend_status(name) for name in backend_names()]
@@ -92,7 +75,9 @@ def usable_engines() -> list[str]:
 
 def quick_engines(names: Sequence[str], device: str) -> list[rollout.Engine]:
     """Return the engines of these names; without names, all that can be used here and are not slow on the device."""
-    engines = chosen_engines(names or usable_engines(), device)
+    from xreset.eval import rollout
+
+    engines = rollout.chosen_engines(names or usable_engines(), device)
     return [each for each in engines if names or not each.slow]
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from xreset.cli._common import Engines, Flat, PolicyOrBaseline, engine_bars
-from xreset.cli._terminal import console
+from xreset.cli._common import Engines, Flat, PolicyOrBaseline
+from xreset.cli._terminal import Progress, console
 from xreset.eval import table
 from xreset.eval.setting import Setting
 
@@ -37,17 +37,16 @@ def evaluate(
     from xreset.eval import evaluate as evaluation
     from xreset.eval import policy_spec
 
-    engines = tuple(dict.fromkeys(backend or ("mujoco",)))
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
-    with engine_bars(engines) as progress:
+    with Progress() as bar:
         summaries = evaluation.evaluate(
             spec,
             demos,
-            engines,
+            tuple(dict.fromkeys(backend or ("mujoco",))),
             episodes=episodes,
             settle=settle,
             out=out,
-            progress=progress,
+            progress=bar.stages(),
             **vars(setting),
         )
     console.print(table.results_table(summaries))

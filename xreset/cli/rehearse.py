@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from xreset.cli._common import Flat, Policy, Several, engine_bars, quick_engines
-from xreset.cli._terminal import console, show_table
+from xreset.cli._common import Flat, Policy, Several, quick_engines
+from xreset.cli._terminal import Progress, console, show_table
 from xreset.eval.setting import Setting
 
 
@@ -40,19 +40,17 @@ def rehearse(
     engines = quick_engines(backend, setting.device)
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
     folder = out or spec.folder.parent / "rehearsal"
-    with engine_bars([e.name for e in engines]) as progress:
+    with Progress() as bar:
         found = rehearsal.rehearse(
             spec,
             demos,
             engines,
             faults=fault,
             episodes=episodes,
-            seed=setting.seed,
-            objects=setting.objects,
-            num_envs=setting.num_envs,
             real_time=real_time,
             out=folder,
-            progress=progress,
+            progress=bar.stages(),
+            **vars(setting),
         )
     table = [
         ("fault", *(f"{card.backend}, {100 * card.task_progress:.0f} % without" for card in found))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from xreset.cli._common import Flat, Several, Source, chosen_engines
+from xreset.cli._common import Flat, Several, Source
 from xreset.cli._terminal import console, show_table
 from xreset.eval.setting import Setting
 
@@ -34,9 +34,10 @@ def select(
         setting: Robot, meshes, device and worlds; --seed is not used, see --starts.
         starts: Seed of the starts; default: one that evaluations do not use.
     """
+    from xreset.eval import rollout
     from xreset.eval import select as selection
 
-    engines = chosen_engines(backend or ("mujoco", "pybullet", "sapien"), setting.device)
+    engines = rollout.chosen_engines(backend or ("mujoco", "pybullet", "sapien"), setting.device)
 
     def say(name: str, engine: str, score: float) -> None:
         console.print(f"{name} in {engine}: {100 * score:.1f} %")

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from xreset.cli._common import Engines, Flat, PolicyOrBaseline, Several, chosen_engines, engine_bars
-from xreset.cli._terminal import console, show_table
+from xreset.cli._common import Engines, Flat, PolicyOrBaseline, Several
+from xreset.cli._terminal import Progress, console, show_table
 from xreset.eval.setting import Setting
 
 if TYPE_CHECKING:
@@ -37,13 +37,13 @@ def stress(
     from xreset.eval import stress as sweeps
 
     properties = sensitivity.chosen(property)
-    engines = chosen_engines(backend, setting.device)
+    engines = rollout.chosen_engines(backend or "mujoco", setting.device)
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
     folder = out or spec.folder.parent / "stress"
     played = rollout.load_trial(
         spec, demos, objects=setting.objects, seed=setting.seed, num_envs=setting.num_envs
     )
-    with engine_bars([e.name for e in engines]) as progress:
+    with Progress() as bar:
         found = sweeps.stress(
             spec,
             played,
@@ -51,7 +51,7 @@ def stress(
             folder,
             sweeps=properties,
             repetitions=episodes,
-            progress=progress,
+            progress=bar.stages(),
         )
     sweeps.write_plot(folder / "stress.png", found, f"{spec.name}: robustness")
     table = [("property", "value", *(result.backend for result in found))]

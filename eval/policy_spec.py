@@ -194,13 +194,10 @@ def load_policy(
     spec = load_robot(robot or contract.robot)
     check_contract(str(file), contract, spec, contract.task)
 
-    def start(motion: Retargeted | None) -> Policy:
-        return OnnxPolicy(file)
-
     is_chosen = choice is not None and choice.policy_hash == loaded.hash
     return PolicySpec(
         name=name,
-        start=start,
+        start=lambda motion: OnnxPolicy(file),
         robot=spec,
         task=contract.task,
         folder=folder / "eval",
@@ -217,16 +214,14 @@ def _baseline(name: str, robot: str | Path | None, seed: int) -> PolicySpec:
         raise PolicyError(f"The baseline {name!r} needs a robot. Add --robot.")
     spec = load_robot(robot)
 
-    def start(motion: Retargeted | None) -> Policy:
-        if name == "zero":
-            return ZeroPolicy(len(spec.joints))
-        if name == "random":
-            return RandomPolicy(len(spec.joints), seed)
-        assert motion is not None, "the baseline ik needs motion"
-        return KinematicRetargeting(motion)
-
+    joints = len(spec.joints)
+    makers: dict[str, Callable[..., Policy]] = {
+        "zero": lambda motion: ZeroPolicy(joints),
+        "random": lambda motion: RandomPolicy(joints, seed),
+        "ik": KinematicRetargeting,
+    }
     folder = Path("runs") / f"{name}-{spec.name}" / "eval"
-    return PolicySpec(name=name, start=start, robot=spec, task=TaskConfig(), folder=folder)
+    return PolicySpec(name=name, start=makers[name], robot=spec, task=TaskConfig(), folder=folder)
 
 
 class KinematicRetargeting:
@@ -241,7 +236,6 @@ class KinematicRetargeting:
     def __init__(self, motion: Retargeted) -> None:
         """Take motion, in the order of the environment's demonstrations."""
         self._motion = motion
-        self._env: ManipulationEnv | None = None
 
     def begin(self, env: ManipulationEnv) -> None:
         """Lay out the targets [N, steps, J] of the episodes that have just begun."""
@@ -266,7 +260,6 @@ class KinematicRetargeting:
     def act(self, observations: TensorDict) -> Tensor:
         """Return the actions [N, J] that bring the targets nearest to the plan."""
         env = self._env
-        assert env is not None, "begin() comes before act()"
         wanted = self._plan[:, min(self._step, self._plan.shape[1] - 1)]
         self._step += 1
         return env.actions.action_for(wanted, env.joint_target)

@@ -76,9 +76,9 @@ def select(
     best: Candidate | None = None
     order = engines
     with tempfile.TemporaryDirectory(prefix="xreset-") as scratch:
-        files: dict[str, Path] = {}
+        chosen = Path(scratch)
         for path in found:
-            file = files[path.name] = Path(scratch) / f"{path.stem}.onnx"
+            file = Path(scratch) / f"{path.stem}.onnx"
             export_checkpoint(folder, path, file)
             policy = load_policy(file, robot=setting.robot)
             trial = load_trial(
@@ -96,11 +96,12 @@ def select(
             played.append(candidate)
             if candidate.worst > bar:
                 best = candidate
+                chosen = file
                 order = sorted(engines, key=lambda engine: scores[engine.name])
         assert best is not None
         choice = Choice(
             chosen=best.name,
-            policy_hash=file_hash(files[best.name]),
+            policy_hash=file_hash(chosen),
             candidates=tuple(played),
             engines={e.name: e.version for e in engines},
             seed=setting.seed,
@@ -109,5 +110,5 @@ def select(
         )
         # A kill after this line does no harm: a run whose policy is not the chosen checkpoint's exports it again.
         write_choice(folder, choice)
-        write_whole(folder / "policy.onnx", files[best.name].read_bytes())
+        write_whole(folder / "policy.onnx", chosen.read_bytes())
     return choice

@@ -13,7 +13,7 @@ from xreset.errors import XResetError as XResetError
 from xreset.eval.evaluate import evaluate as evaluate
 from xreset.eval.export.deploy import export_deploy as export_deploy
 from xreset.eval.film import film as film
-from xreset.eval.play.run import play as play
+from xreset.eval.play.page import play as play
 from xreset.eval.policy_spec import PolicySpec as PolicySpec
 from xreset.eval.policy_spec import load_policy as load_policy
 from xreset.eval.rehearse import Rehearsal as Rehearsal

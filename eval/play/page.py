@@ -19,11 +19,13 @@ from xreset.errors import XResetError
 from xreset.eval.play.record import draw_film, last_moments, write_trace
 from xreset.eval.play.session import Session
 from xreset.eval.plots import COLORS
+from xreset.eval.policy_spec import PolicySpec
 from xreset.pictures.meshes import GOAL_COLOR, OBJECT_COLOR, rgb
 from xreset.pictures.view.colors import TOUCH_COLOR
-from xreset.pictures.view.server import RobotMeshes, WebPage
+from xreset.pictures.view.server import RobotMeshes, WebPage, serve_until_interrupted
 from xreset.plugins import backend_names, robot_names
 from xreset.policies import shipped
+from xreset.tensors import one_thread
 from xreset.text import short_name
 
 HELP = "Drag the **green shape**, and the robot brings the object there. Pull at the object or the robot to disturb it."
@@ -50,6 +52,53 @@ BEHIND = 0.2
 """A delay behind the clock from which the page does not try to catch up [s]."""
 GROWTH = 1.03
 """Size of the goal next to the object, so that a pointer meets the goal first where both are in one place."""
+
+
+def play(
+    policy: str | Path | PolicySpec = "many-objects",
+    *,
+    thing: str | None = None,
+    engine: str = "mujoco",
+    robot: str | Path | None = None,
+    demos: str | Path | None = None,
+    objects: str | Path | None = None,
+    seed: int = 0,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+) -> None:
+    """Serve a live episode as a web page until Ctrl-C. Its visitors drag the goal and disturb the robot.
+
+    Args:
+        policy: as for :func:`~xreset.eval.policy_spec.load_policy`.
+        thing: name of the object to begin with; None: the soup can, or else the first object.
+        engine: name of the engine to begin with.
+        robot: default: the policy's.
+        demos: starts and goals, from a file of demonstrations, motion or reset states; None: synthetic ones.
+        objects: folder of object meshes; None: the folder of the policy's training, or the stand-ins.
+        seed: chooses starts and goals.
+        host: address to serve at; 0.0.0.0 allows other machines.
+        port: port to serve at; if it is taken, the next free one.
+
+    Raises:
+        XResetError: something cannot be loaded, or the server does not start.
+    """
+    print("Loading the policy, the object and the engine ...", flush=True)
+    with one_thread():
+        session = Session(
+            policy,
+            thing=thing,
+            engine=engine,
+            robot=robot,
+            demos=Path(demos) if demos else None,
+            objects=Path(objects) if objects else None,
+            seed=seed,
+        )
+        try:
+            page = Page(session, host=host, port=port)
+            print(f"{session.policy.name} plays at {page.url}. Ctrl-C ends.", flush=True)
+            serve_until_interrupted(page)
+        finally:
+            session.close()
 
 
 class Page(WebPage):

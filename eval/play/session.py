@@ -20,6 +20,7 @@ from xreset.demos.synth import synthesize
 from xreset.env import ManipulationEnv
 from xreset.errors import XResetError
 from xreset.eval.policy_spec import PolicySpec, load_policy
+from xreset.geometry.dynamics import drive_values
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_angle, quat_rotate, quat_rotate_inverse
 from xreset.inputs import Inputs, load_inputs
@@ -185,14 +186,13 @@ class Session:
         """Open worlds; where this fails, the session stays as it was."""
         policy = load_policy(policy, robot=robot, seed=self._seed)
         folder = policy.meshes(self._folder)
-        source = self._demos
-        if source is None:
+        if self._demos is None:
             names = object_names(folder)
-            thing = canonical_name(thing or _usual(names), names)
-            source = synthesize([thing], STARTS, self._seed, meshes=folder)
         else:
-            names = load_inputs(source, robot=policy.robot, objects=folder).bank.object_names
-            thing = canonical_name(thing or _usual(names), names)
+            names = load_inputs(self._demos, robot=policy.robot, objects=folder).bank.object_names
+        usual = ALIASES["soup"]
+        thing = canonical_name(thing or (usual if usual in names else names[0]), names)
+        source = self._demos or synthesize([thing], STARTS, self._seed, meshes=folder)
         inputs = load_inputs(source, robot=policy.robot, objects=folder, only=[thing])
         env = self._make_env(policy, inputs, self.engine)
         try:
@@ -209,9 +209,7 @@ class Session:
         self._player: Policy = player
         spec = policy.robot
         self._kinematics = Kinematics(spec)
-        self._stiffness = torch.tensor(
-            [joint.drive.kp for joint in spec.joints], dtype=torch.float32
-        )
+        self._stiffness = torch.as_tensor(drive_values(spec, "kp")).float()
         self.inputs = _slices(
             layout(len(spec.joints), len(spec.fingertips), policy.task.observation)
         )
@@ -429,11 +427,6 @@ class Session:
 
     def _make_env(self, policy: PolicySpec, inputs: Inputs, engine: str) -> ManipulationEnv:
         return policy.make_env(inputs.objects, inputs.bank, engine=engine, seed=self._seed)
-
-
-def _usual(names: Sequence[str]) -> str:
-    """The object to begin with: the soup can, or else the first."""
-    return ALIASES["soup"] if ALIASES["soup"] in names else names[0]
 
 
 def _slices(groups: dict[str, dict[str, int]]) -> dict[str, slice]:

@@ -59,7 +59,7 @@ def write_page(plan: Plan, out: Path) -> tuple[Path, list[str]]:
         notes=notes,
         compared=_compare(plan, out),
         lifted={
-            label: lifted(_clocks(plan), x) for x, (label, _) in AXES.items() if x != "iterations"
+            label: lifted(_clocks(plan), x) for x, (label, *_) in AXES.items() if x != "iterations"
         },
         versions=caption(run.spec.policy or "" for run in plan.runs),
     )

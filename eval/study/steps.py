@@ -313,14 +313,13 @@ def _xreset(verb: str, *words: object, **options: Any) -> list[str]:
     return [sys.executable, "-m", "xreset", verb, *map(str, words), *flags(options)]
 
 
-def flags(values: dict[str, Any], prefix: str = "--") -> Iterator[str]:
+def flags(values: dict[str, Any]) -> Iterator[str]:
     """Yield values, which may be nested, as options of a command; None gives no option."""
-    for name, value in values.items():
-        flag = name.replace("_", "-")
-        if isinstance(value, dict):
-            yield from flags(value, f"{prefix}{flag}.")
-        elif isinstance(value, bool):
-            yield f"{prefix}{flag}" if value else f"{prefix}no-{flag}"
+    for name, value in flat(values):
+        group, dot, last = name.replace("_", "-").rpartition(".")
+        flag = f"--{group}{dot}{last}"
+        if isinstance(value, bool):
+            yield flag if value else f"--{group}{dot}no-{last}"
         elif value is not None:
-            yield prefix + flag
+            yield flag
             yield from map(str, np.array(value, dtype=object).ravel())  # a schedule holds pairs

@@ -39,7 +39,9 @@ def checked(command: Callable[..., None]) -> Callable[..., None]:
 
     @wraps(command)
     def run(*positional: Any, **named: Any) -> None:
-        options = _flat(signature(command).bind(*positional, **named).arguments)
+        options: dict[str, Any] = {}
+        for name, value in signature(command).bind(*positional, **named).arguments.items():
+            options |= vars(value) if isinstance(value, Options) else {name: value}
         _check(options)
         with ExitStack() as claims:
             for name in _WRITTEN:
@@ -50,13 +52,6 @@ def checked(command: Callable[..., None]) -> Callable[..., None]:
             command(*positional, **named)
 
     return run
-
-
-def _flat(options: dict[str, Any]) -> dict[str, Any]:
-    flat = {}
-    for name, value in options.items():
-        flat.update(vars(value) if isinstance(value, Options) else {name: value})
-    return flat
 
 
 def _check(options: dict[str, Any]) -> None:

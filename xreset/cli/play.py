@@ -28,9 +28,9 @@ def play(
             demonstrations.
         seed: Chooses starts and goals.
     """
-    from xreset.eval.play import run
+    from xreset.eval.play import page
 
-    run.play(
+    page.play(
         policy,
         thing=object,
         engine=backend,

@@ -16,6 +16,7 @@ from tests import toy_grasp
 from xreset.env import ManipulationEnv, make_scene
 from xreset.eval.report.read import read_curves
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
+from xreset.learning.recipes import RECIPES
 from xreset.learning.runner import TrainingRunner
 from xreset.policy import RandomPolicy
 from xreset.resets.distribution import ResetDistribution
@@ -47,6 +48,19 @@ CONFIG = TrainConfig(
     iterations=60,
     save_interval=1000,
 )
+_MINUTES = RECIPES["minutes"].config.task
+RECIPE = replace(
+    CONFIG,
+    task=replace(
+        _MINUTES,
+        action=replace(_MINUTES.action, arm_step=0.02, hand_zero="home"),
+        observation=replace(_MINUTES.observation, cloud_points=8),
+        termination=CONFIG.task.termination,
+        reset=CONFIG.task.reset,
+        distance_points=32,
+    ),
+)
+"""The same training in the task of the recipe ``minutes``: control at 30 Hz, paired points, its actions and rewards."""
 
 
 def shares(mean):
@@ -91,20 +105,20 @@ def trained(seed, backend, config=CONFIG):
     """What a training does in its last iterations in the backend's worlds of :func:`scene`, and its steps in all worlds."""
     torch.manual_seed(seed)
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(StringIO()):
-        runner = TrainingRunner(environment(seed, backend), config, Path(folder))
+        runner = TrainingRunner(environment(seed, backend, config.task), config, Path(folder))
         runner.learn(config.iterations)
         curves = read_curves(Path(folder))
     return shares(lambda name: curves[name].iloc[-LAST:].mean()), runner.env_steps
 
 
-def scene():
+def scene(task=CONFIG.task):
     """Gripper and brick."""
-    return make_scene(toy_grasp.robot(), (toy_grasp.brick(),), CONFIG.task)
+    return make_scene(toy_grasp.robot(), (toy_grasp.brick(),), task)
 
 
-def environment(seed, backend):
-    """The task in the backend's worlds."""
+def environment(seed, backend, task=CONFIG.task):
+    """A task in the backend's worlds."""
     resets = ResetDistribution(
-        bank(), toy_grasp.robot(), (toy_grasp.brick().name,), CONFIG.task.reset, backend.device
+        bank(), toy_grasp.robot(), (toy_grasp.brick().name,), task.reset, backend.device
     )
-    return ManipulationEnv(backend, CONFIG.task, resets, seed=seed)
+    return ManipulationEnv(backend, task, resets, seed=seed)

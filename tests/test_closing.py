@@ -166,10 +166,9 @@ class FingersTest(TestCase):
         weight = 9.81 * toy_grasp.brick().mass
         by_force = squeeze_targets(ROBOT, fingers, joints, SqueezeConfig(force=1.0 + 2 * weight))
         by_weight = squeeze_targets(ROBOT, fingers, joints, SqueezeConfig(force=1.0, weight=2.0))
-        np.testing.assert_allclose(by_weight, by_force, atol=1e-9)
+        assert_allclose(by_weight, by_force, atol=1e-9)
         self.assertTrue(SqueezeConfig(weight=1.0).presses)
-        with self.assertRaisesRegex(ValueError, "no force to balance"):
-            SqueezeConfig(balanced=True)
+        self.assertRaisesRegex(ValueError, "no force to balance", SqueezeConfig, balanced=True)
 
     def test_levers_lead_from_the_centre_of_mass_to_the_finger(self):
         fingers, joints = self.fingers(0.0201)
@@ -179,7 +178,7 @@ class FingersTest(TestCase):
         turn = Rotation.from_quat(toy_grasp.brick_pose()[1], scalar_first=True)
         shift = turn.apply(off_center) @ wrist.numpy()
         sideways = (fingers.lever[0] @ wrist).numpy()
-        np.testing.assert_allclose(sideways[:2], [0.0201 - shift, -0.0201 - shift], atol=3e-4)
+        assert_allclose(sideways[:2], [0.0201 - shift, -0.0201 - shift], atol=3e-4)
 
     def test_balanced_forces_nearly_cancel(self):
         """A thumb against four fingers; and a thumb that nothing opposes."""
@@ -204,7 +203,7 @@ class FingersTest(TestCase):
         thumb, others = float(factor[0, 0]), factor[0, 1:]
         self.assertAlmostEqual(float(factor[0].mean()), 1.0)
         self.assertAlmostEqual(thumb, float(others.sum()), delta=0.1)
-        np.testing.assert_allclose(others, others.mean().expand(4), atol=1e-6)
+        assert_allclose(others, others.mean().expand(4), atol=1e-6)
         self.assertEqual(factor[1].tolist(), [1, 0, 0, 0, 0])
 
     def test_a_squeeze_is_as_far_beyond_as_its_force_takes(self):

@@ -315,7 +315,7 @@ class FailureTest(Reported):
         rollouts = toy_rollouts()
         mixed = (SOUP, SOUP, SOUP, SPAM)
         for progress, objects, count, expected in (
-            ((0.66, 1.0, 0.33, 0.66), (SOUP,) * 4, 3, [2, 0, 3]),
+            ((0.66, 1.0, 0.33, 0.66), (SOUP,) * 4, 4, [2, 0, 3]),
             ((0.0, 0.0, 0.0, 0.66), mixed, 2, [0, 3]),
             ((0.0, 0.0, 0.0, 0.66), mixed, 4, [0, 1, 2, 3]),
         ):

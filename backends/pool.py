@@ -11,7 +11,7 @@ import math
 import weakref
 from abc import ABC, abstractmethod
 from dataclasses import fields
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -19,28 +19,18 @@ from torch import Tensor
 
 from xreset.backends.rigid import ContactArrays, Inertia, LinkArrays, StateArrays
 from xreset.backends.workers import (
+    CONTACT_FIELDS,
     STATE_FIELDS,
-    Arrays,
     Job,
     LocalWorlds,
     WorkerTeam,
+    arrays_in,
+    layout_of,
     usable_cores,
 )
 from xreset.errors import CapabilityError, XResetError
-from xreset.physics import (
-    Backend,
-    Contacts,
-    Health,
-    Links,
-    MassProperties,
-    Parameter,
-    Parameters,
-    State,
-)
+from xreset.physics import Backend, Contacts, Health, Links, MassProperties, Parameter, State
 from xreset.spec import SceneSpec
-from xreset.tensors import Tensors
-
-_Bundle = TypeVar("_Bundle", bound=Tensors)
 
 
 class World(ABC):
@@ -153,7 +143,7 @@ class PoolBackend(Backend):
     """N worlds of a CPU engine, spread over worker processes.
 
     A subclass sets ``name``, ``capabilities`` and ``world_class`` and returns its engine's version. Getters return
-    views of memory that the next command overwrites; inputs are read at the next step.
+    views of shared memory; inputs are read at the next step.
 
     One :meth:`step` is one round trip to each worker, after which all readings are there.
     """
@@ -195,42 +185,40 @@ class PoolBackend(Backend):
             workers = 0 if num_worlds == 1 else usable_cores()
         if workers < 0:
             raise ValueError(f"workers is {workers}, expected 0 or more")
+        layout = layout_of(scene, self.object_index)
         jobs = []
         for worlds in np.array_split(np.arange(num_worlds), max(min(workers, num_worlds), 1)):
             held = tuple(self.object_index[worlds].tolist())
             jobs.append(
                 Job(self.name, self.world_class, world_options, scene, int(worlds[0]), held)
             )
-        self._team = WorkerTeam(jobs) if workers else LocalWorlds(jobs[0])
+        if workers == 0:
+            self._arrays = arrays_in(bytearray(layout.itemsize), layout)
+            self._team: LocalWorlds | WorkerTeam = LocalWorlds(jobs[0], self._arrays)
+        else:
+            self._team = WorkerTeam(jobs, layout)
+            self._arrays = self._team.arrays
         # also runs when the interpreter exits
         self._close = weakref.finalize(self, self._team.close)
-        self._every = np.arange(num_worlds)
-        self._wrench = np.zeros((num_worlds, 6), np.float32)
-        self._nominal = Parameters.nominal(scene, self.object_index)
-        state = State.initial(scene, self.object_index)
+        views = {name: torch.from_numpy(array) for name, array in self._arrays.items()}
+        self._state = State(**{name: views[name] for name in STATE_FIELDS})
+        self._links = Links(**{field.name: views[f"link_{field.name}"] for field in fields(Links)})
+        self._contacts = Contacts(**{name: views[name] for name in CONTACT_FIELDS})
+        self._health = Health(nonfinite=views["nonfinite"], overflow=views["overflow"])
+        self._state.map(Tensor.copy_, State.initial(scene, self.object_index))
         try:
-            self._command("build", values={name: x.numpy() for name, x in vars(state).items()})
+            self._command("build")
         except BaseException:
             self.close()
             raise
-        self._state = self._reported(State)
-        self._links = self._reported(Links)
-        self._contacts = self._reported(Contacts)
-        self._health = self._reported(Health)
-
-    def _reported(self, kind: type[_Bundle]) -> _Bundle:
-        """Return views of what the worlds report, as a bundle of this kind."""
-        arrays = self._team.arrays
-        return kind(**{field.name: torch.from_numpy(arrays[field.name]) for field in fields(kind)})
 
     def set_state(self, state: State, worlds: Tensor | None = None) -> None:
         index = self._selected(worlds)
-        values = {}
-        for name in STATE_FIELDS:
-            shape = getattr(self._state, name).shape[1:]
-            values[name] = self._checked(name, getattr(state, name), (len(index), *shape)).numpy()
-        self._wrench[index] = 0.0
-        self._command("set_state", index, values)
+        values = {name: self._rows(name, getattr(state, name), len(index)) for name in STATE_FIELDS}
+        for name, value in values.items():
+            self._arrays[name][index] = value
+        self._arrays["wrench"][index] = 0.0
+        self._command("set_state", index)
 
     def state(self) -> State:
         self._must_be_open()
@@ -238,12 +226,10 @@ class PoolBackend(Backend):
 
     def set_joint_targets(self, targets: Tensor) -> None:
         self._must_be_open()
-        held = self._state.joint_target
-        held.copy_(self._checked("joint_target", targets, held.shape))
+        self._arrays["joint_target"][:] = self._rows("joint_target", targets, self.num_worlds)
 
     def step(self, substeps: int | None = None) -> None:
-        values = {"joint_target": self._state.joint_target.numpy(), "wrench": self._wrench}
-        self._command("step", values=values, argument=self._checked_substeps(substeps))
+        self._command("step", argument=self._checked_substeps(substeps))
 
     def links(self) -> Links:
         self._must_be_open()
@@ -260,13 +246,14 @@ class PoolBackend(Backend):
     def mass_properties(self) -> MassProperties:
         self._require("mass_properties")
         self._command("mass_properties")
-        return self._reported(MassProperties).clone()
+        found = {name: self._arrays[f"body_{name}"].copy() for name in ("mass", "com", "inertia")}
+        return MassProperties(**{name: torch.from_numpy(values) for name, values in found.items()})
 
     def set_object_wrench(self, force: Tensor, torque: Tensor) -> None:
         self._require("object_wrench")
         self._must_be_open()
         wrench = torch.cat((torch.as_tensor(force), torch.as_tensor(torque)), dim=-1)
-        self._wrench[:] = self._checked("wrench", wrench, self._wrench.shape).numpy()
+        self._arrays["wrench"][:] = self._rows("wrench", wrench, self.num_worlds)
 
     def close(self) -> None:
         self._close()
@@ -274,13 +261,12 @@ class PoolBackend(Backend):
     def _set(self, name: Parameter, value: Tensor, worlds: Tensor | None) -> None:
         self._require(name)
         index = self._selected(worlds)
-        shape = getattr(self._nominal, name).shape[1:]
-        rows = self._checked(name, value, (len(index), *shape)).numpy()
-        self._command("set_parameter", index, {name: rows})
+        self._arrays[name][index] = self._rows(name, value, len(index))
+        self._command("set_parameter", index, name)
 
     def _selected(self, worlds: Tensor | None) -> np.ndarray:
         if worlds is None:
-            return self._every
+            return np.arange(self.num_worlds)
         index = torch.as_tensor(worlds, dtype=torch.long).detach().cpu().numpy()
         if index.ndim != 1 or (index.size and (index.min() < 0 or index.max() >= self.num_worlds)):
             raise ValueError(
@@ -288,19 +274,15 @@ class PoolBackend(Backend):
             )
         return index
 
-    def _command(
-        self,
-        method: str,
-        worlds: np.ndarray | None = None,
-        values: Arrays | None = None,
-        argument: Any = None,
-    ) -> None:
-        """Run a command in the workers, for some worlds with their rows of values."""
+    def _rows(self, name: str, value: Tensor, rows: int) -> np.ndarray:
+        """Return what some rows of a shared array are to hold."""
+        return self._checked(name, value, (rows, *self._arrays[name].shape[1:])).numpy()
+
+    def _command(self, method: str, worlds: np.ndarray | None = None, argument: Any = None) -> None:
+        """Run a command in the workers."""
         self._must_be_open()
-        if worlds is None:
-            worlds = self._every
         try:
-            failure = self._team.command(method, worlds, values or {}, argument)
+            failure = self._team.command(method, worlds, argument)
         except BaseException:  # after Ctrl-C or a worker's death, nobody knows what has been done
             self.close()
             raise

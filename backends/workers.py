@@ -1,13 +1,14 @@
-"""The processes behind :mod:`xreset.backends.pool`: the worlds of one process, and worker processes.
+"""The processes behind :mod:`xreset.backends.pool`: shared arrays, the worlds of one process, and worker processes.
 
 Each worker is a fresh interpreter, so it inherits neither torch's threads nor the caller's ``__main__``: scripts need
-no main guard. Commands and readings travel through a pipe. The system closes it whichever way the parent ends, so its
-workers end too and nothing is left behind.
+no main guard. Numbers travel through a file without a name that every process maps, commands through a pipe. The
+system closes both whichever way the parent ends, so its workers end too and nothing is left behind.
 """
 
 from __future__ import annotations
 
 import contextlib
+import mmap
 import os
 import pickle
 import signal
@@ -21,22 +22,56 @@ from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from torch import Tensor
 
 from xreset.backends.rigid import object_inertia
 from xreset.errors import XResetError
-from xreset.physics import Contacts, Links, State
+from xreset.physics import Contacts, Links, Parameter, Parameters, State
 from xreset.spec import SceneSpec
 
 if TYPE_CHECKING:
     from xreset.backends.pool import World
 
+# Shared arrays --------------------------------------------------------------------------------------------------------
+
 STATE_FIELDS = tuple(field.name for field in fields(State))
-LINK_FIELDS = tuple(field.name for field in fields(Links))
+LINK_FIELDS = tuple(f"link_{field.name}" for field in fields(Links))
 CONTACT_FIELDS = tuple(field.name for field in fields(Contacts))
 
-Arrays = dict[str, np.ndarray]
-"""Rows of numbers of worlds, by name: in single precision, or bool."""
+
+def layout_of(scene: SceneSpec, object_index: Tensor) -> np.dtype:
+    """Return the shared arrays of worlds with these objects [N] as the fields of one record.
+
+    The state is both what a world is set to and what it reports.
+    """
+    robot = scene.robot
+    tips = len(robot.fingertips)
+    links = 1 + tips
+    bodies = len(robot.joints) + len(robot.mimics) + 1
+    shapes = {
+        "link_pos": (links, 3),
+        "link_quat": (links, 4),
+        "link_linvel": (links, 3),
+        "link_angvel": (links, 3),
+        "tip_force": (tips, 3),
+        "table_force": (3,),
+        "wrench": (6,),
+        "body_mass": (bodies,),
+        "body_com": (bodies, 3),
+        "body_inertia": (bodies, 3, 3),
+    }
+    for bundle in (State.initial(scene, object_index), Parameters.nominal(scene, object_index)):
+        shapes |= {name: tuple(value.shape[1:]) for name, value in vars(bundle).items()}
+    n = len(object_index)
+    flags = {"tip_touch": (tips,), "nonfinite": (), "overflow": ()}
+    numbers = [(name, np.float32, (n, *shape)) for name, shape in shapes.items()]
+    return np.dtype(numbers + [(name, np.bool_, (n, *shape)) for name, shape in flags.items()])
+
+
+def arrays_in(memory: Any, layout: np.dtype) -> dict[str, np.ndarray]:
+    """Return the arrays of a layout in a block of memory."""
+    record = np.frombuffer(memory, layout)
+    return {name: record[name][0] for name in layout.fields or ()}
 
 
 def usable_cores() -> int:
@@ -65,7 +100,10 @@ class Job:
 
 
 _MOVING = ("build", "set_state", "step")
-"""Commands after which a world reports another state than before."""
+"""Commands after which a world reports something else than before."""
+
+_GIVEN = {"build": STATE_FIELDS, "set_state": STATE_FIELDS, "step": ("joint_target", "wrench")}
+"""Arrays that a command gives to the worlds, in double precision."""
 
 _INERTIA_ARGUMENT = {"object_mass": "mass", "object_inertia": "scale", "object_com": "offset"}
 """Parameters of the object's mass properties -> arguments of :meth:`Inertia.changed`."""
@@ -74,35 +112,38 @@ _INERTIA_ARGUMENT = {"object_mass": "mass", "object_inertia": "scale", "object_c
 class LocalWorlds:
     """The worlds of one job in this process."""
 
-    def __init__(self, job: Job) -> None:
+    def __init__(self, job: Job, arrays: Mapping[str, np.ndarray]) -> None:
         self._job = job
-        count = len(job.object_index)
-        self.arrays: Arrays = {name: np.zeros(count, bool) for name in ("nonfinite", "overflow")}
-        """What the worlds report."""
+        self._arrays = {name: array[job.first : job.stop] for name, array in arrays.items()}
+        self._given: dict[str, np.ndarray] = {}
         self._worlds: list[World] = []
         self._inertia_changes: list[dict[str, Any]] = [{} for _ in job.object_index]
 
-    def command(
-        self, method: str, worlds: np.ndarray, values: Arrays, argument: Any
-    ) -> Exception | None:
-        """Run one of the methods below for the given worlds with their rows of values, then read what they report.
+    def command(self, method: str, worlds: np.ndarray | None, argument: Any) -> Exception | None:
+        """Run one of the methods below for the given worlds (all if None), then publish what they report.
 
-        All worlds act before any is read: engine and Python code then take turns in the processor's caches once instead
-        of once per world.
+        All worlds act before any is published: engine and Python code then take turns in the processor's caches once
+        instead of once per world.
 
         Returns:
             What to raise because a world raised. It crosses process boundaries, so it holds the trace as text.
         """
-        rows = (worlds - self._job.first).tolist()
+        rows = (
+            range(len(self._job.object_index))
+            if worlds is None
+            else (worlds - self._job.first).tolist()
+        )
+        self._given = {
+            name: self._arrays[name].astype(np.float64) for name in _GIVEN.get(method, ())
+        }
         action = getattr(self, f"_{method}")
         row = 0
         try:
-            for number, row in enumerate(rows):
-                given = {name: value[number].astype(np.float64) for name, value in values.items()}
-                action(row, given, argument)
+            for row in rows:
+                action(row, argument)
             if method in _MOVING:
                 for row in rows:
-                    self._read(row)
+                    self._publish(row)
         except Exception as error:
             world = f"world {self._job.first + row}"
             if isinstance(error, XResetError):  # one that the user can fix
@@ -113,41 +154,38 @@ class LocalWorlds:
             )
         return None
 
-    def readings(self, worlds: np.ndarray) -> Arrays:
-        """Return what the given worlds report."""
-        return {name: array[worlds - self._job.first] for name, array in self.arrays.items()}
-
     def close(self) -> None:
         """Close the worlds."""
         while self._worlds:
             self._worlds.pop().close()
 
-    def _build(self, i: int, given: Arrays, _) -> None:
+    def _build(self, i: int, _) -> None:
         job = self._job
         self._worlds.append(job.world_class(job.scene, job.object_index[i], **job.options))
-        self._set_state(i, given, _)
+        self._set_state(i, _)
 
-    def _set_state(self, i: int, given: Arrays, _) -> None:
-        self._worlds[i].set_state(given)
-        self.arrays["nonfinite"][i] = False
-        self.arrays["overflow"][i] = False
+    def _set_state(self, i: int, _) -> None:
+        self._worlds[i].set_state({name: self._given[name][i] for name in STATE_FIELDS})
+        self._arrays["nonfinite"][i] = False
+        self._arrays["overflow"][i] = False
 
-    def _step(self, i: int, given: Arrays, n: int) -> None:
-        if self.arrays["nonfinite"][i]:
+    def _step(self, i: int, n: int) -> None:
+        if self._arrays["nonfinite"][i]:
             return
         world = self._worlds[i]
-        world.set_joint_targets(given["joint_target"])
-        world.set_object_wrench(given["wrench"][:3], given["wrench"][3:])
+        wrench = self._given["wrench"][i]
+        world.set_joint_targets(self._given["joint_target"][i])
+        world.set_object_wrench(wrench[:3], wrench[3:])
         world.step(n)
 
-    def _mass_properties(self, i: int, *_) -> None:
-        bodies = self._worlds[i].mass_properties()
-        self._write("mass", i, [body.mass for body in bodies])
-        self._write("com", i, [body.com for body in bodies])
-        self._write("inertia", i, [body.matrix for body in bodies])
+    def _mass_properties(self, i: int, _) -> None:
+        for k, body in enumerate(self._worlds[i].mass_properties()):
+            self._arrays["body_mass"][i, k] = body.mass
+            self._arrays["body_com"][i, k] = body.com
+            self._arrays["body_inertia"][i, k] = body.matrix
 
-    def _set_parameter(self, i: int, given: Arrays, _) -> None:
-        ((name, value),) = given.items()
+    def _set_parameter(self, i: int, name: Parameter) -> None:
+        value = self._arrays[name][i].astype(np.float64)
         if not value.ndim:
             value = float(value)
         if name not in _INERTIA_ARGUMENT:
@@ -158,81 +196,67 @@ class LocalWorlds:
         nominal = object_inertia(self._job.scene.objects[self._job.object_index[i]])
         self._worlds[i].set_object_inertia(nominal.changed(**changes))
 
-    def _read(self, i: int) -> None:
-        if self.arrays["nonfinite"][i]:  # nothing has moved since that was read
+    def _publish(self, i: int) -> None:
+        arrays = self._arrays
+        if arrays["nonfinite"][i]:  # nothing has moved since that was published
             return
         world = self._worlds[i]
         state = world.get_state()
         for name, value in state.items():
-            self._write(name, i, value)
+            arrays[name][i] = value
         nonfinite, overflow = world.health(state)
-        self.arrays["nonfinite"][i] |= nonfinite
-        self.arrays["overflow"][i] |= overflow
+        arrays["nonfinite"][i] |= nonfinite
+        arrays["overflow"][i] |= overflow
         readings = (*world.contacts(), *world.links())
         for name, value in zip((*CONTACT_FIELDS, *LINK_FIELDS), readings, strict=True):
-            self._write(name, i, value)
-
-    def _write(self, name: str, i: int, value: ArrayLike) -> None:
-        if name not in self.arrays:
-            first = np.asarray(value)
-            kind = first.dtype if first.dtype == bool else np.float32
-            self.arrays[name] = np.zeros((len(self._job.object_index), *first.shape), kind)
-        self.arrays[name][i] = value
+            arrays[name][i] = value
 
 
 # Worker processes -----------------------------------------------------------------------------------------------------
 
-_BOOT = (
-    "import sys; sys.path[:] = {path!r}; from xreset.backends.workers import serve; serve({pipe})"
-)
+_BOOT = "import sys; sys.path[:] = {path!r}; from xreset.backends.workers import serve; serve({pipe}, {memory})"
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 class WorkerTeam:
     """Worker processes, each with one job."""
 
-    def __init__(self, jobs: Sequence[Job]) -> None:
+    def __init__(self, jobs: Sequence[Job], layout: np.dtype) -> None:
         world_class = jobs[0].world_class
         if world_class.__module__ == "__main__" or "<locals>" in world_class.__qualname__:
             raise XResetError(
                 f"{world_class.__qualname__} is defined in {world_class.__module__!r}, where worker processes cannot "
                 "import it. Move it to a module, or pass workers=0."
             )
-        self.arrays: Arrays = {}
-        """What all worlds report."""
         self._workers: list[_Worker] = []
         try:
-            for job in jobs:
-                self._workers.append(_Worker(job))
+            with open(os.memfd_create("xreset"), "wb") as file:
+                file.truncate(layout.itemsize)
+                self.arrays = arrays_in(mmap.mmap(file.fileno(), layout.itemsize), layout)
+                for job in jobs:
+                    self._workers.append(_Worker(job, file.fileno()))
             for worker in self._workers:
-                failure, _ = worker.receive("start")
-                if failure is not None:
+                worker.send((layout, worker.job))
+            for worker in self._workers:
+                if failure := worker.receive("start"):
                     raise failure
         except BaseException:
             self.close()
             raise
 
-    def command(
-        self, method: str, worlds: np.ndarray, values: Arrays, argument: Any
-    ) -> Exception | None:
-        """Have all workers concerned run a command at the same time, and wait for all of them: see
-        :meth:`LocalWorlds.command`."""
+    def command(self, method: str, worlds: np.ndarray | None, argument: Any) -> Exception | None:
+        """Have all workers concerned run a command at the same time, wait for all of them, and return the first
+        failure."""
         asked = []
         for worker in self._workers:
-            mine = (worlds >= worker.job.first) & (worlds < worker.job.stop)
-            if mine.any():
-                rows = {name: value[mine] for name, value in values.items()}
-                worker.send((method, worlds[mine], rows, argument))
-                asked.append((worker, worlds[mine]))
-        failures = []
-        for worker, concerned in asked:
-            failure, readings = worker.receive(method)
-            failures.append(failure)
-            for name, rows in readings.items():
-                if name not in self.arrays:
-                    shape = (self._workers[-1].job.stop, *rows.shape[1:])
-                    self.arrays[name] = np.zeros(shape, rows.dtype)
-                self.arrays[name][concerned] = rows
+            mine = worlds
+            if worlds is not None:
+                mine = worlds[(worlds >= worker.job.first) & (worlds < worker.job.stop)]
+                if not mine.size:
+                    continue
+            worker.send((method, mine, argument))
+            asked.append(worker)
+        failures = [worker.receive(method) for worker in asked]
         return next(filter(None, failures), None)
 
     def close(self) -> None:
@@ -250,29 +274,28 @@ class _Worker:
     _END_WITHIN = 5.0
     """Seconds that a worker may take to end."""
 
-    def __init__(self, job: Job) -> None:
+    def __init__(self, job: Job, memory: int) -> None:
         self.job = job
         self.pipe, pipe_of_worker = Pipe()
         path = [os.path.abspath(entry) for entry in sys.path]
         with pipe_of_worker:
-            boot = _BOOT.format(path=path, pipe=pipe_of_worker.fileno())
+            boot = _BOOT.format(path=path, pipe=pipe_of_worker.fileno(), memory=memory)
             self._process = subprocess.Popen(
                 [sys.executable, "-c", boot],
-                pass_fds=(pipe_of_worker.fileno(),),
+                pass_fds=(pipe_of_worker.fileno(), memory),
                 stdin=subprocess.DEVNULL,
                 stdout=2,  # engines print; the caller's standard output is not theirs
                 env={**os.environ, **_ONE_THREAD},
                 start_new_session=True,  # Ctrl-C is for the parent, which then closes the pipe
             )
-        self.send(job)
 
-    def send(self, message: Any) -> None:
+    def send(self, message: tuple[Any, ...]) -> None:
         """Send a message; a dead worker is noticed at the reply."""
         with contextlib.suppress(OSError):
             self.pipe.send_bytes(pickle.dumps(message))
 
-    def receive(self, command: str) -> tuple[Exception | None, Arrays]:
-        """Wait for the reply: a failure, and readings."""
+    def receive(self, command: str) -> Exception | None:
+        """Wait for the reply, and return the failure that it holds."""
         try:
             return pickle.loads(self.pipe.recv_bytes())
         except (EOFError, OSError) as error:
@@ -303,27 +326,28 @@ class _Worker:
         )
 
 
-def serve(pipe: int) -> None:
-    """Run a worker process: receive a job and then commands through a pipe with this file descriptor, and answer each
-    with a failure or None, and readings, until the end."""
+def serve(pipe: int, memory: int) -> None:
+    """Run a worker process: receive a job and then commands, and answer each with None or a failure, until the end.
+
+    Args:
+        pipe: file descriptor of the pipe to the parent.
+        memory: file descriptor of the shared arrays.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     connection = Connection(pipe)
     worlds = None
     with contextlib.suppress(EOFError, OSError):  # the parent is gone, or done with this worker
         while True:
             failure = None
-            readings = {}
             message = connection.recv_bytes()
             try:
                 if worlds is None:
-                    worlds = LocalWorlds(pickle.loads(message))
+                    layout, job = pickle.loads(message)
+                    worlds = LocalWorlds(job, arrays_in(mmap.mmap(memory, layout.itemsize), layout))
                 else:
-                    method, concerned, *inputs = pickle.loads(message)
-                    failure = worlds.command(method, concerned, *inputs)
-                    if failure is None and method != "set_parameter":
-                        readings = worlds.readings(concerned)
+                    failure = worlds.command(*pickle.loads(message))
             except Exception:
                 failure = XResetError(f"A worker process failed:\n{traceback.format_exc()}")
-            connection.send_bytes(pickle.dumps((failure, readings)))
+            connection.send_bytes(pickle.dumps(failure))
             if worlds is None:
                 return

@@ -27,10 +27,10 @@ FRAME_INERTIA = 1e-7
 
 
 def pose(
-    xyz: Sequence[float] = (0, 0, 0),
+    xyz: ArrayLike = (0, 0, 0),
     *,
     rpy: Sequence[float] = (0, 0, 0),
-    quat: Sequence[float] | None = None,
+    quat: ArrayLike | None = None,
 ) -> np.ndarray:
     """[4, 4] pose from a position [m] and roll, pitch, yaw about fixed axes [rad], or a quaternion (w, x, y, z) of any
     length."""

@@ -1,3 +1,4 @@
+import re
 import shutil
 from dataclasses import replace
 from importlib.metadata import EntryPoint
@@ -195,6 +196,20 @@ class Registry(Copied):
             "'link5' moves but has the mass 0",
         ):
             self.assertIn(part, found)
+
+    def test_check_names_a_driven_joint_and_a_mimic_that_are_fixed(self):
+        urdf = (self.folder / "robot.urdf").read_text()
+        for name in ("joint7", "finger_joint2"):
+            urdf = re.sub(rf'(<joint name="{name}" type=)"\w+"', r'\1"fixed"', urdf)
+        (self.folder / "robot.urdf").write_text(urdf)
+        for name in ("joint7", "finger_joint2"):
+            self.assertRegex(
+                self.errors(), f"'{name}' is fixed in the URDF, whose moving joints are joint1"
+            )
+        self.assertEqual(
+            self.errors("skipped").splitlines()[0],
+            "mimic joints: 'finger_joint2': fix the errors of joints first",
+        )
 
     def test_check_finds_a_missing_mesh(self):
         self.edit(

@@ -164,12 +164,14 @@ def robot_tree(robot: RobotSpec) -> RobotTree:
 def mismatches(robot: RobotSpec, tree: RobotTree) -> dict[str, list[str]]:
     """Return what is wrong with the joints and the links of a description, given the tree of its URDF."""
     moving = [joint.name for joint in tree.moved_by.values()]
+    fixed = {joint.name for joint in tree.joints if joint.type == "fixed"}
     described = [*robot.joint_names, *(mimic.joint for mimic in robot.mimics)]
     joints = []
     for name in described:
         if name not in moving:
+            where = "fixed in" if name in fixed else "not in"
             joints.append(
-                f"{name!r} is not in the URDF, whose moving joints are {', '.join(moving)}."
+                f"{name!r} is {where} the URDF, whose moving joints are {', '.join(moving)}."
             )
     for name in moving:
         if name not in described:

@@ -153,6 +153,7 @@ def _mimics(spec: RobotSpec, tree: RobotTree) -> Problems:
     known = {joint.name: joint for joint in tree.moved_by.values()}
     for mimic in spec.mimics:
         if not {mimic.joint, mimic.source} <= known.keys():
+            yield "skipped", f"{mimic.joint!r}: fix the errors of joints first"
             continue
         own = known[mimic.joint]
         source = known[mimic.source]

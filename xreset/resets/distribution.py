@@ -114,7 +114,7 @@ class ResetDistribution:
     it.
 
     Attributes:
-        demo_probability: [] share of resets from the bank, ``demo_probability`` unless it is filled with another.
+        demo_probability: [] share of resets from the bank: the configured one, until another is filled in.
     """
 
     def __init__(

@@ -119,7 +119,9 @@ def policy_group(
         offsets = cloud[:, None] - x.links.pos[:, :, None]
         nearest = offsets.square().sum(dim=-1).argmin(dim=-1)
         vectors = offsets.gather(2, nearest[:, :, None, None].expand(-1, -1, 1, 3))[:, :, 0]
-        palm_distance = vectors[:, 0].square().sum(dim=-1, keepdim=True).sqrt()
+        square = vectors[:, 0].square().sum(dim=-1, keepdim=True)
+        # torch's root of float32 is rounded differently on some processors, and the runner's is not
+        palm_distance = square.double().sqrt().to(square.dtype)
         return torch.cat((vectors[:, 1:].flatten(1), palm_distance), dim=-1)
     noise = c.noise
     pos = x.observed_pos + noise.object_pos * _normal(x.observed_pos, generator)

@@ -348,15 +348,17 @@ def _traces(
     scene = env.backend.scene
     goal_pos = env.goal_pos[worlds].cpu().numpy()
     goal_quat = env.goal_quat[worlds].cpu().numpy()
+    of_all = State.cat([state[None] for state in states])
+    joint_target = torch.stack(targets).numpy()
     for i, world in enumerate(worlds):
-        path = State.cat([state[i : i + 1] for state in states])
+        path = of_all[:, i]
         yield Trace(
             sequence=int(env.sequence[world]),
             object=scene.objects[int(env.backend.object_index[world])].name,
             goal_pos=goal_pos[i],
             goal_quat=goal_quat[i],
             time=every * np.arange(len(states)) * scene.control_dt,
-            joint_target=torch.stack(targets)[:, i].numpy(),
+            joint_target=joint_target[:, i],
             joint_pos=path.joint_pos.numpy(),
             object_pos=path.object_pos.numpy(),
             object_quat=path.object_quat.numpy(),

@@ -166,9 +166,8 @@ class FromABankTest(InOneFolder):
             capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"},
         )  # fmt: skip
         self.assertEqual(done.returncode, 0, done.stderr)
-        self.assertLess(
-            done.stdout.partition("the object ends ")[2].partition(" cm")[0], 5.0, done.stdout
-        )
+        distance = done.stdout.partition("the object ends ")[2].partition(" cm")[0]
+        self.assertLess(float(distance), 5.0, done.stdout)
 
     @skipUnless(has("onnxruntime"), "onnxruntime is not installed")
     def test_a_policy_says_where_it_cannot_play(self):

@@ -33,7 +33,7 @@ class StableBaselinesTest(WithEnv):
             ends = step % env.env.max_episode_length == 0
             self.assertEqual(done.tolist(), [ends] * N)
             for world, info in enumerate(infos):
-                self.assertEqual(info, ends)
+                self.assertEqual(bool(info), ends)
                 if ends:
                     self.assertEqual((info["TimeLimit.truncated"], info["faulty"]), (True, False))
                     last = info["terminal_observation"]["policy"]

@@ -24,7 +24,7 @@ from xreset.errors import DemoError
 from xreset.geometry.shapes import turn_of
 from xreset.objects.catalogue import load_objects, object_names
 from xreset.objects.rest import rest_height, resting_orientation
-from xreset.progress import Progress, unseen
+from xreset.progress import unseen
 from xreset.spec import ObjectSpec
 
 T = TypeVar("T")
@@ -69,7 +69,7 @@ def synthesize(
     fps: float = 30.0,
     side: Literal["right", "left"] = "right",
     meshes: str | Path | None = None,
-    progress: Progress = unseen,
+    progress: Callable[[float, int], None] = unseen,
 ) -> Demos:
     """Make synthetic demonstrations of the built-in stand-ins, or of the objects of a folder of meshes, which stand
     with z up.

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from xreset.errors import DemoError
 from xreset.physics import Backend, State
-from xreset.progress import Progress, unseen
+from xreset.progress import unseen
 from xreset.resets.bank import ResetBank, check_joints, starts_and_goals
 from xreset.resets.closing import closing_states, positions_between, rotations_between
 from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
@@ -69,7 +69,7 @@ def make_bank(
     limits: FilterConfig | None = None,
     closing: ClosingConfig | None = None,
     squeeze: SqueezeConfig | None = None,
-    progress: Progress = unseen,
+    progress: Callable[[float, int], None] = unseen,
 ) -> ResetBank:
     """Try every valid frame in every engine and keep those that all engines accept.
 

@@ -113,7 +113,7 @@ def shared_worlds(names: Sequence[str], num_envs: int, share: Mapping[str, float
     Args:
         names: the objects.
         num_envs: N.
-        share: ``task.reset.object_share``. Fractions of worlds go to the objects that miss most.
+        share: ``task.reset.object_share``. Worlds that remain after rounding down go to the largest remainders.
 
     Raises:
         XResetError: an unknown name, or too few worlds.

@@ -19,7 +19,7 @@ from xreset.cameras.pose import mounted_pose
 from xreset.cameras.rays import RayCaster
 from xreset.errors import XResetError
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.rotations import pose_matrix, quat_from_axis_angle, quat_to_matrix
+from xreset.geometry.rotations import homogeneous, quat_from_axis_angle, quat_to_matrix
 from xreset.geometry.shapes import box, shape_mesh, winding_number
 from xreset.geometry.urdf import link_meshes
 from xreset.physics import State
@@ -125,17 +125,17 @@ class Cameras:
         rays = self.rays
         links = self._kinematics.link_poses(state.joint_pos, self._links)
         rays.pose[:, : self._num_links] = links[:, : self._num_links]
-        rays.pose[:, -1] = pose_matrix(quat_to_matrix(state.object_quat), state.object_pos)
+        rays.pose[:, -1] = homogeneous(quat_to_matrix(state.object_quat), state.object_pos)
         for i, mount in enumerate(self._mounts):
             self._believed[:, i] = (
                 self._mounted[i] if mount is None else links[:, mount] @ self._mounted[i]
             )
-        moved = pose_matrix(quat_to_matrix(quat_from_axis_angle(self.turn)), self.shift)
+        moved = homogeneous(quat_to_matrix(quat_from_axis_angle(self.turn)), self.shift)
         self.pose.copy_(self._believed @ moved)
         self._tangent.copy_((self.fov_scale * self._half_fov).tan())
         self._due.copy_(due)
         if self._goal_rays is not None:
-            self._goal_rays.pose[:, 0] = pose_matrix(quat_to_matrix(goal_quat), goal_pos)
+            self._goal_rays.pose[:, 0] = homogeneous(quat_to_matrix(goal_quat), goal_pos)
 
     def cast(self) -> None:
         """Draw the images of the worlds that are due."""

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from xreset.errors import RobotError
-from xreset.geometry.rotations import matvec, pose_matrix, quat_to_matrix
+from xreset.geometry.rotations import homogeneous, matvec, quat_to_matrix
 from xreset.geometry.urdf import Joint, robot_tree
 from xreset.spec import MimicSpec, RobotSpec
 
@@ -104,7 +104,7 @@ class Kinematics:
         """[4, 4] default pose of the root: the robot's base in the world, or the identity below another root."""
         if self.root == tree.root:
             turn = quat_to_matrix(self._tensor(robot.base_quat))
-            self.base = pose_matrix(turn, self._tensor(robot.base_pos))
+            self.base = homogeneous(turn, self._tensor(robot.base_pos))
 
     def _couple(self, moving: Sequence[Joint], mimics: Mapping[str, MimicSpec]) -> None:
         """Set how the moving joints follow from the actuated ones, and the limits that result."""
@@ -198,7 +198,7 @@ class Kinematics:
         indices = [self.link_index(name) for name in (self.link_names if links is None else links)]
         rot, pos, _, _ = self._forward(q, base, indices)
         shape = (*q.shape[:-1], len(indices))
-        return pose_matrix(rot.view(*shape, 3, 3), pos.view(*shape, 3))
+        return homogeneous(rot.view(*shape, 3, 3), pos.view(*shape, 3))
 
     def points(
         self,

@@ -103,7 +103,7 @@ def matrix_to_quat(R: Tensor) -> Tensor:
     return quat_normalize(candidates.gather(-2, best).squeeze(-2))
 
 
-def pose_matrix(R: Tensor, pos: Tensor) -> Tensor:
+def homogeneous(R: Tensor, pos: Tensor) -> Tensor:
     """[..., 4, 4] pose of a rotation matrix [..., 3, 3] and a position [..., 3]."""
     T = pos.new_zeros(*pos.shape[:-1], 4, 4)
     T[..., :3, :3] = R

@@ -21,7 +21,7 @@ from xreset.geometry.balls import hand_balls
 from xreset.geometry.collision import SelfCollision
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics, PointJacobian
-from xreset.geometry.rotations import matvec, pose_matrix, quat_to_matrix
+from xreset.geometry.rotations import homogeneous, matvec, quat_to_matrix
 from xreset.spec import FINGERS, KEYPOINTS, RobotSpec, TableSpec
 from xreset.tensors import Tensors
 
@@ -162,7 +162,7 @@ class HandModel:
     def keypoints(self, joints: Tensor, root_pos: Tensor, root_quat: Tensor) -> Tensor:
         """[..., P, 3] positions of the keypoint links."""
         return self.kinematics.points(
-            joints, self.links, base=pose_matrix(quat_to_matrix(root_quat), root_pos)
+            joints, self.links, base=homogeneous(quat_to_matrix(root_quat), root_pos)
         )
 
     def bodies(self, joints: Tensor, root_pos: Tensor, root_quat: Tensor) -> PointJacobian:
@@ -172,7 +172,7 @@ class HandModel:
         world's axes).
         """
         links = self.kinematics.jacobian(
-            joints, self._bodies, base=pose_matrix(quat_to_matrix(root_quat), root_pos)
+            joints, self._bodies, base=homogeneous(quat_to_matrix(root_quat), root_pos)
         )
         identity = torch.eye(3, dtype=links.pos.dtype, device=links.pos.device).expand(
             *links.pos.shape[:-1], 3, 3

@@ -34,6 +34,7 @@ def evaluate(
     num_envs: int = 64,
     device: str = "cpu",
     settle: bool = False,
+    episode_seconds: float | None = None,
     out: str | Path | None = None,
     progress: Callable[[str, float, int], None] = unseen,
 ) -> Evaluation:
@@ -50,6 +51,7 @@ def evaluate(
         num_envs: worlds that run at the same time.
         device: where GPU engines run: cpu or cuda.
         settle: whether objects come to rest before episodes begin, instead of starting as recorded.
+        episode_seconds: length of an episode [s]; default: as in the policy's training.
         out: folder for the results; default: the folder of the policy.
         progress: called with (engine, control steps done, control steps in all).
 
@@ -59,19 +61,29 @@ def evaluate(
 
     Raises:
         PolicyError: the policy is unknown, or the seed chose this checkpoint.
-        XResetError: another process is writing the folder.
+        XResetError: another process is writing the folder, or a number makes no sense.
     """
     if episodes < 1:
         raise XResetError(f"episodes is {episodes}, expected at least 1.")
     policy = load_policy(policy, robot=robot, seed=seed)
     policy.check_seed(seed)
     chosen = chosen_engines(engines, device)
-    trial = load_trial(policy, demos, objects=objects, seed=seed, num_envs=num_envs, settle=settle)
+    trial = load_trial(
+        policy,
+        demos,
+        objects=objects,
+        seed=seed,
+        num_envs=num_envs,
+        settle=settle,
+        episode_seconds=episode_seconds,
+    )
+    length = trial.task.termination.episode_seconds
     folder = Path(out) if out else policy.folder
     results = []
     tables = []
     with claim_folder(folder):
-        _tell_what_is_replaced([folder / f"{engine.name}.json" for engine in chosen], trial.inputs)
+        files = [folder / f"{engine.name}.json" for engine in chosen]
+        _tell_what_is_replaced(files, trial.inputs, length)
         for engine in chosen:
             player = policy.start(trial.motion)
             rollouts = roll_out(
@@ -88,6 +100,7 @@ def evaluate(
                 objects_folder=str(trial.objects_folder) if trial.objects_folder else None,
                 unseen=policy.unseen(trial.names),
                 vision=trial.task.vision if trial.task.vision.cameras else None,
+                episode_seconds=length,
             )
             write_results(folder, result, rollouts, trial.robot.joint_names)
             results.append(result)
@@ -95,19 +108,27 @@ def evaluate(
     return Evaluation(results, tables)
 
 
-def _tell_what_is_replaced(files: Sequence[Path], inputs: dict[str, str]) -> None:
-    """Name the results of other demonstrations that an evaluation will replace, while it can still be stopped."""
-    others = []
+def _tell_what_is_replaced(files: Sequence[Path], inputs: dict[str, str], length: float) -> None:
+    """Name the results of other demonstrations, or of episodes of another length [s], that an evaluation will replace,
+    while it can still be stopped."""
+    of_other_demos = []
+    of_other_length = []
     for file in files:
         try:
-            known = read_result(file).inputs
+            known = read_result(file)
         except XResetError:  # there is none, or it is damaged
             continue
-        if known.get("demos") != inputs.get("demos"):
-            others.append(str(file))
-    if others:
-        print(
-            f"{', '.join(others)}: results of other demonstrations, which this evaluation replaces. "
-            "To keep them, stop it now and name another folder (--out).",
-            file=sys.stderr,
-        )
+        if known.inputs.get("demos") != inputs.get("demos"):
+            of_other_demos.append(str(file))
+        elif known.episode_seconds not in (None, length):
+            of_other_length.append(str(file))
+    for others, what in (
+        (of_other_demos, "other demonstrations"),
+        (of_other_length, "episodes of another length"),
+    ):
+        if others:
+            print(
+                f"{', '.join(others)}: results of {what}, which this evaluation replaces. "
+                "To keep them, stop it now and name another folder (--out).",
+                file=sys.stderr,
+            )

@@ -20,6 +20,7 @@ from xreset.checks import (
     Checked,
     NonNegativeFloat,
     NonNegativeInt,
+    PositiveFinite,
     PositiveFloat,
     PositiveInt,
     Range,
@@ -236,6 +237,9 @@ class EvalResult(Checked):
     """95 % bootstrap interval over demonstrations."""
     least_distance: NonNegativeFloat | None = None
     """Mean of :attr:`Episode.least_distance` [m]."""
+
+    episode_seconds: PositiveFinite | None = None
+    """Length of an episode [s]. None: an earlier version did not state it, and played the policy's training's."""
 
     def meshes(self, given: Path | None) -> Path | None:
         """Return the given folder of meshes, or else that of the evaluation; None: the stand-ins."""

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from xreset.checks import frozen
 from xreset.env import ManipulationEnv, make_scene, object_origins
+from xreset.errors import XResetError
 from xreset.eval.metrics import EpisodeMetrics, MetricPoints
 from xreset.eval.policy_spec import PolicySpec
 from xreset.eval.results import Episode, Rollouts, Trace
@@ -37,9 +38,13 @@ from xreset.task.config import TaskConfig, evaluation_task
 from xreset.task.randomization import sample_friction
 from xreset.task.reading import Reading
 from xreset.task.terminations import out_of_bounds
+from xreset.text import shown
 
 TRACE_INTERVAL = 0.05
 """Time between the states of a trace [s]."""
+
+LONGEST_EPISODE = 1e6
+"""Largest length of an episode [s]: the largest time that a file of traces may hold."""
 
 MakeBackend = Callable[[SceneSpec, int, Tensor], Backend]
 """Makes the worlds of a scene, given their number and the index of the object in each world [N]."""
@@ -142,6 +147,7 @@ def load_trial(
     seed: int = 0,
     num_envs: int = 64,
     settle: bool = False,
+    episode_seconds: float | None = None,
 ) -> Trial:
     """Load what a policy is to play. For the baseline ``ik``, demonstrations are retargeted here.
 
@@ -154,7 +160,14 @@ def load_trial(
         num_envs: worlds that run at the same time.
         settle: whether objects come to rest before episodes begin (:mod:`xreset.resets.settle`), in MuJoCo for every
             engine, so that all engines play the same starts. Default: the recorded poses, as in the paper.
+        episode_seconds: length of an episode [s]; default: as in the policy's training.
+
+    Raises:
+        XResetError: the length is not a number, too large, or less than a control step.
     """
+    task = evaluation_task(policy.task)
+    if episode_seconds is not None:
+        task = _with_episodes_of(task, episode_seconds)
     folder = policy.meshes(objects)
     inputs = load_inputs(
         source, robot=policy.robot, objects=folder, accept=("demos", "motion", "goals")
@@ -168,7 +181,6 @@ def load_trial(
     if settle:
         bank, _ = settle_starts(bank, policy.robot, used, num_envs=num_envs)
         hashes["starts"] = "settled"
-    task = evaluation_task(policy.task)
     if isinstance(inputs.data, GoalSet):
         task = replace(task, reset=replace(task.reset, spawn_xy=0.0, spawn_yaw=0.0))
     return Trial(
@@ -182,6 +194,17 @@ def load_trial(
         objects_folder=folder,
         inputs=hashes,
     )
+
+
+def _with_episodes_of(task: TaskConfig, seconds: float) -> TaskConfig:
+    control_dt = task.timestep * task.substeps
+    is_number = isinstance(seconds, int | float) and not isinstance(seconds, bool)
+    if not is_number or not control_dt <= seconds <= LONGEST_EPISODE:
+        raise XResetError(
+            f"episode_seconds is {shown(seconds)}, expected a number from {control_dt:.3g}, which is one control "
+            f"step, to {LONGEST_EPISODE:,.0f}. Without it, episodes last as long as in the policy's training."
+        )
+    return replace(task, termination=replace(task.termination, episode_seconds=float(seconds)))
 
 
 def nominal_scene(robot: RobotSpec, objects: tuple[ObjectSpec, ...], task: TaskConfig) -> SceneSpec:

@@ -155,8 +155,10 @@ def _unseen_rows(
 def results_table(summaries: Sequence[EvalResult]) -> Table:
     """Return the table of an evaluation: one column for each engine; four engines fit into 80 characters."""
     first = summaries[0]
+    length = "" if first.episode_seconds is None else f" of {first.episode_seconds:g} s"
     counts = (
-        f"episodes: {first.episodes}, demonstrations: {len(first.per_demo)}, seed: {first.seed}"
+        f"episodes: {first.episodes}{length}, demonstrations: {len(first.per_demo)}, "
+        f"seed: {first.seed}"
     )
     table = Table(
         "",

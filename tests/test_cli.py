@@ -78,6 +78,10 @@ class UsageTest(TestCase):
             ),
             (r"--seed is 9{20}, expected", "eval zero --demos none.npz --seed " + "9" * 20),
             (r"--num-envs is 0, expected a whole number from 1", "train --out x --num-envs 0"),
+            (
+                r"episode_seconds is -1.0, expected a number from 0.0167, which is one control step",
+                "eval zero --robot openarm --demos none.npz --episode-seconds -1",
+            ),
             (r"--minutes is not a number", "train --out x --minutes nan"),
             (r"Unknown device 'quantum'. Expected cpu, cuda or", "train --out x --device quantum"),
             (r"(File name too long|there is no)", "demos info " + "x" * 300),

@@ -365,6 +365,25 @@ class FairnessTest(Compared):
         expected = r"not the same task.termination.episode_seconds \(2.5: short; 5: usual\)"
         self.assertRegex(self.compare("short", "usual"), expected)
 
+    def test_episodes_of_another_length(self):
+        """The length of an evaluation counts, and not that of the training, if the result states it."""
+        short = TrainConfig(task=TaskConfig(termination=TerminationConfig(episode_seconds=2.5)))
+        self.run_and_results("earlier")  # of a version that did not state the length
+        for name, config, seconds, words in (
+            ("usual", None, 5.0, ""),
+            ("long", None, 12.0, r"episode_seconds \(5: earlier; 12: long\)"),
+            ("short", short, 5.0, ""),
+        ):
+            with self.subTest(name):
+                self.write_run(name, config)
+                self.write_results(name, episode_seconds=seconds)
+                text = self.compare("earlier", name)
+                self.assertRegex(text, words or "earlier")
+                self.assertEqual("not comparable" in text, bool(words))
+                self.assertEqual("task progress minus earlier" in text, not words)
+        self.write_results("usual", engines=("sapien",), episode_seconds=12.0)
+        self.assertRegex(self.compare("usual"), r"\(5: usual in mujoco; 12: usual in sapien\)")
+
     def test_a_training_that_began_with_the_networks_of_another(self):
         file = "runs/joint/checkpoints/000900.pt"
         self.run_and_results("new")

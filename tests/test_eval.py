@@ -4,6 +4,7 @@ import contextlib
 import io
 import json
 import math
+import re
 from dataclasses import asdict, replace
 from unittest import TestCase
 from unittest.mock import Mock, patch
@@ -392,6 +393,43 @@ class ResultsTest(InFolder):
             with claim_folder(self.folder), self.assertRaisesRegex(XResetError, "writing"):
                 evaluate(policy, "demos.npz", [])
             self.assertEqual(evaluate(policy, "demos.npz", []), [])
+
+    def test_episodes_have_the_length_that_is_asked_for(self):
+        """The same starts, played for longer: the first states are the same. The result states the length."""
+        policy = load_policy("zero", robot="ur7e-sharpa")
+        bank = toy_bank(policy.robot)
+        found = {}
+        for seconds in (0.1, 0.3):
+            (result,) = evaluate(
+                policy, bank, "mujoco", episodes=1, episode_seconds=seconds, out=self.folder
+            )
+            self.assertEqual(result.episode_seconds, seconds)
+            self.assertIn(
+                f"episodes: 3 of {seconds} s, demonstrations: 3", repr(Evaluation([result], []))
+            )
+            self.assertEqual(read_evaluation(self.folder)[0], result)
+            found[seconds] = read_traces(self.folder, "mujoco", policy.robot.joint_names)
+        for short, long in zip(found[0.1], found[0.3], strict=True):
+            self.assertEqual([len(short.joint_target), len(long.joint_target)], [6, 18])
+            assert_array_equal(long.object_pos[: len(short.time)], short.object_pos)
+        trained = load_trial(policy, bank).task.termination.episode_seconds
+        self.assertEqual(trained, policy.task.termination.episode_seconds)
+
+    def test_episodes_of_no_length_are_refused(self):
+        for seconds in (0, -1.0, 0.01, math.nan, math.inf, 1e300, "12", True):
+            words = rf"^episode_seconds is {re.escape(repr(seconds))}, expected a number from 0.0167, .* to 1,000,000"
+            with self.subTest(seconds), self.assertRaisesRegex(XResetError, words):
+                evaluate("zero", "demos.npz", robot="openarm", episode_seconds=seconds)
+
+    def test_results_of_another_length_are_named_before_they_are_replaced(self):
+        policy = load_policy("zero", robot="ur7e-sharpa")
+        bank = toy_bank(policy.robot)
+        for seconds, told in ((0.1, ""), (0.1, ""), (0.2, "results of episodes of another length")):
+            errors = io.StringIO()
+            with self.subTest(seconds), contextlib.redirect_stderr(errors):
+                evaluate(policy, bank, episodes=1, episode_seconds=seconds, out=self.folder)
+            self.assertIn(told, errors.getvalue())
+            self.assertEqual(bool(told), bool(errors.getvalue()))
 
     def test_results_of_other_demonstrations_are_named_before_they_are_replaced(self):
         rollouts = toy_rollouts()

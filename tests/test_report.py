@@ -431,8 +431,9 @@ class PageTest(Reported):
         self.assertIn(words, page(collect(self.folder), self.clips))
 
     def test_without_clips_curves_and_run(self):
-        self.write(engines=("pybullet",))
+        self.write(engines=("pybullet",), episode_seconds=12.0)
         text = page(collect(self.folder), [])
+        self.assertIn("4 of 12 s in each engine: 2 demonstrations", Outline(text).text)
         self.assertEqual(text.count('<td class="bad">1</td>'), 2, "faults of an engine stand out")
         self.assertNotIn("<video", text)
         self.assertNotIn("Training", Outline(text).text)

@@ -335,13 +335,13 @@ class TablesTest(Studied):
         "[[tables]]\nmetric = 'grasp'\nrows = 'run'\nruns = { ours = 'X-RESET' }\n"
     )  # fmt: skip
 
-    def write(self, name, *progress, first=0):
+    def write(self, name, *progress, first=0, **changes):
         """Results of the toy's episodes from the first on, with other task progress."""
         toy = toy_rollouts()
         own = toy.episodes[first : first + len(progress)]
         episodes = tuple(replace(e, task_progress=p) for e, p in zip(own, progress, strict=True))
         rollouts = replace(toy, episodes=episodes)
-        summary = toy_summary("mujoco", rollouts, robot="openarm", seed=0)
+        summary = toy_summary("mujoco", rollouts, robot="openarm", seed=0, **changes)
         write_results(self.out / name / "eval", summary, rollouts, ("a", "b", "c"))
 
     def test_ours_beside_the_papers(self):
@@ -428,12 +428,23 @@ class TablesTest(Studied):
             ("", ""),
             ("seed = 7\n", "in mujoco"),
             ("episodes = 3\n", "in mujoco"),
+            ("episode_seconds = 5.0\n", ""),
+            ("episode_seconds = 12.0\n", "in mujoco"),
         ):
             text = self.TEXT.replace(
                 "episodes = 2\n",
                 f"{changes}" if "episodes" in changes else f"episodes = 2\n{changes}",
             )
             self.assertEqual(self.plan(text).steps["eval ik"].left(), left)
+        self.write("ik", 0.33, 0.33, 0.33, 0.33, episode_seconds=12.0)
+        for seconds, left in ((None, "in mujoco"), (5.0, "in mujoco"), (12.0, "")):
+            changed = (
+                f"episodes = 2\nepisode_seconds = {seconds}\n" if seconds else "episodes = 2\n"
+            )
+            step = self.plan(self.TEXT.replace("episodes = 2\n", changed)).steps["eval ik"]
+            self.assertEqual(step.left(), left)
+            for command in step.todo()[1]:
+                self.assertEqual("--episode-seconds" in command, seconds is not None)
 
 
 @skipUnless(find_spec("mujoco"), "MuJoCo is not installed")

@@ -17,8 +17,9 @@ if TYPE_CHECKING:
 
 _CONDITIONS = ("objects", "robot", "object meshes", "number of episodes", "seed of the evaluation")
 _PLAYED_TASK = ("task.termination.", "task.reset.spawn_", "task.reset.home_noise", "task.timestep")
-"""Fields of a training's task that its evaluation keeps (:func:`xreset.task.config.evaluation_task`) and that make it
-easier or harder."""
+"""Fields of a training's task that its evaluation keeps (:func:`xreset.task.config.evaluation_task`), unless it states
+another length of episodes, and that make it easier or harder."""
+_LENGTH = "task.termination.episode_seconds"
 _SAME_NAMES = " Their sequences have the same names: if one was made from the other, as for ik, they are comparable."
 
 
@@ -70,6 +71,8 @@ def _condition_table(trainings: Sequence[Training]) -> Table:
             for name, text in training.facts.items():
                 if name.startswith(_PLAYED_TASK):
                     row[name] = text
+            if result.episode_seconds is not None:  # it need not be that of the training
+                row[_LENGTH] = f"{result.episode_seconds:.6g}"
             rows.append(row)
     return pd.DataFrame(rows)
 

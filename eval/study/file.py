@@ -116,6 +116,8 @@ class Evaluation(Checked):
     """Largest number of demonstrations of each object; None: all (of the run's own data: as many as in training)."""
     episodes: PositiveInt = 5
     """Episodes of each demonstration, each with a perturbed start."""
+    episode_seconds: PositiveFinite | None = None
+    """Length of an episode [s]; None: as in the policy's training."""
     seed: Seed = 0
     engines: tuple[str, ...] = ("mujoco", "mujoco-warp", "pybullet", "sapien")
     """Engines that are not installed are left out, with a note."""

@@ -285,6 +285,7 @@ def eval_todo(run: Run, folder: Path, spec: Evaluation, subset: Subset, engines:
         robot=run.spec.robot if policy else None,
         demos=demos,
         episodes=spec.episodes,
+        episode_seconds=spec.episode_seconds,
         seed=spec.seed,
         num_envs=spec.num_envs,
         out=folder,
@@ -294,13 +295,15 @@ def eval_todo(run: Run, folder: Path, spec: Evaluation, subset: Subset, engines:
     if policy is None:
         files["policy"] = run.folder / "policy.onnx"
     hashes = {name: file_hash(file) for name, file in files.items() if file.is_file()}
+    trained = (run.config or TrainConfig()).task.termination.episode_seconds
+    wanted = (spec.seed, spec.episodes, spec.episode_seconds or trained)
     missing = []
     for engine in engines:
         file = folder / f"{engine}.json"
         result = read_result(file) if file.is_file() else None
         if (
             result is None
-            or (result.seed, result.episodes_per_demo) != (spec.seed, spec.episodes)
+            or (result.seed, result.episodes_per_demo, result.episode_seconds or trained) != wanted
             or not hashes.items() <= result.inputs.items()
         ):
             missing.append(engine)

@@ -17,6 +17,7 @@ def evaluate(
     demos: Path,
     episodes: int = 5,
     settle: bool = False,
+    episode_seconds: float | None = None,
     setting: Flat[Setting] = Setting(),
     out: Path | None = None,
 ) -> None:
@@ -30,6 +31,8 @@ def evaluate(
         episodes: Episodes per demonstration, each with another perturbation of robot and object.
         settle: Let objects come to rest before episodes begin. Default: the recorded poses, as in the paper, from which
             one object in eight tips or rolls.
+        episode_seconds: Length of an episode [s], such as 12, as in the published paper. Default: as in the policy's
+            training.
         setting: Robot, meshes, seed, device and worlds.
         out: Folder for the results; default: eval/ in the run folder or next to the policy, runs/NAME/eval for a policy
             that ships with xreset, runs/BASELINE-ROBOT/eval for a baseline.
@@ -45,6 +48,7 @@ def evaluate(
             tuple(dict.fromkeys(backend or ("mujoco",))),
             episodes=episodes,
             settle=settle,
+            episode_seconds=episode_seconds,
             out=out,
             progress=bar.stages(),
             **vars(setting),

@@ -170,6 +170,7 @@ class DistillTest(InOneFolder):
                 "Unknown camera 'rear'. Choose from: front, side, wrist",
                 {"cameras": "rear"},
             ),
+            (XResetError, "'front' is given twice. Give each", {"cameras": ("front", FRONT)}),
             (XResetError, "Unknown camera 3", {"cameras": (FRONT, 3)}),
             (PolicyError, "Unknown policy 'nobody'", {"teacher": "nobody"}),
             (

@@ -164,6 +164,10 @@ class LeRobot(Case):
             ("is there already", {"folder": self.folder / "eval"}),
             ("must be even", {"size": (321, 240)}),
             ("Unknown camera rear", {"cameras": ("rear",)}),
+            (
+                "'side' is given twice. Give each camera once",
+                {"cameras": ("side", "front", "side")},
+            ),
             ("wanted and not wanted", {"cameras": ("front",), "video": False}),
         ):
             with self.subTest(words), self.assertRaisesRegex(XResetError, words):

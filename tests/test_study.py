@@ -209,6 +209,9 @@ class PlanTest(Studied):
             (command,) = played.todo()[1]
             self.assertEqual(command[command.index("--demos") + 1], file)
         self.assertNotIn("eval-goals ik", plan.steps, "goals have no motion to follow")
+        schedule = "config.schedule.demo_probability = [[0.0, 0.5], [1.0, 0.25]]\n"
+        with self.assertRaisesRegex(RunError, r"demonstrated states, and a goal set has none"):
+            self.plan(HEAD + DATA + goals + RUN + f"[runs.a]\ndata = 'goals'\n{schedule}")
         with self.assertRaisesRegex(FileFormatError, r"data\.both has both demos and goals"):
             self.plan(HEAD + DATA + "[data.both]\ndemos = 'a.npz'\ngoals = []\n" + RUN)
 

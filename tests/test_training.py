@@ -168,6 +168,20 @@ class TrainingTest(InOneFolder):
             (info.config.model, info.config.iterations), (CONFIG.model, CONFIG.iterations)
         )
         self.assertEqual(info.weights, str(latest_checkpoint(self.out)))
+        scheduled = ScheduleConfig(demo_probability=((0.0, 0.5), (1.0, 0.0)))
+        config = replace(CONFIG, schedule=scheduled)
+        with self.assertRaisesRegex(
+            RunError, "demonstrated states, and a goal set has none.*--resets"
+        ):
+            self.train("asks", goals=file, **options | {"config": config})
+        self.assertFalse((self.folder / "asks").exists())
+        earlier = self.train("earlier", config=config)
+        for name, more, expected in (("home", {}, ()), ("states", {"bank": self.bank}, scheduled)):
+            tuned = self.train(
+                name, goals=file, weights=earlier, **options | {"config": None} | more
+            )
+            found = read_run(tuned).config.schedule
+            self.assertEqual(found, expected or ScheduleConfig())
         both = read_bank(read_run(self.train("both", goals=file)).resets)
         self.assertEqual(
             (both.num_states, len(both.sequence_name), both.object_names), (6, 7, (SOUP, SPAM))

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from xreset.cameras.config import CAMERAS, VisionConfig
+from xreset.cameras.config import CAMERAS, VisionConfig, check_each_once
 from xreset.errors import XResetError, needs
 from xreset.eval.export.recorded import RecordedEpisodes
 from xreset.eval.report.clips import draw_state, draw_view, encode_mp4, policy_cameras
@@ -58,8 +58,8 @@ def write_lerobot(
         cameras: names of depth cameras (:data:`xreset.cameras.config.CAMERAS`), each of which gives a film.
 
     Raises:
-        XResetError: a camera is unknown, pyarrow or the encoder of films is missing, the folder is not empty, or it
-            cannot be written.
+        XResetError: a camera is unknown or given twice, pyarrow or the encoder of films is missing, the folder is not
+            empty, or it cannot be written.
     """
     with needs("pyarrow, which writes LeRobot data sets,", "lerobot"):
         import pyarrow.parquet  # noqa: F401
@@ -67,6 +67,7 @@ def write_lerobot(
         raise XResetError(
             f"Unknown camera {', '.join(sorted(unknown))}. Choose from: {', '.join(CAMERAS)}."
         )
+    check_each_once([CAMERAS[name] for name in cameras])
     if cameras and not video:
         raise XResetError(
             "Films of cameras are wanted and not wanted. Leave out --no-video or --camera."

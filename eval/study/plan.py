@@ -14,7 +14,7 @@ from xreset.errors import RunError
 from xreset.eval.study.file import Data, Study
 from xreset.eval.study.steps import Run, Step, Subset, bank_todo, eval_todo, train_todo
 from xreset.learning.config import TrainConfig
-from xreset.learning.recipes import starting_config
+from xreset.learning.recipes import from_home, starting_config
 from xreset.objects.catalogue import canonical_names, object_names
 from xreset.plugins import backend_status
 from xreset.text import short_name
@@ -188,9 +188,9 @@ def _runs(plan: Plan, group: str) -> Iterator[Run]:
         yield Run(group=group, spec=spec, objects=objects, subset=subset, folder=plan.out / group)
         return
     changed = merged(asdict(starting_config(spec.recipe)), spec.config)
-    if plan.study.data[spec.data].goals is not None:  # as xreset train does without a bank
-        changed = merged(changed, {"task": {"reset": {"demo_probability": 0.0}}})
     config = from_dict(TrainConfig, changed, f"runs.{group}.config")
+    if plan.study.data[spec.data].goals is not None:
+        config = from_home(config)
     if config.task.reward.own:
         raise RunError(
             f"runs.{group}.config.task.reward.own names code, which a study may not. Use xreset train."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import field
 from typing import Annotated, Literal
 
@@ -16,6 +17,7 @@ from xreset.checks import (
     Share,
     frozen,
 )
+from xreset.errors import XResetError
 
 Point = Annotated[
     tuple[float, float, float],
@@ -113,3 +115,12 @@ WRIST = CameraConfig(
 """A camera behind the palm that looks along the fingers."""
 CAMERAS = {"front": FRONT, "side": SIDE, "wrist": WRIST}
 """Name -> camera."""
+
+
+def check_each_once(cameras: Sequence[CameraConfig]) -> None:
+    """Refuse a camera that is given twice: its second image says what the first one does."""
+    for i, camera in enumerate(cameras):
+        if camera in cameras[:i]:
+            names = [name for name, known in CAMERAS.items() if known == camera]
+            which = f"The camera {names[0]!r}" if names else f"The camera at {camera.pos}"
+            raise XResetError(f"{which} is given twice. Give each camera once (--camera).")

@@ -12,7 +12,7 @@ from pathlib import Path
 from xreset.cli._common import Objects
 from xreset.errors import RunError
 from xreset.learning.config import TrainConfig
-from xreset.learning.recipes import default_recipe, starting_config
+from xreset.learning.recipes import default_recipe, starting_config, without_state_schedule
 
 
 def train(
@@ -102,8 +102,13 @@ def train(
 def command_for(arguments: list[str]) -> Callable[..., None]:
     """Return :func:`train` with the defaults of ``--like``, which must be known before the other flags are read."""
     parser = ArgumentParser(add_help=False, allow_abbrev=False)
-    for flag in ("--like", "--weights", "--goals"):
+    for flag in ("--like", "--weights", "--goals", "--resets"):
         parser.add_argument(flag, nargs="?")  # a missing value is for the real parser to say
     given = parser.parse_known_args(arguments)[0]
     like = given.like or default_recipe(given.weights if given.goals else None)
-    return train if like == "paper" else partial(train, like=like, config=starting_config(like))
+    if like == "paper":
+        return train
+    config = starting_config(like)
+    if not given.like and not given.resets:
+        config = without_state_schedule(config)
+    return partial(train, like=like, config=config)

@@ -76,6 +76,27 @@ def starting_config(like: str) -> TrainConfig:
     return replace(config, task=replace(config.task, reward=replace(reward, own={})))
 
 
+def from_home(config: TrainConfig) -> TrainConfig:
+    """Return the configuration for goals without demonstrated states: every episode begins at home.
+
+    Raises:
+        RunError: a schedule asks for demonstrated states.
+    """
+    reset = replace(config.task.reset, demo_probability=0.0)
+    config = replace(config, task=replace(config.task, reset=reset))
+    if config.uses_states:
+        raise RunError(
+            "schedule.demo_probability asks for demonstrated states, and a goal set has none. Add a reset bank "
+            "(--resets), or leave the schedule empty: --config.schedule.demo-probability"
+        )
+    return config
+
+
+def without_state_schedule(config: TrainConfig) -> TrainConfig:
+    """Return the configuration without a schedule of demonstrated states, which a run that is fine-tuned may have."""
+    return replace(config, schedule=replace(config.schedule, demo_probability=()))
+
+
 def own_terms_flag(own: dict[str, float]) -> str:
     """Return the option of ``xreset train`` that names reward terms of the user's own."""
     terms = [f"{shlex.quote(plain(name))} {weight:g}" for name, weight in own.items()]

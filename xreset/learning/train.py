@@ -13,7 +13,13 @@ from typing import Any
 
 import torch
 
-from xreset.cameras.config import CAMERAS, STUDENT_VISION, CameraConfig, VisionConfig
+from xreset.cameras.config import (
+    CAMERAS,
+    STUDENT_VISION,
+    CameraConfig,
+    VisionConfig,
+    check_each_once,
+)
 from xreset.env import make_env
 from xreset.errors import PolicyError, RunError, XResetError
 from xreset.files import claim_folder, file_hash, write_whole
@@ -21,7 +27,14 @@ from xreset.inputs import Inputs, load_inputs
 from xreset.learning.config import TrainConfig
 from xreset.learning.distributed import Processes, leave
 from xreset.learning.export import export_onnx
-from xreset.learning.recipes import default_recipe, own_terms_flag, starting_config, student_config
+from xreset.learning.recipes import (
+    default_recipe,
+    from_home,
+    own_terms_flag,
+    starting_config,
+    student_config,
+    without_state_schedule,
+)
 from xreset.learning.run import (
     TEACHER,
     RunInfo,
@@ -88,8 +101,8 @@ def train(
         The run folder, which ``xreset.load_policy`` reads.
 
     Raises:
-        RunError: the folder holds a run already, there is no state to reset to, ``weights`` has no checkpoint of
-            networks like these, or there is too little memory.
+        RunError: the folder holds a run already, there is no state to reset to, a schedule asks for states that goals
+            do not have, ``weights`` has no checkpoint of networks like these, or there is too little memory.
         PolicyError: ``weights`` is of another robot, or its policy observes something else.
         XResetError: bank, robot, objects and configuration do not fit together.
     """
@@ -98,6 +111,8 @@ def train(
         raise XResetError("Both recipe and config are given. Give one of them.")
     if config is None:
         config = starting_config(recipe or default_recipe(weights if goals is not None else None))
+        if recipe is None and bank is None:
+            config = without_state_schedule(config)
     if iterations is not None:
         config = replace(config, iterations=iterations)
     device = device or device_for(engine, "cuda" if torch.cuda.is_available() else "cpu")
@@ -114,10 +129,7 @@ def train(
     file = _file_of(out, bank, goals)
     inputs = load_inputs(file, robot=robot, objects=objects, accept=("bank", "goals"))
     if isinstance(inputs.data, GoalSet):
-        reset = replace(config.task.reset, demo_probability=0.0)
-        task = replace(config.task, reset=reset)
-        schedule = replace(config.schedule, demo_probability=())
-        config = replace(config, task=task, schedule=schedule)
+        config = from_home(config)
     if config.schedule.teacher and teacher is None:
         raise RunError(
             "schedule.teacher is for xreset distill, and this training has no teacher. Leave it empty."
@@ -205,8 +217,8 @@ def distill(
 
     Raises:
         PolicyError: the teacher is unknown, sees itself, or is for another robot.
-        XResetError: a camera is unknown or inside a body, no camera ever shows some object, or the renderer cannot
-            start.
+        XResetError: a camera is unknown, given twice or inside a body, no camera ever shows some object, or the
+            renderer cannot start.
     """
     if config is None:
         wanted = [cameras] if isinstance(cameras, str | CameraConfig) else cameras
@@ -217,6 +229,7 @@ def distill(
         raise XResetError(
             "A student needs a camera. Give one or two of: " + ", ".join(CAMERAS) + "."
         )
+    check_each_once(config.task.vision.cameras)
     return train(bank, out=out, config=config, teacher=teacher, **options)
 
 

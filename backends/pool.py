@@ -30,6 +30,7 @@ from xreset.backends.workers import (
 )
 from xreset.errors import CapabilityError, XResetError
 from xreset.physics import Backend, Contacts, Health, Links, MassProperties, Parameter, State
+from xreset.plugins import refuse_unknown_options
 from xreset.spec import SceneSpec
 
 
@@ -174,12 +175,15 @@ class PoolBackend(Backend):
 
         Raises:
             CapabilityError: the device is not the CPU.
+            XResetError: the world class has no such keyword.
         """
         if torch.device(device).type != "cpu":
             raise CapabilityError(
                 f"The backend {self.name!r} runs on the CPU only, found device {device!r}. "
                 "Use device 'cpu', or the backend 'mujoco-warp'."
             )
+        own = ("object_index", "device", "workers")
+        refuse_unknown_options(self.name, world_options, self.world_class, own)
         super().__init__(scene, num_worlds, object_index=object_index, device=device)
         if workers is None:
             workers = 0 if num_worlds == 1 else usable_cores()

@@ -28,6 +28,7 @@ from xreset.geometry.rotations import quat_rotate
 from xreset.learning.recipes import RECIPES
 from xreset.objects.catalogue import load_object, load_objects
 from xreset.physics import State
+from xreset.plugins import backend_status, make_backend
 from xreset.policy import ZeroPolicy
 from xreset.resets.distribution import ResetDistribution
 from xreset.task.config import (
@@ -171,6 +172,14 @@ class RefusalTest(WithEnv):
                 make_env(self.robot, self.objects, self.bank, task, num_envs=num_envs)
         with self.assertRaisesRegex(ValueError, "object_share .*numbers above 0"):
             ResetConfig(object_share={SOUP: 0.0})
+
+    def test_options_that_an_engine_lacks_are_refused(self):
+        scene = make_scene(self.robot, self.objects, TASK)
+        for name in ("mujoco", "mujoco-warp"):
+            if backend_status(name).reason is None:
+                words = f"'{name}' has no option 'integrator'. Choose from: object_index, device"
+                with self.subTest(name), self.assertRaisesRegex(XResetError, words):
+                    make_backend(name, scene, 2, integrator="discrete")
 
     def test_starts_and_goals_do_not_depend_on_the_robot(self):
         rows = np.zeros(self.bank.num_states, dtype=bool)

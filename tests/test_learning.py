@@ -1,11 +1,13 @@
 """The model, the sequence storage, the export and the run folder; no physics."""
 
 import json
+import math
 from dataclasses import asdict, replace
 from types import SimpleNamespace
 from unittest import TestCase, skipUnless
 from unittest.mock import Mock, patch
 
+import numpy as np
 import torch
 from tensordict import TensorDict
 from torch.testing import assert_close
@@ -304,6 +306,22 @@ class ConfigTest(TestCase):
             (PpoConfig, {"discount": 1.01}, "discount is 1.01, expected a number from 0 to 1"),
             (PpoConfig, {"entropy": float("nan")}, "entropy is nan"),
             (ModelConfig, {"initial_std": 0.0}, "initial_std is 0.0, expected a number above 0"),
+            (
+                TrainConfig,
+                {"iterations": 1.5},
+                "iterations is 1.5, expected a whole number above 0",
+            ),
+            (ModelConfig, {"initial_std": "1"}, "initial_std is '1', expected a number above 0"),
+            (
+                ResetConfig,
+                {"object_share": {"soup": "3"}},
+                "object_share is .*expected names of objects and numbers above 0",
+            ),
+            (
+                TaskConfig,
+                {"termination": TerminationConfig(episode_seconds=0.01)},
+                "episode_seconds is 0.01, expected at least one control step, which is 0.0167",
+            ),
             (ModelConfig, {"mlp": (64, 0)}, "mlp is .*expected one width or more"),
             (
                 RandomizationConfig,
@@ -347,6 +365,14 @@ class ChangingSettings(TestCase):
             ((0.0, 0.9), (0.0, 0.1)),
             ((0.0, 1.2),),
             ((-0.1, 0.5),),
+            ((0.0, math.nan),),
+            ((math.nan, 0.5), (1.0, 0.5)),
+            (0.0, 0.5, 1.0, 0.2),  # as on the command line
+            ((0.0, 0.5), (1.0,)),
+            ((0.0, "a"),),
+            {0.0: 0.5},
+            np.array([[0.0, 0.5]]),
+            0.5,
         ):
             with (
                 self.subTest(points=points),

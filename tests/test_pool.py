@@ -39,7 +39,7 @@ class ToyWorld(World):
     """Joints jump to their targets; the object moves at its velocity plus force / mass; readings follow the state."""
 
     def __init__(self, scene, object_index, *, gain=1.0):
-        self.gain = gain
+        self.gain = float(gain)
         self.scene = scene
         self.object_index = object_index
         self.mass = scene.objects[object_index].mass
@@ -278,7 +278,10 @@ class PoolTest(TestCase):
                 self.subTest(workers=workers),
                 self.assertRaisesRegex(RuntimeError, "world 0, build: TypeError"),
             ):
-                ToyBackend(toy_scene(), 2, workers=workers, nonsense=1)
+                ToyBackend(toy_scene(), 2, workers=workers, gain=None)
+        words = "'toy' has no option 'nonsense'. Choose from: object_index, device, workers, gain"
+        with self.assertRaisesRegex(XResetError, words):
+            ToyBackend(toy_scene(), 2, nonsense=1)
 
 
 class DeathTest(TestCase):

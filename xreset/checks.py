@@ -13,6 +13,7 @@ from dataclasses import MISSING, dataclass, fields, is_dataclass
 from difflib import get_close_matches
 from functools import cache
 from math import inf, isfinite
+from numbers import Integral
 from typing import (
     Annotated,
     Any,
@@ -45,16 +46,22 @@ class Rule:
     holds: Callable[[Any], bool]
 
 
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, Integral)
+
+
 Positive = Annotated[T, Rule("a number above 0", lambda x: 0 < x <= inf)]
 """Infinity is allowed, and means no limit; otherwise write :data:`PositiveFinite`."""
 NotNegative = Annotated[T, Rule("a number from 0 to 1e15", lambda x: 0 <= x <= 1e15)]
 """No time, number of steps or distance is larger: such a number in a file is damage."""
 Finite = Annotated[T, Rule("a finite number", isfinite)]
 PositiveFloat = Positive[float]
-PositiveInt = Positive[int]
+PositiveInt = Annotated[int, Rule("a whole number above 0", lambda x: _is_whole(x) and x > 0)]
 PositiveFinite = Positive[Finite[float]]
 NonNegativeFloat = NotNegative[float]
-NonNegativeInt = NotNegative[int]
+NonNegativeInt = Annotated[
+    int, Rule("a whole number from 0 to 1e15", lambda x: _is_whole(x) and 0 <= x <= 1e15)
+]
 FiniteFloat = Finite[float]
 Share = Annotated[float, Rule("a number from 0 to 1", lambda x: 0 <= x <= 1)]
 Range = Annotated[
@@ -99,7 +106,17 @@ def marks_of(cls: type) -> dict[str, list[Any]]:
 def _broken(marks: typing.Iterable[Any], value: Any) -> list[Rule]:
     if value is None:
         return []
-    return [mark for mark in marks if isinstance(mark, Rule) and not mark.holds(value)]
+    return [mark for mark in marks if isinstance(mark, Rule) and not _holds(mark, value)]
+
+
+def _holds(rule: Rule, value: Any) -> bool:
+    try:
+        return bool(rule.holds(value))
+    except (
+        TypeError,
+        ValueError,
+    ):  # a value of another type, such as a text where a number is expected
+        return False
 
 
 def _is_union(hint: Any) -> bool:

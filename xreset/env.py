@@ -123,7 +123,7 @@ def shared_worlds(names: Sequence[str], num_envs: int, share: Mapping[str, float
     unknown = sorted(set(share) - set(names))
     if unknown:
         raise XResetError(
-            f"object_share names {', '.join(unknown)}, but the objects are {', '.join(names)}."
+            f"object_share names {', '.join(unknown)}, but the objects are {', '.join(names)}. Use these names."
         )
     wanted = np.array([share.get(name, 1.0) for name in names])
     exact = num_envs * wanted / wanted.sum()

@@ -10,8 +10,10 @@ from __future__ import annotations
 import os
 import re
 import traceback
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
+from inspect import Parameter, signature
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -171,11 +173,40 @@ def _kind(device: str) -> str:
 
 
 def make_backend(name: str, scene: SceneSpec, num_worlds: int, **options: Any) -> Backend:
-    """Build a backend by name; see :class:`xreset.physics.Backend` for the options."""
+    """Build a backend by name; see :class:`xreset.physics.Backend` for the options.
+
+    Raises:
+        BackendUnavailableError: there is no such engine, or it cannot be used here.
+        XResetError: the engine has no such option.
+    """
     device_for(name, str(options.get("device", "cpu")))  # refuses an unknown device
     cls = backend_class(name)
     cls.engine_version()  # fails with reason and remedy where the engine is missing
+    refuse_unknown_options(name, options, cls)
     return cls(scene, num_worlds, **options)
+
+
+def refuse_unknown_options(
+    engine: str, options: Iterable[str], taker: Callable[..., Any], also: Sequence[str] = ()
+) -> None:
+    """Refuse options that an engine does not have.
+
+    Args:
+        engine: name of the engine.
+        options: names of the given options.
+        taker: class whose first two arguments are no options, and whose others are. One that passes options on, as
+            ``**options``, must refuse them itself.
+        also: options that others take.
+    """
+    parameters = signature(taker).parameters
+    if any(parameter.kind is Parameter.VAR_KEYWORD for parameter in parameters.values()):
+        return
+    known = [*also, *list(parameters)[2:]]
+    unknown = [repr(option) for option in options if option not in known]
+    if unknown:
+        raise XResetError(
+            f"The engine {engine!r} has no option {', '.join(unknown)}. Choose from: {', '.join(known)}."
+        )
 
 
 def backend_status(name: str) -> BackendStatus:

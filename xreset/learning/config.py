@@ -101,7 +101,13 @@ Points = tuple[tuple[float, float], ...]
 
 
 def is_schedule(points: Points) -> bool:
-    """Whether the shares rise from 0 or more to 1 or less, and all values lie between 0 and 1."""
+    """Whether the shares rise from 0 or more to 1 or less, and all values lie between 0 and 1.
+
+    Raises:
+        TypeError, ValueError: these are not pairs of numbers.
+    """
+    if not isinstance(points, tuple | list):
+        return False
     shares = [share for share, _ in points]
     rising = all(earlier < later for earlier, later in pairwise(shares))
     return rising and all(0 <= share <= 1 and 0 <= value <= 1 for share, value in points)

@@ -493,7 +493,13 @@ class TaskConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        steps = self.termination.episode_seconds / (self.timestep * self.substeps)
+        control_dt = self.timestep * self.substeps
+        steps = self.termination.episode_seconds / control_dt
+        if steps < 1 - 1e-6:
+            raise ValueError(
+                f"termination.episode_seconds is {self.termination.episode_seconds:g}, expected at least one control "
+                f"step, which is {control_dt:.3g}"
+            )
         for name in ("action_latency", "hand_latency", "observation_latency", "proprio_latency"):
             longest = self.randomization.longest(name)
             if longest >= steps:

@@ -15,7 +15,7 @@ from xreset import TaskConfig, plugins
 from xreset.description import load_robot as load
 from xreset.errors import PolicyError, RobotError
 from xreset.geometry.dynamics import mass_matrix
-from xreset.geometry.urdf import find_mesh
+from xreset.geometry.urdf import find_mesh, load_urdf
 from xreset.plugins import robot_folder, robot_names
 from xreset.policy import check_contract, policy_contract
 from xreset.robot_tools.check import check
@@ -182,6 +182,7 @@ class Registry(Copied):
         self.edit("robot.toml", 'name = "joint7"', 'name = "joint9"')
         self.edit("robot.toml", "home = 1.50", "home = 2.60")
         self.edit("robot.toml", 'wrist = "link7"', 'wrist = "link77"')
+        self.edit("robot.toml", '["link5", "link7"],', '["link5", "link8"], ["link9", "link7"],')
         self.edit("robot.toml", "mimics = [{", "mimics = [{ multiplier = 2.0,")
         self.edit("robot.urdf", 'ixx="0.000143"', 'ixx="-0.00143"')
         self.edit("robot.urdf", '<mass value="0.550659" />', '<mass value="0" />')
@@ -190,7 +191,8 @@ class Registry(Copied):
             "'joint9' is not in the URDF",
             "'joint7' moves",
             "'joint4' is at home at 2.6",
-            "'link77'",
+            "links: keypoints: the URDF has no link 'link77'. Choose from: link0",
+            "links: collision.exclude: the URDF has no link 'link8', 'link9'. Choose",
             "finger_joint2",
             "'link6' has the principal moments -",
             "'link5' moves but has the mass 0",
@@ -254,6 +256,16 @@ class Registry(Copied):
         self.assertRegex(
             warnings,
             r"'joint1' has the damping ratio 0\.\d+ at home. It swings[\s\S]*finger_joint1': kd = 500",
+        )
+
+    def test_a_robot_whose_links_may_all_touch_the_table(self):
+        solid = [link.name for link in load_urdf(load(self.folder).urdf).links if link.collisions]
+        text = (self.folder / "robot.toml").read_text()
+        text = re.sub("table_exclude = .*", f"table_exclude = {solid}", text)
+        (self.folder / "robot.toml").write_text(text)
+        self.assertIn(
+            "home and table: no shape that may not touch the table is above it; 0 %",
+            self.errors("ok"),
         )
 
     def test_command_fails_on_errors_only(self):

@@ -84,8 +84,11 @@ def height_above_table(points: Tensor, radii: Tensor, table: TableSpec) -> Tenso
 
 
 def table_clearance(kinematics: Kinematics, q: Tensor, table: TableSpec) -> Tensor:
-    """[B] lowest height of the robot's moving shapes above the table [m], at joint positions [B, J]."""
+    """[B] lowest height of the robot's moving shapes above the table [m], at joint positions [B, J]; infinite if none
+    is above it."""
     support = table_points(kinematics)
+    if not support:
+        return q.new_full((len(q),), float("inf"))
     points, radii = map(np.concatenate, zip(*support.values(), strict=True))
     links = np.repeat([*support], [len(own) for own, _ in support.values()])
     centers = kinematics.points(q, links.tolist(), q.new_tensor(points))

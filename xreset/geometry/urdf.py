@@ -185,14 +185,24 @@ def mismatches(robot: RobotSpec, tree: RobotTree) -> dict[str, list[str]]:
                 f"mimic joints follow {mimic.source}, which the description does not actuate. Let them follow an "
                 "actuated joint."
             )
-    named = [robot.hand_root, robot.palm, *robot.self_collision_links, *robot.table_exclude]
-    named += [point.link for point in robot.keypoints]
-    named += chain(*robot.collision_exclude)
+    named = {
+        "hand.root": [robot.hand_root],
+        "hand.palm": [robot.palm],
+        "keypoints": [point.link for point in robot.keypoints],
+        "collision.self": robot.self_collision_links,
+        "collision.exclude": chain(*robot.collision_exclude),
+        "collision.table_exclude": robot.table_exclude,
+    }
     for tip in robot.fingertips:
-        named += (tip.link, *tip.contact_links)
+        named[f"fingertip {tip.name!r}"] = [tip.link, *tip.contact_links]
     known = ", ".join(tree.link_names)
-    absent = [link for link in dict.fromkeys(named) if link not in tree.link_names]
-    links = [f"the URDF has no link {link!r}. Choose from: {known}." for link in absent]
+    links = []
+    for entry, names in named.items():
+        absent = [repr(link) for link in dict.fromkeys(names) if link not in tree.link_names]
+        if absent:
+            links.append(
+                f"{entry}: the URDF has no link {', '.join(absent)}. Choose from: {known}."
+            )
     return {"joints": joints, "links": links}
 
 

@@ -326,10 +326,10 @@ def _above_table(spec: RobotSpec, q: torch.Tensor) -> Problems:
         level = "error"
     elif height[0] < _MIN_CLEARANCE or share > 0.01:
         level = "warning"
-    yield (
-        level,
-        f"lowest at {1e3 * height[0]:.0f} mm above the table; {100 * share:.0f} % of the spread below it",
-    )
+    lowest = f"lowest at {1e3 * height[0]:.0f} mm above the table"
+    if height[0].isinf():
+        lowest = "no shape that may not touch the table is above it"
+    yield level, f"{lowest}; {100 * share:.0f} % of the spread below it"
 
 
 def _free_of_itself(spec: RobotSpec, q: torch.Tensor) -> Problems:

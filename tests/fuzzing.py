@@ -7,6 +7,7 @@ import io
 import json
 import logging
 import pickle
+import re
 import tempfile
 import time
 from collections.abc import Callable
@@ -109,8 +110,8 @@ def readers():
         openarm = load_robot("openarm")
         found: dict[str, Reader] = {}
 
-        def add(what, file, read, kind, may_hold=()):
-            found[what] = Reader(folder / file, read, kind, may_hold)
+        def add(what, file, read, kind, may_hold=(), slow=False):
+            found[what] = Reader(folder / file, read, kind, may_hold, slow)
             return folder / file
 
         path = add(
@@ -319,6 +320,7 @@ def readers():
             lambda p: load_view(p, demos=folder / "demos.npz"),
             "npz",
             (*may, "human_keypoints"),
+            slow=True,
         )
         write_retargeted(path, toy_retargeted(openarm))
         (folder / "both").mkdir()
@@ -335,7 +337,6 @@ def readers():
         with_mesh.write_text(f'<robot name="x"><link name="a">{geometry}</link></robot>')
         path = add("mesh of a URDF", "meshed/box.stl", lambda p: _fresh_urdf(with_mesh), "bytes")
         path.write_bytes((folder / "box.stl").read_bytes())
-        found["motion and archive"] = replace(found["motion and archive"], slow=True)
         try:
             yield found
         finally:
@@ -467,27 +468,10 @@ def _bytes():
 
 def _words():
     """Replaces one number or quoted text of a text file by junk."""
-    import re
-
     junk = (
-        *[
-            "nan",
-            "inf",
-            "-1",
-            "1e300",
-            "0",
-            "",
-            "x",
-            "1 2",
-            '"',
-            "\x00",
-            "\x9b",
-            "../../etc/passwd",
-            "100000000",
-        ],
-        "1" * 5000,
-        "[" * 2000,
-    )
+        "nan", "inf", "-1", "1e300", "0", "", "x", "1 2", '"', "\x00", "\x9b", "../../etc/passwd", "100000000",
+        "1" * 5000, "[" * 2000,
+    )  # fmt: skip
 
     def replaced(at, text):
         def damage(whole):
@@ -526,32 +510,24 @@ def _arrays():
                 try:
                     if how == "number" and array.dtype.kind in "fiu" and array.size:
                         array = array.copy()
-                        if array.dtype.kind == "f":
-                            array.ravel()[int(place * array.size)] = number
-                        else:
-                            array.ravel()[int(place * array.size)] = (
-                                int(np.nan_to_num(number, posinf=2**31, neginf=-(2**31))) % 2**31
-                                - 5
-                            )
-                    elif how == "all":
-                        array = (
-                            np.full(array.shape, number)
-                            if array.dtype.kind == "f"
-                            else np.zeros_like(array)
+                        array.ravel()[int(place * array.size)] = np.array(number).astype(
+                            array.dtype
                         )
+                    elif how == "all" and array.dtype.kind == "f":
+                        array = np.full(array.shape, number)
+                    elif how == "all":
+                        array = np.zeros_like(array)
                     elif how == "type":
                         array = array.astype(kind)
+                    elif how == "shape" and place < 0.3:
+                        array = array[..., None]
                     elif how == "shape":
-                        array = (
-                            array[..., None]
-                            if place < 0.3
-                            else array.reshape(-1)[: max(0, int(place * array.size))]
-                        )
+                        array = array.reshape(-1)[: int(place * array.size)]
                     elif how == "text":
                         array = np.full(array.shape, "\x1b[31m[/bold]")
                     elif how == "grow" and array.dtype.kind != "U" and array.ndim:
                         array = np.tile(array, (1000,) + (1,) * (array.ndim - 1))
-                    elif how == "swap" and len(array.shape) and len(array) > 1:
+                    elif how == "swap" and array.ndim:
                         array = array[::-1]
                 except (ValueError, TypeError, OverflowError):
                     return whole[: int(place * len(whole))]
@@ -577,18 +553,20 @@ def _arrays():
 def _tree(load, dump):
     """Replaces, removes or adds an entry anywhere in nested objects and lists."""
 
+    def key_at(node, share):
+        keys = list(node) if isinstance(node, dict) else range(len(node))
+        return keys[int(share * len(keys))] if keys else None
+
     def changed(path, how, junk):
         def damage(whole):
             data = load(whole)
             node = data
             for step in path:
-                keys = list(node) if isinstance(node, dict) else list(range(len(node)))
-                key = keys[int(step * len(keys))] if keys else None
+                key = key_at(node, step)
                 if key is None or not isinstance(node[key], dict | list) or not node[key]:
                     break
                 node = node[key]
-            keys = list(node) if isinstance(node, dict) else list(range(len(node)))
-            key = keys[int(path[-1] * len(keys))] if keys else None
+            key = key_at(node, path[-1])
             if how == "drop" and key is not None:
                 del node[key]
             elif how == "add" and isinstance(node, dict):

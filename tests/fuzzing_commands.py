@@ -58,23 +58,15 @@ class TooSlow(BaseException):
 def commands():
     """Return the options of each command, from its own parser, by the command's words."""
     found: dict[str, list[Action]] = {}
-
-    def add(words, table):
-        for name in table:
-            module = import_module(f"xreset.cli{words}.{name}".replace(" ", "."))
-            path = f"{words} {name}"
-            if hasattr(module, "COMMANDS"):
-                add(path, module.COMMANDS)
-                continue
-            command: Any = (
-                module.command_for([]) if hasattr(module, "command_for") else module.COMMAND
-            )
-            verbs = command if isinstance(command, dict) else {"": command}
-            for verb, function in verbs.items():
-                found[f"{path} {verb}".strip()] = tyro.extras.get_parser(checked(function))._actions
-
-    add("", COMMANDS)
-    return {words: actions for words, actions in found.items() if words not in WAIT_OR_WORK}
+    for name in COMMANDS:
+        module = import_module(f"xreset.cli.{name}")
+        command = module.command_for([]) if hasattr(module, "command_for") else module.COMMAND
+        verbs = command if isinstance(command, dict) else {"": command}
+        for verb, function in verbs.items():
+            words = f"{name} {verb}".strip()
+            if words not in WAIT_OR_WORK:
+                found[words] = tyro.extras.get_parser(checked(function))._actions
+    return found
 
 
 def draw(random, options):

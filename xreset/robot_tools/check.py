@@ -65,8 +65,8 @@ def check(name_or_folder: str | Path) -> list[Finding]:
     except XResetError as error:
         return [Finding("error", "description", str(error))]
     joints = f"{len(spec.arm_indices)} arm joints, {len(spec.hand_indices)} hand joints"
-    counts = f"{joints}, {len(spec.fingertips)} fingertips"
-    found = [Finding("ok", "description", f"{folder / DESCRIPTION}: {counts}")]
+    content = f"{joints}, {len(spec.fingertips)} fingertips"
+    found = [Finding("ok", "description", f"{folder / DESCRIPTION}: {content}")]
     try:
         tree = load_urdf(spec.urdf)
     except XResetError as error:

@@ -105,9 +105,9 @@ class Couplings:
 
     def _jacobian(self, q: np.ndarray) -> np.ndarray:
         """[E, Q]"""
-        count = len(self._gaps(q))
+        self._gaps(q)
         dofs = self.model.jnt_dofadr[self.joints]
-        return self.data.efc_J.reshape(-1, self.model.nv)[:count, dofs]
+        return self.data.efc_J.reshape(-1, self.model.nv)[: self.data.ne, dofs]
 
     def _groups(self) -> list[np.ndarray]:
         """Return joints that depend on each other, by their indices."""

@@ -119,7 +119,7 @@ def judge(
     backends: Sequence[str] = ("mujoco",),
     *,
     states: int = 8,
-    squeeze: SqueezeConfig | None = None,
+    squeeze: SqueezeConfig = SqueezeConfig(force=5.0, reach=0.01),
     num_envs: int = 32,
     device: str = "cpu",
     progress: Callable[[float, int], None] = unseen,
@@ -133,7 +133,7 @@ def judge(
         backends: engines.
         states: number of states of each object: those in the air in which the thumb and another finger are nearest to
             the object, as many from each demonstration as possible.
-        squeeze: how hard fingers press, and which; default: 5 N, fingers within 1 cm.
+        squeeze: how hard fingers press, and which.
         num_envs: worlds at a time.
         device: where engines run that can use it; the others run on the CPU.
         progress: called with (states done, states in all).
@@ -145,7 +145,6 @@ def judge(
     """
     objects = checked_objects(robot, objects)
     check_states(bank, robot, objects)
-    squeeze = squeeze or SqueezeConfig(force=5.0, reach=0.01)
     height = bank.object_pos[:, 2] - bank.start_pos[bank.sequence_index, 2]
     lifted = bank.with_states(np.flatnonzero(bank.post_contact & (height > LIFT)))
     if not lifted.num_states:
@@ -246,22 +245,12 @@ def _play(kinematics: Kinematics, backend: Backend, start: State) -> Tensor:
         start.object_pos, start.object_quat, palm[:, :3, 3], matrix_to_quat(palm[:, :3, :3])
     )
     able = (up_error < 1) & (turn_error < 1)
+    still = torch.stack((joints, joints))
     kept = torch.ones_like(able)
     passed = []
     moments = []
-    before = joints
-    for path, error in (
-        (joints[None], torch.zeros_like(up_error)),
-        (up, up_error),
-        (turn, turn_error),
-    ):
-        _move(
-            backend,
-            start.joint_target,
-            torch.cat((before[None], path)),
-            kinematics.robot.arm_indices,
-        )
-        before = path[-1]
+    for path, error in ((still, torch.zeros_like(up_error)), (up, up_error), (turn, turn_error)):
+        _move(backend, start.joint_target, path, kinematics.robot.arm_indices)
         now = backend.state().to("cpu").map(Tensor.double)
         links = backend.links().to("cpu").map(Tensor.double)
         now_pos, now_quat = relative_pose(
@@ -289,13 +278,13 @@ def arm_path(
         turn: angle at the end [rad].
 
     Returns:
-        Joints [waypoints, N, J], and the error at the end as a share of what is allowed [N].
+        Joints [1 + waypoints, N, J], and the error at the end as a share of what is allowed [N].
     """
     arm = torch.as_tensor(kinematics.robot.arm_indices)
     links = [kinematics.robot.palm]
     quat = matrix_to_quat(palm[:, :3, :3])
     risen = (kinematics.link_poses(joints, links)[:, 0, 2, 3] - palm[:, 2, 3])[:, None]
-    waypoints = []
+    waypoints = [joints]
     error = joints
     for number in range(1, _WAYPOINTS + 1):
         share = number / _WAYPOINTS
@@ -321,7 +310,7 @@ def arm_path(
 
 
 def _move(backend: Backend, targets: Tensor, path: Tensor, arm: np.ndarray) -> None:
-    """Move the arm's targets along waypoints [waypoints, N, J], and let it rest; the hand keeps its targets [N, J]."""
+    """Move the arm's targets along waypoints [W, N, J], and let it rest; the hand keeps its targets [N, J]."""
     for number in range(1, _MOVE_STEPS + _REST_STEPS + 1):
         place = min(number / _MOVE_STEPS, 1.0) * (len(path) - 1)
         first = min(int(place), len(path) - 2)

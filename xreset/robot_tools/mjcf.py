@@ -167,6 +167,7 @@ def _tree(path: Path, model: mujoco.MjModel, couplings: Couplings) -> RobotTree:
     poses = {}
     for number in range(1, model.nbody):
         body = model.body(number)
+        name = names[number]
         moving = np.flatnonzero((model.jnt_bodyid == number) & (model.jnt_type >= SLIDE)).tolist()
         above = names[int(body.parentid[0])]
         if number == 1 and moving:
@@ -174,7 +175,7 @@ def _tree(path: Path, model: mujoco.MjModel, couplings: Couplings) -> RobotTree:
                 f"{path}: the first body {body.name!r} has joints; put it into a body that does not move."
             )
         T = transform(data.xmat[number], data.xpos[number])
-        children = [*(f"{names[number]}_axis{i}" for i in range(len(moving) - 1)), names[number]]
+        children = [*(f"{name}_axis{i}" for i in range(len(moving) - 1)), name]
         for child, joint in zip(children, moving, strict=False):
             T = transform(T[:3, :3], data.xanchor[joint])
             poses[child] = T
@@ -188,12 +189,12 @@ def _tree(path: Path, model: mujoco.MjModel, couplings: Couplings) -> RobotTree:
             )
             joints.append(placed)
             above = child
-        poses[names[number]] = T
+        poses[name] = T
         if not moving and number > 1:
-            joints.append(fixed(above, names[number], np.linalg.inv(poses[above]) @ T))
+            joints.append(fixed(above, name, np.linalg.inv(poses[above]) @ T))
         R = T[:3, :3].T @ data.ximat[number].reshape(3, 3)
-        links[names[number]] = Link(
-            name=names[number],
+        links[name] = Link(
+            name=name,
             mass=float(body.mass[0]),
             com=T[:3, :3].T @ (data.xipos[number] - T[:3, 3]),
             inertia=R @ np.diag(body.inertia) @ R.T,

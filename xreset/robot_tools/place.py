@@ -55,7 +55,7 @@ def place(
     robot: RobotSpec,
     paths: list[ArmTargets],
     avoid: np.ndarray,
-    config: PlaceConfig | None = None,
+    config: PlaceConfig = PlaceConfig(),
     progress: Progress = unseen,
 ) -> list[Finalist]:
     """Find the placement from which the robot follows most of the motions.
@@ -72,7 +72,6 @@ def place(
     Raises:
         RobotError: there is no wrist pose to reach, or no room for the base.
     """
-    config = config or PlaceConfig()
     wrists = single_frames(paths, Thresholds().hand_error)
     count = len(wrists.annotated)
     if not count:

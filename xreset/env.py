@@ -110,10 +110,14 @@ def make_env(
 def shared_worlds(names: Sequence[str], num_envs: int, share: Mapping[str, float]) -> Tensor | None:
     """Return the object [N] of each world; None: world i holds object i modulo their number.
 
+    Worlds that remain after rounding down go to the largest remainders, so that each object's practice is as near as
+    possible to its share. :func:`xreset.schedule.schedule` shares worlds by another rule, which favors objects with few
+    items: its work ends, and training does not.
+
     Args:
         names: the objects.
         num_envs: N.
-        share: ``task.reset.object_share``. Worlds that remain after rounding down go to the largest remainders.
+        share: ``task.reset.object_share``.
 
     Raises:
         XResetError: an unknown name, or too few worlds.

@@ -28,6 +28,10 @@ class Schedule:
 def schedule(item_object: np.ndarray, max_worlds: int) -> Schedule:
     """Spread items over worlds in the fewest rounds.
 
+    One world after the other goes to the object whose worlds have most to do, which keeps the longest queue shortest.
+    :func:`xreset.env.shared_worlds` rounds shares to the nearest numbers instead, and cannot do this work: of 10 items
+    of one object and 1 of another, it would give all of four worlds to the first.
+
     Args:
         item_object: [I] object index of each item.
         max_worlds: largest number of worlds; more are used if there are more objects.

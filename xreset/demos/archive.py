@@ -261,7 +261,7 @@ def one_sequence(
     side: str,
     fps: float,
     keypoints: np.ndarray,
-    wrist: Rotation | None,
+    wrist: Rotation,
     object_pos: np.ndarray,
     object_rot: Rotation,
 ) -> Demos:
@@ -269,14 +269,13 @@ def one_sequence(
 
     Args:
         keypoints: [F, 21, 3] NaN in frames without a hand.
-        wrist: orientations in the frames with a hand; None: no frame has one.
+        wrist: orientations in the frames with a hand.
         object_pos: [F, 3]
         object_rot: F orientations.
     """
     valid = np.asarray(np.isfinite(keypoints).all(axis=(1, 2)))
     wrist_quat = np.full((len(keypoints), 4), np.nan, dtype=np.float32)
-    if wrist is not None:
-        wrist_quat[valid] = quat_of(wrist)
+    wrist_quat[valid] = quat_of(wrist)
     return Demos(
         sequence_name=np.array([name]),
         subject=np.array([subject]),
@@ -441,7 +440,7 @@ def demo_objects(demos: Demos, folder: Path | None = None) -> dict[str, ObjectSp
 
 
 def _offsets(lengths: Sequence[int] | np.ndarray) -> np.ndarray:
-    return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
+    return np.cumsum([0, *lengths], dtype=np.int32)
 
 
 def sequences_problem(arrays: Arrays) -> str | None:

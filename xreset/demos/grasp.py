@@ -40,6 +40,8 @@ _SIDE_TILTS = (0.6, 0.4, 0.15)
 _TILT_COST = 2.0  # of being less steep [1/rad]
 _LOW_OBJECT = 0.07  # objects up to this height are grasped from above [m]
 _TOUCH = 1e-4  # pieces of an object that are this close are one part [m]
+_RADII = np.full(40, 0.007)  # of the hand's flesh around joints and middles of bones [m]
+_RADII[np.array(TIPS) - 1] = 0.001
 
 
 @frozen
@@ -77,32 +79,29 @@ class Solid:
     def crossings(
         self, origins: np.ndarray, direction: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Intersect lines through origins [L, 3] along a direction [3] with each piece.
+        """Intersect lines through origins [..., 3] along a direction [3] with each piece.
 
         Returns:
-            Line parameters of entry and exit [pieces, L] (entry > exit where the piece is missed), and the normals
-            there [pieces, L, 3].
+            Line parameters of entry and exit [pieces, ...] (entry > exit where the piece is missed), and the normals
+            there [pieces, ..., 3].
         """
         enter = []
         leave = []
         normal_in = []
         normal_out = []
-        lines = np.arange(len(origins))
         directions = np.broadcast_to(direction, origins.shape)
         for plane in self.planes:
             slope = directions @ plane[:, :3].T
             height = plane_heights(origins, plane)
             with np.errstate(divide="ignore", invalid="ignore"):
                 hit = -height / slope
-            outside = ((np.abs(slope) < 1e-12) & (height > 0)).any(axis=1)
+            outside = ((np.abs(slope) < 1e-12) & (height > 0)).any(axis=-1)
             into = np.where(slope < -1e-12, hit, -np.inf)
             out = np.where(slope > 1e-12, hit, np.inf)
-            first = into.argmax(axis=1)
-            last = out.argmin(axis=1)
-            enter.append(np.where(outside, np.inf, into[lines, first]))
-            leave.append(np.where(outside, -np.inf, out[lines, last]))
-            normal_in.append(plane[first, :3])
-            normal_out.append(plane[last, :3])
+            enter.append(np.where(outside, np.inf, into.max(axis=-1)))
+            leave.append(np.where(outside, -np.inf, out.min(axis=-1)))
+            normal_in.append(plane[into.argmax(axis=-1), :3])
+            normal_out.append(plane[out.argmin(axis=-1), :3])
         return np.array(enter), np.array(leave), np.array(normal_in), np.array(normal_out)
 
 
@@ -198,8 +197,7 @@ def _contacts_at(
     up_hand = np.cross(approach, closing) * handedness(side)
     # [n, 5, 3]: the lines of the thumb and the fingers
     origins = centers[:, None] + _STACK[:, None] * up_hand
-    lines = origins.reshape(-1, 3)
-    enter, leave, normal_in, normal_out = solid.crossings(lines, closing)
+    enter, leave, normal_in, normal_out = solid.crossings(origins, closing)
     # The part of the object around each origin: merge the pieces whose intervals overlap the one that holds it.
     holds = (enter <= 0) & (leave >= 0)
     start = np.where(holds, enter, np.inf).min(axis=0)
@@ -211,15 +209,10 @@ def _contacts_at(
     other = (enter <= leave) & ((leave < start - _TOUCH) | (enter > end + _TOUCH))
     room_before = start - np.where(other & (leave < start), leave, -np.inf).max(axis=0)
     room_after = np.where(other & (enter > end), enter, np.inf).min(axis=0) - end
-    number = np.arange(len(lines))
-    facing_fingers = -(normal_in[(enter == start).argmax(axis=0), number] @ closing)
-    facing_thumb = normal_out[(leave == end).argmax(axis=0), number] @ closing
-
-    # [n, 5], the thumb first
-    start, end, room_before, room_after, facing_fingers, facing_thumb = (
-        values.reshape(-1, 5)
-        for values in (start, end, room_before, room_after, facing_fingers, facing_thumb)
-    )
+    first = (enter == start).argmax(axis=0)[None, ..., None]
+    last = (leave == end).argmax(axis=0)[None, ..., None]
+    facing_fingers = -(np.take_along_axis(normal_in, first, axis=0)[0] @ closing)
+    facing_thumb = np.take_along_axis(normal_out, last, axis=0)[0] @ closing
     above_table = origins[..., 2] > 0.007
     fits = np.isfinite(start) & (room_before > _FINGER_ROOM) & (facing_fingers > 0.6) & above_table
     middle_start = np.median(np.where(fits, start, 0.0)[:, 1:3], axis=1, keepdims=True)
@@ -229,11 +222,8 @@ def _contacts_at(
     # length of the object before each center, along the approach: how deep the hand must reach
     into, out, *_ = solid.crossings(centers, approach)
     depth = -np.where((into <= out) & (into < 0), into, 0.0).min(axis=0)
-    with np.errstate(invalid="ignore"):
-        good = (
-            thumb[:, 0] & finger[:, 1:3].all(axis=1) & (width < MAX_OPENING) & (width > MIN_WIDTH)
-        )
-    good &= (depth > 0.004) & (depth < 0.055)
+    good = thumb[:, 0] & finger[:, 1:3].all(axis=1)
+    good &= (width > MIN_WIDTH) & (width < MAX_OPENING) & (depth > 0.004) & (depth < 0.055)
 
     found = []
     for i in np.flatnonzero(good):
@@ -276,17 +266,16 @@ def _fit_from(solid: Solid, contacts: Contacts, lean: float, side: str) -> tuple
 
     def points_of(x: np.ndarray) -> np.ndarray:
         """[n, 21, 3] for parameters [n, 23]: wrist position, rotation away from ``pose``, joint angles."""
-        matrix = (pose * Rotation.from_rotvec(x[:, 3:6])).as_matrix()
-        return np.einsum("nij,nkj->nki", matrix, hand.keypoints(x[:, 6:], side)) + x[:, None, :3]
+        return hand.placed(x[:, :3], pose * Rotation.from_rotvec(x[:, 3:6]), x[:, 6:], side)
 
     def residuals(x: np.ndarray) -> np.ndarray:
         """[n, R], each in units of what is tolerable."""
         points = points_of(x)
-        flesh, radius = _flesh(points)
+        flesh = _flesh(points)
         terms = (
             ((points[:, tips] - targets) / 0.002).reshape(len(x), -1),
-            np.maximum(radius - solid.distance(flesh), 0.0) / 0.003,
-            np.maximum(radius + 0.002 - flesh[..., 2], 0.0) / 0.003,
+            np.maximum(_RADII - solid.distance(flesh), 0.0) / 0.003,
+            np.maximum(_RADII + 0.002 - flesh[..., 2], 0.0) / 0.003,
             x[:, 3:6] / 0.2,
             (x[:, 6:] - _POSTURE) / 0.7,
         )
@@ -307,7 +296,7 @@ def _fit_from(solid: Solid, contacts: Contacts, lean: float, side: str) -> tuple
         max_nfev=60,
     )
     points = points_of(fit.x[None])
-    flesh, _ = _flesh(points)
+    flesh = _flesh(points)
     grasp = Grasp(
         solid=solid,
         side=side,
@@ -320,9 +309,7 @@ def _fit_from(solid: Solid, contacts: Contacts, lean: float, side: str) -> tuple
     return grasp, float(fit.cost)
 
 
-def _flesh(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return points that stand for the hand's flesh [n, 40, 3], joints and middles of bones, and their radii [40]."""
+def _flesh(points: np.ndarray) -> np.ndarray:
+    """[n, 40, 3] points that stand for the hand's flesh: joints, and the middles of bones."""
     middles = (points[:, 1:] + points[:, hand.PARENTS]) / 2
-    radius = np.full(40, 0.007)
-    radius[np.array(TIPS) - 1] = 0.001
-    return np.concatenate((points[:, 1:], middles), axis=1), radius
+    return np.concatenate((points[:, 1:], middles), axis=1)

@@ -7,6 +7,7 @@ thumb is on the +z side; a left hand is the mirror image in x. Lengths are round
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 PARENTS = np.array([0, 1, 2, 3, 0, 5, 6, 7, 0, 9, 10, 11, 0, 13, 14, 15, 0, 17, 18, 19])
 """[20] the keypoint before each of the keypoints 1 to 20: the other end of its bone."""
@@ -39,6 +40,14 @@ def keypoints(angles: np.ndarray, side: str = "right") -> np.ndarray:
     fingers = _fingers(angles[..., :12]).reshape(*angles.shape[:-1], 16, 3)
     points = np.concatenate((wrist, _thumb(angles[..., 12:]), fingers), axis=-2)
     return points * (-1.0, 1.0, 1.0) if side == "left" else points
+
+
+def placed(
+    pos: np.ndarray, rotation: Rotation, angles: np.ndarray, side: str = "right"
+) -> np.ndarray:
+    """[n, 21, 3] keypoints of hands with wrist positions [n, 3], n orientations and joint angles [n, 17]."""
+    turned = np.einsum("nij,nkj->nki", rotation.as_matrix(), keypoints(angles, side))
+    return turned + pos[:, None]
 
 
 def _fingers(angles: np.ndarray) -> np.ndarray:

@@ -275,7 +275,7 @@ def _sequence(arrays: Arrays, convention: Convention) -> Demos:
         side=side,
         fps=fps,
         keypoints=points,
-        wrist=_wrist(points[valid], side) if valid.any() else None,
+        wrist=_wrist(points[valid], side),
         object_pos=pos,
         object_rot=turn,
     )
@@ -420,9 +420,7 @@ def _evenly(arrays: Arrays, convention: Convention, motion: Motion) -> tuple[flo
 def _wrist(points: np.ndarray, side: str) -> Rotation:
     """Fit wrist and knuckles of an average hand to keypoints [F, 21, 3] (Kabsch's algorithm); F orientations of MANO's
     root."""
-    template = np.concatenate((np.zeros((1, 3)), hand.FINGER_BASES))
-    if side == "left":
-        template[:, 0] *= -1
+    template = hand.keypoints(hand.RELAXED, side)[_KNUCKLES]
     found = points[:, _KNUCKLES]
     covariance = np.einsum(
         "ki,fkj->fij", template - template.mean(axis=0), found - found.mean(axis=1, keepdims=True)

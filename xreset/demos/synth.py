@@ -141,7 +141,7 @@ def _sequence(
         object_name=obj.name,
         side=side,
         fps=fps,
-        keypoints=_placed_hand(wrist_pos, wrist_rot, angles, side),
+        keypoints=hand.placed(wrist_pos, wrist_rot, angles, side),
         wrist=wrist_rot,
         object_pos=object_pos,
         object_rot=object_rot,
@@ -264,13 +264,6 @@ def _clear_approach(grasp: Grasp, timing: _Timing, rng: np.random.Generator) -> 
     )
 
 
-def _placed_hand(pos: np.ndarray, rotation: Rotation, angles: np.ndarray, side: str) -> np.ndarray:
-    """[T, 21, 3] keypoints of a hand for wrist positions [T, 3], T wrist orientations and joint angles [T, 17]."""
-    return (
-        np.einsum("nij,nkj->nki", rotation.as_matrix(), hand.keypoints(angles, side)) + pos[:, None]
-    )
-
-
 def _approach(grasp: Grasp, timing: _Timing, rng: np.random.Generator) -> _HandPath:
     """Move to a place before the object while the hand opens, then forward, then close: minimum-jerk motions that
     overlap."""
@@ -301,7 +294,7 @@ def _approach(grasp: Grasp, timing: _Timing, rng: np.random.Generator) -> _HandP
     opening = _minimum_jerk(frame, 0.1 * reach, 0.65 * reach)[:, None]
     closing = _minimum_jerk(frame, 0.8 * reach, close)[:, None]
     angles = hand.RELAXED + opening * (opened - hand.RELAXED) + closing * (grasp.angles - opened)
-    points = _placed_hand(wrist_pos, wrist_rot, angles, grasp.side)[:lift]
+    points = hand.placed(wrist_pos, wrist_rot, angles, grasp.side)[:lift]
     gap = min(grasp.solid.distance(points).min(), points[..., 2].min())
     return float(gap), grasp, wrist_pos, wrist_rot, angles
 

@@ -72,10 +72,9 @@ def _frames_to_follow(retargeted: Retargeted, fingers: Fingers, within: float) -
 
 
 def positions_between(values: np.ndarray, frame: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """[M, n] values on straight lines between frames [F, n]; frames stay the same bit for bit."""
+    """[M, n] values on straight lines between frames [F, n]; frames stay the same."""
     following = values[np.minimum(frame + 1, len(values) - 1)]
-    between = values[frame] + part[:, None] * (following - values[frame])
-    return np.where(part[:, None] > 0, between, values[frame])
+    return values[frame] + part[:, None] * (following - values[frame])
 
 
 def rotations_between(quats: np.ndarray, frame: np.ndarray, part: np.ndarray) -> np.ndarray:

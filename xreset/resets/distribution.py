@@ -90,12 +90,10 @@ class _Grouped:
         self, owners: np.ndarray, object_names: tuple[str, ...], device: torch.device | str
     ) -> None:
         """Sort; ``owners`` names each row's object. Rows of objects that are not in ``object_names`` are left out."""
-        number = {name: i for i, name in enumerate(object_names)}
-        index = np.array([number.get(name, -1) for name in owners], dtype=np.int64)
-        known = np.flatnonzero(index >= 0)
-        self.rows = known[np.argsort(index[known], kind="stable")]
+        rows = [np.flatnonzero(owners == name) for name in object_names]
+        self.rows = np.concatenate(rows)
         """Rows of the table, in the sorted order."""
-        count = np.bincount(index[known], minlength=len(object_names))
+        count = np.array([len(own) for own in rows])
         self.count = _tensor(count, device)
         """Number of rows of each object."""
         self._first = _tensor(np.cumsum(count) - count, device)
@@ -204,7 +202,7 @@ class ResetDistribution:
         device = generator.device
         noise = torch.randn(m, len(self._home), generator=generator, device=device)
         noise = noise * self._home_std * c.home_noise
-        joint_pos = torch.minimum(torch.maximum(self._home + noise, self._lower), self._upper)
+        joint_pos = (self._home + noise).clamp(self._lower, self._upper)
         shift = 2.0 * torch.rand(m, 3, generator=generator, device=device) - 1.0
         spawn_xy = c.spawn_xy if c.training_xy is None else c.training_xy
         demos = self._demos[sequence]

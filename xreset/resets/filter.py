@@ -102,7 +102,8 @@ def make_bank(
             "Look at the reasons of xreset retarget."
         )
     owner = retargeted.sequence_of_frame[retargeted.valid]
-    objects_named(objects, retargeted.object_name[owner])
+    used = objects_named(objects, retargeted.object_name[owner])
+    scene = SceneSpec(robot=robot, objects=tuple(used.values()))
     frame, part = closing_states(retargeted, robot, objects, closing or ClosingConfig())
     valid = retargeted.valid[frame]
     frame = frame[valid]
@@ -110,23 +111,16 @@ def make_bank(
     sequence = retargeted.sequence_of_frame[frame]
     post_contact = retargeted.post_contact[frame]
     object_name = retargeted.object_name[sequence]
-    used = tuple(o for o in objects if o.name in object_name)
-    names = [o.name for o in used]
-    object_index = np.array([names.index(name) for name in object_name])
-    scene = SceneSpec(robot=robot, objects=used)
+    object_index = np.searchsorted(list(used), object_name)
     joint_pos = positions_between(retargeted.joint_pos, frame, part)
     object_pos = positions_between(retargeted.object_pos, frame, part)
     object_quat = rotations_between(retargeted.object_quat_wxyz, frame, part)
-    target = joint_pos.astype(np.float32)
+    states = State.at_rest(*map(torch.as_tensor, (joint_pos, object_pos, object_quat)))
 
     def try_candidates(
         rows: np.ndarray, report: Callable[[int], None] = lambda done: None
     ) -> np.ndarray:
         """Return the reasons for which candidates [rows] are rejected, -1 where every engine accepts them."""
-        arrays = (joint_pos, object_pos, object_quat, target)
-        states = State.at_rest(
-            *(torch.as_tensor(array[rows], dtype=torch.float32) for array in arrays)
-        )
         reason = np.full(len(rows), -1, dtype=np.int64)
         for number, name in enumerate(engines):
             left = np.flatnonzero(reason < 0)
@@ -137,7 +131,7 @@ def make_bank(
                 name,
                 scene,
                 object_index[rows[left]],
-                states[torch.as_tensor(left)],
+                states[rows[left]],
                 partial(rejection, limits=limits),
                 gravity=0.0,
                 steps=limits.steps,
@@ -152,14 +146,21 @@ def make_bank(
     if squeeze.presses:
         rows = np.flatnonzero((reason < 0) & post_contact)
         fingers = fingers_of(
-            robot, used, object_name[rows], joint_pos[rows], object_pos[rows], object_quat[rows]
+            robot,
+            scene.objects,
+            object_name[rows],
+            joint_pos[rows],
+            object_pos[rows],
+            object_quat[rows],
         )
-        target[rows] = squeeze_targets(robot, fingers, joint_pos[rows], squeeze)
+        targets = squeeze_targets(robot, fingers, joint_pos[rows], squeeze)
+        states.joint_target[rows] = torch.as_tensor(targets, dtype=torch.float32)
         refused = rows[try_candidates(rows) >= 0]
-        target[refused] = joint_pos[refused]
+        states.joint_target[refused] = states.joint_pos[refused]
     progress(work, work)
 
     keep = reason < 0
+    stable = states[keep]
     columns = {
         "sequence_index": sequence.astype(np.int32),
         "frame_index": (frame - retargeted.frame_offsets[sequence]).astype(np.int32),
@@ -172,10 +173,10 @@ def make_bank(
     return replace(
         starts_and_goals(retargeted, robot, {o.name: o.source for o in objects}),
         backends=engines,
-        joint_pos=joint_pos[keep].astype(np.float32),
-        joint_target=target[keep] if squeeze.presses else None,
-        object_pos=object_pos[keep].astype(np.float32),
-        object_quat_wxyz=object_quat[keep].astype(np.float32),
+        joint_pos=stable.joint_pos.numpy(),
+        joint_target=stable.joint_target.numpy() if squeeze.presses else None,
+        object_pos=stable.object_pos.numpy(),
+        object_quat_wxyz=stable.object_quat.numpy(),
         object_name=object_name[keep],
         rejected_reason=reason[~keep].astype(np.int32),
         reason_names=REASONS,

@@ -19,7 +19,7 @@ from xreset.geometry.shapes import box, half_spaces, hull, shape_mesh
 from xreset.geometry.solids import link_field, signed_distance
 from xreset.geometry.surface import Surface
 from xreset.retarget.hand.clearance import Objects, too_near
-from xreset.retarget.hand.model import HandModel
+from xreset.retarget.hand.model import HandModel, HandState
 from xreset.spec import Geometry, Shape, TableSpec
 
 
@@ -210,7 +210,7 @@ class SelfCollisionTest(TestCase):
         def found(q):
             return too_near(
                 model,
-                model.bodies(q, above, quat),
+                model.bodies(HandState(q, above, quat)),
                 nothing,
                 torch.ones(3, dtype=torch.bool),
                 0.0,

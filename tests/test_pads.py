@@ -40,11 +40,10 @@ class PadsTest(TestCase):
         half = 0.025 * (math.cos(angle) + math.sin(angle)) + 0.002
         # Each pad of the closed jaw is 0.5 mm from its middle.
         joints = torch.full((1, frames, 1), half - 0.0005, dtype=FLOAT)
-        middle = self.model.keypoints(joints, torch.zeros(1, frames, 3, dtype=FLOAT), turn)[
-            :, :, 1:
-        ].mean(dim=2)
-        state = HandState(joints=joints, root_pos=UP - middle, root_quat=turn)
-        keypoints = self.model.keypoints(joints, state.root_pos, turn)
+        state = HandState(joints, torch.zeros(1, frames, 3, dtype=FLOAT), turn)
+        middle = self.model.keypoints(state)[:, :, 1:].mean(dim=2)
+        state = dataclasses.replace(state, root_pos=UP - middle)
+        keypoints = self.model.keypoints(state)
         flags = torch.full((1, frames), held)
         return state, hand_targets(
             keypoints, self.box.field, held=flags, object_pos=UP.expand(1, frames, 3)
@@ -106,9 +105,8 @@ class AnalyticMapTest(TestCase):
             )
             pos = torch.randn(1, 5, 3, generator=generator, dtype=FLOAT)
             quat = quat_from_axis_angle(torch.randn(1, 5, 3, generator=generator, dtype=FLOAT))
-            followed = model.keypoints(joints, pos, quat)
-            state = jaw_state(model, followed)
-            again = model.keypoints(state.joints, state.root_pos, state.root_quat)
+            followed = model.keypoints(HandState(joints, pos, quat))
+            again = model.keypoints(jaw_state(model, followed))
             assert_close(again, followed, atol=5e-4, rtol=0, msg=name)
 
     def test_a_span_wider_than_the_jaw_keeps_its_middle_and_the_second_jaw_follows_two_fingers(
@@ -124,7 +122,7 @@ class AnalyticMapTest(TestCase):
         field = Surface(box_object(((0, 0, 0), (0.05, 0.05, 0.05)))).field
         targets = hand_targets(torch.as_tensor(jaw_keypoints(model, hand))[None], field)
         motion = retarget_hand(model, targets, HandConfig(jaw="analytic"))
-        tips = model.keypoints(**vars(motion))[0, 0, model.is_tip]
+        tips = model.keypoints(motion)[0, 0, model.is_tip]
         self.assertAlmostEqual(motion.joints.item(), 0.0)
         assert_close(tips[:, 0].abs(), torch.full((2,), 0.0425, dtype=FLOAT), atol=1e-3, rtol=0)
         assert_close(tips[:, 1:], torch.zeros(2, 2, dtype=FLOAT), atol=1e-3, rtol=0)

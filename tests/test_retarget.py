@@ -81,7 +81,7 @@ class HandTest(TestCase):
         cls.robot = toy_robot()
         cls.model = HandModel(cls.robot)
         cls.motion = toy_motion(cls.model, torch.Generator().manual_seed(1), margin=0.1, turn=0.3)
-        cls.keypoints = cls.model.keypoints(**vars(cls.motion))
+        cls.keypoints = cls.model.keypoints(cls.motion)
         cls.tip = cls.model.names.index("index4")
         cls.touching = torch.ones(cls.keypoints.shape[:3], dtype=torch.bool)
         cls.far = Surface(box_object(((0, 0, 0), (0.1, 0.1, 0.1)))).field
@@ -94,16 +94,15 @@ class HandTest(TestCase):
 
     def off(self, motion, keypoints):
         """[S, T, P] distance of the keypoints of a motion from others [m]."""
-        return (self.model.keypoints(**vars(motion)) - keypoints).norm(dim=-1)
+        return (self.model.keypoints(motion) - keypoints).norm(dim=-1)
 
     def too_near(self, targets, state, config):
         """What the clearance term acts on."""
-        flat = (x.flatten(0, 1) for x in (state.joints, state.root_pos, state.root_quat))
         turn = quat_to_matrix(targets.object_quat.flatten(0, 1))
         index = targets.object_index.repeat_interleave(12)
         objects = Objects(targets.object_pos.flatten(0, 1), turn, index, targets.fields)
         limits = (config.object_clearance, config.self_depth)
-        bodies = self.model.bodies(*flat)
+        bodies = self.model.bodies(state.map(lambda x: x.flatten(0, 1)))
         return too_near(self.model, bodies, objects, targets.annotated.flatten(), *limits)
 
     def test_gradient_is_the_derivative_of_the_cost(self):
@@ -197,7 +196,7 @@ class HandTest(TestCase):
         mine = (number >= 0) & (number < len(balls.radii))
         ball = number[mine]
         frame = near.frame[mine]
-        bodies = self.model.bodies(*(x.flatten(0, 1) for x in vars(motion).values()))
+        bodies = self.model.bodies(motion.map(lambda x: x.flatten(0, 1)))
         local = self.model.ball_centers(bodies, frame, ball)
         local = local - targets.object_pos.flatten(0, 1)[frame]
         distance, _ = targets.fields.signed_distance(local, torch.zeros_like(ball))

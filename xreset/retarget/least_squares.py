@@ -102,6 +102,20 @@ def free_to_move(x: Tensor, gradient: Tensor, lower: Tensor, upper: Tensor) -> T
     return (~(at_lower | at_upper)).to(gradient.dtype)
 
 
+def damped(here: Quadratic, size: Tensor, damping: Tensor, free: Tensor) -> tuple[Tensor, Tensor]:
+    """Return matrix [..., n, n] and right-hand side [..., n] of a Levenberg-Marquardt step.
+
+    Args:
+        here: the cost.
+        size: [..., n] what the damping [...] of each variable is relative to.
+        damping: larger for shorter steps.
+        free: [..., n] see :func:`free_to_move`. A variable that may not move has a row of the identity.
+    """
+    ridge = damping[..., None] * size * free + (1.0 - free)
+    matrix = here.curvature * free[..., :, None] * free[..., None, :] + torch.diag_embed(ridge)
+    return matrix, -here.gradient * free
+
+
 def solve_chain(diagonal: Tensor, coupling: Tensor, rhs: Tensor) -> Tensor:
     """Solve H x = b, where H has ``diagonal`` blocks D_t and diagonal matrices C_t between blocks t and t + 1.
 

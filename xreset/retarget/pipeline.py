@@ -268,7 +268,7 @@ def _arm_targets(
     hand: HandModel, arm: ArmModel, targets: HandTargets, motion: HandState
 ) -> ArmTargets:
     """Return the path that a hand's motion demands of the arm."""
-    followed = hand.keypoints(**vars(motion.to(hand.device))).to(targets.keypoints.device)
+    followed = hand.keypoints(motion.to(hand.device)).to(targets.keypoints.device)
     tips_off = (followed - targets.keypoints)[:, :, hand.is_tip.cpu()].norm(dim=-1)
     return ArmTargets(
         root_pos=motion.root_pos,

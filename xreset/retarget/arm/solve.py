@@ -30,7 +30,7 @@ from xreset.geometry.rotations import (
 )
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.arm.model import ArmModel, ArmProblem, ArmTargets, arm_jump
-from xreset.retarget.least_squares import Quadratic, free_to_move, minimize
+from xreset.retarget.least_squares import Quadratic, damped, free_to_move, minimize
 from xreset.retarget.validity import REASONS, Measures, Thresholds, classify
 from xreset.tensors import Tensors
 
@@ -327,11 +327,8 @@ def solve(frame: ArmProblem, q: Tensor, iterations: int, previous: Tensor | None
     def step(q: Tensor, here: Quadratic, damping: Tensor) -> Tensor:
         free = free_to_move(q, here.gradient, model.lower, model.upper)
         diagonal = here.curvature.diagonal(dim1=-2, dim2=-1).clamp_min(1e-3)
-        # a joint that may not move has a row of the identity
-        ridge = damping[:, None] * diagonal * free + (1.0 - free)
-        H = here.curvature * free[:, :, None] * free[:, None, :] + torch.diag_embed(ridge)
-        moved = q + torch.linalg.solve(H, -here.gradient * free)
-        return torch.minimum(torch.maximum(moved, model.lower), model.upper)
+        moved = q + torch.linalg.solve(*damped(here, diagonal, damping, free))
+        return moved.clamp(model.lower, model.upper)
 
     def done(before: Tensor, after: Tensor, *_: Tensor) -> Tensor:
         # all together: the batch keeps its size

@@ -116,9 +116,7 @@ def too_near(
 
 def _moved(rot: Tensor, pos: Tensor, points: Tensor) -> Tensor:
     """[B N, 3] points [N, 3] in each of the poses rot [B, 3, 3], pos [B, 3]."""
-    x, y, z = rot[:, None].unbind(-1)
-    moved = x * points[:, :1] + y * points[:, 1:2] + z * points[:, 2:] + pos[:, None]
-    return moved.flatten(0, 1)
+    return (points @ rot.mT + pos[:, None]).flatten(0, 1)
 
 
 def _outside(

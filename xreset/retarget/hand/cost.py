@@ -80,7 +80,7 @@ def _frames(
     scale = config.length_scale
     frames = targets.annotated.shape[1]
     annotated = targets.annotated.flatten()
-    bodies = model.bodies(*(value.flatten(0, 1) for value in vars(state).values()))
+    bodies = model.bodies(state.map(lambda x: x.flatten(0, 1)))
     found = _keypoint_terms(model, targets, config, bodies)
 
     objects = Objects(

@@ -64,6 +64,11 @@ class HandState(Tensors):
     root_quat: Tensor
     """[S, T, 4]"""
 
+    @property
+    def root(self) -> Tensor:
+        """[S, T, 4, 4] pose of the root."""
+        return homogeneous(quat_to_matrix(self.root_quat), self.root_pos)
+
 
 class HandModel:
     """A robot's hand as a floating tree, and the human keypoints that its links follow."""
@@ -106,9 +111,8 @@ class HandModel:
         self.is_jaw = len(self.home) == 1 and len(robot.fingertips) == 2
         """Whether the hand is a jaw: one joint moves two fingers."""
         upright = self.home.new_tensor([1.0, 0.0, 0.0, 0.0])
-        self.at_home = self.keypoints(
-            self.kinematics.clamp(self.home), self.home.new_zeros(3), upright
-        )
+        joints = self.kinematics.clamp(self.home)
+        self.at_home = self.keypoints(HandState(joints, upright.new_zeros(3), upright))
         """[P, 3] keypoints at home, in the root's frame."""
         self.table = TableSpec()
 
@@ -159,26 +163,22 @@ class HandModel:
             pads.append((own & (front > front[own].max() - _PAD_DEPTH)).nonzero()[:, 0])
         return pads
 
-    def keypoints(self, joints: Tensor, root_pos: Tensor, root_quat: Tensor) -> Tensor:
+    def keypoints(self, state: HandState) -> Tensor:
         """[..., P, 3] positions of the keypoint links."""
-        return self.kinematics.points(
-            joints, self.links, base=homogeneous(quat_to_matrix(root_quat), root_pos)
-        )
+        return self.kinematics.points(state.joints, self.links, base=state.root)
 
-    def bodies(self, joints: Tensor, root_pos: Tensor, root_quat: Tensor) -> PointJacobian:
-        """Compute the links of the hand at joints [B, J] and root poses, and their Jacobians.
+    def bodies(self, state: HandState) -> PointJacobian:
+        """Compute the links of the hand in B frames, and their Jacobians.
 
         Variables: joints, then translation of the root, then rotation of the root about its origin (both along the
         world's axes).
         """
-        links = self.kinematics.jacobian(
-            joints, self._bodies, base=homogeneous(quat_to_matrix(root_quat), root_pos)
-        )
+        links = self.kinematics.jacobian(state.joints, self._bodies, base=state.root)
         identity = torch.eye(3, dtype=links.pos.dtype, device=links.pos.device).expand(
             *links.pos.shape[:-1], 3, 3
         )
         # row i: e_i x r
-        turn = torch.linalg.cross(identity, (links.pos - root_pos[:, None])[..., None, :])
+        turn = torch.linalg.cross(identity, (links.pos - state.root_pos[:, None])[..., None, :])
         return links._replace(
             linear=torch.cat((links.linear, identity, turn.mT), dim=-1),
             angular=torch.cat((links.angular, torch.zeros_like(identity), identity), dim=-1),

@@ -27,7 +27,7 @@ from xreset.retarget.hand.config import HandConfig
 from xreset.retarget.hand.cost import HandSystem, system
 from xreset.retarget.hand.jaw import jaw_state
 from xreset.retarget.hand.model import HandModel, HandState, HandTargets
-from xreset.retarget.least_squares import free_to_move, minimize, solve_chain
+from xreset.retarget.least_squares import damped, free_to_move, minimize, solve_chain
 
 _CLEARANCE_GROWTH = (0.01, 0.1)
 """Shares of the clearance's weight in earlier stages, each of which starts the next. A hand that may pass through the
@@ -135,8 +135,6 @@ def _limited_step(model: HandModel, state: HandState, here: HandSystem, damping:
     free[..., :count] = free_to_move(state.joints, here.gradient[..., :count], lower, upper)
     size = here.curvature.diagonal(dim1=-2, dim2=-1).clamp_min(1e-6)
     root = size[..., count:].unflatten(-1, (2, 3)).mean(-1).repeat_interleave(3, dim=-1)
-    ridge = damping[:, None, None] * torch.cat((size[..., :count], root), dim=-1) * free + (
-        1.0 - free
-    )
-    H = here.curvature * free[..., :, None] * free[..., None, :] + torch.diag_embed(ridge)
-    return solve_chain(H, here.coupling * free[:, 1:] * free[:, :-1], -here.gradient * free)
+    size = torch.cat((size[..., :count], root), dim=-1)
+    matrix, rhs = damped(here, size, damping[:, None], free)
+    return solve_chain(matrix, here.coupling * free[:, 1:] * free[:, :-1], rhs)

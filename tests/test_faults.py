@@ -2,28 +2,23 @@
 
 from collections import deque
 from contextlib import redirect_stdout
+from dataclasses import replace
 from io import StringIO
 from unittest import TestCase, mock
 
 import torch
 
+from tests import toy_training
 from tests.data import InFolder
 from tests.test_env import TASK, BreakableBackend, N, WithEnv
 from tests.test_learning import observations
 from xreset.errors import RunError
-from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.distributed import Processes
 from xreset.learning.ppo import SequencePpo
 from xreset.learning.run import checkpoints
 from xreset.learning.runner import MAX_SHARE, WINDOW, TrainingRunner
 
-CONFIG = TrainConfig(
-    task=TASK,
-    model=ModelConfig(pointnet=(8, 6), lstm=12, mlp=(16,)),
-    ppo=PpoConfig(horizon=8, mini_epochs=2, minibatch_size=16),
-    iterations=3,
-    save_interval=1,
-)
+CONFIG = replace(toy_training.CONFIG, task=TASK, iterations=3)
 
 
 class PlannedBackend(BreakableBackend):
@@ -46,8 +41,7 @@ class Budget(TestCase):
             runner = mock.Mock(
                 env=env,
                 processes=Processes(),
-                _faults_before=torch.zeros(2, dtype=torch.long),
-                _recent_faults=deque(maxlen=WINDOW),
+                _fault_totals=deque([[0, 0]], maxlen=WINDOW),
             )
             for nonfinite, overflow in faults:
                 env.nonfinite_count = env.nonfinite_count + nonfinite

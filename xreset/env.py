@@ -214,10 +214,8 @@ class ManipulationEnv:
             self._cloud_points = self._cloud_points - self._center[:, None]
             self._metric_points = self._metric_points - self._center[:, None]
         self.success_position = torch.tensor(task.reward.success_position, device=self.device)
-        lower = self.actions.lower
-        upper = self.actions.upper
-        self._joint_lower = torch.where(lower.isfinite(), lower, -torch.pi)
-        self._joint_upper = torch.where(upper.isfinite(), upper, torch.pi)
+        self._joint_lower = self.actions.lower.nan_to_num(neginf=-torch.pi)
+        self._joint_upper = self.actions.upper.nan_to_num(posinf=torch.pi)
         self._renderer: Renderer | None = None
         self._allocate()
         self.reset()
@@ -548,8 +546,8 @@ class ManipulationEnv:
         self.variation.begin_episodes(fresh, start.joint_target)
         self.drawn.draw(fresh, self.generator)
         self._episode.map(Tensor.copy_, where(fresh, start, self._episode))
-        for cleared in (self._episode_length, self._previous_action, self._reward, self._over):
-            cleared.masked_fill_(fresh.view(-1, *[1] * (cleared.ndim - 1)), 0)
+        for cleared in (self._episode_length, self._previous_action.T, self._reward, self._over):
+            cleared.masked_fill_(fresh, 0)
 
     def _write_resets(self) -> None:
         """Put the worlds to reset into their new states."""

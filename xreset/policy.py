@@ -44,8 +44,7 @@ class Policy(Protocol):
     name: str
 
     def begin(self, env: ManipulationEnv) -> None:
-        """Prepare for new episodes in every world of the environment."""
-        ...
+        """Prepare for new episodes in every world of the environment. A policy without memory does nothing."""
 
     def act(self, observations: TensorDict) -> Tensor:
         """[N, J] actions in [-1, 1]."""
@@ -88,13 +87,13 @@ def check_contract(source: str, contract: Contract, robot: RobotSpec, task: Task
     }
     of_task = _meaning(here)
     for part, of_policy in _meaning(contract).items():
-        names = [
-            name
-            for name in of_policy | of_task[part]
-            if of_policy.get(name) != of_task[part].get(name)
+        here_too = of_task[part]
+        differing = [
+            f"{name}: {of_policy.get(name)!r}, here {here_too.get(name)!r}"
+            for name in of_policy | here_too
+            if of_policy.get(name) != here_too.get(name)
         ]
-        if names:
-            differing = [f"{n}: {of_policy.get(n)!r}, here {of_task[part].get(n)!r}" for n in names]
+        if differing:
             fix = fixes.get(part, "Use the run's own configuration.")
             raise PolicyError(
                 f"{source} was trained with another {part} ({'; '.join(differing)}). {fix}"
@@ -251,7 +250,7 @@ class OnnxPolicy:
         return outputs
 
 
-class ZeroPolicy:
+class ZeroPolicy(Policy):
     """Action zero: the arm stays, the hand goes where action zero sends it. A baseline and a smoke test."""
 
     name = "zero"
@@ -259,16 +258,13 @@ class ZeroPolicy:
     def __init__(self, num_actions: int) -> None:
         self._num_actions = num_actions
 
-    def begin(self, env: ManipulationEnv) -> None:
-        """Do nothing: the policy has no memory."""
-
     def act(self, observations: TensorDict) -> Tensor:
         """[N, J] zeros."""
         flat = observations["policy"]
         return flat.new_zeros(len(flat), self._num_actions)
 
 
-class RandomPolicy:
+class RandomPolicy(Policy):
     """Uniform actions in [-1, 1], the same for the same seed in every engine."""
 
     name = "random"
@@ -276,9 +272,6 @@ class RandomPolicy:
     def __init__(self, num_actions: int, seed: int) -> None:
         self._num_actions = num_actions
         self._generator = torch.Generator().manual_seed(seed)
-
-    def begin(self, env: ManipulationEnv) -> None:
-        """Do nothing: the policy has no memory."""
 
     def act(self, observations: TensorDict) -> Tensor:
         """[N, J] uniform."""

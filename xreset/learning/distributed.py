@@ -51,9 +51,7 @@ class Processes:
         """Make the process group that averages models: NCCL for GPUs, Gloo for CPUs. One process needs none."""
         if self.count > 1 and not torch.distributed.is_initialized():
             kind = "nccl" if device.startswith("cuda") else "gloo"
-            torch.distributed.init_process_group(
-                backend=kind, rank=self.rank, world_size=self.count
-            )
+            torch.distributed.init_process_group(kind)
 
     def sum(self, values: torch.Tensor) -> torch.Tensor:
         """Return the sum of a tensor over all processes."""

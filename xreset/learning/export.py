@@ -6,7 +6,6 @@ import contextlib
 import io
 import json
 import logging
-import tempfile
 import warnings
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -54,20 +53,18 @@ def export_onnx(
     state = torch.zeros(1, n, policy.lstm_dim)
     example = (torch.zeros(n, policy.flat_dim), torch.zeros(n, *picture), state, state.clone())
     worlds = torch.export.Dim("worlds", min=1, max=65536)
-    with tempfile.TemporaryDirectory() as folder, _quiet(), torch.no_grad():
-        file = Path(folder) / "policy.onnx"
-        torch.onnx.export(
+    with _quiet(), torch.no_grad():
+        program = torch.onnx.export(
             policy,
             example,
-            str(file),
             input_names=list(INPUTS),
             output_names=list(OUTPUTS),
             dynamic_shapes=({0: worlds}, {0: worlds}, {1: worlds}, {1: worlds}),
-            external_data=False,
             dynamo=True,
             verbose=False,
         )
-        model = onnx.load(str(file))
+    assert program is not None, "dynamo returns the graph"
+    model = program.model_proto
     _drop_exporter_notes(model)
     entries = {
         METADATA_KEY: json.dumps(asdict(contract), sort_keys=True),

@@ -68,8 +68,7 @@ class TrainingLog:
         self._finished = torch.zeros(3, device=device)
         self._recent: deque[list[float]] = deque(maxlen=RECENT)
         self._names: tuple[str, ...] = ()
-        self._sums: Tensor | float = 0.0
-        self._steps = 0
+        self._steps: list[Tensor] = []
         self._total = total
         self._last_line = 0.0
 
@@ -84,8 +83,7 @@ class TrainingLog:
         self._returns *= 1 - ended
         self._lengths *= 1 - ended
         self._names = tuple(log)
-        self._sums = self._sums + torch.stack(list(log.values()))
-        self._steps += 1
+        self._steps.append(torch.stack(list(log.values())))
 
     def write(
         self, iteration: int, env_steps: int, elapsed: float, scalars: dict[str, float]
@@ -99,8 +97,8 @@ class TrainingLog:
             scalars: the iteration's further curves, by tag; with ``speed/env_steps_per_second``, and in a distillation
                 with ``policy/teacher_share``.
         """
-        assert isinstance(self._sums, Tensor), "an iteration has at least one step"
-        means = dict(zip(self._names, (self._sums / self._steps).tolist(), strict=True))
+        total = sum(self._steps, torch.zeros_like(self._steps[0]))
+        means = dict(zip(self._names, (total / len(self._steps)).tolist(), strict=True))
         self._recent.append(self._finished.tolist())
         returns, lengths, episodes = (sum(column) for column in zip(*self._recent, strict=True))
         curves = means | scalars
@@ -128,8 +126,7 @@ class TrainingLog:
                 flush=True,
             )
         self._finished.zero_()
-        self._sums = 0.0
-        self._steps = 0
+        self._steps.clear()
 
     def write_lift(self) -> None:
         """Write the lift clock's file."""

@@ -47,10 +47,7 @@ class PointNet(nn.Module):
             from xreset.learning import fused
 
             if fused.supports(cloud.shape[-2], tuple(layer.out_features for layer in linear)):
-                one, two, three = linear
-                return fused.fused_pointnet(
-                    cloud, one.weight, one.bias, two.weight, two.bias, three.weight, three.bias
-                )
+                return fused.fused_pointnet(cloud, *self.mlp.parameters())
         with torch.autocast("cuda", dtype=torch.bfloat16):
             return self.mlp(cloud).amax(dim=-2).float()
 

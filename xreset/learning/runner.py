@@ -81,8 +81,7 @@ class TrainingRunner:
         self.iteration = 0
         self.env_steps = 0
         self.elapsed = 0.0
-        self._faults_before = torch.zeros(2, dtype=torch.long, device=self.device)
-        self._recent_faults: deque[list[int]] = deque(maxlen=WINDOW)
+        self._fault_totals = deque([[0, 0]], maxlen=WINDOW)
 
     def learn(self, total: int, *, seconds: float = math.inf) -> None:
         """Train until a number of iterations is done in all, and write a checkpoint. Ctrl-C ends after an iteration.
@@ -226,17 +225,19 @@ class TrainingRunner:
         Args:
             steps: world-steps of an iteration, of all processes.
         """
-        total = torch.stack((self.env.nonfinite_count, self.env.overflow_count))
-        self._recent_faults.append(self.processes.sum(total - self._faults_before).tolist())
-        self._faults_before = total
-        nonfinite, overflow = (sum(counts) for counts in zip(*self._recent_faults, strict=True))
+        counts = torch.stack((self.env.nonfinite_count, self.env.overflow_count))
+        now = self.processes.sum(counts).tolist()
+        before = self._fault_totals[0]
+        nonfinite = now[0] - before[0]
+        overflow = now[1] - before[1]
         if nonfinite + overflow > MAX_SHARE * WINDOW * steps:
             raise RunError(
                 f"The run ends: {nonfinite} worlds were not finite and {overflow} dropped contacts or constraints in "
-                f"the last {len(self._recent_faults)} iterations, more than {MAX_SHARE:.1%} of the {WINDOW * steps} "
+                f"the last {len(self._fault_totals)} iterations, more than {MAX_SHARE:.1%} of the {WINDOW * steps} "
                 f"world-steps of {WINDOW} iterations. Look for what the robot or an object does that the engine cannot "
                 f"simulate. Then continue from the last checkpoint: xreset train --out {self.folder} --resume"
             )
+        self._fault_totals.append(now)
 
     def _check_finite(self, obs: TensorDict) -> None:
         """Refuse observations that are not finite, once per iteration: they come from worlds whose health was sound."""

@@ -48,7 +48,7 @@ class ActionSpace:
         above = below
         if config.hand_zero == "home":
             home = torch.as_tensor(robot.home, dtype=torch.float32, device=device)
-            zero = torch.minimum(torch.maximum(home, lower), upper)
+            zero = home.clamp(lower, upper)
             below = zero - lower
             above = upper - zero
         self.lower = lower
@@ -69,11 +69,11 @@ class ActionSpace:
         """
         action = action.clamp(-1.0, 1.0)
         new = target + self.step * action
-        new = torch.minimum(torch.maximum(new, joint_pos - self.lead), joint_pos + self.lead)
+        new = new.clamp(joint_pos - self.lead, joint_pos + self.lead)
         if self.config.hand == "absolute":
             hand = self.zero + torch.where(action < 0, self.below, self.above) * action
             new = torch.where(self.is_arm, new, hand)
-        return torch.minimum(torch.maximum(new, self.lower), self.upper)
+        return new.clamp(self.lower, self.upper)
 
     def action_for(self, wanted: Tensor, target: Tensor) -> Tensor:
         """Return the actions [N, J] whose targets come nearest to ``wanted`` [N, J], given the present targets."""

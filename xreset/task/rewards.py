@@ -13,8 +13,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from importlib import import_module
-from typing import Any, cast
+from pkgutil import resolve_name
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -96,9 +96,8 @@ def own_term(name: str) -> OwnTerm:
     Raises:
         RunError: the module cannot be imported, or has no such function.
     """
-    module, _, function = name.partition(":")
     try:
-        found: Any = getattr(import_module(module), function)
+        found = resolve_name(name)
     except Exception as error:  # a user's module may fail in any way
         reason = f"{type(error).__name__}: {error}"
         raise RunError(

@@ -1,7 +1,7 @@
 """Distillation: the teacher's network from its file, a student's training, resumed and exported, and refusals."""
 
 import io
-from contextlib import contextmanager, redirect_stdout
+from contextlib import redirect_stdout
 from dataclasses import replace
 from functools import partial
 from unittest import SkipTest
@@ -11,14 +11,13 @@ import numpy as np
 import pandas as pd
 import torch
 
-from tests.data import InOneFolder
-from tests.toy_bank import toy_bank
-from xreset import distill, make_backend, make_env, resume, robots, train, write_bank
+from tests.toy_training import CONFIG, OPTIONS, WithBank, quickly
+from xreset import distill, make_backend, make_env, resume, train
 from xreset.cameras.config import FRONT, WRIST, VisionConfig
 from xreset.errors import PolicyError, XResetError
 from xreset.eval.report.fairness import missed_by_student
 from xreset.learning.checkpoint import read_checkpoint
-from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
+from xreset.learning.config import PpoConfig, TrainConfig
 from xreset.learning.recipes import student_config
 from xreset.learning.run import TEACHER, latest_checkpoint, read_run
 from xreset.learning.teacher import load_teacher
@@ -36,33 +35,23 @@ except (ImportError, XResetError) as error:
 TASK = TaskConfig(
     observation=ObservationConfig(cloud_points=16, cloud="paired"), distance_points=64
 )
-SMALL = ModelConfig(pointnet=(8, 6), conv=(4, 4), lstm=12, mlp=(16,), initial_std=0.1)
+SMALL = replace(CONFIG.model, conv=(4, 4), initial_std=0.1)
 IMAGES = VisionConfig(cameras=(FRONT, WRIST), width=16, height=12)
 POINTS = replace(IMAGES, view="points", points=8, goal_image=True)
 
 
-class DistillTest(InOneFolder):
+class DistillTest(WithBank):
     @classmethod
     def setUpClass(cls):
         super().setUpClass()
         cls.enterClassContext(patch("xreset.env.make_backend", partial(make_backend, workers=0)))
-        cls.robot = robots.load("openarm")
-        cls.bank_of_robot = toy_bank(
-            cls.robot, joint_pos=np.tile(cls.robot.home, (6, 1)).astype(np.float32)
-        )
-        cls.bank = cls.folder / "bank.npz"
-        write_bank(cls.bank, cls.bank_of_robot)
         cls.teacher = cls.folder / "teacher"
         config = TrainConfig(
             task=TASK, model=SMALL, ppo=PpoConfig(horizon=8, mini_epochs=1), iterations=1
         )
         with redirect_stdout(io.StringIO()):
-            train(cls.bank, out=cls.teacher, config=config, **cls.options())
+            train(cls.bank, out=cls.teacher, config=config, **OPTIONS)
             cls.run_folder = cls.distill("images")
-
-    @staticmethod
-    def options():
-        return {"engine": "mujoco", "device": "cpu", "num_envs": 4, "seed": 3}
 
     @classmethod
     def distill(cls, name, vision=IMAGES, **changes):
@@ -71,17 +60,12 @@ class DistillTest(InOneFolder):
             config.ppo, horizon=8, sequence_length=4, minibatch_size=16, learning_rate=3e-3
         )
         config = replace(config, **({"model": SMALL, "ppo": ppo, "iterations": 2} | changes))
-        return distill(cls.teacher, cls.bank, out=cls.folder / name, config=config, **cls.options())
-
-    @contextmanager
-    def without_export(self):
-        with patch("xreset.learning.train.export_onnx"), redirect_stdout(io.StringIO()):
-            yield
+        return distill(cls.teacher, cls.bank, out=cls.folder / name, config=config, **OPTIONS)
 
     def env(self, vision):
-        objects = load_objects(list(self.bank_of_robot.object_names), None)
+        objects = load_objects(list(self.states.object_names), None)
         task = replace(evaluation_task(TASK), vision=vision)
-        env = make_env(self.robot, objects, self.bank_of_robot, task, engine="mujoco", num_envs=2)
+        env = make_env(self.robot, objects, self.states, task, engine="mujoco", num_envs=2)
         self.addCleanup(env.close)
         return env
 
@@ -126,7 +110,7 @@ class DistillTest(InOneFolder):
         def note(_log, _iteration, _steps, _elapsed, scalars):
             errors.append(scalars["loss/behavior"])
 
-        with self.without_export(), patch("xreset.learning.runner.TrainingLog.write", note):
+        with quickly(), patch("xreset.learning.runner.TrainingLog.write", note):
             out = self.distill("points", POINTS, iterations=15, save_interval=100)
             before = read_checkpoint(latest_checkpoint(out))
             resume(out, iterations=20)
@@ -146,7 +130,7 @@ class DistillTest(InOneFolder):
             clocked.append(iteration)
             return lift
 
-        with self.without_export(), patch("xreset.learning.clock.Lift.after", note):
+        with quickly(), patch("xreset.learning.clock.Lift.after", note):
             self.distill("clock")  # the teacher acts in the first of two iterations
         self.assertEqual(clocked, [2])
 
@@ -179,10 +163,10 @@ class DistillTest(InOneFolder):
                 {"teacher": self.run_folder, "config": student_config(TASK, IMAGES)},
             ),
         ):
-            with self.subTest(words), self.without_export(), self.assertRaisesRegex(error, words):
+            with self.subTest(words), quickly(), self.assertRaisesRegex(error, words):
                 distill(**(two | options))
         words = "No camera shows 005_tomato_soup_can, 010_potted_meat_can"
-        with self.without_export(), self.assertRaisesRegex(XResetError, words):
+        with quickly(), self.assertRaisesRegex(XResetError, words):
             self.distill("away", away)
 
     def test_what_the_teacher_does_better(self):

@@ -6,13 +6,10 @@ import sys
 from pathlib import Path
 from unittest import SkipTest, TestCase, mock
 
-import numpy as np
 import torch
 from torch.testing import assert_close
 
-from tests.data import InOneFolder
-from tests.toy_bank import toy_bank
-from xreset import robots, write_bank
+from tests.toy_training import WithBank
 from xreset.learning.distributed import Processes
 from xreset.learning.run import checkpoints
 
@@ -29,14 +26,10 @@ SMALL = (
 )
 
 
-class TwoProcesses(InOneFolder):
+class TwoProcesses(WithBank):
     @classmethod
     def setUpClass(cls):
         super().setUpClass()
-        robot = robots.load("openarm")
-        cls.bank = cls.folder / "bank.npz"
-        home = np.tile(robot.home, (6, 1)).astype(np.float32)
-        write_bank(cls.bank, toy_bank(robot, joint_pos=home))
         cls.out = cls.folder / "run"
         new = f"--robot openarm --resets {cls.bank} --backend mujoco --device cpu --num-envs 8 --seed 3"
         cls.first = cls.train(f"--out {cls.out} --iterations 2 {new} {SMALL}")

@@ -14,6 +14,7 @@ from torch.testing import assert_close
 
 from tests.data import InFolder
 from tests.toy_bank import SOUP, SPAM, toy_bank
+from tests.toy_training import CONFIG
 from xreset import robots
 from xreset.checks import from_dict
 from xreset.errors import FileFormatError
@@ -37,7 +38,7 @@ from xreset.task.config import (
 
 N, T, L, A = 3, 8, 4, 5
 GROUPS = ("policy", "proprio", "perception")
-SMALL = ModelConfig(pointnet=(8, 6), lstm=12, mlp=(16,))
+SMALL = CONFIG.model
 
 
 def observations(*batch, seed=0):
@@ -175,13 +176,8 @@ class StorageTest(TestCase):
         ``bias`` is added to the first policy's means; without ``capture`` a GPU is given every kernel of an update by itself.
         """
 
-        model = ModelConfig(
-            pointnet=(8, 6),
-            lstm=12,
-            mlp=(16,),
-            initial_std=0.5,
-            normalize_returns=ppo.pop("normalize_returns", False),
-        )
+        returns = ppo.pop("normalize_returns", False)
+        model = replace(SMALL, initial_std=0.5, normalize_returns=returns)
         config = TrainConfig(model=model, ppo=PpoConfig(horizon=8, minibatch_size=128, **ppo))
         torch.manual_seed(0)
         obs = observations(64).to(device)
@@ -345,17 +341,21 @@ class ConfigTest(TestCase):
 
     def test_removed_options_are_ignored_where_they_were_off(self):
         """Files of earlier versions hold them."""
-        data = json.loads(json.dumps(asdict(TrainConfig())))
-        self.assertEqual(from_dict(TrainConfig, data), TrainConfig())
+        config = TrainConfig(task=TaskConfig(timestep=0.01))
+        data = json.loads(json.dumps(asdict(config)))
+        self.assertEqual(from_dict(TrainConfig, data), config)
+        removed = {"frontier_over": "bank", "frontier_power": 1.0, "frontier_rate": 0.1}
+        data["task"]["reset"] |= removed | {"frontier": 0.0}
         data["model"]["activation"] = "elu"
         data["ppo"]["clip_values"] = True
         data["random_episode_start"] = True
-        self.assertEqual(from_dict(TrainConfig, data), TrainConfig())
+        self.assertEqual(from_dict(TrainConfig, data), config)
+        data["task"]["reset"]["frontier"] = 0.75
         data["model"]["synergy_std"] = 0.4
-        with self.assertRaisesRegex(
-            FileFormatError, r"model\.synergy_std is 0\.4\. This option was removed"
-        ):
+        with self.assertRaises(FileFormatError) as caught:
             from_dict(TrainConfig, data)
+        for value in ("task.reset.frontier is 0.75", "model.synergy_std is 0.4"):
+            self.assertIn(f"configuration.{value}. This option was removed;", str(caught.exception))
 
 
 class ChangingSettings(TestCase):

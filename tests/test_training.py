@@ -9,9 +9,8 @@ import signal
 import sys
 import threading
 import time
-from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
+from contextlib import redirect_stderr, suppress
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from unittest import SkipTest
 from unittest.mock import Mock, patch
@@ -20,12 +19,11 @@ import numpy as np
 import torch
 from torch.testing import assert_close
 
-from tests.data import InOneFolder
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_goals import toy_goals
+from tests.toy_training import CONFIG, OPTIONS, WithBank, quickly
 from xreset import (
     OnnxPolicy,
-    make_backend,
     read_bank,
     resume,
     robots,
@@ -37,7 +35,7 @@ from xreset.cli import main
 from xreset.errors import FileFormatError, PolicyError, RunError, XResetError
 from xreset.files import claim, file_hash
 from xreset.learning.checkpoint import load_moments, read_checkpoint
-from xreset.learning.config import ModelConfig, PpoConfig, ScheduleConfig, TrainConfig
+from xreset.learning.config import ScheduleConfig, TrainConfig
 from xreset.learning.recipes import RECIPES
 from xreset.learning.run import (
     Candidate,
@@ -49,20 +47,14 @@ from xreset.learning.run import (
     write_choice,
 )
 from xreset.learning.runner import TrainingRunner, _stop_on_interrupt
-from xreset.task.config import ObservationConfig, RandomizationConfig, TaskConfig
+from xreset.task.config import RandomizationConfig
 
 try:
     import xreset.backends.mujoco  # noqa: F401
 except ImportError as error:
     raise SkipTest(str(error)) from error
 
-CONFIG = TrainConfig(
-    task=TaskConfig(observation=ObservationConfig(cloud_points=16), distance_points=64),
-    model=ModelConfig(pointnet=(8, 6), lstm=12, mlp=(16,)),
-    ppo=PpoConfig(horizon=8, mini_epochs=2, minibatch_size=16),
-    iterations=2,
-    save_interval=1,
-)
+ONE = replace(CONFIG, iterations=1)
 
 
 def newest(out):
@@ -73,32 +65,12 @@ def not_a_number(x):
     return x.tip_distance[:, 0] * float("nan")
 
 
-class TrainingTest(InOneFolder):
+class TrainingTest(WithBank):
     @classmethod
     def setUpClass(cls):
         super().setUpClass()
-        cls.robot = robots.load("openarm")
-        home = np.tile(cls.robot.home, (6, 1)).astype(np.float32)
-        cls.bank = cls.folder / "bank.npz"
-        write_bank(cls.bank, toy_bank(cls.robot, joint_pos=home))
         cls.out = cls.folder / "run"
-        train(cls.bank, out=cls.out, **cls.options())
-
-    @classmethod
-    def options(cls, **changes):
-        options = {"engine": "mujoco", "device": "cpu", "num_envs": 4, "seed": 3, "config": CONFIG}
-        return options | changes
-
-    @contextmanager
-    def quickly(self):
-        """Leave out what takes longer than all the rest: processes for the engine, and the export at the end."""
-        in_this_process = patch("xreset.env.make_backend", partial(make_backend, workers=0))
-        with (
-            in_this_process,
-            patch("xreset.learning.train.export_onnx"),
-            redirect_stdout(io.StringIO()) as said,
-        ):
-            yield said
+        train(cls.bank, out=cls.out, config=CONFIG, **OPTIONS)
 
     def changed_run(self, out, **changes):
         """Change entries of run.json; returns the whole."""
@@ -108,14 +80,13 @@ class TrainingTest(InOneFolder):
 
     def train(self, name, **changes):
         """Train a run of that name in the folder, without an export."""
-        with self.quickly():
-            return train(
-                changes.pop("bank", self.bank), out=self.folder / name, **self.options(**changes)
-            )
+        options = OPTIONS | {"bank": self.bank, "config": CONFIG} | changes
+        with quickly():
+            return train(out=self.folder / name, **options)
 
     def resume(self, out, **options):
         """Continue a run without an export; returns what it printed."""
-        with self.quickly() as said:
+        with quickly() as said:
             resume(out, **options)
         return said.getvalue()
 
@@ -356,7 +327,7 @@ class TrainingTest(InOneFolder):
         naming = "--config.task.reward.own strangers_term:zero 1"
 
         def said(arguments):
-            with self.quickly(), redirect_stderr(io.StringIO()) as text, suppress(SystemExit):
+            with quickly(), redirect_stderr(io.StringIO()) as text, suppress(SystemExit):
                 main(["train", *arguments.split()])
             return text.getvalue()
 
@@ -373,9 +344,7 @@ class TrainingTest(InOneFolder):
         self.assertEqual(len(checkpoints(stranger)), 3)
 
     def test_a_run_begins_with_the_networks_of_another(self):
-        still = replace(
-            CONFIG, ppo=replace(CONFIG.ppo, learning_rate=1e-12, schedule="fixed"), iterations=1
-        )
+        still = replace(ONE, ppo=replace(ONE.ppo, learning_rate=1e-12, schedule="fixed"))
         given = latest_checkpoint(self.out)
         out = self.train("onwards", config=still, weights=self.out)
         info = read_run(out)
@@ -455,13 +424,13 @@ class TrainingTest(InOneFolder):
         self.assertRaisesRegex(RunError, "holds a run already.*--resume", self.train, "run")
         bank = self.folder / "changing.npz"
         write_bank(bank, toy_bank(self.robot))
-        out = self.train("changed", bank=bank, config=replace(CONFIG, iterations=1))
+        out = self.train("changed", bank=bank, config=ONE)
         write_bank(bank, empty)
         with self.assertRaisesRegex(RunError, "not the file that this run was started with"):
             self.resume(out)
 
     def test_a_run_whose_observations_meant_something_else_is_not_resumed(self):
-        out = self.train("older", config=replace(CONFIG, iterations=1))
+        out = self.train("older", config=ONE)
         contract = self.changed_run(out)["contract"]
         terms = contract["observation_layout"]["policy"]
         _, terms["older"] = terms.popitem()
@@ -476,7 +445,7 @@ class TrainingTest(InOneFolder):
             "gloo", store=torch.distributed.HashStore(), rank=0, world_size=1
         )
         self.addCleanup(torch.distributed.destroy_process_group)
-        self.train("polite", config=replace(CONFIG, iterations=1))
+        self.train("polite", config=ONE)
         self.assertEqual(torch.get_float32_matmul_precision(), "medium")
         self.assertTrue(torch.distributed.is_initialized())
 

@@ -11,9 +11,6 @@ No setting changes the depth, and no place in the step between collision and con
 function is wrapped before any kernel is made of it. This module reads the engine's private modules.
 """
 
-# Warp compiles these functions from their source; to a type checker of Python they make no sense.
-# pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportIndexIssue=false
-
 from __future__ import annotations
 
 import warp as wp

@@ -4,10 +4,6 @@ Letters are those of :mod:`xreset.physics`; Q mimic joints. Quaternions are stor
 MuJoCo.
 """
 
-# Warp compiles these functions from their source; to a type checker of Python they make no sense.
-# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false
-# pyright: reportAttributeAccessIssue=false, reportGeneralTypeIssues=false, reportAssignmentType=false
-
 from __future__ import annotations
 
 import warp as wp

@@ -4,9 +4,6 @@ The same kernel runs on the CPU and on a GPU, without a display, and draws the s
 worlds, C cameras, B bodies, H x W pixels.
 """
 
-# Warp compiles the kernels from their source; to a type checker of Python they make no sense.
-# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false, reportAssignmentType=false
-
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -23,52 +20,8 @@ from xreset.geometry.collision import bounding_ball
 with needs("warp", "cameras"):
     import warp as wp
 
+from xreset.cameras.kernels import cast
 from xreset.torch_warp import TorchStream, quiet
-
-
-@wp.kernel
-def _cast(
-    due: wp.array[wp.bool],
-    camera: wp.array2d[wp.mat44],
-    tangent: wp.array2d[float],
-    pose: wp.array2d[wp.mat44],
-    mesh: wp.array2d[wp.uint64],
-    sphere: wp.array2d[wp.vec4],
-    height: int,
-    width: int,
-    depth: wp.array3d[float],
-    body: wp.array3d[wp.int8],
-):
-    world, view, pixel = wp.tid()
-    if not due[world]:
-        return
-    scale = 2.0 * tangent[world, view] / float(height)
-    right = (float(pixel % width) + 0.5 - 0.5 * float(width)) * scale
-    down = (float(pixel // width) + 0.5 - 0.5 * float(height)) * scale
-    length = wp.sqrt(1.0 + right * right + down * down)
-    eye = camera[world, view]
-    start = wp.vec3(eye[0, 3], eye[1, 3], eye[2, 3])
-    ray = wp.transform_vector(eye, wp.vec3(right, down, 1.0)) / length
-    nearest = wp.float32(1.0e6)
-    hit = wp.int32(-1)
-    for i in range(pose.shape[1]):
-        T = pose[world, i]
-        turn = wp.transpose(T)
-        local = wp.transform_vector(turn, start - wp.vec3(T[0, 3], T[1, 3], T[2, 3]))
-        along = wp.transform_vector(turn, ray)
-        ball = sphere[world, i]
-        to_center = wp.vec3(ball[0], ball[1], ball[2]) - local
-        middle = wp.dot(to_center, along)
-        inside = ball[3] * ball[3] - wp.dot(to_center, to_center) + middle * middle
-        if inside > 0.0:
-            half = wp.sqrt(inside)
-            if middle + half > 0.0 and middle - half < nearest:
-                query = wp.mesh_query_ray(mesh[world, i], local, along, nearest)
-                if query.result:
-                    nearest = query.t
-                    hit = i
-    depth[world, view, pixel] = wp.where(hit < 0, 0.0, nearest / length)
-    body[world, view, pixel] = wp.int8(hit)
 
 
 class RayCaster:
@@ -128,9 +81,8 @@ class RayCaster:
                         wp.from_torch(self.depth.flatten(2)),
                         wp.from_torch(self.body.flatten(2)),
                     ]
-                    self._launch = wp.launch(
-                        _cast, (*shape, size[0] * size[1]), arrays, record_cmd=True
-                    )
+                    pixels = size[0] * size[1]
+                    self._launch = wp.launch(cast, (*shape, pixels), arrays, record_cmd=True)
         except Exception as error:  # a missing compiler or driver may fail in any way
             other = "--device cpu, or " if device.type != "cpu" else ""
             raise XResetError(
@@ -145,6 +97,6 @@ class RayCaster:
 
 def _warp_mesh(mesh: trimesh.Trimesh) -> Any:
     return wp.Mesh(
-        wp.array(np.float32(mesh.vertices), dtype=wp.vec3),
-        wp.array(np.int32(mesh.faces).ravel(), dtype=int),
+        wp.array(np.asarray(mesh.vertices, np.float32), dtype=wp.vec3),
+        wp.array(np.asarray(mesh.faces, np.int32).ravel(), dtype=int),
     )

@@ -179,9 +179,9 @@ class _FusedPointNet(torch.autograd.Function):
         return out
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         cloud, w1, b1, low2, b2, low3, winner = ctx.saved_tensors
-        gradient = gradient.contiguous()
+        gradient = gradients[0].contiguous()
         programs = min(len(cloud), _BACKWARD_PROGRAMS * _processors(cloud.device))
         a = len(w1)
         b = len(low2)
@@ -250,4 +250,5 @@ def fused_pointnet(
     size.
     """
     frames = cloud.reshape(-1, *cloud.shape[-2:]).contiguous()
-    return _FusedPointNet.apply(frames, w1, b1, w2, b2, w3, b3).reshape(*cloud.shape[:-2], -1)  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
+    embedded: Any = _FusedPointNet.apply(frames, w1, b1, w2, b2, w3, b3)
+    return embedded.reshape(*cloud.shape[:-2], -1)

@@ -237,7 +237,7 @@ def _shapes(
         if not _is_solid(geom) or kind == "plane":
             continue
         T = np.linalg.inv(T_world_link) @ transform(data.geom_xmat[number], data.geom_xpos[number])
-        geometry = Geometry(kind=kind, size=tuple(map(float, geom.size[: _SIZES[kind]])))  # pyright: ignore[reportArgumentType]
+        geometry = Geometry(kind=kind, size=tuple(map(float, geom.size[: _SIZES[kind]])))
         if kind == "mesh":
             mesh = model.mesh(geom.dataid[0])
             begin = int(mesh.vertadr[0])
@@ -251,7 +251,8 @@ def _shapes(
         yield Shape(geometry=geometry, T_body_shape=T)
 
 
-def _kind(geom: mujoco._structs._MjModelGeomViews) -> str:
+def _kind(geom: mujoco._structs._MjModelGeomViews) -> Any:
+    """Return the name of a kind of shape, which may be one that the project does not have."""
     return mujoco.mjtGeom(int(geom.type[0])).name.removeprefix("mjGEOM_").lower()
 
 

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.errors import XResetError
 from xreset.geometry.rotations import quat_to_matrix
 from xreset.physics import (
     Backend,
@@ -164,15 +163,6 @@ class MujocoWarpBackend(Backend):
         with self._on_stream():
             self._run("begin")
 
-    def state(self) -> State:
-        self._must_be_open()
-        return self._state
-
-    def set_joint_targets(self, targets: Tensor) -> None:
-        self._must_be_open()
-        present = self._state.joint_target
-        present.copy_(self._checked("joint_target", targets, present.shape))
-
     def step(self, substeps: int | None = None) -> None:
         self._must_be_open()
         substeps = self._checked_substeps(substeps)
@@ -182,14 +172,6 @@ class MujocoWarpBackend(Backend):
             self._run("read")
 
     # Readings ---------------------------------------------------------------------------------------------------------
-
-    def links(self) -> Links:
-        self._must_be_open()
-        return self._links
-
-    def contacts(self) -> Contacts:
-        self._must_be_open()
-        return self._contacts
 
     def health(self) -> Health:
         self._must_be_open()
@@ -231,15 +213,9 @@ class MujocoWarpBackend(Backend):
         with self._on_stream():
             self._run("parameters")
 
-    def set_object_wrench(self, force: Tensor, torque: Tensor) -> None:
-        self._must_be_open()
-        wrench = torch.cat((torch.as_tensor(force), torch.as_tensor(torque)), dim=-1)
-        self._xfrc_applied[:, self._at.object_body] = self._checked(
-            "wrench", wrench, (self.num_worlds, 6)
-        )
-
     def close(self) -> None:
         """Free the worlds' memory once nobody else holds a view of it."""
+        self._closed = True
         self._graphs.clear()
         self._model = self._data = None
 
@@ -272,7 +248,7 @@ class MujocoWarpBackend(Backend):
         self._geom_role = ints(at.geom_role)
         self._friction_columns = ints(at.friction_column)
 
-        self._xfrc_applied = wp.to_torch(self._data.xfrc_applied)
+        self._wrench = wp.to_torch(self._data.xfrc_applied)[:, at.object_body]
         self._overflow = wp.to_torch(self._data.overflow)
         self._coming = State.initial(self.scene, self.object_index).to(self.device)
         self._state = replace(self._coming.clone(), joint_target=wp.to_torch(self._data.ctrl))
@@ -448,16 +424,6 @@ class MujocoWarpBackend(Backend):
         self._mask.zero_()
         self._mask[index] = True
         return index
-
-    def _checked_state(self, state: State, rows: int) -> State:
-        checked = {}
-        for name, present in vars(self._coming).items():
-            checked[name] = self._checked(name, getattr(state, name), (rows, *present.shape[1:]))
-        return State(**checked)
-
-    def _must_be_open(self) -> None:
-        if self._data is None:
-            raise XResetError(f"The backend {self.name!r} is closed. Build a new one.")
 
 
 def _arrays(values: Mapping[str, Tensor]) -> list[Any]:

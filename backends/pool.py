@@ -209,6 +209,7 @@ class PoolBackend(Backend):
         self._links = Links(**{field.name: views[f"link_{field.name}"] for field in fields(Links)})
         self._contacts = Contacts(**{name: views[name] for name in CONTACT_FIELDS})
         self._health = Health(nonfinite=views["nonfinite"], overflow=views["overflow"])
+        self._wrench = views["wrench"]
         self._state.map(Tensor.copy_, State.initial(scene, self.object_index))
         try:
             self._command("build")
@@ -218,34 +219,13 @@ class PoolBackend(Backend):
 
     def set_state(self, state: State, worlds: Tensor | None = None) -> None:
         index = self._selected(worlds)
-        values = {name: self._rows(name, getattr(state, name), len(index)) for name in STATE_FIELDS}
-        for name, value in values.items():
+        for name, value in vars(self._checked_state(state, len(index))).items():
             self._arrays[name][index] = value
         self._arrays["wrench"][index] = 0.0
         self._command("set_state", index)
 
-    def state(self) -> State:
-        self._must_be_open()
-        return self._state
-
-    def set_joint_targets(self, targets: Tensor) -> None:
-        self._must_be_open()
-        self._arrays["joint_target"][:] = self._rows("joint_target", targets, self.num_worlds)
-
     def step(self, substeps: int | None = None) -> None:
         self._command("step", argument=self._checked_substeps(substeps))
-
-    def links(self) -> Links:
-        self._must_be_open()
-        return self._links
-
-    def contacts(self) -> Contacts:
-        self._must_be_open()
-        return self._contacts
-
-    def health(self) -> Health:
-        self._must_be_open()
-        return self._health
 
     def mass_properties(self) -> MassProperties:
         self._require("mass_properties")
@@ -253,19 +233,14 @@ class PoolBackend(Backend):
         found = {name: self._arrays[f"body_{name}"].copy() for name in ("mass", "com", "inertia")}
         return MassProperties(**{name: torch.from_numpy(values) for name, values in found.items()})
 
-    def set_object_wrench(self, force: Tensor, torque: Tensor) -> None:
-        self._require("object_wrench")
-        self._must_be_open()
-        wrench = torch.cat((torch.as_tensor(force), torch.as_tensor(torque)), dim=-1)
-        self._arrays["wrench"][:] = self._rows("wrench", wrench, self.num_worlds)
-
     def close(self) -> None:
         self._close()
 
     def _set(self, name: Parameter, value: Tensor, worlds: Tensor | None) -> None:
         self._require(name)
         index = self._selected(worlds)
-        self._arrays[name][index] = self._rows(name, value, len(index))
+        present = self._arrays[name]
+        present[index] = self._checked(name, value, (len(index), *present.shape[1:])).numpy()
         self._command("set_parameter", index, name)
 
     def _selected(self, worlds: Tensor | None) -> np.ndarray:
@@ -277,10 +252,6 @@ class PoolBackend(Backend):
                 f"worlds must be a list of indices in 0..{self.num_worlds - 1}, found {worlds}"
             )
         return index
-
-    def _rows(self, name: str, value: Tensor, rows: int) -> np.ndarray:
-        """Return what some rows of a shared array are to hold."""
-        return self._checked(name, value, (rows, *self._arrays[name].shape[1:])).numpy()
 
     def _command(self, method: str, worlds: np.ndarray | None = None, argument: Any = None) -> None:
         """Run a command in the workers."""

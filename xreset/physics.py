@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from xreset.checks import frozen
-from xreset.errors import BackendUnavailableError, CapabilityError
+from xreset.errors import BackendUnavailableError, CapabilityError, XResetError
 from xreset.spec import SceneSpec, lowest_point
 from xreset.tensors import Tensors
 
@@ -278,13 +278,16 @@ class Backend(ABC):
             worlds: [M] long indices without repetition; None means all (M = N).
         """
 
-    @abstractmethod
     def state(self) -> State:
         """State of all worlds."""
+        self._must_be_open()
+        return self._state
 
-    @abstractmethod
     def set_joint_targets(self, targets: Tensor) -> None:
         """Set the drive targets of all worlds: [N, J] rad (m)."""
+        self._must_be_open()
+        present = self._state.joint_target
+        present.copy_(self._checked("joint_target", targets, present.shape))
 
     @abstractmethod
     def step(self, substeps: int | None = None) -> None:
@@ -292,17 +295,20 @@ class Backend(ABC):
 
     # Readings --------------------------------------------------------------------------------------------------------
 
-    @abstractmethod
     def links(self) -> Links:
         """Poses and velocities of the tracked links, up to date with :meth:`state`."""
+        self._must_be_open()
+        return self._links
 
-    @abstractmethod
     def contacts(self) -> Contacts:
         """Contact forces on the object."""
+        self._must_be_open()
+        return self._contacts
 
-    @abstractmethod
     def health(self) -> Health:
         """What went wrong since each world's state was last set."""
+        self._must_be_open()
+        return self._health
 
     def mass_properties(self) -> MassProperties:
         """Masses, centres of mass and inertias read back from the engine; the present ones, of objects whose mass was
@@ -349,12 +355,15 @@ class Backend(ABC):
         says."""
         self._set("drives", scale, worlds)
 
-    @abstractmethod
     def set_object_wrench(self, force: Tensor, torque: Tensor) -> None:
         """Set an external force [N, 3] N at the object's centre of mass and a torque [N, 3] N m, world frame.
 
         It stays until it is replaced, or the world's state is set.
         """
+        self._require("object_wrench")
+        self._must_be_open()
+        wrench = torch.cat((torch.as_tensor(force), torch.as_tensor(torque)), dim=-1)
+        self._wrench.copy_(self._checked("wrench", wrench, self._wrench.shape))
 
     # Many worlds at once ---------------------------------------------------------------------------------------------
 
@@ -389,6 +398,26 @@ class Backend(ABC):
         self.close()
 
     # For implementers ------------------------------------------------------------------------------------------------
+    # The getters return these tensors, and two setters write to them. A backend without such tensors overrides both.
+
+    _state: State
+    _links: Links
+    _contacts: Contacts
+    _health: Health
+    _wrench: Tensor
+    """[N, 6] force and torque on the object."""
+    _closed = False
+
+    def _must_be_open(self) -> None:
+        if self._closed:
+            raise XResetError(f"The backend {self.name!r} is closed. Build a new one.")
+
+    def _checked_state(self, state: State, rows: int) -> State:
+        """Return a state on the backend's device; ``ValueError`` if it does not have that many rows."""
+        checked = {}
+        for name, present in vars(self._state).items():
+            checked[name] = self._checked(name, getattr(state, name), (rows, *present.shape[1:]))
+        return State(**checked)
 
     def _checked(self, name: str, value: Tensor, shape: tuple[int, ...]) -> Tensor:
         """Return values on the backend's device; ``ValueError`` if their shape is another one."""

@@ -96,6 +96,16 @@ class Worlds:
         self.step(steps)
         return self.state()
 
+    def path(self, start: State, targets: Iterable[Tensor], steps: int) -> Tensor:
+        """[T, N, J] joint positions after some physics steps with each of the drive targets, one after the other."""
+        self.set(start)
+        path = []
+        for target in targets:
+            self.set_targets(target)
+            self.step(steps)
+            path.append(self.state().joint_pos)
+        return torch.stack(path)
+
     def state(self) -> State:
         """Return the state."""
         return self.backend.state().to("cpu").clone()
@@ -315,10 +325,3 @@ def stacked(cases: Iterable[dict[str, Tensor]]) -> dict[str, Tensor]:
         for what, error in case.items():
             errors[what].append(error)
     return {what: torch.stack(rows) for what, rows in errors.items()}
-
-
-def named(names: Sequence[str], errors: Tensor | Sequence[float]) -> list[tuple[str, float]]:
-    """Return pairs of a name and an absolute error."""
-    return list(
-        zip(names, torch.as_tensor(errors, dtype=torch.float64).abs().tolist(), strict=True)
-    )

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import torch
 from scipy.integrate import solve_ivp
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from xreset.backends.conformance.harness import Bench, replace_fields
 from xreset.backends.conformance.results import Measured
 from xreset.geometry.rotations import quat_rotate
+from xreset.geometry.shapes import turn_of
 from xreset.spec import GRAVITY, ObjectSpec
 
 _STEPS = 24
@@ -59,15 +59,15 @@ def free_spin(bench: Bench) -> Measured:
     gravity = np.array([0.0, 0.0, -GRAVITY])
     com = np.array([thing.com for thing in bench.objects])
     spins = np.array([_spin(thing, quat, angvel, t) for thing in bench.objects])
-    turn = Rotation.from_quat(spins[:, :4], scalar_first=True)
+    turn = turn_of(spins[:, :4])
     omega = turn.apply(spins[:, 4:])
-    arm_at_start = Rotation.from_quat(quat, scalar_first=True).apply(com)
+    arm_at_start = turn_of(quat).apply(com)
     arm = turn.apply(com)
     com_velocity = linvel + np.cross(angvel, arm_at_start)
     moved = arm_at_start + com_velocity * t + gravity * t * t / 2 - arm
     off = end.object_pos - start.object_pos - torch.tensor(moved)
     velocity = com_velocity + gravity * t - np.cross(omega, arm)
-    orientation = Rotation.from_quat(end.object_quat.numpy(), scalar_first=True)
+    orientation = turn_of(end.object_quat)
     return {
         "pos, horizontal": off[:, :2],
         "pos, vertical": off[:, 2],
@@ -126,7 +126,7 @@ def _share(found: Tensor, expected: Tensor) -> Tensor:
 def _spin(thing: ObjectSpec, quat: np.ndarray, angvel: np.ndarray, t: float) -> np.ndarray:
     """[7] orientation, and angular velocity in the body's frame, after a time t without torque: Euler's equations."""
     inertia = np.asarray(thing.inertia)
-    body = Rotation.from_quat(quat, scalar_first=True)
+    body = turn_of(quat)
 
     def motion(_, y: np.ndarray) -> np.ndarray:
         w = y[0]

@@ -39,9 +39,10 @@ Verdict = Literal["passed", "known difference", "failed", "unsupported", "skippe
 Group = Literal["state", "worlds", "robot", "object", "contact"]
 """Part of the contract that a check belongs to."""
 
-Errors = Tensor | np.ndarray | float | Iterable[tuple[str, float]]
-"""Errors, of which the largest absolute value counts; or pairs of a name and an error, of which the largest counts and
-its name is shown."""
+Error = Tensor | np.ndarray | float
+"""Differences, of which the largest absolute value counts."""
+Errors = Error | Iterable[tuple[str, Error]]
+"""An error, or pairs of a name and an error, of which the largest counts and its name is shown."""
 
 Measured = Mapping[str, Errors]
 """What a check found, by the names of its measures."""
@@ -167,8 +168,8 @@ def largest(errors: Errors) -> tuple[float, str]:
     """Return the largest error and its name; NaN if there is one."""
     if isinstance(errors, Tensor | np.ndarray | float | int):
         return float(np.abs(np.asarray(errors, dtype=np.float64)).max(initial=0.0)), ""
-    name, error = max(errors, key=lambda pair: math.inf if math.isnan(pair[1]) else float(pair[1]))
-    return float(error), name
+    found = [(largest(error)[0], name) for name, error in errors]
+    return max(found, key=lambda pair: math.inf if math.isnan(pair[0]) else pair[0])
 
 
 def judge(measures: Iterable[Measure]) -> Verdict:

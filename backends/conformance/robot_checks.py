@@ -13,7 +13,7 @@ import torch
 from scipy.integrate import solve_ivp
 from torch import Tensor
 
-from xreset.backends.conformance.harness import Bench, Worlds, finite_limits, named, replace_fields
+from xreset.backends.conformance.harness import Bench, Worlds, finite_limits, replace_fields
 from xreset.backends.conformance.results import Measured, Skipped
 from xreset.backends.rigid import mechanism, object_inertia
 from xreset.geometry.dynamics import drive_values
@@ -46,7 +46,7 @@ def mass_properties(bench: Bench) -> Measured:
             "inertia matrix": (matrix - expected.matrix) / expected.moments[-1],
         }
         for what, error in off.items():
-            errors[what].append((name, float(np.abs(error).max())))
+            errors[what].append((name, error))
     return errors
 
 
@@ -96,7 +96,13 @@ def _against_reference(bench: Bench, scene: SceneSpec, signals: dict[str, Tensor
     which = [0] * len(way)
 
     def paths(worlds: Worlds) -> list[Tensor]:
-        return [_path(worlds, start, way, signal, scene.substeps) for signal in signals.values()]
+        """[T, J] for each signal: the path of joint i in world i."""
+        found = []
+        for signal in signals.values():
+            targets = (start.joint_pos + torch.diag(way * value) for value in signal)
+            path = worlds.path(start, targets, scene.substeps)
+            found.append(path.diagonal(dim1=1, dim2=2))
+        return found
 
     with bench.other(scene, which) as worlds:
         found = paths(worlds)
@@ -107,20 +113,9 @@ def _against_reference(bench: Bench, scene: SceneSpec, signals: dict[str, Tensor
         off = (path - path_there) * (_WAY / way)
         for joint, error in zip(scene.robot.joints, off.T, strict=True):
             case = f"{joint.group}, {signal}"
-            errors[f"{case}, rms"].append((joint.name, float(error.square().mean().sqrt())))
-            errors[f"{case}, peak"].append((joint.name, float(error.abs().max())))
+            errors[f"{case}, rms"].append((joint.name, error.square().mean().sqrt()))
+            errors[f"{case}, peak"].append((joint.name, error))
     return errors
-
-
-def _path(worlds: Worlds, start: State, way: Tensor, signal: Tensor, substeps: int) -> Tensor:
-    """[T, J] path of joint i in world i whose target moves by ``signal`` [T] times its way."""
-    worlds.set(start)
-    path = []
-    for value in signal.tolist():
-        worlds.set_targets(start.joint_pos + torch.diag(way * value))
-        worlds.step(substeps)
-        path.append(worlds.state().joint_pos.diagonal())
-    return torch.stack(path)
 
 
 def drive_equation(bench: Bench) -> Measured:
@@ -136,15 +131,11 @@ def drive_equation(bench: Bench) -> Measured:
         tree.link(name).mass for name in ("carriage", "wrist", "palm", "jaw_a", "jaw_b", "finger_b")
     )
     steps = torch.tensor([0.01, -0.01, 0.08, -0.08])  # the last two run into the effort limit
-    worlds = bench.worlds()
-    target = bench.start().joint_pos
+    start = bench.start()
+    target = start.joint_pos.clone()
     target[:, index] += steps
-    worlds.set_targets(target)
-    found = []
-    for _ in range(12):
-        worlds.step(4)
-        found.append(worlds.state().joint_pos[:, index].double().numpy())
-    path = np.array(found) - robot.joints[index].home
+    found = bench.worlds().path(start, [target] * 12, 4)[..., index]
+    path = found.double().numpy() - robot.joints[index].home
     times = 4 * bench.scene.timestep * np.arange(1, 13)
     errors = {}
     for i, step in enumerate(steps.tolist()):
@@ -158,7 +149,7 @@ def drive_equation(bench: Bench) -> Measured:
         exact = solve_ivp(
             motion, (0.0, times[-1]), [0.0, 0.0], t_eval=times, rtol=1e-6, atol=1e-9, max_step=1e-3
         ).y[0]
-        errors[f"step of {step:+.2f} m"] = float(np.abs(path[:, i] - exact).max()) / abs(step)
+        errors[f"step of {step:+.2f} m"] = (path[:, i] - exact) / step
     return errors
 
 
@@ -176,13 +167,7 @@ def drive_scale(bench: Bench) -> Measured:
     target = (start.joint_pos + way).minimum(limits.upper.float()).maximum(limits.lower.float())
 
     def path(worlds: Worlds, rows: slice) -> Tensor:
-        worlds.set(start[rows])
-        worlds.set_targets(target[rows])
-        found = []
-        for _ in range(30):
-            worlds.step(scene.substeps)
-            found.append(worlds.state().joint_pos)
-        return torch.stack(found, dim=1)
+        return worlds.path(start[rows], [target[rows]] * 30, scene.substeps)
 
     expected = []
     for i, factors in enumerate(_DRIVE_SCALES):
@@ -195,7 +180,7 @@ def drive_scale(bench: Bench) -> Measured:
         # What was set before must not matter.
         for factors in (scales.flip(0), scales):
             worlds.set_parameter("drives", factors[:, :, None].expand(-1, -1, len(way)))
-        return {"path": path(worlds, slice(None)) - torch.cat(expected)}
+        return {"path": path(worlds, slice(None)) - torch.cat(expected, dim=1)}
 
 
 def _with_drives(scene: SceneSpec, **values: np.ndarray) -> SceneSpec:
@@ -229,7 +214,7 @@ def joint_limits(bench: Bench) -> Measured:
             sent.joint_target.diagonal().copy_(target)
             end = worlds.advance(sent, round(1.0 / scene.timestep)).joint_pos.diagonal()
             off = ((end - limit).abs() / way).where(limited, torch.tensor(0.0))
-            errors[f"way off the {name} limit"] = named(names, off)
+            errors[f"way off the {name} limit"] = zip(names, off)
     if not errors:
         raise Skipped("no joint of this robot has limits")
     return errors
@@ -250,8 +235,7 @@ def gravity_compensation(bench: Bench) -> Measured:
     start = replace_fields(bench.start(), joint_pos=q, joint_target=q)
     with bench.other(scene, bench.which) as worlds:
         end = worlds.advance(start, round(2.0 / scene.timestep))
-    off = (end.joint_pos - start.joint_pos).abs().amax(dim=0)
-    return {"sag": named(scene.robot.joint_names, off)}
+    return {"sag": zip(scene.robot.joint_names, (end.joint_pos - start.joint_pos).T)}
 
 
 def own_weight(bench: Bench) -> Measured:

@@ -192,17 +192,13 @@ def _busy(bench: Bench, worlds: Worlds) -> State:
     """[N] states after 0.4 s in which tilted, spinning objects fall and every joint moves, alike in all worlds."""
     start = bench.start()
     tilt = torch.tensor([0.98, 0.17, 0.1, 0.02])
-    worlds.set(
-        replace_fields(
-            start,
-            object_pos=start.object_pos + torch.tensor([0.0, 0.0, 0.02]),
-            object_quat=tilt / tilt.norm(),
-            object_linvel=torch.tensor([0.2, -0.1, 0.0]),
-            object_angvel=torch.tensor([0.0, 1.0, 2.0]),
-        )
+    start = replace_fields(
+        start,
+        object_pos=start.object_pos + torch.tensor([0.0, 0.0, 0.02]),
+        object_quat=tilt / tilt.norm(),
+        object_linvel=torch.tensor([0.2, -0.1, 0.0]),
+        object_angvel=torch.tensor([0.0, 1.0, 2.0]),
     )
     motion = small_motion(bench.kinematics)
-    for k in range(24):
-        worlds.set_targets(start.joint_pos + motion * math.sin(k / 4))
-        worlds.step(4)
+    worlds.path(start, (start.joint_pos + motion * math.sin(k / 4) for k in range(24)), 4)
     return worlds.state()

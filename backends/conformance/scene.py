@@ -12,7 +12,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from xreset.description import read_description
-from xreset.geometry.shapes import transform
+from xreset.geometry.shapes import mass_properties, surface_of, transform
 from xreset.spec import Geometry, ObjectSpec, PairFriction, RobotSpec, SceneSpec, Shape
 
 
@@ -102,28 +102,15 @@ def solid(
     not differ by rounding.
     """
     mass = float(np.float32(mass))
-    mesh = trimesh.util.concatenate([_mesh(piece) for piece in pieces])
+    vertices, faces = surface_of(pieces)
+    com, inertia = mass_properties(vertices, faces, mass)
     R = Rotation.from_euler("xyz", (twist, -twist, twist)).as_matrix()
     return ObjectSpec(
         name=name,
         pieces=pieces,
         mass=mass,
-        com=np.asarray(mesh.center_mass) + np.array(shift),
-        inertia=R @ np.asarray(mesh.moment_inertia) * (mass / mesh.mass) @ R.T,
-        vertices=np.asarray(mesh.vertices),
-        faces=np.asarray(mesh.faces),
+        com=com + np.array(shift),
+        inertia=R @ inertia @ R.T,
+        vertices=vertices,
+        faces=faces,
     )
-
-
-def _mesh(shape: Shape) -> trimesh.Trimesh:
-    size = shape.geometry.size
-    kind = shape.geometry.kind
-    if kind == "box":
-        mesh = trimesh.creation.box(extents=2.0 * np.array(size))
-    elif kind == "sphere":
-        mesh = trimesh.creation.icosphere(radius=size[0])
-    elif kind == "cylinder":
-        mesh = trimesh.creation.cylinder(radius=size[0], height=2.0 * size[1], sections=32)
-    else:
-        mesh = trimesh.Trimesh(shape.geometry.vertices, shape.geometry.faces)
-    return mesh.apply_transform(shape.T_body_shape)

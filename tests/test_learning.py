@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 from torch.testing import assert_close
+from torch.utils._pytree import tree_flatten_with_path
 
 from tests.data import InFolder
 from tests.toy_bank import SOUP, SPAM, toy_bank
@@ -143,18 +144,12 @@ class ModelTest(TestCase):
 def places(alg):
     """Where in memory the tensors lie that an update reads: a captured one reads there for ever."""
     read = vars(alg.storage) | {"rate": alg._rate, "sums": alg._sums}
-    tensors = {f"actor {name}": value for name, value in alg.actor.state_dict().items()}
-    tensors |= {f"critic {name}": value for name, value in alg.critic.state_dict().items()}
-    tensors |= dict(alg.storage.observations.items())
-    for name in set(read) - {
-        "observations",
-        "rewards",
-    }:  # an update reads the returns of the rewards
-        values = read[name] if isinstance(read[name], list | tuple) else [read[name]]
-        for i, value in enumerate(values):
-            if isinstance(value, torch.Tensor):
-                tensors[f"{name} {i}"] = value
-    return {name: value.data_ptr() for name, value in tensors.items()}
+    del read["rewards"]  # an update reads the returns of the rewards
+    read["observations"] = dict(alg.storage.observations.items())
+    for name in ("actor", "critic"):
+        read[name] = getattr(alg, name).state_dict()
+    leaves, _ = tree_flatten_with_path(read)
+    return {str(path): leaf.data_ptr() for path, leaf in leaves if isinstance(leaf, torch.Tensor)}
 
 
 class StorageTest(TestCase):

@@ -43,7 +43,8 @@ class OnnxPolicyTest(WithPolicy):
         """One step with zeros at loading: whatever the graph is like, evaluation meets no surprise."""
         path = self.folder / "tried.onnx"
         OnnxPolicy(write_policy(path, self.contract))
-        layout = self.contract["observation_layout"]
+        layout = self.contract["observation_layout"] | {"policy": {"x": -1}}
+        negative = {"observation_layout": layout}
         partial = {name: value for name, value in self.contract.items() if name != "robot"}
         for words, changes in (
             ("numbers that are not finite", {"value": np.nan}),
@@ -56,23 +57,10 @@ class OnnxPolicyTest(WithPolicy):
             ("not valid JSON", {"metadata": "{nope"}),
             ("a JSON list, expected an object", {"metadata": "[]"}),
             ("missing: .*schema.* Export the policy again", {"metadata": "{}"}),
-            ("missing: robot", {"metadata": json.dumps(partial)}),
-            (
-                r"task is \[\], expected an object",
-                {"metadata": json.dumps(self.contract | {"task": []})},
-            ),
-            (
-                "observation_layout.policy.x is -1",
-                {
-                    "metadata": json.dumps(
-                        self.contract | {"observation_layout": layout | {"policy": {"x": -1}}}
-                    )
-                },
-            ),
-            (
-                r"joint_names\[0\] is 1",
-                {"metadata": json.dumps(self.contract | {"joint_names": [1, 2]})},
-            ),
+            ("missing: robot", {"metadata": partial}),
+            (r"task is \[\], expected an object", {"metadata": self.contract | {"task": []}}),
+            ("observation_layout.policy.x is -1", {"metadata": self.contract | negative}),
+            (r"joint_names\[0\] is 1", {"metadata": self.contract | {"joint_names": [1, 2]}}),
         ):
             with (
                 self.subTest(words, **{k: str(v)[:40] for k, v in changes.items()}),

@@ -5,8 +5,7 @@ import json
 import numpy as np
 from onnx import TensorProto, helper, numpy_helper
 
-from xreset import TaskConfig
-from xreset.checks import from_dict
+from xreset.policy import observation_shapes, read_contract
 
 
 def write_policy(
@@ -22,16 +21,13 @@ def write_policy(
         outputs: how many of the three it has.
         value: of every weight.
         state: ONNX operator that makes the LSTM's new state from the old one.
-        metadata: in place of the contract.
+        metadata: in place of the contract: text, or a dictionary.
     """
-    layout, cloud = (
-        contract["observation_layout"],
-        from_dict(TaskConfig, json.loads(json.dumps(contract["task"]))).observation,
-    )
-    flat = sum(width for terms in (layout["policy"], layout["proprio"]) for width in terms.values())
+    policy, proprio, cloud = observation_shapes(read_contract("it", contract), "it").values()
+    flat = policy[0] + proprio[0]
     shapes = {
         "flat": ["n", flat],
-        "cloud": ["n", cloud.cloud_history, cloud.cloud_points, 3],
+        "cloud": ["n", *cloud],
         "h_in": [1, "n", lstm],
         "c_in": [1, "n", lstm],
     }
@@ -53,7 +49,8 @@ def write_policy(
     graph = helper.make_graph(nodes, "policy", inputs, given, [weights])
     model = helper.make_model(graph, ir_version=9, opset_imports=[helper.make_opsetid("", 18)])
     helper.set_model_props(
-        model, {"xreset": json.dumps(contract) if metadata is None else metadata}
+        model,
+        {"xreset": metadata if isinstance(metadata, str) else json.dumps(metadata or contract)},
     )
     path.write_bytes(model.SerializeToString())
     return path

@@ -48,10 +48,14 @@ def export_onnx(
     import onnx
 
     policy = ExportedPolicy(actor)
-    *_, picture = observation_shapes(contract, str(path)).values()
     n = 2  # an example batch that is not 1, so that the exporter keeps the world dimension free
     state = torch.zeros(1, n, policy.lstm_dim)
-    example = (torch.zeros(n, policy.flat_dim), torch.zeros(n, *picture), state, state.clone())
+    example = (
+        torch.zeros(n, policy.flat_dim),
+        torch.zeros(n, *contract.task.picture_shape),
+        state,
+        state.clone(),
+    )
     worlds = torch.export.Dim("worlds", min=1, max=65536)
     with _quiet(), torch.no_grad():
         program = torch.onnx.export(

@@ -34,7 +34,7 @@ class Variation:
     Attributes:
         parameters: physical parameters [N, ...] by name, without the gravity fraction, which belongs to the start of an
             episode.
-        force_gain: [N, 1, 1] factor on the observed forces; None: 1.
+        force_gain: [N, 1, 1] factor on the observed forces, or 1.
         pushes: pushes on object and arm; None: there are none.
     """
 
@@ -69,7 +69,7 @@ class Variation:
                 f"The backend {backend.name!r} cannot set {', '.join(missing)} in each world, which this task draws. "
                 "Use another backend, or in a training leave these ranges of task.randomization at their defaults."
             )
-        self.force_gain: Tensor | None = None
+        self.force_gain: Tensor | float = 1.0
         if c.draws("force_gain"):
             gain = partial(sample_range, n, c.force_gain)
             self.force_gain = drawn.keep("force_gain", drawn.zeros(1, 1), gain)
@@ -165,7 +165,7 @@ class Variation:
 
     def scaled_forces(self, force: Tensor) -> Tensor:
         """[N, E, 3] forces as they are observed."""
-        return force * (1.0 if self.force_gain is None else self.force_gain)
+        return force * self.force_gain
 
     def observed_pose(
         self, state: State, fresh: Tensor, generator: torch.Generator

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch.testing import assert_close
 
+from tests.command import refused, succeeds
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_goals import toy_goals
 from tests.toy_training import CONFIG, OPTIONS, WithBank, quickly
@@ -274,6 +275,7 @@ class TrainingTest(WithBank):
             (("--like", "minutes", "--resume"), "Omit --like"),
             (("--weights", str(self.out), "--resume"), "Omit --weights"),
             (("--resume", "--config.ppo.entropy", "0.001"), "Omit --config, or start another run"),
+            (("--resume",), "run is not a run folder"),
         ):
             with (
                 self.subTest(arguments),
@@ -282,6 +284,37 @@ class TrainingTest(WithBank):
             ):
                 parsed(*arguments)
             self.assertRegex(said.getvalue(), problem)
+
+    def test_a_run_is_resumed_as_it_was_started(self):
+        """Options that it was started with may be repeated, others are not ignored."""
+        other = self.folder / "other.npz"
+        write_bank(other, toy_bank(self.robot).with_states(np.arange(6) < 3))
+        for options, problem in (
+            ("", ""),
+            (
+                f"--robot openarm --backend mujoco --device cpu --num-envs 4 --seed 3 --resets {self.bank}",
+                "",
+            ),
+            (
+                "--num-envs 8",
+                "--num-envs is 8, but .* was started with 4, and .* Omit --num-envs, or start",
+            ),
+            ("--seed 5", "--seed is 5, but"),
+            ("--backend pybullet", "--backend is pybullet, but .* was started with mujoco"),
+            ("--robot ur7e-sharpa", "--robot is ur7e-sharpa, but .* was started with openarm"),
+            (f"--resets {other}", "--resets is .*other.npz, but .* was started with .*bank.npz"),
+            (f"--objects {self.folder}", "--objects is .*, but .* was started with None"),
+        ):
+            with self.subTest(options), patch("xreset.learning.train.resume") as resumed:
+                words = f"train --resume --out {self.out} {options}".split()
+                error = refused(*words) if problem else succeeds(*words)
+                self.assertRegex(error, problem or "^$")
+                self.assertEqual(resumed.called, not problem)
+
+    def test_a_number_of_iterations_that_has_passed_does_not_shorten_a_run(self):
+        out = self.train("long")
+        self.assertIn("the last one", self.resume(out, iterations=1))
+        self.assertEqual(read_run(out).config, CONFIG)
 
     def test_a_schedule_without_effect_is_refused(self):
         for schedule, problem in (
@@ -399,7 +432,10 @@ class TrainingTest(WithBank):
         for words, options in (
             ("is not a run folder", {"weights": self.folder}),
             ("another observation layout", {"weights": self.out, "config": short}),
-            ("'lstm': 12.*'lstm': 16.*--like", {"weights": self.out, "config": wide}),
+            (r"{'lstm': 12}, .*{'lstm': 16}.*--like", {"weights": self.out, "config": wide}),
+            (r"layout .*--like .*run$", {"weights": self.out, "config": short}),
+            ("many-objects has no critic .* Give a run folder", {"weights": "many-objects"}),
+            ("000002.pt is a file. Give the folder", {"weights": latest_checkpoint(self.out)}),
             ("--num-envs is 0", {"num_envs": 0}),
             ("--minutes is 0", {"minutes": 0.0}),
             ("Unknown device 'quantum'", {"device": "quantum"}),

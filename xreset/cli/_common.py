@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
@@ -12,7 +13,8 @@ from tyro.conf import Positional, UseAppendAction, arg
 from xreset.accounts import Account, described
 from xreset.cli import INVOCATION
 from xreset.cli._terminal import console, show_table
-from xreset.files import code_version, write_json
+from xreset.errors import RunError
+from xreset.files import code_version, file_hash, write_json
 from xreset.plugins import backend_names, backend_status
 
 if TYPE_CHECKING:
@@ -79,6 +81,38 @@ def quick_engines(names: Sequence[str], device: str) -> list[rollout.Engine]:
 
     engines = rollout.chosen_engines(names or usable_engines(), device)
     return [each for each in engines if names or not each.slow]
+
+
+def refuse_changes(command: Callable[..., None], out: Path, **given: Any) -> None:
+    """Refuse options of a run that is resumed, if it was started with others.
+
+    Args:
+        command: what has the options; a value that is its default is not given.
+        out: the run's folder.
+        given: values by name of the option; ``resets`` and ``goals``: files.
+
+    Raises:
+        RunError: names the first option that differs.
+    """
+    from xreset.learning import run
+
+    info = run.read_run(out)
+    files = ("resets", "goals")
+    joined = None not in [given.get(name) for name in files]  # in a file of the run
+    for name, value in given.items():
+        if value == signature(command).parameters[name].default or (joined and name in files):
+            continue
+        found = getattr(info, "resets" if name in files else name)
+        if name in files:
+            is_same = file_hash(value) == info.resets_hash
+        else:
+            is_same = Path(str(value)).resolve() == Path(str(found)).resolve()
+        if not is_same:
+            flag = "TEACHER" if name == "teacher" else f"--{name.replace('_', '-')}"
+            raise RunError(
+                f"{flag} is {value}, but {out} was started with {found}, and --resume continues it as it was. "
+                f"Omit {flag}, or start another run with its networks: --weights {out} --like {out}"
+            )
 
 
 def write_measured(path: Path | None, content: dict[str, Any]) -> None:

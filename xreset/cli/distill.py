@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 
 from xreset.cameras.config import STUDENT_VISION, VisionConfig
-from xreset.cli._common import Objects, Policy, Robot, Several
+from xreset.cli._common import Objects, Policy, Robot, Several, refuse_changes
 from xreset.errors import RunError
 
 
@@ -45,6 +45,22 @@ def distill(
     from xreset.learning import train as training
 
     if resume:
+        if camera or vision != STUDENT_VISION:
+            raise RunError(
+                "--resume continues with the run's own cameras. Omit --camera and --vision."
+            )
+        refuse_changes(
+            distill,
+            out,
+            teacher=teacher,
+            robot=robot,
+            resets=resets,
+            objects=objects,
+            backend=backend,
+            device=device,
+            num_envs=num_envs,
+            seed=seed,
+        )
         training.resume(out, iterations=iterations, minutes=minutes)
         return
     if not teacher or resets is None:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from xreset.cli._common import Objects
+from xreset.cli._common import Objects, refuse_changes
 from xreset.errors import RunError
 from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import default_recipe, starting_config, without_state_schedule
@@ -75,6 +75,18 @@ def train(
             f"networks: --weights {out} --like {out}"
         )
     if resume:
+        refuse_changes(
+            train,
+            out,
+            robot=robot,
+            resets=resets,
+            goals=goals,
+            objects=objects,
+            backend=backend,
+            device=device,
+            num_envs=num_envs,
+            seed=seed,
+        )
         training.resume(out, iterations=iterations, minutes=minutes, own=own, wandb=wandb)
         return
     if goals is None and resets is None:

@@ -74,6 +74,8 @@ def read_run(folder: str | Path, *, as_stated: bool = False) -> RunInfo:
         FileFormatError: the file is damaged, or of another version of xreset.
     """
     folder = Path(folder)
+    if os.path.isfile(folder):
+        raise RunError(f"{folder} is a file. Give the folder of its run, which has a run.json.")
     if not os.path.isfile(folder / "run.json"):
         raise RunError(
             f"{folder} is not a run folder: it has no run.json. Make one with: xreset train --out {folder} ..."

@@ -46,6 +46,7 @@ from xreset.learning.run import (
 )
 from xreset.learning.runner import TrainingRunner
 from xreset.plugins import backend_class, device_for
+from xreset.policies import shipped
 from xreset.policy import OnnxPolicy, check_contract, policy_contract
 from xreset.resets.bank import ResetBank, read_bank, write_bank
 from xreset.resets.goals import GoalSet, read_goals, with_goals, write_goals
@@ -257,12 +258,25 @@ def _copy_teacher(teacher: Path, out: Path, inputs: Inputs, config: TrainConfig)
 
 def _checkpoint_to_start_from(run: Path, inputs: Inputs, config: TrainConfig) -> Path:
     """Return the newest checkpoint of another run, whose networks must be like those of this run."""
-    other = read_run(run)
-    check_contract(str(run), other.contract, inputs.robot, config.task)
-    if other.config.model.layers != config.model.layers:
+    if run.suffix == ".onnx" or (not run.exists() and str(run) in shipped()):
         raise RunError(
-            f"The networks of {run} have the layers {other.config.model.layers}, this run's {config.model.layers}. "
-            f"Start from its configuration: --like {run}"
+            f"{run} has no critic and no checkpoint, so no training can start from it. Give a run folder (--weights)."
+        )
+    other = read_run(run)
+    start = f"Start from its configuration: --like {run}"
+    try:
+        check_contract(str(run), other.contract, inputs.robot, config.task)
+    except PolicyError as error:
+        if other.contract.robot != inputs.robot.name:
+            raise
+        raise PolicyError(f"{error} {start}") from error
+    layers = config.model.layers
+    differing = [name for name, value in other.config.model.layers.items() if value != layers[name]]
+    if differing:
+        theirs = {name: other.config.model.layers[name] for name in differing}
+        ours = {name: layers[name] for name in differing}
+        raise RunError(
+            f"The networks of {run} have the layers {theirs}, this run's {ours}. {start}"
         )
     return latest_checkpoint(run)
 
@@ -415,13 +429,16 @@ def _runner(
         if begin is None and (out / "run.json").is_file():
             for events in out.glob("events.out.tfevents.*"):
                 events.unlink()
+        is_over = runner.iteration >= info.config.iterations
         stated = read_run(out, as_stated=True) if resumed else info
-        write_run(out, replace(stated, config=info.config))
+        if not is_over:  # a number that has passed already must not shorten the run
+            stated = replace(stated, config=info.config)
+        write_run(out, stated)
         if resumed:
             done = f"continuing after iteration {runner.iteration}"
             if begin is None:
                 done = "there is no checkpoint yet: starting from the beginning"
-            elif runner.iteration >= info.config.iterations:
+            elif is_over:
                 done += ", the last one: --iterations asks for more"
             print(done, flush=True)
     return runner

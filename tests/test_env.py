@@ -37,6 +37,7 @@ from xreset.task.config import (
     PushConfig,
     RandomizationConfig,
     ResetConfig,
+    RewardConfig,
     TaskConfig,
     TerminationConfig,
     TrackerConfig,
@@ -304,6 +305,22 @@ class ResetTest(WithEnv):
         # the drives hold the new joint positions
         self.assertTrue(torch.equal(env.joint_target[1], state.joint_pos[1]))
 
+    def test_ends_of_episodes_from_home_count_for_their_demonstration(self):
+        """World 0 ends from home at its goal, world 1 elsewhere, world 2 at its goal from a state of the bank."""
+        near = RewardConfig(contact="near", near_tips=10.0, near_palm=10.0)
+        reset = replace(TASK.reset, demo_probability=0.0, adaptive_share=0.5)
+        env = self.make(replace(TASK, reward=near, reset=reset))
+        state = env.backend.state()
+        env.goal_pos.copy_(state.object_pos)
+        env.goal_quat.copy_(state.object_quat)
+        env.goal_pos[1] += 0.3
+        env.bank_state[2] = 0
+        env.episode_length_buf[:] = env.max_episode_length - 1
+        expected = torch.zeros(3)
+        expected[env.sequence[0]] += 0.05
+        env.step(torch.zeros(N, 7))
+        assert_close(env.resets.success_rate, expected)
+
     def test_starts_come_from_the_distribution_and_may_press(self):
         """Drives begin with the bank's targets; from home they hold the joints."""
         task = replace(TASK, reset=ResetConfig(demo_probability=1.0))
@@ -513,8 +530,10 @@ class RobustnessTest(WithEnv):
 
     def test_a_step_with_all_of_it_never_waits_for_the_device(self):
         """As on a GPU, where any of these operations would stop the host until the device is done, and could not be captured."""
-        for recipe in ("live", "published"):
-            env = self.make(RECIPES[recipe].config.task)
+        live, published = (RECIPES[name].config.task for name in ("live", "published"))
+        adaptive = replace(live, reset=replace(live.reset, adaptive_share=0.5))
+        for task in (adaptive, published):
+            env = self.make(task)
             waiting = Waiting()
             with patch.multiple(env._graphs, active=True, run=lambda part: part()):
                 with patch.object(env.backend, "set_where"), waiting:

@@ -386,6 +386,41 @@ class ResetTest(TestCase):
         ):
             self.sample(objects=(SOUP, "011_banana"))
 
+    def test_demonstrations_that_fail_are_drawn_more_often(self):
+        """The soup can's two demonstrations are 0, which always succeeds, and 2, which never does."""
+        for share, expected in ((0.0, 0.5), (0.5, 0.25 + 0.5 / 1.05), (1.0, 1 / 1.05)):
+            for p in (0.0, 1.0):
+                config = ResetConfig(demo_probability=p, adaptive_share=share)
+                distribution = ResetDistribution(self.bank, self.robot, (SOUP, SPAM), config)
+                distribution.success_rate[0] = 1.0
+                reset = distribution.sample(self.SOUPS, generator())
+                of_second = (reset.sequence == 2).float().mean()
+                with self.subTest(share=share, p=p):
+                    self.assertAlmostEqual(of_second, expected, delta=0.02)
+                    self.assertEqual(set(reset.sequence.tolist()), {0, 2})
+                    assert_close(reset.goal_pos, self.of(reset, "goal_pos"))
+                    self.assertEqual(reset.from_bank.all(), p == 1.0)
+
+    def test_a_demonstration_without_states_is_drawn_at_home_only(self):
+        bank = self.bank.with_states(self.bank.sequence_index != 2)
+        reset = self.sample(bank=bank, demo_probability=1.0, adaptive_share=1.0)
+        self.assertTrue(reset.from_bank.all())
+        self.assertEqual(set(reset.sequence.tolist()), {0})
+
+    def test_rate_of_success_is_that_of_the_last_episodes(self):
+        config = ResetConfig(adaptive_share=0.5)
+        distribution = ResetDistribution(self.bank, self.robot, (SOUP, SPAM), config)
+        sequence = tensor([0, 0, 1, 2])
+        ended = tensor([True, True, True, False])
+        distribution.record(sequence, tensor([True, False, True, True]), ended)
+        assert_close(distribution.success_rate, tensor([0.05, 0.05, 0.0]))
+        for _ in range(200):
+            distribution.record(sequence, tensor([True, False, True, True]), ended)
+        assert_close(distribution.success_rate, tensor([0.5, 1.0, 0.0]), rtol=0, atol=1e-3)
+        many = torch.ones(100, dtype=torch.long)
+        distribution.record(many, many == 0, many == 1)
+        assert_close(distribution.success_rate[1], tensor(0.0))
+
     def test_gravity(self):
         """Of bank resets uniform, of home resets alpha = 1 + eta / 9.81 with eta ~ N(0, 1), clipped."""
         gravity = self.sample(demo_probability=1.0).gravity_fraction

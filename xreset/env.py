@@ -524,6 +524,9 @@ class ManipulationEnv:
         time_out = (self._episode_length >= self.max_episode_length) | self._faulty
         self._time_out.copy_(time_out & ~lost)
         self._reset_mask.copy_((lost | time_out) & live)
+        if self.resets.config.adaptive_share:
+            ended = self._reset_mask & ~self.from_bank & ~self._faulty
+            self.resets.record(self.sequence, reward.success, ended)
         totals = {
             "health/nonfinite_total": self.nonfinite_count,
             "health/overflow_total": self.overflow_count,

@@ -6,7 +6,7 @@ restores a demonstrated hand-object state. The goal is the last object pose of t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -84,27 +84,40 @@ def bank_starts(bank: ResetBank, rows: np.ndarray) -> Reset:
 
 
 class _Grouped:
-    """Rows of a table sorted by the object that each belongs to, to be drawn by object."""
+    """Rows of a table sorted by the group that each belongs to, to be drawn by group."""
 
-    def __init__(
-        self, owners: np.ndarray, object_names: tuple[str, ...], device: torch.device | str
-    ) -> None:
-        """Sort; ``owners`` names each row's object. Rows of objects that are not in ``object_names`` are left out."""
-        rows = [np.flatnonzero(owners == name) for name in object_names]
+    def __init__(self, owners: np.ndarray, groups: Iterable, device: torch.device | str) -> None:
+        """Sort; ``owners`` names each row's group. Rows of groups that are not in ``groups`` are left out."""
+        rows = [np.flatnonzero(owners == group) for group in groups]
         self.rows = np.concatenate(rows)
         """Rows of the table, in the sorted order."""
         count = np.array([len(own) for own in rows])
         self.count = _tensor(count, device)
-        """Number of rows of each object."""
+        """Number of rows of each group."""
         self._first = _tensor(np.cumsum(count) - count, device)
 
-    def draw(self, object_index: Tensor, uniform: Tensor) -> Tensor:
-        """Return places in the sorted order, drawn evenly from the rows of given objects [M] by numbers [M] in [0,
+    def draw(self, group: Tensor, uniform: Tensor) -> Tensor:
+        """Return places in the sorted order, drawn evenly from the rows of given groups [M] by numbers [M] in [0,
         1)."""
-        count = self.count[object_index]
-        return self._first[object_index] + torch.minimum(
-            (uniform * count).long(), (count - 1).clamp_min(0)
-        )
+        count = self.count[group]
+        place = torch.minimum((uniform * count).long(), (count - 1).clamp_min(0))
+        return self._first[group] + place
+
+    def draw_by_weight(self, group: Tensor, uniform: Tensor, weight: Tensor) -> Tensor:
+        """Return places in the sorted order, drawn in proportion to the weight [R] > 0 of each place."""
+        until = pad(weight.double().cumsum(dim=0), (1, 0))
+        first = self._first[group]
+        last = first + self.count[group] - 1
+        begin = until[first]
+        end = until[last + 1]
+        place = torch.searchsorted(until, begin + uniform * (end - begin), right=True) - 1
+        return torch.minimum(torch.maximum(place, first), last)  # against rounding
+
+
+_MEMORY = 0.05
+"""Share of a demonstration's rate of success that an episode replaces: the rate is over the last twenty or so."""
+_LEAST_FAILURE = 0.05
+"""Demonstrations that always succeed are drawn as if one in twenty of their episodes failed."""
 
 
 class ResetDistribution:
@@ -113,6 +126,8 @@ class ResetDistribution:
 
     Attributes:
         demo_probability: [] share of resets from the bank: the configured one, until another is filled in.
+        success_rate: [S] share of the last episodes from home that succeeded, for each demonstration of the bank
+            (:meth:`record`).
     """
 
     def __init__(
@@ -160,6 +175,10 @@ class ResetDistribution:
             goal_quat=_tensor(bank.goal_quat_wxyz, device),
             pivot=_tensor(np.array(of_sequence), device),
         )
+        self.success_rate = torch.zeros(len(bank.sequence_object), device=device)
+        owner = self._states.sequence.numpy(force=True)
+        self._states_of = _Grouped(owner, range(len(bank.sequence_object)), device)
+        self._rows_of = _tensor(self._states_of.rows, device)
         self._lower, self._upper = _tensor(joint_limits(robot), device)
         self._goal_shift = torch.tensor(
             [config.goal_xy, config.goal_xy, config.goal_z, config.goal_yaw], device=device
@@ -178,10 +197,16 @@ class ResetDistribution:
             object_index: [M] object of each world.
             generator: random numbers, on this distribution's device.
         """
-        # Two of the six numbers are not used. They are drawn so that a seed gives the episodes that it gave in earlier
+        # One of the six numbers is not used. It is drawn so that a seed gives the episodes that it gave in earlier
         # versions.
         uniform = torch.rand(len(object_index), 6, generator=generator, device=generator.device)
-        sequence = self._sequences[self._grouped_sequences.draw(object_index, uniform[:, 2])]
+        place = self._grouped_sequences.draw(object_index, uniform[:, 2])
+        adapted = uniform[:, 4] < self.config.adaptive_share
+        if self.config.adaptive_share:
+            failure = (1.0 - self.success_rate[self._sequences]).clamp_min(_LEAST_FAILURE)
+            weak = self._grouped_sequences.draw_by_weight(object_index, uniform[:, 2], failure)
+            place = torch.where(adapted, weak, place)
+        sequence = self._sequences[place]
         home = self.home(sequence, generator)
         if not len(self._states.state):
             return home
@@ -189,11 +214,29 @@ class ResetDistribution:
             self._grouped_states.count[object_index] > 0
         )
         row = self._grouped_states.draw(object_index, uniform[:, 1])
+        if self.config.adaptive_share:
+            has_states = self._states_of.count[sequence] > 0
+            place = torch.where(has_states, self._states_of.draw(sequence, uniform[:, 1]), 0)
+            row = torch.where(adapted & has_states, self._rows_of[place], row)
         row = torch.where(from_bank, row, 0)  # a valid row for home worlds; its values are not used
         gravity = uniform[:, 3] if self.config.random_gravity else torch.ones_like(uniform[:, 3])
         return where(
             from_bank, replace(self._states[row], state=row, gravity_fraction=gravity), home
         )
+
+    def record(self, sequence: Tensor, success: Tensor, ended: Tensor) -> None:
+        """Take into account which demonstrations [N] have succeeded, for the episodes from home that have ended.
+
+        Args:
+            sequence: [N] demonstration of each world.
+            success: [N] bool, whether the object is at its goal now.
+            ended: [N] bool, worlds whose episode from home ends now.
+        """
+        none = torch.zeros_like(self.success_rate)
+        count = none.index_add(0, sequence, ended.float())
+        succeeded = none.index_add(0, sequence, (ended & success).float())
+        change = succeeded / count.clamp_min(1.0) - self.success_rate
+        self.success_rate += (_MEMORY * count).clamp_max(1.0) * change
 
     def home(self, sequence: Tensor, generator: torch.Generator) -> Reset:
         """Return home resets for given demonstrations [M], perturbed as configured."""

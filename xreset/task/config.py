@@ -278,6 +278,10 @@ class ResetConfig(Checked):
     ] = field(default_factory=dict)
     """Trainings: name of an object -> how many times as many worlds it has as an object that is not named. It gives
     more practice with objects that are learned late."""
+    adaptive_share: Share = 0.0
+    """Trainings: share of episodes whose demonstration is drawn in proportion to how often it has failed from home
+    lately, among those of the world's object, in place of evenly. Adaptive sampling as in BeyondMimic (Liao et al.
+    2025), there over the parts of a motion."""
 
 
 @frozen
@@ -536,6 +540,7 @@ def evaluation_task(task: TaskConfig) -> TaskConfig:
             goal_z=0.0,
             goal_yaw=0.0,
             object_share={},
+            adaptive_share=0.0,
         ),
         randomization=replace(task.randomization, enabled=False),
     )

@@ -7,6 +7,7 @@ import os
 import re
 import tempfile
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -93,8 +94,14 @@ def import_mesh(path: str | Path, name: str) -> ObjectSpec:
     """Return the object of a mesh file; see :func:`import_with_notes`. Assumptions are logged as warnings."""
     result = import_with_notes(path, name)
     for note in result.notes:
-        _log.warning("%s: %s", name, note)
+        _warn_once(name, note)
     return result.obj
+
+
+@cache
+def _warn_once(name: str, note: str) -> None:
+    """Log an assumption about an object once in a process, however often its mesh is loaded."""
+    _log.warning("%s: %s", name, note)
 
 
 def import_with_notes(path: str | Path, name: str) -> Import:
@@ -156,7 +163,8 @@ def import_with_notes(path: str | Path, name: str) -> Import:
         inertia = pieces.inertia * mass
         if own.density is None:
             notes.append(
-                f"its mass is unknown: {mass:.3f} kg by a density of {DEFAULT_DENSITY:.0f} kg/m^3"
+                f"its mass is unknown: {mass:.3f} kg is assumed, by a density of"
+                f" {DEFAULT_DENSITY:.0f} kg/m^3. State `mass` in {path.with_suffix('.toml').name}"
             )
     elif mesh.is_volume and mass / pieces.volume < _HOLLOW:
         com, inertia = shell_properties(np.asarray(mesh.vertices), np.asarray(mesh.faces), mass)

@@ -8,12 +8,16 @@ _STUBS = Path(__file__).parents[1] / "xreset/__init__.pyi"
 _MODULE_OF = {
     name: module for module, name in re.findall(r"from (\S+) import (\w+)", _STUBS.read_text())
 }
+_INTERVAL = re.compile(r"\((-?[\d.]+(?:-| to )[-+]?[\d.]+)\)(?![^<]*>)")
+_SHORT_CODE = re.compile(r"<code>([^<\n]{1,36})</code>")
 _ROLE = re.compile(r":(?:func|class|mod|data|attr|meth):<code>~?([^<]*)</code>")
 
 
 def on_page_content(html: str, **_: Any) -> str:
-    """Docstrings name things by Sphinx's roles: what is left of one is its name."""
-    return _ROLE.sub(r"<code>\1</code>", html)
+    """Replace Sphinx's roles of docstrings by names, and keep short code and intervals in one line."""
+    html = _ROLE.sub(r"<code>\1</code>", html)
+    html = _SHORT_CODE.sub(r'<code class="whole">\1</code>', html)
+    return _INTERVAL.sub(r'<span class="whole">(\1)</span>', html)
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:

@@ -1,4 +1,4 @@
-"""A reward term of your own: a function of what the reward looks at, named in the configuration. Nothing in xreset changes.
+"""A reward term of your own: a function that the configuration names. Nothing in xreset changes.
 
 PYTHONPATH=examples xreset train ... --config.task.reward.own 04_own_reward:upright 0.5
 """
@@ -16,7 +16,7 @@ from xreset.task.rewards import RewardInput
 
 
 def upright(x: RewardInput) -> Tensor:
-    """[N] cosine of the angle between the object's z axis and the vertical, while it is more than 5 cm above its start."""
+    """[N] cosine of the angle between the object's z axis and the vertical, from 5 cm above its start."""
     axis = quat_rotate(
         x.object_quat, x.object_pos.new_tensor([0.0, 0.0, 1.0]).expand_as(x.object_pos)
     )

@@ -1,4 +1,4 @@
-"""Learning code that is not xreset's: proximal policy optimisation in one file, as CleanRL writes it, on `xreset.VectorEnv`."""
+"""Learning code of your own: proximal policy optimisation in one file, as CleanRL writes it."""
 
 import sys
 from pathlib import Path
@@ -13,7 +13,7 @@ STEPS, EPOCHS, DISCOUNT, LAMBDA, CLIP = 32, 4, 0.99, 0.95, 0.2
 
 
 def main(bank: Path, iterations: int = 3, num_envs: int = 8) -> None:
-    """Train actor and critic on the flat observations for a few iterations; ``bank``: a file of example 02."""
+    """Train actor and critic on the flat observations; ``bank``: a file of example 02."""
     robot, states = xreset.load_robot("openarm"), xreset.read_bank(bank)
     objects, joints = [xreset.load_object(name) for name in states.object_names], len(robot.joints)
     # an error says what to install if gymnasium is missing

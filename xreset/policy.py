@@ -204,7 +204,6 @@ class OnnxPolicy:
     def _try_step(self, path: Path) -> None:
         """Take one step with zeros, so that a policy that cannot act is refused before work begins."""
         observed = observation_shapes(self.contract, str(path))
-        self._groups = tuple(observed)
         worlds = 2
         zeros = {name: torch.zeros(worlds, *shape) for name, shape in observed.items()}
         try:
@@ -235,12 +234,12 @@ class OnnxPolicy:
         """[N, J] mean action, on the observations' device."""
         actions, *state = self._outputs(observations)
         self._state = [np.array(value) for value in state]
-        device = observations[self._groups[0]].device
+        device = observations["proprio"].device
         return torch.as_tensor(actions, device=device).clamp(-1.0, 1.0)
 
     def _outputs(self, observations: TensorDict | dict[str, Tensor]) -> list[np.ndarray]:
         """Return the graph's outputs: actions [N, J] without limits, and the LSTM's next state."""
-        *flat_groups, picture = self._groups
+        *flat_groups, picture = self.contract.task.policy_groups
         flat = torch.cat([observations[name] for name in flat_groups], dim=-1)
         shape = (1, len(flat), self._lstm_dim)
         if self._state is None or self._state[0].shape != shape:

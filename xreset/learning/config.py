@@ -47,7 +47,9 @@ class ModelConfig(Checked):
     @property
     def layers(self) -> dict[str, Any]:
         """What two networks must share for one to take over the weights of the other."""
-        return {name: value for name, value in asdict(self).items() if name != "initial_std"}
+        layers = asdict(self)
+        del layers["initial_std"]
+        return layers
 
 
 @frozen

@@ -152,11 +152,10 @@ class Trunk(nn.Module):
         pointnet: PointNet | ImageEncoder,
         embedding_dim: int,
         lstm_dim: int,
-        normalizer: EmpiricalNormalization,
     ) -> None:
-        """Build LSTM and layer norm; ``embedding_dim`` is the width of all embeddings of a step."""
+        """Build normalization, LSTM and layer norm; ``embedding_dim`` is the width of all embeddings of a step."""
         super().__init__()
-        self.normalizer = normalizer
+        self.normalizer = EmpiricalNormalization(flat_dim)
         self.pointnet = pointnet
         self.lstm = nn.LSTM(flat_dim + embedding_dim, lstm_dim)
         self.norm = nn.LayerNorm(lstm_dim)
@@ -226,7 +225,6 @@ class PointNetLstmModel(MLPModel):
             config.mlp,
             distribution_cfg=gaussian if stochastic else None,
         )
-        normalizer = EmpiricalNormalization(self.obs_dim)
         shape = obs[self.cloud_group].shape[1:]
         width = config.pointnet[-1]
         encoder: PointNet | ImageEncoder
@@ -235,7 +233,7 @@ class PointNetLstmModel(MLPModel):
         else:
             encoder = PointNet(config.pointnet, shape[2])
             width *= shape[0]
-        self.trunk = Trunk(self.obs_dim, encoder, width, config.lstm, normalizer)
+        self.trunk = Trunk(self.obs_dim, encoder, width, config.lstm)
         self.state: LstmState | None = None
 
     def get_latent(

@@ -207,9 +207,7 @@ def readers():
         path = add("checkpoint", "000001.pt", lambda p: vars(read_checkpoint(p)), "checkpoint")
         write_checkpoint(path, checkpoint)
 
-        described = openarm.urdf.with_name("robot.toml")
-        (folder / "robot.toml").write_bytes(described.read_bytes())
-        add("robot.toml", "robot.toml", read_description, "text")
+        add("robot.toml", "toy.toml", read_description, "text")
         add("URDF", robot.urdf.name, urdf.load_urdf, "text")
         add("URDF, imported", "hand.urdf", lambda p: read_source(p, []), "text").write_text(HAND)
         sizes = '<size nkey="1" nuser_body="1"/><asset><texture name="t" type="2d" builtin="flat" width="8" height="8"/></asset>'
@@ -247,13 +245,8 @@ def readers():
 
         once = synthesize(["soup"], per_object=1, fps=5)
         turn = Rotation.from_quat(once.object_quat_wxyz, scalar_first=True)
-        path = add(
-            "tracker's npz",
-            "tracked.npz",
-            lambda p: read_keypoints(p, PLAIN),
-            "npz",
-            ("hand_keypoints", "wrist_quat_wxyz"),
-        )
+        may = ("hand_keypoints", "wrist_quat_wxyz")
+        path = add("tracker's npz", "tracked.npz", lambda p: read_keypoints(p, PLAIN), "npz", may)
         texts = {"object": np.array(SOUP), "side": np.array("right")}
         arrays = {
             "keypoints": once.hand_keypoints,
@@ -261,13 +254,7 @@ def readers():
             "object_quat_wxyz": once.object_quat_wxyz,
         }
         np.savez(path, **arrays, **texts)
-        path = add(
-            "tracker's CSV",
-            "tracked.csv",
-            lambda p: read_keypoints(p, PLAIN),
-            "text",
-            ("hand_keypoints", "wrist_quat_wxyz"),
-        )
+        path = add("tracker's CSV", "tracked.csv", lambda p: read_keypoints(p, PLAIN), "text", may)
         times = np.arange(len(once.object_pos)) / once.fps
         columns = {"object": SOUP, "side": "right", "time": times}
         write_csv(path, once.hand_keypoints, once.object_pos, turn, columns=columns)

@@ -28,13 +28,17 @@ HEAVY = {
 }
 
 
+def output_of(code):
+    """What some code prints in a new interpreter, on a wide terminal."""
+    command = [sys.executable, "-c", code]
+    wide = os.environ | {"COLUMNS": "300"}
+    return subprocess.run(command, check=True, capture_output=True, text=True, env=wide).stdout
+
+
 def modules_after(code):
     """Top-level modules that are loaded after running some code in a new interpreter."""
     code += "\nimport sys, json; print('\\n' + json.dumps(sorted({m.split('.')[0] for m in sys.modules})))"
-    out = subprocess.run(
-        [sys.executable, "-c", code], check=True, capture_output=True, text=True
-    ).stdout
-    return set(json.loads(out.strip().splitlines()[-1]))
+    return set(json.loads(output_of(code).strip().splitlines()[-1]))
 
 
 class LightnessTest(TestCase):
@@ -120,11 +124,7 @@ class UsageTest(TestCase):
 
     def test_a_missing_engine_is_named_with_the_command_that_mends_it(self):
         code = "import sys; sys.modules['pybullet'] = None; from xreset.cli import main; main(['engines', 'list'])"
-        wide = os.environ | {"COLUMNS": "300"}
-        out = subprocess.run(
-            [sys.executable, "-c", code], check=True, capture_output=True, text=True, env=wide
-        ).stdout
-        self.assertRegex(out, r"pybullet .* no: .*pip install 'xreset\[pybullet\]'")
+        self.assertRegex(output_of(code), r"pybullet .* no: .*pip install 'xreset\[pybullet\]'")
 
     def test_naming_engines_replaces_the_default(self):
         for given, expected in (

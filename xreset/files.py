@@ -349,18 +349,15 @@ def _no_constant(name: str) -> None:
 
 
 def _check_texts(data: Any) -> None:
-    if isinstance(data, str):
-        if not is_plain(data):
-            raise ValueError(
-                f"the text {shown(data)} holds characters that control a terminal, or are none"
-            )
-    elif isinstance(data, dict):
-        for key, value in data.items():
-            _check_texts(key)
-            _check_texts(value)
-    elif isinstance(data, list):
+    if isinstance(data, dict):
+        data = [*data.keys(), *data.values()]
+    if isinstance(data, list):
         for value in data:
             _check_texts(value)
+    elif isinstance(data, str) and not is_plain(data):
+        raise ValueError(
+            f"the text {shown(data)} holds characters that control a terminal, or are none"
+        )
 
 
 def file_hash(path: str | Path) -> str:

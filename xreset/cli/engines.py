@@ -67,6 +67,7 @@ def check(
 
     spec = description.load_robot(robot) if robot else conformance.scene().robot
     runs = []
+    failed = 0
     for name in dict.fromkeys(backend) or usable_engines():
         status = backend_status(name)
         used = device if device.split(":")[0] in status.device else "cpu"
@@ -87,10 +88,8 @@ def check(
                 "checks": [result.as_dict() for result in results],
             }
         )
+        failed += sum(result.verdict == "failed" for result in results)
     write_measured(json, {"schema": conformance.SCHEMA, "runs": runs})
-    failed = 0
-    for record in runs:
-        failed += sum(result["verdict"] == "failed" for result in record["checks"])
     if failed:
         console.print(f"{failed} checks failed", style="bold red")
         raise SystemExit(1)

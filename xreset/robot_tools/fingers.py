@@ -250,7 +250,7 @@ class Hand:
                 if finger.name != "thumb":
                     halfway = np.clip(0.0, joint.lower, joint.upper) + 0.5 * closing
                     T = link_places(self._spec, {name: halfway})[last]
-                    moved += T[:3, :3] @ tip + T[:3, 3] - finger.points[-1]
+                    moved += transformed(tip, T) - finger.points[-1]
         z = moved - (moved @ x) * x
         if is_jaw:
             # as in a right hand, whose thumb is against the palm's y

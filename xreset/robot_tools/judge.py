@@ -176,7 +176,7 @@ def judge(
     index = np.array([names.index(name) for name in tried.object_name.tolist()])
     arrays = (tried.joint_pos, tried.object_pos, tried.object_quat_wxyz, targets)
     start = State.at_rest(*map(torch.as_tensor, arrays))
-    groups = {name: np.flatnonzero(index == number) for number, name in enumerate(names)}
+    groups = {name: np.flatnonzero(tried.object_name == name) for name in names}
     rows = []
     shots: dict[str, np.ndarray] = {}
     for number, backend in enumerate(backends):

@@ -174,17 +174,18 @@ def _tree(path: Path, model: mujoco.MjModel, couplings: Couplings) -> RobotTree:
             raise RobotError(
                 f"{path}: the first body {body.name!r} has joints; put it into a body that does not move."
             )
-        T = transform(data.xmat[number], data.xpos[number])
+        turn = data.xmat[number].reshape(3, 3).T
+        T = transform(turn.T, data.xpos[number])
         children = [*(f"{name}_axis{i}" for i in range(len(moving) - 1)), name]
         for child, joint in zip(children, moving, strict=False):
-            T = transform(T[:3, :3], data.xanchor[joint])
+            T = transform(turn.T, data.xanchor[joint])
             poses[child] = T
             links[child] = frame(child)
             placed = Joint(
                 parent=above,
                 child=child,
                 T_parent_joint=np.linalg.inv(poses[above]) @ T,
-                axis=T[:3, :3].T @ data.xaxis[joint],
+                axis=turn @ data.xaxis[joint],
                 **_motion(model, couplings, joint),
             )
             joints.append(placed)
@@ -192,11 +193,11 @@ def _tree(path: Path, model: mujoco.MjModel, couplings: Couplings) -> RobotTree:
         poses[name] = T
         if not moving and number > 1:
             joints.append(fixed(above, name, np.linalg.inv(poses[above]) @ T))
-        R = T[:3, :3].T @ data.ximat[number].reshape(3, 3)
+        R = turn @ data.ximat[number].reshape(3, 3)
         links[name] = Link(
             name=name,
             mass=float(body.mass[0]),
-            com=T[:3, :3].T @ (data.xipos[number] - T[:3, 3]),
+            com=turn @ (data.xipos[number] - T[:3, 3]),
             inertia=R @ np.diag(body.inertia) @ R.T,
             collisions=tuple(_shapes(model, data, number, T)),
         )

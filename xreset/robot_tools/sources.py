@@ -109,23 +109,25 @@ def bare(arm: RobotTree, flange: str, notes: list[str]) -> RobotTree:
 
 def renamed(hand: RobotTree, arm: RobotTree) -> RobotTree:
     """Return a hand with ``hand_`` before the names of links and joints that the arm has too."""
-    links = {name: f"hand_{name}" for name in arm.link_names}
-    names = {joint.name: f"hand_{joint.name}" for joint in arm.joints}
+    arm_joints = {joint.name for joint in arm.joints}
+
+    def link_name(name: str) -> str:
+        return f"hand_{name}" if name in arm.link_names else name
+
+    def joint_name(name: str) -> str:
+        return f"hand_{name}" if name in arm_joints else name
+
     joints = []
     for joint in hand.joints:
-        name = names.get(joint.name, joint.name)
+        name = joint_name(joint.name)
         mimic = joint.mimic
         if mimic is not None:
-            mimic = replace(mimic, joint=name, source=names.get(mimic.source, mimic.source))
-        parent = links.get(joint.parent, joint.parent)
-        child = links.get(joint.child, joint.child)
+            mimic = replace(mimic, joint=name, source=joint_name(mimic.source))
+        parent = link_name(joint.parent)
+        child = link_name(joint.child)
         joints.append(replace(joint, name=name, parent=parent, child=child, mimic=mimic))
-    return replace(
-        hand,
-        root=links.get(hand.root, hand.root),
-        links=tuple(replace(link, name=links.get(link.name, link.name)) for link in hand.links),
-        joints=tuple(joints),
-    )
+    links = [replace(link, name=link_name(link.name)) for link in hand.links]
+    return replace(hand, root=link_name(hand.root), links=tuple(links), joints=tuple(joints))
 
 
 def combined(

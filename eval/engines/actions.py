@@ -11,12 +11,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
-from types import SimpleNamespace
+from typing import Annotated
 
 import numpy as np
 import torch
 
 from xreset.checks import frozen
+from xreset.demos.archive import OneText
 from xreset.description import load_robot
 from xreset.errors import DemoError, FileFormatError
 from xreset.eval.engines.grasps import Grasps, closing_episode, find_grasps
@@ -27,8 +28,9 @@ from xreset.eval.setting import Place
 from xreset.inputs import load_inputs
 from xreset.objects.catalogue import load_object
 from xreset.physics import State
-from xreset.records import JOINT, POSITION, Field, Schema, npz_schema, read_npz, write_npz
+from xreset.records import JOINT, POSITION, Field, arrays_of, npz_schema, read_record, write_npz
 from xreset.resets.bank import check_robot
+from xreset.retarget.file import JointNames
 from xreset.spec import ObjectSpec, PairFriction, RobotSpec, SceneSpec
 from xreset.task.config import EVALUATION_TIMESTEP, TaskConfig
 
@@ -41,25 +43,32 @@ _STATE_KEYS = {
 
 _SPEED = (-1e4, 1e4)
 """[rad/s, m/s]"""
-_FIELDS: Schema = {
-    "robot": Field((), "U"),
-    "robot_fingerprint": Field((), "U"),
-    "joint_names": Field(("J",), "U"),
-    "object_name": Field((), "U"),
-    "object_source": Field((), "U"),
-    "label": Field((), "U"),
-    "timestep": Field((), "f", within=(1e-6, 1.0)),
-    "substeps": Field((), "i", within=(1, 1e6)),
-    "friction": Field((3,), "f", within=(0.0, 100.0)),
-    "joint_target": Field(("T", "J"), "f", within=JOINT),
-    "start_joint_pos": Field(("J",), "f", within=JOINT),
-    "start_joint_vel": Field(("J",), "f", within=_SPEED),
-    "start_joint_target": Field(("J",), "f", within=JOINT),
-    "start_object_pos": Field((3,), "f", within=POSITION),
-    "start_object_quat_wxyz": Field((4,), "f", unit=True),
-    "start_object_linvel": Field((3,), "f", within=_SPEED),
-    "start_object_angvel": Field((3,), "f", within=_SPEED),
-}
+Joints = Annotated[np.ndarray, Field(("J",), "f", within=JOINT)]
+Velocity = Annotated[np.ndarray, Field((3,), "f", within=_SPEED)]
+
+
+@frozen
+class ActionFile:
+    """Contents of a file of actions, except what engines did with them. Poses in the world frame."""
+
+    robot: OneText
+    robot_fingerprint: OneText
+    joint_names: JointNames
+    object_name: OneText
+    object_source: OneText
+    label: OneText
+    timestep: Annotated[float, Field((), "f", within=(1e-6, 1.0))]
+    substeps: Annotated[int, Field((), "i", within=(1, 1e6))]
+    friction: Annotated[np.ndarray, Field((3,), "f", within=(0.0, 100.0))]
+    """Of fingertips, other links and the table."""
+    joint_target: Annotated[np.ndarray, Field(("T", "J"), "f", within=JOINT)]
+    start_joint_pos: Joints
+    start_joint_vel: Annotated[np.ndarray, Field(("J",), "f", within=_SPEED)]
+    start_joint_target: Joints
+    start_object_pos: Annotated[np.ndarray, Field((3,), "f", within=POSITION)]
+    start_object_quat_wxyz: Annotated[np.ndarray, Field((4,), "f", unit=True)]
+    start_object_linvel: Velocity
+    start_object_angvel: Velocity
 
 
 @frozen
@@ -179,20 +188,21 @@ def write_actions(
     """Write an action sequence, and what engines did with it, by name: the first world of each recording."""
     scene = actions.scene
     friction = scene.friction
-    arrays = {
-        "robot": actions.robot.name,
-        "robot_fingerprint": actions.robot.fingerprint,
-        "joint_names": np.array(actions.robot.joint_names),
-        "object_name": actions.object.name,
-        "object_source": actions.object.source,
-        "label": actions.label,
-        "timestep": np.float64(scene.timestep),
-        "substeps": np.int64(scene.substeps),
-        "friction": np.array([friction.tip, friction.link, friction.table]),
-        "joint_target": actions.joint_target.numpy(),
-    }
-    for name, key in _STATE_KEYS.items():
-        arrays[key] = getattr(actions.start, name)[0].numpy()
+    start = {key: getattr(actions.start, name)[0].numpy() for name, key in _STATE_KEYS.items()}
+    content = ActionFile(
+        robot=actions.robot.name,
+        robot_fingerprint=actions.robot.fingerprint,
+        joint_names=actions.robot.joint_names,
+        object_name=actions.object.name,
+        object_source=actions.object.source,
+        label=actions.label,
+        timestep=scene.timestep,
+        substeps=scene.substeps,
+        friction=np.array([friction.tip, friction.link, friction.table]),
+        joint_target=actions.joint_target.numpy(),
+        **start,
+    )
+    arrays = arrays_of(content)
     if replays:
         arrays["engine"] = np.array(list(replays))
         for name in ("joint_pos", "object_pos", "object_quat", "tip_force"):
@@ -215,28 +225,26 @@ def read_actions(
     Raises:
         FileFormatError: the file is damaged, or for another robot or object geometry.
     """
-    a = read_npz(path, SCHEMA, _FIELDS, what="an action sequence", check=_check)
-    spec = robot if isinstance(robot, RobotSpec) else load_robot(robot or str(a["robot"]))
-    made_for = {name: a[name].tolist() for name in ("robot", "robot_fingerprint")}
-    made_for["joint_names"] = tuple(a["joint_names"].tolist())
-    check_robot(path, "action sequence", SimpleNamespace(**made_for), spec)
-    thing = objects(str(a["object_name"]))
-    if thing.source != str(a["object_source"]):
+    made = read_record(ActionFile, path, SCHEMA, what="an action sequence", check=_check)
+    spec = robot if isinstance(robot, RobotSpec) else load_robot(robot or made.robot)
+    check_robot(path, "action sequence", made, spec)
+    thing = objects(made.object_name)
+    if thing.source != made.object_source:
         raise FileFormatError(
-            f"{path} was made with another geometry of {thing.name} ({a['object_source']}, here {thing.source}). "
+            f"{path} was made with another geometry of {thing.name} ({made.object_source}, here {thing.source}). "
             "Give the same --objects folder."
         )
-    tip, link, table = a["friction"].tolist()
+    tip, link, table = made.friction.tolist()
     scene = SceneSpec(
         robot=spec,
         objects=(thing,),
         friction=PairFriction(tip=tip, link=link, table=table),
-        timestep=float(a["timestep"]),
-        substeps=int(a["substeps"]),
+        timestep=made.timestep,
+        substeps=int(made.substeps),
     )
-    start = {name: torch.as_tensor(a[key]).float()[None] for name, key in _STATE_KEYS.items()}
-    target = torch.as_tensor(a["joint_target"]).float()
-    return Actions(scene=scene, label=str(a["label"]), start=State(**start), joint_target=target)
+    start = {n: torch.as_tensor(getattr(made, key)).float()[None] for n, key in _STATE_KEYS.items()}
+    target = torch.as_tensor(made.joint_target).float()
+    return Actions(scene=scene, label=made.label, start=State(**start), joint_target=target)
 
 
 def _check(arrays: dict[str, np.ndarray]) -> str | None:

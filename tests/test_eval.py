@@ -23,6 +23,7 @@ from xreset import PolicySpec, TaskConfig, evaluate, load_object, load_policy
 from xreset.checks import from_dict
 from xreset.errors import FileFormatError, PolicyError, XResetError
 from xreset.eval.metrics import EpisodeMetrics, MetricPoints
+from xreset.eval.report.groups import estimate
 from xreset.eval.results import (
     Episode,
     EvalResult,
@@ -289,7 +290,21 @@ class BootstrapTest(TestCase):
         self.assertTrue(0 <= alone[0] < 0.5 < alone[1] <= 1)
 
 
+JOINTS = ("a", "b", "c")
+
+
 class ResultsTest(InFolder):
+    """Results of the toy in two engines."""
+
+    def setUp(self):
+        super().setUp()
+        self.rollouts = toy_rollouts()
+        for name in ("sapien", "mujoco"):
+            write_results(self.folder, toy_summary(name), self.rollouts, JOINTS)
+        self.policy = PolicySpec(
+            name="zero", start=Mock(), robot=Mock(), task=TaskConfig(), folder=self.folder
+        )
+
     def test_the_table_tells_trained_objects_from_unseen_ones(self):
         summary = toy_summary(unseen=(OBJECTS[1],))
         table = {row[0].strip(): row[1] for row in reversed(result_rows([summary]))}
@@ -298,12 +313,18 @@ class ResultsTest(InFolder):
             self.assertNotIn("unseen objects", {row[0].strip() for row in result_rows([same])})
         self.assertEqual(from_dict(EvalResult, json.loads(json.dumps(asdict(summary)))), summary)
 
-    JOINTS = ("a", "b", "c")
-
     def test_an_evaluation_shows_its_table(self):
-        evaluation = Evaluation([toy_summary()], [])
+        evaluation = read_evaluation(self.folder)
+        table = evaluation.to_frame()
+        self.assertEqual(len(table), 8)
+        means = table.groupby("engine")["task_progress"].mean().round(6).to_dict()
+        self.assertEqual(means, dict.fromkeys(("mujoco", "sapien"), 0.4975))
+        first = table.iloc[0][["policy", "robot", "seed", "sequence_name"]]
+        self.assertEqual(first.tolist(), ["zero", "toy", 3, "demo_0"])
         self.assertEqual(repr(evaluation), str(evaluation))
-        self.assertIn("task progress", repr(evaluation))
+        for expected in ("mujoco", "sapien", "49.8%", "episodes: 4, demonstrations: 2, seed: 3"):
+            self.assertIn(expected, str(evaluation))
+        self.assertIn("task progress", str(Evaluation([toy_summary()], [])))
 
     def test_summary(self):
         s = toy_summary()
@@ -324,58 +345,86 @@ class ResultsTest(InFolder):
             (s.per_demo[1].grasp_rate, s.per_demo[1].object, s.per_demo[1].episodes), (0.5, SPAM, 2)
         )
 
-    def test_what_is_no_result_is_refused(self):
-        write_results(self.folder, toy_summary(), toy_rollouts(), self.JOINTS)
-        path = self.folder / "mujoco.json"
-        good = json.loads(path.read_text())
+    def test_impossible_values_are_refused(self):
+        episode = asdict(self.rollouts.episodes[0])
         health = {"nonfinite": "<script>alert(1)</script>", "overflow": 0, "out_of_bounds": 0}
-        for words, changes in (
-            ("missing: grasp_rate", {"grasp_rate": None}),
-            ("unknown: later", {"later": 1}),
-            ("policy is 5, expected str", {"policy": 5}),
-            (
-                "mean is 7, expected a number from 0 to 1",
-                {"task_progress": {"mean": 7, "ci95": [0, 1]}},
-            ),
-            ("ci95 has 1 entries", {"task_progress": {"mean": 0.5, "ci95": [0]}}),
-            ("nonfinite is '<script>alert", {"health": health}),
-            ("inputs.demos is 3", {"inputs": {"demos": 3}}),
-            (r"per_demo is \[\], expected one demonstration", {"per_demo": []}),
+        wide = {"mean": 7, "ci95": [0, 1]}
+        short = {"mean": 0.5, "ci95": [0]}
+        number = "is .*, expected a"
+        for file, words, changes in (
+            ("mujoco.json", "missing: grasp_rate", {}),
+            ("mujoco.json", "unknown: later", {"later": 1}),
+            ("mujoco.json", "policy is 5, expected str", {"policy": 5}),
+            ("mujoco.json", "mean is 7, expected a number from 0 to 1", {"task_progress": wide}),
+            ("mujoco.json", "ci95 has 1 entries", {"task_progress": short}),
+            ("mujoco.json", "nonfinite is '<script>alert", {"health": health}),
+            ("mujoco.json", "inputs.demos is 3", {"inputs": {"demos": 3}}),
+            ("mujoco.json", r"per_demo is \[\], expected one demonstration", {"per_demo": []}),
+            ("mujoco.json", "schema version 'xreset-eval/0'", {"schema": "xreset-eval/0"}),
+            ("mujoco.episodes.json", number, {"task_progress": 1e308}),
+            ("mujoco.episodes.json", number, {"reorientation_progress": -7}),
+            ("mujoco.episodes.json", number, {"sequence": -1}),
         ):
-            changed = {
-                name: value
-                for name, value in (good | changes).items()
-                if value is not None or name == "objects_folder"
-            }
-            path.write_text(json.dumps(changed))
-            with self.subTest(words), self.assertRaisesRegex(FileFormatError, words):
+            path = self.folder / file
+            whole = path.read_text()
+            content = json.loads(whole)
+            if "episodes" in file:
+                content["episodes"] = [episode | changes] * 4
+            elif changes:
+                content |= changes
+            else:
+                del content["grasp_rate"]
+            path.write_text(json.dumps(content))
+            with self.subTest(changes), self.assertRaisesRegex(FileFormatError, words):
                 read_evaluation(self.folder)
+            path.write_text(whole)
+
+    def test_an_earlier_version_did_not_measure_the_published_success(self):
+        """Its files load and say so; the rest of the table is as it was, also next to results of today."""
+        today = read_evaluation(self.folder)
+        self.assertEqual(today.to_frame()["published_success"].dtype, bool)
+        self.assertRegex(str(today), r"published success *│ *25.0% │ *25.0%")
+        for file, fields in (
+            ("mujoco.json", ("published_success_rate", "published_success_ci95", "least_distance")),
+            (
+                "mujoco.episodes.json",
+                ("published_success", "least_distance", "final_distance", "final_angle"),
+            ),
+        ):
+            content = json.loads((self.folder / file).read_text())
+            rows = content["episodes"] if "episodes" in file else content["per_demo"]
+            for entry in (content, *rows):
+                for name in fields:
+                    entry.pop(name, None)
+            (self.folder / file).write_text(json.dumps(content))
+        evaluation = read_evaluation(self.folder)
+        self.assertRegex(str(evaluation), r"published success *│ *missing │ *25.0%")
+        self.assertRegex(str(evaluation), r"task progress *│ *49.8% │ *49.8%")
+        table = evaluation.to_frame()
+        self.assertEqual(
+            table.groupby("engine")["least_distance"].count().to_dict(), {"mujoco": 0, "sapien": 4}
+        )
+        for name, expected in (("mujoco", np.nan), ("sapien", 0.0775)):
+            found, low, _ = estimate(table[table["engine"] == name], "least_distance")
+            assert_allclose(found, expected)
+            self.assertEqual(np.isnan(low), np.isnan(expected))
 
     def test_files(self):
-        rollouts = toy_rollouts()
-        for name in ("sapien", "mujoco"):
-            write_results(self.folder, toy_summary(name, rollouts), rollouts, self.JOINTS)
-        self.assertEqual([s.backend for s in read_evaluation(self.folder)], ["mujoco", "sapien"])
-        self.assertEqual(read_evaluation(self.folder)[0], toy_summary("mujoco"))
-        traces = read_traces(self.folder, "mujoco", self.JOINTS)
-        for found, made in zip(traces, rollouts.traces, strict=True):
+        found = read_evaluation(self.folder)
+        self.assertEqual([s.backend for s in found], ["mujoco", "sapien"])
+        self.assertEqual(found[0], toy_summary("mujoco"))
+        traces = read_traces(self.folder, "mujoco", JOINTS)
+        for read, made in zip(traces, self.rollouts.traces, strict=True):
             for name, value in vars(made).items():
-                assert_array_equal(getattr(found, name), value, name)
+                assert_array_equal(getattr(read, name), value, name)
         episodes = json.loads((self.folder / "mujoco.episodes.json").read_text())["episodes"]
-        self.assertEqual(Episode(**episodes[2]), rollouts.episodes[2])
-
-    def test_refusals(self):
-        rollouts = toy_rollouts()
-        write_results(self.folder, toy_summary(), rollouts, self.JOINTS)
+        self.assertEqual(Episode(**episodes[2]), self.rollouts.episodes[2])
         with self.assertRaisesRegex(FileFormatError, "joints a, b, c.*robot has a, c, b"):
             read_traces(self.folder, "mujoco", ("a", "c", "b"))
         trace = self.folder / "mujoco.trace.npz"
         trace.write_bytes(trace.read_bytes()[:200])
         with self.assertRaisesRegex(FileFormatError, "cannot be read as an evaluation trace"):
-            read_traces(self.folder, "mujoco", self.JOINTS)
-        (self.folder / "sapien.json").write_text('{"schema": "xreset-eval/0"}')
-        with self.assertRaisesRegex(FileFormatError, "schema version 'xreset-eval/0'"):
-            read_evaluation(self.folder)
+            read_traces(self.folder, "mujoco", JOINTS)
 
     def test_what_cannot_be_played_is_refused(self):
         with self.assertRaisesRegex(PolicyError, "Linear.*expected a name, a path or a PolicySpec"):
@@ -386,13 +435,10 @@ class ResultsTest(InFolder):
             evaluate("zero", "demos.npz", robot="openarm", episodes=0)
 
     def test_two_evaluations_are_not_written_into_one_folder(self):
-        policy = PolicySpec(
-            name="zero", start=Mock(), robot=Mock(), task=TaskConfig(), folder=self.folder
-        )
         with patch("xreset.eval.evaluate.load_trial"):
             with claim_folder(self.folder), self.assertRaisesRegex(XResetError, "writing"):
-                evaluate(policy, "demos.npz", [])
-            self.assertEqual(evaluate(policy, "demos.npz", []), [])
+                evaluate(self.policy, "demos.npz", [])
+            self.assertEqual(evaluate(self.policy, "demos.npz", []), [])
 
     def test_episodes_have_the_length_that_is_asked_for(self):
         """The same starts, played for longer: the first states are the same. The result states the length."""
@@ -427,17 +473,13 @@ class ResultsTest(InFolder):
         for seconds, told in ((0.1, ""), (0.1, ""), (0.2, "results of episodes of another length")):
             errors = io.StringIO()
             with self.subTest(seconds), contextlib.redirect_stderr(errors):
-                evaluate(policy, bank, episodes=1, episode_seconds=seconds, out=self.folder)
+                out = self.folder / "new"
+                evaluate(policy, bank, episodes=1, episode_seconds=seconds, out=out)
             self.assertIn(told, errors.getvalue())
             self.assertEqual(bool(told), bool(errors.getvalue()))
 
     def test_results_of_other_demonstrations_are_named_before_they_are_replaced(self):
-        rollouts = toy_rollouts()
-        write_results(self.folder, toy_summary(inputs={"demos": "ab"}), rollouts, self.JOINTS)
         before = (self.folder / "mujoco.json").read_bytes()
-        policy = PolicySpec(
-            name="zero", start=Mock(), robot=Mock(), task=TaskConfig(), folder=self.folder
-        )
         for demos, told in (("ab", ""), ("cd", f"{self.folder / 'mujoco.json'}: results of other")):
             errors = io.StringIO()
             with (
@@ -448,14 +490,14 @@ class ResultsTest(InFolder):
                 self.assertRaises(KeyboardInterrupt),
             ):
                 load_trial.return_value.inputs = {"demos": demos}
-                evaluate(policy, "demos.npz", "mujoco")
+                evaluate(self.policy, "demos.npz", "mujoco")
             self.assertEqual(errors.getvalue()[: len(told) or None], told)
         self.assertEqual((self.folder / "mujoco.json").read_bytes(), before)
 
     def test_a_result_that_is_not_a_number_is_not_written(self):
-        rollouts = toy_rollouts()
-        bad = replace(rollouts.episodes[0], reorientation_progress=math.nan)
-        broken = replace(rollouts, episodes=(bad,))
+        bad = replace(self.rollouts.episodes[0], reorientation_progress=math.nan)
+        broken = replace(self.rollouts, episodes=(bad,))
+        new = self.folder / "new"
         with self.assertRaises(ValueError):
-            write_results(self.folder, toy_summary(rollouts=broken), broken, self.JOINTS)
-        self.assertEqual(list(self.folder.iterdir()), [])
+            write_results(new, toy_summary(rollouts=broken), broken, JOINTS)
+        self.assertFalse(new.exists())

@@ -35,9 +35,16 @@ class LiftTest(InFolder):
 
     def test_earlier_runs_and_damaged_files(self):
         self.assertEqual(read_lift(self.folder), Lift())
-        (self.folder / FILE).write_text('{"schema": "xreset-lift/1", "passed": 3}')
-        with self.assertRaisesRegex(FileFormatError, "passed is 3, expected a list"):
-            read_lift(self.folder)
+        passing = {"share": 1e308, "iteration": 3, "env_steps": 30, "minutes": 0.5}
+        for words, changes in (
+            ("passed is 3, expected a list", {"passed": 3}),
+            ("minutes is 1e.300, expected a", {"minutes": 1e300}),
+            ("iteration is -5, expected a", {"iteration": -5}),
+            ("share is 1e.308, expected a", {"passed": [passing]}),
+        ):
+            write_json(self.folder / FILE, {"schema": "xreset-lift/1"} | changes)
+            with self.subTest(words), self.assertRaisesRegex(FileFormatError, words):
+                read_lift(self.folder)
 
 
 class CurvesTest(InFolder):

@@ -319,8 +319,7 @@ def _reachable(scene: SceneSpec, *, tip: bool) -> tuple[np.ndarray, np.ndarray, 
             f"no {what} of {robot.name!r} at home can be reached from outside, so its friction cannot be measured."
         )
     normal = normals[best]
-    along = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    along /= np.linalg.norm(along)
+    along = -_across(normal)
     if along[2] < 0:
         along = -along  # away from the table
     return mine[reach[:, best].argmax()], normal, along
@@ -335,10 +334,15 @@ def _directions(count: int) -> np.ndarray:
     return np.stack((r * np.cos(angle), r * np.sin(angle), z), axis=1)
 
 
+def _across(direction: np.ndarray) -> np.ndarray:
+    """[3] unit vector at right angles to a direction [3]."""
+    across = np.cross(np.eye(3)[np.abs(direction).argmin()], direction)
+    return across / np.linalg.norm(across)
+
+
 def _z_to(direction: np.ndarray) -> np.ndarray:
     """[4] rotation that turns z into a unit vector [3]."""
-    x = np.cross(np.eye(3)[np.abs(direction).argmin()], direction)
-    x /= np.linalg.norm(x)
+    x = _across(direction)
     return Rotation.from_matrix(np.stack((x, np.cross(direction, x), direction), axis=1)).as_quat(
         scalar_first=True
     )

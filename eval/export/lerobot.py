@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +97,7 @@ def _write(root: Path, recording: RecordedEpisodes, videos: tuple[str, ...], siz
     task_index, tasks = pd.factorize(recording.episodes["task"])
     samples: dict[str, list[np.ndarray]] = {}
     rows = []
-    painters: dict[Any, Painter] = {}
+    painter = cache(partial(_painter, recording.robot, size))
     for i, episode in enumerate(recording.episodes.to_dict("records")):
         length = int(offsets[i + 1] - offsets[i])
         arrays = _arrays(episode, i, int(offsets[i]), int(task_index[i]), recording.fps)
@@ -124,7 +124,9 @@ def _write(root: Path, recording: RecordedEpisodes, videos: tuple[str, ...], siz
         }
         for video in videos:
             chunk, file = divmod(i, _FORMAT["info"]["chunks_size"])
-            film = _draw(recording.robot, episode, video, painters, size)
+            trace = episode["trace"]
+            paint = painter(video, trace.object, episode["meshes"])
+            film = np.stack([paint(trace, row) for row in range(length)])
             path = root / f"videos/{video}/chunk-{chunk:03d}/file-{file:03d}.mp4"
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(encode_mp4(film, recording.fps, keyframes=_KEYFRAMES))
@@ -241,27 +243,14 @@ def _stats(key: str, rows: np.ndarray) -> dict[str, list[Any]]:
     return lists | {"count": [len(rows)]}
 
 
-def _draw(
-    robot: RobotSpec,
-    episode: dict[str, Any],
-    video: str,
-    painters: dict[Any, Painter],
-    size: Size,
-) -> np.ndarray:
-    """Return the film [T, H, W, 3] of an episode, always from the same camera, so that episodes can be compared."""
-    trace = episode["trace"]
-    named = (trace.object, episode["meshes"])
-    key = (video, *named)
-    if key not in painters:
-        obj = load_object(*named)
-        if video == VIDEO:
-            renderer = Renderer(SceneSpec(robot=robot, objects=(obj,)), size=size)
-            painters[key] = partial(draw_state, renderer)
-        else:
-            camera = CAMERAS[video.removeprefix(_DEPTH)]
-            eyes = policy_cameras(
-                robot, obj, VisionConfig(cameras=(camera,), width=size[0], height=size[1])
-            )
-            assert eyes is not None, "there is a camera"
-            painters[key] = partial(draw_view, eyes, width=size[0])
-    return np.stack([painters[key](trace, row) for row in range(len(trace.time))])
+def _painter(robot: RobotSpec, size: Size, video: str, thing: str, meshes: Path | None) -> Painter:
+    """Return what draws the episodes of an object for one of the films, always from the same camera, so that episodes
+    can be compared."""
+    obj = load_object(thing, meshes)
+    if video == VIDEO:
+        return partial(draw_state, Renderer(SceneSpec(robot=robot, objects=(obj,)), size=size))
+    camera = CAMERAS[video.removeprefix(_DEPTH)]
+    vision = VisionConfig(cameras=(camera,), width=size[0], height=size[1])
+    eyes = policy_cameras(robot, obj, vision)
+    assert eyes is not None, "there is a camera"
+    return partial(draw_view, eyes, width=size[0])

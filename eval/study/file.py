@@ -101,6 +101,11 @@ class Data(Checked):
     """Options of ``xreset goals``, which may be none: the data are starts and goals of the meshes, without
     demonstrations. Trainings with them begin every episode at home."""
 
+    @property
+    def states(self) -> Literal["resets", "goals"]:
+        """What trainings begin with: a reset bank, or a goal set."""
+        return "resets" if self.goals is None else "goals"
+
 
 @frozen
 class Evaluation(Checked):

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
 from xreset.checks import from_dict, merged
 from xreset.demos.archive import read_demos
@@ -18,8 +17,6 @@ from xreset.learning.recipes import from_home, starting_config
 from xreset.objects.catalogue import canonical_names, object_names
 from xreset.plugins import backend_status
 from xreset.text import short_name
-
-_T = TypeVar("_T")
 
 
 @dataclass(kw_only=True)
@@ -43,13 +40,12 @@ class Plan:
     parts: dict[Path, object] = field(default_factory=dict)
     """Folder -> the part of the study that writes it."""
 
-    def own(self, folder: Path, part: _T) -> _T:
+    def own(self, folder: Path, part: object) -> None:
         """Note which part of the study writes a folder; refuse a second one."""
         if self.parts.setdefault(folder, part) != part:
             raise RunError(
                 f"Two parts of the study would both write {folder}. Give one of them another name."
             )
-        return part
 
     def add(self, step: Step) -> str:
         """Add a step, and return its name."""
@@ -75,7 +71,8 @@ class Plan:
         made = Subset(
             folder=folder, data=data, given=self.given, objects=chosen, per_object=per_object
         )
-        return self.own(folder, made)
+        self.own(folder, made)
+        return made
 
     def bank(self, subset: Subset, robot: str) -> str:
         """Add the step to a reset bank or goal set, and return its name."""
@@ -158,7 +155,8 @@ def make_plan(study: Study, name: str, *, given: Path, out: Path, only: Iterable
         if not only or group in only:
             plan.runs += _runs(plan, group)
     for run in plan.runs:
-        plan.own(run.folder, run).check()
+        plan.own(run.folder, run)
+        run.check()
         if run.config is not None:
             plan.train(run)
     for run in plan.runs:

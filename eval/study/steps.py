@@ -91,7 +91,7 @@ class Subset:
 
     def bank(self, robot: str) -> Path:
         """Return the reset bank or goal set of a robot."""
-        return self.robot(robot) / ("resets.npz" if self.data.goals is None else "goals.npz")
+        return self.robot(robot) / f"{self.data.states}.npz"
 
     def starts(self, robot: str) -> Path:
         """Return the file with starts and goals that a robot's policies play."""
@@ -135,19 +135,15 @@ class Subset:
         if self.is_made():
             return
         data = self.data
-        if data.goals is None:
-            self._write_demos()
-        write_json(self.folder / "subset.json", {"schema": SUBSET_SCHEMA} | self.definition)
-
-    def _write_demos(self) -> None:
-        data = self.data
         objects = self.objects or None
-        if data.demos:
-            demos = read_demos(self.given / data.demos)
-        else:
-            demos = synthesize(objects, data.synthetic_per_object, data.synthetic_seed)
-        chosen = demos.select(objects=objects, max_per_object=self.per_object)
-        write_demos(self.demos, chosen, config=self.definition)
+        if data.goals is None:
+            if data.demos:
+                demos = read_demos(self.given / data.demos)
+            else:
+                demos = synthesize(objects, data.synthetic_per_object, data.synthetic_seed)
+            chosen = demos.select(objects=objects, max_per_object=self.per_object)
+            write_demos(self.demos, chosen, config=self.definition)
+        write_json(self.folder / "subset.json", {"schema": SUBSET_SCHEMA} | self.definition)
 
 
 @frozen
@@ -259,8 +255,7 @@ def train_todo(run: Run) -> Todo:
         "train",
         **length,
         robot=spec.robot,
-        resets=run.bank if run.subset.data.goals is None else None,
-        goals=run.bank if run.subset.data.goals is not None else None,
+        **{run.subset.data.states: run.bank},
         backend=spec.backend,
         device=spec.device,
         num_envs=spec.num_envs,

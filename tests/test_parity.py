@@ -90,20 +90,14 @@ def grasps_of(robot, thing, offsets=OFFSETS, *, gap=0.066, height=0.06):
     pos[:, 2] = float(rest_height(thing, upright))
     n = len(offsets)
     joints = both.repeat(n, 1)
-    palm = kinematics.link_poses(joints, [robot.palm])[:, 0]
     object_pos = pos.repeat_interleave(2, dim=0)
     object_pos[1::2, 2] += 0.1
     return toy_retargeted(
         robot,
         [thing.name] * n,
         list(range(0, 2 * n + 1, 2)),
-        sequence_name=np.array([f"toy/{i}" for i in range(n)]),
         joint_pos=joints.numpy(),
-        palm_pos=palm[:, :3, 3].numpy(),
-        palm_quat_wxyz=np.tile(upright, (2 * n, 1)),
-        fingertip_pos=tips(kinematics, joints).numpy(),
         object_pos=object_pos.numpy(),
-        object_quat_wxyz=np.tile(upright, (2 * n, 1)),
         first_contact=np.zeros(n, dtype=np.int32),
     )
 
@@ -207,7 +201,7 @@ class Finding(TestCase):
         table = self.find(motion)
         air = self.find(motion, where="air")
         for found, frame in ((table, 0), (air, 1)):
-            self.assertEqual(set(found.label), {f"toy/{i}:{frame}" for i in range(5)})
+            self.assertEqual(set(found.label), {f"demo{i}:{frame}" for i in range(5)})
         assert_close(
             air.start.object_pos[:, 2] - table.start.object_pos[:, 2],
             torch.full((5,), 0.1),
@@ -231,7 +225,7 @@ class Finding(TestCase):
         quat = motion.object_quat_wxyz.copy()
         quat[3] = quat_from_axis_angle(tensor([0.0, 0.0, 0.2])).numpy()
         found = self.find(replace(motion, object_quat_wxyz=quat))
-        self.assertEqual(set(found.label), {"toy/0:0", "toy/1:0", "toy/2:0", "toy/2:1"})
+        self.assertEqual(set(found.label), {"demo0:0", "demo1:0", "demo2:0", "demo2:1"})
 
     def test_objects_and_sequences_take_turns(self):
         spam = load_object("spam")

@@ -4,7 +4,7 @@ import contextlib
 import json
 import os
 import tempfile
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
 from unittest import mock, skipUnless
@@ -15,9 +15,10 @@ from tests.command import refused, succeeds
 from tests.data import InOneFolder
 from tests.toy_bank import SOUP
 from tests.toy_policy import write_policy
+from tests.toy_results import toy_choice
 from xreset import load_policy, policies, robots, synthesize, write_demos
 from xreset.errors import PolicyError
-from xreset.learning.run import Candidate, Choice, write_choice
+from xreset.learning.run import write_choice
 from xreset.policy import OnnxPolicy, policy_contract
 from xreset.task.config import ObservationConfig, TaskConfig, TerminationConfig
 
@@ -101,20 +102,11 @@ class ShippedTest(WithPolicy):
         self.assertEqual(subject.hash, load_policy(self.file).hash)
 
     def test_a_policy_knows_the_seed_that_chose_it(self):
-        candidate = Candidate(name="1.pt", task_progress={"mujoco": 0.5})
-        choice = Choice(
-            chosen="1.pt",
-            policy_hash=load_policy("skilled").hash or "",
-            candidates=(candidate,),
-            engines={"mujoco": "1"},
-            seed=7,
-            episodes_per_demo=1,
-            demos="",
-        )
+        own_hash = load_policy("skilled").hash
         folder = Path("runs/skilled")
         folder.mkdir(parents=True)
-        for policy_hash, seed in ((choice.policy_hash, 7), ("another", None)):
-            write_choice(folder, replace(choice, policy_hash=policy_hash))
+        for policy_hash, seed in ((own_hash, 7), ("another", None)):
+            write_choice(folder, toy_choice(policy_hash=policy_hash))
             self.assertEqual(load_policy("skilled").selection_seed, seed)
 
     def test_the_list_is_of_cards(self):

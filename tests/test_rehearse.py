@@ -12,7 +12,7 @@ from tests import toy_grasp
 from tests.command import refused, succeeds
 from tests.data import InFolder
 from tests.toy_bank import SOUP
-from tests.toy_results import episodes
+from tests.toy_results import episodes, toy_card
 from xreset.eval.rehearse import PROPERTIES, Rehearsal, judge, page
 from xreset.eval.rollout import engine, play_rounds
 from xreset.eval.stress import curve
@@ -125,7 +125,7 @@ class FrameTest(TestCase):
 
 class VerdictTest(TestCase):
     def card(self, backend="mujoco", **losses):
-        """A card of five episodes; ``action_delay_67=0.2`` is a loss of 20 points in every one."""
+        """A card; ``action_delay_67=0.2`` is a loss of 20 points in every episode."""
         curves = []
         for prop in PROPERTIES:
             name = prop.option.replace("-", "_")
@@ -133,16 +133,8 @@ class VerdictTest(TestCase):
             for value in prop.values:
                 swept[value] = episodes([0.8 - losses.get(f"{name}_{value:g}", 0.0)] * 5)
             curves.append(curve(prop, episodes([0.8] * 5), swept))
-        return Rehearsal(
-            backend=backend,
-            backend_version="4",
-            episodes=5,
-            task_progress=0.8,
-            ci95=(0.7, 0.9),
-            curves=tuple(curves),
-            left_out=(),
-            stopped={"The pose is old.": 2},
-        )
+        stopped = {"The pose is old.": 2}
+        return toy_card(Rehearsal, backend=backend, curves=tuple(curves), stopped=stopped)
 
     def test_verdicts(self):
         self.assertEqual(judge([self.card()]), ("Ready for a first, careful trial on a robot.", []))

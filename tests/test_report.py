@@ -13,7 +13,15 @@ from numpy.testing import assert_allclose
 
 from tests.command import refused, succeeds
 from tests.toy_bank import SOUP, SPAM
-from tests.toy_results import ENGINES, InFolder, toy_rollouts, toy_summary
+from tests.toy_results import (
+    ENGINES,
+    InFolder,
+    episodes,
+    toy_card,
+    toy_choice,
+    toy_rollouts,
+    toy_summary,
+)
 from tests.toy_robot import toy_hand_arm
 from xreset import TrainConfig, load_object, robots
 from xreset.cameras.config import FRONT, VisionConfig
@@ -31,9 +39,10 @@ from xreset.eval.report.clips import (
 from xreset.eval.report.make import count_failures, headline, make_report, page
 from xreset.eval.report.read import collect
 from xreset.eval.results import TaskProgress, episode_table, recorded, write_results
-from xreset.eval.stress import Curve, Point, Stress
+from xreset.eval.sensitivity import chosen
+from xreset.eval.stress import curve
 from xreset.files import claim_folder, write_json
-from xreset.learning.run import Candidate, Choice, write_choice
+from xreset.learning.run import write_choice
 from xreset.pictures.render import pose_matrix
 
 VOID = {"meta", "br", "link", "img", "input", "hr"}
@@ -161,35 +170,14 @@ class CollectTest(Reported):
     def test_what_it_bears_and_how_it_was_chosen(self):
         policy = {"policy": "ab12"}
         self.write(inputs=policy)
-        (self.folder / "stress").mkdir()
-        result = {"task_progress": 0.8, "ci95": (0.7, 0.9)}
-        points = tuple(
-            Point(difference_ci95=(-0.3, 0.1), value=v, difference=v - 1, **result)
-            for v in (0.6, 1.0)
-        )
-        curve = Curve(
-            property="arm-stiffness", unit="x", nominal=1.0, points=points, lower=0.8, upper=None
-        )
-        card = Stress(
-            backend="mujoco",
-            backend_version="4",
-            episodes=4,
-            curves=(curve,),
-            left_out=(),
-            **result,
-        )
-        card = replace(card, policy="soup", robot="toy", inputs=policy)
+        (prop,) = chosen(["force-gain=2"])
+        scattered = curve(prop, episodes([0.8] * 4), {2.0: episodes([0.2, 0.2, 1.0, 1.0])})
+        card = toy_card(curves=(scattered,), inputs=policy)
         write_json(f"{self.folder}/stress/mujoco.json", asdict(card))
-        tried = tuple(
-            Candidate(name=f"{i}.pt", task_progress={"mujoco": 0.5 + 0.2 * (i == 1)})
-            for i in (2, 1)
-        )
-        choice = Choice(
-            chosen="1.pt", policy_hash="ab12", candidates=tried, engines={"mujoco": "4"}, seed=9, episodes_per_demo=2, demos="cd",
-        )  # fmt: skip
+        choice = toy_choice()
         write_choice(self.folder, choice)
         text = Outline(page(collect(self.folder), [])).text
-        for words in ("What it tolerates", "x 0.8, or chance", choice.sentence()):
+        for words in ("What it tolerates", "x 1.5, or chance", choice.sentence()):
             self.assertIn(words, text)
         write_choice(self.folder, replace(choice, policy_hash="another"))
         self.write(inputs={"policy": "retrained"})
@@ -208,12 +196,12 @@ class ClipTest(Reported):
         tables = [table_of(*worse, engine=engine) for engine in ENGINES[2:]]
         mixed = pd.concat([*(table_of(*whole, engine=engine) for engine in ENGINES[:2]), *tables])
         traces = dict.fromkeys(ENGINES, (first, second))
-        for episodes, shown, expected in (
+        for table, shown, expected in (
             (alike, traces, [0] * 4),
             (mixed, traces, [1] * 4),
             (alike, {"mujoco": (first,), "sapien": (second,)}, []),
         ):
-            parts = [recorded(episodes, engine, found) for engine, found in shown.items()]
+            parts = [recorded(table, engine, found) for engine, found in shown.items()]
             best = best_everywhere(pd.concat(parts, ignore_index=True))
             self.assertEqual(best["sequence"].tolist(), expected)
             self.assertFalse(best["repetition"].any())

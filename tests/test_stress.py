@@ -9,10 +9,10 @@ from numpy.testing import assert_allclose
 from tests.command import succeeds
 from tests.data import InFolder
 from tests.toy_bank import SOUP
-from tests.toy_results import episodes
+from tests.toy_results import episodes, toy_card
 from xreset.errors import XResetError
 from xreset.eval.sensitivity import SWEEPS, chosen, nominal_task
-from xreset.eval.stress import Stress, curve, read_stress
+from xreset.eval.stress import curve, read_stress
 from xreset.files import write_json
 from xreset.task.config import RandomizationConfig, TaskConfig, evaluation_task
 
@@ -107,22 +107,13 @@ class CurveTest(InFolder):
         )
 
     def test_cards_of_another_policy_are_left_out(self):
-        card = Stress(
-            backend="mujoco",
-            backend_version="4",
-            episodes=4,
-            task_progress=0.8,
-            ci95=(0.7, 0.9),
-            curves=(),
-            left_out=(),
-        )
         for backend, inputs in (
             ("mujoco", {"policy": "old"}),
             ("sapien", {"policy": "new"}),
             ("pybullet", {}),
         ):
-            changed = replace(card, backend=backend, inputs=inputs)
-            write_json(f"{self.folder}/{backend}.json", asdict(changed))
+            card = toy_card(backend=backend, inputs=inputs)
+            write_json(f"{self.folder}/{backend}.json", asdict(card))
         self.assertEqual(
             [c.backend for c in read_stress(self.folder, "new")], ["pybullet", "sapien"]
         )

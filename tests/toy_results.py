@@ -9,7 +9,8 @@ from tests import data
 from tests.toy_bank import SOUP, SPAM
 from xreset import TrainConfig
 from xreset.eval.results import Episode, Rollouts, Trace, summarize, write_results
-from xreset.learning.run import RunInfo, write_run
+from xreset.eval.stress import Stress
+from xreset.learning.run import Candidate, Choice, RunInfo, write_run
 
 OBJECTS = (SOUP, SPAM)
 ENGINES = ("mujoco", "mujoco-warp", "pybullet", "sapien")
@@ -93,6 +94,22 @@ def toy_summary(backend="mujoco", rollouts=None, **changes):
         "objects_folder": None,
     }
     return summarize(rollouts or toy_rollouts(), backend=backend, **(arguments | changes))
+
+
+def toy_card(card_type=Stress, **changes):
+    """Return a card of a sweep without curves; ``changes`` replace its fields."""
+    fields = {"backend": "mujoco", "backend_version": "4", "episodes": 4, "task_progress": 0.8}
+    fields |= {"ci95": (0.7, 0.9), "curves": (), "left_out": ()}
+    return card_type(**(fields | changes))
+
+
+def toy_choice(**changes):
+    """Return the choice of the older of two checkpoints; ``changes`` replace its fields."""
+    fields = {"chosen": "1.pt", "policy_hash": "ab12", "engines": {"mujoco": "4"}, "seed": 7}
+    fields |= {"episodes_per_demo": 2, "demos": "cd"}
+    scores = {"2.pt": 0.5, "1.pt": 0.7}
+    tried = [Candidate(name=n, task_progress={"mujoco": x}) for n, x in scores.items()]
+    return Choice(**({"candidates": tuple(tried)} | fields | changes))
 
 
 class InFolder(data.InFolder):

@@ -3,6 +3,8 @@
 import contextlib
 import io
 
+from rich.console import Console
+
 from xreset.cli import main
 
 
@@ -31,3 +33,10 @@ def refused(*arguments):
     code, out, err = xreset(*arguments)
     assert code == 1, f"exit status {code}: {err}"
     return out + err
+
+
+def printed(table):
+    """A table as a terminal of 120 columns shows it."""
+    with io.StringIO() as sink:
+        Console(width=120, file=sink).print(table)
+        return sink.getvalue()

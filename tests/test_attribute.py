@@ -1,18 +1,16 @@
 """What costs a skill: measurements of altered engines, changes of the task, and engines whose one mistake is named."""
 
-import io
 import json
 import math
 from dataclasses import fields, replace
 from unittest import TestCase
 
 import torch
-from rich.console import Console
 
 from tests import toy_grasp
-from tests.command import refused
+from tests.command import printed, refused
 from tests.toy_results import episodes
-from xreset import SceneSpec, XResetError
+from xreset import XResetError
 from xreset.eval.engines.attribution import (
     Attribution,
     Row,
@@ -27,10 +25,6 @@ from xreset.eval.rollout import engine
 from xreset.eval.sensitivity import COMPARED, Effect, nominal_task
 from xreset.task.config import RandomizationConfig, TaskConfig, TerminationConfig
 from xreset.task.randomization import pair_friction
-
-SCENE = SceneSpec(
-    robot=toy_grasp.robot(), objects=(toy_grasp.brick(),), friction=toy_grasp.FRICTION
-)
 
 TASK = TaskConfig(
     reset=toy_grasp.AT_HOME,
@@ -51,17 +45,17 @@ def mujoco():
     return engine("mujoco", workers=0)
 
 
-def altered(base, *, friction=1.0, stiffness=1.0, **scene):
+def altered(
+    base, *, friction=1.0, stiffness=1.0, arm_stiffness=1.0, damping=1.0, torsional=1.0, finer=1
+):
     """The engine with some mistakes: factors on friction and drives, and finer steps."""
 
     def change(asked):
         joints = []
         for joint in asked.robot.joints:
-            kp = stiffness if joint.group == "hand" else scene.get("arm_stiffness", 1.0)
-            kd = scene.get("damping", 1.0)
-            drive = replace(joint.drive, kp=kp * joint.drive.kp, kd=kd * joint.drive.kd)
+            kp = stiffness if joint.group == "hand" else arm_stiffness
+            drive = replace(joint.drive, kp=kp * joint.drive.kp, kd=damping * joint.drive.kd)
             joints.append(replace(joint, drive=drive))
-        finer = int(scene.get("finer", 1))
         pairs = asked.friction
         return replace(
             asked,
@@ -69,7 +63,7 @@ def altered(base, *, friction=1.0, stiffness=1.0, **scene):
             friction=replace(
                 pairs,
                 tip=friction * pairs.tip,
-                torsional=scene.get("torsional", 1.0) * pairs.torsional,
+                torsional=torsional * pairs.torsional,
             ),
             timestep=asked.timestep / finer,
             substeps=asked.substeps * finer,
@@ -86,7 +80,7 @@ def altered(base, *, friction=1.0, stiffness=1.0, **scene):
             set_friction(values, worlds)
 
         def step_finer(substeps=None):
-            step(None if substeps is None else substeps * int(scene.get("finer", 1)))
+            step(None if substeps is None else substeps * finer)
 
         backend.set_friction = rub
         backend.step = step_finer
@@ -108,9 +102,11 @@ class ProbesTest(TestCase):
             )
 
     def test_what_the_scene_says_and_what_is_altered(self):
-        self.assert_measured(measure(mujoco(), SCENE))
+        self.assert_measured(measure(mujoco(), toy_grasp.scene()))
         mistakes = {"arm_stiffness": 0.8, "damping": 0.9, "torsional": 1.5, "finer": 2}
-        found = measure(altered(mujoco(), friction=0.5, stiffness=0.5, **mistakes), SCENE)
+        found = measure(
+            altered(mujoco(), friction=0.5, stiffness=0.5, **mistakes), toy_grasp.scene()
+        )
         self.assert_measured(
             found, tip_friction=0.45, torsional_friction=0.003, arm_stiffness=0.8, arm_damping=0.9, hand_stiffness=0.5,
             hand_damping=0.9, timestep=1 / 480,
@@ -189,9 +185,8 @@ class AttributeTest(TestCase):
             (data["schema"], data["costs_most"]), ("xreset-attribution/2", "tip friction")
         )
         self.assertLess(data["rows"][1]["difference"], -0.1)
-        with io.StringIO() as sink:
-            Console(width=120, file=sink).print(rich_table(found, "title"))
-            self.assertRegex(sink.getvalue(), r"tip friction.* 0.\d+ -> 0.4\d+ .*100%")
+        text = printed(rich_table(found, "title"))
+        self.assertRegex(text, r"tip friction.* 0.\d+ -> 0.4\d+ .*100%")
 
     def test_half_the_drives_stiffness_is_told_from_torsional_friction(self):
         found = self.attribute(altered(mujoco(), stiffness=0.5, torsional=1.5))

@@ -1,6 +1,5 @@
 """Replays in several engines: partings of constructed recordings, altered engines found at the right place, files, refusals."""
 
-import io
 import json
 import math
 from dataclasses import replace
@@ -13,7 +12,7 @@ from torch import tensor
 from torch.testing import assert_close
 
 from tests import toy_grasp
-from tests.command import refused
+from tests.command import printed, refused
 from tests.data import InFolder
 from tests.engine_checks import JOINT, with_drive
 from tests.toy_bank import SOUP, SPAM
@@ -39,7 +38,7 @@ from xreset.eval.rollout import engine, roll_out
 from xreset.eval.setting import Place
 from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.physics import State
-from xreset.spec import PairFriction, SceneSpec
+from xreset.spec import PairFriction
 from xreset.task.config import RandomizationConfig, TaskConfig, TerminationConfig
 
 DT = 1 / 60
@@ -48,9 +47,7 @@ DT = 1 / 60
 def grasp_actions(steps=60):
     """The toy grasp: close and lift."""
     return Actions(
-        scene=SceneSpec(
-            robot=toy_grasp.robot(), objects=(toy_grasp.brick(),), friction=toy_grasp.FRICTION
-        ),
+        scene=toy_grasp.scene(),
         label="toy grasp",
         start=toy_grasp.start(),
         joint_target=torch.as_tensor(
@@ -75,8 +72,7 @@ def assert_near(found, expected):
 
 
 def compare(found, reference):
-    scene = grasp_actions().scene
-    traced = compared(engine("mujoco"), found, reference, scene)
+    traced = compared(engine("mujoco"), found, reference, toy_grasp.scene())
     return {d.quantity: d for d in traced.divergences}
 
 
@@ -227,17 +223,9 @@ class TraceTest(TestCase):
         )
         self.assertEqual(len(data["noise"]), len(THRESHOLDS))
         two = replace(self.result, engines=self.result.engines[1:2])
-        with io.StringIO() as sink:
-            from rich.console import Console
-
-            Console(width=120, file=sink).print(rich_table(two))
-            for expected in (
-                "slippery",
-                "object position",
-                "(from 5 mm)",
-                "4 starts moved by 1e-06",
-            ):
-                self.assertIn(expected, sink.getvalue())
+        text = printed(rich_table(two))
+        for expected in ("slippery", "object position", "(from 5 mm)", "4 starts moved by 1e-06"):
+            self.assertIn(expected, text)
 
 
 class ActionsTest(InFolder):

@@ -15,7 +15,7 @@ from xreset.eval.engines.recording import Recording
 from xreset.eval.rollout import Trial
 from xreset.geometry.kinematics import Kinematics
 from xreset.physics import State
-from xreset.spec import PairFriction
+from xreset.spec import PairFriction, SceneSpec
 from xreset.task.config import ResetConfig, TaskConfig
 
 FRICTION = PairFriction(tip=0.9, link=0.5, table=0.6, torsional=0.002)
@@ -40,6 +40,10 @@ def robot():
 
 def brick():
     return objects()[0]
+
+
+def scene():
+    return SceneSpec(robot=robot(), objects=(brick(),), friction=FRICTION)
 
 
 def brick_pose():

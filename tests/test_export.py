@@ -9,13 +9,11 @@ from unittest import skipUnless
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
-from tests.data import InFolder
-from tests.toy_results import toy_rollouts, toy_summary
+from tests.toy_results import InFolder, toy_rollouts
 from xreset.description import load_robot
 from xreset.errors import FileFormatError, RunError, XResetError
 from xreset.eval.export.lerobot import write_lerobot
 from xreset.eval.export.recorded import read_recorded, write_arrays
-from xreset.eval.results import write_results
 from xreset.files import file_hash
 
 PARQUET = find_spec("pyarrow") is not None
@@ -26,12 +24,10 @@ LEROBOT = find_spec("lerobot") is not None
 class Case(InFolder):
     robot = load_robot("ur7e-sharpa")
 
-    def evaluate(self, name="eval", engines=("mujoco", "sapien"), change=lambda rollouts: rollouts):
-        rollouts = change(toy_rollouts(np.array([joint.home for joint in self.robot.joints])))
-        for engine in engines:
-            summary = toy_summary(engine, rollouts, robot="ur7e-sharpa")
-            write_results(self.folder / name, summary, rollouts, self.robot.joint_names)
-        return self.folder / name
+    def evaluate(self, name="", change=lambda rollouts: rollouts):
+        rollouts = change(toy_rollouts(self.robot.home))
+        about = {"joints": self.robot.joint_names, "robot": "ur7e-sharpa"}
+        return self.write_results(name, rollouts, ("mujoco", "sapien"), **about)
 
     def change_first(self, **changes):
         return lambda rollouts: replace(
@@ -47,10 +43,8 @@ class Episodes(Case):
             list(recording.episodes["engine"]), ["mujoco", "mujoco", "sapien", "sapien"]
         )
         assert_array_equal(recording.offsets, [0, 5, 10, 15, 20])
-        steps = (recording.episodes["action"][0] - recording.robot.home)[
-            :, 0
-        ] / 0.01  # 12 control steps between 5 states
-        assert_allclose(steps, [2, 5, 8, 11, 11], atol=1e-4)
+        steps = (recording.episodes["action"][0] - recording.robot.home)[:, 0] / 0.01
+        assert_allclose(steps, [2, 5, 8, 11, 11], atol=1e-4)  # 12 control steps between 5 states
         self.assertEqual(
             recording.episodes["task"][0],
             "Grasp the tomato soup can and bring it to the goal pose.",

@@ -68,21 +68,26 @@ def between(kinematics, q):
     return 0.5 * (points[:, 1:].mean(1) + points[:, 0])
 
 
-def grasps_of(robot, thing, offsets=OFFSETS, *, gap=0.066, height=0.06):
+def opening(kinematics, q):
+    """[G, 3] from the thumb's tip to the mean of the others."""
+    points = tips(kinematics, q)
+    return points[:, 1:].mean(1) - points[:, 0]
+
+
+def grasps_of(robot, thing, offsets=OFFSETS, *, gap=0.066):
     """The home pose's hand lowered over an upright object at several places between its fingers: sequences of two
     frames, the second of which is lifted by 0.1 m."""
     kinematics = Kinematics(robot)
     home = torch.as_tensor(robot.home)[None]
-    points = tips(kinematics, home)
-    opening = float((points[:, 1:].mean(1) - points[:, 0]).norm())
-    q = moved_fingertips(kinematics, home, 0.5 * (opening - gap))
+    width = float(opening(kinematics, home).norm())
+    q = moved_fingertips(kinematics, home, 0.5 * (width - gap))
 
     def shifted(q, z):
         way = torch.zeros(40, 3)
         way[:, 2] = torch.linspace(0, z, 40)
         return carried_palm(kinematics, q, way)[-1]
 
-    low = shifted(q, height - float(between(kinematics, q)[0, 2]))
+    low = shifted(q, 0.06 - float(between(kinematics, q)[0, 2]))
     both = torch.cat((low, shifted(low, 0.1)))
     upright = np.array([1.0, 0.0, 0.0, 0.0])
     pos = between(kinematics, low).repeat(len(offsets), 1)
@@ -102,10 +107,10 @@ def grasps_of(robot, thing, offsets=OFFSETS, *, gap=0.066, height=0.06):
     )
 
 
-def weak(scene, factor=0.5):
+def weak(scene):
     """The scene with weaker drives."""
     joints = [
-        replace(joint, drive=replace(joint.drive, kp=factor * joint.drive.kp))
+        replace(joint, drive=replace(joint.drive, kp=0.5 * joint.drive.kp))
         for joint in scene.robot.joints
     ]
     return replace(scene, robot=replace(scene.robot, joints=tuple(joints)))
@@ -128,7 +133,7 @@ class Episodes(TestCase):
             home = torch.as_tensor(kinematics.robot.home)[None]
             q = moved_fingertips(kinematics, home, distance)
             before, after = tips(kinematics, home), tips(kinematics, q)
-            line = torch.nn.functional.normalize(before[:, 1:].mean(1) - before[:, 0], dim=-1)
+            line = torch.nn.functional.normalize(opening(kinematics, home), dim=-1)
             moved = ((after - before) * line[:, None]).sum(-1)[0]
             expected = torch.full_like(moved, -distance)
             expected[0] = distance
@@ -144,8 +149,7 @@ class Episodes(TestCase):
             target = squeezed(self.kinematics, self.home)
         kp = tensor([joint.drive.kp for joint in self.robot.joints], dtype=torch.float64)
         torque = (kp * (target - held))[0]
-        before = tips(self.kinematics, self.home)
-        line = torch.nn.functional.normalize(before[0, 1:].mean(0) - before[0, 0], dim=0)
+        line = torch.nn.functional.normalize(opening(self.kinematics, self.home)[0], dim=0)
         # four fingers share what the thumb bears
         force = torch.stack([4.0 * line, *[-1.0 * line] * 4])
         jacobian = self.kinematics.jacobian(
@@ -169,8 +173,7 @@ class Episodes(TestCase):
         closing = closing_steps(DT)
         self.assertEqual(closing, 36)
         self.assertEqual(len(targets), 36 + 30 + 12 + 2 * 24)
-        points = tips(self.kinematics, targets[:, 0].double())
-        gaps = (points[:, 1:].mean(1) - points[:, 0]).norm(dim=-1).tolist()
+        gaps = opening(self.kinematics, targets[:, 0].double()).norm(dim=-1).tolist()
         self.assertAlmostEqual(gaps[5], gaps[0], places=6)  # settling
         self.assertGreater(gaps[5], gaps[closing - 1] + 0.05)
         assert_close(start.joint_pos, targets[0])

@@ -281,26 +281,23 @@ class EvaluationTest(InFolder):
         mujoco = engine("mujoco", workers=0)
         cls.episode = roll_out(toy_grasp.OpenLoop(), mujoco, trial, repetitions=1).traces[1]
 
+    def actions(self, **changes):
+        """The actions of the episode with some changes."""
+        episode = replace(self.episode, **changes)
+        return recorded_actions(toy_grasp.robot(), toy_grasp.brick(), episode, label="episode")
+
     def test_a_replay_in_the_same_engine_is_the_episode(self):
-        episode = self.episode
-        actions = recorded_actions(toy_grasp.robot(), toy_grasp.brick(), episode, label="episode")
+        time = self.episode.time
+        actions = self.actions()
         self.assertEqual(len(actions.joint_target), 42)
+        self.assertEqual(self.actions(time=2 * time).scene.substeps, 8)
+        with self.assertRaisesRegex(FileFormatError, "steps of 0.015 s, expected a multiple"):
+            self.actions(time=0.9 * time)
         replayed = trace(actions, engine("mujoco", workers=0), []).reference.recording
-        slower = replace(episode, time=2 * episode.time)
-        self.assertEqual(
-            recorded_actions(toy_grasp.robot(), toy_grasp.brick(), slower, label="").scene.substeps,
-            8,
-        )
-        odd = replace(episode, time=0.9 * episode.time)
-        with self.assertRaisesRegex(
-            FileFormatError, "control steps of 0.015 s, expected a multiple"
-        ):
-            recorded_actions(toy_grasp.robot(), toy_grasp.brick(), odd, label="")
-        every = 3  # control steps of 1/60 s between recorded states
-        assert_allclose(
-            replayed.object_pos[every - 1 :: every, 0], episode.object_pos[1:], atol=1e-6
-        )
-        assert_allclose(replayed.joint_pos[every - 1 :: every, 0], episode.joint_pos[1:], atol=1e-6)
+        every = slice(2, None, 3)  # control steps of 1/60 s between recorded states
+        for name in ("object_pos", "joint_pos"):
+            found = getattr(replayed, name)[every, 0]
+            assert_allclose(found, getattr(self.episode, name)[1:], atol=1e-6)
 
     def test_from_files(self):
         from tests.toy_results import toy_rollouts, toy_summary

@@ -167,7 +167,7 @@ def load_trial(
     """
     task = evaluation_task(policy.task)
     if episode_seconds is not None:
-        task = _with_episodes_of(task, episode_seconds)
+        task = with_episodes_of(task, episode_seconds)
     folder = policy.meshes(objects)
     inputs = load_inputs(
         source, robot=policy.robot, objects=folder, accept=("demos", "motion", "goals")
@@ -196,7 +196,12 @@ def load_trial(
     )
 
 
-def _with_episodes_of(task: TaskConfig, seconds: float) -> TaskConfig:
+def with_episodes_of(task: TaskConfig, seconds: float) -> TaskConfig:
+    """Return the task with episodes of another length [s].
+
+    Raises:
+        XResetError: the length is not a number, too large, or less than a control step.
+    """
     control_dt = task.timestep * task.substeps
     is_number = isinstance(seconds, int | float) and not isinstance(seconds, bool)
     if not is_number or not control_dt <= seconds <= LONGEST_EPISODE:

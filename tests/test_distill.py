@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import torch
 
+from tests.command import refused, succeeds
 from tests.toy_training import CONFIG, OPTIONS, WithBank, quickly
 from xreset import distill, make_backend, make_env, resume, train
 from xreset.cameras.config import FRONT, WRIST, VisionConfig
@@ -168,6 +169,19 @@ class DistillTest(WithBank):
         words = "No camera shows 005_tomato_soup_can, 010_potted_meat_can"
         with quickly(), self.assertRaisesRegex(XResetError, words):
             self.distill("away", away)
+
+    def test_a_student_is_resumed_as_it_was_started(self):
+        for options, problem in (
+            (f"{self.teacher} --resets {self.bank}", ""),
+            ("--camera front", "the run's own cameras. Omit --camera and --vision"),
+            ("many-objects", "TEACHER is many-objects, but .* was started with"),
+            ("--num-envs 77", "--num-envs is 77, but .* was started with"),
+        ):
+            with self.subTest(options), patch("xreset.learning.train.resume") as resumed:
+                words = f"distill --resume --out {self.run_folder} {options}".split()
+                error = refused(*words) if problem else succeeds(*words)
+                self.assertRegex(error, problem or "^$")
+                self.assertEqual(resumed.called, not problem)
 
     def test_what_the_teacher_does_better(self):
         common = {

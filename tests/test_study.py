@@ -21,7 +21,7 @@ from tests.toy_results import toy_rollouts, toy_summary
 from tests.toy_study import shell_step
 from xreset import synthesize, write_demos
 from xreset.cli import main
-from xreset.errors import FileFormatError, ObjectError, RunError
+from xreset.errors import FileFormatError, ObjectError, RunError, XResetError
 from xreset.eval.results import write_results
 from xreset.eval.study.file import SHIPPED, read_study, study_path
 from xreset.eval.study.launch import launch
@@ -234,7 +234,11 @@ class PlanTest(Studied):
         with self.assertRaisesRegex(RunError, "has no runs b; it has a"):
             self.plan(BASE + "[runs.a]\n", only=("b",))
         climbing = f"{HEAD}[data.toy]\ndemos = 'climbs.npz'\n[runs.a]\ndata = 'toy'\nalone = true\n"
-        self.assertRaisesRegex(FileFormatError, r"there is no .*climbs\.npz", self.plan, climbing)
+        words = r"there is no .*climbs\.npz, .*\(--data\)"
+        self.assertRaisesRegex(FileFormatError, words, self.plan, climbing)
+        share = "[runs.a]\nconfig.task.reset.object_share = { mug = 3.0 }\n"
+        with self.assertRaisesRegex(XResetError, "object_share names mug, but the objects are"):
+            self.plan(BASE + share)
         names = np.array(["../../elsewhere"])
         demos = replace(synthesize(["soup"], 1, 0), object_name=names)
         write_demos(f"{self.folder}/climbs.npz", demos)
@@ -439,6 +443,9 @@ class TablesTest(Studied):
                 f"{changes}" if "episodes" in changes else f"episodes = 2\n{changes}",
             )
             self.assertEqual(self.plan(text).steps["eval ik"].left(), left)
+        short = self.TEXT.replace("episodes = 2\n", "episodes = 2\nepisode_seconds = 0.01\n")
+        with self.assertRaisesRegex(XResetError, "episode_seconds is 0.01, expected a number from"):
+            self.plan(short)
         self.write("ik", 0.33, 0.33, 0.33, 0.33, episode_seconds=12.0)
         for seconds, left in ((None, "in mujoco"), (5.0, "in mujoco"), (12.0, "")):
             changed = (

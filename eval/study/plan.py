@@ -9,13 +9,16 @@ from pathlib import Path
 
 from xreset.checks import from_dict, merged
 from xreset.demos.archive import read_demos
-from xreset.errors import RunError
+from xreset.env import shared_worlds
+from xreset.errors import FileFormatError, RunError
+from xreset.eval.rollout import with_episodes_of
 from xreset.eval.study.file import Data, Study
 from xreset.eval.study.steps import Run, Step, Subset, bank_todo, eval_todo, train_todo
 from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import from_home, starting_config
 from xreset.objects.catalogue import canonical_names, object_names
 from xreset.plugins import backend_status
+from xreset.task.config import TaskConfig
 from xreset.text import short_name
 
 
@@ -104,6 +107,9 @@ class Plan:
         engines = [engine for engine in spec.engines if engine not in self.unavailable]
         if not objects:
             return
+        if spec.episode_seconds is not None:
+            task = TaskConfig() if run.config is None else run.config.task
+            with_episodes_of(task, spec.episode_seconds)  # refuses less than a control step
         self.played.setdefault((run.group, key), set()).update(objects)
         if not engines:
             return
@@ -131,6 +137,7 @@ def make_plan(study: Study, name: str, *, given: Path, out: Path, only: Iterable
         RunError: a run is unknown, or the folder of a run or an evaluation has another configuration.
         FileFormatError: a file of the data is missing or damaged, or a change of the recipe names an unknown key.
         ObjectError: the data do not have an object.
+        XResetError: a run cannot share its worlds as it wants, or an evaluation's episodes are too short.
     """
     unknown = sorted(set(only) - set(study.runs))
     if unknown:
@@ -173,6 +180,11 @@ def _objects_of(data: Data, given: Path) -> tuple[str, ...]:
         return object_names(given / data.meshes if data.meshes else None)
     if data.demos is None:
         return object_names()
+    if not (given / data.demos).is_file():
+        raise FileFormatError(
+            f"there is no {given / data.demos}, an archive of the study. Put it there, or give the folder of the "
+            "study's data (--data). Comments in the study file say how archives are made."
+        )
     return tuple(sorted(set(read_demos(given / data.demos).object_name.tolist())))
 
 
@@ -197,6 +209,8 @@ def _runs(plan: Plan, group: str) -> Iterator[Run]:
         iterations = round(spec.steps / (spec.num_envs * config.ppo.horizon))
         config = replace(config, iterations=max(1, iterations))
     for chosen in [(name,) for name in objects] if spec.alone else [objects]:
+        share = config.task.reset.object_share
+        shared_worlds(chosen, spec.num_envs, share)  # refuses an object that is not there
         for seed in spec.seeds:
             yield Run(
                 group=group,

@@ -6,8 +6,12 @@ thumb is on the +z side; a left hand is the mirror image in x. Lengths are round
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-from scipy.spatial.transform import Rotation
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation  # which the help of `xreset view` must not load
 
 PARENTS = np.array([0, 1, 2, 3, 0, 5, 6, 7, 0, 9, 10, 11, 0, 13, 14, 15, 0, 17, 18, 19])
 """[20] the keypoint before each of the keypoints 1 to 20: the other end of its bone."""

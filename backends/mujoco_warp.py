@@ -16,14 +16,13 @@ from xreset.geometry.rotations import quat_to_matrix
 from xreset.physics import (
     Backend,
     Capability,
-    Contacts,
     Health,
     KnownDifference,
-    Links,
     MassProperties,
     Parameter,
     Parameters,
     State,
+    no_readings,
     unavailable,
 )
 from xreset.plugins import existing_device
@@ -223,12 +222,7 @@ class MujocoWarpBackend(Backend):
 
     def _allocate(self) -> None:
         """Allocate the arrays that the worlds are read into, and name the arrays that setters write to."""
-        n = self.num_worlds
-        tips = len(self.scene.robot.fingertips)
         at = self._at
-
-        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-            return torch.zeros(n, *shape, dtype=dtype, device=self.device)
 
         def ints(values: np.ndarray) -> Any:
             return wp.array(values.astype(np.int32), dtype=int)
@@ -252,18 +246,13 @@ class MujocoWarpBackend(Backend):
         self._overflow = wp.to_torch(self._data.overflow)
         self._coming = State.initial(self.scene, self.object_index).to(self.device)
         self._state = replace(self._coming.clone(), joint_target=wp.to_torch(self._data.ctrl))
-        self._nonfinite = zeros(dtype=torch.bool)
-        self._links = Links(
-            pos=zeros(1 + tips, 3),
-            quat=zeros(1 + tips, 4),
-            linvel=zeros(1 + tips, 3),
-            angvel=zeros(1 + tips, 3),
-        )
-        self._contacts = Contacts(
-            tip_force=zeros(tips, 3), tip_touch=zeros(tips, dtype=torch.bool), table_force=zeros(3)
-        )
-        self._every_world = torch.arange(n, device=self.device)
-        self._mask = zeros(dtype=torch.bool)
+        readings = no_readings(self.scene.robot, self.num_worlds)
+        links, contacts, health = (reading.to(self.device) for reading in readings)
+        self._links = links
+        self._contacts = contacts
+        self._nonfinite = health.nonfinite
+        self._every_world = torch.arange(self.num_worlds, device=self.device)
+        self._mask = torch.zeros_like(self._nonfinite)
         self._name_parameters()
 
     def _name_parameters(self) -> None:

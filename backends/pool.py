@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import weakref
 from abc import ABC, abstractmethod
-from dataclasses import fields
 from typing import Any, ClassVar
 
 import numpy as np
@@ -20,6 +19,7 @@ from torch import Tensor
 from xreset.backends.rigid import ContactArrays, Inertia, LinkArrays, StateArrays
 from xreset.backends.workers import (
     CONTACT_FIELDS,
+    LINK_FIELDS,
     STATE_FIELDS,
     Job,
     LocalWorlds,
@@ -206,7 +206,7 @@ class PoolBackend(Backend):
         self._close = weakref.finalize(self, self._team.close)
         views = {name: torch.from_numpy(array) for name, array in self._arrays.items()}
         self._state = State(**{name: views[name] for name in STATE_FIELDS})
-        self._links = Links(**{field.name: views[f"link_{field.name}"] for field in fields(Links)})
+        self._links = Links(**{name: views[name] for name in LINK_FIELDS})
         self._contacts = Contacts(**{name: views[name] for name in CONTACT_FIELDS})
         self._health = Health(nonfinite=views["nonfinite"], overflow=views["overflow"])
         self._wrench = views["wrench"]

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from xreset.backends.rigid import object_inertia
 from xreset.errors import XResetError
-from xreset.physics import Contacts, Links, Parameter, Parameters, State
+from xreset.physics import Contacts, Links, Parameter, Parameters, State, no_readings
 from xreset.spec import SceneSpec
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 # Shared arrays --------------------------------------------------------------------------------------------------------
 
 STATE_FIELDS = tuple(field.name for field in fields(State))
-LINK_FIELDS = tuple(f"link_{field.name}" for field in fields(Links))
+LINK_FIELDS = tuple(field.name for field in fields(Links))
 CONTACT_FIELDS = tuple(field.name for field in fields(Contacts))
 
 
@@ -45,27 +45,24 @@ def layout_of(scene: SceneSpec, object_index: Tensor) -> np.dtype:
     The state is both what a world is set to and what it reports.
     """
     robot = scene.robot
-    tips = len(robot.fingertips)
-    links = 1 + tips
-    bodies = len(robot.joints) + len(robot.mimics) + 1
-    shapes = {
-        "link_pos": (links, 3),
-        "link_quat": (links, 4),
-        "link_linvel": (links, 3),
-        "link_angvel": (links, 3),
-        "tip_force": (tips, 3),
-        "table_force": (3,),
-        "wrench": (6,),
-        "body_mass": (bodies,),
-        "body_com": (bodies, 3),
-        "body_inertia": (bodies, 3, 3),
-    }
-    for bundle in (State.initial(scene, object_index), Parameters.nominal(scene, object_index)):
-        shapes |= {name: tuple(value.shape[1:]) for name, value in vars(bundle).items()}
     n = len(object_index)
-    flags = {"tip_touch": (tips,), "nonfinite": (), "overflow": ()}
-    numbers = [(name, np.float32, (n, *shape)) for name, shape in shapes.items()]
-    return np.dtype(numbers + [(name, np.bool_, (n, *shape)) for name, shape in flags.items()])
+    bodies = len(robot.joints) + len(robot.mimics) + 1
+    arrays = []
+    for bundle in (
+        State.initial(scene, object_index),
+        Parameters.nominal(scene, object_index),
+        *no_readings(robot, n),
+    ):
+        for name, value in vars(bundle).items():
+            arrays.append((name, value.numpy().dtype, tuple(value.shape)))
+    for name, shape in (
+        ("wrench", (6,)),
+        ("body_mass", (bodies,)),
+        ("body_com", (bodies, 3)),
+        ("body_inertia", (bodies, 3, 3)),
+    ):
+        arrays.append((name, np.float32, (n, *shape)))
+    return np.dtype(arrays)
 
 
 def arrays_in(memory: Any, layout: np.dtype) -> dict[str, np.ndarray]:

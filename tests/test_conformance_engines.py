@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from tests.data import PYBULLET
+from tests.toy_robot import ROBOTS
 from xreset.backends.conformance import CHECKS, run
+from xreset.description import read_description
 from xreset.geometry.dynamics import drive_inertia
 from xreset.plugins import backend_status, make_backend
-from xreset.spec import DriveSpec, FingertipSpec, JointSpec, KeypointSpec, MimicSpec, RobotSpec
 
 BACKENDS = ("mujoco", "mujoco-warp", "pybullet", "sapien")
 
@@ -37,36 +38,13 @@ def panda():
     """The Franka Panda of the package ``pybullet_data``, standing beside the table, with critically damped drives."""
     import pybullet_data
 
+    urdf = Path(pybullet_data.getDataPath()) / "franka_panda" / "panda.urdf"
+    robot = replace(read_description(ROBOTS / "panda.toml"), urdf=urdf)
     joints = []
-    for i, q in enumerate((0.0, -0.6, 0.0, -2.2, 0.0, 1.6, 0.8), start=1):
-        strong = i <= 4
-        drive = DriveSpec(
-            kp=1500.0 if strong else 300.0, kd=0.0, effort=87.0 if strong else 12.0, armature=0.1
-        )
-        joints.append(JointSpec(name=f"panda_joint{i}", group="arm", home=q, drive=drive))
-    drive = DriveSpec(kp=1000.0, kd=0.0, effort=20.0)
-    joints.append(JointSpec(name="panda_finger_joint1", group="hand", home=0.02, drive=drive))
-    tips = []
-    for name, link in (("thumb", "panda_leftfinger"), ("index", "panda_rightfinger")):
-        tips.append(FingertipSpec(name=name, link=link, contact_links=(link,), keypoint=f"{name}4"))
-    robot = RobotSpec(
-        name="panda",
-        urdf=Path(pybullet_data.getDataPath()) / "franka_panda" / "panda.urdf",
-        joints=tuple(joints),
-        mimics=(MimicSpec(joint="panda_finger_joint2", source="panda_finger_joint1"),),
-        base_pos=(0.57, -0.35, 0.0),
-        base_quat=(0.70710678, 0.0, 0.0, 0.70710678),
-        palm="panda_grasptarget",
-        fingertips=tuple(tips),
-        keypoints=(KeypointSpec(keypoint="wrist", link="panda_hand"),),
-        hand_root="panda_hand",
-        table_exclude=("panda_link0",),
-    )
-    damped = []
     for joint, inertia in zip(robot.joints, drive_inertia(robot, robot.home), strict=True):
         kd = 2.0 * float(np.sqrt(joint.drive.kp * inertia))
-        damped.append(replace(joint, drive=replace(joint.drive, kd=kd)))
-    return replace(robot, joints=tuple(damped))
+        joints.append(replace(joint, drive=replace(joint.drive, kd=kd)))
+    return replace(robot, joints=tuple(joints))
 
 
 class EveryBackend(unittest.TestCase):

@@ -7,15 +7,15 @@ import re
 import sys
 import tomllib
 import unittest
-from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 from unittest.mock import patch
 
 import torch
 
 from tests.data import InFolder
+from tests.engine_checks import with_drive
 from xreset import plugins
 from xreset.backends.conformance import CHECKS, run
 from xreset.backends.conformance.scene import scene
@@ -38,7 +38,14 @@ def declared(engine):
     return EntryPoint(name=name, value=value, group=plugins.ENGINES)
 
 
-class PluginTest(InFolder):
+class Unavailable(unittest.TestCase):
+    def assert_unavailable(self, engine, pattern):
+        with self.assertRaisesRegex(BackendUnavailableError, pattern):
+            make_backend(engine, scene(), 1)
+        self.assertRegex(backend_status(engine).reason or "", pattern)
+
+
+class PluginTest(InFolder, Unavailable):
     """Without any foreign engine: a package in a folder of its own, made known by an entry point."""
 
     def plugin(self, source, value="someones_engine:SomeonesBackend"):
@@ -47,7 +54,7 @@ class PluginTest(InFolder):
         self.enterContext(patch.dict(sys.modules))
         sys.modules.pop("someones_engine", None)
         entry = EntryPoint(name="someones", value=value, group=plugins.ENGINES)
-        self.enterContext(patch.object(plugins, "entry_points", lambda group: [entry]))
+        self.enterContext(patch.object(plugins, "entry_points", return_value=[entry]))
 
     def test_a_plugin_is_found_built_and_tested_like_any_engine(self):
         self.plugin(
@@ -64,11 +71,6 @@ class PluginTest(InFolder):
             main(["engines", "check", "--backend", "someones", "--check", "state_round_trip"])
         self.assertIn("someones 7.1", out.getvalue())
         self.assertIn("no check failed", out.getvalue())
-
-    def assert_unavailable(self, pattern):
-        with self.assertRaisesRegex(BackendUnavailableError, pattern):
-            make_backend("someones", scene(), 1)
-        self.assertRegex(backend_status("someones").reason or "", pattern)
 
     def test_a_plugin_that_cannot_be_used_says_why(self):
         backend = "SomeonesBackend"
@@ -89,9 +91,7 @@ class PluginTest(InFolder):
         ):
             with self.subTest(source):
                 self.plugin(source, value=f"someones_engine:{name}")
-                with self.assertRaisesRegex(BackendUnavailableError, pattern):
-                    make_backend("someones", scene(), 1)
-                self.assertRegex(backend_status("someones").reason or "", pattern)
+                self.assert_unavailable("someones", pattern)
 
     def test_a_defect_of_one_plugin_does_not_hide_the_others(self):
         self.plugin(
@@ -106,27 +106,21 @@ class PluginTest(InFolder):
         self.assertIn("someones", out.getvalue())
 
 
-class ExampleTest(unittest.TestCase):
+class ExampleTest(Unavailable):
     def test_without_its_engine_an_example_says_what_to_install(self):
         for engine, package in EXAMPLES.items():
             ours = f"xreset_{engine}"
-            absent = {name: None for name in list(sys.modules) if name.split(".")[0] == package} | {
-                package: None
-            }
-            kept = {
-                name: module for name, module in sys.modules.items() if not name.startswith(ours)
-            }
+            modules: dict[str, Any] = {package: None}
+            for name, module in sys.modules.items():
+                if not name.startswith(ours):
+                    modules[name] = None if name.split(".")[0] == package else module
             with (
                 self.subTest(engine),
                 patch.object(sys, "path", [str(folder_of(engine)), *sys.path]),
-                patch.dict(sys.modules, kept | absent, clear=True),
-                patch.object(
-                    plugins, "entry_points", lambda group, engine=engine: [declared(engine)]
-                ),
+                patch.dict(sys.modules, modules, clear=True),
+                patch.object(plugins, "entry_points", return_value=[declared(engine)]),
             ):
-                with self.assertRaisesRegex(BackendUnavailableError, f"pip install '?{engine}"):
-                    make_backend(engine, scene(), 1)
-                self.assertRegex(backend_status(engine).reason or "", f"pip install '?{engine}")
+                self.assert_unavailable(engine, f"pip install '?{engine}")
 
     def test_they_use_the_public_interface_only(self):
         public = {
@@ -181,15 +175,10 @@ class NewtonTest(EngineTest, unittest.TestCase):
     """
 
     def test_what_it_lacks_is_refused(self):
-        stiff = scene().robot
-        joints = tuple(
-            replace(joint, drive=replace(joint.drive, friction_loss=0.1)) for joint in stiff.joints
-        )
-        with self.assertRaisesRegex(
-            CapabilityError,
-            "no dry friction of joints on the CPU: give the robot's drives a friction_loss of 0",
-        ):
-            self.make(replace(scene(), robot=replace(stiff, joints=joints)), 1)
+        rough = with_drive(scene().robot, "lift", friction_loss=0.1)
+        words = "no dry friction of joints on the CPU: give the robot's drives a friction_loss of 0"
+        with self.assertRaisesRegex(CapabilityError, words):
+            self.make(scene(rough), 1)
 
 
 class DrakeTest(EngineTest, unittest.TestCase):
@@ -208,8 +197,7 @@ class DrakeTest(EngineTest, unittest.TestCase):
 
     def test_a_world_that_drake_gives_up_is_broken_until_it_is_set(self):
         with self.make(scene(), 1) as backend:
-            good = backend.state()
-            good = type(good)(**{name: value.clone() for name, value in vars(good).items()})
+            good = backend.state().clone()
             [world] = backend._team._worlds
             with (
                 patch.object(world, "_simulator") as simulator,

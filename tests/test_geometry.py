@@ -8,7 +8,7 @@ import trimesh
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
-from tests.toy_retarget import FLOAT, UPRIGHT, box_object, double
+from tests.toy_retarget import UPRIGHT, box_object, double
 from xreset import robots
 from xreset.geometry.balls import BARE, SPACING, inscribed_balls, link_balls, sharp_points
 from xreset.geometry.collision import SelfCollision, bounding_ball, height_above_table
@@ -23,10 +23,10 @@ from xreset.retarget.hand.model import HandModel, HandState
 from xreset.spec import Geometry, Shape, TableSpec
 
 
-def distance_from_box(points, half):
-    """[n] signed distance of points [n, 3] from a box around the origin."""
-    beyond = np.abs(points) - half
-    return np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(axis=1), 0)
+def distances(field, points):
+    """[n] signed distances of points [n, 3] from the only object of a field."""
+    which = torch.zeros(len(points), dtype=torch.long)
+    return field.signed_distance(torch.as_tensor(points), which)[0].numpy()
 
 
 class SurfaceTest(TestCase):
@@ -35,12 +35,10 @@ class SurfaceTest(TestCase):
         size = (0.06, 0.08, 0.10)
         cls.surface = Surface(box_object(((0, 0, 0), size)))
         cls.points = default_rng(0).uniform(-0.065, 0.065, (500, 3))
-        cls.exact = distance_from_box(cls.points, np.array(size) / 2)
+        cls.exact = signed_distance(box((0, 0, 0), size), cls.points)
 
     def test_signed_distance_of_a_box(self):
-        only = torch.zeros(len(self.points), dtype=torch.long)
-        distance, _ = self.surface.field.signed_distance(torch.as_tensor(self.points), only)
-        distance = distance.numpy()
+        distance = distances(self.surface.field, self.points)
         near = self.exact < 0.01
         # The field is off by half a cell where it has an edge.
         assert_allclose(distance[near], self.exact[near], atol=2.1e-3)
@@ -56,9 +54,7 @@ class SurfaceTest(TestCase):
         two = Surface(
             box_object(((-0.02, 0, 0), (0.08, 0.06, 0.06)), ((0.02, 0, 0), (0.08, 0.06, 0.06)))
         )
-        distance, _ = two.field.signed_distance(
-            torch.zeros(1, 3, dtype=FLOAT), torch.zeros(1).long()
-        )
+        (distance,) = distances(two.field, np.zeros((1, 3)))
         # To the outer faces, not to the ends of the boxes at x = +-0.02.
         self.assertAlmostEqual(distance, -0.03, delta=2.1e-3)
 
@@ -128,11 +124,10 @@ class ShapesTest(TestCase):
         # A tube, open at both ends.
         walls = [box((0, 0, z), (0.06, 0.04, 0.001)) for z in (-0.0095, 0.0095)]
         walls += [box((0, y, 0), (0.06, 0.001, 0.02)) for y in (-0.0195, 0.0195)]
-        half = np.array((0.03, 0.02, 0.01))
-        points = default_rng(0).uniform(-1.2 * half, 1.2 * half, (2000, 3))
-        which = torch.zeros(len(points), dtype=torch.long)
-        found = link_field(walls).signed_distance(torch.as_tensor(points), which)[0].numpy()
-        solid = distance_from_box(points, half)
+        size = np.array((0.06, 0.04, 0.02))
+        points = default_rng(0).uniform(-0.6 * size, 0.6 * size, (2000, 3))
+        found = distances(link_field(walls), points)
+        solid = signed_distance(box((0, 0, 0), size), points)
         middle = np.abs(points[:, 0]) < 0.015  # at its open ends a ball of a gap's size looks in
         assert_allclose(found[middle], solid[middle], atol=1e-3)
         self.assertGreater((found - solid).min(), -1e-3)
@@ -177,7 +172,7 @@ class SelfCollisionTest(TestCase):
 
     def test_fingers_that_cross_are_found_and_neighbours_are_not(self):
         kinematics = Kinematics(self.robot)
-        collision = SelfCollision(self.robot, kinematics)
+        collision = SelfCollision(kinematics)
         self.assertNotIn(("right_index_MP", "right_index_DP"), collision.link_pairs)
         poses = kinematics.link_poses(
             torch.as_tensor(self.home_and(("right_index_MCP_AA", 0.35)))
@@ -191,7 +186,7 @@ class SelfCollisionTest(TestCase):
             self.assertIn("right_index", a + b)
 
     def test_pairs_that_the_arm_moves_join_hand_and_arm(self):
-        collision = SelfCollision(self.robot, Kinematics(self.robot), moved_by_arm=True)
+        collision = SelfCollision(Kinematics(self.robot), moved_by_arm=True)
         self.assertIn(("forearm_link", "right_index_DP"), collision.link_pairs)
         self.assertNotIn(("right_index_DP", "right_middle_DP"), collision.link_pairs)
 

@@ -7,26 +7,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from tests.data import InFolder
+from tests.toy_retarget import box_object
 from xreset.description import load_robot as load
 from xreset.errors import RobotError, XResetError
 from xreset.geometry.kinematics import Kinematics
 from xreset.pictures import meshes, render
 from xreset.pictures.meshes import link_colors
 from xreset.pictures.render import Camera, Points, Renderer, pose_matrix, write_png
-from xreset.spec import Geometry, ObjectSpec, SceneSpec, Shape
-
-
-def cube(half):
-    mesh = trimesh.creation.box([2 * half] * 3)
-    return ObjectSpec(
-        name="cube",
-        pieces=(Shape(geometry=Geometry(kind="box", size=(half,) * 3)),),
-        mass=0.2,
-        com=np.zeros(3),
-        inertia=np.eye(3) * 1e-4,
-        vertices=np.asarray(mesh.vertices),
-        faces=np.asarray(mesh.faces),
-    )
+from xreset.spec import SceneSpec
 
 
 def at(x, y, z):
@@ -50,9 +38,8 @@ class Pictures(TestCase):
     def setUpClass(cls):
         cls.robot = load("openarm")
         cls.size = (240, 180)
-        cls.renderer = Renderer(
-            SceneSpec(robot=cls.robot, objects=(cube(0.04), cube(0.08))), size=cls.size
-        )
+        cubes = [box_object(((0, 0, 0), (edge, edge, edge))) for edge in (0.08, 0.16)]
+        cls.renderer = Renderer(SceneSpec(robot=cls.robot, objects=tuple(cubes)), size=cls.size)
         cls.camera = Camera()
         cls.home = cls.robot.home
 
@@ -61,10 +48,7 @@ class Pictures(TestCase):
 
     def test_object_appears_where_it_is(self):
         empty = self.renderer.draw(self.home)
-        for position in (
-            (0.4, 0.1, 0.3),
-            (0.6, 0.2, 0.5),
-        ):  # in the air: its shadow falls elsewhere
+        for position in ((0.4, 0.1, 0.3), (0.6, 0.2, 0.5)):  # its shadow falls elsewhere
             picture = self.renderer.draw(self.home, at(*position))
             orange = (picture[..., 0] > picture[..., 2] + 60) & self.changed(picture, empty)
             y, x = np.nonzero(orange)
@@ -77,13 +61,11 @@ class Pictures(TestCase):
 
     def test_the_object_is_the_one_of_the_index_and_the_robot_moves(self):
         empty = self.renderer.draw(self.home)
-        small, large = (
-            self.changed(
-                self.renderer.draw(self.home, at(0.4, 0.1, 0.4), object_index=i), empty
-            ).sum()
-            for i in (0, 1)
-        )
-        self.assertGreater(large, 2.5 * small)
+        areas = []
+        for i in (0, 1):
+            picture = self.renderer.draw(self.home, at(0.4, 0.1, 0.4), object_index=i)
+            areas.append(self.changed(picture, empty).sum())
+        self.assertGreater(areas[1], 2.5 * areas[0])
         moved = self.home.copy()
         moved[0] += 0.5
         self.assertGreater(self.changed(empty, self.renderer.draw(moved)).sum(), 100)

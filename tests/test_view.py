@@ -243,14 +243,14 @@ class Served(WithFiles):
         page = self.page(self.retargeted, sequence=1)
         scene = page._scene
         self.assertEqual(page.row, 4)
-        poses = Kinematics(self.robot).link_poses(torch.tensor(self.robot.home)).numpy()
+        kinematics = Kinematics(self.robot)
+        poses = kinematics.link_poses(torch.tensor(self.robot.home)).numpy()
         for frame, color in ((1, reason_color("joint limit")), (2, None)):
             page._frame.value = frame
             page.show()
             self.assertEqual("joint limit" in page._text.content, color is not None)
             assert_allclose(scene._objects[1].position, page.view.object_pos[4 + frame])
             self.assertEqual([handle.visible for handle in scene._objects], [False, True])
-            kinematics = Kinematics(self.robot)
             for name, link in scene._robot.links.items():
                 assert_allclose(link.position, poses[kinematics.link_index(name), :3, 3], atol=1e-6)
                 own = scene._robot._colors[name]

@@ -8,26 +8,19 @@ from importlib.util import find_spec
 import numpy as np
 
 from tests.browser import INPUT, Browser, find_chromium, wait_until
-from tests.data import InOneFolder
-from tests.test_view import toy_demos, toy_retargeted
-from xreset import robots, write_demos, write_retargeted
+from tests.test_view import WithFiles
 from xreset.pictures.view.load import load_view
 
 SLIDER = INPUT + ".querySelector('[role=slider]')"
 
 
 @unittest.skipUnless(find_spec("viser"), "viser is not installed")
-class InTheBrowser(InOneFolder):
+class InTheBrowser(WithFiles):
     @classmethod
     def setUpClass(cls):
         super().setUpClass()
         cls.browser = Browser(find_chromium())
         cls.addClassCleanup(cls.browser.close)
-        robot = robots.load("openarm")
-        cls.demos = cls.folder / "demos.npz"
-        cls.retargeted = cls.folder / "retargeted.npz"
-        write_demos(cls.demos, toy_demos())
-        write_retargeted(cls.retargeted, toy_retargeted(robot))
 
     def open(self, path, **options):
         """A page that the browser shows."""

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from xreset.checks import frozen
 from xreset.errors import BackendUnavailableError, CapabilityError, XResetError
-from xreset.spec import SceneSpec, lowest_point
+from xreset.spec import RobotSpec, SceneSpec, lowest_point
 from xreset.tensors import Tensors
 
 Parameter = Literal[
@@ -165,6 +165,21 @@ class Health(Tensors):
     """[N] bool: a position or velocity is not finite."""
     overflow: Tensor
     """[N] bool: contacts or constraints were dropped because a buffer was full."""
+
+
+def no_readings(robot: RobotSpec, num_worlds: int) -> tuple[Links, Contacts, Health]:
+    """Return readings of N worlds that are all zero."""
+    links = torch.zeros(num_worlds, len(robot.tracked_links), 3)
+    tips = torch.zeros(num_worlds, len(robot.fingertips), 3)
+    none = torch.zeros(num_worlds, dtype=torch.bool)
+    quat = torch.zeros(*links.shape[:2], 4)
+    return (
+        Links(pos=links, quat=quat, linvel=links, angvel=links).clone(),
+        Contacts(
+            tip_force=tips, tip_touch=tips[..., 0] > 0, table_force=torch.zeros(num_worlds, 3)
+        ),
+        Health(nonfinite=none, overflow=none).clone(),
+    )
 
 
 @frozen

@@ -234,7 +234,7 @@ class Bench:
             return 2.0 * torch.rand(*shape, generator=random) - 1.0
 
         joints = Kinematics(robot or self.scene.robot)
-        home = torch.as_tensor(joints.robot.home, dtype=torch.float64)
+        home = joints.home
         lower, upper = finite_limits(joints)
         reach = 0.3 * (upper - lower)
         count = len(home)
@@ -278,7 +278,8 @@ def free_place(scene: SceneSpec) -> tuple[float, float]:
     robot = scene.robot
     x, y = scene.table.center
     half_x, half_y, _ = scene.table.half_size
-    palm = Kinematics(robot).link_poses(torch.as_tensor(robot.home), [robot.palm])[0, :2, 3].numpy()
+    kinematics = Kinematics(robot)
+    palm = kinematics.points(kinematics.home, [robot.palm])[0, :2].numpy()
     avoid = np.stack((palm, robot.base_pos[:2]))
     xs = (x - (half_x - 0.25), x + (half_x - 0.25))
     ys = (y - (half_y - 0.2), y + (half_y - 0.2))
@@ -300,10 +301,9 @@ def finite_limits(kinematics: Kinematics, most: float = 3.0) -> tuple[Tensor, Te
 
 def small_motion(kinematics: Kinematics) -> Tensor:
     """[J] a small distance for each joint, towards the middle of its range."""
-    home = torch.as_tensor(kinematics.robot.home, dtype=torch.float64)
     lower, upper = finite_limits(kinematics)
     step = 0.05 * (upper - lower)
-    return torch.where(home > (lower + upper) / 2, -step, step).float()
+    return torch.where(kinematics.home > (lower + upper) / 2, -step, step).float()
 
 
 def state_errors(found: State, expected: State, words: str = "") -> dict[str, Tensor]:

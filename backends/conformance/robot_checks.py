@@ -80,8 +80,9 @@ def _alone(bench: Bench) -> tuple[State, Tensor]:
     lower = bench.kinematics.lower
     upper = bench.kinematics.upper
     way = torch.where(slides, _SLIDE_WAY, _WAY).double().minimum(0.3 * (upper - lower))
-    home = torch.as_tensor(robot.home)
-    middle = torch.minimum(torch.maximum(home, lower + 1.5 * way), upper - 1.5 * way)
+    middle = torch.minimum(
+        torch.maximum(bench.kinematics.home, lower + 1.5 * way), upper - 1.5 * way
+    )
     start = bench.initial(bench.scene, [0] * len(slides))
     start.joint_pos.diagonal().copy_(middle.float())
     return replace_fields(start, joint_target=start.joint_pos), way.float()
@@ -231,7 +232,7 @@ def gravity_compensation(bench: Bench) -> Measured:
         bench.NUM_WORLDS, len(lower), generator=random, dtype=torch.float64
     )
     q = lower + (upper - lower) * share
-    q[0] = torch.as_tensor(scene.robot.home)
+    q[0] = bench.kinematics.home
     start = replace_fields(bench.start(), joint_pos=q, joint_target=q)
     with bench.other(scene, bench.which) as worlds:
         end = worlds.advance(start, round(2.0 / scene.timestep))

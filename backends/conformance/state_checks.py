@@ -122,8 +122,7 @@ def _view_of_object(bench: Bench) -> CameraConfig:
 def _view_of_hand(bench: Bench) -> CameraConfig:
     """Return a camera that looks at the palm at home, from beyond what the robot reaches."""
     robot = bench.scene.robot
-    home = torch.as_tensor(robot.home)
-    palm = bench.kinematics.link_poses(home, [robot.palm])[0, :3, 3].numpy()
+    palm = bench.kinematics.points(bench.kinematics.home, [robot.palm])[0].numpy()
     ahead = palm[:2] - robot.base_pos[:2]
     ahead /= max(float(np.linalg.norm(ahead)), 1e-6)
     away = (*0.8 * ahead, 0.4) if ahead.any() else (0.8, 0.0, 0.4)

@@ -297,8 +297,7 @@ def _reachable(scene: SceneSpec, *, tip: bool) -> tuple[np.ndarray, np.ndarray, 
     robot = scene.robot
     kinematics = Kinematics(robot)
     meshes = link_meshes(robot)
-    home = torch.as_tensor(robot.home, dtype=torch.float64)
-    poses = kinematics.link_poses(home, list(meshes)).numpy()
+    poses = kinematics.link_poses(kinematics.home, list(meshes)).numpy()
     contact_links = set().union(*(finger.contact_links for finger in robot.fingertips))
     points: dict[bool, list[np.ndarray]] = {True: [], False: []}
     for (name, mesh), T in zip(meshes.items(), poses, strict=True):

@@ -70,9 +70,7 @@ class Cameras:
         mounts = [robot.palm if c.link == "palm" else c.link for c in config.cameras]
         self._mounts = [None if name is None else len(bodies) + i for i, name in enumerate(mounts)]
         self._links = [*bodies, *(name or self._kinematics.root for name in mounts)]
-        home = self._kinematics.link_poses(
-            torch.as_tensor(robot.home, dtype=torch.float32, device=device), self._links
-        )
+        home = self._kinematics.link_poses(self._kinematics.home, self._links)
         x, y, z = scene.table.half_size
         table = shape_mesh(box((*scene.table.center, -z), (2 * x, 2 * y, 2 * z)))
         self._check_outside(home.cpu().numpy(), bodies, table)

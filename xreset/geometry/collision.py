@@ -100,7 +100,6 @@ class SelfCollision:
 
     def __init__(
         self,
-        robot: RobotSpec,
         kinematics: Kinematics,
         *,
         moved_by_arm: bool = False,
@@ -111,7 +110,6 @@ class SelfCollision:
         Neighbors, excluded pairs and pairs that overlap at home (a matter of modeling) never count.
 
         Args:
-            robot: the robot.
             kinematics: kinematics of the whole robot, or of its hand.
             moved_by_arm: only pairs whose relative pose depends on an arm joint.
             only: only pairs among these links.
@@ -141,6 +139,7 @@ class SelfCollision:
         self._T_link_shape = np.array(local).reshape(-1, 4, 4)
         self._center = np.array(centers).reshape(-1, 3)
         self._radius = np.array(radii)
+        robot = kinematics.robot
         tree = kinematics.tree
         pairs = combinations(dict.fromkeys(self._link), 2)
         counted = [pair for pair in pairs if _may_collide(robot, tree, *pair)]
@@ -153,8 +152,8 @@ class SelfCollision:
 
             counted = [(a, b) for a, b in counted if movers(a) != movers(b)]
         self._count(counted)
-        home = kinematics.lower.new_tensor(robot.home[kinematics.joint_indices])
-        overlapping = self.near(kinematics.link_poses(kinematics.clamp(home))[None].numpy(), 0.0)
+        home = kinematics.link_poses(kinematics.clamp(kinematics.home))
+        overlapping = self.near(home[None].numpy(), 0.0)
         self.overlapping_at_home = [pair for pair in counted if (0, *pair) in overlapping]
         """Pairs of links that do not count because they overlap at home."""
         self._count([pair for pair in counted if pair not in self.overlapping_at_home])

@@ -97,6 +97,8 @@ class Kinematics:
         URDF's."""
         self.joint_names = tuple(robot.joint_names[i] for i in indices)
         """Names of the joints, in the robot's joint order."""
+        self.home = self._tensor(robot.home[indices])
+        """[J] joint positions at home."""
         self._couple(moving, mimics)
         self._chain(joints, moving)
 

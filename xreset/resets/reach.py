@@ -36,11 +36,11 @@ class Reach:
     def __init__(self, robot: RobotSpec) -> None:
         """Prepare the arm, and the grasps to try: home's orientation of the hand first, then others around it."""
         self._model = ArmModel(robot)
-        home = torch.as_tensor(robot.home)
-        self._hand_joints = home[torch.as_tensor(self._model.hand.joint_indices)]
+        self._hand_joints = self._model.hand.home
         tips = self._model.hand.points(self._hand_joints, [tip.link for tip in robot.fingertips])
         self._center = (tips[0] + tips[1:].mean(dim=0)).numpy() / 2
-        root = self._model.kinematics.link_poses(home[None], [robot.hand_root])[0, 0, :3, :3]
+        whole = self._model.kinematics
+        root = whole.link_poses(whole.home, [robot.hand_root])[0, :3, :3]
         at_home = Rotation.from_matrix(root.numpy())
         level = np.cross((0.0, 0.0, 1.0), at_home.apply(self._center))
         level /= max(np.linalg.norm(level), 1e-9)

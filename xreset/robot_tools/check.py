@@ -334,7 +334,7 @@ def _above_table(spec: RobotSpec, q: torch.Tensor) -> Problems:
 
 def _free_of_itself(spec: RobotSpec, q: torch.Tensor) -> Problems:
     kinematics = Kinematics(spec)
-    collision = SelfCollision(spec, kinematics)
+    collision = SelfCollision(kinematics)
     for pair in collision.overlapping_at_home:
         yield (
             "error",

@@ -138,7 +138,7 @@ def import_robot(
         )
         spec = _with_arm_home(spec, found.palm_in_hand, notes)
         spec = _with_drives(spec, whole, notes)
-        pairs = SelfCollision(spec, Kinematics(spec)).overlapping_at_home
+        pairs = SelfCollision(Kinematics(spec)).overlapping_at_home
         if pairs:
             listed = "; ".join(f"{a} and {b}" for a, b in pairs)
             notes.append(f"never collide, because they meet at home: {listed}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from xreset.geometry.kinematics import Kinematics
 from xreset.pictures.render import Camera, Renderer
@@ -23,7 +22,7 @@ def robot_picture(robot: RobotSpec) -> np.ndarray:
     fingertips (left) and of the links that follow the human's keypoints (right). x is red, y green, z blue.
     """
     kinematics = Kinematics(robot)
-    poses = kinematics.link_poses(torch.tensor(robot.home), robot.tracked_links).numpy()
+    poses = kinematics.link_poses(kinematics.home, robot.tracked_links).numpy()
     points = poses[:, :3, 3]
     middle = points.mean(axis=0)
     distance = max(3.0 * np.ptp(points, axis=0).max(), 0.25)

@@ -109,9 +109,9 @@ class ArmModel:
         """Links whose motion the arm's joints determine: the hand root, which carries the hand, then the arm's
         links."""
         carrier_of = {link: 0 if link in in_hand else self.carriers.index(link) for link in names}
-        self.arm_collision = SelfCollision(robot, self.kinematics, moved_by_arm=True)
+        self.arm_collision = SelfCollision(self.kinematics, moved_by_arm=True)
         """Distances that the arm's joints change."""
-        self._hand_collision = SelfCollision(robot, self.hand, only=robot.self_collision_links)
+        self._hand_collision = SelfCollision(self.hand, only=robot.self_collision_links)
 
         support = table_points(self.kinematics)
         links = sorted(support, key=lambda link: link not in in_hand)

@@ -106,7 +106,7 @@ class HandModel:
         """[P] whether a fingertip follows the keypoint."""
         self.pairs = torch.tensor(keypoint_pairs(self.names, self.links), device=self.device)
         """[C, 2] pairs of mapped keypoints whose difference is matched."""
-        self.home = torch.as_tensor(robot.home[robot.hand_indices], device=self.device)
+        self.home = self.kinematics.home
         """[J] home configuration of the hand."""
         self.is_jaw = len(self.home) == 1 and len(robot.fingertips) == 2
         """Whether the hand is a jaw: one joint moves two fingers."""
@@ -116,7 +116,7 @@ class HandModel:
         """[P, 3] keypoints at home, in the root's frame."""
         self.table = TableSpec()
 
-        collision = SelfCollision(robot, on_cpu, only=robot.self_collision_links)
+        collision = SelfCollision(on_cpu, only=robot.self_collision_links)
         self.balls = hand_balls(on_cpu, collision).to(self.device)
         """Balls that keep the hand out of the object, the table and itself."""
         pads = self._pads()

@@ -17,7 +17,6 @@ import torch
 from torch import tensor
 from torch.testing import assert_close
 
-from xreset.backends.conformance.scene import ball, gripper
 from xreset.backends.pool import PoolBackend, World, is_finite
 from xreset.backends.workers import STATE_FIELDS
 from xreset.errors import CapabilityError, RobotError, XResetError
@@ -92,6 +91,9 @@ class ToyBackend(PoolBackend):
 
 
 def toy_scene():
+    # workers, which import this module too, start sooner without it
+    from xreset.backends.conformance.scene import ball, gripper
+
     robot = replace(gripper(), joints=gripper().joints[:2], mimics=())
     return SceneSpec(robot=robot, objects=(replace(ball(), mass=1.0), replace(ball(), mass=2.0)))
 

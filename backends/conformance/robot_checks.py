@@ -33,20 +33,19 @@ def mass_properties(bench: Bench) -> Measured:
     """Read masses, centres of mass and inertias back from the engine, of every moving body and of the objects."""
     found = bench.worlds().backend.mass_properties().to("cpu").map(Tensor.double)
     bodies = mechanism(bench.scene.robot).bodies[1:]
-    rows = [(0, i, body.name, body.inertia) for i, body in enumerate(bodies)]
-    for world, thing in enumerate(bench.objects):
-        rows.append((world, len(bodies), thing.name, object_inertia(thing)))
+    robot = [(body.name, body.inertia) for body in bodies]
     errors = defaultdict(list)
-    for world, i, name, expected in rows:
-        matrix = found.inertia[world, i].numpy()
-        off = {
-            "mass": found.mass[world, i] / expected.mass - 1.0,
-            "centre of mass": found.com[world, i].numpy() - expected.com,
-            "principal inertia": np.linalg.eigvalsh(matrix) / expected.moments - 1.0,
-            "inertia matrix": (matrix - expected.matrix) / expected.moments[-1],
-        }
-        for what, error in off.items():
-            errors[what].append((name, error))
+    for world, thing in enumerate(bench.objects):
+        for i, (name, expected) in enumerate([*robot, (thing.name, object_inertia(thing))]):
+            matrix = found.inertia[world, i].numpy()
+            off = {
+                "mass": found.mass[world, i] / expected.mass - 1.0,
+                "centre of mass": found.com[world, i].numpy() - expected.com,
+                "principal inertia": np.linalg.eigvalsh(matrix) / expected.moments - 1.0,
+                "inertia matrix": (matrix - expected.matrix) / expected.moments[-1],
+            }
+            for what, error in off.items():
+                errors[what].append((name, error))
     return errors
 
 

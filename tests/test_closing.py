@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from functools import partial
 from unittest import TestCase
 from unittest.mock import patch
 
@@ -17,10 +16,11 @@ from tests import toy_grasp
 from tests.command import refused, succeeds
 from tests.data import InFolder
 from tests.engine_checks import with_drive
-from tests.toy_bank import toy_bank, toy_retargeted
-from xreset import ClosingConfig, SqueezeConfig, make_backend, read_bank, write_bank
+from tests.toy_bank import in_this_process, toy_bank, toy_retargeted
+from xreset import ClosingConfig, SqueezeConfig, read_bank, write_bank
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_rotate
+from xreset.geometry.shapes import quat_of, turn_of
 from xreset.resets.closing import closing_states, positions_between, rotations_between
 from xreset.resets.distribution import ResetDistribution, bank_starts
 from xreset.resets.fingers import Fingers, _balance, fingers_of, squeeze_targets
@@ -56,34 +56,32 @@ def grasp_and_lift():
     return retargeted(joints, pos, first_contact=np.array([1]))
 
 
+def toy_fingers(states, links, **changes):
+    """Fingers of one link each that touch the object; ``changes`` replace fields."""
+    none = torch.zeros(states, links, 3)
+    values = dict.fromkeys(("point", "inward", "lever"), none) | {
+        "links": tuple("abcde"[:links]),
+        "finger": torch.arange(links),
+        "gap": none[..., 0],
+        "weight": torch.ones(states),
+    }
+    return Fingers(**(values | changes))
+
+
 class ClosingTest(TestCase):
     """Two demonstrations of five frames in which the first finger moves by 12 mm a frame and the second by 4."""
 
     def setUp(self):
-        rng = np.random.default_rng(0)
-        joints = ROBOT.home + 0.01 * rng.normal(size=(10, len(ROBOT.joints)))
-        tips = np.zeros((10, 2, 3))
-        tips[:, 0, 0], tips[:, 1, 1] = 0.012 * np.arange(10), 0.004 * np.arange(10)
-        angle = 0.2 * np.arange(10)
-        turned = np.stack((np.cos(angle / 2), 0 * angle, 0 * angle, np.sin(angle / 2)), axis=-1)
-        self.data = retargeted(
-            joints, np.tile([0.5, 0.3, 0.1], (10, 1)), [0, 5, 10], fingertip_pos=tips, palm_pos=rng.normal(size=(10, 3)),
-            palm_quat_wxyz=turned, object_quat_wxyz=turned, hand_error=rng.normal(size=10), contact=np.arange(10) % 5 > 2,
-            first_contact=np.array([3, -1]),
-        )  # fmt: skip
+        joints = ROBOT.home + 0.01 * np.random.default_rng(0).normal(size=(10, len(ROBOT.joints)))
+        tips = np.arange(10)[:, None, None] * [[0.012, 0, 0], [0, 0.004, 0]]
+        turned = quat_of(Rotation.from_rotvec(0.2 * np.arange(10)[:, None] * [0, 0, 1]))
+        pos = np.tile([0.5, 0.3, 0.1], (10, 1))
+        changes = {"fingertip_pos": tips, "object_quat_wxyz": turned}
+        self.data = retargeted(joints, pos, [0, 5, 10], **changes)
         self.gap = np.full((10, 2), 0.03)
 
     def states(self, data=None, **config):
-        none = torch.zeros(10, 2, 3)
-        fingers = Fingers(
-            links=("a", "b"),
-            finger=tensor([0, 1]),
-            gap=torch.as_tensor(self.gap),
-            point=none,
-            inward=none,
-            lever=none,
-            weight=torch.zeros(10),
-        )
+        fingers = toy_fingers(10, 2, gap=torch.as_tensor(self.gap))
         config = ClosingConfig(**({"spacing": 0.005} | config))
         with patch("xreset.resets.closing.fingers_of", lambda *_: fingers):
             return closing_states(data or self.data, ROBOT, (toy_grasp.brick(),), config)
@@ -175,8 +173,7 @@ class FingersTest(TestCase):
         wrist = Kinematics(ROBOT).link_poses(torch.as_tensor(joints), ["wrist"])[0, 0, :3, 0]
         brick = toy_grasp.brick()
         off_center = brick.com - brick.pieces[0].T_body_shape[:3, 3]
-        turn = Rotation.from_quat(toy_grasp.brick_pose()[1], scalar_first=True)
-        shift = turn.apply(off_center) @ wrist.numpy()
+        shift = turn_of(toy_grasp.brick_pose()[1]).apply(off_center) @ wrist.numpy()
         sideways = (fingers.lever[0] @ wrist).numpy()
         assert_allclose(sideways[:2], [0.0201 - shift, -0.0201 - shift], atol=3e-4)
 
@@ -187,19 +184,9 @@ class FingersTest(TestCase):
         height = torch.tensor([0.0, 0.03, 0.01, -0.01, -0.03], dtype=torch.float64)
         lever = -0.04 * inward
         lever[..., 2] = height
-        none = torch.zeros(2, 5, 3)
-        fingers = Fingers(
-            links=tuple("abcde"),
-            finger=torch.arange(5),
-            gap=none[..., 0],
-            point=none,
-            inward=inward,
-            lever=lever,
-            weight=torch.ones(2),
-        )
         pressing = torch.ones(2, 5, dtype=torch.bool)
         pressing[1, 1:] = False
-        factor = _balance(fingers, pressing)
+        factor = _balance(toy_fingers(2, 5, inward=inward, lever=lever), pressing)
         thumb, others = float(factor[0, 0]), factor[0, 1:]
         self.assertAlmostEqual(float(factor[0].mean()), 1.0)
         self.assertAlmostEqual(thumb, float(others.sum()), delta=0.1)
@@ -281,8 +268,7 @@ class CommandTest(InFolder):
             self.skipTest(str(error))
         super().setUp()
         self.enterContext(patch("xreset.inputs.load_robot", lambda _: ROBOT))
-        in_this_process = partial(make_backend, workers=0)
-        self.enterContext(patch("xreset.resets.probe.make_backend", in_this_process))
+        self.enterContext(in_this_process())
         self.enterContext(patch("xreset.inputs.load_objects", lambda *_: (toy_grasp.brick(),)))
         write_retargeted(f"{self.folder}/r.npz", grasp_and_lift())
 

@@ -1,19 +1,18 @@
 """Goal sets: starts at rest, goals of each family within reach, and what is refused."""
 
 from dataclasses import replace
-from functools import partial
 from unittest import TestCase, mock
 
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
-from scipy.spatial.transform import Rotation
 
 from tests.data import InFolder
-from tests.toy_bank import SOUP
+from tests.toy_bank import SOUP, in_this_process
 from tests.toy_goals import toy_goals
-from xreset import GoalConfig, load_object, load_policy, load_robot, make_backend
+from xreset import GoalConfig, load_object, load_policy, load_robot
 from xreset.errors import DemoError, FileFormatError, GoalError
 from xreset.eval.rollout import engine, load_trial, roll_out
+from xreset.geometry.shapes import turn_of
 from xreset.inputs import load_inputs
 from xreset.objects.rest import rest_height
 from xreset.records import npz_schema
@@ -23,24 +22,17 @@ BANANA = "011_banana"
 EXACT = GoalConfig(per_family=1, start_xy=0.0, start_yaw=0.0, goal_xy=0.0, goal_z=0.0, goal_yaw=0.0)
 
 
-def rotations(quat):
-    return Rotation.from_quat(quat, scalar_first=True)
-
-
 class MadeTest(TestCase):
     @classmethod
     def setUpClass(cls):
-        in_this_process = mock.patch(
-            "xreset.resets.probe.make_backend", partial(make_backend, workers=0)
-        )
-        cls.enterClassContext(in_this_process)
+        cls.enterClassContext(in_this_process())
         cls.robot = load_robot("ur7e-sharpa")
         cls.banana = load_object(BANANA)
         cls.exact = make_goals(["banana"], robot=cls.robot, config=EXACT)
 
     def centers(self, goals, which):
         """[S, 3] centres of mass."""
-        turn = rotations(getattr(goals, f"{which}_quat_wxyz"))
+        turn = turn_of(getattr(goals, f"{which}_quat_wxyz"))
         return getattr(goals, f"{which}_pos") + turn.apply(self.banana.com)
 
     def test_starts_are_at_rest_and_goals_are_what_their_family_says(self):
@@ -55,11 +47,11 @@ class MadeTest(TestCase):
         self.assertTrue(
             (goals.goal_pos[:, 2] > rest_height(self.banana, goals.goal_quat_wxyz)).all()
         )
-        ups = rotations(goals.start_quat_wxyz).inv().apply([0.0, 0.0, 1.0])
+        ups = turn_of(goals.start_quat_wxyz).inv().apply([0.0, 0.0, 1.0])
         self.assertLess((ups @ ups.T).min(), 0.9, "the banana rests on one side only")
         shift = self.centers(goals, "goal") - self.centers(goals, "start")
         assert_allclose(shift[:4], np.tile([0.0, 0.0, 0.2], (4, 1)), atol=1e-5)
-        turn = rotations(goals.goal_quat_wxyz) * rotations(goals.start_quat_wxyz).inv()
+        turn = turn_of(goals.goal_quat_wxyz) * turn_of(goals.start_quat_wxyz).inv()
         expected = np.radians(60) * np.array([[0.0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0]])
         assert_allclose(np.abs(turn.as_rotvec()[:4]), expected, atol=1e-5)
 
@@ -70,7 +62,7 @@ class MadeTest(TestCase):
         shift = self.centers(goals, "goal") - self.centers(goals, "start") - [0.0, 0.0, 0.2]
         self.assertTrue((np.abs(shift) <= [0.05, 0.05, 0.05]).all(), shift)
         self.assertTrue((np.ptp(shift, axis=0) > 0.01).all(), shift)
-        turn = rotations(goals.goal_quat_wxyz) * rotations(goals.start_quat_wxyz).inv()
+        turn = turn_of(goals.goal_quat_wxyz) * turn_of(goals.start_quat_wxyz).inv()
         assert_allclose(turn.as_rotvec()[:, :2], 0.0, atol=1e-5)
         self.assertTrue(10 < np.degrees(turn.magnitude()).max() <= 55)
 

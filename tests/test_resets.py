@@ -1,15 +1,14 @@
 """The physics filter on the MuJoCo C engine: what stays put is kept, what moves is rejected, with its reason."""
 
 from dataclasses import replace
-from functools import partial
 from unittest import SkipTest, TestCase, mock
 
 import numpy as np
 import torch
 from numpy.testing import assert_allclose
 
-from tests.toy_bank import SOUP, SPAM, toy_retargeted
-from xreset import FilterConfig, SceneSpec, make_backend, robots
+from tests.toy_bank import SOUP, SPAM, in_this_process, toy_retargeted
+from xreset import FilterConfig, SceneSpec, robots
 from xreset.errors import DemoError
 from xreset.objects.catalogue import load_objects
 from xreset.objects.rest import rest_height
@@ -27,10 +26,7 @@ UPRIGHT = np.array([1.0, 0, 0, 0])
 class FilterTest(TestCase):
     @classmethod
     def setUpClass(cls):
-        in_this_process = mock.patch(
-            "xreset.resets.probe.make_backend", partial(make_backend, workers=0)
-        )
-        cls.enterClassContext(in_this_process)
+        cls.enterClassContext(in_this_process())
         cls.robot = robots.load("openarm")
         cls.objects = load_objects([SOUP, SPAM])
         cls.height = float(rest_height(cls.objects[0], UPRIGHT))
@@ -38,10 +34,7 @@ class FilterTest(TestCase):
     def try_one(self, pos, backend_class=MujocoBackend):
         """The reason (None: accepted) of one state with the soup can at ``pos``."""
         scene = SceneSpec(robot=self.robot, objects=self.objects[:1])
-        rows = [
-            torch.as_tensor(np.asarray(v)[None], dtype=torch.float32)
-            for v in (self.robot.home, pos, UPRIGHT)
-        ]
+        rows = [torch.as_tensor(np.asarray(v)[None]) for v in (self.robot.home, pos, UPRIGHT)]
         with backend_class(scene, 1, workers=0) as backend:
             start = State.at_rest(*rows)
             backend.set_object_gravity(torch.zeros(1))
@@ -75,14 +68,7 @@ class FilterTest(TestCase):
     def retargeted(self, **changes):
         """Two demonstrations of three frames: soup (at rest, inside the table, at rest) and spam (not valid, at rest, at rest)."""
         spam_height = float(rest_height(self.objects[1], UPRIGHT))
-        heights = [
-            self.height,
-            self.height - 0.02,
-            self.height,
-            spam_height,
-            spam_height,
-            spam_height,
-        ]
+        heights = [self.height, self.height - 0.02, self.height] + 3 * [spam_height]
         pos = np.array([[0.45 + 0.02 * i, 0.3, z] for i, z in enumerate(heights)])
         reason = np.array([0, 0, 0, 1, 0, 0])
         values = {

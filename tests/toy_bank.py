@@ -1,12 +1,19 @@
 """A small reset bank for tests, with soup and spam, three demonstrations and six states, all numbers distinct; and trajectories."""
 
+from functools import partial
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
-from xreset import ResetBank, Retargeted
+from xreset import ResetBank, Retargeted, make_backend
 
 SOUP, SPAM = "005_tomato_soup_can", "010_potted_meat_can"
+
+
+def in_this_process():
+    """Try states without worker processes, while it is entered."""
+    return patch("xreset.resets.probe.make_backend", partial(make_backend, workers=0))
 
 
 def toy_bank(robot, **changes):

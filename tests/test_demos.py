@@ -28,24 +28,21 @@ from xreset.demos.grasp import TIPS, Solid
 from xreset.demos.keypoints import ORDERS
 from xreset.demos.plausible import doubts
 from xreset.errors import DemoError, FileFormatError
+from xreset.geometry.shapes import turn_of
 from xreset.objects.rest import rest_height
 
 ARCHIVES = (("dexycb_right_9x20.npz", "right"), ("dexycb_left_9x10.npz", "left"))
 KNUCKLES = [5, 9, 13, 17]
 
 
-def turns(quats):
-    return Rotation.from_quat(quats, scalar_first=True)
-
-
 def angles(a, b):
     """Angles between orientations (w, x, y, z) [rad]."""
-    return (turns(a).inv() * turns(b)).magnitude()
+    return (turn_of(a).inv() * turn_of(b)).magnitude()
 
 
 def in_frame(pos, quats, points):
     """Points [F, K, 3] in frames at positions [F, 3] and orientations [F, 4]."""
-    return np.einsum("fji,fkj->fki", turns(quats).as_matrix(), points - pos[:, None])
+    return np.einsum("fji,fkj->fki", turn_of(quats).as_matrix(), points - pos[:, None])
 
 
 class Archive(InFolder):
@@ -277,10 +274,10 @@ class DexYCB(InFolder):
         tag_rot, tag_pos = poses["apriltag"]
         pose_y = np.zeros((frames, 2, 7), dtype=np.float32)
         pose_y[:, 0, 3] = 1
-        pose_y[:, 1, :4] = (tag_rot * turns(self.demos.object_quat_wxyz)).as_quat()
+        pose_y[:, 1, :4] = (tag_rot * turn_of(self.demos.object_quat_wxyz)).as_quat()
         pose_y[:, 1, 4:] = tag_rot.apply(self.demos.object_pos) + tag_pos
         pose_m = np.zeros((frames, 1, 51), dtype=np.float32)
-        pose_m[:, 0, :3] = (tag_rot * turns(self.demos.wrist_quat_wxyz)).as_rotvec()
+        pose_m[:, 0, :3] = (tag_rot * turn_of(self.demos.wrist_quat_wxyz)).as_rotvec()
         pose_m[0] = 0  # no hand yet
         np.savez(self.sequence / "pose.npz", pose_y=pose_y, pose_m=pose_m)
         world = tag_rot.apply(self.demos.hand_keypoints.reshape(-1, 3)) + tag_pos
@@ -461,7 +458,7 @@ class Synthetic(InFolder):
                 self.assertGreater(distance[:, 1:].min(), -0.002)
                 self.assertGreater(points[..., 2].min(), 0.0)
                 # the object is between thumb and fingers
-                solid = Solid.of(obj, pos[lifted], turns(one.object_quat_wxyz[lifted]))
+                solid = Solid.of(obj, pos[lifted], turn_of(one.object_quat_wxyz[lifted]))
                 tips = points[lifted, TIPS]
                 share = np.linspace(0, 1, 41)[1:-1, None]
                 between = tips[0] + share * (tips[1:3].mean(axis=0) - tips[0])

@@ -13,21 +13,17 @@ from scipy.spatial.transform import Rotation
 
 from tests.command import succeeds, xreset
 from tests.data import InFolder, data_dir
+from tests.test_demos import angles
 from xreset import read_demos, synthesize
 from xreset.demos.keypoints import ORDERS, Convention, read_keypoints
 from xreset.errors import DemoError, FileFormatError
+from xreset.geometry.shapes import turn_of
 
 CAMERA = np.eye(4)
 CAMERA[:3, :3] = Rotation.from_euler("xyz", [2.2, 0.1, 3.0]).as_matrix()
 CAMERA[:3, 3] = (0.4, 1.3, 0.9)
 """Pose of a camera that looks down at the table."""
 PLAIN = Convention(order="mediapipe", units="m", frame="table", fps=10.0)
-
-
-def turned(a, b, field):
-    """[F] angles [rad] between orientations of two archives."""
-    one, two = (Rotation.from_quat(getattr(d, field), scalar_first=True) for d in (a, b))
-    return (one.inv() * two).magnitude()
 
 
 def written(points, order):
@@ -40,7 +36,7 @@ def seen_from(T, demos):
     turn = Rotation.from_matrix(T[:3, :3]).inv()
     points = (demos.hand_keypoints.astype(float) - T[:3, 3]) @ T[:3, :3]
     pos = (demos.object_pos.astype(float) - T[:3, 3]) @ T[:3, :3]
-    return points, pos, turn * Rotation.from_quat(demos.object_quat_wxyz, scalar_first=True)
+    return points, pos, turn * turn_of(demos.object_quat_wxyz)
 
 
 def write_csv(path, points, pos, turn, scale=1.0, columns=MappingProxyType({}), quat="wxyz"):
@@ -67,7 +63,7 @@ class Synthetic(InFolder):
     def setUp(self):
         super().setUp()
         self.points = self.demos.hand_keypoints.astype(float)
-        self.turn = Rotation.from_quat(self.demos.object_quat_wxyz, scalar_first=True)
+        self.turn = turn_of(self.demos.object_quat_wxyz)
         self.arrays = {
             "keypoints": self.points,
             "object_pos": self.demos.object_pos,
@@ -89,7 +85,8 @@ class Synthetic(InFolder):
             "object_quat_wxyz",
             "wrist_quat_wxyz",
         ):  # synthetic hands are the average hand
-            self.assertLess(turned(found, self.demos, field).max(), 1e-3)
+            off = angles(getattr(found, field), getattr(self.demos, field))
+            self.assertLess(off.max(), 1e-3)
         self.assertEqual(found.object_name.tolist(), self.demos.object_name.tolist())
 
     def refused(self, message, convention=PLAIN, **changes):
@@ -253,5 +250,5 @@ class Real(InFolder):
         found = read_keypoints(self.folder, convention)
         assert_array_equal(found.hand_valid, seen)
         self.assertLess(np.abs(found.hand_keypoints - demos.hand_keypoints)[seen].max(), 1e-4)
-        wrists = [replace(d, wrist_quat_wxyz=d.wrist_quat_wxyz[seen]) for d in (found, demos)]
-        self.assertLess(turned(*wrists, "wrist_quat_wxyz").max(), np.radians(3.7))
+        off = angles(found.wrist_quat_wxyz[seen], demos.wrist_quat_wxyz[seen])
+        self.assertLess(off.max(), np.radians(3.7))

@@ -6,12 +6,13 @@ import unittest
 import numpy as np
 from numpy.testing import assert_allclose
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
+from tests.test_demos import in_frame
 from tests.toy_retarget import box_object
 from xreset import load_object, synthesize
 from xreset.demos.mirror import mirrored, symmetry
 from xreset.errors import DemoError
+from xreset.geometry.shapes import turn_of
 from xreset.spec import TableSpec
 
 
@@ -41,7 +42,7 @@ class MirrorTest(unittest.TestCase):
         for frame in (0, self.demos.num_frames // 2, self.demos.num_frames - 1):
             placed = []
             for demos in (self.demos, self.found):
-                turn = Rotation.from_quat(demos.object_quat_wxyz[frame], scalar_first=True)
+                turn = turn_of(demos.object_quat_wxyz[frame])
                 self.assertAlmostEqual(np.linalg.det(turn.as_matrix()), 1.0, delta=5e-6)
                 placed.append(turn.apply(self.object.vertices) + demos.object_pos[frame])
             distance, _ = cKDTree(placed[1]).query(reflect(placed[0]))
@@ -51,13 +52,11 @@ class MirrorTest(unittest.TestCase):
     def test_a_left_hand_becomes_a_right_hand(self):
         """In its own frame, a left hand is the mirror image in x of a right one."""
         self.assertEqual(self.found.hand_side.tolist(), ["right"])
-        local = []
-        for demos in (self.demos, self.found):
-            turn = Rotation.from_quat(demos.wrist_quat_wxyz, scalar_first=True).as_matrix()
-            local.append(
-                np.einsum("fji,fkj->fki", turn, demos.hand_keypoints - demos.hand_keypoints[:, :1])
-            )
-        assert_allclose(local[1], local[0] * [-1.0, 1.0, 1.0], atol=1e-5)
+        left, right = (
+            in_frame(demos.hand_keypoints[:, 0], demos.wrist_quat_wxyz, demos.hand_keypoints)
+            for demos in (self.demos, self.found)
+        )
+        assert_allclose(right, left * [-1.0, 1.0, 1.0], atol=1e-5)
 
     def test_an_object_that_is_not_symmetric_is_refused(self):
         crooked = dataclasses.replace(self.symmetries[self.object.name], deviation=0.02)

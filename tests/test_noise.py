@@ -6,12 +6,8 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
 from xreset import synthesize
-from xreset.demos.hand import PARENTS
+from xreset.demos.hand import bone_lengths
 from xreset.demos.noise import MEMORY, TIERS, with_noise
-
-
-def bones(points):
-    return np.linalg.norm(points[:, 1:] - points[:, PARENTS], axis=-1)
 
 
 class NoiseTest(unittest.TestCase):
@@ -35,7 +31,7 @@ class NoiseTest(unittest.TestCase):
         noisy = with_noise(self.demos, wrist=0.0, finger=0.006, cap=0.012)
         before = self.demos.hand_keypoints[self.seen].astype(float)
         after = noisy.hand_keypoints[self.seen].astype(float)
-        assert_allclose(bones(after), bones(before), atol=1e-6)
+        assert_allclose(bone_lengths(after), bone_lengths(before), atol=1e-6)
         assert_array_equal(after[:, 0], before[:, 0])
         moved = np.linalg.norm(after - before, axis=-1)[:, 1:]
         self.assertGreater(moved.mean(), 0.003)

@@ -13,12 +13,18 @@ import torch
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial import ConvexHull, cKDTree
-from scipy.spatial.transform import Rotation
 
 from tests.command import refused, succeeds
 from tests.data import InFolder, data_dir
 from xreset.errors import ObjectError, XResetError
-from xreset.geometry.shapes import half_spaces, hull, shape_mesh, winding_number
+from xreset.geometry.shapes import (
+    half_spaces,
+    hull,
+    plane_heights,
+    shape_mesh,
+    turn_of,
+    winding_number,
+)
 from xreset.objects.catalogue import (
     canonical_name,
     canonical_names,
@@ -43,14 +49,15 @@ from xreset.task.randomization import own_friction
 
 Z = np.array([0.0, 0.0, 1.0])
 BOX = trimesh.creation.box((0.1, 0.06, 0.04))
+CUBE = trimesh.creation.box((0.1, 0.1, 0.1))
 RING = trimesh.creation.annulus(0.036, 0.04, 0.02, sections=32)
 CUTS = skipUnless(importlib.util.find_spec("manifold3d"), "manifold3d is not installed")
 
 
-def distance_to_pieces(points, obj):
+def distance_to_pieces(points, pieces):
     """Signed distance to the union of convex pieces (a lower bound outside)."""
-    planes = [half_spaces(piece) for piece in obj.pieces]
-    return np.min([(points @ plane[:, :3].T + plane[:, 3]).max(axis=1) for plane in planes], axis=0)
+    heights = [plane_heights(np.array(points), half_spaces(piece)) for piece in pieces]
+    return np.min([height.max(axis=-1) for height in heights], axis=0)
 
 
 class Names(TestCase):
@@ -81,9 +88,7 @@ class Geometry(TestCase):
         directions = np.random.default_rng(0).normal(size=(5000, 3))
         points = directions / np.linalg.norm(directions, axis=1, keepdims=True) * (0.03, 0.02, 0.01)
         few = hull(points, 5e-4)
-        planes = half_spaces(few)
-        beyond = points @ planes[:, :3].T + planes[:, 3]
-        self.assertLessEqual(beyond.max(), 5e-4)
+        self.assertLessEqual(plane_heights(points, half_spaces(few)).max(), 5e-4)
         self.assertLess(len(few.geometry.vertices), 200)
         self.assertTrue((few.geometry.vertices[:, None] == points).all(axis=-1).any(axis=1).all())
 
@@ -105,7 +110,7 @@ class Sampling(TestCase):
     def test_well_spread_on_the_outer_surface(self):
         obj = load_object("scissors")  # whose pieces overlap
         points = surface_points(obj, 64)
-        assert_allclose(distance_to_pieces(points, obj), 0, atol=1e-4)
+        assert_allclose(distance_to_pieces(points, obj.pieces), 0, atol=1e-4)
         assert_array_equal(points, surface_points(obj))
         self.assertFalse(np.array_equal(points, surface_points(obj, seed=1)))
         obj = load_object("soup")
@@ -130,7 +135,7 @@ class Rest(TestCase):
 
     def test_stable_pose_stands_over_its_base(self):
         obj = load_object("powerdrill")
-        rotation = Rotation.from_quat(resting_orientation(obj, Z), scalar_first=True)
+        rotation = turn_of(resting_orientation(obj, Z))
         self.assertGreater(rotation.apply(Z)[2], np.cos(np.radians(5)))
         vertices = rotation.apply(obj.vertices)
         base = vertices[vertices[:, 2] < vertices[:, 2].min() + 1e-5, :2]
@@ -138,7 +143,7 @@ class Rest(TestCase):
         self.assertLess((edges[:, :2] @ rotation.apply(obj.com)[:2] + edges[:, 2]).max(), 1e-6)
         box = load_object("cheez-its")
         for up, nearest in (([0.9, 0.1, 0.4], [1, 0, 0]), (-Z, -Z)):
-            rotation = Rotation.from_quat(resting_orientation(box, np.array(up)), scalar_first=True)
+            rotation = turn_of(resting_orientation(box, np.array(up)))
             assert_allclose(rotation.apply(nearest), Z, atol=1e-9)
 
 
@@ -182,7 +187,7 @@ class MeshImport(InFolder):
         self.assertAlmostEqual(volume / RING.volume, 1.0, delta=0.1)
         assert_allclose(first.com, 0, atol=1e-9)
         # the hole stays open
-        self.assertGreater(distance_to_pieces(np.zeros((1, 3)), first)[0], 0.03)
+        self.assertGreater(distance_to_pieces([0, 0, 0], first.pieces), 0.03)
         (file,) = (self.folder / "cache" / "objects").glob("*.npz")
         with patch("xreset.objects.cache.decompose", side_effect=AssertionError):
             again = self.load(RING).obj
@@ -209,7 +214,7 @@ class MeshImport(InFolder):
 
     @CUTS
     def test_open_meshes_are_closed_and_it_is_said(self):
-        box = trimesh.creation.box((0.1, 0.1, 0.1)).subdivide().subdivide()
+        box = CUBE.subdivide().subdivide()
         result = self.load(trimesh.Trimesh(box.vertices, box.faces[:-1]), facts="mass = 1.0")
         self.assertIn("not closed", result.notes[0])
         assert_allclose(np.diag(result.obj.inertia), 0.01 / 6, rtol=1e-6)
@@ -275,9 +280,9 @@ class MeshImport(InFolder):
         self.assertEqual(found.hollows(), "")
         cut_short = replace(found, deviation=0.01)  # its tolerance is stated: that is no advice
         self.assertEqual(cut_short.hollows(), "")
-        neck = np.array([[0.0205, 0, 0.157]])
-        self.assertGreater(distance_to_pieces(neck, found.obj)[0], 0.001)
-        self.assertLess(distance_to_pieces(neck, plain.obj)[0], -0.003)
+        neck = [0.0205, 0, 0.157]
+        self.assertGreater(distance_to_pieces(neck, found.obj.pieces), 0.001)
+        self.assertLess(distance_to_pieces(neck, plain.obj.pieces), -0.003)
 
     def test_archives_and_gltf_are_bounded(self):
         content = self.write(BOX).read_bytes() + b"#" * (2 << 20)
@@ -329,14 +334,13 @@ class MeshImport(InFolder):
         )
 
     def test_bad_meshes(self):
-        box = trimesh.creation.box((0.1, 0.1, 0.1))
-        obj = box.export(file_type="obj")
+        obj = CUBE.export(file_type="obj")
         square = "v 0 0 0\nv 0.1 0 0.1\nv 0 0.1 0.1\nv 0.1 0.1 0.2\nf 1 2 3\nf 2 4 3\n"
         for text, message in (
             ("", "no triangles|cannot be read"),
             (obj.replace("v ", "v nan ", 1), "finite|cannot be read"),
             (square, "flat"),
-            (box.apply_scale(1000).export(file_type="obj"), "millimetres"),
+            (CUBE.copy().apply_scale(1000).export(file_type="obj"), "millimetres"),
         ):
             path = self.folder / "bad.obj"
             path.write_text(text)
@@ -344,12 +348,11 @@ class MeshImport(InFolder):
                 import_with_notes(path, "bad")
 
     def test_layouts(self):
-        mesh = trimesh.creation.box((0.1, 0.1, 0.1))
-        self.write(mesh, "011_banana")
+        self.write(CUBE, "011_banana")
         for name in ("025_mug/textured", "025_mug/textured_simple", "024_bowl/textured"):
             path = self.folder / f"{name}.obj"
             path.parent.mkdir(exist_ok=True)
-            mesh.export(path)
+            CUBE.export(path)
         files = ["011_banana.obj", "024_bowl/textured.obj", "025_mug/textured_simple.obj"]
         self.assertEqual(
             [*mesh_files(self.folder).values()], [self.folder / file for file in files]
@@ -369,17 +372,12 @@ class MeshImport(InFolder):
         obj = load_object("soup", data_dir() / "ycb")
         self.assertEqual(len(obj.pieces), 1)
         # 64 vertices are enough
-        self.assertLess(distance_to_pieces(obj.vertices, obj).max(), 0.002)
+        self.assertLess(distance_to_pieces(obj.vertices, obj.pieces).max(), 0.002)
 
 
 @CUTS
 class ThinWalls(TestCase):
     """Pieces keep to the surface."""
-
-    def room(self, point, pieces):
-        """[m] From a point to the nearest piece, at least."""
-        planes = map(half_spaces, pieces.shapes)
-        return min((plane[:, :3] @ point + plane[:, 3]).max() for plane in planes)
 
     def test_a_finger_fits_into_a_mug_and_its_handle(self):
         outline = [[0, 0], [0.04, 0], [0.04, 0.09], [0.0365, 0.09], [0.0365, 0.004], [0, 0.004]]
@@ -404,9 +402,9 @@ class ThinWalls(TestCase):
         self.assertLess(pieces.deviation, 0.002)
         self.assertLess(len(pieces.shapes), 40)
         # the cup's inner radius is 36.5 mm
-        self.assertGreater(self.room([0, 0, 0.05], pieces), 0.030)
+        self.assertGreater(distance_to_pieces([0, 0, 0.05], pieces.shapes), 0.030)
         # a finger of 16 mm through the handle
-        self.assertGreater(self.room([0.051, 0, 0.045], pieces), 0.008)
+        self.assertGreater(distance_to_pieces([0.051, 0, 0.045], pieces.shapes), 0.008)
         self.assertAlmostEqual(pieces.volume, mug.volume, delta=1e-9)
 
     def test_a_small_bridge_on_a_large_piece_is_seen(self):
@@ -426,7 +424,7 @@ class ThinWalls(TestCase):
         self.assertAlmostEqual(solid.volume(), sheet.area * 0.001, delta=0.1 * sheet.area * 0.001)
         pieces = decompose(sheet, Settings(hull_depth=0.0, tolerance=0.004))
         # 20 mm above the bottom
-        self.assertGreater(self.room([0, 0, 0.02], pieces), 0.012)
+        self.assertGreater(distance_to_pieces([0, 0, 0.02], pieces.shapes), 0.012)
         self.assertLess(pieces.deviation, 0.004)
 
     def test_limits_of_pieces_and_effort(self):

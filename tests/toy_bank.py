@@ -25,7 +25,8 @@ def toy_bank(robot, **changes):
     num = len(robot.joints)
     sequence = np.array([0, 0, 1, 1, 2, 2], dtype=np.int32)
     owners = np.array([SOUP, SPAM, SOUP])
-    upright, turned = np.array([1.0, 0, 0, 0]), np.array([np.sqrt(0.5), np.sqrt(0.5), 0, 0])
+    upright = np.array([1.0, 0, 0, 0])
+    turned = np.sqrt([0.5, 0.5, 0, 0])
     start = np.stack([[0.50 + s / 100, 0.3, 0.05] for s in range(3)])
     fields: dict[str, Any] = {
         "robot": robot.name,

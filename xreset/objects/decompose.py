@@ -340,7 +340,7 @@ class _Cutter:
             parts, self._quick_excess, self._best_cut, tolerance, int(2 * _FEW * most)
         )
         pieces = [part.hull() for *_, part in cut]
-        tolerance = max(tolerance, *(self._solid.excess(piece, quick=True) for piece in pieces))
+        tolerance = max(tolerance, *(-excess for excess, *_ in cut))
         pieces = self._joined(pieces, tolerance)
         while len(pieces) > _FEW * most and self.effort > 0:
             tolerance *= 1.1

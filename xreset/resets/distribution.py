@@ -169,12 +169,12 @@ class ResetDistribution:
         pivots = pivots or {}
         of_sequence = [pivots.get(name, np.zeros(3)) for name in bank.sequence_object]
         self._demos = _Demonstrations(
-            start_pos=_tensor(bank.start_pos, device),
-            start_quat=_tensor(bank.start_quat_wxyz, device),
-            goal_pos=_tensor(bank.goal_pos, device),
-            goal_quat=_tensor(bank.goal_quat_wxyz, device),
-            pivot=_tensor(np.array(of_sequence), device),
-        )
+            start_pos=_tensor(bank.start_pos),
+            start_quat=_tensor(bank.start_quat_wxyz),
+            goal_pos=_tensor(bank.goal_pos),
+            goal_quat=_tensor(bank.goal_quat_wxyz),
+            pivot=_tensor(np.array(of_sequence)),
+        ).to(device)
         self.success_rate = torch.zeros(len(bank.sequence_object), device=device)
         owner = self._states.sequence.numpy(force=True)
         self._states_of = _Grouped(owner, range(len(bank.sequence_object)), device)

@@ -164,7 +164,7 @@ class HandMotions:
         surfaces = {
             name: Surface(spec) for name, spec in objects_named(objects, demos.object_names).items()
         }
-        self._objects = list(surfaces)
+        _, self._object_index = np.unique(demos.object_name, return_inverse=True)
         self._fields = DistanceFields.join([surface.field for surface in surfaces.values()])
         self.demos = demos = rest_on_table(demos, objects)
         self._contact_points, self.touching = human_contacts(
@@ -213,7 +213,6 @@ class HandMotions:
         held = np.logical_and(
             self.touching[:, _THUMB].any(axis=1), self.touching[:, _FINGERS].any(axis=1)
         )
-        which = [self._objects.index(name) for name in demos.object_name[sequences].tolist()]
         return HandTargets(
             keypoints=padded(keypoints),
             annotated=padded(demos.hand_valid),
@@ -222,7 +221,7 @@ class HandMotions:
             held=padded(held),
             object_pos=padded(demos.object_pos),
             object_quat=padded(demos.object_quat_wxyz),
-            object_index=torch.tensor(which),
+            object_index=torch.as_tensor(self._object_index[sequences]),
             fields=self._fields,
         )
 

@@ -36,7 +36,9 @@ from xreset.tensors import Tensors
 
 _CONVERGED = 1e-5
 """Steps smaller than this end the iteration [rad or m]."""
-_WRIST_MISSED = ("joint limit", "wrist position", "wrist orientation")
+_WRIST_MISSED = torch.tensor(
+    [REASONS.index(name) for name in ("joint limit", "wrist position", "wrist orientation")]
+)
 """Reasons of frames whose wrist is not where it should be."""
 _HOME_BIAS = 1e-3
 """Preference among solutions of the first frame for those near home [1/rad^2]."""
@@ -102,7 +104,7 @@ def _rescued(problem: ArmProblem, paths: Paths, joints: Tensor, worth: Tensor) -
         paths = Paths.cat((paths, backwards.map(lambda x: x.flip(2))), dim=1)
     if problem.config.reseeds:
         reason = problem.reasons(joints)
-        missed = torch.isin(reason, torch.tensor([REASONS.index(name) for name in _WRIST_MISSED]))
+        missed = torch.isin(reason, _WRIST_MISSED)
         rows = missed.any(dim=1).nonzero()[:, 0]
         if len(rows):
             part = problem[rows]

@@ -141,6 +141,10 @@ class FingersTest(TestCase):
             ROBOT, (toy_grasp.brick(),), np.full(len(jaw), "brick"), joints, pos, quat
         ), joints
 
+    def wrist_axis(self, joints):
+        """[M, 3] direction of the wrist's x axis, along which the jaws slide."""
+        return Kinematics(ROBOT).link_poses(torch.as_tensor(joints), ["wrist"])[:, 0, :3, 0]
+
     def test_gaps_and_directions(self):
         jaws = np.array([0.0201, 0.0251, 0.0501])
         fingers, joints = self.fingers(*jaws)
@@ -153,7 +157,7 @@ class FingersTest(TestCase):
         self.assertEqual(
             fingers.leading.tolist(), [[True, True, False]] * 3, "finger_b has no shape of its own"
         )
-        wrist = Kinematics(ROBOT).link_poses(torch.as_tensor(joints), ["wrist"])[:, 0, :3, 0]
+        wrist = self.wrist_axis(joints)
         assert_close(fingers.inward[:, 0], -wrist, atol=0.02, rtol=0)
         assert_close(fingers.inward[:, 1], wrist, atol=0.02, rtol=0)
         # the jaw's inner side
@@ -170,7 +174,7 @@ class FingersTest(TestCase):
 
     def test_levers_lead_from_the_centre_of_mass_to_the_finger(self):
         fingers, joints = self.fingers(0.0201)
-        wrist = Kinematics(ROBOT).link_poses(torch.as_tensor(joints), ["wrist"])[0, 0, :3, 0]
+        wrist = self.wrist_axis(joints)[0]
         brick = toy_grasp.brick()
         off_center = brick.com - brick.pieces[0].T_body_shape[:3, 3]
         shift = turn_of(toy_grasp.brick_pose()[1]).apply(off_center) @ wrist.numpy()

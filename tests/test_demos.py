@@ -269,14 +269,11 @@ class DexYCB(InFolder):
             self.folder / "calibration" / "extrinsics_20200702_151821" / "extrinsics.yml"
         )
         self.calibration.parent.mkdir(parents=True)
-        lines = ["extrinsics:"]
+        entries = {}
         for key, (rot, pos) in poses.items():
-            lines.append(f"  '{key}': !!python/tuple")
-            lines += [
-                f"  - {value!r}"
-                for value in np.column_stack((rot.as_matrix(), pos)).ravel().tolist()
-            ]
-        self.calibration.write_text("\n".join(lines))
+            entries[key] = tuple(np.column_stack((rot.as_matrix(), pos)).ravel().tolist())
+        # tuples have the tag that DexYCB's files have
+        self.calibration.write_text(yaml.dump({"extrinsics": entries}))
         self.sequence.mkdir(parents=True)
         self.write_meta()
         frames = self.demos.num_frames
@@ -377,9 +374,7 @@ class RealData(TestCase):
         compared = 0
         for name, _ in ARCHIVES:
             archive = read_demos(data_dir() / name)
-            for sequence in set(layout.sequence_name.tolist()) & set(
-                archive.sequence_name.tolist()
-            ):
+            for sequence in np.intersect1d(layout.sequence_name, archive.sequence_name):
                 compared += 1
                 a, b = (demos.select(names=[sequence]) for demos in (archive, layout))
                 for field in ("hand_side", "hand_valid"):

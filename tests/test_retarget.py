@@ -1,7 +1,5 @@
 """Retargeting: the solver, the hand, the arm, the validity of frames, and the whole pipeline."""
 
-import contextlib
-import io
 import json
 from dataclasses import replace
 from unittest import TestCase
@@ -11,11 +9,11 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from torch import tensor
 
+from tests.command import succeeds
 from tests.data import InOneFolder, data_dir
 from tests.toy_retarget import FLOAT, arm_targets, box_object, check_gradient, double, hand_targets
 from tests.toy_robot import toy_motion, toy_robot
 from xreset import read_retargeted, robots, synthesize, write_retargeted
-from xreset.cli.retarget import retarget as command
 from xreset.demos.archive import demo_objects, read_demos, write_demos
 from xreset.errors import DemoError, FileFormatError, RobotError
 from xreset.geometry.collision import table_clearance
@@ -96,14 +94,18 @@ class HandTest(TestCase):
         """[S, T, P] distance of the keypoints of a motion from others [m]."""
         return (self.model.keypoints(motion) - keypoints).norm(dim=-1)
 
-    def too_near(self, targets, state, config):
-        """What the clearance term acts on."""
+    def in_frames(self, targets, state):
+        """Links of the hand and objects in all frames."""
         turn = quat_to_matrix(targets.object_quat.flatten(0, 1))
         index = targets.object_index.repeat_interleave(12)
         objects = Objects(targets.object_pos.flatten(0, 1), turn, index, targets.fields)
+        return self.model.bodies(state.map(lambda x: x.flatten(0, 1))), objects
+
+    def too_near(self, targets, state, config):
+        """What the clearance term acts on."""
         limits = (config.object_clearance, config.self_depth)
-        bodies = self.model.bodies(state.map(lambda x: x.flatten(0, 1)))
-        return too_near(self.model, bodies, objects, targets.annotated.flatten(), *limits)
+        frames = self.in_frames(targets, state)
+        return too_near(self.model, *frames, targets.annotated.flatten(), *limits)
 
     def test_gradient_is_the_derivative_of_the_cost(self):
         """All terms at once: bones, alignment, contact (beyond and below the knee), object, smoothness, jumps."""
@@ -196,10 +198,9 @@ class HandTest(TestCase):
         mine = (number >= 0) & (number < len(balls.radii))
         ball = number[mine]
         frame = near.frame[mine]
-        bodies = self.model.bodies(motion.map(lambda x: x.flatten(0, 1)))
-        local = self.model.ball_centers(bodies, frame, ball)
-        local = local - targets.object_pos.flatten(0, 1)[frame]
-        distance, _ = targets.fields.signed_distance(local, torch.zeros_like(ball))
+        bodies, objects = self.in_frames(targets, motion)
+        centers = self.model.ball_centers(bodies, frame, ball)
+        distance, _ = objects.signed_distance(centers, frame)
         expected = distance - balls.radii[ball] - HandConfig().object_clearance
         assert_close(near.value[mine], expected, atol=1e-9, rtol=0)
 
@@ -317,12 +318,10 @@ class PipelineTest(InOneFolder):
         write_retargeted(self.folder / name, result)
         return self.folder / name
 
-    def commanded(self, name, robot, **configs):
+    def commanded(self, name, options):
         """What the command prints that retargets demonstrations."""
         out = self.folder / f"{name}-robot.npz"
-        with contextlib.redirect_stdout(io.StringIO()) as text:
-            command(self.folder / f"{name}.npz", robot=robot, out=out, **configs)
-        return text.getvalue()
+        return succeeds("retarget", f"{self.folder}/{name}.npz", "--out", out, *options.split())
 
     def test_most_frames_of_a_synthetic_demonstration_are_valid(self):
         seen = self.result.annotated[self.first]
@@ -343,8 +342,8 @@ class PipelineTest(InOneFolder):
         away = replace(away, hand_keypoints=away.hand_keypoints + np.float32(0.3))
         left = np.full(1, "left")
         write_demos(f"{self.folder}/away.npz", replace(away, hand_side=left))
-        configs = {"hand": HandConfig(tolerance=0.1), "arm": ArmConfig(restarts=1, branches=1)}
-        said = self.commanded("away", "ur7e-sharpa", **configs)
+        quick = "--robot ur7e-sharpa --hand.tolerance 0.1 --arm.restarts 1 --arm.branches 1"
+        said = self.commanded("away", quick)
         self.assertIn("In 1 of 1 sequences the object moves while no hand", said)
         self.assertIn("1 of 1 sequences are of left hands", said)
 
@@ -400,8 +399,8 @@ class PipelineTest(InOneFolder):
 
     def test_the_command_writes_a_file_for_a_gripper(self):
         write_demos(f"{self.folder}/demos.npz", self.demos.select(indices=[0]))
-        configs = {"hand": HandConfig(tolerance=0.002), "arm": ArmConfig(restarts=8)}
-        self.assertIn("005_toma", self.commanded("demos", "openarm", **configs))
+        options = "--robot openarm --hand.tolerance 0.002 --arm.restarts 8"
+        self.assertIn("005_toma", self.commanded("demos", options))
         with np.load(f"{self.folder}/demos-robot.npz") as file:
             used = json.loads(str(file["meta"]))["config"]["retarget"]
         self.assertEqual((used["hand"]["tolerance"], used["arm"]["restarts"]), (0.002, 8))

@@ -36,7 +36,7 @@ class SettleTest(TestCase):
         z = self.height
         pos = np.float32([[0.5, 0.3, z + 0.01], [0.57, 2.0, 0.3], [0.55, 0.25, z + 0.005]])
         quat = quat_of(tilted([[0], [0], [6]]))
-        bank = toy_bank(self.robot, start_pos=pos, start_quat_wxyz=quat.astype(np.float32))
+        bank = toy_bank(self.robot, start_pos=pos, start_quat_wxyz=quat)
         settled, at_rest = settle_starts(bank, self.robot, self.objects)
         self.assertEqual(at_rest.tolist(), [True, False, True])
         assert_array_equal(settled.start_pos[1], pos[1])  # it left the table

@@ -17,7 +17,7 @@ def in_this_process():
 
 
 def toy_bank(robot, **changes):
-    """The bank; ``changes`` replace fields.
+    """The bank; ``changes`` replace fields. Numbers are in single precision.
 
     Demonstrations 0 (soup), 1 (spam) and 2 (soup) start at x = 0.50, 0.51, 0.52 and end 0.2 higher, turned by 90 degrees about x. States:
     two of each, the second after first contact, and the object's x of state i is 0.6 + i / 100.
@@ -33,19 +33,19 @@ def toy_bank(robot, **changes):
         "robot_fingerprint": robot.fingerprint,
         "backends": ("mujoco",),
         "joint_names": robot.joint_names,
-        "joint_pos": (np.arange(6)[:, None] * 0.01 + np.arange(num) * 0.001).astype(np.float32),
-        "object_pos": np.stack([[0.6 + i / 100, 0.3, 0.15] for i in range(6)]).astype(np.float32),
-        "object_quat_wxyz": np.tile(upright, (6, 1)).astype(np.float32),
+        "joint_pos": np.arange(6)[:, None] * 0.01 + np.arange(num) * 0.001,
+        "object_pos": np.stack([[0.6 + i / 100, 0.3, 0.15] for i in range(6)]),
+        "object_quat_wxyz": np.tile(upright, (6, 1)),
         "object_name": owners[sequence],
         "sequence_index": sequence,
         "frame_index": np.array([3, 9, 4, 8, 5, 7], dtype=np.int32),
         "post_contact": np.array([False, True] * 3),
         "sequence_name": np.array(["demo_a", "demo_b", "demo_c"]),
         "sequence_object": owners,
-        "start_pos": start.astype(np.float32),
-        "start_quat_wxyz": np.tile(upright, (3, 1)).astype(np.float32),
-        "goal_pos": (start + np.array([0, 0, 0.2])).astype(np.float32),
-        "goal_quat_wxyz": np.tile(turned, (3, 1)).astype(np.float32),
+        "start_pos": start,
+        "start_quat_wxyz": np.tile(upright, (3, 1)),
+        "goal_pos": start + np.array([0, 0, 0.2]),
+        "goal_quat_wxyz": np.tile(turned, (3, 1)),
         "object_names": (SOUP, SPAM),
         "object_sources": ("stand-in", "stand-in"),
         "rejected_sequence_index": np.array([0, 1, 1], dtype=np.int32),
@@ -54,7 +54,10 @@ def toy_bank(robot, **changes):
         "rejected_reason": np.array([0, 1, 1], dtype=np.int32),
         "reason_names": ("out of bounds", "object linear velocity"),
     }
-    return ResetBank(**(fields | changes))
+    for name, value in (fields | changes).items():
+        is_double = isinstance(value, np.ndarray) and value.dtype == np.float64
+        fields[name] = value.astype(np.float32) if is_double else value
+    return ResetBank(**fields)
 
 
 def toy_retargeted(robot, objects, offsets, **changes):

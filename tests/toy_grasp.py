@@ -103,10 +103,10 @@ def bank():
         sequence_object=np.full(3, "brick"),
         object_names=("brick",),
         object_sources=("stand-in",),
-        start_pos=start_pos.astype(np.float32),
-        start_quat_wxyz=np.tile(quat, (3, 1)).astype(np.float32),
-        goal_pos=(start_pos + np.array([0, 0, RAISED])).astype(np.float32),
-        goal_quat_wxyz=np.tile(quat, (3, 1)).astype(np.float32),
+        start_pos=start_pos,
+        start_quat_wxyz=np.tile(quat, (3, 1)),
+        goal_pos=start_pos + np.array([0, 0, RAISED]),
+        goal_quat_wxyz=np.tile(quat, (3, 1)),
     )
 
 

@@ -46,9 +46,7 @@ def keypoints(angles: np.ndarray, side: str = "right") -> np.ndarray:
     return points * (-1.0, 1.0, 1.0) if side == "left" else points
 
 
-def placed(
-    pos: np.ndarray, rotation: Rotation, angles: np.ndarray, side: str = "right"
-) -> np.ndarray:
+def placed(pos: np.ndarray, rotation: Rotation, angles: np.ndarray, side: str) -> np.ndarray:
     """[n, 21, 3] keypoints of hands with wrist positions [n, 3], n orientations and joint angles [n, 17]."""
     turned = np.einsum("nij,nkj->nki", rotation.as_matrix(), keypoints(angles, side))
     return turned + pos[:, None]

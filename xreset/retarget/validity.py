@@ -72,6 +72,7 @@ def classify(measures: Measures, thresholds: Thresholds) -> Tensor:
     position = ~(measures.wrist_position <= thresholds.wrist_position)
     orientation = ~(measures.wrist_orientation <= thresholds.wrist_orientation)
     applies = {
+        "valid": torch.zeros_like(measures.annotated),
         "not annotated": ~measures.annotated,
         "hand error": ~(measures.hand_error <= thresholds.hand_error),
         "joint limit": (position | orientation) & measures.at_limit,
@@ -81,7 +82,5 @@ def classify(measures: Measures, thresholds: Thresholds) -> Tensor:
         "table collision": ~(measures.table_clearance >= -thresholds.table_depth),
         "self collision": ~(measures.self_clearance >= -thresholds.self_depth),
     }
-    reason = torch.zeros_like(measures.annotated, dtype=torch.long)
-    for index in range(len(REASONS) - 1, 0, -1):
-        reason[applies[REASONS[index]]] = index
-    return reason
+    # the first that applies, and where none does the row of valid frames
+    return torch.stack([applies[reason] for reason in REASONS]).long().argmax(dim=0)

@@ -52,12 +52,10 @@ def retarget_hand(
     config = config or HandConfig()
     home = targets.keypoints.device
     targets = targets.to(model.device)
+    human = _gaps_filled(targets)
     if model.is_jaw and config.jaw == "analytic":
-        rows = torch.arange(len(targets.annotated), device=model.device)[:, None]
-        return jaw_state(model, targets.keypoints[rows, _nearest_annotated(targets.annotated)]).to(
-            home
-        )
-    root_pos, root_quat = _align_root(model, targets)
+        return jaw_state(model, human).to(home)
+    root_pos, root_quat = _align_root(model, human)
     joints = model.kinematics.clamp(model.home).expand(*targets.annotated.shape, -1)
     state = HandState(joints, root_pos, root_quat)
     if config.clearance_weight:
@@ -88,10 +86,9 @@ def _minimize(
     return minimize(start, evaluate, step, done, config.iterations)
 
 
-def _align_root(model: HandModel, targets: HandTargets) -> tuple[Tensor, Tensor]:
-    """Return a first guess of the root: the rigid motion of the hand's keypoints at home onto the human's (Kabsch's
-    method)."""
-    human = targets.keypoints
+def _align_root(model: HandModel, human: Tensor) -> tuple[Tensor, Tensor]:
+    """Return a first guess of the root: the rigid motion of the hand's keypoints at home onto the human's [S, T, P, 3]
+    (Kabsch's method)."""
     center_home = model.at_home.mean(0)
     center_human = human.mean(-2, keepdim=True)
     U, _, Vt = torch.linalg.svd((human - center_human).mT @ (model.at_home - center_home))
@@ -99,18 +96,23 @@ def _align_root(model: HandModel, targets: HandTargets) -> tuple[Tensor, Tensor]
     flip[..., 2] = torch.det(U) * torch.det(Vt)
     rot = (U * flip[..., None, :]) @ Vt
     pos = center_human[..., 0, :] - matvec(rot, center_home)
-    nearest = _nearest_annotated(targets.annotated)
-    rows = torch.arange(len(nearest), device=nearest.device)[:, None]
-    return pos[rows, nearest], matrix_to_quat(rot)[rows, nearest]
+    return pos, matrix_to_quat(rot)
 
 
-def _nearest_annotated(annotated: Tensor) -> Tensor:
-    """[S, T] index of the annotated frame that is nearest in time; ``ValueError`` if a sequence has none."""
+def _gaps_filled(targets: HandTargets) -> Tensor:
+    """[S, T, P, 3] human keypoints; frames that are not annotated have those of the nearest annotated frame.
+
+    Raises:
+        ValueError: a sequence has no annotated frame.
+    """
+    annotated = targets.annotated
     if not annotated.any(dim=1).all():
         raise ValueError("A sequence has no annotated frame. Select sequences that have one.")
     time = torch.arange(annotated.shape[1], device=annotated.device)
     distance = (time[:, None] - time).abs().expand(len(annotated), -1, -1)
-    return distance.masked_fill(~annotated[:, None, :], len(time) * 2).argmin(dim=-1)
+    nearest = distance.masked_fill(~annotated[:, None, :], len(time) * 2).argmin(dim=-1)
+    rows = torch.arange(len(annotated), device=annotated.device)[:, None]
+    return targets.keypoints[rows, nearest]
 
 
 def _moved(model: HandModel, state: HandState, step: Tensor) -> HandState:

@@ -11,12 +11,13 @@ from numpy.testing import assert_allclose
 from torch import tensor
 from torch.testing import assert_close
 
-from tests import toy_grasp
+from tests import toy_grasp, toy_results
 from tests.command import printed, refused
 from tests.data import InFolder
 from tests.engine_checks import JOINT, with_drive
 from tests.toy_bank import SOUP, SPAM
 from tests.toy_grasp import recording
+from xreset import robots
 from xreset.errors import DemoError, FileFormatError, XResetError
 from xreset.eval.engines.actions import (
     Actions,
@@ -33,7 +34,6 @@ from xreset.eval.engines.replay import (
     sentences,
     trace,
 )
-from xreset.eval.results import write_results
 from xreset.eval.rollout import engine, roll_out
 from xreset.eval.setting import Place
 from xreset.geometry.rotations import quat_from_axis_angle
@@ -267,7 +267,7 @@ class ActionsTest(InFolder):
             read_actions(self.path, robot, lambda _: thing)
 
 
-class EvaluationTest(InFolder):
+class EvaluationTest(toy_results.InFolder):
     """Actions that an evaluation has recorded."""
 
     @classmethod
@@ -300,18 +300,14 @@ class EvaluationTest(InFolder):
             assert_allclose(found, getattr(self.episode, name)[1:], atol=1e-6)
 
     def test_from_files(self):
-        from tests.toy_results import toy_rollouts, toy_summary
-        from xreset import robots
-
         robot = robots.load("openarm")
-        made = toy_rollouts(robot.home)
+        made = toy_results.toy_rollouts(robot.home)
 
         def load(episode, thing=None, **changes):
             """The actions of an evaluation whose traces have some changes."""
             rollouts = replace(made, traces=tuple(replace(t, **changes) for t in made.traces))
-            summary = toy_summary("sapien", rollouts, robot="openarm")
-            write_results(self.folder, summary, rollouts, robot.joint_names)
-            return from_file(self.folder / "sapien.trace.npz", Place(), thing, episode)
+            self.write_results("", rollouts, ("sapien",), robot.joint_names, robot="openarm")
+            return from_file(self.folder / "eval" / "sapien.trace.npz", Place(), thing, episode)
 
         actions = load(0, SPAM)
         self.assertEqual(

@@ -184,7 +184,10 @@ class ProgressTest(Compared):
         mean = line([a, b], "task/success", "iterations")["mean"]
         assert_allclose(mean, [0.1, 0.4, 0.6], atol=1e-12)
         self.assertIsNone(line([a, b], "task/other", "minutes"))
-        assert_allclose(line([b], "task/success", "minutes").T, [[0.2, 0.6, 0.8]] * 3)
+        broken = self.training("a", curves_of((60.0,) * 2, (np.nan, np.nan)))
+        for members in ([b], [b, broken]):
+            found = line(members, "task/success", "minutes")
+            assert_allclose(found.T, [[0.2, 0.6, 0.8]] * 3)
 
 
 class LiftTest(Compared):

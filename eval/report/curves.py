@@ -60,17 +60,16 @@ def line(members: Sequence[Training], tag: str, x: X) -> Table | None:
     """
     curves = []
     for training in members:
-        if tag in training.curves:
-            values = training.curves[tag].dropna()
+        values = training.curves.get(tag, pd.Series()).dropna()
+        if len(values):  # a training that broke down logs no number
             done = amounts(training, x)
             curves.append((np.interp(values.index, done.index, done), values))
     if not curves:
         return None
     at = max((own for own, _ in curves), key=len)
-    if len(curves) > 1:
-        start = max(own[0] for own, _ in curves)
-        end = min(own[-1] for own, _ in curves)
-        at = at[(at >= start) & (at <= end)]
+    start = max(own[0] for own, _ in curves)
+    end = min(own[-1] for own, _ in curves)
+    at = at[(at >= start) & (at <= end)]
     values = np.stack([np.interp(at, own, value) for own, value in curves])
     return pd.DataFrame(
         {"mean": values.mean(axis=0), "low": values.min(axis=0), "high": values.max(axis=0)},

@@ -15,6 +15,7 @@ from torch import tensor
 
 from tests.command import succeeds
 from tests.data import DEFAULT, InFolder
+from tests.toy_robot import ROBOTS
 from xreset import load_object, load_robot, make_backend
 from xreset.errors import BackendUnavailableError, RobotError
 from xreset.geometry.collision import table_clearance
@@ -63,59 +64,10 @@ def _hand(*fingers):
 
 HAND = _hand(*map(_finger, _PLACES))
 
-ARM = '<robot name="arm"><link name="base"><collision><geometry><cylinder radius="0.06" length="0.1"/></geometry></collision></link>'
-for _number, (_xyz, _axis) in enumerate(
-    [
-        ("0 0 0.15", "0 0 1"),
-        ("0 0 0.1", "0 1 0"),
-        ("0 0 0.4", "0 1 0"),
-        ("0 0 0.2", "0 0 1"),
-        ("0 0 0.2", "0 1 0"),
-        ("0 0 0.1", "0 0 1"),
-    ]
-):
-    ARM += f"""<link name="l{_number}"><inertial><mass value="2"/><origin xyz="0 0 0.03"/>
-      <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>
-      <collision><origin xyz="0 0 0.03"/><geometry><cylinder radius="0.03" length="0.05"/></geometry></collision></link>
-      <joint name="j{_number}" type="revolute"><parent link="{f"l{_number - 1}" if _number else "base"}"/><child link="l{_number}"/>
-      <origin xyz="{_xyz}"/><axis xyz="{_axis}"/><limit lower="-2.9" upper="2.9" effort="60" velocity="3"/></joint>"""
-ARM += "</robot>"
-
-_MJCF_FINGER = """<body name="{0}_a" pos="{1}" euler="{2}"><inertial pos="0.02 0 0" mass="0.05" diaginertia="1e-5 1e-5 1e-5"/>
-  <joint name="{0}_1" axis="0 1 0" range="0 1.5"/><geom type="box" pos="0.02 0 0" size="0.018 0.007 0.007"/>
-  <body name="{0}_b" pos="0.045 0 0"><inertial pos="0.02 0 0" mass="0.03" diaginertia="1e-5 1e-5 1e-5"/>
-  <joint name="{0}_2" axis="0 1 0" range="0 1.5"/><geom type="box" pos="0.02 0 0" size="0.018 0.007 0.007"/></body></body>"""
-MJCF = (
-    '<mujoco model="hand"><compiler angle="radian" eulerseq="XYZ"/><worldbody><body name="base">'
-    '<inertial pos="0.04 0 0" mass="0.4" diaginertia="3e-4 3e-4 5e-4"/><geom type="box" pos="0.04 0 0" size="0.04 0.04 0.01"/>'
-    + "".join(
-        _MJCF_FINGER.format(name, "{} {} {}".format(*xyz), rpy)
-        for name, (xyz, rpy) in _PLACES.items()
-    )
-    + "</body></worldbody><equality>"
-    + "".join(
-        f'<joint joint1="{name}_2" joint2="{name}_1" polycoef="0.1 0.8 0 0 0"/>' for name in _PLACES
-    )
-    + '</equality><actuator><position joint="f1_1" kp="3" kv="0.2" forcerange="-2 2"/></actuator></mujoco>'
-)
-
-
-_SIDE = """<body name="{0}_arm" pos="0 0.02 0.05" {1}><inertial pos="0 0.01 0" mass="0.02" diaginertia="1e-5 1e-5 1e-5"/>
-  <joint name="{0}_crank" axis="1 0 0" range="0 0.8"/><geom type="box" pos="0 0.02 0.015" size="0.005 0.02 0.004"/>
-  <body name="{0}_pad" pos="0 0.04 0.03"><inertial pos="0 0 0.02" mass="0.02" diaginertia="1e-5 1e-5 1e-5"/>
-  <joint name="{0}_finger" axis="1 0 0" range="-1 1"/><geom type="box" pos="0 0 0.025" size="0.01 0.004 0.02"/></body></body>
-  <body name="{0}_rod" pos="0 {2} 0.07" {1}><inertial pos="0 0.01 0" mass="0.02" diaginertia="1e-5 1e-5 1e-5"/>
-  <joint name="{0}_rocker" axis="1 0 0" range="-1 1"/><geom type="capsule" fromto="0 0 0 0 0.03 0.02" size="0.004"/></body>"""
-JAW = (
-    '<mujoco model="jaw"><compiler angle="radian"/><worldbody><body name="mount"><geom type="box" pos="0 0 0.02" '
-    'size="0.03 0.03 0.02"/>'
-    + _SIDE.format("l", "", 0.02)
-    + _SIDE.format("r", 'quat="0 0 0 1"', -0.02).replace('pos="0 0.02 0.05"', 'pos="0 -0.02 0.05"')
-    + '</body></worldbody><equality><connect name="left" body1="l_rod" body2="l_pad" anchor="0 0.04 0.03"/>'
-    '<connect name="right" body1="r_rod" body2="r_pad" anchor="0 0.04 0.03"/>'
-    '<joint joint1="r_crank" joint2="l_crank"/></equality>'
-    '<actuator><position joint="l_crank" kp="20" forcerange="-5 5"/></actuator></mujoco>'
-)
+ARM = (ROBOTS / "arm.urdf").read_text()
+MJCF = (ROBOTS / "hand.xml").read_text()
+"""The same hand, but for one actuator."""
+JAW = (ROBOTS / "jaw.xml").read_text()
 """Two fingers on parallelograms: rods that are pinned to the pads keep these parallel."""
 
 

@@ -199,9 +199,10 @@ def compare(
 
 def _print(result: agreement.Parity) -> None:
     columns = (result.floor, *result.engines)
-    holds = [flags for name, flags in result.reference.carried.items() if name != "closing"]
-    held = sum(map(sum, holds))
-    tried = sum(map(len, holds))
+    holds = dict(result.reference.carried)
+    closings = holds.pop("closing")
+    held = sum(map(sum, holds.values()))
+    tried = sum(map(len, holds.values()))
     reference = result.reference.backend
     heads = [f"{tested.backend}\n{tested.version}, {tested.device}" for tested in columns]
     table: list[tuple[str | Text, ...]] = [(f"against {reference}", "target", *heads)]
@@ -213,7 +214,6 @@ def _print(result: agreement.Parity) -> None:
             number = (_number(metric.measured, metric.unit), style)
             cells.append(Text.assemble(number, f" (n = {metric.n})"))
         table.append((row.metric, f"{row.sense} {_number(row.target, row.unit)}", *cells))
-    closings = result.reference.carried["closing"]
     grasps = (
         f"{result.robot}, {len(result.objects)} objects: {len(closings)} closings, {tried} holds"
     )

@@ -78,7 +78,7 @@ def link_places(spec: RobotSpec, positions: dict[str, float]) -> dict[str, np.nd
     )
     poses = kinematics.link_poses(kinematics.clamp(q)).numpy()
     root = np.linalg.inv(poses[kinematics.link_index(spec.hand_root)])
-    return {name: root @ poses[kinematics.link_index(name)] for name in kinematics.link_names}
+    return dict(zip(kinematics.link_names, root @ poses, strict=True))
 
 
 def description_text(spec: RobotSpec, notes: Sequence[str]) -> str:

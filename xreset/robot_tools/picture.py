@@ -22,8 +22,7 @@ def robot_picture(robot: RobotSpec) -> np.ndarray:
     fingertips (left) and of the links that follow the human's keypoints (right). x is red, y green, z blue.
     """
     kinematics = Kinematics(robot)
-    poses = kinematics.link_poses(kinematics.home, robot.tracked_links).numpy()
-    points = poses[:, :3, 3]
+    points = kinematics.points(kinematics.home, robot.tracked_links).numpy()
     middle = points.mean(axis=0)
     distance = max(3.0 * np.ptp(points, axis=0).max(), 0.25)
     moving = list(kinematics.tree.moved_by)

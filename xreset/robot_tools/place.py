@@ -182,9 +182,9 @@ def _candidates(
 ) -> list[RobotSpec]:
     """Return the candidates of a round: first evenly over the ranges, then around the elite."""
     own = _parameters(robot)[4]
-    least_tilt, most_tilt = config.tilt or (own, own)
-    low = np.array([config.x[0], config.y[0], config.z[0], -180.0, least_tilt, -180.0])
-    high = np.array([config.x[1], config.y[1], config.z[1], 180.0, most_tilt, 180.0])
+    tilt = config.tilt or (own, own)
+    turn = (-180.0, 180.0)
+    low, high = np.array([config.x, config.y, config.z, turn, tilt, turn]).T
     spread = (high - low) / 4 * _SHRINK**number
     centers = [_parameters(candidate) for candidate in elite]
     bounded = [0, 1, 2, 4]  # all but the angles that go round

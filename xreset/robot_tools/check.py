@@ -94,7 +94,8 @@ def check(name_or_folder: str | Path) -> list[Finding]:
     )
     if any(finding.level == "error" for finding in found):
         return [*found, Finding("skipped", "home", "fix the errors above first")]
-    q = _around_home(spec)
+    kinematics = Kinematics(spec)
+    q = _around_home(kinematics)
     found += _topic("drives", _drives(spec), "damping ratios at home are between 0.5 and 5")
     found += _topic(
         "frames", _frames(spec, tree), "the palm frame is in the palm, and looks along the fingers"
@@ -102,8 +103,8 @@ def check(name_or_folder: str | Path) -> list[Finding]:
     found += _topic(
         "fingers", _fingers(spec, tree), "no fingertip opposes the others more than the thumb"
     )
-    found += _topic("home and table", _above_table(spec, q))
-    found += _topic("home and self", _free_of_itself(spec, q))
+    found += _topic("home and table", _above_table(kinematics, q))
+    found += _topic("home and self", _free_of_itself(kinematics, q))
     found += _topic("retargeting", _size(spec))
     return found
 
@@ -308,18 +309,18 @@ def _thumb(spec: RobotSpec) -> Problems:
         )
 
 
-def _around_home(spec: RobotSpec) -> torch.Tensor:
+def _around_home(kinematics: Kinematics) -> torch.Tensor:
     """[1 + samples, J] home, and joint positions spread around it as at the start of episodes."""
-    home = torch.tensor(spec.home)
-    spread = torch.tensor(np.where(spec.is_arm, *spec.home_std))
+    home = kinematics.home
+    spread = torch.tensor(np.where(kinematics.robot.is_arm, *kinematics.robot.home_std))
     noise = torch.randn(
         _SAMPLES, len(home), generator=torch.Generator().manual_seed(0), dtype=home.dtype
     )
-    return torch.cat((home[None], Kinematics(spec).clamp(home + spread * noise)))
+    return torch.cat((home[None], kinematics.clamp(home + spread * noise)))
 
 
-def _above_table(spec: RobotSpec, q: torch.Tensor) -> Problems:
-    height = table_clearance(Kinematics(spec), q, TableSpec())
+def _above_table(kinematics: Kinematics, q: torch.Tensor) -> Problems:
+    height = table_clearance(kinematics, q, TableSpec())
     share = float((height < 0).double().mean())
     level: Level = "ok"
     if height[0] < 0:
@@ -332,8 +333,7 @@ def _above_table(spec: RobotSpec, q: torch.Tensor) -> Problems:
     yield level, f"{lowest}; {100 * share:.0f} % of the spread below it"
 
 
-def _free_of_itself(spec: RobotSpec, q: torch.Tensor) -> Problems:
-    kinematics = Kinematics(spec)
+def _free_of_itself(kinematics: Kinematics, q: torch.Tensor) -> Problems:
     collision = SelfCollision(kinematics)
     for pair in collision.overlapping_at_home:
         yield (

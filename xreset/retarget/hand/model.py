@@ -225,14 +225,14 @@ def keypoint_pairs(names: Sequence[str], links: Sequence[str]) -> list[tuple[int
 
     Any subset of the 21 keypoints will do. Pairs on the same link carry no information and are omitted.
     """
-    wrist = [i for i, name in enumerate(names) if name == "wrist"]
+    from_base = sorted(range(len(names)), key=names.__getitem__)
+    wrist = [i for i in from_base if names[i] == "wrist"]
     fingers = []
-    for finger in FINGERS:
-        own = [i for i, name in enumerate(names) if name.startswith(finger)]
-        fingers.append(sorted(own, key=lambda i: names[i]))  # base to tip
     pairs = []
-    for finger in fingers:
-        pairs += pairwise(wrist + finger)
+    for finger in FINGERS:
+        own = [i for i in from_base if names[i].startswith(finger)]
+        fingers.append(own)
+        pairs += pairwise(wrist + own)
     thumb = fingers[0]
     others = [finger for finger in fingers[1:] if finger]
     for left, right in pairwise(others):

@@ -203,11 +203,13 @@ class TrainingTest(WithBank):
                     self.assertTrue(value.isfinite().all())
 
     def test_the_same_ctrl_c_told_twice_is_one(self):
-        with _stop_on_interrupt() as stop:
+        with _stop_on_interrupt(say=True) as stop, patch("os.write") as written:
             self.assertFalse(stop)
             os.kill(os.getpid(), signal.SIGINT)
             os.kill(os.getpid(), signal.SIGTERM)
             self.assertEqual(len(stop), 2)
+            written.assert_called_once()
+            self.assertIn(b"stopping after this iteration", written.call_args.args[1])
             stop[0] -= 60.0
             with self.assertRaises(KeyboardInterrupt):
                 os.kill(os.getpid(), signal.SIGINT)
@@ -229,7 +231,8 @@ class TrainingTest(WithBank):
         stopped = newest(out).iteration
         self.assertGreater(stopped, 0)
         self.assertEqual(latest_checkpoint(out).name, f"{stopped:06d}.pt")
-        self.resume(out, minutes=0.1 / 60)
+        said = self.resume(out, minutes=0.1 / 60)
+        self.assertIn(f"To continue: xreset train --out {out} --resume", said)
         done = newest(out).iteration
         self.assertGreater(done, stopped)
         self.resume(out, iterations=done + 1)

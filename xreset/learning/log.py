@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections import deque
 from pathlib import Path
@@ -139,4 +140,7 @@ class TrainingLog:
             self._online.finish()
         self.write_lift()
         if stopped:
-            print("stopped after the current iteration; a checkpoint is written.")
+            print(
+                "stopped after the current iteration; a checkpoint is written. To continue: "
+                f"xreset train --out {shlex.quote(str(self._folder))} --resume"
+            )

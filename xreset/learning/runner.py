@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+import os
 import signal
 import time
 from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -109,7 +110,7 @@ class TrainingRunner:
         steps = self.config.ppo.horizon * env.num_envs * self.processes.count
         earlier = self.elapsed
         begin = time.perf_counter()
-        with _stop_on_interrupt() as requests:
+        with _stop_on_interrupt(say=self.processes.is_main) as requests:
             while self.iteration < total:
                 if self._agreed(bool(requests) or time.perf_counter() - begin > seconds):
                     break
@@ -258,14 +259,27 @@ _SAME_REQUEST = 2.0
 """[s] within which signals are one request: under torchrun, Ctrl-C arrives from the terminal and from torchrun."""
 
 
+_STOPPING = (
+    b"\nstopping after this iteration. Ctrl-C again stops at once, without a new checkpoint.\n"
+)
+"""What standard error says after the first request."""
+
+
 @contextmanager
-def _stop_on_interrupt() -> Iterator[list[float]]:
-    """Yield the times of requests to stop (Ctrl-C or SIGTERM). A second request interrupts at once."""
+def _stop_on_interrupt(*, say: bool = False) -> Iterator[list[float]]:
+    """Yield the times of requests to stop (Ctrl-C or SIGTERM). A second request interrupts at once.
+
+    Args:
+        say: whether the first request is answered on standard error, because an iteration may take minutes.
+    """
     requests = []
 
     def ask(_number: int, _frame: Any) -> None:
         if requests and time.monotonic() - requests[0] > _SAME_REQUEST:
             raise KeyboardInterrupt
+        if say and not requests:
+            with suppress(OSError):  # print may be what the signal has interrupted
+                os.write(2, _STOPPING)
         requests.append(time.monotonic())
 
     try:

@@ -7,7 +7,7 @@ import math
 import re
 from dataclasses import asdict, replace
 from unittest import TestCase
-from unittest.mock import Mock, patch
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -16,10 +16,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 from torch import tensor
 
+from tests import toy_grasp
 from tests.data import InFolder
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_results import OBJECTS, toy_rollouts, toy_summary
-from xreset import PolicySpec, TaskConfig, evaluate, load_object, load_policy
+from xreset import evaluate, load_object, load_policy
 from xreset.checks import from_dict
 from xreset.errors import FileFormatError, PolicyError, XResetError
 from xreset.eval.metrics import EpisodeMetrics, MetricPoints
@@ -301,9 +302,7 @@ class ResultsTest(InFolder):
         self.rollouts = toy_rollouts()
         for name in ("sapien", "mujoco"):
             write_results(self.folder, toy_summary(name), self.rollouts, JOINTS)
-        self.policy = PolicySpec(
-            name="zero", start=Mock(), robot=Mock(), task=TaskConfig(), folder=self.folder
-        )
+        self.policy = replace(toy_grasp.policy(), folder=self.folder)
 
     def test_the_table_tells_trained_objects_from_unseen_ones(self):
         summary = toy_summary(unseen=(OBJECTS[1],))

@@ -120,6 +120,13 @@ class Arrays(Case):
 
 @skipUnless(PARQUET, "pyarrow is not installed")
 class LeRobot(Case):
+    def films(self, **options):
+        """The episodes of one engine, and a data set with small films of them."""
+        recording = read_recorded([self.evaluate()], backends=["sapien"])
+        root = self.folder / "set"
+        write_lerobot(root, recording, size=(64, 48), **options)
+        return recording, root
+
     def test_meta_agrees_with_the_data(self):
         import pyarrow.parquet as parquet
 
@@ -174,9 +181,7 @@ class LeRobot(Case):
 
     @skipUnless(FILMS, "there is no encoder of films")
     def test_films_of_depth_cameras(self):
-        recording = read_recorded([self.evaluate()], backends=["sapien"])
-        root = self.folder / "set"
-        write_lerobot(root, recording, size=(64, 48), cameras=("side",))
+        _, root = self.films(cameras=("side",))
         films = sorted(path.parts[-3] for path in root.rglob("*.mp4"))
         self.assertEqual(
             films, ["observation.images.depth_side"] * 2 + ["observation.images.front"] * 2
@@ -189,9 +194,7 @@ class LeRobot(Case):
     def test_the_package_reads_it_back(self):
         from lerobot.datasets.lerobot_dataset import LeRobotDataset  # pyright: ignore[reportMissingImports]
 
-        recording = read_recorded([self.evaluate()], backends=["sapien"])
-        root = self.folder / "set"
-        write_lerobot(root, recording, size=(64, 48))
+        recording, root = self.films()
         found = LeRobotDataset(
             "xreset/test", root=root, delta_timestamps={"action": [0.0, 0.05]}, video_backend="pyav"
         )

@@ -1,13 +1,15 @@
 """Choosing among checkpoints: the best in its worst engine, what is played for it, and what the choice does afterwards."""
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 from unittest.mock import Mock, patch
 
+from tests import toy_grasp
 from tests.command import refused
 from tests.data import InFolder
 from tests.toy_results import episodes
-from xreset import PolicySpec, TaskConfig, evaluate
+from xreset import evaluate
 from xreset.errors import FileFormatError, PolicyError, RunError
 from xreset.eval.engines.attribution import attribute
 from xreset.eval.select import SEED, candidates_in, select
@@ -78,14 +80,7 @@ class SelectTest(InFolder):
 
     def test_the_starts_that_decided_are_not_reported(self):
         choice = self.choose()
-        policy = PolicySpec(
-            name="p",
-            start=Mock(),
-            robot=Mock(),
-            task=TaskConfig(),
-            folder=self.folder / "eval",
-            selection_seed=choice.seed,
-        )
+        policy = replace(toy_grasp.policy(), selection_seed=choice.seed)
         trial = Mock(seed=SEED)
         for measure in (
             lambda: evaluate(policy, self.demos, [], seed=SEED),

@@ -67,6 +67,10 @@ def wave_actions():
     return replace(actions, start=start, joint_target=(home + step).expand(30, -1).clone())
 
 
+def no_force():
+    return torch.zeros(20, 1, 2, 3)
+
+
 def assert_near(found, expected):
     assert_allclose(np.array(found, dtype=float), expected, atol=1e-6)
 
@@ -99,20 +103,20 @@ class DivergenceTest(TestCase):
         assert_near((d.time, d.largest), (6 * DT, 0.03))
 
     def test_contacts_must_differ_for_a_while_and_name_the_finger(self):
-        force = torch.zeros(20, 1, 2, 3)
-        other = torch.zeros(20, 1, 2, 3)
+        force = no_force()
+        other = no_force()
         force[4, 0, 0] = tensor([0.0, 0.0, 0.2])  # the thumb flickers: too little over 50 ms
         other[9:, 0, 1, 0] = 1.0  # the index finger touches in the reference only
         d = compare(recording(tip_force=force), recording(tip_force=other))["contacts"]
         self.assertEqual(d.where, "index does not touch")
         self.assertAlmostEqual(d.time, 10 * DT)
-        short = torch.zeros(20, 1, 2, 3)
+        short = no_force()
         short[18:, 0, 0, 2] = 1.0  # two steps: shorter than 50 ms
         self.assertIsNone(compare(recording(tip_force=short), recording())["contacts"].time)
 
     def test_forces_are_averaged_and_their_direction_does_not_count(self):
-        force = torch.zeros(20, 1, 2, 3)
-        other = torch.zeros(20, 1, 2, 3)
+        force = no_force()
+        other = no_force()
         force[:, 0, 0, 2] = 5.0
         other[:, 0, 0, 0] = 5.0
         force[10, 0, 1, 2] = 5.0  # one step of 5 N is 5 / 3 N over 50 ms

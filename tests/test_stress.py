@@ -76,27 +76,23 @@ class CurveTest(InFolder):
     def test_the_limit_lies_between_two_values_that_were_tried(self):
         base = [1.0, 0.6, 0.8, 0.8]
 
-        def swept(option, **changes):
+        def swept(option, changes):
             """The curve of a property; at each value every episode changes by so much."""
-            (prop,) = chosen([f"{option}={','.join(value[1:] for value in changes)}"])
+            (prop,) = chosen([option])
             found = {}
             for value, change in changes.items():
-                found[float(value[1:])] = episodes(
-                    [p + c for p, c in zip(base, np.broadcast_to(change, 4), strict=True)]
-                )
+                found[value] = episodes(np.add(base, change).tolist())
             return curve(prop, episodes(base), found)
 
-        stiffness = swept(
-            "arm-stiffness", **{"v0.5": -0.3, "v0.8": -0.05, "v1.5": -0.02, "v2.0": -0.08}
-        )
+        stiffness = swept("arm-stiffness", {0.5: -0.3, 0.8: -0.05, 1.5: -0.02, 2.0: -0.08})
         self.assertEqual([p.value for p in stiffness.points], [0.5, 0.8, 1.0, 1.5, 2.0])
         self.assertAlmostEqual(stiffness.lower, 0.8 - 0.3 * 0.05 / 0.25)
         self.assertIsNone(stiffness.upper)
         assert_allclose(stiffness.points[0].difference_ci95, (-0.3, -0.3), atol=1e-9)
         self.assertEqual(stiffness.costs(), "x 0.74")
-        late = swept("action-latency", **{"v1.0": -0.15, "v2.0": -0.3})
-        harmless = swept("object-mass", **{"v0.5": 0.0, "v2.0": 0.0})
-        scattered = swept("force-gain", **{"v2.0": [-0.6, -0.6, 0.2, 0.2]})
+        late = swept("action-latency", {1.0: -0.15, 2.0: -0.3})
+        harmless = swept("object-mass", {0.5: 0.0, 2.0: 0.0})
+        scattered = swept("force-gain", {2.0: [-0.6, -0.6, 0.2, 0.2]})
         self.assertEqual(
             (scattered.loses_beyond(scattered.upper), stiffness.loses_beyond(stiffness.lower)),
             (False, True),

@@ -2,7 +2,8 @@
 
 import json
 from dataclasses import replace
-from unittest import TestCase
+from importlib.util import find_spec
+from unittest import TestCase, skipUnless
 from unittest.mock import patch
 
 import numpy as np
@@ -33,27 +34,23 @@ WIDE = toy_grasp.OPEN + 0.03
 """A jaw position 30.1 mm from the brick."""
 
 
-def retargeted(joint_pos, object_pos, offsets=None, **changes):
-    """Trajectories of the gripper and the brick, given by joints [F, J] and the brick's positions [F, 3]."""
-    frames = len(joint_pos)
-    offsets = offsets or [0, frames]
-    links = [tip.link for tip in ROBOT.fingertips]
-    values = {
-        "joint_pos": joint_pos,
-        "fingertip_pos": Kinematics(ROBOT).points(torch.as_tensor(joint_pos), links).numpy(),
-        "object_pos": object_pos,
-        "object_quat_wxyz": np.tile(toy_grasp.brick_pose()[1], (frames, 1)),
-    }
-    return toy_retargeted(ROBOT, ["brick"] * (len(offsets) - 1), offsets, **(values | changes))
-
-
 def grasp_and_lift():
-    """Three frames: jaws 30.1 mm from the brick; 0.1 mm from it; and that 4 cm higher."""
+    """Three frames of gripper and brick: jaws 30.1 mm from it; 0.1 mm from it; and that 4 cm higher."""
     joints = np.tile(ROBOT.home, (3, 1))
     joints[:, JAW] = WIDE, toy_grasp.OPEN, toy_grasp.OPEN
     joints[2, LIFT] += toy_grasp.RAISED
-    pos = toy_grasp.brick_pose()[0] + np.array([[0, 0, 0], [0, 0, 0], [0, 0, toy_grasp.RAISED]])
-    return retargeted(joints, pos, first_contact=np.array([1]))
+    pos, quat = toy_grasp.brick_pose()
+    links = [tip.link for tip in ROBOT.fingertips]
+    return toy_retargeted(
+        ROBOT,
+        ["brick"],
+        [0, 3],
+        joint_pos=joints,
+        fingertip_pos=Kinematics(ROBOT).points(torch.as_tensor(joints), links).numpy(),
+        object_pos=pos + np.array([[0, 0, 0], [0, 0, 0], [0, 0, toy_grasp.RAISED]]),
+        object_quat_wxyz=np.tile(quat, (3, 1)),
+        first_contact=np.array([1]),
+    )
 
 
 def toy_fingers(states, links, **changes):
@@ -75,9 +72,8 @@ class ClosingTest(TestCase):
         joints = ROBOT.home + 0.01 * np.random.default_rng(0).normal(size=(10, len(ROBOT.joints)))
         tips = np.arange(10)[:, None, None] * [[0.012, 0, 0], [0, 0.004, 0]]
         turned = quat_of(Rotation.from_rotvec(0.2 * np.arange(10)[:, None] * [0, 0, 1]))
-        pos = np.tile([0.5, 0.3, 0.1], (10, 1))
-        changes = {"fingertip_pos": tips, "object_quat_wxyz": turned}
-        self.data = retargeted(joints, pos, [0, 5, 10], **changes)
+        changes = {"joint_pos": joints, "fingertip_pos": tips, "object_quat_wxyz": turned}
+        self.data = toy_retargeted(ROBOT, ["brick", "brick"], [0, 5, 10], **changes)
         self.gap = np.full((10, 2), 0.03)
 
     def states(self, data=None, **config):
@@ -264,12 +260,9 @@ class TargetsTest(InFolder):
         assert_close(chosen.joint_target, chosen.joint_pos + 0.25)
 
 
+@skipUnless(find_spec("mujoco"), "MuJoCo is not installed")
 class CommandTest(InFolder):
     def setUp(self):
-        try:
-            import mujoco  # noqa: F401  # pyright: ignore[reportMissingImports]
-        except ImportError as error:
-            self.skipTest(str(error))
         super().setUp()
         self.enterContext(patch("xreset.inputs.load_robot", lambda _: ROBOT))
         self.enterContext(in_this_process())

@@ -1,6 +1,5 @@
 """Goal sets: starts at rest, goals of each family within reach, and what is refused."""
 
-from dataclasses import replace
 from unittest import TestCase, mock
 
 import numpy as np
@@ -108,13 +107,7 @@ class UsedTest(InFolder):
         self.assertEqual(npz_schema(f"{self.folder}/goals.npz"), SCHEMA)
         assert_array_equal(read_goals(f"{self.folder}/goals.npz").family, goals.family)
         policy = load_policy("zero", robot="ur7e-sharpa")
-        policy = replace(
-            policy,
-            task=replace(
-                policy.task, termination=replace(policy.task.termination, episode_seconds=0.1)
-            ),
-        )
-        trial = load_trial(policy, self.folder / "goals.npz")
+        trial = load_trial(policy, self.folder / "goals.npz", episode_seconds=0.1)
         rollouts = roll_out(policy.start(None), engine("mujoco", workers=0), trial, repetitions=1)
         self.assertEqual([e.sequence_name for e in rollouts.episodes], goals.sequence_name.tolist())
         for i, trace in enumerate(rollouts.traces):

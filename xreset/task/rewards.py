@@ -13,8 +13,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from pkgutil import resolve_name
-from typing import cast
+from importlib import import_module
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -96,8 +96,9 @@ def own_term(name: str) -> OwnTerm:
     Raises:
         RunError: the module cannot be imported, or has no such function.
     """
+    module, _, function = name.partition(":")
     try:
-        found = resolve_name(name)
+        found: Any = getattr(import_module(module), function)
     except Exception as error:  # a user's module may fail in any way
         reason = f"{type(error).__name__}: {error}"
         raise RunError(

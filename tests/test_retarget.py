@@ -199,8 +199,8 @@ class HandTest(TestCase):
         ball = number[mine]
         frame = near.frame[mine]
         bodies, objects = self.in_frames(targets, motion)
-        centers = self.model.ball_centers(bodies, frame, ball)
-        distance, _ = objects.signed_distance(centers, frame)
+        local = self.model.ball_centers(bodies, frame, ball) - objects.pos[frame]
+        distance, _ = targets.fields.signed_distance(local, torch.zeros_like(ball))
         expected = distance - balls.radii[ball] - HandConfig().object_clearance
         assert_close(near.value[mine], expected, atol=1e-9, rtol=0)
 

@@ -68,7 +68,7 @@ class Ho3d(InFolder):
     def test_back_as_it_was(self):
         self.write()
         found = self.read()
-        assert_same_motion(found, self.demos, angle=1e-3)
+        assert_same_motion(self.demos, found, angle=1e-3)
         self.assertEqual((found.sequence_name[0], found.hand_side[0]), ("SM2", "right"))
         self.assertEqual(found.object_name[0], self.demos.object_name[0])
 

@@ -80,7 +80,7 @@ class Synthetic(InFolder):
 
     def same(self, found):
         # synthetic hands are the average hand
-        assert_same_motion(found, self.demos, atol=2e-6, angle=1e-3)
+        assert_same_motion(self.demos, found, atol=2e-6, angle=1e-3)
         self.assertEqual(found.object_name.tolist(), self.demos.object_name.tolist())
 
     def refused(self, message, convention=PLAIN, **changes):

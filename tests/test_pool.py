@@ -18,10 +18,10 @@ from torch import tensor
 from torch.testing import assert_close
 
 from xreset.backends.pool import PoolBackend, World, is_finite
-from xreset.backends.workers import STATE_FIELDS
+from xreset.backends.workers import STATE_FIELDS, arrays_in, layout_of
 from xreset.errors import CapabilityError, RobotError, XResetError
 from xreset.physics import State
-from xreset.spec import SceneSpec
+from xreset.spec import PairFriction, SceneSpec
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -241,6 +241,21 @@ class PoolTest(TestCase):
         words = "'toy' has no option 'nonsense'. Choose from: object_index, device, workers, gain"
         with self.assertRaisesRegex(XResetError, words):
             ToyBackend(toy_scene(), 2, nonsense=1)
+
+
+class MemoryTest(TestCase):
+    def test_numbers_are_aligned_and_of_single_precision(self):
+        """However many flags stand before them, and where a scene states whole numbers."""
+        scene = toy_scene()
+        whole = tuple(replace(spec, mass=1) for spec in scene.objects)
+        friction = PairFriction(tip=1, link=1, table=1, torsional=0)
+        scene = replace(scene, objects=whole, friction=friction)
+        for n in range(1, 5):
+            layout = layout_of(scene, torch.zeros(n, dtype=torch.long))
+            for name, array in arrays_in(bytearray(layout.itemsize), layout).items():
+                with self.subTest(name, n=n):
+                    self.assertTrue(array.flags.aligned)
+                    self.assertIn(array.dtype, (np.float32, np.bool_))
 
 
 class DeathTest(TestCase):

@@ -111,10 +111,12 @@ class Parameters(Tensors):
         """Return what the scene states for worlds with these objects [N]."""
         n = len(object_index)
         friction = scene.friction
-        masses = torch.tensor([spec.mass for spec in scene.objects])
+        # in single precision also where they are stated as whole numbers
+        masses = torch.tensor([spec.mass for spec in scene.objects], dtype=torch.float32)
+        pairs = torch.tensor([friction.tip, friction.link, friction.table], dtype=torch.float32)
         return cls(
-            friction=torch.tensor([friction.tip, friction.link, friction.table]).repeat(n, 1),
-            torsional_friction=torch.full((n,), friction.torsional),
+            friction=pairs.repeat(n, 1),
+            torsional_friction=torch.full((n,), float(friction.torsional)),
             object_mass=masses[object_index.cpu()],
             object_inertia=torch.ones(n),
             object_com=torch.zeros(n, 3),

@@ -3,6 +3,7 @@
 import importlib.util
 from dataclasses import fields, replace
 from unittest import TestCase, skipUnless
+from unittest.mock import patch
 
 import numpy as np
 import trimesh
@@ -331,6 +332,21 @@ class DexYCB(InFolder):
         for frame in (4, 6, 7, 8):  # the other camera fills in
             self.labels(self.SERIALS[0], frame).unlink()
         self.check()
+
+    def test_a_sequence_without_a_hand(self):
+        """Is read by a scipy that refuses zero orientations, as the oldest that is allowed does."""
+        made = Rotation.from_rotvec
+
+        def from_rotvec(rotvec):
+            self.assertTrue(len(rotvec))
+            return made(rotvec)
+
+        poses = dict(np.load(self.sequence / "pose.npz"))
+        np.savez(self.sequence / "pose.npz", **poses | {"pose_m": 0 * poses["pose_m"]})
+        with patch("xreset.demos.dexycb.Rotation.from_rotvec", from_rotvec):
+            read = read_dexycb(self.folder)
+        self.assertFalse(read.hand_valid.any())
+        self.assertTrue(np.isnan(read.wrist_quat_wxyz).all())
 
     def test_incomplete(self):
         for changes, message in (

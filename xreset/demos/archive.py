@@ -261,7 +261,7 @@ def one_sequence(
     side: str,
     fps: float,
     keypoints: np.ndarray,
-    wrist: Rotation,
+    wrist: Rotation | None,
     object_pos: np.ndarray,
     object_rot: Rotation,
 ) -> Demos:
@@ -269,13 +269,15 @@ def one_sequence(
 
     Args:
         keypoints: [F, 21, 3] NaN in frames without a hand.
-        wrist: orientations in the frames with a hand.
+        wrist: orientations in the frames with a hand; None: no frame has one (scipy 1.14 refuses zero
+            orientations).
         object_pos: [F, 3]
         object_rot: F orientations.
     """
     valid = np.asarray(np.isfinite(keypoints).all(axis=(1, 2)))
     wrist_quat = np.full((len(keypoints), 4), np.nan, dtype=np.float32)
-    wrist_quat[valid] = quat_of(wrist)
+    if wrist is not None:
+        wrist_quat[valid] = quat_of(wrist)
     return Demos(
         sequence_name=np.array([name]),
         subject=np.array([subject]),

@@ -97,7 +97,7 @@ def _read(folder: Path, meta: Mapping[str, Any], extrinsics: _Poses) -> Demos:
         side=meta["mano_sides"][0],
         fps=FPS,
         keypoints=transformed(keypoints, T_table_world),
-        wrist=turn * Rotation.from_rotvec(pose_hand[valid, :3]),
+        wrist=turn * Rotation.from_rotvec(pose_hand[valid, :3]) if valid.any() else None,
         object_pos=transformed(pose_object[:, 4:], T_table_world),
         object_rot=turn * Rotation.from_quat(pose_object[:, :4]),
     )

@@ -275,7 +275,7 @@ def _sequence(arrays: Arrays, convention: Convention) -> Demos:
         side=side,
         fps=fps,
         keypoints=points,
-        wrist=_wrist(points[valid], side),
+        wrist=_wrist(points[valid], side) if valid.any() else None,
         object_pos=pos,
         object_rot=turn,
     )

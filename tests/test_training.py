@@ -307,6 +307,7 @@ class TrainingTest(WithBank):
             ("--robot ur7e-sharpa", "--robot is ur7e-sharpa, but .* was started with openarm"),
             (f"--resets {other}", "--resets is .*other.npz, but .* was started with .*bank.npz"),
             (f"--objects {self.folder}", "--objects is .*, but .* was started with None"),
+            (f"--resets {self.bank} --goals {other}", "--goals is .*other.npz, but .* was started"),
         ):
             with self.subTest(options), patch("xreset.learning.train.resume") as resumed:
                 words = f"train --resume --out {self.out} {options}".split()

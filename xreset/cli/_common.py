@@ -98,7 +98,9 @@ def refuse_changes(command: Callable[..., None], out: Path, **given: Any) -> Non
 
     info = run.read_run(out)
     files = ("resets", "goals")
-    joined = None not in [given.get(name) for name in files]  # in a file of the run
+    # a bank and a goal set are joined in a file of the run
+    is_joined = Path(info.resets).resolve().parent == out.resolve()
+    joined = is_joined and None not in [given.get(name) for name in files]
     for name, value in given.items():
         if value == signature(command).parameters[name].default or (joined and name in files):
             continue

@@ -176,9 +176,10 @@ class ResetDistribution:
             pivot=_tensor(np.array(of_sequence)),
         ).to(device)
         self.success_rate = torch.zeros(len(bank.sequence_object), device=device)
-        owner = self._states.sequence.numpy(force=True)
-        self._states_of = _Grouped(owner, range(len(bank.sequence_object)), device)
-        self._rows_of = _tensor(self._states_of.rows, device)
+        if config.adaptive_share:
+            owner = self._states.sequence.numpy(force=True)
+            self._states_of = _Grouped(owner, range(len(bank.sequence_object)), device)
+            self._rows_of = _tensor(self._states_of.rows, device)
         self._lower, self._upper = _tensor(joint_limits(robot), device)
         self._goal_shift = torch.tensor(
             [config.goal_xy, config.goal_xy, config.goal_z, config.goal_yaw], device=device

@@ -112,10 +112,7 @@ def _broken(marks: typing.Iterable[Any], value: Any) -> list[Rule]:
 def _holds(rule: Rule, value: Any) -> bool:
     try:
         return bool(rule.holds(value))
-    except (
-        TypeError,
-        ValueError,
-    ):  # a value of another type, such as a text where a number is expected
+    except (TypeError, ValueError):  # of another type, such as a text in place of a number
         return False
 
 

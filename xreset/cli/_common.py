@@ -104,10 +104,12 @@ def refuse_changes(command: Callable[..., None], out: Path, **given: Any) -> Non
     for name, value in given.items():
         if value == signature(command).parameters[name].default or (joined and name in files):
             continue
-        found = getattr(info, "resets" if name in files else name)
         if name in files:
+            found = info.resets
             is_same = file_hash(value) == info.resets_hash
         else:
+            found = getattr(info, name)
+            # a folder may be written in several ways; names and numbers are compared by their text
             is_same = Path(str(value)).resolve() == Path(str(found)).resolve()
         if not is_same:
             flag = "TEACHER" if name == "teacher" else f"--{name.replace('_', '-')}"

@@ -434,7 +434,7 @@ class TrainingTest(WithBank):
         wide = replace(CONFIG, model=replace(CONFIG.model, lstm=16))
         empty = toy_bank(self.robot).with_states(np.zeros(6, dtype=bool))
         for words, options in (
-            ("is not a run folder", {"weights": self.folder}),
+            ("is not a run folder", {"weights": self.folder, "goals": toy_goals(self.robot)}),
             ("another observation layout", {"weights": self.out, "config": short}),
             (r"{'lstm': 12}, .*{'lstm': 16}.*--like", {"weights": self.out, "config": wide}),
             (r"layout .*--like .*run$", {"weights": self.out, "config": short}),
@@ -455,6 +455,8 @@ class TrainingTest(WithBank):
         ):
             with self.subTest(words), self.assertRaisesRegex(XResetError, words):
                 self.train("refused", **options)
+            self.assertEqual(list(self.folder.glob("refused/*.npz")), [], words)
+        (self.folder / "refused").mkdir()
         with (
             claim(self.folder / "refused"),
             self.assertRaisesRegex(XResetError, "nother (command|process) is writing"),

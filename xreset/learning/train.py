@@ -8,6 +8,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -127,8 +128,9 @@ def train(
         raise RunError(
             f"The engine {engine!r} does not run on {device!r}. Omit --device, or choose another --backend."
         )
-    file = _file_of(out, bank, goals)
-    inputs = load_inputs(file, robot=robot, objects=objects, accept=("bank", "goals"))
+    data = _data_of(bank, goals)
+    loading = partial(load_inputs, robot=robot, objects=objects, accept=("bank", "goals"))
+    inputs = loading(data)
     if isinstance(inputs.data, GoalSet):
         config = from_home(config)
     if config.schedule.teacher and teacher is None:
@@ -142,17 +144,23 @@ def train(
         )
     if config.uses_states and not inputs.bank.num_states:
         raise RunError(
-            f"{file} holds no state to reset to: every candidate was rejected. Look at its reasons (xreset resets), "
-            "or train without it: --config.task.reset.demo-probability 0"
+            f"There is no state to reset to in {inputs.name}: every candidate was rejected. Look at its reasons (xreset "
+            "resets), or train without it: --config.task.reset.demo-probability 0"
         )
     start = None
     if weights is not None:
         start = _checkpoint_to_start_from(Path(weights), inputs, config)
     if teacher is not None:
         _copy_teacher(policy_file(teacher), out, inputs, config)
+    if isinstance(data, GoalSet):
+        write_goals(out / "goals.npz", data)
+        inputs = loading(out / "goals.npz")
+    elif isinstance(data, ResetBank):
+        write_bank(out / "resets.npz", data, config={}, inputs={})
+        inputs = loading(out / "resets.npz")
     info = RunInfo(
         robot=str(inputs.robot_name),
-        resets=str(file),
+        resets=str(inputs.path),
         resets_hash=str(inputs.hash),
         objects=str(inputs.objects_folder) if inputs.objects_folder else None,
         backend=engine,
@@ -170,23 +178,17 @@ def train(
     return out
 
 
-def _file_of(
-    out: Path, bank: str | Path | ResetBank | None, goals: str | Path | GoalSet | None
-) -> Path:
-    """Return the file of a bank, of a goal set, or of both together; what has none is written into the run folder."""
+def _data_of(
+    bank: str | Path | ResetBank | None, goals: str | Path | GoalSet | None
+) -> str | Path | ResetBank:
+    """Return a bank or a goal set, as they were given, or a bank with the goals of both."""
     if bank is not None and goals is not None:
         bank = bank if isinstance(bank, ResetBank) else read_bank(bank)
         bank = with_goals(bank, goals if isinstance(goals, GoalSet) else read_goals(goals))
     given = goals if bank is None else bank
     if given is None:
         raise RunError("A training needs a reset bank (--resets), a goal set (--goals), or both.")
-    if isinstance(given, GoalSet):
-        write_goals(out / "goals.npz", given)
-        return out / "goals.npz"
-    if isinstance(given, ResetBank):
-        write_bank(out / "resets.npz", given, config={}, inputs={})
-        return out / "resets.npz"
-    return Path(given)
+    return given
 
 
 def distill(

@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SMALL = (
     "--config.task.observation.cloud-points 16 --config.task.distance-points 64 --config.model.pointnet 8 6 "
     "--config.model.lstm 12 --config.model.mlp 16 --config.ppo.horizon 8 --config.ppo.mini-epochs 2 "
-    "--config.ppo.minibatch-size 32 --config.save-interval 1"
+    "--config.ppo.minibatch-size 32 --config.save-interval 1 --config.task.reset.adaptive-share 0.5"
 )
 
 
@@ -73,6 +73,14 @@ class TwoProcesses(WithBank):
         )
         for before, after in zip(self.first, self.second, strict=True):
             assert_close(before["actor"], after["start_actor"], rtol=0, atol=0)
+
+    def test_demonstrations_have_the_same_rates_of_success_in_both(self):
+        """The processes begin with rates of 0 and 1; a resumed run begins with those of the checkpoint."""
+        one, two = self.first
+        assert_close(one["success_rate"], two["success_rate"], rtol=0, atol=0)
+        assert_close(one["success_rate"], torch.full((3,), 0.5), rtol=0, atol=0.2)
+        for end in self.second:
+            assert_close(end["start_success_rate"], one["success_rate"], rtol=0, atol=0)
 
     def test_the_main_process_alone_writes(self):
         self.assertEqual(self.made.count("run.json"), 1)

@@ -63,7 +63,7 @@ class CurvesTest(InFolder):
                 curves.add(torch.ones(2), torch.zeros(2), log)
                 curves.write(3, 10, 1.0, {"speed/env_steps_per_second": 2.0})
                 self.assertEqual(len(read_lift(folder).passed), 3, "a passing is on disk at once")
-                curves.close(stopped=False)
+                curves.close()
                 self.assertEqual(online.init.called, project is not None)
             self.assertEqual(online.init.call_args.kwargs["project"], "project")
             self.assertEqual(online.init.call_args.kwargs["config"], {"a": 1})

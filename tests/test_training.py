@@ -238,6 +238,23 @@ class TrainingTest(WithBank):
         self.resume(out, iterations=done + 1)
         self.assertEqual(newest(out).iteration, done + 1)
 
+    def test_rates_of_success_of_demonstrations_are_kept(self):
+        reset = replace(ONE.task.reset, adaptive_share=0.5)
+        adaptive = replace(ONE, task=replace(ONE.task, reset=reset))
+        out = self.train("adaptive", config=adaptive)
+        rates = torch.tensor([0.25, 0.5, 1.0])
+        content = torch.load(latest_checkpoint(out), weights_only=True)
+        torch.save(content | {"success_rate": rates}, latest_checkpoint(out))
+        self.resume(out, iterations=2)
+        assert_close(newest(out).success_rate, rates, rtol=0, atol=0.1)
+        torch.save(content | {"success_rate": torch.ones(4)}, latest_checkpoint(out))
+        with self.assertRaisesRegex(RunError, "000002.pt does not fit this run"):
+            self.resume(out, iterations=3)
+        del content["success_rate"]  # as in earlier versions
+        torch.save(content, latest_checkpoint(out))
+        self.resume(out, iterations=2)
+        assert_close(newest(out).success_rate, torch.zeros(3))
+
     def test_a_schedule_continues_where_a_stopped_run_was(self):
         """Stopped after two of many iterations, then resumed for as much time as it had taken."""
         out = self.train("scheduled")
@@ -375,7 +392,13 @@ class TrainingTest(WithBank):
         self.assertEqual(len(checkpoints(stranger)), 2)
         self.assertNotIn("strangers_term", sys.modules)
         for arguments in (f"{like}/with", resume):
-            said(f"{arguments} {naming}")
+            with patch.object(TrainingRunner, "_agreed", return_value=True), quickly() as stopped:
+                main(["train", *f"{arguments} {naming}".split()])
+            out = arguments.partition("--out ")[2].split()[0]
+            self.assertIn(
+                f"To continue: xreset train --out {out} --resume {naming}", stopped.getvalue()
+            )
+            said(f"--resume --out {out} {naming}")
         self.assertIn("strangers_term", sys.modules)
         self.assertEqual(read_run(f"{self.folder}/with").config.task.reward.own, own)
         self.assertEqual(len(checkpoints(stranger)), 3)
@@ -556,6 +579,7 @@ class TrainingTest(WithBank):
                 adam | {"state": {0: {"step": torch.ones(()), "exp_avg": None}}},
             ),
             ("optimizer_state_dict", adam | {"state": []}),
+            ("success_rate", torch.tensor([0.5, math.nan])),
         ):
             torch.save(good | {key: wrong}, file)
             words = rf"(?s){file.name}\.{key} is .*, expected "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import time
 from collections import deque
 from pathlib import Path
@@ -133,14 +132,9 @@ class TrainingLog:
         """Write the lift clock's file."""
         write_lift(self._folder, self._lift)
 
-    def close(self, *, stopped: bool) -> None:
-        """End the files; ``stopped`` says whether the training ended before its last iteration."""
+    def close(self) -> None:
+        """End the files."""
         self._curves.close()
         if self._online is not None:
             self._online.finish()
         self.write_lift()
-        if stopped:
-            print(
-                "stopped after the current iteration; a checkpoint is written. To continue: "
-                f"xreset train --out {shlex.quote(str(self._folder))} --resume"
-            )

@@ -99,8 +99,14 @@ def without_state_schedule(config: TrainConfig) -> TrainConfig:
 
 def own_terms_flag(own: dict[str, float]) -> str:
     """Return the option of ``xreset train`` that names reward terms of the user's own."""
-    terms = [f"{shlex.quote(plain(name))} {weight:g}" for name, weight in own.items()]
+    terms = [f"{shlex.quote(plain(name))} {weight:.15g}" for name, weight in own.items()]
     return " ".join(["--config.task.reward.own", *terms])
+
+
+def resume_command(folder: Path, own: dict[str, float]) -> str:
+    """Return the command that continues a run, with the reward terms of the user's own."""
+    words = f"xreset train --out {shlex.quote(str(folder))} --resume"
+    return f"{words} {own_terms_flag(own)}" if own else words
 
 
 def student_config(teacher: TaskConfig, vision: VisionConfig) -> TrainConfig:

@@ -29,6 +29,7 @@ from xreset.learning.distillation import SequenceDistillation
 from xreset.learning.distributed import Processes
 from xreset.learning.log import TrainingLog
 from xreset.learning.ppo import SequencePpo
+from xreset.learning.recipes import resume_command
 
 MAX_SHARE = 1e-3
 """Largest share of world-steps that may break; the run ends beyond it."""
@@ -83,6 +84,7 @@ class TrainingRunner:
         self.env_steps = 0
         self.elapsed = 0.0
         self._fault_totals = deque([[0, 0]], maxlen=WINDOW)
+        self._resume_command = resume_command(folder, config.task.reward.own)
 
     def learn(self, total: int, *, seconds: float = math.inf) -> None:
         """Train until a number of iterations is done in all, and write a checkpoint. Ctrl-C ends after an iteration.
@@ -121,6 +123,7 @@ class TrainingRunner:
                     obs = self._roll_out(obs, log)
                     self._check_finite(obs)
                     self._check_faults(steps)
+                    self._share_success_rates()
                     collected = time.perf_counter()
                     self.alg.compute_returns(obs)
                 losses = self.alg.update()
@@ -147,7 +150,12 @@ class TrainingRunner:
         if self.iteration != saved_at or not self.iteration:
             self.save_checkpoint()
         if log is not None:
-            log.close(stopped=self.iteration < total)
+            log.close()
+            if self.iteration < total:
+                print(
+                    "stopped after the current iteration; a checkpoint is written. To continue: "
+                    + self._resume_command
+                )
 
     def _roll_out(self, obs: TensorDict, log: TrainingLog | None) -> TensorDict:
         """Let the policy act for a horizon; returns the last observations."""
@@ -189,14 +197,17 @@ class TrainingRunner:
             env_steps=self.env_steps,
             elapsed=self.elapsed,
             learning_rate=self.alg.learning_rate,
+            success_rate=self.env.resets.success_rate,
         )
         write_checkpoint(self.folder / "checkpoints" / f"{self.iteration:06d}.pt", content)
 
     def load_checkpoint(self, path: Path) -> None:
-        """Continue from a checkpoint: models, optimizer and counters. Episodes begin again."""
+        """Continue from a checkpoint: models, optimizer, counters and rates of success. Episodes begin again."""
         content = self._load(path)
         with must_fit(path):
             load_moments(self.alg.optimizer, content.optimizer_state_dict["state"])
+            if content.success_rate is not None:
+                self.env.resets.success_rate.copy_(content.success_rate)
         self.alg.learning_rate = content.learning_rate
         self.iteration = content.iteration
         self.env_steps = content.env_steps
@@ -236,14 +247,20 @@ class TrainingRunner:
                 f"The run ends: {nonfinite} worlds were not finite and {overflow} dropped contacts or constraints in "
                 f"the last {len(self._fault_totals)} iterations, more than {MAX_SHARE:.1%} of the {WINDOW * steps} "
                 f"world-steps of {WINDOW} iterations. Look for what the robot or an object does that the engine cannot "
-                f"simulate. Then continue from the last checkpoint: xreset train --out {self.folder} --resume"
+                f"simulate. Then continue from the last checkpoint: {self._resume_command}"
             )
         self._fault_totals.append(now)
+
+    def _share_success_rates(self) -> None:
+        """Give every process the mean of the demonstrations' rates of success in all processes."""
+        if self.config.task.reset.adaptive_share:
+            rates = self.env.resets.success_rate
+            rates.copy_(self.processes.sum(rates) / self.processes.count)
 
     def _check_finite(self, obs: TensorDict) -> None:
         """Refuse observations that are not finite, once per iteration: they come from worlds whose health was sound."""
         own = ", ".join(self.env.task.reward.own)
-        remedy = f"Continue from the last checkpoint: xreset train --out {self.folder} --resume"
+        remedy = f"Continue from the last checkpoint: {self._resume_command}"
         if own:
             remedy = (
                 f"The critic observes the reward: do your own terms return finite numbers ({own})?"

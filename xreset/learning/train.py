@@ -144,8 +144,8 @@ def train(
         )
     if config.uses_states and not inputs.bank.num_states:
         raise RunError(
-            f"There is no state to reset to in {inputs.name}: every candidate was rejected. Look at its reasons (xreset "
-            "resets), or train without it: --config.task.reset.demo-probability 0"
+            f"There is no state to reset to in {inputs.name}: every candidate was rejected. Look at its reasons "
+            "(xreset resets), or train without it: --config.task.reset.demo-probability 0"
         )
     start = None
     if weights is not None:

@@ -1,11 +1,27 @@
 """Loading of demonstrations, motion and banks, with the robot and the objects that they need."""
 
+import re
+from unittest.mock import patch
+
 import numpy as np
 
 from tests.data import InOneFolder
-from tests.toy_bank import SOUP, SPAM, toy_bank
-from xreset import Retargeted, robots, synthesize, write_bank, write_demos
-from xreset.errors import DemoError, FileFormatError
+from tests.toy_bank import SOUP, SPAM, toy_bank, toy_retargeted
+from xreset import (
+    Retargeted,
+    evaluate,
+    load_object,
+    make_bank,
+    make_env,
+    rehearse,
+    retarget_demos,
+    robots,
+    synthesize,
+    train,
+    write_bank,
+    write_demos,
+)
+from xreset.errors import DemoError, FileFormatError, XResetError
 from xreset.files import file_hash
 from xreset.inputs import load_inputs
 
@@ -67,3 +83,33 @@ class InputsTest(InOneFolder):
             FileFormatError, "was made with an imported mesh of 005_tomato_soup_can"
         ):
             load_inputs(other)
+
+    def test_arguments_of_another_type_are_named(self):
+        """Python's own errors come from deep inside."""
+        bank = toy_bank(self.robot)
+        motion = toy_retargeted(self.robot, [SOUP], [0, 2])
+        objects = [load_object(name) for name in (SOUP, SPAM)]
+        run = {"bank": self.bank_file, "out": self.folder / "run", "engine": "mujoco"}
+        scene = {"robot": self.robot, "objects": objects}
+        playing = {"policy": "zero", "robot": "ur7e-sharpa", "demos": bank}
+        for call, given, wrong, expected in (
+            (train, run, {"minutes": "1"}, "float"),
+            (train, run, {"config": {"iterations": 5}}, "TrainConfig | None"),
+            (train, run, {"seed": "3"}, "int"),
+            (evaluate, playing, {"episodes": "5"}, "int"),
+            (evaluate, playing, {"engines": 5}, "str | Sequence[str | Engine]"),
+            (rehearse, {"policy": "soup-can", "demos": bank}, {"episodes": "5"}, "int"),
+            (retarget_demos, {"demos": self.demos} | scene, {"config": {"arm": 1}}, "RetargetConfig | None"),
+            (make_bank, {"retargeted": motion} | scene, {"limits": {"steps": 1}}, "FilterConfig | None"),
+            (make_env, {"bank": bank} | scene, {"task": {"timestep": 1}}, "TaskConfig | None"),
+        ):  # fmt: skip
+            words = f"is .*, expected {re.escape(expected)}. Look at help.xreset.{call.__name__}"
+            with (
+                self.subTest(call.__name__, **wrong),
+                self.assertRaisesRegex(XResetError, f"^{next(iter(wrong))} {words}"),
+            ):
+                call(**given | wrong)
+
+    def test_errors_of_right_arguments_are_not_changed(self):
+        with patch("xreset.eval.evaluate.load_policy", side_effect=TypeError("defect")):
+            self.assertRaisesRegex(TypeError, "defect", evaluate, "zero", self.demos)

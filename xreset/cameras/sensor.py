@@ -5,6 +5,7 @@ Shape letters: N worlds, C cameras, H x W pixels, B bodies, P points.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import astuple
 from typing import Any
 
@@ -15,12 +16,11 @@ from PIL import Image
 from torch import Tensor
 
 from xreset.cameras.config import VisionConfig
-from xreset.cameras.pose import mounted_pose
 from xreset.cameras.rays import RayCaster
 from xreset.errors import XResetError
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import homogeneous, quat_from_axis_angle, quat_to_matrix
-from xreset.geometry.shapes import box, shape_mesh, winding_number
+from xreset.geometry.shapes import box, look_at, shape_mesh, transform, winding_number
 from xreset.geometry.urdf import link_meshes
 from xreset.physics import State
 from xreset.spec import SceneSpec
@@ -73,7 +73,8 @@ class Cameras:
         home = self._kinematics.link_poses(self._kinematics.home, self._links)
         x, y, z = scene.table.half_size
         table = shape_mesh(box((*scene.table.center, -z), (2 * x, 2 * y, 2 * z)))
-        self._check_outside(home.cpu().numpy(), bodies, table)
+        mounted = [transform(look_at(c.pos, c.target).T, c.pos) for c in config.cameras]
+        self._check_outside(mounted, home.cpu().numpy(), bodies, table)
         worlds = len(object_index)
         fixed = torch.arange(first_object, device=device).expand(worlds, -1)
         held = first_object + object_index[:, None]
@@ -97,7 +98,7 @@ class Cameras:
         noise = tensor([astuple(c.noise) for c in config.cameras])
         self._spread, self._step, self._holes, self._edges, self._edge = noise.T[..., None, None]
         self._half_fov = tensor([c.fov / 2 for c in config.cameras])
-        self._mounted = tensor(np.stack([mounted_pose(c) for c in config.cameras]))
+        self._mounted = tensor(mounted)
         y, x = torch.meshgrid(
             *(torch.arange(n, device=device) + 0.5 - n / 2 for n in size), indexing="ij"
         )
@@ -186,16 +187,24 @@ class Cameras:
         return (self._on_object() & (self._in_range(self.rays.depth) > 0)).flatten(1).any(dim=1)
 
     def _check_outside(
-        self, poses: np.ndarray, bodies: dict[str, trimesh.Trimesh], table: trimesh.Trimesh
+        self,
+        mounted: Sequence[np.ndarray],
+        poses: np.ndarray,
+        bodies: dict[str, trimesh.Trimesh],
+        table: trimesh.Trimesh,
     ) -> None:
-        """Refuse cameras inside the table or a link of the robot at home; poses [L, 4, 4] of the bodies, then of the
-        cameras' links."""
+        """Refuse cameras inside the table or a link of the robot at home.
+
+        Args:
+            mounted: [4, 4] pose of each camera in the frame of its link or of the world.
+            poses: [L, 4, 4] of the bodies, then of the cameras' links.
+        """
         solids = {f"the robot's link {name!r}": mesh for name, mesh in bodies.items()}
         solids["the table"] = table
         places = [*poses[: len(bodies)], np.eye(4)]
         for i, camera in enumerate(self.config.cameras):
             mount = self._mounts[i]
-            eye = mounted_pose(camera)[:, 3]
+            eye = mounted[i][:, 3]
             if mount is not None:
                 eye = poses[mount] @ eye
             for (name, mesh), pose in zip(solids.items(), places, strict=True):

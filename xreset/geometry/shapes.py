@@ -45,6 +45,17 @@ def transform(R: ArrayLike, position: ArrayLike) -> np.ndarray:
     return T
 
 
+def look_at(eye: tuple[float, ...], target: tuple[float, ...]) -> np.ndarray:
+    """Return [3, 3] unit vectors of a camera to the right, down and forward, as rows; z is up."""
+    forward = np.array(target, dtype=float) - eye
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    if np.linalg.norm(right) < 1e-6:  # straight up or down
+        right = np.array([1.0, 0.0, 0.0])
+    right /= np.linalg.norm(right)
+    return np.stack((right, np.cross(forward, right), forward))
+
+
 def turn_of(quats: ArrayLike) -> Rotation:
     """Return the rotations of quaternions [..., 4], (w, x, y, z)."""
     return Rotation.from_quat(quats, scalar_first=True)

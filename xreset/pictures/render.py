@@ -17,13 +17,12 @@ import torch
 import trimesh
 from PIL import Image, ImageDraw, ImageFont
 
-from xreset.cameras.pose import look_at
 from xreset.checks import frozen
 from xreset.errors import XResetError
 from xreset.files import write_whole
 from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.shapes import look_at, transform, turn_of
 from xreset.geometry.urdf import link_meshes
-from xreset.geometry.urdf_writer import pose
 from xreset.pictures.meshes import (
     GOAL_COLOR,
     OBJECT_COLOR,
@@ -176,7 +175,8 @@ class Renderer:
         goal = None
         if goal_pose is not None:
             goal = place(self._objects[object_index], GOAL_COLOR, np.asarray(goal_pose))
-        image = _image(join(parts), goal, camera, self.size, self._smooth)
+        scene = join(parts)
+        image = _image(scene, goal, camera, self.size, self._smooth)
         _draw_points(image, camera, points)
         return np.asarray(image.reduce(2))
 
@@ -220,7 +220,7 @@ def draw_bodies(
 
 def pose_matrix(pos: np.ndarray, quat: np.ndarray) -> np.ndarray:
     """[4, 4] pose from a position [3] and a quaternion [4] (w, x, y, z)."""
-    return pose(pos, quat=quat)
+    return transform(turn_of(np.array(quat, dtype=float)).as_matrix(), pos)
 
 
 def add_caption(picture: np.ndarray, caption: Sequence[str], lines: int) -> np.ndarray:

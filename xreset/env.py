@@ -590,8 +590,8 @@ class ManipulationEnv:
         self._best_reach.copy_(
             torch.where(self._reset_mask, reading.tip_distance.mean(dim=-1), self._best_reach)
         )
-        observed_pos, observed_quat = self.variation.observed_pose(
-            state, self._reset_mask, self.generator
+        observed_pos, observed_quat = self.variation.tracker.observe(
+            state.object_pos, state.object_quat, self._reset_mask, self.generator
         )
         x = obs.ObservationInput(
             state=state,
@@ -606,7 +606,7 @@ class ManipulationEnv:
             start_quat=self.start_quat,
             gravity_fraction=self.gravity_fraction,
             previous_action=self._previous_action.clamp(-1.0, 1.0),
-            tip_force=self.variation.scaled_forces(reading.contacts.tip_force),
+            tip_force=reading.contacts.tip_force * self.variation.force_gain,
             tip_distance=reading.tip_distance,
             reward=self._reward,
         )

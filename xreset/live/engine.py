@@ -68,7 +68,7 @@ class EngineDriver(Driver):
         backend = self.env.backend
         state = backend.state()
         links = backend.links()
-        force = self.env.variation.scaled_forces(backend.contacts().tip_force)
+        force = backend.contacts().tip_force * self.env.variation.force_gain
         now = np.full(backend.num_worlds, self.now())
         return Reading(
             joint_pos=_array(state.joint_pos),

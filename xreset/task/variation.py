@@ -35,6 +35,7 @@ class Variation:
         parameters: physical parameters [N, ...] by name, without the gravity fraction, which belongs to the start of an
             episode.
         force_gain: [N, 1, 1] factor on the observed forces, or 1.
+        tracker: reports the object's pose.
         pushes: pushes on object and arm; None: there are none.
     """
 
@@ -77,7 +78,7 @@ class Variation:
         self._commands = DelayLine(
             drawn, "commands", len(is_arm), longest, self._sample_action_latency, by_column=True
         )
-        self._tracker = Tracker(drawn, c)
+        self.tracker = Tracker(drawn, c)
         age = partial(sample_range, n, c.proprio_latency)
         longest = c.longest("proprio_latency")
         self._proprio = DelayLine(drawn, "proprio", proprio_width, longest, age)
@@ -162,16 +163,3 @@ class Variation:
             return proprio
         self._proprio.fill(fresh, proprio)
         return self._proprio.push(proprio, self._proprio.delay.round())
-
-    def scaled_forces(self, force: Tensor) -> Tensor:
-        """[N, E, 3] forces as they are observed."""
-        return force * self.force_gain
-
-    def observed_pose(
-        self, state: State, fresh: Tensor, generator: torch.Generator
-    ) -> tuple[Tensor, Tensor]:
-        """Return the object's position [N, 3] and orientation [N, 4] as its tracker reports them.
-
-        In the ``fresh`` worlds [N] the present pose becomes the whole past.
-        """
-        return self._tracker.observe(state.object_pos, state.object_quat, fresh, generator)

@@ -30,6 +30,7 @@ from xreset.objects.catalogue import (
     canonical_names,
     load_object,
     load_objects,
+    mesh_files,
     object_names,
 )
 from xreset.objects.decompose import Settings, as_solid, decompose, limited_hull
@@ -37,7 +38,6 @@ from xreset.objects.meshes import (
     DEFAULT_DENSITY,
     add_mesh,
     import_with_notes,
-    mesh_files,
     read_mesh,
 )
 from xreset.objects.procedural import make_shapes

@@ -54,7 +54,7 @@ def import_(
         tolerance: Largest deviation of the pieces from the surface, in metres; default: 0.002.
         png: Picture to write: the meshes next to their pieces, with the deviation in millimetres.
     """
-    from xreset.objects import meshes
+    from xreset.objects import catalogue, meshes
     from xreset.pictures import pieces, render
 
     try:
@@ -67,7 +67,7 @@ def import_(
                 f"{path} is a folder. --out, --name, --scale, --mass, --density, --friction and --tolerance are for one"
                 " mesh file. For a folder, write these properties into NAME.toml next to each mesh."
             )
-        files = meshes.mesh_files(path)
+        files = catalogue.mesh_files(path)
     elif out is None:
         raise ObjectError("A mesh file needs a folder of objects to go into. Add --out.")
     else:

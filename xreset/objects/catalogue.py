@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
 from xreset.errors import ObjectError
-from xreset.objects.meshes import import_mesh, mesh_files
+from xreset.objects.meshes import import_mesh
 from xreset.objects.standins import STAND_INS, stand_in
 from xreset.objects.ycb import ALIAS_OF
 from xreset.spec import ObjectSpec
+from xreset.text import shown
 
 ALIASES = {alias: name for name, alias in ALIAS_OF.items()}
 """The paper's names -> official names."""
@@ -20,6 +22,27 @@ def object_names(folder: str | Path | None = None) -> tuple[str, ...]:
     if folder is None:
         return STAND_INS
     return tuple(mesh_files(folder))
+
+
+def mesh_files(folder: str | Path) -> dict[str, Path]:
+    """Return object name -> mesh file, for every object of a folder.
+
+    Layouts: ``NAME.obj``; ``NAME/textured_simple.obj`` (as in DexYCB's ``models``); ``NAME/textured.obj`` (as in the
+        YCB object set).
+
+    Raises:
+        ObjectError: the folder does not exist or has no mesh.
+    """
+    folder = Path(folder)
+    expected = "Expected NAME.obj, NAME/textured_simple.obj or NAME/textured.obj."
+    if not os.path.isdir(folder):
+        raise ObjectError(f"There is no folder {shown(str(folder))}. {expected}")
+    found = {path.stem: path for path in folder.glob("*.obj")}
+    for file in ("textured.obj", "textured_simple.obj"):  # the simpler one wins
+        found |= {path.parent.name: path for path in folder.glob(f"*/{file}")}
+    if not found:
+        raise ObjectError(f"There is no mesh in {folder}. {expected}")
+    return dict(sorted(found.items()))
 
 
 def canonical_name(name: str, known: Iterable[str] = STAND_INS) -> str:

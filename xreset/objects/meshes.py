@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import re
 import tempfile
 from dataclasses import replace
@@ -67,27 +66,6 @@ class Import:
             f"{pieces} hollows up to {1e3 * self.deviation:.1f} mm deep. `tolerance = 0.002` in {self.obj.name}.toml"
             " keeps them open"
         )
-
-
-def mesh_files(folder: str | Path) -> dict[str, Path]:
-    """Return object name -> mesh file, for every object of a folder.
-
-    Layouts: ``NAME.obj``; ``NAME/textured_simple.obj`` (as in DexYCB's ``models``); ``NAME/textured.obj`` (as in the
-        YCB object set).
-
-    Raises:
-        ObjectError: the folder does not exist or has no mesh.
-    """
-    folder = Path(folder)
-    expected = "Expected NAME.obj, NAME/textured_simple.obj or NAME/textured.obj."
-    if not os.path.isdir(folder):
-        raise ObjectError(f"There is no folder {shown(str(folder))}. {expected}")
-    found = {path.stem: path for path in folder.glob("*.obj")}
-    for file in ("textured.obj", "textured_simple.obj"):  # the simpler one wins
-        found |= {path.parent.name: path for path in folder.glob(f"*/{file}")}
-    if not found:
-        raise ObjectError(f"There is no mesh in {folder}. {expected}")
-    return dict(sorted(found.items()))
 
 
 def import_mesh(path: str | Path, name: str) -> ObjectSpec:

@@ -71,7 +71,8 @@ def select(
         RunError: there is nothing to choose from.
     """
     found = candidates_in(folder, most)
-    meshes = setting.objects or read_run(folder).objects
+    run = read_run(folder)
+    meshes = setting.objects or run.objects
     played: list[Candidate] = []
     best: Candidate | None = None
     order = engines
@@ -79,7 +80,7 @@ def select(
         chosen = Path(scratch)
         for path in found:
             file = Path(scratch) / f"{path.stem}.onnx"
-            export_checkpoint(folder, path, file)
+            export_checkpoint(folder, run, path, file)
             policy = load_policy(file, robot=setting.robot)
             trial = load_trial(
                 policy, demos, objects=meshes, seed=setting.seed, num_envs=setting.num_envs

@@ -18,11 +18,12 @@ from tensordict import TensorDict
 from xreset.files import atomic_write, code_version, file_hash
 from xreset.learning.checkpoint import must_fit, read_checkpoint
 from xreset.learning.model import ExportedPolicy, PointNetLstmModel, make_actor
-from xreset.learning.run import read_run
 from xreset.policy import INPUTS, METADATA_KEY, OUTPUTS, Contract, observation_shapes
 
 if TYPE_CHECKING:
     from onnx import ModelProto
+
+    from xreset.learning.run import RunInfo
 
 _VERSION_KEY = "xreset-version"
 """Key of the ONNX metadata entry that holds the version and commit of xreset."""
@@ -110,17 +111,16 @@ def _quiet() -> Iterator[None]:
         logger.setLevel(level)
 
 
-def export_checkpoint(out: Path, checkpoint: Path, policy: Path) -> None:
-    """Write the policy of one of a run's checkpoints as an ONNX file."""
-    info = read_run(out)
-    shapes = observation_shapes(info.contract, str(out))
+def export_checkpoint(folder: Path, run: RunInfo, checkpoint: Path, policy: Path) -> None:
+    """Write the policy of one of the checkpoints in a run's folder as an ONNX file."""
+    shapes = observation_shapes(run.contract, str(folder))
     example = TensorDict(
         {name: torch.zeros(1, *shape) for name, shape in shapes.items()}, batch_size=[1]
     )
-    actor = make_actor(example, len(info.contract.joint_names), info.config)
+    actor = make_actor(example, len(run.contract.joint_names), run.config)
     with must_fit(checkpoint):
         actor.load_state_dict(read_checkpoint(checkpoint).actor_state_dict)
-    export_onnx(actor, policy, info.contract, checkpoint=checkpoint)
+    export_onnx(actor, policy, run.contract, checkpoint=checkpoint)
 
 
 def is_exported_from(policy: Path, checkpoint: Path) -> bool:

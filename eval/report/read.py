@@ -120,8 +120,9 @@ def collect(folder: Path, robot: str | None = None, objects: Path | None = None)
     if choice is not None and choice.policy_hash not in policies:
         choice = None
     stress = read_stress(place / "stress", training.first.inputs.get("policy"))
+    taught = read_evaluation(folder / "teacher")
     notes = uneven([training]) + not_described
-    if taught := read_evaluation(folder / "teacher"):
+    if taught:
         notes.append(missed_by_student(training.episodes, taught.to_frame()))
     elif run is not None and run.teacher is not None:
         notes.append(

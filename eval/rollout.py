@@ -17,8 +17,7 @@ import torch
 from torch import Tensor
 
 from xreset.checks import frozen
-from xreset.env import ManipulationEnv, make_scene, object_origins
-from xreset.errors import XResetError
+from xreset.env import ManipulationEnv, make_scene
 from xreset.eval.metrics import EpisodeMetrics, MetricPoints
 from xreset.eval.policy_spec import PolicySpec
 from xreset.eval.results import Episode, Rollouts, Trace
@@ -34,17 +33,13 @@ from xreset.resets.settle import settle_starts
 from xreset.retarget.file import Retargeted
 from xreset.schedule import schedule
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
-from xreset.task.config import TaskConfig, evaluation_task
+from xreset.task.config import TaskConfig, evaluation_task, with_episodes_of
 from xreset.task.randomization import sample_friction
 from xreset.task.reading import Reading
 from xreset.task.terminations import out_of_bounds
-from xreset.text import shown
 
 TRACE_INTERVAL = 0.05
 """Time between the states of a trace [s]."""
-
-LONGEST_EPISODE = 1e6
-"""Largest length of an episode [s]: the largest time that a file of traces may hold."""
 
 MakeBackend = Callable[[SceneSpec, int, Tensor], Backend]
 """Makes the worlds of a scene, given their number and the index of the object in each world [N]."""
@@ -127,8 +122,7 @@ class Trial:
 
     def starts(self, device: str | torch.device = "cpu") -> ResetDistribution:
         """Return the distribution of starts. Drawn on the CPU, they are the same in every engine."""
-        pivots = object_origins(self.objects, self.task)
-        return ResetDistribution(self.bank, self.robot, self.names, self.task.reset, device, pivots)
+        return ResetDistribution.of(self.bank, self.robot, self.objects, self.task, device)
 
     @contextmanager
     def worlds(self, engine: Engine, object_index: Tensor) -> Iterator[ManipulationEnv]:
@@ -194,22 +188,6 @@ def load_trial(
         objects_folder=folder,
         inputs=hashes,
     )
-
-
-def with_episodes_of(task: TaskConfig, seconds: float) -> TaskConfig:
-    """Return the task with episodes of another length [s].
-
-    Raises:
-        XResetError: the length is not a number, too large, or less than a control step.
-    """
-    control_dt = task.timestep * task.substeps
-    is_number = isinstance(seconds, int | float) and not isinstance(seconds, bool)
-    if not is_number or not control_dt <= seconds <= LONGEST_EPISODE:
-        raise XResetError(
-            f"episode_seconds is {shown(seconds)}, expected a number from {control_dt:.3g}, which is one control "
-            f"step, to {LONGEST_EPISODE:,.0f}. Without it, episodes last as long as in the policy's training."
-        )
-    return replace(task, termination=replace(task.termination, episode_seconds=float(seconds)))
 
 
 def nominal_scene(robot: RobotSpec, objects: tuple[ObjectSpec, ...], task: TaskConfig) -> SceneSpec:

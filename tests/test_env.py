@@ -20,7 +20,7 @@ from tests.data import InFolder
 from tests.toy_bank import SOUP, SPAM, toy_bank, toy_retargeted
 from tests.toy_robot import toy_robot
 from xreset import make_bank
-from xreset.env import ManipulationEnv, make_env, make_scene, object_origins
+from xreset.env import ManipulationEnv, make_env, make_scene
 from xreset.errors import CapabilityError, XResetError
 from xreset.eval.metrics import EpisodeMetrics, MetricPoints
 from xreset.eval.rollout import Engine, Trial, roll_out
@@ -572,8 +572,7 @@ class ObjectFrameTest(WithEnv, InFolder):
         """Observations, rewards and actions of every step; the action is a function of the observations."""
         backend = MujocoBackend(make_scene(self.robot, (spec,), task), N, workers=0)
         self.addCleanup(backend.close)
-        pivots = object_origins((spec,), task)
-        resets = ResetDistribution(bank, self.robot, (spec.name,), task.reset, "cpu", pivots)
+        resets = ResetDistribution.of(bank, self.robot, (spec,), task)
         env = ManipulationEnv(backend, task, resets)
         found = []
         for _ in range(5):  # contact makes rounding grow from the seventh step on

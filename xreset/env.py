@@ -101,8 +101,7 @@ def make_env(
     object_index = shared_worlds(names, num_envs, task.reset.object_share)
     backend = make_backend(engine, scene, num_envs, object_index=object_index, device=device)
     try:
-        pivots = object_origins(objects, task)
-        resets = ResetDistribution(bank, robot, names, task.reset, backend.device, pivots)
+        resets = ResetDistribution.of(bank, robot, objects, task, backend.device)
         return ManipulationEnv(backend, task, resets, seed=seed)
     except BaseException:
         backend.close()
@@ -142,13 +141,6 @@ def shared_worlds(names: Sequence[str], num_envs: int, share: Mapping[str, float
             "Take more worlds (--num-envs)."
         )
     return torch.as_tensor(np.repeat(np.arange(len(names)), worlds))
-
-
-def object_origins(objects: Sequence[ObjectSpec], task: TaskConfig) -> dict[str, np.ndarray] | None:
-    """Return the origin [3] of each object in the task, in its mesh frame, by name; None: the mesh's own."""
-    if task.object_frame == "mesh":
-        return None
-    return {o.name: center(o) for o in objects}
 
 
 class ManipulationEnv:

@@ -63,7 +63,7 @@ def policy_contract(robot: RobotSpec, task: TaskConfig, objects: tuple[str, ...]
         observation_layout=layout(
             len(robot.joints), len(robot.fingertips), task.observation, task.vision
         ),
-        control_dt=task.timestep * task.substeps,
+        control_dt=task.control_dt,
         task=task,
     )
 

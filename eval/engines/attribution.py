@@ -231,7 +231,7 @@ def change_towards(
         substeps = max(1, round(task.substeps * a / b))
         if substeps == task.substeps:
             return f"with {substeps} physics steps per control step, no other timestep comes nearer"
-        return replace(task, timestep=task.timestep * task.substeps / substeps, substeps=substeps)
+        return replace(task, timestep=task.control_dt / substeps, substeps=substeps)
     if a <= 0:
         return f"there is none in {engine}, so no factor leads to the other value"
     ratio = max(b, 0.0) / a

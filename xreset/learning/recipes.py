@@ -116,8 +116,8 @@ def student_config(teacher: TaskConfig, vision: VisionConfig) -> TrainConfig:
         teacher: the teacher's task, without cameras.
         vision: the cameras of the student.
     """
-    control_dt = teacher.timestep * teacher.substeps
     task = replace(teacher, vision=vision, reward=replace(teacher.reward, own={}))
     changes = tomllib.loads(_STUDENT.read_text())
-    changes["task"]["randomization"]["camera_latency"] = [0.0, round(1 / 30 / control_dt, 3)]
+    latency = round(1 / 30 / teacher.control_dt, 3)
+    changes["task"]["randomization"]["camera_latency"] = [0.0, latency]
     return from_dict(TrainConfig, merged({"task": asdict(task)}, changes), str(_STUDENT))

@@ -6,8 +6,9 @@ restores a demonstrated hand-object state. The goal is the last object pose of t
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from typing import Self
 
 import numpy as np
 import torch
@@ -18,9 +19,10 @@ from xreset.checks import frozen
 from xreset.errors import DemoError
 from xreset.geometry.rotations import quat_from_axis_angle, quat_multiply, quat_rotate
 from xreset.geometry.urdf import joint_limits
+from xreset.objects.sampling import center
 from xreset.resets.bank import ResetBank
-from xreset.spec import GRAVITY, RobotSpec
-from xreset.task.config import ResetConfig
+from xreset.spec import GRAVITY, ObjectSpec, RobotSpec
+from xreset.task.config import ResetConfig, TaskConfig
 from xreset.tensors import Tensors, where
 
 
@@ -187,6 +189,20 @@ class ResetDistribution:
         self._home = _tensor(robot.home, device)
         self._home_std = _tensor(np.where(robot.is_arm, *robot.home_std), device)
 
+    @classmethod
+    def of(
+        cls,
+        bank: ResetBank,
+        robot: RobotSpec,
+        objects: Sequence[ObjectSpec],
+        task: TaskConfig,
+        device: torch.device | str = "cpu",
+    ) -> Self:
+        """Return the resets of a task: objects turn about their origins in the task (``TaskConfig.object_frame``)."""
+        names = tuple(o.name for o in objects)
+        pivots = {o.name: center(o) for o in objects} if task.object_frame == "center" else None
+        return cls(bank, robot, names, task.reset, device, pivots)
+
     def start_pose(self, sequence: Tensor) -> tuple[Tensor, Tensor]:
         """Return the object's pose at the start of given demonstrations [M]: position [M, 3] and quaternion [M, 4]."""
         return self._demos.start_pos[sequence], self._demos.start_quat[sequence]
@@ -250,9 +266,9 @@ class ResetDistribution:
         shift = 2.0 * torch.rand(m, 3, generator=generator, device=device) - 1.0
         spawn_xy = c.spawn_xy if c.training_xy is None else c.training_xy
         demos = self._demos[sequence]
-        object_quat = quat_multiply(_about_z(shift[:, 2] * c.spawn_yaw), demos.start_quat)
-        object_pos = _turned(demos.start_pos, demos.start_quat, object_quat, demos.pivot)
-        object_pos = object_pos + pad(shift[:, :2] * spawn_xy, (0, 1))
+        object_pos, object_quat = _turned_about_z(
+            demos.start_pos, demos.start_quat, demos.pivot, shift[:, 2] * c.spawn_yaw
+        )
         gravity = (
             1.0 + torch.randn(m, generator=generator, device=device) * c.home_gravity_std / GRAVITY
         )
@@ -260,7 +276,7 @@ class ResetDistribution:
         return Reset(
             joint_pos=joint_pos,
             joint_target=joint_pos,
-            object_pos=object_pos,
+            object_pos=object_pos + pad(shift[:, :2] * spawn_xy, (0, 1)),
             object_quat=object_quat,
             goal_pos=goal_pos,
             goal_quat=goal_quat,
@@ -280,16 +296,20 @@ class ResetDistribution:
             return pos, quat
         uniform = torch.rand(len(pos), 4, generator=generator, device=generator.device)
         shift = (2.0 * uniform - 1.0) * self._goal_shift
-        new_quat = quat_multiply(_about_z(shift[:, 3]), quat)
         at_start = _turned(pos, quat, demos.start_quat, demos.pivot)
         above_start = (at_start - demos.start_pos)[:, 2]
         shift[:, 2] = torch.maximum(shift[:, 2], -above_start.clamp_min(0.0))
-        return _turned(pos, quat, new_quat, demos.pivot) + shift[:, :3], new_quat
+        new_pos, new_quat = _turned_about_z(pos, quat, demos.pivot, shift[:, 3])
+        return new_pos + shift[:, :3], new_quat
 
 
-def _about_z(angle: Tensor) -> Tensor:
-    """[M, 4] turns about the vertical by angles [M]."""
-    return quat_from_axis_angle(pad(angle[:, None], (2, 0)))
+def _turned_about_z(
+    pos: Tensor, quat: Tensor, pivot: Tensor, angle: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return poses [M, 3], [M, 4] of objects that turn about the vertical through their pivots by angles [M]."""
+    turn = quat_from_axis_angle(pad(angle[:, None], (2, 0)))
+    new_quat = quat_multiply(turn, quat)
+    return _turned(pos, quat, new_quat, pivot), new_quat
 
 
 def _turned(pos: Tensor, quat: Tensor, new_quat: Tensor, pivot: Tensor) -> Tensor:

@@ -22,6 +22,8 @@ from xreset.checks import (
     Share,
     frozen,
 )
+from xreset.errors import XResetError
+from xreset.text import shown
 
 PositiveRange = Annotated[Range, Rule("factors above 0", lambda x: x[0] > 0)]
 
@@ -482,6 +484,11 @@ class TaskConfig(Checked):
     """Surface points per object for fingertip distances."""
 
     @property
+    def control_dt(self) -> float:
+        """Time between two actions [s]."""
+        return self.timestep * self.substeps
+
+    @property
     def policy_groups(self) -> tuple[str, str, str]:
         """Names of the observation groups that a policy gets: two flat ones, then clouds or images."""
         return (
@@ -497,12 +504,11 @@ class TaskConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        control_dt = self.timestep * self.substeps
-        steps = self.termination.episode_seconds / control_dt
+        steps = self.termination.episode_seconds / self.control_dt
         if steps < 1 - 1e-6:
             raise ValueError(
                 f"termination.episode_seconds is {self.termination.episode_seconds:g}, expected at least one control "
-                f"step, which is {control_dt:.3g}"
+                f"step, which is {self.control_dt:.3g}"
             )
         for name in ("action_latency", "hand_latency", "observation_latency", "proprio_latency"):
             longest = self.randomization.longest(name)
@@ -524,8 +530,8 @@ def evaluation_task(task: TaskConfig) -> TaskConfig:
     no figure rests on them, and their module need not be installed.
     """
     zero = NoiseConfig(joint_pos=0.0, joint_vel=0.0, object_pos=0.0, object_rot=0.0, cloud=0.0)
-    substeps = round(task.timestep * task.substeps / EVALUATION_TIMESTEP)
-    if substeps and abs(substeps * EVALUATION_TIMESTEP - task.timestep * task.substeps) < 1e-9:
+    substeps = round(task.control_dt / EVALUATION_TIMESTEP)
+    if substeps and abs(substeps * EVALUATION_TIMESTEP - task.control_dt) < 1e-9:
         task = replace(task, timestep=EVALUATION_TIMESTEP, substeps=substeps)
     return replace(
         task,
@@ -544,3 +550,23 @@ def evaluation_task(task: TaskConfig) -> TaskConfig:
         ),
         randomization=replace(task.randomization, enabled=False),
     )
+
+
+LONGEST_EPISODE = 1e6
+"""Largest length of an episode [s]: the largest time that a file of traces may hold."""
+
+
+def with_episodes_of(task: TaskConfig, seconds: float) -> TaskConfig:
+    """Return the task with episodes of another length [s].
+
+    Raises:
+        XResetError: the length is not a number, too large, or less than a control step.
+    """
+    control_dt = task.control_dt
+    is_number = isinstance(seconds, int | float) and not isinstance(seconds, bool)
+    if not is_number or not control_dt <= seconds <= LONGEST_EPISODE:
+        raise XResetError(
+            f"episode_seconds is {shown(seconds)}, expected a number from {control_dt:.3g}, which is one control "
+            f"step, to {LONGEST_EPISODE:,.0f}. Without it, episodes last as long as in the policy's training."
+        )
+    return replace(task, termination=replace(task.termination, episode_seconds=float(seconds)))

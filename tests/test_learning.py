@@ -311,7 +311,7 @@ class ConfigTest(TestCase):
             (
                 TaskConfig,
                 {"termination": TerminationConfig(episode_seconds=0.01)},
-                "episode_seconds is 0.01, expected at least one control step, which is 0.0167",
+                "episode_seconds is 0.01, expected a number from 0.0167, which is one control step, to 1,000,000",
             ),
             (ModelConfig, {"mlp": (64, 0)}, "mlp is .*expected one width or more"),
             (

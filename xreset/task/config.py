@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import field, replace
 from math import isfinite
+from numbers import Real
 from typing import Annotated, ClassVar, Literal
 
 from xreset.cameras.config import VisionConfig
@@ -24,6 +25,9 @@ from xreset.checks import (
 )
 from xreset.errors import XResetError
 from xreset.text import shown
+
+LONGEST_EPISODE = 1e6
+"""Largest length of an episode [s]: the largest time that a file of traces may hold."""
 
 PositiveRange = Annotated[Range, Rule("factors above 0", lambda x: x[0] > 0)]
 
@@ -223,8 +227,8 @@ class RewardConfig(Checked):
 class TerminationConfig(Checked):
     """When an episode ends. The paper names the out-of-bounds termination, not its bounds."""
 
-    episode_seconds: PositiveFinite = 5.0
-    """Time limit [s]; not a failure: its value is bootstrapped."""
+    episode_seconds: float = 5.0
+    """Time limit [s], from one control step to :data:`LONGEST_EPISODE`; not a failure: its value is bootstrapped."""
     object_low: FiniteFloat = -0.05
     """The object is out of bounds when its origin is below this height [m]: it has left the table."""
     object_high: FiniteFloat = 1.0
@@ -504,12 +508,14 @@ class TaskConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        steps = self.termination.episode_seconds / self.control_dt
-        if steps < 1 - 1e-6:
+        seconds = self.termination.episode_seconds
+        is_number = isinstance(seconds, Real) and not isinstance(seconds, bool)
+        if not is_number or not (1 - 1e-6) * self.control_dt <= seconds <= LONGEST_EPISODE:
             raise ValueError(
-                f"termination.episode_seconds is {self.termination.episode_seconds:g}, expected at least one control "
-                f"step, which is {self.control_dt:.3g}"
+                f"episode_seconds is {shown(seconds)}, expected a number from {self.control_dt:.3g}, which is one "
+                f"control step, to {LONGEST_EPISODE:,.0f}"
             )
+        steps = seconds / self.control_dt
         for name in ("action_latency", "hand_latency", "observation_latency", "proprio_latency"):
             longest = self.randomization.longest(name)
             if longest >= steps:
@@ -552,21 +558,15 @@ def evaluation_task(task: TaskConfig) -> TaskConfig:
     )
 
 
-LONGEST_EPISODE = 1e6
-"""Largest length of an episode [s]: the largest time that a file of traces may hold."""
-
-
 def with_episodes_of(task: TaskConfig, seconds: float) -> TaskConfig:
     """Return the task with episodes of another length [s].
 
     Raises:
         XResetError: the length is not a number, too large, or less than a control step.
     """
-    control_dt = task.control_dt
-    is_number = isinstance(seconds, int | float) and not isinstance(seconds, bool)
-    if not is_number or not control_dt <= seconds <= LONGEST_EPISODE:
+    try:
+        return replace(task, termination=replace(task.termination, episode_seconds=seconds))
+    except ValueError as error:
         raise XResetError(
-            f"episode_seconds is {shown(seconds)}, expected a number from {control_dt:.3g}, which is one control "
-            f"step, to {LONGEST_EPISODE:,.0f}. Without it, episodes last as long as in the policy's training."
-        )
-    return replace(task, termination=replace(task.termination, episode_seconds=float(seconds)))
+            f"{error}. Without it, episodes last as long as in the policy's training."
+        ) from None

@@ -419,6 +419,11 @@ class PageTest(Reported):
         self.write(engines=("pybullet",), episode_seconds=12.0)
         text = page(collect(self.folder), [])
         self.assertIn("4 of 12 s in each engine: 2 demonstrations", Outline(text).text)
+        self.write(engines=("mujoco",), episode_seconds=5.0)
+        both = Outline(page(collect(self.folder), [])).text
+        self.assertIn(
+            "4 in each engine, of 5 s in mujoco, of 12 s in pybullet: 2 demonstrations", both
+        )
         self.assertEqual(text.count('<td class="bad">1</td>'), 2, "faults of an engine stand out")
         self.assertNotIn("<video", text)
         self.assertNotIn("Training", Outline(text).text)

@@ -264,9 +264,11 @@ class TargetsTest(InFolder):
 class CommandTest(InFolder):
     def setUp(self):
         super().setUp()
-        self.enterContext(patch("xreset.inputs.load_robot", lambda _: ROBOT))
+        self.enterContext(patch("xreset.description.load_robot", lambda _: ROBOT))
         self.enterContext(in_this_process())
-        self.enterContext(patch("xreset.inputs.load_objects", lambda *_: (toy_grasp.brick(),)))
+        self.enterContext(
+            patch("xreset.objects.catalogue.load_objects", lambda *_: (toy_grasp.brick(),))
+        )
         write_retargeted(f"{self.folder}/r.npz", grasp_and_lift())
 
     def resets(self, *options):
@@ -308,7 +310,7 @@ class CommandTest(InFolder):
         out = self.folder / "c.npz"
         for name, message in (
             ("b.npz", "states schema 'xreset-resets/1', expected 'xreset-retargeted/1'"),
-            ("text", "text is not a file of xreset retarget"),
+            ("text", "text cannot be read as a file of xreset retarget"),
             ("none.npz", r"none.npz \(a file of xreset retarget\). Check the path"),
         ):
             self.assertRegex(refused("resets", self.folder / name, "--out", out), message)

@@ -551,7 +551,7 @@ class TrainingTest(WithBank):
                 self.train("memory")
 
     def test_many_worlds_on_a_cpu_are_warned_of(self):
-        stopped = patch("xreset.learning.train._runner", side_effect=RunError("stopped"))
+        stopped = patch("xreset.learning.train._train", side_effect=RunError("stopped"))
         for worlds, warned in ((300, True), (4, False)):
             said = io.StringIO()
             with stopped, redirect_stderr(said), self.assertRaisesRegex(RunError, "stopped"):

@@ -19,18 +19,11 @@ from xreset.objects.catalogue import canonical_names, load_objects
 from xreset.progress import Progress, unseen
 from xreset.records import npz_schema
 from xreset.resets.bank import SCHEMA as BANK
-from xreset.resets.bank import (
-    ResetBank,
-    check_objects,
-    check_retargeted,
-    check_robot,
-    read_bank,
-    starts_and_goals,
-)
+from xreset.resets.bank import ResetBank, check_objects, read_bank, starts_and_goals
 from xreset.resets.goals import SCHEMA as GOALS
 from xreset.resets.goals import GoalSet, checked_goals, read_goals
 from xreset.retarget.file import SCHEMA as MOTION
-from xreset.retarget.file import Retargeted, read_retargeted
+from xreset.retarget.file import Retargeted, check_retargeted, check_robot, read_retargeted
 from xreset.retarget.pipeline import rest_on_table, retarget_demos
 from xreset.spec import ObjectSpec, RobotSpec
 from xreset.text import shown

@@ -179,7 +179,7 @@ def make_backend(name: str, scene: SceneSpec, num_worlds: int, **options: Any) -
         BackendUnavailableError: there is no such engine, or it cannot be used here.
         XResetError: the engine has no such option.
     """
-    device_for(name, str(options.get("device", "cpu")))  # refuses an unknown device
+    _kind(str(options.get("device", "cpu")))  # refuses an unknown device
     cls = backend_class(name)
     cls.engine_version()  # fails with reason and remedy where the engine is missing
     refuse_unknown_options(name, options, cls)

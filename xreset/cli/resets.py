@@ -10,6 +10,7 @@ from tyro.conf import arg
 
 from xreset.cli._common import Device, Objects, Several, Source, show_accounts
 from xreset.cli._terminal import Progress, console, show_notes
+from xreset.files import file_hash
 from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
 
 
@@ -42,18 +43,22 @@ def resets(
         settle: Let objects come to rest (in the first engine) before episodes begin at home. Default: the recorded
             poses, as in the paper, from which one object in eight tips or rolls.
     """
-    from xreset.inputs import load_inputs
+    from xreset.description import load_robot
+    from xreset.objects.catalogue import load_objects
     from xreset.resets.bank import write_bank
     from xreset.resets.filter import make_bank
     from xreset.resets.settle import settle_starts
-    from xreset.retarget.file import object_sources
+    from xreset.retarget.file import check_retargeted, object_sources, read_retargeted
 
     backends = list(dict.fromkeys(backend)) or ["mujoco"]
-    inputs = load_inputs(retargeted, robot=robot, objects=objects, accept=("motion",))
-    motion = inputs.motion()
-    scene = (inputs.robot, inputs.objects)
+    motion = read_retargeted(retargeted)
     stated = object_sources(retargeted)
-    if changed := [o.name for o in inputs.objects if stated.get(o.name, o.source) != o.source]:
+    made_from = {"retargeted": file_hash(retargeted)}
+    spec = load_robot(robot or motion.robot)
+    check_retargeted(retargeted, motion, spec)
+    loaded = load_objects(motion.object_names, objects)
+    scene = (spec, loaded)
+    if changed := [o.name for o in loaded if stated.get(o.name, o.source) != o.source]:
         meshes = f"{retargeted} was made with other meshes of {', '.join(changed)}"
         show_notes([f"{meshes}. Give the same --objects folder."])
     where = {"num_envs": num_envs, "device": device}
@@ -74,7 +79,7 @@ def resets(
         "squeeze": asdict(squeeze),
         "settle": settle,
     }
-    write_bank(out, bank, config=config, inputs={"retargeted": str(inputs.hash)})
+    write_bank(out, bank, config=config, inputs=made_from)
     accounts = bank.accounts()
     show_accounts(accounts, f"{bank.robot}: {title}")
     if squeeze.presses:

@@ -366,8 +366,7 @@ def _run(
             stack.enter_context(claim_folder(out))
             stack.enter_context(claim_folder(out / "checkpoints"))
         try:
-            runner = _runner(stack, processes, out, info, inputs, resumed=resumed, wandb=wandb)
-            runner.learn(info.config.iterations, seconds=60 * minutes)
+            _train(processes, out, info, inputs, minutes=minutes, resumed=resumed, wandb=wandb)
         except (MemoryError, RuntimeError) as error:
             if isinstance(error, RuntimeError) and not _NO_MEMORY.search(str(error)):
                 raise
@@ -380,38 +379,27 @@ def _run(
                 f"{info.num_envs} worlds on {info.device} need more memory than there is; {state}. "
                 "Start with fewer (--num-envs), or smaller minibatches (--config.ppo.minibatch-size), in another --out."
             ) from error
-        if processes.is_main:
-            export_onnx(
-                runner.alg.networks["actor"],
-                out / "policy.onnx",
-                info.contract,
-                checkpoint=latest_checkpoint(out),
-            )
-            print(
-                f"policy after {runner.iteration} iterations in {out / 'policy.onnx'}", flush=True
-            )
 
 
-def _runner(
-    stack: ExitStack,
+def _train(
     processes: Processes,
     out: Path,
     info: RunInfo,
     inputs: Inputs,
     *,
+    minutes: float,
     resumed: bool,
     wandb: str | None,
-) -> TrainingRunner:
-    """Return a run's runner, which has read the checkpoint that it continues from, or the networks that it begins with;
-    the stack closes its worlds."""
+) -> None:
+    """Train from the newest checkpoint, from the networks of ``weights`` or from new ones, and export the policy."""
     device = processes.device(info.device)
-    begin = latest_checkpoint(out) if resumed and checkpoints(out) else None
+    newest = latest_checkpoint(out) if resumed and checkpoints(out) else None
     # a run that continues draws other numbers than it began with
-    seed = processes.seed(info.seed) + (0 if begin is None else int(begin.stem))
+    seed = processes.seed(info.seed) + (0 if newest is None else int(newest.stem))
     if device.startswith("cuda:"):
         torch.cuda.set_device(device)
     torch.manual_seed(seed)
-    env = make_env(
+    with make_env(
         inputs.robot,
         inputs.objects,
         inputs.bank,
@@ -420,31 +408,40 @@ def _runner(
         num_envs=info.num_envs,
         device=device,
         seed=seed,
-    )
-    stack.enter_context(env)
-    if env.vision is not None:
-        env.vision.check_sees_objects()
-    teacher = out / TEACHER if info.teacher else None
-    runner = TrainingRunner(env, info.config, out, teacher=teacher, wandb=wandb)
-    if begin is not None:
-        runner.load_checkpoint(begin)
-    elif info.weights is not None:
-        runner.load_networks(Path(info.weights))
+    ) as env:
+        if env.vision is not None:
+            env.vision.check_sees_objects()
+        teacher = out / TEACHER if info.teacher else None
+        runner = TrainingRunner(env, info.config, out, teacher=teacher, wandb=wandb)
+        if newest is not None:
+            runner.load_checkpoint(newest)
+        elif info.weights is not None:
+            runner.load_networks(Path(info.weights))
+        if processes.is_main:
+            _begin(out, info, runner.iteration, is_new=newest is None, resumed=resumed)
+        runner.learn(info.config.iterations, seconds=60 * minutes)
     if processes.is_main:
-        # before the first checkpoint a killed run leaves nothing worth keeping; files without a run are of others
-        if begin is None and (out / "run.json").is_file():
-            for events in out.glob("events.out.tfevents.*"):
-                events.unlink()
-        is_over = runner.iteration >= info.config.iterations
-        stated = read_run(out, as_stated=True) if resumed else info
-        if not is_over:  # a number that has passed already must not shorten the run
-            stated = replace(stated, config=info.config)
-        write_run(out, stated)
-        if resumed:
-            done = f"continuing after iteration {runner.iteration}"
-            if begin is None:
-                done = "there is no checkpoint yet: starting from the beginning"
-            elif is_over:
-                done += ", the last one: --iterations asks for more"
-            print(done, flush=True)
-    return runner
+        policy = out / "policy.onnx"
+        networks = runner.alg.networks
+        export_onnx(networks["actor"], policy, info.contract, checkpoint=latest_checkpoint(out))
+        print(f"policy after {runner.iteration} iterations in {policy}", flush=True)
+
+
+def _begin(out: Path, info: RunInfo, iteration: int, *, is_new: bool, resumed: bool) -> None:
+    """Write ``run.json``, and say where a resumed run continues."""
+    # before the first checkpoint a killed run leaves nothing worth keeping; files without a run are of others
+    if is_new and (out / "run.json").is_file():
+        for events in out.glob("events.out.tfevents.*"):
+            events.unlink()
+    is_over = iteration >= info.config.iterations
+    stated = read_run(out, as_stated=True) if resumed else info
+    if not is_over:  # a number that has passed already must not shorten the run
+        stated = replace(stated, config=info.config)
+    write_run(out, stated)
+    if resumed:
+        done = f"continuing after iteration {iteration}"
+        if is_new:
+            done = "there is no checkpoint yet: starting from the beginning"
+        elif is_over:
+            done += ", the last one: --iterations asks for more"
+        print(done, flush=True)

@@ -25,7 +25,6 @@ from xreset.demos.archive import (
     SequenceTexts,
 )
 from xreset.errors import FileFormatError, XResetError
-from xreset.geometry.urdf import joint_limits
 from xreset.records import (
     JOINT,
     POSITION,
@@ -36,7 +35,7 @@ from xreset.records import (
     unique_problem,
     write_record,
 )
-from xreset.retarget.file import JointNames, ReasonNames, Retargeted
+from xreset.retarget.file import JointNames, ReasonNames, check_joints, check_robot
 from xreset.spec import ObjectSpec, RobotSpec
 from xreset.text import Brief, shown
 
@@ -210,33 +209,6 @@ def read_bank(path: str | Path, *, robot: RobotSpec | None = None) -> ResetBank:
     return bank
 
 
-def check_robot(path: str | Path, what: str, data: Any, robot: RobotSpec) -> None:
-    """Refuse data that were made for another robot, or for another version of this robot; ``FileFormatError``.
-
-    Args:
-        data: anything with ``robot``, ``robot_fingerprint`` and ``joint_names``.
-    """
-    if data.robot != robot.name or data.joint_names != robot.joint_names:
-        raise FileFormatError(
-            f"{path} is a {what} for the robot {data.robot!r} with {len(data.joint_names)} joints; "
-            f"{robot.name!r} has {len(robot.joints)}. Make it again with --robot {robot.name}, or use --robot "
-            f"{data.robot}."
-        )
-    if not robot.has_fingerprint(data.robot_fingerprint):
-        raise FileFormatError(
-            f"{path} is a {what} for another version of {data.robot!r}: its URDF or robot.toml has changed. Make it "
-            "again."
-        )
-
-
-def check_joints(what: str, data: Any, robot: RobotSpec) -> None:
-    """Refuse data with other joints than the robot's; ``FileFormatError``."""
-    if data.joint_names != robot.joint_names:
-        raise FileFormatError(
-            f"{what} for the robot {data.robot!r}, whose joints are not those of {robot.name!r}. Use one robot."
-        )
-
-
 def check_states(bank: ResetBank, robot: RobotSpec, objects: tuple[ObjectSpec, ...]) -> None:
     """Refuse a bank whose states have other joints or other object geometry; ``FileFormatError``."""
     if not isinstance(bank, ResetBank):
@@ -244,24 +216,6 @@ def check_states(bank: ResetBank, robot: RobotSpec, objects: tuple[ObjectSpec, .
     if bank.num_states:
         check_joints("The reset bank is", bank, robot)
         check_objects("The reset bank", bank, objects)
-
-
-_TOLERANCE = 1e-4
-"""[rad or m] How far single precision may carry a joint beyond its limits."""
-
-
-def check_retargeted(path: str | Path, data: Retargeted, robot: RobotSpec) -> None:
-    """Refuse trajectories of another robot, or with joints outside this robot's limits; ``FileFormatError``."""
-    check_robot(path, "retargeted file", data, robot)
-    lower, upper = joint_limits(robot)
-    outside = np.maximum(lower - data.joint_pos, data.joint_pos - upper)
-    beyond = np.where(data.valid[:, None], outside, -np.inf)
-    frame, joint = np.unravel_index(beyond.argmax(), beyond.shape)
-    if beyond[frame, joint] > _TOLERANCE:
-        raise FileFormatError(
-            f"{path} holds {data.joint_names[joint]} = {data.joint_pos[frame, joint]:.4g} in frame {frame}, but the "
-            f"joint goes from {lower[joint]:.4g} to {upper[joint]:.4g}. Make the file again: xreset retarget."
-        )
 
 
 def check_objects(path: str | Path, bank: ResetBank, objects: tuple[ObjectSpec, ...]) -> None:

@@ -28,7 +28,7 @@ MOVED = 0.01
 def closing_states(
     retargeted: Retargeted, robot: RobotSpec, objects: Sequence[ObjectSpec], config: ClosingConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Choose the frames of a motion, and states between valid ones where the hand closes in.
+    """Choose the valid frames of a motion, and states between them where the hand closes in.
 
     That is where a finger is near the object, until the thumb and another finger touch the object or the object has
     been moved. The human's first contact is not the end: there the robot's fingers are usually 5 to 10 mm away.
@@ -37,7 +37,7 @@ def closing_states(
         For each state [M] the frame that it is or follows, ascending, and how far it is on the way to the next frame,
         in [0, 1); 0 is the frame itself.
     """
-    pieces = np.ones(len(retargeted.joint_pos), dtype=int)
+    pieces = retargeted.valid.astype(int)
     if config.spacing is not None:
         object_name = retargeted.object_name[retargeted.sequence_of_frame]
         poses = (retargeted.joint_pos, retargeted.object_pos, retargeted.object_quat_wxyz)

@@ -18,12 +18,12 @@ from xreset.checks import names_wrong_arguments
 from xreset.errors import DemoError
 from xreset.physics import Backend, State
 from xreset.progress import unseen
-from xreset.resets.bank import ResetBank, check_joints, starts_and_goals
+from xreset.resets.bank import ResetBank, starts_and_goals
 from xreset.resets.closing import closing_states, positions_between, rotations_between
 from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
 from xreset.resets.fingers import fingers_of, squeeze_targets
 from xreset.resets.probe import probe
-from xreset.retarget.file import Retargeted
+from xreset.retarget.file import Retargeted, check_joints
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, checked_objects, objects_named
 from xreset.task.config import TerminationConfig
 from xreset.task.terminations import out_of_bounds
@@ -94,6 +94,8 @@ def make_bank(
         FileFormatError: the trajectories are for a robot with other joints.
     """
     objects = checked_objects(robot, objects)
+    owner = retargeted.sequence_of_frame
+    used = objects_named(objects, retargeted.object_name[owner[retargeted.valid]])
     check_joints("The motion is", retargeted, robot)
     engines = (engine,) if isinstance(engine, str) else tuple(engine)
     limits = limits or FilterConfig()
@@ -103,21 +105,18 @@ def make_bank(
             "no frame of the retargeted trajectories is valid, so there is no state to try. "
             "Look at the reasons of xreset retarget."
         )
-    owner = retargeted.sequence_of_frame[retargeted.valid]
-    used = objects_named(objects, retargeted.object_name[owner])
     scene = SceneSpec(robot=robot, objects=tuple(used.values()))
     frame, part = closing_states(retargeted, robot, objects, closing or ClosingConfig())
-    valid = retargeted.valid[frame]
-    frame = frame[valid]
-    part = part[valid]
-    sequence = retargeted.sequence_of_frame[frame]
+    sequence = owner[frame]
     post_contact = retargeted.post_contact[frame]
     object_name = retargeted.object_name[sequence]
     object_index = np.searchsorted(list(used), object_name)
-    joint_pos = positions_between(retargeted.joint_pos, frame, part)
-    object_pos = positions_between(retargeted.object_pos, frame, part)
-    object_quat = rotations_between(retargeted.object_quat_wxyz, frame, part)
-    states = State.at_rest(*map(torch.as_tensor, (joint_pos, object_pos, object_quat)))
+    poses = (
+        positions_between(retargeted.joint_pos, frame, part),
+        positions_between(retargeted.object_pos, frame, part),
+        rotations_between(retargeted.object_quat_wxyz, frame, part),
+    )
+    states = State.at_rest(*map(torch.as_tensor, poses))
 
     def try_candidates(
         rows: np.ndarray, report: Callable[[int], None] = lambda done: None
@@ -147,15 +146,9 @@ def make_bank(
     reason = try_candidates(np.arange(len(frame)), lambda done: progress(done, work))
     if squeeze.presses:
         rows = np.flatnonzero((reason < 0) & post_contact)
-        fingers = fingers_of(
-            robot,
-            scene.objects,
-            object_name[rows],
-            joint_pos[rows],
-            object_pos[rows],
-            object_quat[rows],
-        )
-        targets = squeeze_targets(robot, fingers, joint_pos[rows], squeeze)
+        touching = [values[rows] for values in poses]
+        fingers = fingers_of(robot, scene.objects, object_name[rows], *touching)
+        targets = squeeze_targets(robot, fingers, touching[0], squeeze)
         states.joint_target[rows] = torch.as_tensor(targets, dtype=torch.float32)
         refused = rows[try_candidates(rows) >= 0]
         states.joint_target[refused] = states.joint_pos[refused]

@@ -25,6 +25,8 @@ from xreset.demos.archive import (
     SequenceTexts,
     sequences_problem,
 )
+from xreset.errors import FileFormatError
+from xreset.geometry.urdf import joint_limits
 from xreset.records import (
     JOINT,
     POSITION,
@@ -35,6 +37,7 @@ from xreset.records import (
     read_record,
     write_record,
 )
+from xreset.spec import RobotSpec
 
 SCHEMA = "xreset-retargeted/1"
 
@@ -129,12 +132,57 @@ def read_retargeted(path: str | Path) -> Retargeted:
     Raises:
         FileFormatError: the file is missing, damaged, of another kind, or inconsistent.
     """
-    return read_record(Retargeted, path, SCHEMA, what="retargeted trajectories", check=_check)
+    return read_record(Retargeted, path, SCHEMA, what="a file of xreset retarget", check=_check)
+
+
+_TOLERANCE = 1e-4
+"""[rad or m] How far single precision may carry a joint beyond its limits."""
+
+
+def check_retargeted(path: str | Path, data: Retargeted, robot: RobotSpec) -> None:
+    """Refuse trajectories of another robot, or with joints outside this robot's limits; ``FileFormatError``."""
+    check_robot(path, "retargeted file", data, robot)
+    lower, upper = joint_limits(robot)
+    outside = np.maximum(lower - data.joint_pos, data.joint_pos - upper)
+    beyond = np.where(data.valid[:, None], outside, -np.inf)
+    frame, joint = np.unravel_index(beyond.argmax(), beyond.shape)
+    if beyond[frame, joint] > _TOLERANCE:
+        raise FileFormatError(
+            f"{path} holds {data.joint_names[joint]} = {data.joint_pos[frame, joint]:.4g} in frame {frame}, but the "
+            f"joint goes from {lower[joint]:.4g} to {upper[joint]:.4g}. Make the file again: xreset retarget."
+        )
+
+
+def check_robot(path: str | Path, what: str, data: Any, robot: RobotSpec) -> None:
+    """Refuse data that were made for another robot, or for another version of this robot; ``FileFormatError``.
+
+    Args:
+        data: anything with ``robot``, ``robot_fingerprint`` and ``joint_names``.
+    """
+    if data.robot != robot.name or data.joint_names != robot.joint_names:
+        raise FileFormatError(
+            f"{path} is a {what} for the robot {data.robot!r} with {len(data.joint_names)} joints; "
+            f"{robot.name!r} has {len(robot.joints)}. Make it again with --robot {robot.name}, or use --robot "
+            f"{data.robot}."
+        )
+    if not robot.has_fingerprint(data.robot_fingerprint):
+        raise FileFormatError(
+            f"{path} is a {what} for another version of {data.robot!r}: its URDF or robot.toml has changed. Make it "
+            "again."
+        )
+
+
+def check_joints(what: str, data: Any, robot: RobotSpec) -> None:
+    """Refuse data with other joints than the robot's; ``FileFormatError``."""
+    if data.joint_names != robot.joint_names:
+        raise FileFormatError(
+            f"{what} for the robot {data.robot!r}, whose joints are not those of {robot.name!r}. Use one robot."
+        )
 
 
 def object_sources(path: str | Path) -> dict[str, str]:
     """Return object name -> :attr:`~xreset.spec.ObjectSpec.source` when the file was made, where it states them."""
-    meta = read_npz(path, SCHEMA, {}, what="retargeted trajectories").get("meta")
+    meta = read_npz(path, SCHEMA, {}, what="a file of xreset retarget").get("meta")
     try:
         inputs = json.loads(str(meta))["inputs"]
         objects = [name for name in inputs if name.startswith("object ")]

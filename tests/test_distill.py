@@ -174,6 +174,8 @@ class DistillTest(WithBank):
         for options, problem in (
             (f"{self.teacher} --resets {self.bank}", ""),
             ("--camera front", "the run's own cameras. Omit --camera and --vision"),
+            ("--vision.view points", "Omit --camera and --vision"),
+            ("--num-envs 1024", "--num-envs is 1024, but .* was started with"),
             ("many-objects", "TEACHER is many-objects, but .* was started with"),
             ("--num-envs 77", "--num-envs is 77, but .* was started with"),
         ):

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Sequence
-from inspect import signature
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
@@ -83,13 +82,18 @@ def quick_engines(names: Sequence[str], device: str) -> list[rollout.Engine]:
     return [each for each in engines if names or not each.slow]
 
 
-def refuse_changes(command: Callable[..., None], out: Path, **given: Any) -> None:
+def given_flags() -> list[str]:
+    """Return the flags of the command that is running, such as ``--num-envs``; its defaults are not among them."""
+    return [word.partition("=")[0].replace("_", "-") for word in INVOCATION]
+
+
+def refuse_changes(out: Path, **options: Any) -> None:
     """Refuse options of a run that is resumed, if it was started with others.
 
     Args:
-        command: what has the options; a value that is its default is not given.
         out: the run's folder.
-        given: values by name of the option; ``resets`` and ``goals``: files.
+        options: values by name of the option, also those that were not given; ``resets`` and ``goals``: files;
+            ``teacher``: empty if it was not given.
 
     Raises:
         RunError: names the first option that differs.
@@ -100,19 +104,20 @@ def refuse_changes(command: Callable[..., None], out: Path, **given: Any) -> Non
     files = ("resets", "goals")
     # a bank and a goal set are joined in a file of the run
     is_joined = Path(info.resets).resolve().parent == out.resolve()
-    joined = is_joined and None not in [given.get(name) for name in files]
-    for name, value in given.items():
-        if value == signature(command).parameters[name].default or (joined and name in files):
+    joined = is_joined and None not in [options.get(name) for name in files]
+    for name, value in options.items():
+        flag = "TEACHER" if name == "teacher" else f"--{name.replace('_', '-')}"
+        is_given = bool(value) if name == "teacher" else flag in given_flags()
+        if not is_given or (joined and name in files):
             continue
         if name in files:
             found = info.resets
-            is_same = file_hash(value) == info.resets_hash
+            is_same = value is not None and file_hash(value) == info.resets_hash
         else:
             found = getattr(info, name)
             # a folder may be written in several ways; names and numbers are compared by their text
             is_same = Path(str(value)).resolve() == Path(str(found)).resolve()
         if not is_same:
-            flag = "TEACHER" if name == "teacher" else f"--{name.replace('_', '-')}"
             raise RunError(
                 f"{flag} is {value}, but {out} was started with {found}, and --resume continues it as it was. "
                 f"Omit {flag}, or start another run with its networks: --weights {out} --like {out}"

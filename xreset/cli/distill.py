@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 
 from xreset.cameras.config import STUDENT_VISION, VisionConfig
-from xreset.cli._common import Objects, Policy, Robot, Several, refuse_changes
+from xreset.cli._common import Objects, Policy, Robot, Several, given_flags, refuse_changes
 from xreset.errors import RunError
 
 
@@ -45,12 +45,11 @@ def distill(
     from xreset.learning import train as training
 
     if resume:
-        if camera or vision != STUDENT_VISION:
+        if any(flag.startswith(("--camera", "--vision")) for flag in given_flags()):
             raise RunError(
                 "--resume continues with the run's own cameras. Omit --camera and --vision."
             )
         refuse_changes(
-            distill,
             out,
             teacher=teacher,
             robot=robot,

@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from argparse import ArgumentParser
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from xreset.cli._common import Objects, refuse_changes
+from xreset.cli._common import Objects, given_flags, refuse_changes
 from xreset.errors import RunError
 from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import default_recipe, starting_config, without_state_schedule
@@ -61,22 +60,21 @@ def train(
     """
     from xreset.learning import train as training
 
-    if resume and like != "paper":
+    flags = given_flags()
+    if resume and "--like" in flags:
         raise RunError("--resume continues with the run's own configuration. Omit --like.")
     if resume and weights is not None:
         raise RunError(
             "--resume continues with the run's own networks. Omit --weights, or start another run with it."
         )
-    own = config.task.reward.own
-    reward = replace(config.task.reward, own={})
-    if resume and replace(config, task=replace(config.task, reward=reward)) != TrainConfig():
+    own = "--config.task.reward.own"
+    if resume and any(flag.startswith("--config.") and flag != own for flag in flags):
         raise RunError(
             "--resume continues with the run's own configuration. Omit --config, or start another run with this run's "
             f"networks: --weights {out} --like {out}"
         )
     if resume:
         refuse_changes(
-            train,
             out,
             robot=robot,
             resets=resets,
@@ -87,7 +85,13 @@ def train(
             num_envs=num_envs,
             seed=seed,
         )
-        training.resume(out, iterations=iterations, minutes=minutes, own=own, wandb=wandb)
+        training.resume(
+            out,
+            iterations=iterations,
+            minutes=minutes,
+            own=config.task.reward.own,
+            wandb=wandb,
+        )
         return
     if goals is None and resets is None:
         raise RunError(

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import tensor
 from torch.testing import assert_close
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_robot
@@ -332,6 +333,19 @@ class RandomizationTest(TestCase):
         self.assertEqual(len(material.mul(1e5).round().unique()), 250)
 
 
+class Comparisons(TorchDispatchMode):
+    """Takes note of which numbers are compared."""
+
+    def __init__(self):
+        super().__init__()
+        self.names = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        if "aten.lt" in str(func):
+            self.names.append(str(func))
+        return func(*args, **(kwargs or {}))
+
+
 class ResetTest(TestCase):
     robot = toy_robot()
     bank = toy_bank(robot)
@@ -400,6 +414,14 @@ class ResetTest(TestCase):
                     self.assertEqual(set(reset.sequence.tolist()), {0, 2})
                     assert_close(reset.goal_pos, self.of(reset, "goal_pos"))
                     self.assertEqual(reset.from_bank.all(), p == 1.0)
+
+    def test_what_only_adaptive_sampling_needs_is_not_computed_without_it(self):
+        """Numbers are compared with the share; with the probability of a state, which is a tensor, always."""
+        for share in (0.0, 0.5):
+            with Comparisons() as done:
+                self.sample(adaptive_share=share)
+            self.assertEqual("aten.lt.Scalar" in done.names, share > 0)
+            self.assertIn("aten.lt.Tensor", done.names)
 
     def test_a_demonstration_without_states_is_drawn_at_home_only(self):
         bank = self.bank.with_states(self.bank.sequence_index != 2)

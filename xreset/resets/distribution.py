@@ -218,11 +218,11 @@ class ResetDistribution:
         # versions.
         uniform = torch.rand(len(object_index), 6, generator=generator, device=generator.device)
         place = self._grouped_sequences.draw(object_index, uniform[:, 2])
-        adapted = uniform[:, 4] < self.config.adaptive_share
-        if self.config.adaptive_share:
+        share = self.config.adaptive_share
+        if share:
             failure = (1.0 - self.success_rate[self._sequences]).clamp_min(_LEAST_FAILURE)
             weak = self._grouped_sequences.draw_by_weight(object_index, uniform[:, 2], failure)
-            place = torch.where(adapted, weak, place)
+            place = torch.where(uniform[:, 4] < share, weak, place)
         sequence = self._sequences[place]
         home = self.home(sequence, generator)
         if not len(self._states.state):
@@ -231,10 +231,10 @@ class ResetDistribution:
             self._grouped_states.count[object_index] > 0
         )
         row = self._grouped_states.draw(object_index, uniform[:, 1])
-        if self.config.adaptive_share:
-            has_states = self._states_of.count[sequence] > 0
-            place = torch.where(has_states, self._states_of.draw(sequence, uniform[:, 1]), 0)
-            row = torch.where(adapted & has_states, self._rows_of[place], row)
+        if share:
+            adapted = (uniform[:, 4] < share) & (self._states_of.count[sequence] > 0)
+            place = torch.where(adapted, self._states_of.draw(sequence, uniform[:, 1]), 0)
+            row = torch.where(adapted, self._rows_of[place], row)
         row = torch.where(from_bank, row, 0)  # a valid row for home worlds; its values are not used
         gravity = uniform[:, 3] if self.config.random_gravity else torch.ones_like(uniform[:, 3])
         return where(

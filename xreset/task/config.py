@@ -228,7 +228,7 @@ class TerminationConfig(Checked):
     """When an episode ends. The paper names the out-of-bounds termination, not its bounds."""
 
     episode_seconds: float = 5.0
-    """Time limit [s], from one control step to :data:`LONGEST_EPISODE`; not a failure: its value is bootstrapped."""
+    """Time limit [s], from one control step to 1,000,000 s; not a failure: its value is bootstrapped."""
     object_low: FiniteFloat = -0.05
     """The object is out of bounds when its origin is below this height [m]: it has left the table."""
     object_high: FiniteFloat = 1.0

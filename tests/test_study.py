@@ -115,6 +115,18 @@ class FileTest(Studied):
                     words = rf"data\.toy\.{command} {message}"
                     self.assertRaisesRegex(FileFormatError, words, read_study, file)
 
+    def test_defaults_hold_the_options_of_resets_of_all_data(self):
+        default = ("--squeeze.force", "5")
+        text = RUN.replace("[defaults]", f"[defaults]\nresets = {json.dumps(default)}")
+        other = f"[data.own]\nresets = ['--settle']\n[data.plain]\nresets = []\n{text}[runs.a]\n"
+        found = read_study(self.file(HEAD + DATA + other)).data
+        self.assertEqual(
+            {name: data.resets for name, data in found.items()},
+            {"toy": default, "own": ("--settle",), "plain": ()},
+        )
+        with self.assertRaisesRegex(FileFormatError, "each entry of data and runs must be tables"):
+            read_study(self.file(f"data = 3\n{HEAD}{text}"))
+
     def test_every_study_that_ships_can_be_read(self):
         files = sorted(SHIPPED.glob("*.toml"))
         self.assertIn("nine_objects", [f.stem for f in files])

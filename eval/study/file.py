@@ -12,7 +12,7 @@
     [evaluations.eval]                 # results go to RUN/eval, where xreset compare and xreset report look
     episodes = 5
 
-    [defaults]                         # of every run
+    [defaults]                         # of every run; `resets`: of all data
     data = "right"
     minutes = 8.0
 
@@ -217,12 +217,20 @@ def read_study(path: Path) -> Study:
     """
     raw = read_toml(path, SCHEMA)
     defaults = raw.pop("defaults", {})
+    data = raw.get("data", {})
     runs = raw.get("runs", {})
-    tables = [defaults, runs]
-    if isinstance(runs, dict):
-        tables += runs.values()
+    tables = [defaults, data, runs]
+    for group in (data, runs):
+        if isinstance(group, dict):
+            tables += group.values()
     if not all(isinstance(table, dict) for table in tables):
-        raise FileFormatError(f"{path}: defaults, runs and each of the runs must be tables.")
+        raise FileFormatError(
+            f"{path}: defaults, data, runs, and each entry of data and runs must be tables."
+        )
+    if "resets" in defaults:
+        resets = defaults.pop("resets")
+        for each in data.values():
+            each.setdefault("resets", resets)
     raw["runs"] = {name: merged(defaults, run) for name, run in runs.items()}
     study = from_dict(Study, raw, str(path))
     try:

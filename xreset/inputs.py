@@ -23,9 +23,9 @@ from xreset.resets.bank import ResetBank, check_objects, read_bank, starts_and_g
 from xreset.resets.goals import SCHEMA as GOALS
 from xreset.resets.goals import GoalSet, checked_goals, read_goals
 from xreset.retarget.file import SCHEMA as MOTION
-from xreset.retarget.file import Retargeted, check_retargeted, check_robot, read_retargeted
+from xreset.retarget.file import Retargeted, check_retargeted, read_retargeted
 from xreset.retarget.pipeline import rest_on_table, retarget_demos
-from xreset.spec import ObjectSpec, RobotSpec
+from xreset.spec import ObjectSpec, RobotSpec, check_robot
 from xreset.text import shown
 
 Kind = Literal["demos", "motion", "bank", "goals"]

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from xreset.checks import NotNegative, Number, Positive, Rule, Text, frozen
-from xreset.errors import DemoError, XResetError
+from xreset.errors import DemoError, FileFormatError, XResetError
 from xreset.text import Brief, shown
 
 GRAVITY = 9.81
@@ -295,6 +295,33 @@ def checked_objects(robot: Any, objects: Any) -> tuple[ObjectSpec, ...]:
                 f"objects has {shown(obj)}, expected an ObjectSpec: xreset.load_object(NAME)."
             )
     return found
+
+
+def check_robot(path: str | Path, what: str, data: Any, robot: RobotSpec) -> None:
+    """Refuse data that were made for another robot, or for another version of this robot; ``FileFormatError``.
+
+    Args:
+        data: anything with ``robot``, ``robot_fingerprint`` and ``joint_names``.
+    """
+    if data.robot != robot.name or data.joint_names != robot.joint_names:
+        raise FileFormatError(
+            f"{path} is a {what} for the robot {data.robot!r} with {len(data.joint_names)} joints; "
+            f"{robot.name!r} has {len(robot.joints)}. Make it again with --robot {robot.name}, or use --robot "
+            f"{data.robot}."
+        )
+    if not robot.has_fingerprint(data.robot_fingerprint):
+        raise FileFormatError(
+            f"{path} is a {what} for another version of {data.robot!r}: its URDF or robot.toml has changed. Make it "
+            "again."
+        )
+
+
+def check_joints(what: str, data: Any, robot: RobotSpec) -> None:
+    """Refuse data with other joints than the robot's; ``FileFormatError``."""
+    if data.joint_names != robot.joint_names:
+        raise FileFormatError(
+            f"{what} for the robot {data.robot!r}, whose joints are not those of {robot.name!r}. Use one robot."
+        )
 
 
 def objects_named(objects: Sequence[ObjectSpec], names: Iterable[str]) -> dict[str, ObjectSpec]:

@@ -62,10 +62,18 @@ def resets(
         meshes = f"{retargeted} was made with other meshes of {', '.join(changed)}"
         show_notes([f"{meshes}. Give the same --objects folder."])
     where = {"num_envs": num_envs, "device": device}
-    options = {"limits": limits, "closing": closing, "squeeze": squeeze}
     title = f"states stable in {', '.join(backends)}"
     with Progress() as bar:
-        bank = make_bank(motion, *scene, backends, progress=bar.count(title), **where, **options)
+        bank = make_bank(
+            motion,
+            *scene,
+            backends,
+            limits=limits,
+            closing=closing,
+            squeeze=squeeze,
+            progress=bar.count(title),
+            **where,
+        )
         if settle:
             count = bar.count("start poses come to rest")
             bank, at_rest = settle_starts(bank, *scene, backends[0], progress=count, **where)

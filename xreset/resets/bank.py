@@ -35,8 +35,8 @@ from xreset.records import (
     unique_problem,
     write_record,
 )
-from xreset.retarget.file import JointNames, ReasonNames, check_joints, check_robot
-from xreset.spec import ObjectSpec, RobotSpec
+from xreset.retarget.file import JointNames, ReasonNames
+from xreset.spec import ObjectSpec, RobotSpec, check_joints, check_robot
 from xreset.text import Brief, shown
 
 SCHEMA = "xreset-resets/1"

@@ -23,8 +23,15 @@ from xreset.resets.closing import closing_states, positions_between, rotations_b
 from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
 from xreset.resets.fingers import fingers_of, squeeze_targets
 from xreset.resets.probe import probe
-from xreset.retarget.file import Retargeted, check_joints
-from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, checked_objects, objects_named
+from xreset.retarget.file import Retargeted
+from xreset.spec import (
+    ObjectSpec,
+    RobotSpec,
+    SceneSpec,
+    check_joints,
+    checked_objects,
+    objects_named,
+)
 from xreset.task.config import TerminationConfig
 from xreset.task.terminations import out_of_bounds
 
@@ -94,9 +101,9 @@ def make_bank(
         FileFormatError: the trajectories are for a robot with other joints.
     """
     objects = checked_objects(robot, objects)
+    check_joints("The motion is", retargeted, robot)
     owner = retargeted.sequence_of_frame
     used = objects_named(objects, retargeted.object_name[owner[retargeted.valid]])
-    check_joints("The motion is", retargeted, robot)
     engines = (engine,) if isinstance(engine, str) else tuple(engine)
     limits = limits or FilterConfig()
     squeeze = squeeze or SqueezeConfig()
@@ -110,7 +117,6 @@ def make_bank(
     sequence = owner[frame]
     post_contact = retargeted.post_contact[frame]
     object_name = retargeted.object_name[sequence]
-    object_index = np.searchsorted(list(used), object_name)
     poses = (
         positions_between(retargeted.joint_pos, frame, part),
         positions_between(retargeted.object_pos, frame, part),
@@ -131,7 +137,7 @@ def make_bank(
             reason[left] = probe(
                 name,
                 scene,
-                object_index[rows[left]],
+                object_name[rows[left]],
                 states[rows[left]],
                 partial(rejection, limits=limits),
                 gravity=0.0,

@@ -20,7 +20,7 @@ Judge = Callable[[Backend, State], Tensor]
 def probe(
     engine: str,
     scene: SceneSpec,
-    object_index: np.ndarray,
+    object_name: np.ndarray,
     states: State,
     judge: Judge,
     *,
@@ -35,7 +35,7 @@ def probe(
     Args:
         engine: name of the engine.
         scene: robot and objects.
-        object_index: [M] which of the scene's objects each state has.
+        object_name: [M] which of the scene's objects each state has.
         states: [M, ...]
         judge: called after the last step of each round.
         gravity: fraction of the objects' weight.
@@ -44,7 +44,8 @@ def probe(
         device: where the engine runs if it can.
         progress: called with the number of states done.
     """
-    plan = schedule(object_index, num_envs)
+    names = [spec.name for spec in scene.objects]
+    plan = schedule(np.array([names.index(name) for name in object_name]), num_envs)
     worlds = torch.as_tensor(plan.object_index)
     rows = []
     verdicts = []

@@ -53,7 +53,6 @@ def settle_starts(
     Returns:
         The bank, and whether each object came to rest on the table [S]; the others start as recorded.
     """
-    names = [o.name for o in objects]
     scene = SceneSpec(robot=robot, objects=tuple(objects))
     number = len(bank.sequence_name)
     home = torch.as_tensor(robot.home, dtype=torch.float32).expand(number, -1)
@@ -62,7 +61,7 @@ def settle_starts(
     found = probe(
         engine,
         scene,
-        np.array([names.index(name) for name in bank.sequence_object]),
+        bank.sequence_object,
         State.at_rest(home, start_pos, start_quat, home),
         rest_pose,
         gravity=1.0,

@@ -37,7 +37,7 @@ from xreset.records import (
     read_record,
     write_record,
 )
-from xreset.spec import RobotSpec
+from xreset.spec import RobotSpec, check_robot
 
 SCHEMA = "xreset-retargeted/1"
 
@@ -150,33 +150,6 @@ def check_retargeted(path: str | Path, data: Retargeted, robot: RobotSpec) -> No
         raise FileFormatError(
             f"{path} holds {data.joint_names[joint]} = {data.joint_pos[frame, joint]:.4g} in frame {frame}, but the "
             f"joint goes from {lower[joint]:.4g} to {upper[joint]:.4g}. Make the file again: xreset retarget."
-        )
-
-
-def check_robot(path: str | Path, what: str, data: Any, robot: RobotSpec) -> None:
-    """Refuse data that were made for another robot, or for another version of this robot; ``FileFormatError``.
-
-    Args:
-        data: anything with ``robot``, ``robot_fingerprint`` and ``joint_names``.
-    """
-    if data.robot != robot.name or data.joint_names != robot.joint_names:
-        raise FileFormatError(
-            f"{path} is a {what} for the robot {data.robot!r} with {len(data.joint_names)} joints; "
-            f"{robot.name!r} has {len(robot.joints)}. Make it again with --robot {robot.name}, or use --robot "
-            f"{data.robot}."
-        )
-    if not robot.has_fingerprint(data.robot_fingerprint):
-        raise FileFormatError(
-            f"{path} is a {what} for another version of {data.robot!r}: its URDF or robot.toml has changed. Make it "
-            "again."
-        )
-
-
-def check_joints(what: str, data: Any, robot: RobotSpec) -> None:
-    """Refuse data with other joints than the robot's; ``FileFormatError``."""
-    if data.joint_names != robot.joint_names:
-        raise FileFormatError(
-            f"{what} for the robot {data.robot!r}, whose joints are not those of {robot.name!r}. Use one robot."
         )
 
 

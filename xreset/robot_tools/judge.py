@@ -173,7 +173,6 @@ def judge(
     used = [spec for spec in objects if spec.name in tried.object_name]
     names = [spec.name for spec in used]
     scene = SceneSpec(robot=robot, objects=tuple(used))
-    index = np.array([names.index(name) for name in tried.object_name.tolist()])
     arrays = (tried.joint_pos, tried.object_pos, tried.object_quat_wxyz, targets)
     start = State.at_rest(*map(torch.as_tensor, arrays))
     groups = {name: np.flatnonzero(tried.object_name == name) for name in names}
@@ -182,8 +181,8 @@ def judge(
     for number, backend in enumerate(backends):
         before = number * len(chosen)
         table = probe(
-            backend, scene, index, start, partial(_play, Kinematics(robot)), gravity=0.0, steps=_CLOSE_STEPS,
-            num_envs=num_envs, device=device,
+            backend, scene, tried.object_name, start, partial(_play, Kinematics(robot)), gravity=0.0,
+            steps=_CLOSE_STEPS, num_envs=num_envs, device=device,
             progress=lambda done, before=before: progress(before + done, len(backends) * len(chosen)),
         )  # fmt: skip
         verdicts = table[:, : 1 + len(PHASES)].astype(int)

@@ -12,7 +12,7 @@ of the goal at the episode's end). Task progress is 0, 0.33, 0.66 or 1 for the h
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from torch import Tensor
 
 from xreset.checks import frozen
 from xreset.geometry.rotations import quat_angle
-from xreset.objects.sampling import center, keypoints, metric_points
+from xreset.objects.sampling import Frame, keypoints, metric_points
 from xreset.spec import ObjectSpec
 from xreset.task.reading import Reading
 from xreset.task.rewards import contact_gate, point_distances
@@ -54,7 +54,7 @@ class MetricPoints(Tensors):
     """[N, 64, 3] of the published success."""
 
     @classmethod
-    def of(cls, objects: Sequence[ObjectSpec], frame: Literal["mesh", "center"] = "mesh") -> Self:
+    def of(cls, objects: Sequence[ObjectSpec], frame: Frame = "mesh") -> Self:
         """Return the points of some objects; ``frame``: ``object_frame`` of the task."""
 
         def stacked(points: list[np.ndarray]) -> Tensor:
@@ -62,9 +62,7 @@ class MetricPoints(Tensors):
 
         return cls(
             keypoints=stacked([keypoints(o, frame) for o in objects]),
-            surface=stacked(
-                [metric_points(o) - (center(o) if frame == "center" else 0.0) for o in objects]
-            ),
+            surface=stacked([metric_points(o, frame) for o in objects]),
         )
 
 

@@ -11,9 +11,10 @@ from tests.toy_retarget import box_object
 from xreset.description import load_robot as load
 from xreset.errors import RobotError, XResetError
 from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.shapes import pose_matrix
 from xreset.pictures import meshes, render
 from xreset.pictures.meshes import link_colors
-from xreset.pictures.render import Camera, Points, Renderer, pose_matrix, write_png
+from xreset.pictures.render import Camera, Points, Renderer, write_png
 from xreset.spec import SceneSpec
 
 

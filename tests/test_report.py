@@ -36,14 +36,13 @@ from xreset.eval.report.clips import (
     make_film,
     worst_episodes,
 )
-from xreset.eval.report.make import count_failures, headline, make_report, page
-from xreset.eval.report.read import collect
+from xreset.eval.report.make import collect, count_failures, headline, make_report, page
 from xreset.eval.results import TaskProgress, episode_table, recorded, write_results
 from xreset.eval.sensitivity import chosen
 from xreset.eval.stress import curve
 from xreset.files import claim_folder, write_json
+from xreset.geometry.shapes import pose_matrix
 from xreset.learning.run import write_choice
-from xreset.pictures.render import pose_matrix
 
 VOID = {"meta", "br", "link", "img", "input", "hr"}
 

@@ -18,6 +18,7 @@ from xreset.capture import GraphRunner
 from xreset.checks import names_wrong_arguments
 from xreset.errors import XResetError
 from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
+from xreset.geometry.shapes import pose_matrix
 from xreset.objects.sampling import center, metric_points, surface_points
 from xreset.physics import Backend, Parameters, State
 from xreset.plugins import make_backend
@@ -401,7 +402,7 @@ class ManipulationEnv:
             size: width and height in pixels.
         """
         # trimesh, which training does not need
-        from xreset.pictures.render import Renderer, pose_matrix
+        from xreset.pictures.render import Renderer
 
         if self._renderer is None or self._renderer.size != size:
             self._renderer = Renderer(self.backend.scene, size=size)

@@ -13,7 +13,8 @@ from xreset.eval.play.session import Moment, Session
 from xreset.eval.report.clips import encode_mp4
 from xreset.eval.results import Trace, write_traces
 from xreset.files import write_whole
-from xreset.pictures.render import Renderer, pose_matrix
+from xreset.geometry.shapes import pose_matrix
+from xreset.pictures.render import Renderer
 from xreset.spec import SceneSpec
 
 FRAMES_PER_SECOND = 20.0

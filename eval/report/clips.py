@@ -17,9 +17,10 @@ from xreset.errors import RunError, XResetError, needs
 from xreset.eval.report.read import ReportData
 from xreset.eval.results import Table, Trace
 from xreset.files import write_whole
+from xreset.geometry.shapes import pose_matrix
 from xreset.objects.catalogue import load_object
 from xreset.physics import State
-from xreset.pictures.render import Camera, Renderer, add_caption, pose_matrix
+from xreset.pictures.render import Camera, Renderer, add_caption
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 from xreset.text import short_name
 

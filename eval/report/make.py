@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from xreset.errors import RunError, XResetError
+from xreset.errors import FileFormatError, RunError, XResetError
 from xreset.eval.pages import percent, render
 from xreset.eval.plots import COLORS
 from xreset.eval.report import fairness, tables
@@ -23,11 +23,20 @@ from xreset.eval.report.clips import Clip, draw_report, encode_mp4
 from xreset.eval.report.curves import AXES, X
 from xreset.eval.report.figures import draw_training, write_picture
 from xreset.eval.report.groups import by_engine, grouped, scores, singles
-from xreset.eval.report.read import ReportData, Training, collect, read_trainings, versions
-from xreset.eval.results import Table
-from xreset.eval.stress import by_property
+from xreset.eval.report.read import (
+    ReportData,
+    Training,
+    how_to_evaluate,
+    name_of,
+    read_training,
+    read_trainings,
+    versions,
+)
+from xreset.eval.results import Table, read_evaluation
+from xreset.eval.stress import by_property, read_stress
 from xreset.eval.table import FIGURES, caption
 from xreset.files import claim_folder, write_whole
+from xreset.learning.run import TEACHER, read_choice, read_run
 from xreset.pictures.render import encode_png
 
 DEFAULT_CURVES = ("task/success", "task/success_from_home")
@@ -61,6 +70,54 @@ def make_report(
             data = replace(data, notes=(*data.notes, f"There are no clips: {error}"))
         write_whole(out / "index.html", page(data, clips, strips))
     return out / "index.html", data
+
+
+def collect(folder: Path, robot: str | None = None, objects: Path | None = None) -> ReportData:
+    """Read everything that a report shows.
+
+    Args:
+        folder: a run folder, or a folder that holds ``ENGINE.json`` files, itself or in ``eval/``.
+        robot: name or folder of the robot; default: as the run and the results name it.
+        objects: folder of meshes; default: as the results name it.
+
+    Raises:
+        RunError: the folder does not exist or holds no results.
+        FileFormatError: a file is damaged or of another version.
+    """
+    training = read_training(name_of(folder), folder)
+    if not training.results:
+        raise RunError(f"{folder} holds no evaluation results. {how_to_evaluate(folder)}")
+    run = None
+    not_described = []
+    if training.facts:
+        try:
+            run = read_run(folder)
+        except FileFormatError as error:  # results outlive a change of the training's configuration
+            not_described.append(f"The training is not described here: {error}")
+    place = training.results_folder.parent
+    choice = read_choice(place)
+    policies = {result.inputs.get("policy") for result in training.results.values()}
+    if choice is not None and choice.policy_hash not in policies:
+        choice = None
+    stress = read_stress(place / "stress", training.first.inputs.get("policy"))
+    taught = read_evaluation(folder / "teacher")
+    notes = fairness.uneven([training]) + not_described
+    if taught:
+        notes.append(fairness.missed_by_student(training.episodes, taught.to_frame()))
+    elif run is not None and run.teacher is not None:
+        notes.append(
+            "The teacher was not evaluated from the same starts. Make its results first: "
+            f"xreset eval {folder / TEACHER} --out {folder / 'teacher'} --demos DEMOS"
+        )
+    return ReportData(
+        training=training,
+        run=run,
+        choice=choice,
+        stress=stress,
+        notes=tuple(notes),
+        robot=robot or (run or training.first).robot,
+        meshes=training.first.meshes(objects),
+    )
 
 
 def page(data: ReportData, clips: Sequence[Clip], strips: Sequence[Clip] = ()) -> str:

@@ -12,14 +12,13 @@ import pandas as pd
 from xreset.cameras.config import VisionConfig
 from xreset.checks import frozen
 from xreset.errors import FileFormatError, RunError, needs
-from xreset.eval.report.fairness import missed_by_student, uneven
 from xreset.eval.results import EvalResult, Table, read_evaluation, read_traces, recorded
-from xreset.eval.stress import Stress, read_stress
+from xreset.eval.stress import Stress
 from xreset.files import read_json
 from xreset.learning.clock import Lift, read_lift
 from xreset.learning.run import SCHEMA as RUN_SCHEMA
-from xreset.learning.run import TEACHER, Choice, RunInfo, read_choice, read_run
-from xreset.policies import results_folder, shipped
+from xreset.learning.run import Choice, RunInfo
+from xreset.policies import run_folder
 from xreset.spec import RobotSpec
 from xreset.text import short_name
 
@@ -90,54 +89,6 @@ class ReportData:
             return self.training.first.vision
         vision = self.run.config.task.vision
         return vision if vision.cameras else None
-
-
-def collect(folder: Path, robot: str | None = None, objects: Path | None = None) -> ReportData:
-    """Read everything that a report shows.
-
-    Args:
-        folder: a run folder, or a folder that holds ``ENGINE.json`` files, itself or in ``eval/``.
-        robot: name or folder of the robot; default: as the run and the results name it.
-        objects: folder of meshes; default: as the results name it.
-
-    Raises:
-        RunError: the folder does not exist or holds no results.
-        FileFormatError: a file is damaged or of another version.
-    """
-    training = read_training(name_of(folder), folder)
-    if not training.results:
-        raise RunError(f"{folder} holds no evaluation results. {_evaluate(folder)}")
-    run = None
-    not_described = []
-    if training.facts:
-        try:
-            run = read_run(folder)
-        except FileFormatError as error:  # results outlive a change of the training's configuration
-            not_described.append(f"The training is not described here: {error}")
-    place = training.results_folder.parent
-    choice = read_choice(place)
-    policies = {result.inputs.get("policy") for result in training.results.values()}
-    if choice is not None and choice.policy_hash not in policies:
-        choice = None
-    stress = read_stress(place / "stress", training.first.inputs.get("policy"))
-    taught = read_evaluation(folder / "teacher")
-    notes = uneven([training]) + not_described
-    if taught:
-        notes.append(missed_by_student(training.episodes, taught.to_frame()))
-    elif run is not None and run.teacher is not None:
-        notes.append(
-            "The teacher was not evaluated from the same starts. Make its results first: "
-            f"xreset eval {folder / TEACHER} --out {folder / 'teacher'} --demos DEMOS"
-        )
-    return ReportData(
-        training=training,
-        run=run,
-        choice=choice,
-        stress=stress,
-        notes=tuple(notes),
-        robot=robot or (run or training.first).robot,
-        meshes=training.first.meshes(objects),
-    )
 
 
 def results_in(folder: Path) -> Path:
@@ -244,9 +195,7 @@ def read_trainings(runs: Sequence[str]) -> tuple[Training, ...]:
                 raise RunError(
                     f"{text!r} is not NAME=FOLDER: a {'folder' if label else 'name'} is missing."
                 )
-        folder = Path(name)
-        if not folder.exists() and name in shipped():
-            folder = results_folder(name)
+        folder = run_folder(name)
         label = label or name_of(folder)
         if label in folders:
             raise RunError(
@@ -280,7 +229,7 @@ def read_training(label: str, folder: Path, results: Path | None = None) -> Trai
     if not evaluation and curves.empty and not lift.iteration:
         raise RunError(
             f"{folder} holds neither learning curves (events.out.tfevents.*) nor evaluation results. "
-            + _evaluate(folder)
+            + how_to_evaluate(folder)
         )
     return Training(
         label=label,
@@ -293,7 +242,7 @@ def read_training(label: str, folder: Path, results: Path | None = None) -> Trai
     )
 
 
-def _evaluate(folder: Path) -> str:
+def how_to_evaluate(folder: Path) -> str:
     """Return what to do where results are missing."""
     if (folder / "run.json").is_file():
         return f"Make them first: xreset eval {folder} --demos DEMOS"

@@ -7,7 +7,7 @@ from pathlib import Path
 from xreset.cli._common import Robot, Source
 from xreset.cli._terminal import console, show_notes
 from xreset.eval import table
-from xreset.policies import results_folder, shipped
+from xreset.policies import run_folder
 from xreset.text import short_name
 
 
@@ -30,10 +30,8 @@ def report(
     """
     from xreset.eval.report import clips, make
 
-    if not run.exists() and str(run) in shipped():
-        run = results_folder(str(run))
     with console.status("drawing clips"):
-        html, data = make.make_report(run, out, robot=robot, objects=objects)
+        html, data = make.make_report(run_folder(run), out, robot=robot, objects=objects)
     console.print(table.results_table(list(data.training.results.values())))
     console.print(make.headline(data))
     show_notes(data.notes)

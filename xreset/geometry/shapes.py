@@ -45,6 +45,11 @@ def transform(R: ArrayLike, position: ArrayLike) -> np.ndarray:
     return T
 
 
+def pose_matrix(position: ArrayLike, quat: ArrayLike) -> np.ndarray:
+    """[4, 4] pose of a position [3] and a quaternion [4] (w, x, y, z) of any length."""
+    return transform(turn_of(np.array(quat, dtype=float)).as_matrix(), position)
+
+
 def look_at(eye: tuple[float, ...], target: tuple[float, ...]) -> np.ndarray:
     """Return [3, 3] unit vectors of a camera to the right, down and forward, as rows; z is up."""
     forward = np.array(target, dtype=float) - eye

@@ -17,7 +17,7 @@ import trimesh
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from xreset.geometry.shapes import transform, turn_of
+from xreset.geometry.shapes import pose_matrix, transform
 from xreset.geometry.urdf import Joint, Link, RobotTree
 
 FRAME_MASS = 1e-4
@@ -34,11 +34,9 @@ def pose(
 ) -> np.ndarray:
     """[4, 4] pose from a position [m] and roll, pitch, yaw about fixed axes [rad], or a quaternion (w, x, y, z) of any
     length."""
-    if quat is None:
-        rotation = Rotation.from_euler("xyz", rpy)
-    else:
-        rotation = turn_of(np.array(quat, dtype=float))
-    return transform(rotation.as_matrix(), xyz)
+    if quat is not None:
+        return pose_matrix(xyz, quat)
+    return transform(Rotation.from_euler("xyz", rpy).as_matrix(), xyz)
 
 
 def axes(*, x: Sequence[float] | np.ndarray, z: Sequence[float] | np.ndarray) -> np.ndarray:

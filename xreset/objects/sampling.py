@@ -10,6 +10,8 @@ from scipy.spatial import ConvexHull
 from xreset.geometry.shapes import winding_number
 from xreset.spec import ObjectSpec
 
+Frame = Literal["mesh", "center"]
+"""``object_frame`` of a task."""
 METRIC_POINTS = 64
 """Points of the published success (the published paper, section V)."""
 _CANDIDATES_PER_POINT = 8
@@ -30,9 +32,11 @@ def surface_points(obj: ObjectSpec, count: int = 64, seed: int = 0) -> np.ndarra
     return farthest_points(points[outside], count)
 
 
-def metric_points(obj: ObjectSpec) -> np.ndarray:
-    """[64, 3] the ordered surface points whose mean distance to the goal decides the published success."""
-    return surface_points(obj, METRIC_POINTS)
+def metric_points(obj: ObjectSpec, frame: Frame = "mesh") -> np.ndarray:
+    """[64, 3] the ordered surface points whose mean distance to the goal decides the published success; with the frame
+    ``center`` relative to :func:`center`."""
+    points = surface_points(obj, METRIC_POINTS)
+    return points - center(obj) if frame == "center" else points
 
 
 def sample_surface(
@@ -82,16 +86,16 @@ def center(obj: ObjectSpec) -> np.ndarray:
     return inside + volumes @ corners.sum(axis=1) / (4 * volumes.sum())
 
 
-def keypoints(obj: ObjectSpec, frame: Literal["mesh", "center"] = "mesh") -> np.ndarray:
+def keypoints(obj: ObjectSpec, frame: Frame = "mesh") -> np.ndarray:
     """[4, 3] the object-frame keypoints of the pose metric (the paper, appendix A).
 
     The paper does not define them; here they are four alternating corners of the axis-aligned bounding box: a
     tetrahedron, so that no rotation leaves all four in place, at the object's own scale. A box depends on the axes of
     the mesh: with the frame ``center`` they are the first four of :func:`metric_points`, which are far from each other
-    too, relative to :func:`center`.
+    too.
     """
     if frame == "center":
-        return metric_points(obj)[:4] - center(obj)
+        return metric_points(obj, frame)[:4]
     corners = np.array(bounding_box(obj))
     pick = np.array([[0, 0, 0], [1, 1, 0], [1, 0, 1], [0, 1, 1]])
     return corners[pick, np.arange(3)]

@@ -21,7 +21,7 @@ from xreset.checks import frozen
 from xreset.errors import XResetError
 from xreset.files import write_whole
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.shapes import look_at, transform, turn_of
+from xreset.geometry.shapes import look_at
 from xreset.geometry.urdf import link_meshes
 from xreset.pictures.meshes import (
     GOAL_COLOR,
@@ -216,11 +216,6 @@ def draw_bodies(
     for mesh, color in zip(meshes, colors, strict=True):
         bodies.append(place(shade_smoothly(mesh), color, np.eye(4)))
     return np.asarray(_image(join(bodies), None, camera, size, smooth=True).reduce(2))
-
-
-def pose_matrix(pos: np.ndarray, quat: np.ndarray) -> np.ndarray:
-    """[4, 4] pose from a position [3] and a quaternion [4] (w, x, y, z)."""
-    return transform(turn_of(np.array(quat, dtype=float)).as_matrix(), pos)
 
 
 def add_caption(picture: np.ndarray, caption: Sequence[str], lines: int) -> np.ndarray:

@@ -43,6 +43,13 @@ def card(file: Path) -> Card:
     )
 
 
+def run_folder(run: str | Path) -> Path:
+    """Return the folder of a run; or that of a shipped policy's results, if no file or folder has its name."""
+    if not Path(run).exists() and str(run) in shipped():
+        return results_folder(str(run))
+    return Path(run)
+
+
 def results_folder(name: str) -> Path:
     """Where the results of a shipped policy go by default, as a run's lie in its run folder."""
     return Path("runs") / name

@@ -31,8 +31,9 @@ from xreset.geometry.rotations import (
     quat_to_axis_angle,
     relative_pose,
 )
+from xreset.geometry.shapes import pose_matrix
 from xreset.physics import Backend, State
-from xreset.pictures.render import Camera, Renderer, add_caption, pose_matrix
+from xreset.pictures.render import Camera, Renderer, add_caption
 from xreset.progress import unseen
 from xreset.resets.bank import ResetBank, check_states
 from xreset.resets.config import SqueezeConfig

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from xreset.description import load_robot
-from xreset.pictures.render import Points, Renderer, Size, pose_matrix
+from xreset.geometry.shapes import pose_matrix
+from xreset.pictures.render import Points, Renderer, Size
 from xreset.pictures.view.colors import HUMAN_COLOR, REACHED_COLOR, TOUCH_COLOR, reason_color
 from xreset.pictures.view.data import BONES, View
 from xreset.plugins import robot_names

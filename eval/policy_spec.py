@@ -231,8 +231,6 @@ class KinematicRetargeting:
     the demonstration at its own speed, and holds its last frame. Actions go through the same interface as a policy's.
     """
 
-    name = "ik"
-
     def __init__(self, motion: Retargeted) -> None:
         """Take motion, in the order of the environment's demonstrations."""
         self._motion = motion

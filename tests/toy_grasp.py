@@ -128,8 +128,6 @@ def policy():
 class OpenLoop:
     """The policy that gives :func:`targets`."""
 
-    name = "open-loop"
-
     def begin(self, env):
         self._env, self._step = env, 0
 

@@ -41,8 +41,6 @@ OUTPUTS = ("actions", "h_out", "c_out")
 class Policy(Protocol):
     """Interface of a policy."""
 
-    name: str
-
     def begin(self, env: ManipulationEnv) -> None:
         """Prepare for new episodes in every world of the environment. A policy without memory does nothing."""
 
@@ -252,8 +250,6 @@ class OnnxPolicy:
 class ZeroPolicy(Policy):
     """Action zero: the arm stays, the hand goes where action zero sends it. A baseline and a smoke test."""
 
-    name = "zero"
-
     def __init__(self, num_actions: int) -> None:
         self._num_actions = num_actions
 
@@ -265,8 +261,6 @@ class ZeroPolicy(Policy):
 
 class RandomPolicy(Policy):
     """Uniform actions in [-1, 1], the same for the same seed in every engine."""
-
-    name = "random"
 
     def __init__(self, num_actions: int, seed: int) -> None:
         self._num_actions = num_actions

@@ -80,7 +80,7 @@ class ClosingTest(TestCase):
         fingers = toy_fingers(10, 2, gap=torch.as_tensor(self.gap))
         config = ClosingConfig(**({"spacing": 0.005} | config))
         with patch("xreset.resets.closing.fingers_of", lambda *_: fingers):
-            return closing_states(data or self.data, ROBOT, (toy_grasp.brick(),), config)
+            return closing_states(data or self.data, ROBOT, (toy_grasp.brick(),), config)[:2]
 
     def bridged(self, data=None, **config):
         """Frames that states between follow."""

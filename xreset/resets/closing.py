@@ -27,15 +27,15 @@ MOVED = 0.01
 
 def closing_states(
     retargeted: Retargeted, robot: RobotSpec, objects: Sequence[ObjectSpec], config: ClosingConfig
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Choose the valid frames of a motion, and states between them where the hand closes in.
 
     That is where a finger is near the object, until the thumb and another finger touch the object or the object has
     been moved. The human's first contact is not the end: there the robot's fingers are usually 5 to 10 mm away.
 
     Returns:
-        For each state [M] the frame that it is or follows, ascending, and how far it is on the way to the next frame,
-        in [0, 1); 0 is the frame itself.
+        For each state [M] the frame that it is or follows, ascending; how far it is on the way to the next frame, in
+        [0, 1), where 0 is the frame itself; and joint positions [M, J], object positions [M, 3] and quaternions [M, 4].
     """
     pieces = retargeted.valid.astype(int)
     if config.spacing is not None:
@@ -48,7 +48,11 @@ def closing_states(
         pieces[before] = np.maximum(np.ceil(travel / config.spacing).astype(int), 1)
     frame = np.repeat(np.arange(len(pieces)), pieces)
     first = np.cumsum(pieces) - pieces
-    return frame, (np.arange(len(frame)) - first[frame]) / pieces[frame]
+    part = (np.arange(len(frame)) - first[frame]) / pieces[frame]
+    joint_pos = positions_between(retargeted.joint_pos, frame, part)
+    object_pos = positions_between(retargeted.object_pos, frame, part)
+    object_quat = rotations_between(retargeted.object_quat_wxyz, frame, part)
+    return frame, part, (joint_pos, object_pos, object_quat)
 
 
 def _frames_to_follow(retargeted: Retargeted, fingers: Fingers, within: float) -> np.ndarray:

@@ -17,9 +17,9 @@ from torch import Tensor
 from xreset.checks import names_wrong_arguments
 from xreset.errors import DemoError
 from xreset.physics import Backend, State
-from xreset.progress import unseen
+from xreset.progress import Progress, unseen
 from xreset.resets.bank import ResetBank, starts_and_goals
-from xreset.resets.closing import closing_states, positions_between, rotations_between
+from xreset.resets.closing import closing_states
 from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
 from xreset.resets.fingers import fingers_of, squeeze_targets
 from xreset.resets.probe import probe
@@ -113,20 +113,14 @@ def make_bank(
             "Look at the reasons of xreset retarget."
         )
     scene = SceneSpec(robot=robot, objects=tuple(used.values()))
-    frame, part = closing_states(retargeted, robot, objects, closing or ClosingConfig())
+    frame, part, poses = closing_states(retargeted, robot, objects, closing or ClosingConfig())
     sequence = owner[frame]
     post_contact = retargeted.post_contact[frame]
     object_name = retargeted.object_name[sequence]
-    poses = (
-        positions_between(retargeted.joint_pos, frame, part),
-        positions_between(retargeted.object_pos, frame, part),
-        rotations_between(retargeted.object_quat_wxyz, frame, part),
-    )
     states = State.at_rest(*map(torch.as_tensor, poses))
+    work = len(engines) * len(frame)
 
-    def try_candidates(
-        rows: np.ndarray, report: Callable[[int], None] = lambda done: None
-    ) -> np.ndarray:
+    def try_candidates(rows: np.ndarray, report: Progress = unseen) -> np.ndarray:
         """Return the reasons for which candidates [rows] are rejected, -1 where every engine accepts them."""
         reason = np.full(len(rows), -1, dtype=np.int64)
         for number, name in enumerate(engines):
@@ -144,12 +138,11 @@ def make_bank(
                 steps=limits.steps,
                 num_envs=num_envs,
                 device=device,
-                progress=lambda done, before=before: report(before + done),
+                progress=lambda done, before=before: report(before + done, work),
             )
         return reason
 
-    work = len(engines) * len(frame)
-    reason = try_candidates(np.arange(len(frame)), lambda done: progress(done, work))
+    reason = try_candidates(np.arange(len(frame)), progress)
     if squeeze.presses:
         rows = np.flatnonzero((reason < 0) & post_contact)
         touching = [values[rows] for values in poses]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -59,7 +60,9 @@ def read_description(path: Path) -> RobotSpec:
     if spec is not None:
         problems = _contradictions(spec)
         if not problems:
-            return replace(spec, meshes=_meshes(spec.urdf))
+            with suppress(RobotError):  # a wrong URDF is reported by whoever reads it
+                spec = replace(spec, meshes=tuple(mesh_files(spec.urdf)))
+            return spec
     listed = "".join(f"\n  - {_as_written(problem)}" for problem in problems)
     noun = "place" if len(problems) == 1 else "places"
     raise RobotError(f"{path} is wrong in {len(problems)} {noun}:{listed}")
@@ -115,14 +118,6 @@ def _as_written(problem: str) -> str:
     written = {field: entry for entry, field in _FIELDS.items()}
     problem = problem.removeprefix("the file.").replace("].drive", "]")
     return re.sub(r"^\w+", lambda match: written.get(match[0], match[0]), problem)
-
-
-def _meshes(urdf: Path) -> tuple[Path, ...]:
-    """Mesh files of the collision shapes; a wrong URDF is reported by whoever reads it."""
-    try:
-        return tuple(mesh_files(urdf))
-    except RobotError:
-        return ()
 
 
 def _contradictions(spec: RobotSpec) -> list[str]:

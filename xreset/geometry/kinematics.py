@@ -82,6 +82,11 @@ class Kinematics:
         self.root = tree.link(root or tree.root).name
         self.dtype = dtype
         self.device = torch.device(device)
+        self.base = torch.eye(4, dtype=dtype, device=self.device)
+        """[4, 4] default pose of the root: the robot's base in the world, or the identity below another root."""
+        if self.root == tree.root:
+            turn = quat_to_matrix(self._tensor(robot.base_quat))
+            self.base = homogeneous(turn, self._tensor(robot.base_pos))
         self.link_names = tuple(tree.below(self.root))
         """Links from the root down, parents before children (length L)."""
         joints = [tree.above[name] for name in self.link_names[1:]]
@@ -101,12 +106,6 @@ class Kinematics:
         """[J] joint positions at home."""
         self._couple(moving, mimics)
         self._chain(joints, moving)
-
-        self.base = torch.eye(4, dtype=dtype, device=self.device)
-        """[4, 4] default pose of the root: the robot's base in the world, or the identity below another root."""
-        if self.root == tree.root:
-            turn = quat_to_matrix(self._tensor(robot.base_quat))
-            self.base = homogeneous(turn, self._tensor(robot.base_pos))
 
     def _couple(self, moving: Sequence[Joint], mimics: Mapping[str, MimicSpec]) -> None:
         """Set how the moving joints follow from the actuated ones, and the limits that result."""

@@ -62,7 +62,7 @@ def settle_starts(
         engine,
         scene,
         bank.sequence_object,
-        State.at_rest(home, start_pos, start_quat, home),
+        State.at_rest(home, start_pos, start_quat),
         rest_pose,
         gravity=1.0,
         steps=round(SECONDS / scene.control_dt),

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from xreset.checks import names_wrong_arguments
 from xreset.errors import XResetError
 from xreset.eval.policy_spec import PolicySpec, load_policy
 from xreset.eval.results import (
@@ -23,7 +22,6 @@ from xreset.inputs import Data
 from xreset.progress import unseen
 
 
-@names_wrong_arguments
 def evaluate(
     policy: str | Path | PolicySpec,
     demos: str | Path | Data,

@@ -13,7 +13,7 @@ from dataclasses import asdict, field, replace
 from pathlib import Path
 from typing import Any
 
-from xreset.checks import frozen, names_wrong_arguments
+from xreset.checks import frozen
 from xreset.demos.synth import synthesize
 from xreset.eval.pages import render
 from xreset.eval.plots import COLORS, svg
@@ -64,7 +64,6 @@ LEAST = 0.5
 """Task progress without faults, below which a policy is not worth a robot."""
 
 
-@names_wrong_arguments
 def rehearse(
     policy: str | Path | PolicySpec,
     demos: str | Path | Data | None = None,

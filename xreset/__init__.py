@@ -34,7 +34,12 @@ __all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'xreset' has no attribute {name!r}")
-    value = globals()[name] = getattr(import_module(_HOMES[name]), name)
+    value = getattr(import_module(_HOMES[name]), name)
+    if not isinstance(value, type):
+        from xreset.checks import names_wrong_arguments
+
+        value = names_wrong_arguments(value)
+    globals()[name] = value
     return value
 
 

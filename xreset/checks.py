@@ -9,6 +9,7 @@ from __future__ import annotations
 import types
 import typing
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from difflib import get_close_matches
 from functools import cache, wraps
@@ -18,7 +19,6 @@ from numbers import Integral, Real
 from typing import (
     Annotated,
     Any,
-    ParamSpec,
     TypeVar,
     dataclass_transform,
     get_args,
@@ -32,7 +32,6 @@ from xreset.errors import FileFormatError, XResetError
 from xreset.text import Brief, shown
 
 T = TypeVar("T")
-P = ParamSpec("P")
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
@@ -131,25 +130,25 @@ def is_rigid(T: np.ndarray) -> bool:
     return bool(is_orthogonal and np.array_equal(T[3], (0, 0, 0, 1)) and np.linalg.det(R) > 0)
 
 
-def names_wrong_arguments(function: Callable[P, T]) -> Callable[P, T]:
-    """Return a function of ``import xreset`` that raises ``XResetError`` in place of Python's own errors if an argument
-    is of another type than its annotation says."""
+def names_wrong_arguments(function: Callable[..., T]) -> Callable[..., T]:
+    """Return a function that raises ``XResetError`` in place of Python's own errors if an argument is of another type
+    than its annotation says."""
 
     @wraps(function)
-    def call(*positional: P.args, **named: P.kwargs) -> T:
-        given = signature(function).bind(*positional, **named).arguments
+    def call(*positional: Any, **named: Any) -> T:
         try:
             return function(*positional, **named)
-        except XResetError:
-            raise
-        except Exception as error:
-            hints = get_type_hints(function)
-            for name, value in given.items():
-                if not _is_of(hints[name], value):
-                    raise XResetError(
-                        f"{name} is {shown(value)}, expected {function.__annotations__[name]}. "
-                        f"Look at help(xreset.{function.__name__})."
-                    ) from error
+        except (AttributeError, TypeError, ValueError) as error:
+            # an unknown argument; a type that only type checkers know
+            with suppress(NameError, TypeError):
+                given = signature(function).bind(*positional, **named).arguments
+                hints = get_type_hints(function)
+                for name, value in given.items():
+                    if not _is_of(hints[name], value):
+                        raise XResetError(
+                            f"{name} is {shown(value)}, expected {function.__annotations__[name]}. "
+                            f"Look at help(xreset.{function.__name__})."
+                        ) from error
             raise
 
     return call
@@ -162,7 +161,7 @@ def _is_of(hint: Any, value: Any) -> bool:
     """Whether a value is of an annotated type; items of lists are not looked at."""
     parts = get_args(hint) if _is_union(hint) else (hint,)
     kinds = [get_origin(part) or part for part in parts]
-    return Any in kinds or any(isinstance(value, _WIDER.get(kind, kind)) for kind in kinds)
+    return isinstance(value, tuple(_WIDER.get(kind, kind) for kind in kinds))
 
 
 # Reading from JSON and TOML -------------------------------------------------------------------------------------------

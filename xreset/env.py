@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from xreset.capture import GraphRunner
-from xreset.checks import names_wrong_arguments
 from xreset.errors import XResetError
 from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
 from xreset.geometry.shapes import pose_matrix
@@ -64,7 +63,6 @@ def make_scene(robot: RobotSpec, objects: tuple[ObjectSpec, ...], task: TaskConf
     return SceneSpec(robot=robot, objects=objects, timestep=task.timestep, substeps=task.substeps)
 
 
-@names_wrong_arguments
 def make_env(
     robot: RobotSpec,
     objects: Sequence[ObjectSpec],

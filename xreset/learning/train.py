@@ -21,7 +21,6 @@ from xreset.cameras.config import (
     VisionConfig,
     check_each_once,
 )
-from xreset.checks import names_wrong_arguments
 from xreset.env import make_env
 from xreset.errors import PolicyError, RunError, XResetError
 from xreset.files import claim_folder, file_hash, write_whole
@@ -55,7 +54,6 @@ from xreset.resets.goals import GoalSet, read_goals, with_goals, write_goals
 from xreset.text import shown
 
 
-@names_wrong_arguments
 def train(
     bank: str | Path | ResetBank | None = None,
     *,
@@ -193,7 +191,6 @@ def _data_of(
     return given
 
 
-@names_wrong_arguments
 def distill(
     teacher: str | Path,
     bank: str | Path | ResetBank,
@@ -286,7 +283,6 @@ def _checkpoint_to_start_from(run: Path, inputs: Inputs, config: TrainConfig) ->
     return latest_checkpoint(run)
 
 
-@names_wrong_arguments
 def resume(
     out: str | Path,
     *,

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.checks import names_wrong_arguments
 from xreset.errors import DemoError
 from xreset.physics import Backend, State
 from xreset.progress import Progress, unseen
@@ -66,7 +65,6 @@ def rejection(backend: Backend, start: State, limits: FilterConfig) -> Tensor:
     return reason
 
 
-@names_wrong_arguments
 def make_bank(
     retargeted: Retargeted,
     robot: RobotSpec,

@@ -22,7 +22,7 @@ from typing import Annotated
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xreset.checks import frozen, names_wrong_arguments
+from xreset.checks import frozen
 from xreset.demos.synth import LIFT, WORKSPACE
 from xreset.description import load_robot
 from xreset.errors import FileFormatError, GoalError
@@ -82,7 +82,6 @@ class _Episode:
     goal_turn: Rotation
 
 
-@names_wrong_arguments
 def make_goals(
     objects: Iterable[str] | None = None,
     *,

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.checks import frozen, names_wrong_arguments
+from xreset.checks import frozen
 from xreset.demos.archive import Demos, grounded, levelled
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.rotations import matrix_to_quat
@@ -49,7 +49,6 @@ class RetargetConfig:
     """A human keypoint nearer than this to the object's surface touches it [m]."""
 
 
-@names_wrong_arguments
 def retarget_demos(
     demos: Demos,
     robot: RobotSpec,

@@ -244,16 +244,19 @@ class TrainingTest(WithBank):
         out = self.train("adaptive", config=adaptive)
         rates = torch.tensor([0.25, 0.5, 1.0])
         content = torch.load(latest_checkpoint(out), weights_only=True)
-        torch.save(content | {"success_rate": rates}, latest_checkpoint(out))
+        kept = {"resets_state_dict": {"success_rate": rates}}
+        torch.save(content | kept, latest_checkpoint(out))
         self.resume(out, iterations=2)
-        assert_close(newest(out).success_rate, rates, rtol=0, atol=0.1)
-        torch.save(content | {"success_rate": torch.ones(4)}, latest_checkpoint(out))
+        found = newest(out).resets_state_dict["success_rate"]
+        assert_close(found, rates, rtol=0, atol=0.1)
+        kept = {"resets_state_dict": {"success_rate": torch.ones(4)}}
+        torch.save(content | kept, latest_checkpoint(out))
         with self.assertRaisesRegex(RunError, "000002.pt does not fit this run"):
             self.resume(out, iterations=3)
-        del content["success_rate"]  # as in earlier versions
+        del content["resets_state_dict"]  # as in earlier versions
         torch.save(content, latest_checkpoint(out))
         self.resume(out, iterations=2)
-        assert_close(newest(out).success_rate, torch.zeros(3))
+        assert_close(newest(out).resets_state_dict["success_rate"], torch.zeros(3))
 
     def test_a_schedule_continues_where_a_stopped_run_was(self):
         """Stopped after two of many iterations, then resumed for as much time as it had taken."""
@@ -584,7 +587,7 @@ class TrainingTest(WithBank):
                 adam | {"state": {0: {"step": torch.ones(()), "exp_avg": None}}},
             ),
             ("optimizer_state_dict", adam | {"state": []}),
-            ("success_rate", torch.tensor([0.5, math.nan])),
+            ("resets_state_dict", {"success_rate": torch.tensor([0.5, math.nan])}),
         ):
             torch.save(good | {key: wrong}, file)
             words = rf"(?s){file.name}\.{key} is .*, expected "

@@ -32,10 +32,6 @@ def _is_optimizer(values: dict[str, Any]) -> bool:
 
 
 _Networks = Annotated[dict[str, Any], Rule("tensors of finite numbers", _are_tensors)]
-_Rates = Annotated[
-    torch.Tensor,
-    Rule("numbers from 0 to 1", lambda rates: bool(((rates >= 0) & (rates <= 1)).all())),
-]
 
 
 @frozen
@@ -55,8 +51,8 @@ class Checkpoint:
     elapsed: NonNegativeFloat
     """Time of all iterations [s]."""
     learning_rate: NonNegativeFloat
-    success_rate: _Rates | None = None
-    """:attr:`xreset.resets.distribution.ResetDistribution.success_rate`; None: an earlier version did not write it."""
+    resets_state_dict: _Networks = field(default_factory=dict)
+    """``success_rate`` of the reset distribution; empty: an earlier version did not write it."""
 
 
 def write_checkpoint(path: Path, content: Checkpoint) -> None:

@@ -123,7 +123,9 @@ class TrainingRunner:
                     obs = self._roll_out(obs, log)
                     self._check_finite(obs)
                     self._check_faults(steps)
-                    self._share_success_rates()
+                    # processes play other episodes of the same demonstrations
+                    rates = env.resets.success_rate
+                    rates.copy_(self.processes.sum(rates) / self.processes.count)
                     collected = time.perf_counter()
                     self.alg.compute_returns(obs)
                 losses = self.alg.update()
@@ -197,7 +199,7 @@ class TrainingRunner:
             env_steps=self.env_steps,
             elapsed=self.elapsed,
             learning_rate=self.alg.learning_rate,
-            success_rate=self.env.resets.success_rate,
+            resets_state_dict={"success_rate": self.env.resets.success_rate},
         )
         write_checkpoint(self.folder / "checkpoints" / f"{self.iteration:06d}.pt", content)
 
@@ -206,8 +208,8 @@ class TrainingRunner:
         content = self._load(path)
         with must_fit(path):
             load_moments(self.alg.optimizer, content.optimizer_state_dict["state"])
-            if content.success_rate is not None:
-                self.env.resets.success_rate.copy_(content.success_rate)
+            if content.resets_state_dict:
+                self.env.resets.success_rate.copy_(content.resets_state_dict["success_rate"])
         self.alg.learning_rate = content.learning_rate
         self.iteration = content.iteration
         self.env_steps = content.env_steps
@@ -250,12 +252,6 @@ class TrainingRunner:
                 f"simulate. Then continue from the last checkpoint: {self._resume_command}"
             )
         self._fault_totals.append(now)
-
-    def _share_success_rates(self) -> None:
-        """Give every process the mean of the demonstrations' rates of success in all processes."""
-        if self.config.task.reset.adaptive_share:
-            rates = self.env.resets.success_rate
-            rates.copy_(self.processes.sum(rates) / self.processes.count)
 
     def _check_finite(self, obs: TensorDict) -> None:
         """Refuse observations that are not finite, once per iteration: they come from worlds whose health was sound."""

@@ -124,8 +124,13 @@ class FileTest(Studied):
             {name: data.resets for name, data in found.items()},
             {"toy": default, "own": ("--settle",), "plain": ()},
         )
-        with self.assertRaisesRegex(FileFormatError, "each entry of data and runs must be tables"):
-            read_study(self.file(f"data = 3\n{HEAD}{text}"))
+        for entry, words in (
+            ("data = 3", "defaults, data and runs must be tables"),
+            ("data.toy = 3", r"data\.toy is 3, expected an object"),
+        ):
+            self.assertRaisesRegex(
+                FileFormatError, words, read_study, self.file(f"{entry}\n{HEAD}{text}")
+            )
 
     def test_every_study_that_ships_can_be_read(self):
         files = sorted(SHIPPED.glob("*.toml"))

@@ -219,20 +219,11 @@ def read_study(path: Path) -> Study:
     defaults = raw.pop("defaults", {})
     data = raw.get("data", {})
     runs = raw.get("runs", {})
-    tables = [defaults, data, runs]
-    for group in (data, runs):
-        if isinstance(group, dict):
-            tables += group.values()
-    if not all(isinstance(table, dict) for table in tables):
-        raise FileFormatError(
-            f"{path}: defaults, data, runs, and each entry of data and runs must be tables."
-        )
-    if "resets" in defaults:
-        resets = defaults.pop("resets")
-        for each in data.values():
-            each.setdefault("resets", resets)
-    raw["runs"] = {name: merged(defaults, run) for name, run in runs.items()}
-    study = from_dict(Study, raw, str(path))
+    if not all(isinstance(table, dict) for table in (defaults, data, runs)):
+        raise FileFormatError(f"{path}: defaults, data and runs must be tables.")
+    of_data = {"resets": defaults.pop("resets", ())}
+    base = {"data": dict.fromkeys(data, of_data), "runs": dict.fromkeys(runs, defaults)}
+    study = from_dict(Study, merged(base, raw), str(path))
     try:
         _check_names(study)
     except ValueError as error:

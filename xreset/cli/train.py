@@ -60,20 +60,18 @@ def train(
     """
     from xreset.learning import train as training
 
-    flags = given_flags()
-    if resume and "--like" in flags:
-        raise RunError("--resume continues with the run's own configuration. Omit --like.")
     if resume and weights is not None:
         raise RunError(
             "--resume continues with the run's own networks. Omit --weights, or start another run with it."
         )
-    own = "--config.task.reward.own"
-    if resume and any(flag.startswith("--config.") and flag != own for flag in flags):
-        raise RunError(
-            "--resume continues with the run's own configuration. Omit --config, or start another run with this run's "
-            f"networks: --weights {out} --like {out}"
-        )
     if resume:
+        for flag in given_flags():
+            name = flag.partition(".")[0]
+            if name in ("--like", "--config") and flag != "--config.task.reward.own":
+                raise RunError(
+                    f"--resume continues with the run's own configuration. Omit {name}, or start another run with this "
+                    f"run's networks: --weights {out} --like {out}"
+                )
         refuse_changes(
             out,
             robot=robot,

@@ -11,7 +11,7 @@ from pathlib import Path
 from xreset.cli._common import Objects, given_flags, refuse_changes
 from xreset.errors import RunError
 from xreset.learning.config import TrainConfig
-from xreset.learning.recipes import default_recipe, starting_config, without_state_schedule
+from xreset.learning.recipes import default_config, starting_config
 
 
 def train(
@@ -119,10 +119,9 @@ def command_for(arguments: list[str]) -> Callable[..., None]:
     for flag in ("--like", "--weights", "--goals", "--resets"):
         parser.add_argument(flag, nargs="?")  # a missing value is for the real parser to say
     given = parser.parse_known_args(arguments)[0]
-    like = given.like or default_recipe(given.weights if given.goals else None)
-    if like == "paper":
-        return train
-    config = starting_config(like)
-    if not given.like and not given.resets:
-        config = without_state_schedule(config)
+    like = given.like
+    if like:
+        config = starting_config(like)
+    else:
+        like, config = default_config(given.resets, given.goals, given.weights)
     return partial(train, like=like, config=config)

@@ -7,6 +7,7 @@ import sys
 import tomllib
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 from xreset.cameras.config import VisionConfig
 from xreset.checks import from_dict, frozen, merged
@@ -42,10 +43,18 @@ RECIPES = _read_recipes()
 """Name -> recipe."""
 
 
-def default_recipe(fine_tuned: str | Path | None) -> str:
-    """Return where the configuration comes from if nothing is said: a run that is fine-tuned, else the paper."""
-    is_run = fine_tuned is not None and (Path(fine_tuned) / "run.json").is_file()
-    return str(fine_tuned) if is_run else "paper"
+def default_config(bank: Any, goals: Any, weights: str | Path | None) -> tuple[str, TrainConfig]:
+    """Return where the configuration comes from if nothing is said, and the configuration.
+
+    A run that is fine-tuned on goals goes on with its own; without a bank, it leaves its schedule of demonstrated
+    states. Other trainings are the paper's.
+    """
+    if goals is None or weights is None or not (Path(weights) / "run.json").is_file():
+        return "paper", TrainConfig()
+    config = starting_config(str(weights))
+    if bank is None:
+        config = replace(config, schedule=replace(config.schedule, demo_probability=()))
+    return str(weights), config
 
 
 def starting_config(like: str) -> TrainConfig:
@@ -90,11 +99,6 @@ def from_home(config: TrainConfig) -> TrainConfig:
             "(--resets), or leave the schedule empty: --config.schedule.demo-probability"
         )
     return config
-
-
-def without_state_schedule(config: TrainConfig) -> TrainConfig:
-    """Return the configuration without a schedule of demonstrated states, which a run that is fine-tuned may have."""
-    return replace(config, schedule=replace(config.schedule, demo_probability=()))
 
 
 def own_terms_flag(own: dict[str, float]) -> str:

@@ -29,12 +29,11 @@ from xreset.learning.config import TrainConfig
 from xreset.learning.distributed import Processes, leave
 from xreset.learning.export import export_onnx
 from xreset.learning.recipes import (
-    default_recipe,
+    default_config,
     from_home,
     own_terms_flag,
     starting_config,
     student_config,
-    without_state_schedule,
 )
 from xreset.learning.run import (
     TEACHER,
@@ -111,10 +110,10 @@ def train(
     out = Path(out)
     if config is not None and recipe is not None:
         raise XResetError("Both recipe and config are given. Give one of them.")
-    if config is None:
-        config = starting_config(recipe or default_recipe(weights if goals is not None else None))
-        if recipe is None and bank is None:
-            config = without_state_schedule(config)
+    if recipe is not None:
+        config = starting_config(recipe)
+    elif config is None:
+        _, config = default_config(bank, goals, weights)
     if iterations is not None:
         config = replace(config, iterations=iterations)
     device = device or device_for(engine, "cuda" if torch.cuda.is_available() else "cpu")

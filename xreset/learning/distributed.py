@@ -24,10 +24,11 @@ class Processes:
     @classmethod
     def of_environment(cls) -> Processes:
         """Read what ``torchrun`` has put into the environment; without it there is one process."""
-        rank = int(os.environ.get("RANK", 0))
-        local_rank = int(os.environ.get("LOCAL_RANK", 0))
-        count = int(os.environ.get("WORLD_SIZE", 1))
-        return cls(rank=rank, local_rank=local_rank, count=count)
+        return cls(
+            rank=int(os.environ.get("RANK", 0)),
+            local_rank=int(os.environ.get("LOCAL_RANK", 0)),
+            count=int(os.environ.get("WORLD_SIZE", 1)),
+        )
 
     @property
     def ranks(self) -> dict[str, int] | None:

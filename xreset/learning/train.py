@@ -155,7 +155,7 @@ def train(
         write_goals(out / "goals.npz", data)
         inputs = loading(out / "goals.npz")
     elif isinstance(data, ResetBank):
-        write_bank(out / "resets.npz", data, config={}, inputs={})
+        write_bank(out / "resets.npz", data)
         inputs = loading(out / "resets.npz")
     info = RunInfo(
         robot=str(inputs.robot_name),

@@ -7,7 +7,7 @@ goal (the paper's appendix D.c). Shape letters: L states, C rejected candidates,
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import inf
 from pathlib import Path
@@ -162,13 +162,13 @@ def no_states(robot: RobotSpec) -> dict[str, Any]:
 
 
 def starts_and_goals(
-    motions: ObjectMotions, robot: RobotSpec, sources: Mapping[str, str] | None = None
+    motions: ObjectMotions, robot: RobotSpec, objects: Sequence[ObjectSpec] = ()
 ) -> ResetBank:
-    """Return a bank of demonstrations or trajectories without states; ``sources`` maps objects to where their geometry
-    came from."""
+    """Return a bank of demonstrations or trajectories without states; ``objects`` tell where their geometry came
+    from."""
     start_pos, start_quat = motions.start_pose
     goal_pos, goal_quat = motions.goal_pose
-    sources = sources or {}
+    sources = {o.name: o.source for o in objects}
     return ResetBank(
         **no_states(robot),
         sequence_name=motions.sequence_name,

@@ -91,29 +91,28 @@ class _Grouped:
     def __init__(self, owners: np.ndarray, groups: Iterable, device: torch.device | str) -> None:
         """Sort; ``owners`` names each row's group. Rows of groups that are not in ``groups`` are left out."""
         rows = [np.flatnonzero(owners == group) for group in groups]
-        self.rows = np.concatenate(rows)
-        """Rows of the table, in the sorted order."""
+        self.rows = _tensor(np.concatenate(rows), device)
+        """Rows of the table, group after group."""
         count = np.array([len(own) for own in rows])
         self.count = _tensor(count, device)
         """Number of rows of each group."""
         self._first = _tensor(np.cumsum(count) - count, device)
 
     def draw(self, group: Tensor, uniform: Tensor) -> Tensor:
-        """Return places in the sorted order, drawn evenly from the rows of given groups [M] by numbers [M] in [0,
-        1)."""
+        """Return rows of given groups [M], drawn evenly by numbers [M] in [0, 1); any row where a group is empty."""
         count = self.count[group]
         place = torch.minimum((uniform * count).long(), (count - 1).clamp_min(0))
-        return self._first[group] + place
+        return self.rows[(self._first[group] + place).clamp_max(len(self.rows) - 1)]
 
     def draw_by_weight(self, group: Tensor, uniform: Tensor, weight: Tensor) -> Tensor:
-        """Return places in the sorted order, drawn in proportion to the weight [R] > 0 of each place."""
-        until = pad(weight.double().cumsum(dim=0), (1, 0))
+        """Return rows of given groups [M], drawn in proportion to the weight [R] > 0 of each row of the table."""
+        until = pad(weight[self.rows].double().cumsum(dim=0), (1, 0))
         first = self._first[group]
         last = first + self.count[group] - 1
         begin = until[first]
         end = until[last + 1]
         place = torch.searchsorted(until, begin + uniform * (end - begin), right=True) - 1
-        return torch.minimum(torch.maximum(place, first), last)  # against rounding
+        return self.rows[torch.minimum(torch.maximum(place, first), last)]  # against rounding
 
 
 _MEMORY = 0.05
@@ -164,10 +163,9 @@ class ResetDistribution:
             )
         if config.pre_contact_only:
             bank = bank.with_states(~bank.post_contact)
-        self._grouped_states = _Grouped(bank.object_name, object_names, device)
-        self._states = bank_starts(bank, self._grouped_states.rows).to(device)
-        self._grouped_sequences = _Grouped(bank.sequence_object, object_names, device)
-        self._sequences = _tensor(self._grouped_sequences.rows, device)
+        self._states = bank_starts(bank, np.arange(bank.num_states)).to(device)
+        self._states_of_object = _Grouped(bank.object_name, object_names, device)
+        self._sequences_of_object = _Grouped(bank.sequence_object, object_names, device)
         pivots = pivots or {}
         of_sequence = [pivots.get(name, np.zeros(3)) for name in bank.sequence_object]
         self._demos = _Demonstrations(
@@ -179,9 +177,8 @@ class ResetDistribution:
         ).to(device)
         self.success_rate = torch.zeros(len(bank.sequence_object), device=device)
         if config.adaptive_share:
-            owner = self._states.sequence.numpy(force=True)
-            self._states_of = _Grouped(owner, range(len(bank.sequence_object)), device)
-            self._rows_of = _tensor(self._states_of.rows, device)
+            sequences = range(len(bank.sequence_object))
+            self._states_of_sequence = _Grouped(bank.sequence_index, sequences, device)
         self._lower, self._upper = _tensor(joint_limits(robot), device)
         self._goal_shift = torch.tensor(
             [config.goal_xy, config.goal_xy, config.goal_z, config.goal_yaw], device=device
@@ -217,25 +214,22 @@ class ResetDistribution:
         # One of the six numbers is not used. It is drawn so that a seed gives the episodes that it gave in earlier
         # versions.
         uniform = torch.rand(len(object_index), 6, generator=generator, device=generator.device)
-        place = self._grouped_sequences.draw(object_index, uniform[:, 2])
+        sequence = self._sequences_of_object.draw(object_index, uniform[:, 2])
         share = self.config.adaptive_share
         if share:
-            failure = (1.0 - self.success_rate[self._sequences]).clamp_min(_LEAST_FAILURE)
-            weak = self._grouped_sequences.draw_by_weight(object_index, uniform[:, 2], failure)
-            place = torch.where(uniform[:, 4] < share, weak, place)
-        sequence = self._sequences[place]
+            failure = (1.0 - self.success_rate).clamp_min(_LEAST_FAILURE)
+            weak = self._sequences_of_object.draw_by_weight(object_index, uniform[:, 2], failure)
+            sequence = torch.where(uniform[:, 4] < share, weak, sequence)
         home = self.home(sequence, generator)
-        if not len(self._states.state):
+        states = self._states_of_object
+        if not len(states.rows):
             return home
-        from_bank = (uniform[:, 0] < self.demo_probability) & (
-            self._grouped_states.count[object_index] > 0
-        )
-        row = self._grouped_states.draw(object_index, uniform[:, 1])
+        from_bank = (uniform[:, 0] < self.demo_probability) & (states.count[object_index] > 0)
+        row = states.draw(object_index, uniform[:, 1])
         if share:
-            adapted = (uniform[:, 4] < share) & (self._states_of.count[sequence] > 0)
-            place = torch.where(adapted, self._states_of.draw(sequence, uniform[:, 1]), 0)
-            row = torch.where(adapted, self._rows_of[place], row)
-        row = torch.where(from_bank, row, 0)  # a valid row for home worlds; its values are not used
+            own = self._states_of_sequence
+            adapted = (uniform[:, 4] < share) & (own.count[sequence] > 0)
+            row = torch.where(adapted, own.draw(sequence, uniform[:, 1]), row)
         gravity = uniform[:, 3] if self.config.random_gravity else torch.ones_like(uniform[:, 3])
         return where(
             from_bank, replace(self._states[row], state=row, gravity_fraction=gravity), home

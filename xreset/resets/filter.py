@@ -163,7 +163,7 @@ def make_bank(
     kept = {name: values[keep] for name, values in columns.items()}
     rejected = {f"rejected_{name}": values[~keep] for name, values in columns.items()}
     return replace(
-        starts_and_goals(retargeted, robot, {o.name: o.source for o in objects}),
+        starts_and_goals(retargeted, robot, objects),
         backends=engines,
         joint_pos=stable.joint_pos.numpy(),
         joint_target=stable.joint_target.numpy() if squeeze.presses else None,

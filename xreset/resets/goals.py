@@ -149,7 +149,7 @@ def make_goals(
 
 def write_goals(path: str | Path, goals: GoalSet, config: GoalConfig | None = None) -> None:
     """Write a goal set; see :func:`xreset.records.write_record`."""
-    write_record(path, SCHEMA, goals, config=asdict(config) if config else {}, inputs={})
+    write_record(path, SCHEMA, goals, config=asdict(config) if config else None)
 
 
 def read_goals(path: str | Path) -> GoalSet:

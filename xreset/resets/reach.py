@@ -49,10 +49,9 @@ class Reach:
         self._grasps = (Rotation.from_rotvec(turns[:, 1:] * (0.0, 0.0, 1.0)) * tilted).as_quat()
         self._base = np.array(robot.base_pos)
         self._stretch = float(np.linalg.norm(self._center)) + _THRESHOLDS.wrist_position
-        tree = self._model.kinematics.tree
         link = robot.hand_root
-        while link != tree.root:
-            joint = tree.above[link]
+        while link != whole.root:
+            joint = whole.tree.above[link]
             self._stretch += float(np.linalg.norm(joint.T_parent_joint[:3, 3]))
             if joint.type == "prismatic":
                 self._stretch += max(abs(joint.lower), abs(joint.upper))

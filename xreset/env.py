@@ -17,7 +17,6 @@ from torch import Tensor
 from xreset.capture import GraphRunner
 from xreset.errors import XResetError
 from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
-from xreset.geometry.shapes import pose_matrix
 from xreset.objects.sampling import center, metric_points, surface_points
 from xreset.physics import Backend, Parameters, State
 from xreset.plugins import make_backend
@@ -407,10 +406,8 @@ class ManipulationEnv:
         state = self.backend.state()[world].to("cpu")
         return self._renderer.draw(
             state.joint_pos.numpy(),
-            pose_matrix(state.object_pos.numpy(), state.object_quat.numpy()),
-            goal_pose=pose_matrix(
-                self.goal_pos[world].cpu().numpy(), self.goal_quat[world].cpu().numpy()
-            ),
+            (state.object_pos.numpy(), state.object_quat.numpy()),
+            goal_pose=(self.goal_pos[world].cpu().numpy(), self.goal_quat[world].cpu().numpy()),
             object_index=int(self.backend.object_index[world]),
         )
 

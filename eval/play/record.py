@@ -13,7 +13,6 @@ from xreset.eval.play.session import Moment, Session
 from xreset.eval.report.clips import encode_mp4
 from xreset.eval.results import Trace, write_traces
 from xreset.files import write_whole
-from xreset.geometry.shapes import pose_matrix
 from xreset.pictures.render import Renderer
 from xreset.spec import SceneSpec
 
@@ -79,8 +78,8 @@ def draw_film(scene: SceneSpec, moments: Sequence[Moment]) -> bytes:
     every = max(1, round(1.0 / (FRAMES_PER_SECOND * scene.control_dt)))
     frames = []
     for moment in moments[::every]:
-        pose = pose_matrix(moment.object_pos, moment.object_quat)
-        goal = pose_matrix(moment.goal_pos, moment.goal_quat)
+        pose = (moment.object_pos, moment.object_quat)
+        goal = (moment.goal_pos, moment.goal_quat)
         frames.append(renderer.draw(moment.joint_pos, pose, goal_pose=goal))
     return encode_mp4(np.stack(frames), 1.0 / (every * scene.control_dt))
 

@@ -117,10 +117,9 @@ def draw_state(
     renderer: Renderer, trace: Trace, row: int, eyes: Cameras | None = None
 ) -> np.ndarray:
     """Draw one state of a trace, with the goal as a translucent object, above what the policy's cameras show."""
-    pose = pose_matrix(trace.object_pos[row], trace.object_quat[row])
-    picture = renderer.draw(
-        trace.joint_pos[row], pose, goal_pose=pose_matrix(trace.goal_pos, trace.goal_quat)
-    )
+    pose = (trace.object_pos[row], trace.object_quat[row])
+    goal = (trace.goal_pos, trace.goal_quat)
+    picture = renderer.draw(trace.joint_pos[row], pose, goal_pose=goal)
     if eyes is None:
         return picture
     return np.vstack((picture, draw_view(eyes, trace, row, picture.shape[1])))

@@ -21,7 +21,7 @@ from xreset.checks import frozen
 from xreset.errors import XResetError
 from xreset.files import write_whole
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.shapes import look_at
+from xreset.geometry.shapes import look_at, pose_matrix
 from xreset.geometry.urdf import link_meshes
 from xreset.pictures.meshes import (
     GOAL_COLOR,
@@ -41,6 +41,8 @@ from xreset.spec import SceneSpec
 
 Size = tuple[int, int]
 """Width and height [pixels]."""
+Pose = tuple[np.ndarray, np.ndarray]
+"""Position [3] and quaternion [4] (w, x, y, z), world frame."""
 
 SKY_COLORS: tuple[Color, Color] = ((0.90, 0.93, 0.97), (0.98, 0.98, 0.98))
 """Background at the upper and lower edge of a picture."""
@@ -144,9 +146,9 @@ class Renderer:
     def draw(
         self,
         joint_pos: np.ndarray | None,
-        object_pose: np.ndarray | None = None,
+        object_pose: Pose | None = None,
         *,
-        goal_pose: np.ndarray | None = None,
+        goal_pose: Pose | None = None,
         object_index: int = 0,
         robot_tint: Color | None = None,
         points: Sequence[Points] = (),
@@ -156,8 +158,8 @@ class Renderer:
 
         Args:
             joint_pos: [J] rad (m), in the robot's joint order; None omits the robot.
-            object_pose: [4, 4] pose of the object in the world; None omits the object.
-            goal_pose: [4, 4] pose at which a translucent copy of the object is drawn.
+            object_pose: pose of the object in the world; None omits the object.
+            goal_pose: pose at which a translucent copy of the object is drawn.
             object_index: index into the scene's objects.
             robot_tint: color to mix into the robot's own (:func:`tint`).
             points: dots on top.
@@ -171,10 +173,12 @@ class Renderer:
         if joint_pos is not None:
             parts += self._robot(joint_pos, robot_tint)
         if object_pose is not None:
-            parts.append(place(self._objects[object_index], OBJECT_COLOR, np.asarray(object_pose)))
+            parts.append(
+                place(self._objects[object_index], OBJECT_COLOR, pose_matrix(*object_pose))
+            )
         goal = None
         if goal_pose is not None:
-            goal = place(self._objects[object_index], GOAL_COLOR, np.asarray(goal_pose))
+            goal = place(self._objects[object_index], GOAL_COLOR, pose_matrix(*goal_pose))
         scene = join(parts)
         image = _image(scene, goal, camera, self.size, self._smooth)
         _draw_points(image, camera, points)

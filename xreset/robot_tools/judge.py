@@ -31,7 +31,6 @@ from xreset.geometry.rotations import (
     quat_to_axis_angle,
     relative_pose,
 )
-from xreset.geometry.shapes import pose_matrix
 from xreset.physics import Backend, State
 from xreset.pictures.render import Camera, Renderer, add_caption
 from xreset.progress import unseen
@@ -336,7 +335,7 @@ def judge_picture(
         for phase, moment in zip(("start", *PHASES), moments, strict=True):
             target = moment[-7:-4]
             camera = Camera(eye=tuple(target + np.array((0.42, -0.42, 0.22))), target=tuple(target))
-            tile = renderer.draw(moment[:-7], pose_matrix(target, moment[-4:]), camera=camera)
+            tile = renderer.draw(moment[:-7], (target, moment[-4:]), camera=camera)
             caption = [name]
             if phase != "start":
                 caption = [

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from xreset.description import load_robot
-from xreset.geometry.shapes import pose_matrix
 from xreset.pictures.render import Points, Renderer, Size
 from xreset.pictures.view.colors import HUMAN_COLOR, REACHED_COLOR, TOUCH_COLOR, reason_color
 from xreset.pictures.view.data import BONES, View
@@ -40,8 +39,8 @@ class Drawer:
             points.append(Points(pos=view.fingertips[row], color=REACHED_COLOR, radius=0.003))
         return self._renderer.draw(
             None if view.joint_pos is None else view.joint_pos[row],
-            pose_matrix(view.object_pos[row], view.object_quat[row]),
-            goal_pose=pose_matrix(view.goal_pos[sequence], view.goal_quat[sequence]),
+            (view.object_pos[row], view.object_quat[row]),
+            goal_pose=(view.goal_pos[sequence], view.goal_quat[sequence]),
             object_index=int(view.object_index[row]),
             robot_tint=reason_color(view.reason[row]),
             points=points,

@@ -1,5 +1,6 @@
 """Loading of demonstrations, motion and banks, with the robot and the objects that they need."""
 
+import pickle
 import re
 from unittest.mock import patch
 
@@ -109,6 +110,10 @@ class InputsTest(InOneFolder):
                 self.assertRaisesRegex(XResetError, f"^{next(iter(wrong))} {words}"),
             ):
                 call(**given | wrong)
+
+    def test_functions_of_the_package_can_be_sent_to_other_processes(self):
+        for function in (evaluate, make_env, train):
+            self.assertIs(pickle.loads(pickle.dumps(function)), function)
 
     def test_errors_of_right_arguments_are_not_changed(self):
         with patch("xreset.eval.evaluate.load_policy", side_effect=TypeError("defect")):

@@ -39,6 +39,7 @@ def __getattr__(name: str) -> Any:
         from xreset.checks import names_wrong_arguments
 
         value = names_wrong_arguments(value)
+        value.__module__ = __name__  # where pickle finds it
     globals()[name] = value
     return value
 

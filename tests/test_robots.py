@@ -116,7 +116,9 @@ class Registry(Copied):
 
     def test_names_and_folders(self):
         self.assertLessEqual(set(BUILT_IN), set(robot_names()))
-        self.assertEqual(load(self.folder).home.tolist(), load("openarm").home.tolist())
+        robot = load(self.folder)
+        self.assertEqual(robot.home.tolist(), load("openarm").home.tolist())
+        self.assertIs(load(robot), robot)
         self.assertRaisesRegex(RobotError, "ur7e-sharpa", load, "no-such-robot")
 
     def test_a_plugin_has_the_name_that_files_give_its_robot(self):

@@ -29,16 +29,18 @@ SCHEMA = "xreset-robot/1"
 """What ``schema`` in the description must be."""
 
 
-def load_robot(name_or_folder: str | Path) -> RobotSpec:
+def load_robot(name_or_folder: str | Path | RobotSpec) -> RobotSpec:
     """Read a robot's description.
 
     Args:
-        name_or_folder: a registered name, or a folder with a ``robot.toml``.
+        name_or_folder: a registered name, or a folder with a ``robot.toml``. A loaded robot is returned as it is.
 
     Raises:
         RobotError: the robot is unknown, or its description is wrong; the message lists everything that is wrong.
             Whether the URDF has the named links and joints is found by :func:`xreset.robot_tools.check.check`.
     """
+    if isinstance(name_or_folder, RobotSpec):
+        return name_or_folder
     spec = read_description(robot_folder(name_or_folder) / DESCRIPTION)
     name = str(name_or_folder)
     if name in robot_names() and spec.name != name:  # files name the robot as robot.toml does

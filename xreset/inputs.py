@@ -148,7 +148,7 @@ def load_inputs(
     else:
         loaded = load_objects(names, folder)
         robot = robot or data.robot
-    spec = load_robot(robot) if isinstance(robot, str | Path) else robot
+    spec = None if robot is None else load_robot(robot)
     inputs = Inputs(
         data=data,
         objects=loaded,

@@ -226,7 +226,7 @@ def read_actions(
         FileFormatError: the file is damaged, or for another robot or object geometry.
     """
     made = read_record(ActionFile, path, SCHEMA, what="an action sequence", check=_check)
-    spec = robot if isinstance(robot, RobotSpec) else load_robot(robot or made.robot)
+    spec = load_robot(robot or made.robot)
     check_robot(path, "action sequence", made, spec)
     thing = objects(made.object_name)
     if thing.source != made.object_source:

@@ -116,7 +116,7 @@ def make_goals(
     if unknown := [family for family in families if family not in FAMILIES]:
         raise GoalError(f"Unknown family {unknown[0]!r}. Choose from: {', '.join(FAMILIES)}.")
     specs = load_objects(objects or object_names(meshes), meshes)
-    spec = robot if isinstance(robot, RobotSpec) else load_robot(robot)
+    spec = load_robot(robot)
     own = [_own_pose(pose) for pose in poses]
     for obj in specs:
         for pos, quat in own:

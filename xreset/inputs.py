@@ -79,11 +79,12 @@ class Inputs:
     @cached_property
     def bank(self) -> ResetBank:
         """The reset bank; for demonstrations and motion a bank without states, which holds their starts and goals."""
-        if isinstance(self.data, ResetBank):
-            return self.data
-        if isinstance(self.data, Demos):
-            return starts_and_goals(rest_on_table(self.data, self.objects), self.robot)
-        return starts_and_goals(self.data, self.robot)
+        data = self.data
+        if isinstance(data, ResetBank):
+            return data
+        if isinstance(data, Demos):
+            data = rest_on_table(data, self.objects)
+        return starts_and_goals(data, self.robot)
 
     def motion(self, progress: Progress = unseen) -> Retargeted:
         """Return the robot's motion; demonstrations are retargeted here, which takes about a second for each.

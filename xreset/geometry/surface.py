@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from xreset.geometry.fields import DistanceFields
-from xreset.geometry.shapes import half_spaces, plane_heights, surface_of, turn_of
+from xreset.geometry.shapes import half_spaces, plane_heights, shape_mesh, surface_of, turn_of
 from xreset.spec import ObjectSpec, Shape
 
 _SAMPLE_SPACING = 0.003
@@ -137,12 +137,8 @@ def _nodes_inside(pieces: Sequence[Shape], nodes: np.ndarray) -> np.ndarray:
     shifted = (nodes + _NODE_SHIFT).reshape(-1, 3)
     inside = np.zeros(len(shifted), dtype=bool)
     for piece in pieces:
-        vertices, _ = surface_of([piece])
-        in_box = (
-            ((shifted >= vertices.min(axis=0)) & (shifted <= vertices.max(axis=0)))
-            .all(axis=1)
-            .nonzero()[0]
-        )
+        low, high = shape_mesh(piece).bounds
+        in_box = np.flatnonzero(((shifted >= low) & (shifted <= high)).all(axis=1))
         heights = plane_heights(shifted[in_box], half_spaces(piece))
         inside[in_box[(heights <= 0).all(axis=1)]] = True
     return inside.reshape(nodes.shape[:3])

@@ -175,15 +175,12 @@ def load_policy(
     if name in BASELINES:
         return _baseline(name, robot, seed)
     path = Path(policy)
-    objects_folder = None
-    if os.path.isdir(path):
-        run = read_run(path)
-        objects_folder = Path(run.objects) if run.objects else None
-        robot = robot or run.robot
+    run = read_run(path) if os.path.isdir(path) else None
     file = policy_file(policy, also=BASELINES)
     folder = file.parent
-    if os.path.isdir(path):
+    if run is not None:
         name = path.name
+        robot = robot or run.robot
     elif file == path:
         name = path.stem
     else:
@@ -201,7 +198,7 @@ def load_policy(
         robot=spec,
         task=contract.task,
         folder=folder / "eval",
-        objects_folder=objects_folder,
+        objects_folder=Path(run.objects) if run and run.objects else None,
         objects=contract.objects,
         hash=loaded.hash,
         file=file,

@@ -256,7 +256,7 @@ class TargetsTest(InFolder):
         still = turned.object_pos + quat_rotate(turned.object_quat, pivot.expand(3, 3))
         assert_close(still, torch.as_tensor(bank.start_pos) + pivot)
         self.assertGreater(turned.object_quat[:, 3].abs().max(), 0.1)
-        chosen = bank_starts(bank, np.array([4, 1]))
+        chosen = bank_starts(bank)[tensor([4, 1])]
         assert_close(chosen.joint_target, chosen.joint_pos + 0.25)
 
 

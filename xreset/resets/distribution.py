@@ -69,18 +69,18 @@ def _tensor(array: np.ndarray, device: torch.device | str = "cpu") -> Tensor:
     return torch.as_tensor(np.ascontiguousarray(array), dtype=dtype, device=device)
 
 
-def bank_starts(bank: ResetBank, rows: np.ndarray) -> Reset:
-    """Return starts from given states [M] of a bank at full gravity; ``state`` is the row in the bank."""
-    sequence = bank.sequence_index[rows]
+def bank_starts(bank: ResetBank) -> Reset:
+    """Return starts from the states of a bank at full gravity."""
+    sequence = bank.sequence_index
     return Reset(
-        joint_pos=_tensor(bank.joint_pos[rows]),
-        joint_target=_tensor(bank.targets[rows]),
-        object_pos=_tensor(bank.object_pos[rows]),
-        object_quat=_tensor(bank.object_quat_wxyz[rows]),
+        joint_pos=_tensor(bank.joint_pos),
+        joint_target=_tensor(bank.targets),
+        object_pos=_tensor(bank.object_pos),
+        object_quat=_tensor(bank.object_quat_wxyz),
         goal_pos=_tensor(bank.goal_pos[sequence]),
         goal_quat=_tensor(bank.goal_quat_wxyz[sequence]),
-        gravity_fraction=torch.ones(len(rows)),
-        state=_tensor(rows),
+        gravity_fraction=torch.ones(bank.num_states),
+        state=torch.arange(bank.num_states),
         sequence=_tensor(sequence),
     )
 
@@ -163,7 +163,7 @@ class ResetDistribution:
             )
         if config.pre_contact_only:
             bank = bank.with_states(~bank.post_contact)
-        self._states = bank_starts(bank, np.arange(bank.num_states)).to(device)
+        self._states = bank_starts(bank).to(device)
         self._states_of_object = _Grouped(bank.object_name, object_names, device)
         self._sequences_of_object = _Grouped(bank.sequence_object, object_names, device)
         pivots = pivots or {}

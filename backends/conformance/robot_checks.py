@@ -17,7 +17,7 @@ from xreset.backends.conformance.harness import Bench, Worlds, finite_limits, re
 from xreset.backends.conformance.results import Measured, Skipped
 from xreset.backends.rigid import mechanism, object_inertia
 from xreset.geometry.dynamics import drive_values
-from xreset.geometry.urdf import robot_tree
+from xreset.geometry.urdf import prismatic_joints, robot_tree
 from xreset.physics import State
 from xreset.spec import GRAVITY, SceneSpec
 
@@ -73,9 +73,7 @@ def effort_limit(bench: Bench) -> Measured:
 
 def _alone(bench: Bench) -> tuple[State, Tensor]:
     """[J] worlds: in world i joint i has room for its way on both sides, the others are at home; and each way [J]."""
-    robot = bench.scene.robot
-    tree = robot_tree(robot)
-    slides = torch.tensor([tree.joint(name).type == "prismatic" for name in robot.joint_names])
+    slides = torch.tensor(prismatic_joints(bench.scene.robot))
     lower = bench.kinematics.lower
     upper = bench.kinematics.upper
     way = torch.where(slides, _SLIDE_WAY, _WAY).double().minimum(0.3 * (upper - lower))

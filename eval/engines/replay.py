@@ -24,7 +24,7 @@ from xreset.eval.engines.actions import Actions
 from xreset.eval.engines.recording import Recording, play
 from xreset.eval.rollout import Engine
 from xreset.geometry.rotations import quat_angle
-from xreset.geometry.urdf import robot_tree
+from xreset.geometry.urdf import prismatic_joints
 from xreset.physics import State
 from xreset.spec import SceneSpec
 
@@ -100,8 +100,7 @@ def compared(
     """
     robot = scene.robot
     dt = scene.control_dt
-    tree = robot_tree(robot)
-    scale = [10.0 if tree.joint(name).type == "prismatic" else 1.0 for name in robot.joint_names]
+    scale = np.where(prismatic_joints(robot), 10.0, 1.0)
     fingers = robot.fingertip_names
     force = found.tip_force[:, world].norm(dim=-1).double().numpy()
     other = reference.tip_force[:, 0].norm(dim=-1).double().numpy()

@@ -213,6 +213,12 @@ def joint_limits(robot: RobotSpec) -> np.ndarray:
     return np.array([(joint.lower, joint.upper) for joint in joints]).T
 
 
+def prismatic_joints(robot: RobotSpec) -> np.ndarray:
+    """[J] bool: which of a robot's joints slide."""
+    tree = robot_tree(robot)
+    return np.array([tree.joint(name).type == "prismatic" for name in robot.joint_names])
+
+
 def link_meshes(robot: RobotSpec) -> dict[str, trimesh.Trimesh]:
     """Return the collision shapes of each link of the robot's URDF that has some, as one mesh in the link's frame."""
     import trimesh

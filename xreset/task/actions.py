@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from xreset.geometry.urdf import joint_limits, robot_tree
+from xreset.geometry.urdf import joint_limits, prismatic_joints
 from xreset.spec import RobotSpec
 from xreset.task.config import ActionConfig
 
@@ -38,9 +38,7 @@ class ActionSpace:
         self.config = config
         lower, upper = torch.tensor(joint_limits(robot), dtype=torch.float32, device=device)
         is_arm = torch.tensor(robot.is_arm, device=device)
-        tree = robot_tree(robot)
-        kinds = [tree.joint(name).type for name in robot.joint_names]
-        slides = torch.tensor([kind == "prismatic" for kind in kinds], device=device)
+        slides = torch.tensor(prismatic_joints(robot), device=device)
         unit = torch.where(slides & ~is_arm, FINGER, 1.0)
         hand_step = config.hand_step if config.hand == "relative" else 0.0
         zero = (lower + upper) / 2

@@ -13,7 +13,7 @@ import numpy as np
 
 from xreset.backends.rigid import OTHER_LINK, Inertia, Mechanism
 from xreset.checks import frozen
-from xreset.geometry.shapes import transform
+from xreset.geometry.shapes import transform, transformed
 from xreset.geometry.urdf import Joint
 from xreset.spec import Shape
 
@@ -140,7 +140,7 @@ def _geometry(shape: Shape, mesh: Path) -> str:
 
 def moved_vertices(shape: Shape) -> np.ndarray:
     """[V, 3] vertices of a hull in the frame of its body."""
-    return shape.geometry.vertices @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3]
+    return transformed(np.asarray(shape.geometry.vertices), shape.T_body_shape)
 
 
 def _origin(T: np.ndarray) -> str:

@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 import weakref
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar
+from dataclasses import fields
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch
@@ -18,9 +19,6 @@ from torch import Tensor
 
 from xreset.backends.rigid import ContactArrays, Inertia, LinkArrays, StateArrays
 from xreset.backends.workers import (
-    CONTACT_FIELDS,
-    LINK_FIELDS,
-    STATE_FIELDS,
     Job,
     LocalWorlds,
     WorkerTeam,
@@ -32,6 +30,9 @@ from xreset.errors import CapabilityError, XResetError
 from xreset.physics import Backend, Contacts, Health, Links, MassProperties, Parameter, State
 from xreset.plugins import refuse_unknown_options
 from xreset.spec import SceneSpec
+from xreset.tensors import Tensors
+
+_Bundle = TypeVar("_Bundle", bound=Tensors)
 
 
 class World(ABC):
@@ -204,12 +205,11 @@ class PoolBackend(Backend):
             self._arrays = self._team.arrays
         # also runs when the interpreter exits
         self._close = weakref.finalize(self, self._team.close)
-        views = {name: torch.from_numpy(array) for name, array in self._arrays.items()}
-        self._state = State(**{name: views[name] for name in STATE_FIELDS})
-        self._links = Links(**{name: views[name] for name in LINK_FIELDS})
-        self._contacts = Contacts(**{name: views[name] for name in CONTACT_FIELDS})
-        self._health = Health(nonfinite=views["nonfinite"], overflow=views["overflow"])
-        self._wrench = views["wrench"]
+        self._state = self._views(State)
+        self._links = self._views(Links)
+        self._contacts = self._views(Contacts)
+        self._health = self._views(Health)
+        self._wrench = torch.from_numpy(self._arrays["wrench"])
         self._state.map(Tensor.copy_, State.initial(scene, self.object_index))
         try:
             self._command("build")
@@ -230,8 +230,7 @@ class PoolBackend(Backend):
     def mass_properties(self) -> MassProperties:
         self._require("mass_properties")
         self._command("mass_properties")
-        found = {name: self._arrays[f"body_{name}"].copy() for name in ("mass", "com", "inertia")}
-        return MassProperties(**{name: torch.from_numpy(values) for name, values in found.items()})
+        return self._views(MassProperties, "body_").clone()
 
     def close(self) -> None:
         self._close()
@@ -242,6 +241,11 @@ class PoolBackend(Backend):
         present = self._arrays[name]
         present[index] = self._checked(name, value, (len(index), *present.shape[1:])).numpy()
         self._command("set_parameter", index, name)
+
+    def _views(self, bundle: type[_Bundle], prefix: str = "") -> _Bundle:
+        """Return views of the shared arrays of a bundle's fields."""
+        names = [field.name for field in fields(bundle)]
+        return bundle(**{name: torch.from_numpy(self._arrays[prefix + name]) for name in names})
 
     def _selected(self, worlds: Tensor | None) -> np.ndarray:
         if worlds is None:

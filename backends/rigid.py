@@ -48,7 +48,7 @@ class Inertia:
     @cached_property
     def axes(self) -> np.ndarray:
         """[3, 3] the principal axes in the body's frame, as rows."""
-        return np.stack([rotate(self.quat, axis) for axis in np.eye(3)])
+        return rotate(self.quat, np.eye(3))
 
     @cached_property
     def matrix(self) -> np.ndarray:

@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import time
 import tomllib
-from collections.abc import Callable, Iterable
+from collections import ChainMap
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -54,12 +55,7 @@ __all__ = [
 
 _MODULES = (state_checks, world_checks, robot_checks, motion_checks, contact_checks, grasp_checks)
 _TABLE = tomllib.loads(Path(__file__).with_name("checks.toml").read_text())
-
-
-_FUNCTIONS: dict[str, Any] = {}
-for _module in _MODULES:
-    _FUNCTIONS |= vars(_module)
-
+_FUNCTIONS: Mapping[str, Any] = ChainMap(*map(vars, _MODULES))
 CHECKS = tuple(
     Check(name=name, run=_FUNCTIONS[name], **row) for name, row in _TABLE["checks"].items()
 )

@@ -145,7 +145,6 @@ class Bench:
         self.kinematics = Kinematics(scene.robot)
         self.which = [i % len(scene.objects) for i in range(self.NUM_WORLDS)]
         """Index of the object of each shared world."""
-        self._shared: Worlds | None = None
 
     @property
     def objects(self) -> list[ObjectSpec]:
@@ -165,12 +164,14 @@ class Bench:
     @property
     def backend(self) -> Backend:
         """The backend of the shared worlds."""
-        return (self._shared or self.worlds()).backend
+        return self._shared.backend
+
+    @cached_property
+    def _shared(self) -> Worlds:
+        return self._made(self.scene, self.which)
 
     def worlds(self) -> Worlds:
         """Return the shared worlds in their initial state, with nominal parameters."""
-        if self._shared is None:
-            self._shared = self._made(self.scene, self.which)
         worlds = self._shared
         if worlds.altered:
             nominal = Parameters.nominal(self.scene, torch.tensor(self.which))
@@ -269,7 +270,7 @@ class Bench:
 
     def close(self) -> None:
         """Close the shared worlds."""
-        if self._shared is not None:
+        if "_shared" in vars(self):
             self._shared.backend.close()
 
 

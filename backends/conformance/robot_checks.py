@@ -16,7 +16,7 @@ from torch import Tensor
 from xreset.backends.conformance.harness import Bench, Worlds, finite_limits, replace_fields
 from xreset.backends.conformance.results import Measured, Skipped
 from xreset.backends.rigid import mechanism, object_inertia
-from xreset.geometry.dynamics import drive_values
+from xreset.geometry.dynamics import com_jacobian, drive_values
 from xreset.geometry.urdf import prismatic_joints, robot_tree
 from xreset.physics import State
 from xreset.spec import GRAVITY, SceneSpec
@@ -77,9 +77,7 @@ def _alone(bench: Bench) -> tuple[State, Tensor]:
     lower = bench.kinematics.lower
     upper = bench.kinematics.upper
     way = torch.where(slides, _SLIDE_WAY, _WAY).double().minimum(0.3 * (upper - lower))
-    middle = torch.minimum(
-        torch.maximum(bench.kinematics.home, lower + 1.5 * way), upper - 1.5 * way
-    )
+    middle = bench.kinematics.home.clamp(lower + 1.5 * way, upper - 1.5 * way)
     start = bench.initial(bench.scene, [0] * len(slides))
     start.joint_pos.diagonal().copy_(middle.float())
     return replace_fields(start, joint_target=start.joint_pos), way.float()
@@ -135,18 +133,15 @@ def drive_equation(bench: Bench) -> Measured:
     found = bench.worlds().path(start, [target] * 12, 4)[..., index]
     path = found.double().numpy() - robot.joints[index].home
     times = 4 * bench.scene.timestep * np.arange(1, 13)
+
+    def motion(_, y: np.ndarray, goal: float) -> list[float]:
+        effort = np.clip(drive.kp * (goal - y[0]) - drive.kd * y[1], -drive.effort, drive.effort)
+        return [y[1], effort / (carried + drive.armature)]
+
     errors = {}
+    options = {"t_eval": times, "rtol": 1e-6, "atol": 1e-9, "max_step": 1e-3}
     for i, step in enumerate(steps.tolist()):
-
-        def motion(_, y: np.ndarray, goal: float = step) -> list[float]:
-            effort = np.clip(
-                drive.kp * (goal - y[0]) - drive.kd * y[1], -drive.effort, drive.effort
-            )
-            return [y[1], effort / (carried + drive.armature)]
-
-        exact = solve_ivp(
-            motion, (0.0, times[-1]), [0.0, 0.0], t_eval=times, rtol=1e-6, atol=1e-9, max_step=1e-3
-        ).y[0]
+        exact = solve_ivp(motion, (0.0, times[-1]), [0.0, 0.0], args=(step,), **options).y[0]
         errors[f"step of {step:+.2f} m"] = (path[:, i] - exact) / step
     return errors
 
@@ -162,7 +157,7 @@ def drive_scale(bench: Bench) -> Measured:
     _, way = _alone(bench)
     start = bench.initial(scene, which)
     limits = bench.kinematics
-    target = (start.joint_pos + way).minimum(limits.upper.float()).maximum(limits.lower.float())
+    target = (start.joint_pos + way).clamp(limits.lower.float(), limits.upper.float())
 
     def path(worlds: Worlds, rows: slice) -> Tensor:
         return worlds.path(start[rows], [target[rows]] * 30, scene.substeps)
@@ -243,15 +238,13 @@ def own_weight(bench: Bench) -> Measured:
     """
     scene = bench.free_scene
     scene = replace(scene, robot=replace(scene.robot, gravity_compensated=False))
-    kinematics = bench.kinematics
     start = bench.start()
     with bench.other(scene, bench.which) as worlds:
         worlds.set_parameter("object_gravity", torch.tensor([0.0, 0.5, 1.0, 0.25]))
         q = worlds.advance(start, round(2.0 / scene.timestep)).joint_pos.double()
-    links = [kinematics.tree.link(name) for name in kinematics.link_names]
-    com = torch.tensor(np.stack([link.com for link in links]))
+    links, jacobian = com_jacobian(bench.kinematics, q)
     mass = torch.tensor([link.mass for link in links], dtype=torch.float64)
-    rise = kinematics.jacobian(q, kinematics.link_names, com).linear[:, :, 2]  # [N, L, J]
+    rise = jacobian.linear[:, :, 2]  # [N, L, J]
     stiffness = torch.as_tensor(drive_values(scene.robot, "kp"))
     sag = GRAVITY * torch.einsum("l,nlj->nj", mass, rise) / stiffness
     return {

@@ -76,7 +76,7 @@ def links_after_steps(bench: Bench) -> Measured:
 
 
 def mimic_joints(bench: Bench) -> Measured:
-    """Do the same for links that a mimic joint moves, which follows through a stiff coupling."""
+    """Do the same for links that a mimic joint moves; a stiff coupling lets it follow its source."""
     moved = _moved_by_mimics(bench.scene)
     if not moved.any():
         raise Skipped("no tracked link of this robot is moved by a mimic joint")
@@ -154,14 +154,11 @@ def _link_errors(kinematics: Kinematics, state: State, links: Links) -> dict[str
 
 def _moved_by_mimics(scene: SceneSpec) -> Tensor:
     """[K] whether a mimic joint moves each tracked link."""
-    mimics = {mimic.joint for mimic in scene.robot.mimics}
-    joint_above = {joint.child: joint for joint in robot_tree(scene.robot).joints}
-
-    def moved(link: str) -> bool:
-        joint = joint_above.get(link)
-        return joint is not None and (joint.name in mimics or moved(joint.parent))
-
-    return torch.tensor([moved(link) for link in scene.robot.tracked_links])
+    tree = robot_tree(scene.robot)
+    moved = set()
+    for mimic in scene.robot.mimics:
+        moved.update(tree.below(tree.joint(mimic.joint).child))
+    return torch.tensor([link in moved for link in scene.robot.tracked_links])
 
 
 def _errors_on_the_way(bench: Bench, which: Tensor) -> Measured:

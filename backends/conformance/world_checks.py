@@ -18,6 +18,7 @@ from xreset.backends.conformance.harness import (
 )
 from xreset.backends.conformance.results import Measured, Skipped
 from xreset.physics import Parameter, State
+from xreset.spec import GRAVITY
 from xreset.tensors import where
 
 
@@ -93,7 +94,7 @@ def objects_in_a_batch(bench: Bench) -> Measured:
         difference = state_errors(together[[i]], state)
         errors[f"pos of {thing.name}"] = difference["object_pos"]
         errors[f"quat of {thing.name}"] = difference["object_quat"]
-        errors[f"weight of {thing.name}"] = float(forces[i] - force[0]) / (thing.mass * 9.81)
+        errors[f"weight of {thing.name}"] = float(forces[i] - force[0]) / (thing.mass * GRAVITY)
     return errors
 
 

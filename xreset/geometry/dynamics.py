@@ -6,9 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.kinematics import Kinematics, PointJacobian
+from xreset.geometry.urdf import Link
 from xreset.spec import DriveSpec, JointSpec, RobotSpec
+
+
+def com_jacobian(kinematics: Kinematics, q: Tensor) -> tuple[list[Link], PointJacobian]:
+    """Return the L links, and the Jacobian of their centers of mass at joint positions [..., J]."""
+    links = [kinematics.tree.link(name) for name in kinematics.link_names]
+    com = torch.tensor(np.stack([link.com for link in links]))
+    return links, kinematics.jacobian(q, kinematics.link_names, com)
 
 
 def mass_matrix(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
@@ -21,13 +30,10 @@ def mass_matrix(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
         robot: the robot.
         joint_pos: [J] position [rad or m].
     """
-    kinematics = Kinematics(robot)
-    links = [kinematics.tree.link(name) for name in kinematics.link_names]
-    com = torch.tensor(np.stack([link.com for link in links]))
-    q = torch.as_tensor(joint_pos, dtype=torch.float64)
-    _, rot, linear, angular = (
-        x.numpy() for x in kinematics.jacobian(q, kinematics.link_names, com)
+    links, jacobian = com_jacobian(
+        Kinematics(robot), torch.as_tensor(joint_pos, dtype=torch.float64)
     )
+    _, rot, linear, angular = (x.numpy() for x in jacobian)
     mass = np.array([link.mass for link in links])
     inertia = rot @ np.stack([link.inertia for link in links]) @ rot.transpose(0, 2, 1)
     return np.einsum("l,lai,laj->ij", mass, linear, linear) + np.einsum(

@@ -66,7 +66,7 @@ class DistanceFields(Tensors):
 
     def box_distance(self, points: Tensor, which: Tensor) -> Tensor:
         """[...] distance of points [..., 3] from the bounding box of their object [...]; 0 inside."""
-        nearest = torch.minimum(torch.maximum(points, self.low[which]), self.high[which])
+        nearest = points.clamp(self.low[which], self.high[which])
         return (points - nearest).norm(dim=-1)
 
     def nearer(self, points: Tensor, which: Tensor, limit: Tensor) -> tuple[Tensor, Tensor, Tensor]:

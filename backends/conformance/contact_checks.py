@@ -65,8 +65,8 @@ def rest_and_bounce(bench: Bench) -> Measured:
     objects = flat_objects()
     names = [thing.name for thing in objects]
     scene = replace(bench.scene, objects=objects)
-    which = range(len(objects))
-    start = bench.initial(scene, which)
+    object_index = range(len(objects))
+    start = bench.initial(scene, object_index)
     height = start.object_pos[:, 2]
 
     def heights(worlds: Worlds, above: float) -> Tensor:
@@ -80,7 +80,7 @@ def rest_and_bounce(bench: Bench) -> Measured:
             rows.append(worlds.state().object_pos[:, 2])
         return torch.stack(rows)
 
-    with bench.other(scene, which) as worlds:
+    with bench.other(scene, object_index) as worlds:
         resting = heights(worlds, 0.0)
         dropped = heights(worlds, 0.03)
     bounce = []
@@ -156,9 +156,9 @@ def _against_built(
     return errors
 
 
-def _slide(bench: Bench, worlds: Worlds, which: Sequence[int]) -> tuple[State, Tensor]:
+def _slide(bench: Bench, worlds: Worlds, rows: Sequence[int]) -> tuple[State, Tensor]:
     """Let objects slide and turn on the table for a moment; later, contacts have made much of a last bit."""
-    start = bench.start()[list(which)]
+    start = bench.start()[list(rows)]
     start = replace_fields(
         start,
         object_linvel=torch.tensor([0.25, 0.1, 0.0]),
@@ -168,15 +168,15 @@ def _slide(bench: Bench, worlds: Worlds, which: Sequence[int]) -> tuple[State, T
     return end, worlds.contacts().table_force
 
 
-def _tumble(bench: Bench, worlds: Worlds, which: Sequence[int]) -> tuple[State, Tensor]:
+def _tumble(bench: Bench, worlds: Worlds, rows: Sequence[int]) -> tuple[State, Tensor]:
     """Let objects tumble through the air for a moment, under a torque."""
-    start = bench.random_state(seed=21)[list(which)]
+    start = bench.random_state(seed=21)[list(rows)]
     worlds.set(start)
-    size = torch.tensor([float(np.trace(bench.objects[i].inertia)) for i in which])
+    size = torch.tensor([float(np.trace(bench.objects[i].inertia)) for i in rows])
     torque = size[:, None] * torch.tensor([20.0, -10.0, 5.0])  # some rad/s^2
     worlds.push(torch.zeros(3), torque)
     worlds.step(24)
-    return worlds.state(), torch.zeros(len(which), 3)
+    return worlds.state(), torch.zeros(len(rows), 3)
 
 
 _FREE_AND_SLIDING: dict[str, Motion] = {"tumbling": _tumble, "sliding": _slide}
@@ -193,12 +193,12 @@ def sliding_distance(bench: Bench) -> Measured:
     """Push boxes off at the speed v with which Coulomb friction stops them after v^2 / (2 mu g) = 0.2 m."""
     shapes = flat_objects()[:3]
     scene = replace(bench.scene, objects=shapes)
-    which = [*range(len(shapes))] * len(_CASES)
+    object_index = [*range(len(shapes))] * len(_CASES)
     mu, direction = _cases(bench, len(shapes))
     speed = (2.0 * mu * GRAVITY * _DISTANCE).sqrt()
-    start = bench.initial(scene, which)
+    start = bench.initial(scene, object_index)
     start = replace_fields(start, object_linvel=speed[:, None] * direction)
-    with bench.other(scene, which) as worlds:
+    with bench.other(scene, object_index) as worlds:
         worlds.set_parameter("friction", _pairs(mu))
         end = worlds.advance(start, round(1.0 / scene.timestep))
     way = ((end.object_pos - start.object_pos) * direction).sum(-1)
@@ -213,13 +213,13 @@ def slope(bench: Bench) -> Measured:
     scene = replace(bench.scene, objects=(box,))
     mu, direction = _cases(bench, 2)  # two worlds a case: one below the cone, one beyond it
     ratio = torch.tensor([0.95, 1.05]).repeat(len(_CASES))
-    which = [0] * len(mu)
+    object_index = [0] * len(mu)
     force = (ratio * mu * box.mass * GRAVITY)[:, None] * direction
     quarter = round(0.25 / scene.timestep)
     half = round(0.5 / scene.timestep)
-    with bench.other(scene, which) as worlds:
+    with bench.other(scene, object_index) as worlds:
         worlds.set_parameter("friction", _pairs(mu))
-        worlds.advance(bench.initial(scene, which), quarter)
+        worlds.advance(bench.initial(scene, object_index), quarter)
         worlds.push(force, torch.zeros(3))
         worlds.step(quarter)
         first = worlds.state()
@@ -269,12 +269,12 @@ def _spin_lost(
     """[count] what balls on the table lose of their spin, as a share of what the scene's torsional friction takes."""
     thing = ball()
     scene = replace(bench.scene, objects=(thing,))
-    which = [0] * count
+    object_index = [0] * count
     start = replace_fields(
-        bench.initial(scene, which), object_angvel=torch.tensor([0.0, 0.0, 10.0])
+        bench.initial(scene, object_index), object_angvel=torch.tensor([0.0, 0.0, 10.0])
     )
     steps = round(seconds / scene.timestep)
-    with bench.other(scene, which) as worlds:
+    with bench.other(scene, object_index) as worlds:
         prepare(worlds)
         lost = 10.0 - worlds.advance(start, steps).object_angvel[:, 2]
     braking = scene.friction.torsional * thing.mass * GRAVITY / float(thing.inertia[2, 2])

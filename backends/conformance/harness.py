@@ -143,13 +143,13 @@ class Bench:
         self.scene = scene
         self.own_robot = scene.robot.name == gripper().name
         self.kinematics = Kinematics(scene.robot)
-        self.which = [i % len(scene.objects) for i in range(self.NUM_WORLDS)]
+        self.object_index = [i % len(scene.objects) for i in range(self.NUM_WORLDS)]
         """Index of the object of each shared world."""
 
     @property
     def objects(self) -> list[ObjectSpec]:
         """The object of each shared world."""
-        return [self.scene.objects[i] for i in self.which]
+        return [self.scene.objects[i] for i in self.object_index]
 
     @property
     def masses(self) -> Tensor:
@@ -168,13 +168,13 @@ class Bench:
 
     @cached_property
     def _shared(self) -> Worlds:
-        return self._made(self.scene, self.which)
+        return self._made(self.scene, self.object_index)
 
     def worlds(self) -> Worlds:
         """Return the shared worlds in their initial state, with nominal parameters."""
         worlds = self._shared
         if worlds.altered:
-            nominal = Parameters.nominal(self.scene, torch.tensor(self.which))
+            nominal = Parameters.nominal(self.scene, torch.tensor(self.object_index))
             for name, value in nominal.given().items():
                 if name in worlds.backend.capabilities:
                     worlds.set_parameter(name, value)
@@ -183,17 +183,17 @@ class Bench:
         return worlds
 
     @contextmanager
-    def other(self, scene: SceneSpec, which: Sequence[int] = (0,)) -> Iterator[Worlds]:
+    def other(self, scene: SceneSpec, object_index: Sequence[int] = (0,)) -> Iterator[Worlds]:
         """Worlds of another scene with the given objects, closed at the end of the block."""
-        worlds = self._made(scene, which)
+        worlds = self._made(scene, object_index)
         with worlds.backend:
             yield worlds
 
-    def _made(self, scene: SceneSpec, which: Sequence[int]) -> Worlds:
-        return Worlds(self._make(scene, len(which), object_index=torch.tensor(which)))
+    def _made(self, scene: SceneSpec, object_index: Sequence[int]) -> Worlds:
+        return Worlds(self._make(scene, len(object_index), object_index=torch.tensor(object_index)))
 
     @contextmanager
-    def reference(self, scene: SceneSpec, which: Sequence[int]) -> Iterator[Worlds]:
+    def reference(self, scene: SceneSpec, object_index: Sequence[int]) -> Iterator[Worlds]:
         """The same worlds in the reference engine; finer steps of its own if the reference is what is tested."""
         status = backend_status(REFERENCE)
         if status.reason is not None:
@@ -201,17 +201,17 @@ class Bench:
         finer = REFINEMENT if self.backend.name == REFERENCE else 1
         scene = replace(scene, timestep=scene.timestep / finer)
         with make_backend(
-            REFERENCE, scene, len(which), object_index=torch.tensor(which), workers=0
+            REFERENCE, scene, len(object_index), object_index=torch.tensor(object_index), workers=0
         ) as backend:
             yield Worlds(backend, finer)
 
     def start(self) -> State:
         """Return [N] initial states, the object resting where the robot is not."""
-        return self.initial(self.scene, self.which)
+        return self.initial(self.scene, self.object_index)
 
-    def initial(self, scene: SceneSpec, which: Sequence[int]) -> State:
+    def initial(self, scene: SceneSpec, object_index: Sequence[int]) -> State:
         """Return initial states of worlds of a scene with the given objects, which rest where the robot is not."""
-        state = State.initial(scene, torch.tensor(which))
+        state = State.initial(scene, torch.tensor(object_index))
         state.object_pos[:, :2] = torch.tensor(self.place)
         return state
 

@@ -89,7 +89,7 @@ def _against_reference(bench: Bench, scene: SceneSpec, signals: dict[str, Tensor
     A slide's path counts in proportion to its way, as if that were 0.2 rad.
     """
     start, way = _alone(bench)
-    which = [0] * len(way)
+    object_index = [0] * len(way)
 
     def paths(worlds: Worlds) -> list[Tensor]:
         """[T, J] for each signal: the path of joint i in world i."""
@@ -100,9 +100,9 @@ def _against_reference(bench: Bench, scene: SceneSpec, signals: dict[str, Tensor
             found.append(path.diagonal(dim1=1, dim2=2))
         return found
 
-    with bench.other(scene, which) as worlds:
+    with bench.other(scene, object_index) as worlds:
         found = paths(worlds)
-    with bench.reference(scene, which) as reference:
+    with bench.reference(scene, object_index) as reference:
         expected = paths(reference)
     errors = defaultdict(list)
     for signal, path, path_there in zip(signals, found, expected, strict=True):
@@ -153,9 +153,9 @@ def drive_scale(bench: Bench) -> Measured:
     """
     scene = bench.free_scene
     scales = torch.tensor(_DRIVE_SCALES)
-    which = [0] * len(scales)
+    object_index = [0] * len(scales)
     _, way = _alone(bench)
-    start = bench.initial(scene, which)
+    start = bench.initial(scene, object_index)
     limits = bench.kinematics
     target = (start.joint_pos + way).clamp(limits.lower.float(), limits.upper.float())
 
@@ -169,7 +169,7 @@ def drive_scale(bench: Bench) -> Measured:
             drives[name] = factor * drive_values(scene.robot, name)
         with bench.other(_with_drives(scene, **drives)) as worlds:
             expected.append(path(worlds, slice(i, i + 1)))
-    with bench.other(scene, which) as worlds:
+    with bench.other(scene, object_index) as worlds:
         # What was set before must not matter.
         for factors in (scales.flip(0), scales):
             worlds.set_parameter("drives", factors[:, :, None].expand(-1, -1, len(way)))
@@ -226,7 +226,7 @@ def gravity_compensation(bench: Bench) -> Measured:
     q = lower + (upper - lower) * share
     q[0] = bench.kinematics.home
     start = replace_fields(bench.start(), joint_pos=q, joint_target=q)
-    with bench.other(scene, bench.which) as worlds:
+    with bench.other(scene, bench.object_index) as worlds:
         end = worlds.advance(start, round(2.0 / scene.timestep))
     return {"sag": zip(scene.robot.joint_names, (end.joint_pos - start.joint_pos).T)}
 
@@ -239,7 +239,7 @@ def own_weight(bench: Bench) -> Measured:
     scene = bench.free_scene
     scene = replace(scene, robot=replace(scene.robot, gravity_compensated=False))
     start = bench.start()
-    with bench.other(scene, bench.which) as worlds:
+    with bench.other(scene, bench.object_index) as worlds:
         worlds.set_parameter("object_gravity", torch.tensor([0.0, 0.5, 1.0, 0.25]))
         q = worlds.advance(start, round(2.0 / scene.timestep)).joint_pos.double()
     links, jacobian = com_jacobian(bench.kinematics, q)

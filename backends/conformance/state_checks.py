@@ -48,7 +48,7 @@ def same_pixels(bench: Bench) -> Measured:
         raise Skipped(str(error)) from error
     worlds = bench.worlds()
     vision = VisionConfig(cameras=(_view_of_object(bench), _view_of_hand(bench)))
-    cameras = Cameras(bench.scene, torch.tensor(bench.which), vision)
+    cameras = Cameras(bench.scene, torch.tensor(bench.object_index), vision)
     differing = []
     for seed in range(3):
         state = bench.random_state(seed)
@@ -88,14 +88,14 @@ def joint_order(bench: Bench) -> Measured:
     scene = reorder_joints(bench.scene)
     kinematics = Kinematics(scene.robot)
     count = len(scene.robot.joints)
-    which = [0] * count
-    with bench.other(scene, which) as worlds:
+    object_index = [0] * count
+    with bench.other(scene, object_index) as worlds:
         state = bench.random_state(3, scene.robot, count)
         worlds.set(state)
         links = _link_errors(kinematics, state, worlds.links())
         found = state_errors(worlds.state(), state)
 
-        start = bench.initial(scene, which)
+        start = bench.initial(scene, object_index)
         motion = small_motion(kinematics)
         worlds.set(start)
         worlds.set_targets(start.joint_pos + torch.diag(motion))  # world i moves joint i
@@ -161,7 +161,7 @@ def _moved_by_mimics(scene: SceneSpec) -> Tensor:
     return torch.tensor([link in moved for link in scene.robot.tracked_links])
 
 
-def _errors_on_the_way(bench: Bench, which: Tensor) -> Measured:
+def _errors_on_the_way(bench: Bench, chosen: Tensor) -> Measured:
     """Return the errors of some tracked links' poses, [T, N, ...], while every joint moves."""
     worlds = bench.worlds()
     worlds.set_targets(bench.start().joint_pos + small_motion(bench.kinematics))
@@ -169,5 +169,5 @@ def _errors_on_the_way(bench: Bench, which: Tensor) -> Measured:
     for _ in range(6):
         worlds.step(4)
         now = _link_errors(bench.kinematics, worlds.state(), worlds.links())
-        errors.append({what: now[what][:, which] for what in ("pos", "angle")})
+        errors.append({what: now[what][:, chosen] for what in ("pos", "angle")})
     return stacked(errors)

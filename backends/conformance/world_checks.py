@@ -110,13 +110,13 @@ def repeatable(bench: Bench) -> Measured:
 
     The shared worlds will not do: the masses that another check has put back in them are rounded to single precision.
     """
-    with bench.other(bench.scene, bench.which) as worlds:
+    with bench.other(bench.scene, bench.object_index) as worlds:
         if worlds.backend.device.type != "cpu":
             raise Skipped("only CPUs add numbers in the same order every time")
         first = _busy(bench, worlds)
         worlds.advance(bench.random_state(seed=9), 30)
         again = _busy(bench, worlds)
-    with bench.other(bench.scene, bench.which) as new:
+    with bench.other(bench.scene, bench.object_index) as new:
         in_new_worlds = _busy(bench, new)
     return {
         **state_errors(again, first, "again,"),

@@ -67,7 +67,7 @@ def robot_parts(robot: Mechanism) -> list[Part]:
 WEIGHTLESS = Inertia(
     mass=1e-9, com=np.zeros(3), quat=np.array([1.0, 0, 0, 0]), moments=np.full(3, 1e-14)
 )
-"""Inertia of fixed pieces, whose mass is counted in their body: Bullet would invent one for a link without."""
+"""Inertia of fixed pieces, whose mass is counted in their body: Bullet would invent one."""
 
 
 def robot_urdf(robot: Mechanism, parts: Sequence[Part], folder: Path) -> Path:

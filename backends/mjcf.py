@@ -305,8 +305,8 @@ def _limit_self_collision(
 def _add_drives(
     spec: mujoco.MjSpec, scene: SceneSpec, joints: MovingJoints, names: Sequence[str]
 ) -> None:
-    """Add the drives: on joints, and on joints that others follow through a tendon: see
-    :func:`~xreset.geometry.dynamics.drive_shares`."""
+    """Add the drives and the mimic joints; a drive whose joint others follow acts on all of them through a tendon, with
+    the shares of :func:`~xreset.geometry.dynamics.drive_shares`."""
     offset = np.zeros(joints.count)
     offset[joints.mimic] = joints.offset
     for joint, shares in zip(scene.robot.joints, joints.shares, strict=True):

@@ -18,7 +18,7 @@ from xreset.checks import frozen
 from xreset.spec import SceneSpec
 
 OBJECT = -3
-"""Value of :attr:`SceneModel.geom_role` next to what touches an object."""
+"""Value of :attr:`SceneModel.geom_role` for the geoms of the object itself."""
 
 MIN_FRICTION = 1e-4
 """Sliding friction of the object's own geoms, and the smallest of any pair."""

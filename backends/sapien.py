@@ -82,8 +82,8 @@ class SapienWorld(World):
         self.set_friction(np.array([scene.friction.tip, scene.friction.link, scene.friction.table]))
         self._quat = np.array([1.0, 0.0, 0.0, 0.0])
         self._last_step: tuple[np.ndarray, ...] | None = None
-        """Of the last physics step: the object's velocity, angular velocity and orientation before it; the force and
-        torque given."""
+        """The object's velocity, angular velocity and orientation before the last physics step, and the force and
+        torque that were given; None right after a state is set."""
 
     def set_state(self, state: StateArrays) -> None:
         self._renew_scene()
@@ -376,7 +376,7 @@ def _material(owner: int) -> str:
 
 
 def _rotation(quat: np.ndarray) -> np.ndarray:
-    """[3, 3] rotation matrix of a unit quaternion [4], whose products are rounded to its precision."""
+    """[3, 3] rotation matrix of a unit quaternion [4], in double precision but for the products of its numbers."""
     products = np.outer(quat, quat)
     squares = products[1:, 1:].astype(np.float64)
     turn = cross(products[0, 1:], np.eye(3)).T

@@ -62,7 +62,7 @@ def layout_of(scene: SceneSpec, object_index: Tensor) -> np.dtype:
         ("body_inertia", (bodies, 3, 3)),
     ):
         arrays.append((name, np.float32, (n, *shape)))
-    return np.dtype(arrays, align=True)  # numbers stand behind flags of any number
+    return np.dtype(arrays, align=True)  # a number may follow any number of flags
 
 
 def arrays_in(memory: Any, layout: np.dtype) -> dict[str, np.ndarray]:

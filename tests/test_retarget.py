@@ -80,7 +80,7 @@ class HandTest(TestCase):
         cls.model = HandModel(cls.robot)
         cls.motion = toy_motion(cls.model, torch.Generator().manual_seed(1), margin=0.1, turn=0.3)
         cls.keypoints = cls.model.keypoints(cls.motion)
-        cls.tip = cls.model.names.index("index4")
+        cls.tip = cls.model.keypoint_names.index("index4")
         cls.touching = torch.ones(cls.keypoints.shape[:3], dtype=torch.bool)
         cls.far = Surface(box_object(((0, 0, 0), (0.1, 0.1, 0.1)))).field
 

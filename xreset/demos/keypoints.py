@@ -182,7 +182,7 @@ def read_transform(path: str | Path) -> np.ndarray:
 
 def _read_csv(path: Path, name: str) -> Iterator[Arrays]:
     """Yield the arrays of each sequence of a table with one row for each frame, as an npz would hold them; an empty
-    cell is NaN. The frames of a sequence stand together."""
+    cell is NaN. The rows of a sequence follow one another."""
     arrays = {}
     try:
         if path.stat().st_size > max_bytes():

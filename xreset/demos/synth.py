@@ -39,11 +39,11 @@ MAX_SEQUENCES = 100_000
 
 _Z = (0.0, 0.0, 1.0)
 _REST_UP = {  # mesh directions that may point up at the start; else z
-    "005_tomato_soup_can": (_Z, (1.0, 0.0, 0.0)),  # 9 of 20 lie in DexYCB
+    "005_tomato_soup_can": (_Z, (1.0, 0.0, 0.0)),  # 9 of DexYCB's 20 cans are on their side
     "035_power_drill": (_Z, (0.0, 1.0, 0.0)),
 }
 _NEAR_BEST = 1.0
-"""Plans whose cost is within this of the best are as good."""
+"""Plans whose cost is within this of the best plan's count as equally good."""
 _GRASP_TRIES = 5
 """Grasps that a sequence tries until one has an approach that stays clear."""
 _TRIES = 12

@@ -35,7 +35,7 @@ them a box of 5 x 14 x 4 cm would be bare up to 8 mm deep near its edges, enough
 APART = 6e-3
 """Smallest distance between the balls of one link that keep out of other links [m]."""
 STAND_IN = 3.5e-3
-"""Such a ball is larger by this where it stands for others nearby [m]. Where edges cross between two balls they are
+"""How much larger such a ball is where it represents others nearby [m]. Where edges cross between two balls they are
 deeper in each other than any ball, and the exact test measures how far two shapes must move to separate. With this
 value the LEAP hand loses 1 % of its frames to that test, without it 90 %."""
 
@@ -64,7 +64,7 @@ class Balls(Tensors):
     guards: Tensor
     """[R] balls that keep out of other links; two of one link are at least :data:`APART` apart."""
     guard_radii: Tensor
-    """[R] their radii against other links: larger where they stand for other balls."""
+    """[R] their radii against other links: larger where they represent other balls."""
     guard_slices: tuple[slice, ...]
     """Guards of each link (length G)."""
     fields: DistanceFields

@@ -159,7 +159,7 @@ class SelfCollision:
         self._count([pair for pair in counted if pair not in self.overlapping_at_home])
 
     def _count(self, link_pairs: list[tuple[str, str]]) -> None:
-        """Let the shapes of these pairs of links count."""
+        """Measure only these pairs of links from now on."""
         self.link_pairs = link_pairs
         """Pairs of links that count."""
         shapes = combinations(range(len(self._link)), 2)

@@ -137,7 +137,7 @@ class Kinematics:
         self._moving = moving
         self._steps: list[_Step] = []
         self._above = torch.eye(len(self.link_names), dtype=torch.bool)
-        """[L, L] whether a link (first) is another one (second), or is carried by it."""
+        """[L, L] whether the first link is the second one, or is carried by it."""
         for i, joint in enumerate(joints, start=1):
             parent = self._link_index[joint.parent]
             self._above[i] |= self._above[parent]

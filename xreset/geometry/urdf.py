@@ -36,7 +36,7 @@ HULL_TOLERANCE = 5e-4
 """How far points of a mesh may stand out of its hull [m]: makers' meshes have thousands of points, engines accept
 hundreds."""
 _LARGEST = 1e6
-"""Largest number in a URDF, limits excepted: masses [kg], positions [m], inertias [kg m^2]. No robot comes near."""
+"""Larger numbers in a URDF are errors: masses [kg], positions [m], inertias [kg m^2], but not limits."""
 _SMALLEST = 1e-6
 """[m] Smallest size of a shape."""
 _SHORTEST_AXIS = 1e-9
@@ -269,7 +269,7 @@ def mesh_files(urdf: Path) -> list[Path]:
 
 @lru_cache(maxsize=16)
 def _load(path: Path, changed: tuple[int, ...]) -> RobotTree:
-    """Read a URDF that was last changed then, and its meshes [ns]."""
+    """Read a URDF and its meshes; their times of change [ns] make the cache read changed files again."""
     xml = parse_xml(path)
     if xml.tag == "mujoco":
         raise RobotError(f"{path} is MJCF, not URDF; `xreset robots import` makes a robot of it.")

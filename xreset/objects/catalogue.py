@@ -81,7 +81,7 @@ def canonical_names(names: Iterable[str], known: Iterable[str] = STAND_INS) -> t
 
 
 def official_name(name: str) -> str:
-    """Return the official name of a built-in object; another name stays as it is, for it may be that of a mesh."""
+    """Return the official name of a built-in object; another name stays as it is, because it may belong to a mesh."""
     try:
         return canonical_name(name)
     except ObjectError:

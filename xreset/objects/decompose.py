@@ -294,8 +294,8 @@ class _Surface:
         return np.linalg.norm(points - closest.reshape(points.shape), axis=3)
 
     def uncovered(self, shapes: Sequence[Shape]) -> float:
-        """Return the distance of its worst point from all pieces: exact next to a face, too small next to an edge
-        [m]."""
+        """Return the largest distance of a point of this surface from all pieces [m]: exact near a face of a piece, too
+        small near an edge."""
         planes = [half_spaces(shape) for shape in shapes]
         distances = [plane_heights(self._points, own).max(axis=1) for own in planes]
         return float(np.min(distances, axis=0).max().clip(0.0))
@@ -321,8 +321,8 @@ class _Solid(_Surface):
 
 
 class _Cutter:
-    """One decomposition of a solid. Pieces are made of the solid with fewer triangles, and measured on the whole one in
-    the end."""
+    """One decomposition of a solid. Pieces are cut from a copy with fewer triangles; in the end they are measured
+    against the whole solid."""
 
     def __init__(self, whole: Manifold, settings: Settings) -> None:
         self.surface = _Solid(whole)

@@ -35,9 +35,9 @@ _SIZES = (0.005, 2.0)
 _FLAT = 1e-5
 """A thinner mesh is flat [m]."""
 _HOLLOW = 120.0
-"""A solid mesh of a lower density stands for a shell [kg/m^3]."""
+"""A closed mesh of a lower density is a shell [kg/m^3]."""
 _FEW_MM = 0.002
-"""Pieces that deviate more from the surface are worth a note [m]."""
+"""Deviation of pieces from the surface that is worth a note [m]."""
 
 _log = logging.getLogger(__name__)
 
@@ -91,8 +91,8 @@ def import_with_notes(path: str | Path, name: str) -> Import:
     Args:
         path: mesh file, in metres, in the frame of the object's poses; NAME.toml next to it may state its properties
             (:mod:`xreset.objects.properties`).
-        name: the object's name; the masses of the YCB object set are known by name. Others are
-            found by density.
+        name: the object's name. The masses of the YCB object set are known by name, other masses follow from a
+            density.
 
     Raises:
         ObjectError: the file is missing, damaged, empty or flat, or not in metres.

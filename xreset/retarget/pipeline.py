@@ -179,8 +179,8 @@ class HandMotions:
         """Retarget the hand alone, in batches of those sequences that have a hand.
 
         Yields:
-            Of each batch of S sequences, padded to T frames: the B rows of its frames in all frames, which places of
-            the batch [S, T] they fill (bool), the hand's targets, and the hand's motion.
+            For each batch of S sequences, padded to T frames: the rows [B] of its frames among all frames, the places
+            [S, T] bool in the batch that they fill, the hand's targets, and the hand's motion.
         """
         owner = self.demos.sequence_of_frame
         lengths = np.diff(self.demos.frame_offsets)

@@ -30,11 +30,11 @@ _MIN_CLEARANCE = 0.005
 """Clearance [m] from the table that the home configuration should have."""
 _SAMPLES = 200
 _LIMIT_SLACK = 1e-3
-"""[rad or m] By which a mimic joint's limits may fall short of its source's: published figures are rounded."""
+"""[rad or m] How far a mimic joint's limits may fall short of its source's: published figures are rounded."""
 _LISTED = 4
 """Pairs of links that are named, most frequent first."""
 _PALM = 0.12
-"""[m] From the palm's frame to the nearest joint of a finger: a human palm is 10 cm long."""
+"""[m] Largest distance from the palm's frame to the nearest joint of a finger: a human palm is 10 cm long."""
 _LESS_OPPOSED = 0.75
 """Share of the best fingertip's opposition that a thumb has at least. Index fingers have up to 0.73 (Allegro)."""
 
@@ -250,12 +250,12 @@ def _frames(spec: RobotSpec, tree: RobotTree) -> Problems:
             f"the fingers do not lie along x of the palm {spec.palm!r}. Its x should point towards them, its z out of "
             "its inner side.",
         )
-    body = tree.moving_ancestor(spec.hand_root)
-    if tree.moving_ancestor(spec.palm) != body:
+    palm_body = tree.moving_ancestor(spec.palm)
+    if palm_body != tree.moving_ancestor(spec.hand_root):
         yield (
             "warning",
             f"the palm {spec.palm!r} is not fixed to the hand's root {spec.hand_root!r}, but to "
-            f"{tree.moving_ancestor(spec.palm)!r}. Fix it to the body that carries the fingers.",
+            f"{palm_body!r}. Fix it to the body that carries the fingers.",
         )
     knuckles = [(palm @ places[chain[0]])[:3, 3] for chain in _chains(spec, tree)[1:]]
     distance = min(np.linalg.norm(knuckles, axis=1)) if knuckles else 0.0

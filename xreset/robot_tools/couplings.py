@@ -21,7 +21,7 @@ _SAMPLES = 25
 _OPEN = 3e-3
 """[m] Gap that a closed loop may have when its joints follow straight lines."""
 _CURVED = 0.05
-"""[rad or m] By which two coupled joints may be off a straight line."""
+"""[rad or m] How far two coupled joints may be off a straight line."""
 _STILL = 2e-3
 """[rad or m] A coupled joint that moves by less is fixed."""
 _DIGITS = 5
@@ -29,8 +29,8 @@ _EQUALITY = 1e6
 _PULL = 1e3
 _LIMIT = 1e2
 _STAY = 1e-3
-"""Weights against each other: equalities are met, then tendons pull all their joints alike, then joints stay within
-their limits, then springs rest (with their stiffness), then joints stay where they were."""
+"""Weights of what coupled joints should do, the most important first: meet the equalities; let each tendon pull all its
+joints alike; stay within the limits; let springs rest (weighted by their stiffness); stay where they were."""
 
 
 Pull = dict[int, float]

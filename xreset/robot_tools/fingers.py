@@ -34,9 +34,9 @@ _BONE = r"(?=j\d|base|hub|knuckle|metacarpal|proximal|middle|distal|tip)"
 _HUMAN = (0.0, 0.45, 0.73)
 """Positions of a human finger's joints between its first one and its tip: knuckle, middle joint, last joint (rounded
 averages)."""
-_BESIDE = 0.003
-"""[m] A joint's origin that is farther from the middle of the finger, along the joint's axis, gets a frame there for
-its keypoint."""
+_OFF_MIDDLE = 0.003
+"""[m] Distance of a joint's origin from the middle of the finger, along the joint's axis, beyond which its keypoint
+gets a frame in the middle."""
 _WRIST_BEHIND = 0.095
 """[m] The human wrist behind the knuckles."""
 _PALM_BEHIND = 0.04
@@ -54,7 +54,7 @@ class Finger:
     links: tuple[str, ...]
     """Its moving links from the palm on."""
     joints: tuple[str, ...]
-    rest: tuple[str, ...]
+    fixed_links: tuple[str, ...]
     """Links fixed to the last one."""
     points: np.ndarray
     """[links + 1, 3] its joints, in the middle of the finger, and its tip in the frame of the hand's root, straight."""
@@ -162,7 +162,9 @@ class Hand:
             marked = [chain for chain in chains if chain.name == "thumb"]
         else:
             marked = [
-                chain for chain in chains if thumb in (*chain.links, *chain.joints, *chain.rest)
+                chain
+                for chain in chains
+                if thumb in (*chain.links, *chain.joints, *chain.fixed_links)
             ]
             if len(marked) != 1:
                 raise RobotError(
@@ -203,7 +205,7 @@ class Hand:
                 name=_stated_finger(" ".join((*links, *joints, *rest, *fixed_joints))),
                 links=tuple(links),
                 joints=tuple(joints),
-                rest=tuple(rest),
+                fixed_links=tuple(rest),
                 points=np.empty(0),
             )
             chains.append(chain)
@@ -273,7 +275,7 @@ class Hand:
         self._add_frame("wrist_frame", self.root, wrist)
         for finger in fingers:
             last = finger.links[-1]
-            ends = (last, *finger.rest)
+            ends = (last, *finger.fixed_links)
             tip = FingertipSpec(
                 name=finger.name,
                 link=f"{finger.name}_tip_frame",
@@ -285,9 +287,9 @@ class Hand:
             self._add_frame(tip.link, last, transform(R, self._in_link(last, finger.points[-1])))
             for keypoint, near in _keypoint_joints(finger).items():
                 link = finger.links[near]
-                beside = self._in_link(link, finger.points[near])
-                if np.linalg.norm(beside) > _BESIDE:
-                    self._add_frame(f"{keypoint}_frame", link, transform(np.eye(3), beside))
+                middle = self._in_link(link, finger.points[near])
+                if np.linalg.norm(middle) > _OFF_MIDDLE:
+                    self._add_frame(f"{keypoint}_frame", link, transform(np.eye(3), middle))
                     link = f"{keypoint}_frame"
                 self.keypoints.append(KeypointSpec(keypoint=keypoint, link=link))
             self.keypoints.append(KeypointSpec(keypoint=tip.keypoint, link=tip.link))
@@ -320,11 +322,11 @@ class Hand:
         joint.
         """
         points = [self._on_axis(link, self._surface([link])) for link in finger.links]
-        tips = [name for name in finger.rest if "tip" in name.lower()]
+        tips = [name for name in finger.fixed_links if "tip" in name.lower()]
         if tips:
             return np.array([*points, self._at[tips[0]][:3, 3]])
         last = finger.links[-1]
-        cloud = self._surface((last, *finger.rest))
+        cloud = self._surface((last, *finger.fixed_links))
         if not len(cloud):
             raise RobotError(
                 f"the last link of a finger, {last!r}, has no collision shape, so it can touch nothing."

@@ -19,11 +19,11 @@ from xreset.spec import RobotSpec
 _STEPS = (-0.15, 0.0, 0.15)
 """[m] Steps along each axis to other places that are tried."""
 _CLEAR = 0.10
-"""[m] Height above the table that keeps the spread around a home clear of it."""
+"""[m] Height of a home above the table from which the spread around that home is clear of the table."""
 
 
 def hold_near(robot: RobotSpec, T_world_root: np.ndarray) -> tuple[RobotSpec, str] | None:
-    """Return the robot with a home that holds the hand's root at a pose [4, 4], or at the nearest pose beside it.
+    """Return the robot with a home that holds the hand's root at a pose [4, 4], or at the nearest pose next to it.
 
     A pose with 10 cm of room above the table is preferred.
 

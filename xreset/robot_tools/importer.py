@@ -36,7 +36,7 @@ for a step of 1/240 s. The inertia of a link means the same in every engine, whi
 robots)."""
 _HAND_EFFORT = 1.0
 _ARM_EFFORT = 50.0
-"""[N m] Where none is stated."""
+"""[N m] Effort limits of joints without a stated one."""
 _STABLE = 0.8
 """Share of the largest kp that is stable in engines that integrate drives explicitly: kd times the step stays below the
 inertia."""

@@ -47,11 +47,11 @@ LIFT = 0.01
 HEIGHT = 0.10
 """How far the arm raises the hand [m]."""
 TURN = np.pi / 4
-"""By how much it turns the hand [rad]."""
+"""How far the arm turns the hand [rad]."""
 DISTANCE = 0.03
 """Largest change of the object's position in the palm's frame [m]."""
 ANGLE = np.pi / 4
-"""Largest change of its orientation in the palm's frame [rad]."""
+"""Largest change of the object's orientation in the palm's frame [rad]."""
 _CLOSE_STEPS = 15
 """Control steps without weight."""
 _MOVE_STEPS = 45
@@ -90,7 +90,7 @@ class Judgement:
     rows: tuple[Judged, ...]
     """For each engine one for each object, and their sum."""
     without: tuple[str, ...]
-    """Objects of which the bank has no lifted grasp."""
+    """Objects for which the bank has no lifted grasp."""
     shots: dict[str, np.ndarray]
     """Object -> [1 + P, J + 7] joint positions, position and orientation of the object in its best state, at the start
     and after each phase in the first engine."""
@@ -208,7 +208,7 @@ def judge(
 
 
 def _tightest(fingers: Fingers, bank: ResetBank, count: int, reach: float) -> list[int]:
-    """Return rows of the states that grasp most tightly, ``count`` of each object, from its sequences in turn."""
+    """Return the rows of the ``count`` tightest grasps of each object, taken from its sequences in turn."""
     thumb = fingers.gap[:, fingers.finger == 0].amin(dim=-1)
     other = fingers.gap[:, fingers.finger != 0].amin(dim=-1)
     gap = torch.maximum(thumb, other).numpy()

@@ -39,15 +39,15 @@ _FINAL_FRAMES = 600
 _LENGTH = 0.10
 """[m] Length that counts as much as one radian in the measure of dexterity."""
 _FIRST = 12
-"""Frames that a candidate is tried on before all others: most fail on enough of them."""
+"""Frames that a candidate is tried on first: most candidates fail on so many of them that they are given up."""
 _DRAWS = 1000
 """Times that a candidate is drawn until it is clear of wrists and objects; then the round goes without it."""
 _UPRIGHT = 45.0
-"""[degrees] A base that is tilted less stands on something."""
+"""[degrees] A base with less tilt than this stands on something."""
 _SHRINK = 0.6
 """Factor by which the spread of candidates about the best shrinks from round to round."""
 _HOME_CLEAR = 0.02
-"""[m] Least height above the table of a home of which only the joints are kept."""
+"""[m] Least height above the table at home, where the new home is the old one's joints."""
 
 
 @one_thread()
@@ -137,11 +137,10 @@ def _finalist(
 
 
 def reach(robot: RobotSpec, wrists: ArmTargets, least: int = 0) -> tuple[float, float]:
-    """Return what the robot reaches of wrist poses [F, 1, ...] from where it stands: share and dexterity, as in
-    :class:`Finalist`.
+    """Return the share of wrist poses [F, 1, ...] that the robot reaches, and its dexterity: see :class:`Finalist`.
 
-    It is given up after some frames if the first number of its rank must stay below ``least``; then all frames that
-    were not tried count as reached.
+    The trial ends early when the first number of the robot's rank can no longer be ``least`` or more; frames that were
+    not tried then count as reached.
     """
     model = ArmModel(robot)
     thresholds = Thresholds(

@@ -24,14 +24,14 @@ class PlaceConfig:
     tilt: tuple[float, float] | None = None
     """Range of the angle between the base's z axis and the vertical [degrees]; None: as the description has it."""
     clear: float = 0.30
-    """Distance that the base's origin, and what an upright base stands on, keep from every wrist and object of the
-    demonstrations [m]."""
+    """Least distance [m] from the base's origin to every wrist and object of the demonstrations; what is below an
+    upright base keeps the same distance."""
     frames: int = 100
     """Frames that each candidate is tried on, each on its own."""
     candidates: int = 40
-    """Of each round."""
+    """Candidates of each round."""
     rounds: int = 5
-    """Of candidates; 0 measures the description's own placement only."""
+    """Rounds of candidates; 0 measures only the description's own placement."""
     elite: int = 5
     """Best candidates: the next round is drawn around them, and in the end they and the description's own placement are
     the finalists."""

@@ -50,4 +50,4 @@ class ArmConfig(Checked):
 
 
 QUICK = ArmConfig(restarts=4, branches=2, first_iterations=40, reseeds=0)
-"""Effort for single frames, of which thousands are tried: what the arm can reach."""
+"""Effort of a search that tries thousands of single frames to see what the arm can reach."""

@@ -213,8 +213,8 @@ def _reseeded(problem: ArmProblem, missed: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _first_frames(problem: ArmProblem) -> Tensor:
-    """[S, K, n] distinct solutions of the first frame: the one that home leads to, then the best others; the last one
-    fills up."""
+    """[S, K, n] distinct solutions of the first frame: the one that home leads to, then the best others. The last one
+    is repeated where there are fewer than K."""
     model = problem.model
     config = problem.config
     home = model.home

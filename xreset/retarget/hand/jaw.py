@@ -29,7 +29,7 @@ def jaw_keypoints(model: HandModel, keypoints: np.ndarray) -> np.ndarray:
     chosen = keypoints[:, model.keypoint_indices]
     for tip, followed in zip(model.robot.fingertips, (("thumb4",), _OPPOSING), strict=True):
         point = keypoints[:, [KEYPOINTS.index(name) for name in followed]].mean(axis=1)
-        chosen[:, np.array(model.names) == tip.keypoint] = point[:, None]
+        chosen[:, np.array(model.keypoint_names) == tip.keypoint] = point[:, None]
     return chosen
 
 
@@ -54,12 +54,12 @@ def jaw_state(model: HandModel, keypoints: Tensor) -> HandState:
     own = _axes(finger[widest] - thumb[widest], palm)
 
     follows = ("wrist", *(tip.keypoint for tip in robot.fingertips))
-    if absent := [name for name in follows if name not in model.names]:
+    if absent := [name for name in follows if name not in model.keypoint_names]:
         raise RobotError(
             f"robot {robot.name!r}: the analytic map of a jaw needs a link for {', '.join(absent)}."
         )
     wrist, human_thumb, human_finger = (
-        keypoints[..., model.names.index(name), :] for name in follows
+        keypoints[..., model.keypoint_names.index(name), :] for name in follows
     )
     across = human_finger - human_thumb
     middle = (human_thumb + human_finger) / 2

@@ -90,21 +90,25 @@ class HandModel:
                 f"robot {robot.name!r}: the joints below the hand root {robot.hand_root!r} are {below}, but the hand "
                 f"group is {group}. Choose the last link that the arm moves as hand_root."
             )
-        self.names = tuple(spec.keypoint for spec in robot.keypoints)
+        self.keypoint_names = tuple(spec.keypoint for spec in robot.keypoints)
         """Human keypoint of each mapped keypoint (length P)."""
-        self.links = tuple(spec.link for spec in robot.keypoints)
+        self.keypoint_links = tuple(spec.link for spec in robot.keypoints)
         """Link of each mapped keypoint."""
-        count = len(set(self.links))
+        count = len(set(self.keypoint_links))
         if count < 3:
             raise RobotError(
                 f"robot {robot.name!r}: {count} links follow keypoints, expected 3 or more (wrist, thumb, finger)."
             )
-        self.keypoint_indices = np.array([KEYPOINTS.index(name) for name in self.names])
+        self.keypoint_indices = np.array([KEYPOINTS.index(name) for name in self.keypoint_names])
         """[P] indices into the 21 human keypoints."""
         tips = {tip.keypoint for tip in robot.fingertips}
-        self.is_tip = torch.tensor([name in tips for name in self.names], device=self.device)
+        self.is_tip = torch.tensor(
+            [name in tips for name in self.keypoint_names], device=self.device
+        )
         """[P] whether a fingertip follows the keypoint."""
-        self.pairs = torch.tensor(keypoint_pairs(self.names, self.links), device=self.device)
+        self.pairs = torch.tensor(
+            keypoint_pairs(self.keypoint_names, self.keypoint_links), device=self.device
+        )
         """[C, 2] pairs of mapped keypoints whose difference is matched."""
         self.home = self.kinematics.home
         """[J] home configuration of the hand."""
@@ -126,8 +130,8 @@ class HandModel:
             [self.home.new_full((len(pad),), 1.0 / max(len(pad), 1)) for pad in pads]
         )
         """[N] share of each of these balls in its pad: the shares of a pad add up to 1."""
-        self._bodies = tuple(dict.fromkeys((*self.links, *self.balls.links)))
-        self.keypoint_body = self._body_indices(self.links)
+        self._bodies = tuple(dict.fromkeys((*self.keypoint_links, *self.balls.links)))
+        self.keypoint_body = self._body_indices(self.keypoint_links)
         """[P] index among the bodies of each keypoint's link."""
         self.group_body = self._body_indices(self.balls.links)
         """[G] index among the bodies of each link with balls."""
@@ -165,7 +169,7 @@ class HandModel:
 
     def keypoints(self, state: HandState) -> Tensor:
         """[..., P, 3] positions of the keypoint links."""
-        return self.kinematics.points(state.joints, self.links, base=state.root)
+        return self.kinematics.points(state.joints, self.keypoint_links, base=state.root)
 
     def bodies(self, state: HandState) -> PointJacobian:
         """Compute the links of the hand in B frames, and their Jacobians.

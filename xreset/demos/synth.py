@@ -12,7 +12,7 @@ import zlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -122,18 +122,19 @@ def _sequence(
     path = _best_of(
         _GRASP_TRIES,
         lambda: _clear_approach(_grasp(obj, resting, plans, side, rng), timing, rng),
-        is_good=lambda path: path[0] > 0,
-        cost=lambda path: -path[0],
+        is_good=lambda path: path.gap > 0,
+        cost=lambda path: -path.gap,
     )
-    _, grasp, wrist_pos, wrist_rot, angles = path
+    grasp = path.grasp
     solid = grasp.solid
     object_pos, object_rot = _object_path(solid.pos, solid.rotation, timing, rng)
     # From the lift on, the hand moves with the object.
     moved = object_rot * solid.rotation.inv()
-    held = (np.arange(len(angles)) >= timing[2])[:, None]
+    lift = timing[2]
+    held = (np.arange(len(object_pos)) >= lift)[:, None]
     carried = moved.apply(grasp.wrist_pos - solid.pos) + object_pos
-    wrist_pos = np.where(held, carried, wrist_pos)
-    wrist_quat = np.where(held, (moved * grasp.wrist_rot).as_quat(), wrist_rot.as_quat())
+    wrist_pos = np.where(held, carried, path.wrist_pos)
+    wrist_quat = np.where(held, (moved * grasp.wrist_rot).as_quat(), path.wrist_rot.as_quat())
     wrist_rot = Rotation.from_quat(wrist_quat)
     return one_sequence(
         name=name,
@@ -141,7 +142,7 @@ def _sequence(
         object_name=obj.name,
         side=side,
         fps=fps,
-        keypoints=hand.placed(wrist_pos, wrist_rot, angles, side),
+        keypoints=hand.placed(wrist_pos, wrist_rot, path.angles, side),
         wrist=wrist_rot,
         object_pos=object_pos,
         object_rot=object_rot,
@@ -215,9 +216,20 @@ def _best_of(
 _Timing = tuple[int, ...]
 """Events of a demonstration, as numbers of frames: the hand has arrived, the fingers are on the object, the object
 begins to move, it is at the goal, and the last frame."""
-_HandPath = tuple[float, Grasp, np.ndarray, Rotation, np.ndarray]
-"""A hand's motion up to the grasp, which holds to the end: the smallest distance of a keypoint to object and table
-until the lift [m], the grasp, positions [T, 3] and T orientations of the wrist, and joint angles [T, 17]."""
+
+
+class _HandPath(NamedTuple):
+    """A hand's motion up to the grasp, which holds to the end."""
+
+    gap: float
+    """Smallest distance of a keypoint from object and table until the lift [m]."""
+    grasp: Grasp
+    wrist_pos: np.ndarray
+    """[T, 3]"""
+    wrist_rot: Rotation
+    """T orientations."""
+    angles: np.ndarray
+    """[T, 17] joint angles."""
 
 
 def _random_timing(fps: float, rng: np.random.Generator) -> _Timing:
@@ -259,8 +271,8 @@ def _clear_approach(grasp: Grasp, timing: _Timing, rng: np.random.Generator) -> 
     return _best_of(
         _TRIES,
         lambda: _approach(grasp, timing, rng),
-        is_good=lambda path: path[0] > _CLEAR,
-        cost=lambda path: -path[0],
+        is_good=lambda path: path.gap > _CLEAR,
+        cost=lambda path: -path.gap,
     )
 
 
@@ -296,7 +308,7 @@ def _approach(grasp: Grasp, timing: _Timing, rng: np.random.Generator) -> _HandP
     angles = hand.RELAXED + opening * (opened - hand.RELAXED) + closing * (grasp.angles - opened)
     points = hand.placed(wrist_pos, wrist_rot, angles, grasp.side)[:lift]
     gap = min(grasp.solid.distance(points).min(), points[..., 2].min())
-    return float(gap), grasp, wrist_pos, wrist_rot, angles
+    return _HandPath(float(gap), grasp, wrist_pos, wrist_rot, angles)
 
 
 def _minimum_jerk(frame: np.ndarray, start: float, end: float) -> np.ndarray:

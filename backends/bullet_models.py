@@ -13,7 +13,7 @@ import numpy as np
 
 from xreset.backends.rigid import OTHER_LINK, Inertia, Mechanism
 from xreset.checks import frozen
-from xreset.geometry.shapes import transform, transformed
+from xreset.geometry.shapes import roll_pitch_yaw, transform, transformed
 from xreset.geometry.urdf import Joint
 from xreset.spec import Shape
 
@@ -144,16 +144,8 @@ def moved_vertices(shape: Shape) -> np.ndarray:
 
 
 def _origin(T: np.ndarray) -> str:
-    R = T[:3, :3]
-    cos_pitch = float(np.hypot(R[0, 0], R[1, 0]))
-    if cos_pitch > 1e-9:
-        roll = np.arctan2(R[2, 1], R[2, 2])
-        yaw = np.arctan2(R[1, 0], R[0, 0])
-    else:  # gimbal lock: roll and yaw turn about the same axis
-        roll = np.arctan2(-R[1, 2], R[1, 1])
-        yaw = 0.0
-    pitch = np.arctan2(-R[2, 0], cos_pitch)
-    return f'<origin xyz="{_numbers(T[:3, 3])}" rpy="{_numbers((roll, pitch, yaw))}"/>'
+    rpy = roll_pitch_yaw(T[:3, :3], level=1e-9)
+    return f'<origin xyz="{_numbers(T[:3, 3])}" rpy="{_numbers(rpy)}"/>'
 
 
 def _numbers(values: Any) -> str:

@@ -71,6 +71,19 @@ def quat_of(turn: Rotation) -> np.ndarray:
     return turn.as_quat(canonical=True, scalar_first=True)
 
 
+def roll_pitch_yaw(R: np.ndarray, level: float = 1e-5) -> tuple[float, float, float]:
+    """Return the angles of R = Rz(yaw) Ry(pitch) Rx(roll) [rad].
+
+    Where pitch is +-90 degrees, only the sum of roll and yaw is defined; yaw is 0 there. ``level`` is the cosine of the
+    pitch below which this holds.
+    """
+    cosine = np.hypot(R[0, 0], R[1, 0])
+    pitch = np.arctan2(-R[2, 0], cosine)
+    if cosine <= level:
+        return np.arctan2(-R[1, 2], R[1, 1]), pitch, 0.0
+    return np.arctan2(R[2, 1], R[2, 2]), pitch, np.arctan2(R[1, 0], R[0, 0])
+
+
 def transformed(points: np.ndarray, T: np.ndarray) -> np.ndarray:
     """[n, 3] points [n, 3] of a frame, in the frame in which the first one has the pose T [4, 4]."""
     return points @ T[:3, :3].T + T[:3, 3]

@@ -6,7 +6,6 @@ reading are inverse.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
@@ -17,7 +16,7 @@ import trimesh
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from xreset.geometry.shapes import pose_matrix, transform
+from xreset.geometry.shapes import pose_matrix, roll_pitch_yaw, transform
 from xreset.geometry.urdf import Joint, Link, RobotTree
 
 FRAME_MASS = 1e-4
@@ -166,18 +165,6 @@ def _add(parent: Element, tag: str, **attributes: str | ArrayLike) -> None:
     for name, value in attributes.items():
         texts[name] = value if isinstance(value, str) else _text(value)
     SubElement(parent, tag, texts)
-
-
-def roll_pitch_yaw(R: np.ndarray) -> tuple[float, float, float]:
-    """Return the angles of R = Rz(yaw) Ry(pitch) Rx(roll) [rad].
-
-    Where pitch is +-90 degrees, only the sum of roll and yaw is defined; yaw is 0 there.
-    """
-    level = math.hypot(R[0, 0], R[1, 0])
-    pitch = math.atan2(-R[2, 0], level)
-    if level < 1e-5:
-        return math.atan2(-R[1, 2], R[1, 1]), pitch, 0.0
-    return math.atan2(R[2, 1], R[2, 2]), pitch, math.atan2(R[1, 0], R[0, 0])
 
 
 def _text(values: ArrayLike) -> str:

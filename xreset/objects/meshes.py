@@ -18,7 +18,7 @@ from xreset.errors import ObjectError
 from xreset.files import file_hash, write_whole
 from xreset.geometry.shapes import load_mesh, shell_properties
 from xreset.objects.cache import cached_pieces
-from xreset.objects.decompose import WALL, Settings, openings
+from xreset.objects.decompose import WALL, Pieces, Settings, openings
 from xreset.objects.properties import Properties, properties_of
 from xreset.objects.ycb import MASSES
 from xreset.spec import ObjectSpec
@@ -102,32 +102,15 @@ def import_with_notes(path: str | Path, name: str) -> Import:
     own = properties_of(path)
     source = file_hash(path)
     try:
-        settings = (
-            Settings()
-            if own.tolerance is None
-            else Settings(hull_depth=0.0, tolerance=own.tolerance)
-        )
+        settings = Settings()
+        if own.tolerance is not None:
+            settings = Settings(hull_depth=0.0, tolerance=own.tolerance)
         pieces = cached_pieces(mesh, source, settings)
     except QhullError as error:
         raise ObjectError(
             f"{path} spans no volume: it is flat, or damaged. A solid object is needed."
         ) from error
-    notes = []
-    if not mesh.is_volume:
-        widths = [1e3 * np.ptp(mesh.vertices[loop], axis=0).max() for loop, _ in openings(mesh)]
-        problem = "the mesh is not closed"
-        if widths:
-            problem += (
-                f" ({len(widths)} hole{'s' * (len(widths) > 1)}, the widest {max(widths):.0f} mm)"
-            )
-        if len(pieces.shapes) == 1:
-            notes.append(
-                f"{problem}: volume, center of mass and inertia are those of its convex hull"
-            )
-        elif pieces.volume < 1.5 * mesh.area * WALL:
-            notes.append(f"{problem}: it is taken as a wall {1e3 * WALL:g} mm thick")
-        else:
-            notes.append(f"{problem}: its holes were filled")
+    notes = [] if mesh.is_volume else [_how_closed(mesh, pieces)]
     mass = own.mass
     mass_source = "stated"
     if mass is None and own.density is None and name in MASSES:
@@ -174,6 +157,20 @@ def import_with_notes(path: str | Path, name: str) -> Import:
         mass_source=mass_source,
         tolerance=own.tolerance,
     )
+
+
+def _how_closed(mesh: trimesh.Trimesh, pieces: Pieces) -> str:
+    """Return a sentence about what was taken as the solid of a mesh that is not closed."""
+    widths = [1e3 * np.ptp(mesh.vertices[loop], axis=0).max() for loop, _ in openings(mesh)]
+    holes = ""
+    if widths:
+        holes = f" ({len(widths)} hole{'s' * (len(widths) > 1)}, the widest {max(widths):.0f} mm)"
+    solid = "its holes were filled"
+    if len(pieces.shapes) == 1:
+        solid = "volume, center of mass and inertia are those of its convex hull"
+    elif pieces.volume < 1.5 * mesh.area * WALL:
+        solid = f"it is taken as a wall {1e3 * WALL:g} mm thick"
+    return f"the mesh is not closed{holes}: {solid}"
 
 
 def add_mesh(

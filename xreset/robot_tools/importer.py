@@ -21,9 +21,9 @@ from xreset.files import atomic_folder
 from xreset.geometry.collision import SelfCollision
 from xreset.geometry.dynamics import drive_inertia
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.shapes import surface_of
+from xreset.geometry.shapes import roll_pitch_yaw, surface_of
 from xreset.geometry.urdf import RobotTree
-from xreset.geometry.urdf_writer import axes, pose, roll_pitch_yaw
+from xreset.geometry.urdf_writer import axes, pose
 from xreset.robot_tools.draft import description_text, draft_spec
 from xreset.robot_tools.fingers import Hand
 from xreset.robot_tools.homes import hold_near

@@ -527,6 +527,7 @@ class ObservationTest(TestCase):
             joint_target=rand(self.J),
             joint_lower=torch.full((self.J,), -2.0),
             joint_upper=torch.full((self.J,), 3.0),
+            points=torch.zeros(self.N, 1, 3),
             observed_pos=rand(3),
             observed_quat=quat(),
             goal_pos=rand(3),
@@ -606,7 +607,7 @@ class ObservationTest(TestCase):
         # the paper's 648 inputs
         self.assertEqual((flat, flat + widths["perception"]["paired_cloud"]), (72, 648))
         points = torch.randn(self.N, 64, 3, generator=generator())
-        found = obs.policy_group(self.x, c, generator(), points)
+        found = obs.policy_group(replace(self.x, points=points), c, generator())
         cloud = quat_rotate(self.x.observed_quat[:, None], points) + self.x.observed_pos[:, None]
         distance = (self.x.links.pos[:, :, None] - cloud[:, None]).norm(dim=-1).amin(dim=-1)
         vectors = found[:, :-1].unflatten(1, (-1, 3))
@@ -633,6 +634,7 @@ class ObservationTest(TestCase):
 
     def test_clouds(self):
         points = torch.randn(self.N, 10, 3, generator=generator(1))
+        x = replace(self.x, points=points)
         now = quat_rotate(self.x.observed_quat[2], points[2, 7]) + self.x.observed_pos[2]
         goal = quat_rotate(self.x.goal_quat[2], points[2, 7]) + self.x.goal_pos[2]
         scaled = replace(self.config, cloud_scale=5.0)
@@ -641,7 +643,7 @@ class ObservationTest(TestCase):
             (scaled, 5.0 * now),
             (replace(scaled, cloud="paired"), 5.0 * torch.cat((now, goal, goal - now))),
         ):
-            cloud = obs.cloud_frame(points, self.x, config, generator())
+            cloud = obs.cloud_frame(x, config, generator())
             self.assertEqual(tuple(cloud.shape), (self.N, 10, config.cloud_shape[2]))
             assert_close(cloud[2, 7], expected)
 
@@ -676,7 +678,8 @@ class ObservationTest(TestCase):
         assert_close(spread, expected, rtol=0.1, atol=1e-6)
         angle = quat_angle(rotation, x.observed_quat).square().mean().sqrt()
         self.assertAlmostEqual(angle, 0.05 * math.sqrt(3), delta=0.005)
-        cloud = obs.cloud_frame(torch.zeros(self.N, 1000, 3), self.x, c, generator())
+        x = replace(self.x, points=torch.zeros(self.N, 1000, 3))
+        cloud = obs.cloud_frame(x, c, generator())
         self.assertAlmostEqual((cloud - self.x.observed_pos[:, None]).std(), 0.03, delta=0.001)
 
 

@@ -587,6 +587,7 @@ class ManipulationEnv:
             joint_target=self._target,
             joint_lower=self._joint_lower,
             joint_upper=self._joint_upper,
+            points=self._cloud_points,
             observed_pos=observed_pos,
             observed_quat=observed_quat,
             goal_pos=self.task_goal_pos,
@@ -598,11 +599,11 @@ class ManipulationEnv:
             tip_distance=reading.tip_distance,
             reward=self._reward,
         )
-        frame = obs.cloud_frame(self._cloud_points, x, c, self.generator)[:, None]
+        frame = obs.cloud_frame(x, c, self.generator)[:, None]
         history = torch.cat((self._cloud[:, 1:], frame), dim=1)
         self._cloud.copy_(where(self._reset_mask, frame, history))
         groups = {
-            "policy": obs.policy_group(x, c, self.generator, self._cloud_points),
+            "policy": obs.policy_group(x, c, self.generator),
             "proprio": self.variation.observed_proprio(
                 obs.proprio_group(x, c, self.generator), self._reset_mask
             ),

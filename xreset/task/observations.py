@@ -39,6 +39,8 @@ class ObservationInput:
     """[J]"""
     joint_upper: Tensor
     """[J]"""
+    points: Tensor
+    """[N, P, 3] surface points of each world's object, object frame."""
     observed_pos: Tensor
     """[N, 3] object position as the policy observes it, possibly delayed."""
     observed_quat: Tensor
@@ -67,13 +69,15 @@ def layout(
     ``view``.
     """
     turn, width = ("quat", 4) if c.rotation == "quaternion" else ("rotation", 6)
-    pose = {"object_pos": 3, f"object_{turn}": width, "goal_pos": 3, f"goal_{turn}": width}
-    if c.rotation == "to_goal":
-        pose = {"object_pos": 3, "goal_pos": 3, "rotation_to_goal": 6}
-    perception = {"cloud" if c.cloud == "history" else "paired_cloud": prod(c.cloud_shape)}
-    groups = {
-        "policy": {**pose, "gravity_fraction": 1, "previous_action": num_joints},
-        "proprio": {
+    if c.content == "published":
+        policy = {"tip_to_object": 3 * num_tips, "palm_distance": 1}
+        proprio = {"joint_pos": num_joints, "target_pos": num_joints}
+    else:
+        pose = {"object_pos": 3, f"object_{turn}": width, "goal_pos": 3, f"goal_{turn}": width}
+        if c.rotation == "to_goal":
+            pose = {"object_pos": 3, "goal_pos": 3, "rotation_to_goal": 6}
+        policy = pose | {"gravity_fraction": 1, "previous_action": num_joints}
+        proprio = {
             "joint_pos": num_joints,
             "joint_vel": num_joints,
             "palm_pos": 3,
@@ -82,57 +86,43 @@ def layout(
             "palm_angvel": 3,
             "tip_pos": 3 * num_tips,
             "tip_force": 3 * num_tips,
-            **({"joint_target": num_joints} if c.joint_target else {}),
-        },
-        "perception": perception,
-    }
-    if c.content == "published":
-        groups = {
-            "policy": {"tip_to_object": 3 * num_tips, "palm_distance": 1},
-            "proprio": {"joint_pos": num_joints, "target_pos": num_joints},
-            "perception": perception,
         }
+        if c.joint_target:
+            proprio["joint_target"] = num_joints
     if vision is None or not vision.cameras:
-        return groups
+        cloud = "cloud" if c.cloud == "history" else "paired_cloud"
+        return {"policy": policy, "proprio": proprio, "perception": {cloud: prod(c.cloud_shape)}}
     goal = "rotation_from_start" if c.rotation == "to_goal" else f"goal_{turn}"
     return {
         "goal": {"goal_pos": 3, goal: width, "previous_action": num_joints},
-        "proprio": groups["proprio"],
+        "proprio": proprio,
         "view": {vision.view: prod(vision.view_shape)},
     }
 
 
-def policy_group(
-    x: ObservationInput,
-    c: ObservationConfig,
-    generator: torch.Generator,
-    points: Tensor | None = None,
-) -> Tensor:
+def policy_group(x: ObservationInput, c: ObservationConfig, generator: torch.Generator) -> Tensor:
     """[N, 15 + J] object pose (noisy), goal pose, gravity fraction, previous action.
 
     With ``rotation="matrix"`` there are four numbers more, with ``to_goal`` two less. With ``content="published"``,
-    [N, 3 E + 1] vectors from the fingertips to the nearest of the object's ``points`` [N, P, 3] (object frame), and the
-    palm's distance to its nearest one [m].
+    [N, 3 E + 1] vectors from the fingertips to the object's nearest points, and the palm's distance to its nearest
+    point [m].
     """
-    if c.content == "published" and points is not None:
-        cloud = quat_rotate(x.observed_quat[:, None], points) + x.observed_pos[:, None]
-        offsets = cloud[:, None] - x.links.pos[:, :, None]
+    if c.content == "published":
+        offsets = _world_points(x)[:, None] - x.links.pos[:, :, None]
         nearest = offsets.square().sum(dim=-1).argmin(dim=-1)
         vectors = offsets.gather(2, nearest[:, :, None, None].expand(-1, -1, 1, 3))[:, :, 0]
         square = vectors[:, 0].square().sum(dim=-1, keepdim=True)
         # torch's root of float32 is rounded differently on some processors, and the runner's is not
         palm_distance = square.double().sqrt().to(square.dtype)
         return torch.cat((vectors[:, 1:].flatten(1), palm_distance), dim=-1)
-    noise = c.noise
-    pos = x.observed_pos + noise.object_pos * _normal(x.observed_pos, generator)
-    turn = quat_from_axis_angle(noise.object_rot * _normal(x.observed_pos, generator))
-    observed_quat = quat_multiply(turn, x.observed_quat)
+    pos = _noisy(x.observed_pos, c.noise.object_pos, generator)
+    turn = quat_from_axis_angle(c.noise.object_rot * _normal(x.observed_pos, generator))
+    quat = quat_multiply(turn, x.observed_quat)
     if c.rotation == "to_goal":
-        to_goal = _shown(quat_multiply(x.goal_quat, quat_conjugate(observed_quat)), c)
-        poses = (pos, x.goal_pos, to_goal)
+        to_goal = quat_multiply(x.goal_quat, quat_conjugate(quat))
+        poses = (pos, x.goal_pos, _encoded(to_goal, c))
     else:
-        rotation, goal_rotation = _shown(torch.stack((observed_quat, x.goal_quat)), c)
-        poses = (pos, rotation, x.goal_pos, goal_rotation)
+        poses = (pos, _encoded(quat, c), x.goal_pos, _encoded(x.goal_quat, c))
     return torch.cat((*poses, x.gravity_fraction[:, None], x.previous_action), dim=-1)
 
 
@@ -145,7 +135,7 @@ def goal_group(x: ObservationInput, c: ObservationConfig) -> Tensor:
     turn = x.goal_quat
     if c.rotation == "to_goal":
         turn = quat_multiply(x.goal_quat, quat_conjugate(x.start_quat))
-    return torch.cat((x.goal_pos, _shown(turn, c), x.previous_action), dim=-1)
+    return torch.cat((x.goal_pos, _encoded(turn, c), x.previous_action), dim=-1)
 
 
 def proprio_group(x: ObservationInput, c: ObservationConfig, generator: torch.Generator) -> Tensor:
@@ -154,26 +144,22 @@ def proprio_group(x: ObservationInput, c: ObservationConfig, generator: torch.Ge
     Joint positions are scaled to [-1, 1] between their limits. Without quaternions there are two numbers more, with
     ``joint_target`` J more. With ``content="published"``, [N, 2 J] positions and drives' targets, both scaled.
     """
-    pos = x.state.joint_pos + c.noise.joint_pos * _normal(x.state.joint_pos, generator)
+    pos = _noisy(x.state.joint_pos, c.noise.joint_pos, generator)
     if c.content == "published":
-        both = torch.stack((pos, x.joint_target), dim=1)
-        return (2.0 * (both - x.joint_lower) / (x.joint_upper - x.joint_lower) - 1.0).flatten(1)
-    vel = x.state.joint_vel + c.noise.joint_vel * _normal(x.state.joint_vel, generator)
-    force = (c.contact_force_scale * x.tip_force).clamp(-1.0, 1.0)
-    return torch.cat(
-        (
-            2.0 * (pos - x.joint_lower) / (x.joint_upper - x.joint_lower) - 1.0,
-            c.joint_vel_scale * vel,
-            x.links.pos[:, 0],
-            _shown(x.links.quat[:, 0], c),
-            x.links.linvel[:, 0],
-            x.links.angvel[:, 0],
-            x.links.pos[:, 1:].flatten(1),
-            force.flatten(1),
-            *((x.joint_target - x.state.joint_pos,) if c.joint_target else ()),
-        ),
-        dim=-1,
-    )
+        return torch.cat((_scaled(pos, x), _scaled(x.joint_target, x)), dim=-1)
+    terms = [
+        _scaled(pos, x),
+        c.joint_vel_scale * _noisy(x.state.joint_vel, c.noise.joint_vel, generator),
+        x.links.pos[:, 0],
+        _encoded(x.links.quat[:, 0], c),
+        x.links.linvel[:, 0],
+        x.links.angvel[:, 0],
+        x.links.pos[:, 1:].flatten(1),
+        _limited_force(x, c),
+    ]
+    if c.joint_target:
+        terms.append(x.joint_target - x.state.joint_pos)
+    return torch.cat(terms, dim=-1)
 
 
 def privileged_group(x: ObservationInput, c: ObservationConfig) -> Tensor:
@@ -182,49 +168,58 @@ def privileged_group(x: ObservationInput, c: ObservationConfig) -> Tensor:
     With ``content="published"``, [N, 15 + J + 3 E]: joint velocities and contact forces follow, which the policy does
     not observe then.
     """
-    unobserved = ()
+    to_goal = quat_multiply(x.goal_quat, quat_conjugate(x.state.object_quat))
+    terms = [
+        x.state.object_linvel,
+        x.state.object_angvel,
+        x.goal_pos - x.state.object_pos,
+        quat_to_axis_angle(to_goal),
+        x.tip_distance.min(dim=-1, keepdim=True).values,
+        x.gravity_fraction[:, None],
+        x.reward[:, None],
+    ]
     if c.content == "published":
-        force = (c.contact_force_scale * x.tip_force).clamp(-1.0, 1.0)
-        unobserved = (c.joint_vel_scale * x.state.joint_vel, force.flatten(1))
-    rotation_error = quat_to_axis_angle(
-        quat_multiply(x.goal_quat, quat_conjugate(x.state.object_quat))
-    )
-    return torch.cat(
-        (
-            x.state.object_linvel,
-            x.state.object_angvel,
-            x.goal_pos - x.state.object_pos,
-            rotation_error,
-            x.tip_distance.min(dim=-1, keepdim=True).values,
-            x.gravity_fraction[:, None],
-            x.reward[:, None],
-            *unobserved,
-        ),
-        dim=-1,
-    )
+        terms += [c.joint_vel_scale * x.state.joint_vel, _limited_force(x, c)]
+    return torch.cat(terms, dim=-1)
 
 
-def cloud_frame(
-    points: Tensor, x: ObservationInput, c: ObservationConfig, generator: torch.Generator
-) -> Tensor:
-    """[N, P, K] one frame of the object's points [N, P, 3] (object frame) in the world frame, times ``cloud_scale``.
+def cloud_frame(x: ObservationInput, c: ObservationConfig, generator: torch.Generator) -> Tensor:
+    """[N, P, K] one frame of the object's points in the world frame, times ``cloud_scale``.
 
     The present positions are noisy. With ``cloud="paired"`` the goal positions and the differences follow them.
     """
-    cloud = quat_rotate(x.observed_quat[:, None], points) + x.observed_pos[:, None]
-    cloud = cloud + c.noise.cloud * _normal(cloud, generator)
+    cloud = _noisy(_world_points(x), c.noise.cloud, generator)
     if c.cloud == "history":
         return c.cloud_scale * cloud
-    goal = quat_rotate(x.goal_quat[:, None], points) + x.goal_pos[:, None]
+    goal = quat_rotate(x.goal_quat[:, None], x.points) + x.goal_pos[:, None]
     return c.cloud_scale * torch.cat((cloud, goal, goal - cloud), dim=-1)
+
+
+def _world_points(x: ObservationInput) -> Tensor:
+    """[N, P, 3] the object's points in the world frame, as they are observed."""
+    return quat_rotate(x.observed_quat[:, None], x.points) + x.observed_pos[:, None]
+
+
+def _scaled(joint_pos: Tensor, x: ObservationInput) -> Tensor:
+    """[N, J] joint positions between their limits, in [-1, 1]."""
+    return 2.0 * (joint_pos - x.joint_lower) / (x.joint_upper - x.joint_lower) - 1.0
+
+
+def _limited_force(x: ObservationInput, c: ObservationConfig) -> Tensor:
+    """[N, 3 E] fingertip forces, scaled and limited to [-1, 1]."""
+    return (c.contact_force_scale * x.tip_force).clamp(-1.0, 1.0).flatten(1)
+
+
+def _noisy(values: Tensor, std: float, generator: torch.Generator) -> Tensor:
+    return values + std * _normal(values, generator)
 
 
 def _normal(like: Tensor, generator: torch.Generator) -> Tensor:
     return torch.randn(like.shape, generator=generator, device=like.device, dtype=like.dtype)
 
 
-def _shown(quat: Tensor, c: ObservationConfig) -> Tensor:
-    """[..., 4] or [..., 6] a rotation, the same numbers for both of its quaternions."""
+def _encoded(quat: Tensor, c: ObservationConfig) -> Tensor:
+    """[..., 4] or [..., 6] a rotation as the policy observes it: the same numbers for both of its quaternions."""
     if c.rotation == "quaternion":
         return torch.where(quat[..., :1] < 0, -quat, quat)
     return quat_to_matrix(quat)[..., :2].mT.flatten(-2)

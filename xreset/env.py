@@ -6,7 +6,7 @@ policy is trained. Evaluations run in the same class with another configuration.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Self
 
@@ -22,6 +22,7 @@ from xreset.physics import Backend, Parameters, State
 from xreset.plugins import make_backend
 from xreset.resets.bank import ResetBank, check_states
 from xreset.resets.distribution import Reset, ResetDistribution
+from xreset.schedule import shared_worlds
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, checked_objects
 from xreset.task import observations as obs
 from xreset.task.actions import ActionSpace
@@ -96,7 +97,8 @@ def make_env(
     check_states(bank, robot, objects)
     names = tuple(o.name for o in objects)
     scene = make_scene(robot, objects, task)
-    object_index = shared_worlds(names, num_envs, task.reset.object_share)
+    worlds = shared_worlds(names, num_envs, task.reset.object_share)
+    object_index = None if worlds is None else torch.as_tensor(worlds)
     backend = make_backend(engine, scene, num_envs, object_index=object_index, device=device)
     try:
         resets = ResetDistribution.of(bank, robot, objects, task, backend.device)
@@ -104,41 +106,6 @@ def make_env(
     except BaseException:
         backend.close()
         raise
-
-
-def shared_worlds(names: Sequence[str], num_envs: int, share: Mapping[str, float]) -> Tensor | None:
-    """Return the object [N] of each world; None: world i holds object i modulo their number.
-
-    Worlds that remain after rounding down go to the largest remainders, so that each object's practice is as near as
-    possible to its share. :func:`xreset.schedule.schedule` shares worlds by another rule, which favors objects with few
-    items: its work ends, and training does not.
-
-    Args:
-        names: the objects.
-        num_envs: N.
-        share: ``task.reset.object_share``.
-
-    Raises:
-        XResetError: an unknown name, or too few worlds.
-    """
-    if not share:
-        return None
-    unknown = sorted(set(share) - set(names))
-    if unknown:
-        raise XResetError(
-            f"object_share names {', '.join(unknown)}, but the objects are {', '.join(names)}. Use these names."
-        )
-    wanted = np.array([share.get(name, 1.0) for name in names])
-    exact = num_envs * wanted / wanted.sum()
-    worlds = np.floor(exact).astype(int)
-    by_remainder = np.argsort(worlds - exact, kind="stable")
-    worlds[by_remainder[: num_envs - worlds.sum()]] += 1
-    if not worlds.all():
-        raise XResetError(
-            f"With {num_envs} worlds and this object_share, {names[worlds.argmin()]} gets no world. "
-            "Take more worlds (--num-envs)."
-        )
-    return torch.as_tensor(np.repeat(np.arange(len(names)), worlds))
 
 
 class ManipulationEnv:

@@ -1,12 +1,13 @@
-"""Shares work among worlds. A world always holds the same object, so it works through items of one object."""
+"""Shares worlds among objects. A world always holds the same object."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
 from xreset.checks import frozen
+from xreset.errors import XResetError
 
 
 @frozen
@@ -29,8 +30,6 @@ def schedule(item_object: np.ndarray, max_worlds: int) -> Schedule:
     """Spread items over worlds in the fewest rounds.
 
     One world after the other goes to the object whose worlds have most to do, which keeps the longest queue shortest.
-    :func:`xreset.env.shared_worlds` rounds shares to the nearest numbers instead, and cannot do this work: of 10 items
-    of one object and 1 of another, it would give all of four worlds to the first.
 
     Args:
         item_object: [I] object index of each item.
@@ -39,7 +38,7 @@ def schedule(item_object: np.ndarray, max_worlds: int) -> Schedule:
     objects, counts = np.unique(item_object, return_counts=True)
     worlds = np.ones_like(counts)
     for _ in range(min(max_worlds, len(item_object)) - len(objects)):
-        worlds[np.argmax(counts / worlds)] += 1  # the object whose worlds have most to do
+        worlds[np.argmax(counts / worlds)] += 1
     num_rounds = np.max(-(-counts // worlds))
     columns = []
     fresh = []
@@ -53,3 +52,39 @@ def schedule(item_object: np.ndarray, max_worlds: int) -> Schedule:
         rounds=np.concatenate(columns, axis=1),
         fresh=np.concatenate(fresh, axis=1),
     )
+
+
+def shared_worlds(
+    names: Sequence[str], num_envs: int, share: Mapping[str, float]
+) -> np.ndarray | None:
+    """Return the object [N] of each world; None: world i holds object i modulo their number.
+
+    Worlds that remain after rounding down go to the largest remainders, so that each object's practice is as near as
+    possible to its share. Training does not end, so there is no longest queue to shorten as in :func:`schedule`.
+
+    Args:
+        names: the objects.
+        num_envs: N.
+        share: ``task.reset.object_share``.
+
+    Raises:
+        XResetError: an unknown name, or too few worlds.
+    """
+    if not share:
+        return None
+    unknown = sorted(set(share) - set(names))
+    if unknown:
+        raise XResetError(
+            f"object_share names {', '.join(unknown)}, but the objects are {', '.join(names)}. Use these names."
+        )
+    wanted = np.array([share.get(name, 1.0) for name in names])
+    exact = num_envs * wanted / wanted.sum()
+    worlds = np.floor(exact).astype(int)
+    by_remainder = np.argsort(worlds - exact, kind="stable")
+    worlds[by_remainder[: num_envs - worlds.sum()]] += 1
+    if not worlds.all():
+        raise XResetError(
+            f"With {num_envs} worlds and this object_share, {names[worlds.argmin()]} gets no world. "
+            "Take more worlds (--num-envs)."
+        )
+    return np.repeat(np.arange(len(names)), worlds)

@@ -187,8 +187,10 @@ def with_goals(bank: ResetBank, goals: GoalSet) -> ResetBank:
 def checked_goals(
     where: str, goals: GoalSet, robot: RobotSpec, objects: Sequence[ObjectSpec]
 ) -> GoalSet:
-    """Return a goal set for a robot. If it was made for another one, the reach of this robot is tried here; a file of
-    its own is only searched for goals where no arm of its length gets to.
+    """Return a goal set for a robot.
+
+    In a goal set of another robot, every goal must be within this robot's reach. In one of its own, only goals that the
+    stretched arm does not reach are refused, because the file was checked when it was made.
 
     Args:
         where: what messages call the goal set.
@@ -304,39 +306,37 @@ def _draw(
     number: int,
     attempt: int,
 ) -> _Episode:
-    """Draw a start and a goal; nothing else decides what is drawn."""
+    """Draw a start and a goal. The arguments alone decide what is drawn."""
     key = [config.seed, zlib.crc32(f"{obj.name} {family}".encode()), number, attempt]
     random = np.random.default_rng(key)
-    height, turn = rests[int(random.integers(len(rests)))]
+    height, resting = rests[int(random.integers(len(rests)))]
     (x, y), (goal_x, goal_y) = random.uniform(*np.transpose(WORKSPACE), size=(2, 2))
-    place = np.array([x, y, height])
-    heading = _about_z(random.uniform(0.0, 2.0 * np.pi)) * turn
-    at_start = np.random.default_rng([_START_SEED, *key]).uniform(-1.0, 1.0, 3)  # x, y, yaw
-    at_goal = np.random.default_rng([_GOAL_SEED, *key]).uniform(-1.0, 1.0, 4)  # x, y, z, yaw
+    center = np.array([x, y, height])
+    resting = _about_z(random.uniform(0.0, 2.0 * np.pi)) * resting
+    start_offset = np.random.default_rng([_START_SEED, *key]).uniform(-1.0, 1.0, 3)  # x, y, yaw
+    goal_offset = np.random.default_rng([_GOAL_SEED, *key]).uniform(-1.0, 1.0, 4)  # x, y, z, yaw
     if family == OWN:
         pos, quat = own[number]
         goal_turn = turn_of(quat)
         goal = pos + goal_turn.apply(obj.com)
     else:
-        goal = place + np.array([0.0, 0.0, config.lift])
+        goal = center + np.array([0.0, 0.0, config.lift])
         turn = Rotation.identity()
         if family == "random":
             goal = np.array([goal_x, goal_y, height + random.uniform(*LIFT)])
             axis = random.normal(size=3)
             turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * random.uniform(0.0, np.pi))
         elif family in _TURN_AXES:
-            side = random.choice((-1.0, 1.0))
-            turn = Rotation.from_rotvec(
-                side * np.radians(config.angle) * np.array(_TURN_AXES[family])
-            )
-        goal += np.array([config.goal_xy, config.goal_xy, config.goal_z]) * at_goal[:3]
-        goal_turn = _about_z(np.radians(config.goal_yaw) * at_goal[3]) * turn * heading
+            angle = random.choice((-1.0, 1.0)) * np.radians(config.angle)
+            turn = Rotation.from_rotvec(angle * np.array(_TURN_AXES[family]))
+        goal += np.array([config.goal_xy, config.goal_xy, config.goal_z]) * goal_offset[:3]
+        goal_turn = _about_z(np.radians(config.goal_yaw) * goal_offset[3]) * turn * resting
     return _Episode(
         obj=obj,
         family=family,
         number=number,
-        start=place + np.array([config.start_xy, config.start_xy, 0.0]) * at_start,
-        start_turn=_about_z(np.radians(config.start_yaw) * at_start[2]) * heading,
+        start=center + np.array([config.start_xy, config.start_xy, 0.0]) * start_offset,
+        start_turn=_about_z(np.radians(config.start_yaw) * start_offset[2]) * resting,
         goal=goal,
         goal_turn=goal_turn,
     )

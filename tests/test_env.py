@@ -223,7 +223,7 @@ class StepTest(WithEnv):
         assert_close(policy[:, 7:10], env.goal_pos)
         assert_close(policy[:, 14], env.gravity_fraction)
         assert_close(policy[:, 15:], self.actions(5)[-1])
-        scaled = env.actions.within_limits(state.joint_pos)
+        scaled = env.actions.absolute_action(state.joint_pos)
         assert_close(observations["proprio"][:, 3:7], scaled[:, 3:])
         cloud = quat_rotate(state.object_quat[:, None], env._cloud_points)
         assert_close(observations["perception"][:, -1], cloud + state.object_pos[:, None])

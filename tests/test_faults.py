@@ -16,7 +16,7 @@ from xreset.errors import RunError
 from xreset.learning.distributed import Processes
 from xreset.learning.ppo import SequencePpo
 from xreset.learning.run import checkpoints
-from xreset.learning.runner import MAX_SHARE, WINDOW, TrainingRunner
+from xreset.learning.runner import FAULT_WINDOW, MAX_FAULTY_SHARE, TrainingRunner
 
 CONFIG = replace(toy_training.CONFIG, task=TASK, iterations=3)
 
@@ -41,7 +41,7 @@ class Budget(TestCase):
             runner = mock.Mock(
                 env=env,
                 processes=Processes(),
-                _fault_totals=deque([[0, 0]], maxlen=WINDOW),
+                _fault_totals=deque([[0, 0]], maxlen=FAULT_WINDOW),
             )
             for nonfinite, overflow in faults:
                 env.nonfinite_count = env.nonfinite_count + nonfinite
@@ -49,7 +49,7 @@ class Budget(TestCase):
                 TrainingRunner._check_faults(runner, 1000)
 
         counted((150, 50))
-        counted((200, 0), *[(0, 0)] * (WINDOW - 1), (0, 200))  # old faults are forgotten
+        counted((200, 0), *[(0, 0)] * (FAULT_WINDOW - 1), (0, 200))  # old faults are forgotten
         with self.assertRaisesRegex(RunError, "151 worlds were not finite and 50 dropped .* 0.1%"):
             counted((150, 50), (1, 0))
 
@@ -123,7 +123,7 @@ class Run(WithEnv, InFolder):
             self.assertTrue(value.isfinite().all(), name)
         # all in the second iteration
         plan = {step: ("broken" if step % 2 else "overflow", step % N) for step in range(9, 17)}
-        self.assertGreater(len(plan), MAX_SHARE * WINDOW * 8 * N)
+        self.assertGreater(len(plan), MAX_FAULTY_SHARE * FAULT_WINDOW * 8 * N)
         with self.assertRaisesRegex(
             RunError, "4 worlds were not finite and 4 dropped contacts.*--resume"
         ):

@@ -298,7 +298,8 @@ def _value(hint: Any, value: Any, where: str, problems: list[str]) -> Any:
         if arguments[-1] is Ellipsis:
             kinds = arguments[:1] * len(value)
         if len(kinds) != len(value):
-            return problems.append(f"{where} has {len(value)} entries, expected {len(kinds)}.")
+            problems.append(f"{where} has {len(value)} entries, expected {len(kinds)}.")
+            return None
         return tuple(
             _value(kind, value[i], f"{where}[{i}]", problems) for i, kind in enumerate(kinds)
         )

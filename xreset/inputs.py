@@ -149,14 +149,18 @@ def load_inputs(
     else:
         loaded = load_objects(names, folder)
         robot = robot or data.robot
-    spec = None if robot is None else load_robot(robot)
+    robot_name = None
+    spec = None
+    if robot is not None:
+        robot_name = robot.name if isinstance(robot, RobotSpec) else str(robot)
+        spec = load_robot(robot)
     inputs = Inputs(
         data=data,
         objects=loaded,
         path=path,
         hash=file_hash(path) if path else None,
         objects_folder=folder,
-        robot_name=robot.name if isinstance(robot, RobotSpec) else robot and str(robot),
+        robot_name=robot_name,
         loaded_robot=spec,
     )
     if isinstance(data, GoalSet):

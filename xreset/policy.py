@@ -83,13 +83,13 @@ def check_contract(source: str, contract: Contract, robot: RobotSpec, task: Task
         "version of the robot": "Its URDF or description has changed. Train again.",
         "observation layout": "Use the run's own configuration, or train again if it is of an earlier xreset.",
     }
-    of_task = _meaning(here)
-    for part, of_policy in _meaning(contract).items():
-        here_too = of_task[part]
+    meaning_here = _meaning(here)
+    for part, trained in _meaning(contract).items():
+        needed = meaning_here[part]
         differing = [
-            f"{name}: {of_policy.get(name)!r}, here {here_too.get(name)!r}"
-            for name in of_policy | here_too
-            if of_policy.get(name) != here_too.get(name)
+            f"{name}: {trained.get(name)!r}, here {needed.get(name)!r}"
+            for name in trained | needed
+            if trained.get(name) != needed.get(name)
         ]
         if differing:
             fix = fixes.get(part, "Use the run's own configuration.")

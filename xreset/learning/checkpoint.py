@@ -104,8 +104,8 @@ def load_moments(optimizer: torch.optim.Optimizer, moments: dict[int, Any]) -> N
         ValueError: moments have another shape than their parameters; torch would notice in the next step.
     """
     optimizer.load_state_dict(optimizer.state_dict() | {"state": moments})
-    for parameter, moments in optimizer.state.items():
-        for name, value in moments.items():
+    for parameter, loaded in optimizer.state.items():
+        for name, value in loaded.items():
             if value.shape not in ((), parameter.shape):
                 raise ValueError(
                     f"{name} has shape {tuple(value.shape)}, expected {tuple(parameter.shape)}"

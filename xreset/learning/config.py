@@ -173,5 +173,7 @@ class TrainConfig(Checked):
     @property
     def uses_states(self) -> bool:
         """Whether episodes ever begin in states of the bank."""
-        points = self.schedule.demo_probability
-        return max(value for _, value in points or ((0.0, self.task.reset.demo_probability),)) > 0
+        schedule = self.schedule.demo_probability
+        if not schedule:
+            return self.task.reset.demo_probability > 0
+        return any(value > 0 for _, value in schedule)

@@ -31,9 +31,9 @@ from xreset.learning.log import TrainingLog
 from xreset.learning.ppo import SequencePpo
 from xreset.learning.recipes import resume_command
 
-MAX_SHARE = 1e-3
+MAX_FAULTY_SHARE = 1e-3
 """Largest share of world-steps that may break; the run ends beyond it."""
-WINDOW = 200
+FAULT_WINDOW = 200
 """Iterations over which the share is taken. The first iterations may use the allowance of the whole window."""
 
 
@@ -76,14 +76,16 @@ class TrainingRunner:
         )
         self.processes = Processes.of_environment()
         self.processes.join(self.device)
-        made_of = (env.get_observations(), env.num_actions, config, self.device, self.processes)
-        self.alg = (
-            SequencePpo(*made_of) if teacher is None else SequenceDistillation(*made_of, teacher)
-        )
+        given = (env.get_observations(), env.num_actions, config, self.device, self.processes)
+        self.alg: SequencePpo | SequenceDistillation
+        if teacher is None:
+            self.alg = SequencePpo(*given)
+        else:
+            self.alg = SequenceDistillation(*given, teacher)
         self.iteration = 0
         self.env_steps = 0
         self.elapsed = 0.0
-        self._fault_totals = deque([[0, 0]], maxlen=WINDOW)
+        self._fault_totals = deque([[0, 0]], maxlen=FAULT_WINDOW)
         self._resume_command = resume_command(folder, config.task.reward.own)
 
     def learn(self, total: int, *, seconds: float = math.inf) -> None:
@@ -244,12 +246,13 @@ class TrainingRunner:
         before = self._fault_totals[0]
         nonfinite = now[0] - before[0]
         overflow = now[1] - before[1]
-        if nonfinite + overflow > MAX_SHARE * WINDOW * steps:
+        if nonfinite + overflow > MAX_FAULTY_SHARE * FAULT_WINDOW * steps:
             raise RunError(
                 f"The run ends: {nonfinite} worlds were not finite and {overflow} dropped contacts or constraints in "
-                f"the last {len(self._fault_totals)} iterations, more than {MAX_SHARE:.1%} of the {WINDOW * steps} "
-                f"world-steps of {WINDOW} iterations. Look for what the robot or an object does that the engine cannot "
-                f"simulate. Then continue from the last checkpoint: {self._resume_command}"
+                f"the last {len(self._fault_totals)} iterations, more than {MAX_FAULTY_SHARE:.1%} of the "
+                f"{FAULT_WINDOW * steps} world-steps of {FAULT_WINDOW} iterations. Look for what the robot or an "
+                "object does that the engine cannot simulate. Then continue from the last checkpoint: "
+                f"{self._resume_command}"
             )
         self._fault_totals.append(now)
 

@@ -107,7 +107,7 @@ class FaultyDriver(EngineDriver):
         bias = np.repeat((faults.position_bias, faults.angle_bias), 3)
         noise = np.repeat((faults.position_noise, faults.angle_noise), 3)
         self._error = bias * drawn(1, 6) + noise * drawn(steps, 6)
-        self._lost = self._gaps(
+        self._lost = self._lost_steps(
             faults.lost_frames, drawn(int(seconds / Faults.LOSS_PERIOD) + 1), steps
         )
         is_arm = env.actions.is_arm.cpu().numpy()
@@ -116,14 +116,14 @@ class FaultyDriver(EngineDriver):
         self._missed = (drawn(steps) + 1.0) / 2.0 < faults.missed_deadlines
         self._plan_pushes(faults, drawn, steps)
         self._frames: list[dict[str, np.ndarray]] = []
-        self._shown: dict[str, np.ndarray] = {}
-        self._sent: list[tuple[np.ndarray, np.ndarray]] = []
-        self._current = env.joint_target.cpu().numpy().copy()
+        self._observed: dict[str, np.ndarray] = {}
+        self._pending: list[tuple[np.ndarray, np.ndarray]] = []
+        self._applied = env.joint_target.cpu().numpy().copy()
 
-    def _gaps(self, length: float, where: np.ndarray, steps: int) -> np.ndarray:
-        """[N, C] whether the pose of a step is lost."""
+    def _lost_steps(self, length: float, draws: np.ndarray, steps: int) -> np.ndarray:
+        """[N, C] whether the pose of a step is lost, for gaps of a length [s] whose times are drawn in [-1, 1)."""
         period = Faults.LOSS_PERIOD
-        start = period * np.arange(where.shape[1]) + (where + 1.0) / 2.0 * max(0.0, period - length)
+        start = period * np.arange(draws.shape[1]) + (draws + 1.0) / 2.0 * max(0.0, period - length)
         time = np.arange(steps)[None, :, None] * self._dt
         inside = (time >= start[:, None]) & (time < start[:, None] + length)
         return inside.any(axis=2)
@@ -163,13 +163,13 @@ class FaultyDriver(EngineDriver):
         for frame in self._frames:
             arrived = frame["arrival"] <= now + 1e-9
             for name in ("object_pos", "object_quat", "object_time"):
-                old = self._shown.get(name, frame[name])
-                self._shown[name] = np.where(
+                old = self._observed.get(name, frame[name])
+                self._observed[name] = np.where(
                     arrived.reshape(-1, *[1] * (old.ndim - 1)), frame[name], old
                 )
             frame["arrival"][arrived] = np.inf
         self._frames = [frame for frame in self._frames if np.isfinite(frame["arrival"]).any()]
-        return replace(reading, **self._shown)
+        return replace(reading, **self._observed)
 
     def _with_errors(self, reading: Reading, k: int) -> dict[str, np.ndarray]:
         """Return the pose as the tracker sees it in step k."""
@@ -190,7 +190,7 @@ class FaultyDriver(EngineDriver):
         """Send targets [N, J], which take effect later, or never."""
         due = self._substeps + self._delay
         due[self._missed[:, self._step]] = _NEVER
-        self._sent.append((due, target))
+        self._pending.append((due, target))
 
     def _advance(self, substeps: int) -> None:
         backend = self.env.backend
@@ -205,14 +205,14 @@ class FaultyDriver(EngineDriver):
         end = at + substeps
         while at < end:
             following = end
-            for due, target in self._sent:
+            for due, target in self._pending:
                 arrived = due <= at
-                self._current = np.where(arrived, target, self._current)
+                self._applied = np.where(arrived, target, self._applied)
                 due[arrived] = _NEVER
                 following = min(following, int(due.min()))
             self._target = torch.as_tensor(
-                (self._current + self._offset[:, k]).astype(np.float32), device=backend.device
+                (self._applied + self._offset[:, k]).astype(np.float32), device=backend.device
             )
             super()._advance(following - at)
             at = following
-        self._sent = [(due, target) for due, target in self._sent if (due < _NEVER).any()]
+        self._pending = [(due, target) for due, target in self._pending if (due < _NEVER).any()]

@@ -9,7 +9,7 @@ from xreset.geometry.urdf import joint_limits, prismatic_joints
 from xreset.spec import RobotSpec
 from xreset.task.config import ActionConfig
 
-FINGER = 0.04
+FINGER_LEVER = 0.04
 """[m] A hand joint that slides moves as far as a point at this distance from a joint that turns: the length of a
 finger's link."""
 
@@ -39,7 +39,7 @@ class ActionSpace:
         lower, upper = torch.tensor(joint_limits(robot), dtype=torch.float32, device=device)
         is_arm = torch.tensor(robot.is_arm, device=device)
         slides = torch.tensor(prismatic_joints(robot), device=device)
-        unit = torch.where(slides & ~is_arm, FINGER, 1.0)
+        unit = torch.where(slides & ~is_arm, FINGER_LEVER, 1.0)
         hand_step = config.hand_step if config.hand == "relative" else 0.0
         zero = (lower + upper) / 2
         below = (upper - lower) / 2
@@ -77,10 +77,10 @@ class ActionSpace:
         """Return the actions [N, J] whose targets come nearest to ``wanted`` [N, J], given the present targets."""
         action = (wanted - target) / self.step.clamp_min(1e-9)
         if self.config.hand == "absolute":
-            action = torch.where(self.is_arm, action, self.within_limits(wanted))
+            action = torch.where(self.is_arm, action, self.absolute_action(wanted))
         return action.clamp(-1.0, 1.0)
 
-    def within_limits(self, joint_pos: Tensor) -> Tensor:
-        """Return where hand joints [N, J] are between their limits, in [-1, 1] as for absolute targets."""
+    def absolute_action(self, joint_pos: Tensor) -> Tensor:
+        """Return the actions [N, J] whose absolute targets are these positions of the hand's joints."""
         above_zero = joint_pos - self.zero
         return above_zero / torch.where(above_zero < 0, self.below, self.above).clamp_min(1e-9)

@@ -63,7 +63,9 @@ class Variation:
         self._config = config
         self.parameters = self._keep_parameters(drawn, backend)
         pushed = c.draws("push")
-        needed = [*self.parameters, *(["object_wrench"] if pushed and c.push.moves_object else [])]
+        needed = list(self.parameters)
+        if pushed and c.push.moves_object:
+            needed.append("object_wrench")
         missing = [name.replace("_", " ") for name in needed if name not in backend.capabilities]
         if missing:
             raise CapabilityError(

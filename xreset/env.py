@@ -124,7 +124,7 @@ class ManipulationEnv:
         sequence: [N] demonstration of each world.
         bank_state: [N] bank state that each world's episode began with, -1 for home.
         gravity_fraction: [N] share of the object's weight that acts.
-        success_position: [] limit of success [m], ``task.reward.success_position`` unless it is filled with another.
+        success_position: [] limit of success [m], ``task.reward.success_position`` until another is filled in.
         nonfinite_count: [] number of episodes that ended because a number was not finite.
         overflow_count: [] number of episodes that ended because the engine dropped contacts.
         drawn: what is drawn at each reset in addition to the start.
@@ -538,7 +538,7 @@ class ManipulationEnv:
             )
 
     def _compute_observations(self) -> None:
-        """Refresh the observations. A fresh world's cloud history is copies, and its best reach is the present one."""
+        """Refresh the observations. A fresh world's cloud history and best reach are the present ones."""
         reading = self.reading()
         state = reading.task_state
         c = self.task.observation

@@ -186,10 +186,10 @@ def no_readings(robot: RobotSpec, num_worlds: int) -> tuple[Links, Contacts, Hea
 
 @frozen
 class MassProperties(Tensors):
-    """What the engine itself holds of the bodies that move: B of the robot (links fixed to one another are one), then
-    the object.
+    """Masses as the engine has them, of B moving bodies of the robot and then the object.
 
-    The robot's bodies are in the order of :func:`xreset.backends.rigid.mechanism`, without the base.
+    Links that are fixed to one another are one body. The robot's bodies are in the order of
+    :func:`xreset.backends.rigid.mechanism`, without the base.
     """
 
     mass: Tensor
@@ -202,9 +202,9 @@ class MassProperties(Tensors):
 
 @frozen
 class KnownDifference:
-    """A tolerance of the conformance suite that an engine is known to miss, by how much at most, and why.
+    """A check of the conformance suite for which an engine has a wider tolerance, and why.
 
-    It is still measured: beyond the bound the check fails.
+    Beyond the bound the check still fails.
     """
 
     check: str
@@ -236,9 +236,9 @@ class Backend(ABC):
     name: ClassVar[str]
     """Name in the registry."""
     capabilities: ClassVar[frozenset[Capability]]
-    """What this backend can do beyond the obligatory."""
+    """What this backend can do and others may not."""
     known_differences: ClassVar[tuple[KnownDifference, ...]] = ()
-    """What cannot agree with the reference, each with its size and reason."""
+    """Checks for which this engine has a wider tolerance."""
 
     def __init__(
         self,
@@ -328,8 +328,7 @@ class Backend(ABC):
         return self._health
 
     def mass_properties(self) -> MassProperties:
-        """Masses, centres of mass and inertias read back from the engine; the present ones, of objects whose mass was
-        set too."""
+        """Return masses, centres of mass and inertias as the engine has them now, after any change of them."""
         self._require("mass_properties")
         raise NotImplementedError
 
@@ -348,15 +347,15 @@ class Backend(ABC):
         self._set("torsional_friction", torsional, worlds)
 
     def set_object_inertia(self, scale: Tensor, worlds: Tensor | None = None) -> None:
-        """Set the factor [M] on the object's inertia about its centre of mass, next to what its mass does; 1 is what
-        the spec says."""
+        """Set the factor [M] on the object's inertia about its centre of mass, in addition to the change with its
+        mass; 1 is what the spec says."""
         self._set("object_inertia", scale, worlds)
 
     def set_object_com(self, offset: Tensor, worlds: Tensor | None = None) -> None:
-        """Move the object's centre of mass by [M, 3] m from where its spec has it, in its mesh frame; its inertia about
-        it stays.
+        """Move the object's centre of mass by [M, 3] m from that of its spec, in its mesh frame; the inertia about it
+        stays.
 
-        Of an object that moves, set the state again.
+        If the object moves, set its state again.
         """
         self._set("object_com", offset, worlds)
 

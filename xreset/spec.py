@@ -154,8 +154,8 @@ class RobotSpec:
     meshes: tuple[Path, ...] = field(default=(), repr=False, compare=False)
     """Mesh files of the URDF's collision shapes."""
     like: str = field(default="", repr=False)
-    """Fingerprint of the robot that this one differs from in nothing but shapes, so that its policies play here; no
-    part of its own."""
+    """Fingerprint of a robot that differs in shapes only: its policies play here. It is no part of this robot's
+    fingerprint."""
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -232,7 +232,7 @@ class ObjectSpec(Brief):
     source: str = "stand-in"
     """Where the geometry comes from: ``stand-in`` or the mesh file's SHA-256."""
     friction: float | None = None
-    """Coefficient of its material: the middle of what the task draws for it. None: as the task draws."""
+    """Coefficient of its material, around which the task draws. None: the task's own range."""
 
 
 @frozen

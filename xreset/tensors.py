@@ -65,8 +65,8 @@ def where(mask: Tensor, yes: _Batch, no: _Batch) -> _Batch:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Batches here are small: a second thread gains nothing, and spins while it waits, which beside other work costs
-    many times the run."""
+    """Let torch use one thread. For small batches a second one gains nothing and spins while it waits, which slows
+    other processes."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

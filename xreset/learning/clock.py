@@ -16,7 +16,7 @@ SCHEMA = "xreset-lift/1"
 FILE = "lift.json"
 """File next to ``run.json``."""
 SHARES = (0.01, 0.1, 0.5)
-"""Shares of the home worlds' steps spent at the goal whose first passing is noted."""
+"""Shares of success from home whose first passing is recorded."""
 
 
 @frozen

@@ -18,7 +18,7 @@ class Processes:
 
     rank: int = 0
     local_rank: int = 0
-    """Number among the processes of this machine, and of its GPU."""
+    """Rank among the processes of this machine, and index of its GPU."""
     count: int = 1
 
     @classmethod
@@ -32,7 +32,7 @@ class Processes:
 
     @property
     def ranks(self) -> dict[str, int] | None:
-        """What rsl-rl's algorithms want to know of several processes."""
+        """Rank and count as rsl-rl's algorithms take them; None: there is one process."""
         return {"global_rank": self.rank, "world_size": self.count} if self.count > 1 else None
 
     @property

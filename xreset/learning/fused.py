@@ -222,11 +222,9 @@ def _columns(width: int) -> int:
 @functools.cache
 def _processors(device: torch.device) -> int:
     """Multiprocessors of a GPU; 2 elsewhere, where Triton's interpreter runs the programs one after the other."""
-    return (
-        torch.cuda.get_device_properties(device).multi_processor_count
-        if device.type == "cuda"
-        else 2
-    )
+    if device.type != "cuda":
+        return 2
+    return torch.cuda.get_device_properties(device).multi_processor_count
 
 
 def supports(points: int, widths: tuple[int, ...]) -> bool:
@@ -243,7 +241,7 @@ def supports(points: int, widths: tuple[int, ...]) -> bool:
 def fused_pointnet(
     cloud: Tensor, w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, w3: Tensor, b3: Tensor
 ) -> Tensor:
-    """Embed clouds [..., P, K] as [..., C]: layers K -> A -> B -> C (weights as of ``nn.Linear``) with ELU between,
+    """Embed clouds [..., P, K] as [..., C]: layers K -> A -> B -> C (weights as in ``nn.Linear``) with ELU between,
     maximum over points.
 
     Matrix products take bfloat16 factors: against the plain layers in float32 the result differs by some 1e-3 of its

@@ -96,7 +96,7 @@ class SequencePpo(PPO):
         self._sums = torch.zeros(4, device=device)
         self._worlds = torch.zeros(count // self.num_mini_batches, dtype=torch.long, device=device)
         self._graphs = GraphRunner(torch.device(device))
-        # all minibatches alike
+        # a graph needs minibatches of one size
         self._graphs.active &= not self.is_multi_gpu and count % self.num_mini_batches == 0
 
     def update(self) -> dict[str, float]:

@@ -168,8 +168,7 @@ class Candidate(Checked):
     name: str
     """File name of the checkpoint or policy."""
     task_progress: Annotated[dict[str, Share], Rule("an engine at least", bool)]
-    """Engine -> mean over the episodes; without engines in which it was not played because it could no longer be
-    chosen."""
+    """Engine -> mean over the episodes. Engines are missing once the candidate could no longer be chosen."""
 
     @property
     def worst(self) -> float:

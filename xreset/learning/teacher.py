@@ -93,13 +93,13 @@ def _weights(graph: GraphProto) -> dict[str, Tensor]:
             weights["trunk.lstm.bias_ih_l0"] = _reordered(input_bias)
             weights["trunk.lstm.bias_hh_l0"] = _reordered(recurrent_bias)
             for name, given in zip(("weight_ih_l0", "weight_hh_l0"), node.input[1:3], strict=True):
-                if given in found:  # of a small network, the exporter has reordered the gates
+                if given in found:  # in a small network, the exporter has reordered the gates
                     weights[f"trunk.lstm.{name}"] = _reordered(found[given][0])
     return weights
 
 
 def _arrays(graph: GraphProto) -> Iterator[tuple[str, Tensor]]:
-    """Yield the names and values of a graph's constants; those stored in float16 by the name before."""
+    """Yield the names and values of a graph's constants; names of float16 constants without their suffix."""
     from onnx import numpy_helper
 
     for constant in graph.initializer:

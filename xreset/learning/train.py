@@ -365,11 +365,9 @@ def _run(
         except (MemoryError, RuntimeError) as error:
             if isinstance(error, RuntimeError) and not _NO_MEMORY.search(str(error)):
                 raise
-            state = (
-                "the last checkpoint can be used"
-                if checkpoints(out)
-                else "no checkpoint was written"
-            )
+            state = "no checkpoint was written"
+            if checkpoints(out):
+                state = "the last checkpoint can be used"
             raise RunError(
                 f"{info.num_envs} worlds on {info.device} need more memory than there is; {state}. "
                 "Start with fewer (--num-envs), or smaller minibatches (--config.ppo.minibatch-size), in another --out."

@@ -150,7 +150,7 @@ def write_deployed(policy: Path, contract: dict[str, Any], out: Path) -> None:
 
     Args:
         policy: exported policy (.onnx).
-        contract: what :func:`deploy_contract` says of it.
+        contract: what :func:`deploy_contract` returns for it.
         out: folder to write; must not exist, or be empty.
 
     Raises:

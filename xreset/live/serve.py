@@ -37,7 +37,7 @@ class PolicyServer:
     def __init__(
         self, contract: dict[str, Any], policy: bytes, *, host: str = "127.0.0.1", port: int = 8765
     ) -> None:
-        """Begin to listen.
+        """Start listening.
 
         Args:
             contract: what the policy expects.
@@ -75,7 +75,7 @@ class PolicyServer:
         self._server.serve_forever()
 
     def close(self) -> None:
-        """Stop to listen, and end all connections."""
+        """Stop listening, and end all connections."""
         self._server.shutdown()
         for client in tuple(self._clients):
             client.close()

@@ -164,8 +164,8 @@ def no_states(robot: RobotSpec) -> dict[str, Any]:
 def starts_and_goals(
     motions: ObjectMotions, robot: RobotSpec, objects: Sequence[ObjectSpec] = ()
 ) -> ResetBank:
-    """Return a bank of demonstrations or trajectories without states; ``objects`` tell where their geometry came
-    from."""
+    """Return a bank of demonstrations or trajectories without states; ``objects`` state the sources of their
+    geometry."""
     start_pos, start_quat = motions.start_pose
     goal_pos, goal_quat = motions.goal_pose
     sources = {o.name: o.source for o in objects}

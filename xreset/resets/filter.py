@@ -42,8 +42,7 @@ REASONS = (
     "not finite",
     "overflow",
 )
-"""Why a candidate is rejected. Where several reasons apply, the last one is stated: a state that is not finite is
-nothing else."""
+"""Why a candidate is rejected. Where several reasons apply, the last one is stated."""
 
 
 def rejection(backend: Backend, start: State, limits: FilterConfig) -> Tensor:

@@ -129,8 +129,8 @@ def squeeze_targets(
     positions.
 
     Args:
-        robot: its drives.
-        fingers: of the same states.
+        robot: robot of the states.
+        fingers: how near its fingers are to the objects.
         joint_pos: [M, J]
         config: which fingers press, and how hard.
     """
@@ -152,16 +152,17 @@ def squeeze_targets(
 
 
 _LEVER = 0.05
-"""Lever arm [m] with which a torque that is left counts as much as a force."""
+"""Lever arm [m] with which a remaining torque weighs as much as a force."""
 _EVEN = 0.1
-"""How much it counts that forces differ from one another, next to the forces and torques that are left."""
+"""Weight of the factors' differences from 1, next to the remaining force and torque."""
 
 
 def _balance(fingers: Fingers, pressing: Tensor) -> Tensor:
     """Return a factor on the force of each pressing finger [M, G], with mean 1, so that all forces nearly cancel.
 
     With equal forces four fingers push an object out past the one thumb that opposes them. The factors are the least
-    squares solution without negative ones: what is left of force and torque on the object, and the differences to 1.
+    squares solution without negative values. The errors are the remaining force and torque on the object, and the
+    differences of the factors from 1.
     """
     arm = torch.linalg.cross(fingers.lever, fingers.inward) / _LEVER
     wrench = torch.cat((fingers.inward, arm), dim=-1).numpy()

@@ -348,11 +348,11 @@ def _about_z(angle: float) -> Rotation:
 
 def _reached(reach: Reach, drawn: Sequence[_Episode]) -> list[_Episode]:
     """Return the episodes whose goal is above the table and can be reached."""
-    above = [
-        e
-        for e in drawn
-        if e.goal[2] >= rest_height(e.obj, quat_of(e.goal_turn)) + e.goal_turn.apply(e.obj.com)[2]
-    ]
+    above = []
+    for e in drawn:
+        lowest = rest_height(e.obj, quat_of(e.goal_turn)) + e.goal_turn.apply(e.obj.com)[2]
+        if e.goal[2] >= lowest:
+            above.append(e)
     if not above:
         return []
     turns = Rotation.concatenate([e.goal_turn * e.start_turn.inv() for e in above])

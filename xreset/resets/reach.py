@@ -58,8 +58,8 @@ class Reach:
             link = joint.parent
 
     def stretches_to(self, places: np.ndarray) -> np.ndarray:
-        """[N] bool: whether places [N, 3] in the world are no farther from the base than the stretched arm. Where it
-        cannot hold anything, this may be true."""
+        """[N] bool: whether places [N, 3] in the world are no farther from the base than the stretched arm, whether
+        or not it can hold anything there."""
         return np.linalg.norm(places - self._base, axis=1) <= self._stretch
 
     @one_thread()
@@ -76,7 +76,7 @@ class Reach:
         tried = 0
         while tried < len(self._grasps) and not held.all():
             left = np.flatnonzero(~held)
-            # few objects: many at once
+            # the fewer objects are left, the more grasps at once
             grasps = self._grasps[tried : tried + max(1, len(self._grasps) // len(left))]
             tried += len(grasps)
             rows = np.repeat(left, len(grasps))

@@ -51,7 +51,7 @@ class Reading:
     tip_force: Array | None = None
     """[N, E, 3] force of each fingertip on the object, world frame [N]; None: the robot does not measure it."""
     links: Links | None = None
-    """Only of an engine; None: they follow from the joints."""
+    """Measured links, which only engines have; None: they are computed from the joints."""
 
     def batched(self) -> Reading:
         """Return the reading with the axis N, in float32 (times: float64).

@@ -495,11 +495,9 @@ class TaskConfig(Checked):
     @property
     def policy_groups(self) -> tuple[str, str, str]:
         """Names of the observation groups that a policy gets: two flat ones, then clouds or images."""
-        return (
-            ("goal", "proprio", "view")
-            if self.vision.cameras
-            else ("policy", "proprio", "perception")
-        )
+        if self.vision.cameras:
+            return "goal", "proprio", "view"
+        return "policy", "proprio", "perception"
 
     @property
     def picture_shape(self) -> tuple[int, int, int]:

@@ -23,7 +23,7 @@ class Pushes:
     """
 
     def __init__(self, drawn: Drawn, backend: Backend, config: PushConfig, is_arm: Tensor) -> None:
-        """Allocate, and have the probabilities drawn with all that is drawn at a reset; ``is_arm`` [J] bool."""
+        """Allocate, and register what is drawn at each reset; ``is_arm`` [J] bool."""
         self.config = config
         low, high = (log(limit) for limit in config.probability)
         scene = backend.scene

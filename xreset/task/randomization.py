@@ -23,7 +23,7 @@ class Drawn:
     """
 
     def __init__(self, num_worlds: int, device: torch.device) -> None:
-        """Begin with none."""
+        """Start without buffers."""
         self.num_worlds = num_worlds
         self.device = device
         self.lasting: dict[str, Tensor] = {}
@@ -49,7 +49,7 @@ class Drawn:
         return buffer
 
     def draw(self, fresh: Tensor, generator: torch.Generator) -> None:
-        """Draw for every world, so that nothing waits for their number; the worlds of a mask [N] take the values."""
+        """Draw values for every world, so that nothing waits for a count; the worlds of a mask [N] take them."""
         for sample, buffer, is_fault in self._samples:
             values = sample(generator).view_as(buffer)
             if is_fault:

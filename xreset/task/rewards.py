@@ -28,7 +28,7 @@ from xreset.task.config import RewardConfig
 
 @frozen
 class RewardInput:
-    """What the reward looks at; N worlds, E fingertips with the thumb first."""
+    """What the reward is computed from; N worlds, E fingertips with the thumb first."""
 
     tip_distance: Tensor
     """[N, E] distance from each fingertip to the object's surface [m]."""
@@ -70,7 +70,7 @@ class RewardInput:
 
 @frozen
 class Reward:
-    """Weighted terms and what they rest on."""
+    """The reward, its terms and their conditions."""
 
     total: Tensor
     """[N] scaled sum of the terms."""

@@ -14,8 +14,7 @@ def out_of_bounds(object_pos: Tensor, table: TableSpec, c: TerminationConfig) ->
     Args:
         object_pos: [N, 3] origin of the object, world frame.
     """
-    offset = [
-        (object_pos[:, k] - table.center[k]).abs() > table.half_size[k] + c.margin for k in range(2)
-    ]
-    beside = offset[0] | offset[1]
-    return beside | (object_pos[:, 2] < c.object_low) | (object_pos[:, 2] > c.object_high)
+    x, y, z = object_pos.unbind(dim=-1)
+    is_far = (x - table.center[0]).abs() > table.half_size[0] + c.margin
+    is_far |= (y - table.center[1]).abs() > table.half_size[1] + c.margin
+    return is_far | (z < c.object_low) | (z > c.object_high)

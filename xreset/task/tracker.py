@@ -14,10 +14,10 @@ from xreset.task.randomization import Drawn, sample_range, symmetric, uniform
 
 
 class Tracker:
-    """Fixed buffers of N worlds. What is off costs nothing and draws no random number."""
+    """Fixed buffers of N worlds. A fault that is off costs nothing and draws no random number."""
 
     def __init__(self, drawn: Drawn, config: RandomizationConfig) -> None:
-        """Allocate, and have what lasts for an episode drawn with all that is drawn at a reset."""
+        """Allocate, and register what is drawn at each reset."""
         c = config.tracker if config.enabled else TrackerConfig()
         self._config = c
         self._fault_scale = drawn.fault_scale

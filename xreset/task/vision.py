@@ -23,10 +23,10 @@ class Vision:
     """
 
     def __init__(self, drawn: Drawn, backend: Backend, task: TaskConfig) -> None:
-        """Allocate, and start the renderer; ``drawn`` is what is drawn at each reset.
+        """Allocate, register what is drawn at each reset, and start the renderer.
 
         Raises:
-            XResetError: as of :class:`~xreset.cameras.sensor.Cameras`.
+            XResetError: as for :class:`~xreset.cameras.sensor.Cameras`.
         """
         self._backend = backend
         c = task.randomization
@@ -58,8 +58,8 @@ class Vision:
         self._delay = DelayLine(drawn, "delayed_views", width, longest, age, is_fault=False)
 
     def aim(self, state: State, goal_pos: Tensor, goal_quat: Tensor, episode_step: Tensor) -> None:
-        """Put bodies and cameras where they are; arguments as of :meth:`Cameras.aim`, and control steps [N] since each
-        world's reset."""
+        """Move the renderer's bodies and cameras to the present state; arguments as for :meth:`Cameras.aim`, and
+        control steps [N] since each world's reset."""
         due = episode_step % self.cameras.config.interval == 0
         self.cameras.aim(state, goal_pos, goal_quat, due)
 
@@ -82,7 +82,7 @@ class Vision:
             )
 
     def observe(self, fresh: Tensor, generator: torch.Generator) -> Tensor:
-        """[N, ...] what the policy sees: :attr:`~xreset.cameras.config.VisionConfig.view_shape`.
+        """[N, ...] what the policy sees, of shape :attr:`~xreset.cameras.config.VisionConfig.view_shape`.
 
         In the ``fresh`` worlds [N] the present view becomes the whole past.
         """

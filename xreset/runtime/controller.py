@@ -167,56 +167,74 @@ class Controller:
 
     def observe(self, reading: Reading) -> tuple[Array, Array]:
         """Return the policy's inputs: [N, F] flat, and the cloud [N, H, P, K]."""
-        o = self.contract["observation"]
         links = reading.links or self.kinematics.links(reading.joint_pos, reading.joint_vel)
-        limits = (self._scaled_lower, self._scaled_upper)
-        joint_pos = _scaled(reading.joint_pos, *limits)
-        if o["content"] == "published":
-            joints = [joint_pos, _scaled(self.target, *limits)]
-            flat = np.concatenate((*self._observe_geometry(reading, links), *joints), axis=1)
-            return flat, self._observe_cloud(reading)
+        if self.contract["observation"]["content"] == "published":
+            terms = self._published_terms(reading, links)
+        else:
+            terms = self._draft_terms(reading, links)
+        return np.concatenate(terms, axis=1), self._observe_cloud(reading)
+
+    def _draft_terms(self, reading: Reading, links: Links) -> list[Array]:
+        """Return the flat observations of the draft of the paper, each [N, ...]."""
+        o = self.contract["observation"]
         count = len(self.target)
+        pos = self._origin(reading.object_pos, reading.object_quat)
+        if o["rotation"] == "to_goal":
+            inverse = reading.object_quat * np.array([1, -1, -1, -1], np.float32)
+            to_goal = multiply(self._goal_quat, inverse)
+            poses = [pos, self._goal_pos, self._encoded(to_goal)]
+        else:
+            quat = self._encoded(reading.object_quat)
+            poses = [pos, quat, self._goal_pos, self._encoded(self._goal_quat)]
         force = reading.tip_force
         if force is None:
             force = np.zeros_like(links.tip_pos)
-        pose = [self._origin(reading.object_pos, reading.object_quat)]
-        if o["rotation"] == "to_goal":
-            inverse = reading.object_quat * np.array([1, -1, -1, -1], np.float32)
-            pose += [self._goal_pos, _shown(multiply(self._goal_quat, inverse), o["rotation"])]
-        else:
-            pose += [_shown(reading.object_quat, o["rotation"]), self._goal_pos]
-            pose += [_shown(self._goal_quat, o["rotation"])]
-        parts = [
-            *pose,
+        terms = [
+            *poses,
             np.ones((count, 1), np.float32),  # the share of its weight that the object has
             self.action,
-            joint_pos,
+            self._scaled(reading.joint_pos),
             np.float32(o["joint_vel_scale"]) * reading.joint_vel,
             links.palm_pos,
-            _shown(links.palm_quat, o["rotation"]),
+            self._encoded(links.palm_quat),
             links.palm_linvel,
             links.palm_angvel,
             links.tip_pos.reshape(count, -1),
             np.clip(np.float32(o["contact_force_scale"]) * force, -1.0, 1.0).reshape(count, -1),
         ]
         if o["joint_target"]:
-            parts.append(self.target - reading.joint_pos)
-        return np.concatenate(parts, axis=1), self._observe_cloud(reading)
+            terms.append(self.target - reading.joint_pos)
+        return terms
 
-    def _world_points(self, reading: Reading) -> Array:
-        """[N, P, 3] the object's points."""
-        origin = self._origin(reading.object_pos, reading.object_quat)
-        return rotate(reading.object_quat[:, None], self._points) + origin[:, None]
-
-    def _observe_geometry(self, reading: Reading, links: Links) -> tuple[Array, Array]:
-        """Return vectors from the fingertips to the nearest points [N, 3 E], and the palm's least distance [N, 1]."""
-        count = len(self.target)
+    def _published_terms(self, reading: Reading, links: Links) -> list[Array]:
+        """Return the flat observations of the published paper, each [N, ...]."""
         links_pos = np.concatenate((links.palm_pos[:, None], links.tip_pos), axis=1)
         offsets = self._world_points(reading)[:, None] - links_pos[:, :, None]
         nearest = np.square(offsets).sum(axis=-1).argmin(axis=-1)
         vectors = np.take_along_axis(offsets, nearest[:, :, None, None], axis=2)[:, :, 0]
         x, y, z = np.split(np.square(vectors[:, 0]), 3, axis=1)
-        return vectors[:, 1:].reshape(count, -1), np.sqrt(x + y + z)
+        return [
+            vectors[:, 1:].reshape(len(vectors), -1),
+            np.sqrt(x + y + z),
+            self._scaled(reading.joint_pos),
+            self._scaled(self.target),
+        ]
+
+    def _scaled(self, joints: Array) -> Array:
+        """[N, J] joint positions between their limits, in [-1, 1]."""
+        lower = self._scaled_lower
+        return np.float32(2.0) * (joints - lower) / (self._scaled_upper - lower) - np.float32(1.0)
+
+    def _encoded(self, quat: Array) -> Array:
+        """[N, 4] or [N, 6] a rotation as the policy observes it."""
+        if self.contract["observation"]["rotation"] == "quaternion":
+            return np.where(quat[:, :1] < 0, -quat, quat)
+        return rotate(quat[:, None], np.eye(3, dtype=np.float32)[:2]).reshape(len(quat), 6)
+
+    def _world_points(self, reading: Reading) -> Array:
+        """[N, P, 3] the object's points."""
+        origin = self._origin(reading.object_pos, reading.object_quat)
+        return rotate(reading.object_quat[:, None], self._points) + origin[:, None]
 
     def _observe_cloud(self, reading: Reading) -> Array:
         o = self.contract["observation"]
@@ -245,15 +263,3 @@ def load_controller(folder: str | Path) -> Controller:
     """Return the controller of a folder that ``xreset export deploy`` wrote; ``LiveError`` if it cannot be used."""
     contract = read_contract(folder)
     return Controller(contract, OnnxActor((Path(folder) / POLICY).read_bytes()))
-
-
-def _scaled(joints: Array, lower: Array, upper: Array) -> Array:
-    """[N, J] joint positions between their limits, in [-1, 1]."""
-    return np.float32(2.0) * (joints - lower) / (upper - lower) - np.float32(1.0)
-
-
-def _shown(quat: Array, rotation: str) -> Array:
-    """[N, 4] or [N, 6] a rotation as the policy observes it."""
-    if rotation == "quaternion":
-        return np.where(quat[:, :1] < 0, -quat, quat)
-    return rotate(quat[:, None], np.eye(3, dtype=np.float32)[:2]).reshape(len(quat), 6)

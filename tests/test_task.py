@@ -25,7 +25,7 @@ from xreset.geometry.rotations import (
 )
 from xreset.learning.recipes import RECIPES
 from xreset.physics import Links, State
-from xreset.policy import RandomPolicy, ZeroPolicy, check_contract, policy_contract, read_contract
+from xreset.policy import RandomPolicy, ZeroPolicy, check_contract, parsed_contract, policy_contract
 from xreset.resets.distribution import ResetDistribution
 from xreset.spec import TableSpec
 from xreset.task import observations as obs
@@ -711,7 +711,7 @@ class PolicyTest(TestCase):
     def refused(self, words, task=None, **changes):
         contract = asdict(policy_contract(self.robot, self.TASK, (SOUP,))) | changes
         with self.subTest(words), self.assertRaisesRegex(PolicyError, f"(?s)p.onnx.*{words}"):
-            read = read_contract("p.onnx", contract)
+            read = parsed_contract("p.onnx", contract)
             check_contract("p.onnx", read, self.robot, task or self.TASK)
 
     def test_its_own_robot_and_task_are_accepted(self):
@@ -719,7 +719,7 @@ class PolicyTest(TestCase):
         for name in ("cloud_scale", "rotation"):  # which files of earlier versions do not have
             del contract["task"]["observation"][name]
         for task in (self.TASK, evaluation_task(self.TASK)):
-            check_contract("p.onnx", read_contract("p.onnx", contract), self.robot, task)
+            check_contract("p.onnx", parsed_contract("p.onnx", contract), self.robot, task)
 
     def test_refusals_name_what_differs(self):
         layout = policy_contract(self.robot, self.TASK, ()).observation_layout

@@ -5,7 +5,7 @@ import json
 import numpy as np
 from onnx import TensorProto, helper, numpy_helper
 
-from xreset.policy import observation_shapes, read_contract
+from xreset.policy import observation_shapes, parsed_contract
 
 
 def write_policy(
@@ -23,7 +23,7 @@ def write_policy(
         state: ONNX operator that makes the LSTM's new state from the old one.
         metadata: in place of the contract: text, or a dictionary.
     """
-    policy, proprio, cloud = observation_shapes(read_contract("it", contract), "it").values()
+    policy, proprio, cloud = observation_shapes(parsed_contract("it", contract), "it").values()
     flat = policy[0] + proprio[0]
     shapes = {
         "flat": ["n", flat],

@@ -119,7 +119,7 @@ def _meaning(contract: Contract) -> dict[str, dict[str, Any]]:
     }
 
 
-def read_contract(source: str, contract: Any) -> Contract:
+def parsed_contract(source: str, contract: Any) -> Contract:
     """Return a contract with types; ``PolicyError`` if it lacks an entry or holds one of another type."""
     typed, problems = parsed(Contract, contract, f"The contract of {source}")
     if typed is None:
@@ -194,7 +194,7 @@ class OnnxPolicy:
             raise PolicyError(
                 f"{path} holds a contract that is not valid JSON ({error}). Export it again."
             ) from error
-        self.contract = read_contract(str(path), contract)
+        self.contract = parsed_contract(str(path), contract)
         self._state: list[np.ndarray] | None = None
         self._try_step(path)
         self.name = path.stem if path.stem != "policy" else path.resolve().parent.name

@@ -173,7 +173,7 @@ def train(
         weights_hash=file_hash(start) if start else None,
         teacher=str(teacher) if teacher else None,
     )
-    _run(out, info, inputs, minutes=minutes, resumed=False, wandb=wandb)
+    _train_alone(out, info, inputs, minutes=minutes, resumed=False, wandb=wandb)
     return out
 
 
@@ -324,7 +324,7 @@ def resume(
             f"{info.resets} is not the file that this run was started with. Put it back, or start a new run."
         )
     check_contract(str(out), info.contract, inputs.robot, info.config.task)
-    _run(out, info, inputs, minutes=minutes, resumed=True, wandb=wandb)
+    _train_alone(out, info, inputs, minutes=minutes, resumed=True, wandb=wandb)
     return out
 
 
@@ -334,7 +334,7 @@ _NO_MEMORY = re.compile("Failed to allocate|out of memory")
 """How Warp reports too little memory, as a ``RuntimeError``."""
 
 
-def _run(
+def _train_alone(
     out: Path,
     info: RunInfo,
     inputs: Inputs,
@@ -411,7 +411,7 @@ def _train(
         elif info.weights is not None:
             runner.load_networks(Path(info.weights))
         if processes.is_main:
-            _begin(out, info, runner.iteration, is_new=newest is None, resumed=resumed)
+            _write_start(out, info, runner.iteration, is_new=newest is None, resumed=resumed)
         runner.learn(info.config.iterations, seconds=60 * minutes)
     if processes.is_main:
         policy = out / "policy.onnx"
@@ -420,7 +420,7 @@ def _train(
         print(f"policy after {runner.iteration} iterations in {policy}", flush=True)
 
 
-def _begin(out: Path, info: RunInfo, iteration: int, *, is_new: bool, resumed: bool) -> None:
+def _write_start(out: Path, info: RunInfo, iteration: int, *, is_new: bool, resumed: bool) -> None:
     """Write ``run.json``, and say where a resumed run continues."""
     # before the first checkpoint a killed run leaves nothing worth keeping; files without a run are of others
     if is_new and (out / "run.json").is_file():

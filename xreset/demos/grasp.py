@@ -184,6 +184,37 @@ def _centers(
     return (low + high) / 2 * flat + c * closing + a * away + z * (0.0, 0.0, 1.0)
 
 
+def _part_around(solid: Solid, origins: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Find the part of the object around each point of a line: the pieces that hold the point, and those that overlap
+    them on the line.
+
+    Args:
+        solid: the object.
+        origins: [n, 5, 3] points.
+        direction: [3] of all lines.
+
+    Returns:
+        [6, n, 5] where the part starts and ends on the line, inf and -inf where no piece holds the point [m]; the free
+        room before the start and after the end [m]; the cosines of the angles between line and surface normal there.
+    """
+    enter, leave, normal_in, normal_out = solid.crossings(origins, direction)
+    holds = (enter <= 0) & (leave >= 0)
+    start = np.where(holds, enter, np.inf).min(axis=0)
+    end = np.where(holds, leave, -np.inf).max(axis=0)
+    for _ in range(len(solid.planes)):
+        touches = (enter <= end + _TOUCH) & (leave >= start - _TOUCH) & (enter <= leave)
+        start = np.minimum(start, np.where(touches, enter, np.inf).min(axis=0))
+        end = np.maximum(end, np.where(touches, leave, -np.inf).max(axis=0))
+    other = (enter <= leave) & ((leave < start - _TOUCH) | (enter > end + _TOUCH))
+    room_before = start - np.where(other & (leave < start), leave, -np.inf).max(axis=0)
+    room_after = np.where(other & (enter > end), enter, np.inf).min(axis=0) - end
+    first = (enter == start).argmax(axis=0)[None, ..., None]
+    last = (leave == end).argmax(axis=0)[None, ..., None]
+    facing_start = -(np.take_along_axis(normal_in, first, axis=0)[0] @ direction)
+    facing_end = np.take_along_axis(normal_out, last, axis=0)[0] @ direction
+    return np.stack((start, end, room_before, room_after, facing_start, facing_end))
+
+
 def _contacts_at(
     solid: Solid,
     centers: np.ndarray,
@@ -197,22 +228,9 @@ def _contacts_at(
     up_hand = np.cross(approach, closing) * handedness(side)
     # [n, 5, 3]: the lines of the thumb and the fingers
     origins = centers[:, None] + _STACK[:, None] * up_hand
-    enter, leave, normal_in, normal_out = solid.crossings(origins, closing)
-    # The part of the object around each origin: merge the pieces whose intervals overlap the one that holds it.
-    holds = (enter <= 0) & (leave >= 0)
-    start = np.where(holds, enter, np.inf).min(axis=0)
-    end = np.where(holds, leave, -np.inf).max(axis=0)
-    for _ in range(len(solid.planes)):
-        touches = (enter <= end + _TOUCH) & (leave >= start - _TOUCH) & (enter <= leave)
-        start = np.minimum(start, np.where(touches, enter, np.inf).min(axis=0))
-        end = np.maximum(end, np.where(touches, leave, -np.inf).max(axis=0))
-    other = (enter <= leave) & ((leave < start - _TOUCH) | (enter > end + _TOUCH))
-    room_before = start - np.where(other & (leave < start), leave, -np.inf).max(axis=0)
-    room_after = np.where(other & (enter > end), enter, np.inf).min(axis=0) - end
-    first = (enter == start).argmax(axis=0)[None, ..., None]
-    last = (leave == end).argmax(axis=0)[None, ..., None]
-    facing_fingers = -(np.take_along_axis(normal_in, first, axis=0)[0] @ closing)
-    facing_thumb = np.take_along_axis(normal_out, last, axis=0)[0] @ closing
+    start, end, room_before, room_after, facing_fingers, facing_thumb = _part_around(
+        solid, origins, closing
+    )
     above_table = origins[..., 2] > 0.007
     fits = np.isfinite(start) & (room_before > _FINGER_ROOM) & (facing_fingers > 0.6) & above_table
     middle_start = np.median(np.where(fits, start, 0.0)[:, 1:3], axis=1, keepdims=True)

@@ -145,6 +145,51 @@ def judge(
     """
     objects = checked_objects(robot, objects)
     check_states(bank, robot, objects)
+    tried, start = _grasps(bank, robot, objects, states, squeeze)
+    count = tried.num_states
+    used = [spec for spec in objects if spec.name in tried.object_name]
+    names = [spec.name for spec in used]
+    scene = SceneSpec(robot=robot, objects=tuple(used))
+    groups = {name: np.flatnonzero(tried.object_name == name) for name in names}
+    rows = []
+    shots: dict[str, np.ndarray] = {}
+    for number, backend in enumerate(backends):
+        before = number * count
+        table = probe(
+            backend, scene, tried.object_name, start, partial(_play, Kinematics(robot)), gravity=0.0,
+            steps=_CLOSE_STEPS, num_envs=num_envs, device=device,
+            progress=lambda done, before=before: progress(before + done, len(backends) * count),
+        )  # fmt: skip
+        verdicts = table[:, : 1 + len(PHASES)].astype(int)
+        for name, mine in {**groups, "all": np.arange(count)}.items():
+            able, hold, lift, turn = verdicts[mine].sum(axis=0).tolist()
+            row = Judged(
+                backend=backend,
+                object_name=name,
+                tried=len(mine),
+                hold=hold,
+                lift=lift,
+                turn=turn,
+                arm_fails=len(mine) - able,
+            )
+            rows.append(row)
+        if number == 0:
+            for name, mine in groups.items():
+                best = mine[verdicts[mine, 1:].sum(axis=1).argmax()]
+                later = table[best, 1 + len(PHASES) :].reshape(len(PHASES), -1)
+                shots[name] = np.vstack((_moment(start[[best]]).numpy(), later))
+    without = sorted({*bank.object_names} - set(names))
+    return Judgement(robot=robot.name, rows=tuple(rows), without=tuple(without), shots=shots)
+
+
+def _grasps(
+    bank: ResetBank,
+    robot: RobotSpec,
+    objects: Sequence[ObjectSpec],
+    states: int,
+    squeeze: SqueezeConfig,
+) -> tuple[ResetBank, State]:
+    """Return the states to try, and how they start: at rest, with targets that press on the object."""
     height = bank.object_pos[:, 2] - bank.start_pos[bank.sequence_index, 2]
     lifted = bank.with_states(np.flatnonzero(bank.post_contact & (height > LIFT)))
     if not lifted.num_states:
@@ -170,41 +215,8 @@ def judge(
         )
     targets = squeeze_targets(robot, fingers, lifted.joint_pos, squeeze)[chosen]
     tried = lifted.with_states(np.array(chosen))
-    used = [spec for spec in objects if spec.name in tried.object_name]
-    names = [spec.name for spec in used]
-    scene = SceneSpec(robot=robot, objects=tuple(used))
     arrays = (tried.joint_pos, tried.object_pos, tried.object_quat_wxyz, targets)
-    start = State.at_rest(*map(torch.as_tensor, arrays))
-    groups = {name: np.flatnonzero(tried.object_name == name) for name in names}
-    rows = []
-    shots: dict[str, np.ndarray] = {}
-    for number, backend in enumerate(backends):
-        before = number * len(chosen)
-        table = probe(
-            backend, scene, tried.object_name, start, partial(_play, Kinematics(robot)), gravity=0.0,
-            steps=_CLOSE_STEPS, num_envs=num_envs, device=device,
-            progress=lambda done, before=before: progress(before + done, len(backends) * len(chosen)),
-        )  # fmt: skip
-        verdicts = table[:, : 1 + len(PHASES)].astype(int)
-        for name, mine in {**groups, "all": np.arange(len(chosen))}.items():
-            able, hold, lift, turn = verdicts[mine].sum(axis=0).tolist()
-            row = Judged(
-                backend=backend,
-                object_name=name,
-                tried=len(mine),
-                hold=hold,
-                lift=lift,
-                turn=turn,
-                arm_fails=len(mine) - able,
-            )
-            rows.append(row)
-        if number == 0:
-            for name, mine in groups.items():
-                best = mine[verdicts[mine, 1:].sum(axis=1).argmax()]
-                later = table[best, 1 + len(PHASES) :].reshape(len(PHASES), -1)
-                shots[name] = np.vstack((_moment(start[[best]]).numpy(), later))
-    without = sorted({*bank.object_names} - set(names))
-    return Judgement(robot=robot.name, rows=tuple(rows), without=tuple(without), shots=shots)
+    return tried, State.at_rest(*map(torch.as_tensor, arrays))
 
 
 def _tightest(fingers: Fingers, bank: ResetBank, count: int, reach: float) -> list[int]:

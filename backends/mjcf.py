@@ -166,6 +166,7 @@ def compile_scene(
 
 
 def _empty_spec(scene: SceneSpec) -> mujoco.MjSpec:
+    """Return a model without bodies, with the solver's settings."""
     spec = mujoco.MjSpec()
     spec.modelname = scene.robot.name
     spec.memory = _ARENA
@@ -362,7 +363,7 @@ def _add_object(
         hulls[i] = _add_hulls(spec, scene.objects[i], i)
         # the larger of the two counts
         slots |= Counter(piece.geometry.kind for piece in scene.objects[i].pieces)
-    spare = next(filter(None, chain.from_iterable(hulls.values())), "")
+    spare = next(chain.from_iterable(hulls.values()), "")
 
     # MuJoCo ignores gravcomp unless it is set while compiling.
     body = spec.worldbody.add_body(name="object", gravcomp=1.0, explicitinertial=True)

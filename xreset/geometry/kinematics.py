@@ -243,13 +243,11 @@ class Kinematics:
         linear = q.new_zeros(*pos.shape, len(moved))
         angular = torch.zeros_like(linear)
         for column, (joint, rows) in enumerate(moved):
-            axis = axes[joint][:, None]
+            motion = axes[joint][:, None].expand(-1, len(rows), -1)
             if self._moving[joint].type == "revolute":
-                lever = pos[:, rows] - origins[joint][:, None]
-                linear[..., column][:, rows] = torch.linalg.cross(axis, lever)
-                angular[..., column][:, rows] = axis.expand(-1, len(rows), -1)
-            else:
-                linear[..., column][:, rows] = axis.expand(-1, len(rows), -1)
+                angular[..., column][:, rows] = motion
+                motion = torch.linalg.cross(motion, pos[:, rows] - origins[joint][:, None])
+            linear[..., column][:, rows] = motion
         coupling = self._coupling[[joint for joint, _ in moved]]
         return PointJacobian(
             pos=pos.view(*shape, 3),

@@ -81,6 +81,7 @@ class PybulletWorld(World):
         self._build()
 
     def _build(self) -> None:
+        """Make a client with robot, object and table in it."""
         scene = self._scene
         self._p = p = _Client()
         dt = scene.timestep / INTERNAL_STEPS

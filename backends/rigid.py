@@ -288,6 +288,7 @@ def principal(
 
 
 def _fused_inertia(robot: RobotSpec, links: list[Link], frames: Frames) -> Inertia:
+    """Return the common mass properties of links in the frame of their body."""
     mass = sum(link.mass for link in links)
     com = np.zeros(3)
     inertia = np.zeros((3, 3))

@@ -194,6 +194,7 @@ class LocalWorlds:
         self._worlds[i].set_object_inertia(nominal.changed(**changes))
 
     def _publish(self, i: int) -> None:
+        """Copy what a world reports to the shared arrays."""
         arrays = self._arrays
         if arrays["nonfinite"][i]:  # nothing has moved since that was published
             return

@@ -234,6 +234,7 @@ class Demos(ObjectMotions):
     def _few_per_object(
         self, chosen: np.ndarray, most: int | None, share: float, spread: bool, seed: int | None
     ) -> np.ndarray:
+        """Return some of the chosen sequences of each object; arguments as of :meth:`select`."""
         names = self.object_name[chosen]
         objects = np.unique(names)
         kept = []

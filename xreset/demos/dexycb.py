@@ -68,6 +68,7 @@ def read_dexycb(root: str | Path, *, progress: Progress = unseen) -> Demos:
 
 
 def _read(folder: Path, meta: Mapping[str, Any], extrinsics: _Poses) -> Demos:
+    """Read one sequence, in the table frame."""
     T_table_world = np.linalg.inv(extrinsics["apriltag"])
     turn = Rotation.from_matrix(T_table_world[:3, :3])
     path = folder / "pose.npz"

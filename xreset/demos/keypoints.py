@@ -244,6 +244,7 @@ def sequence_of(arrays: Arrays, what: str, convention: Convention) -> Demos:
 
 
 def _sequence(arrays: Arrays, convention: Convention) -> Demos:
+    """Return one sequence in metres and in the table frame, checked and evenly spaced in time."""
     scale = 1e-3 if convention.units == "mm" else 1.0
     points = np.asarray(arrays["keypoints"], dtype=float) * scale
     valid = np.isfinite(points).all(axis=(1, 2))

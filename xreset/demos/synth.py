@@ -117,6 +117,7 @@ def _sequence(
     fps: float,
     rng: np.random.Generator,
 ) -> Demos:
+    """Make one sequence from the ways in which the object may start, each with the plans to hold it."""
     resting, plans = starts[int(rng.integers(len(starts)))]
     timing = _random_timing(fps, rng)
     path = _best_of(

@@ -74,6 +74,7 @@ def signed_distance(shape: Shape, points: np.ndarray) -> np.ndarray:
 
 
 def _distance_from_hull(shape: Shape, points: np.ndarray) -> np.ndarray:
+    """See :func:`signed_distance`. Next to edges and corners, the distance is that of samples on the surface."""
     from trimesh.remesh import subdivide_to_size
 
     planes = half_spaces(shape)

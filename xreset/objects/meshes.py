@@ -246,6 +246,7 @@ def read_mesh(path: Path, *, scale: float = 1.0) -> trimesh.Trimesh:
 
 
 def _checked(mesh: trimesh.Trimesh, path: Path) -> trimesh.Trimesh:
+    """Return the mesh, joined where triangles touch; see :func:`read_mesh` for errors."""
     if not np.isfinite(mesh.vertices).all():
         raise ObjectError(f"{path} has a vertex that is not finite; it is damaged.")
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):

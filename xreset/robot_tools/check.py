@@ -110,6 +110,7 @@ def check(name_or_folder: str | Path) -> list[Finding]:
 
 
 Problems = Iterator[tuple[Level, str]]
+"""Level and message of everything that is wrong with a topic."""
 
 
 def _topic(topic: str, problems: Problems, otherwise: str = "") -> list[Finding]:
@@ -151,6 +152,7 @@ def _joints(spec: RobotSpec, tree: RobotTree, wrong: list[str]) -> Problems:
 
 
 def _mimics(spec: RobotSpec, tree: RobotTree) -> Problems:
+    """Look for mimic joints that their own limits would stop."""
     known = {joint.name: joint for joint in tree.moved_by.values()}
     for mimic in spec.mimics:
         if not {mimic.joint, mimic.source} <= known.keys():

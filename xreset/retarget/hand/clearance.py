@@ -157,6 +157,7 @@ def _in_each_other(
     considered: Tensor,
     self_depth: float,
 ) -> Iterator[Distances]:
+    """Yield the distances of each link's guards from the links that they must not enter."""
     balls = model.balls
     fields = balls.fields
     a, b = balls.link_pairs.unbind(1)

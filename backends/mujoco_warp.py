@@ -63,12 +63,21 @@ _SET_PER_WORLD = (
 They, and all that MuJoCo derives from them, must be batched, or every world gets the values of world 0.
 """
 
-_TYPES: dict[str, Any] = dict.fromkeys(
-    ("pos", "linvel", "angvel", "object_pos", "object_linvel", "object_angvel"), wp.vec3
+_VECTORS = (
+    "pos",
+    "linvel",
+    "angvel",
+    "object_pos",
+    "object_linvel",
+    "object_angvel",
+    "tip_force",
+    "table_force",
+    "friction",
+    "object_com",
+    "inertia",
+    "com",
 )
-_TYPES |= dict.fromkeys(
-    ("tip_force", "table_force", "friction", "object_com", "inertia", "com"), wp.vec3
-)
+_TYPES: dict[str, Any] = dict.fromkeys(_VECTORS, wp.vec3)
 _TYPES |= {"quat": wp.quat, "object_quat": wp.quat, "invweight": wp.vec2}
 """Types for Warp of values that are no plain numbers."""
 
@@ -229,8 +238,10 @@ class MujocoWarpBackend(Backend):
 
         joints = at.joints
         self._addresses = [ints(at.qpos[joints.driven]), ints(at.dof[joints.driven])]
-        self._mimic = [ints(at.qpos[joints.mimic]), ints(at.dof[joints.mimic]), ints(joints.source)]
-        self._mimic += [
+        self._mimic = [
+            ints(at.qpos[joints.mimic]),
+            ints(at.dof[joints.mimic]),
+            ints(joints.source),
             wp.array(joints.multiplier, dtype=float),
             wp.array(joints.offset, dtype=float),
         ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import torch
@@ -183,7 +184,7 @@ _FREE_AND_SLIDING: dict[str, Motion] = {"tumbling": _tumble, "sliding": _slide}
 
 # Friction -------------------------------------------------------------------------------------------------------------
 
-_CASES = [(mu, degrees) for mu in (0.2, 0.5, 0.8, 1.2) for degrees in (0, 45)]  # noqa: XR002
+_CASES = list(product((0.2, 0.5, 0.8, 1.2), (0, 45)))
 """Coefficient with the table, and direction of motion."""
 _CASE_NAMES = [f"mu {mu}, {degrees} degrees" for mu, degrees in _CASES]
 _DISTANCE = 0.2  # m that every object slides

@@ -44,7 +44,7 @@ class Triangles(NamedTuple):
     """[F, 3]"""
 
 
-def place(mesh: trimesh.Trimesh, color: Color, pose: np.ndarray) -> Triangles:
+def placed(mesh: trimesh.Trimesh, color: Color, pose: np.ndarray) -> Triangles:
     """Return the triangles of a mesh at a pose [4, 4], in one color."""
     vertices = np.float32(transformed(mesh.vertices, pose))
     normals = np.float32(mesh.vertex_normals @ pose[:3, :3].T)
@@ -52,7 +52,7 @@ def place(mesh: trimesh.Trimesh, color: Color, pose: np.ndarray) -> Triangles:
     return Triangles(vertices[faces], normals[faces], np.full((len(faces), 3), color, np.float32))
 
 
-def join(parts: Sequence[Triangles]) -> Triangles:
+def joined(parts: Sequence[Triangles]) -> Triangles:
     """Return all triangles of several sets as one set."""
     return Triangles(*map(np.concatenate, zip(*parts, strict=True)))
 
@@ -116,5 +116,5 @@ def table_top(table: TableSpec) -> Triangles:
     for index in np.ndindex(*cells):
         corner = np.array(table.center) - size[:2] / 2
         pose[:2, 3] = corner + (np.array(index) + 0.5) * cell[:2]
-        squares.append(place(square, TABLE_COLORS[sum(index) % 2], pose))
-    return join(squares)
+        squares.append(placed(square, TABLE_COLORS[sum(index) % 2], pose))
+    return joined(squares)

@@ -28,10 +28,10 @@ from xreset.pictures.meshes import (
     OBJECT_COLOR,
     Color,
     Triangles,
-    join,
+    joined,
     link_colors,
     object_mesh,
-    place,
+    placed,
     rgb,
     shade_smoothly,
     table_top,
@@ -174,12 +174,12 @@ class Renderer:
             parts += self._robot(joint_pos, robot_tint)
         if object_pose is not None:
             parts.append(
-                place(self._objects[object_index], OBJECT_COLOR, pose_matrix(*object_pose))
+                placed(self._objects[object_index], OBJECT_COLOR, pose_matrix(*object_pose))
             )
         goal = None
         if goal_pose is not None:
-            goal = place(self._objects[object_index], GOAL_COLOR, pose_matrix(*goal_pose))
-        scene = join(parts)
+            goal = placed(self._objects[object_index], GOAL_COLOR, pose_matrix(*goal_pose))
+        scene = joined(parts)
         image = _image(scene, goal, camera, self.size, self._smooth)
         _draw_points(image, camera, points)
         return np.asarray(image.reduce(2))
@@ -205,7 +205,7 @@ class Renderer:
         poses = self._link_poses(joint_pos, list(self._links))
         parts = []
         for (name, mesh), T in zip(self._links.items(), poses, strict=True):
-            parts.append(place(mesh, tint(self._colors[name], robot_tint), T))
+            parts.append(placed(mesh, tint(self._colors[name], robot_tint), T))
         return parts
 
 
@@ -218,8 +218,8 @@ def draw_bodies(
     """Return a [H, W, 3] uint8 picture of meshes, each in its color, without a table."""
     bodies = []
     for mesh, color in zip(meshes, colors, strict=True):
-        bodies.append(place(shade_smoothly(mesh), color, np.eye(4)))
-    return np.asarray(_image(join(bodies), None, camera, size, smooth=True).reduce(2))
+        bodies.append(placed(shade_smoothly(mesh), color, np.eye(4)))
+    return np.asarray(_image(joined(bodies), None, camera, size, smooth=True).reduce(2))
 
 
 def add_caption(picture: np.ndarray, caption: Sequence[str], lines: int) -> np.ndarray:

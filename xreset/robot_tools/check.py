@@ -273,7 +273,10 @@ def _chains(spec: RobotSpec, tree: RobotTree) -> list[list[str]]:
     """Return for each fingertip the moving links from the hand's body to it, the body's neighbor first."""
     inside = tree.below(tree.moving_ancestor(spec.hand_root))[1:]
     moving = [link for link in inside if link in tree.moved_by]
-    return [[link for link in moving if tip.link in tree.below(link)] for tip in spec.fingertips]  # noqa: XR002
+    chains = []
+    for tip in spec.fingertips:
+        chains.append([link for link in moving if tip.link in tree.below(link)])
+    return chains
 
 
 def _fingers(spec: RobotSpec, tree: RobotTree) -> Problems:
@@ -296,7 +299,10 @@ def _thumb(spec: RobotSpec) -> Problems:
     meetings = opposition(spec, tips, np.zeros((len(tips), 3)))
     scores = np.sqrt(meetings).sum(axis=1)
     best = scores.argmax()
-    met = [", ".join(names[i] for i in np.flatnonzero(row)) or "no other" for row in meetings]  # noqa: XR002
+
+    def met(tip: int) -> str:
+        return ", ".join(names[i] for i in np.flatnonzero(meetings[tip])) or "no other"
+
     if scores[best] == 0:
         yield (
             "warning",
@@ -305,7 +311,7 @@ def _thumb(spec: RobotSpec) -> Problems:
     elif scores[0] < _LESS_OPPOSED * scores[best]:
         yield (
             "error",
-            f"the thumb {tips[0]!r} can meet {met[0]} pad to pad, {names[best]} {tips[best]!r} can meet {met[best]} "
+            f"the thumb {tips[0]!r} can meet {met(0)} pad to pad, {names[best]} {tips[best]!r} can meet {met(best)} "
             "more often: is that the thumb? Then import again with "
             f"--thumb {tips[best]}, or make it the first fingertip, with keypoint thumb4.",
         )

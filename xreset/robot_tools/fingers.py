@@ -157,7 +157,8 @@ class Hand:
     def _find_thumb(self, chains: list[Finger], thumb: str | None) -> Finger:
         """Return the chain with the stated link or joint, the one that is called so, or the one that opposes the
         others."""
-        known = "; ".join(", ".join(chain.links) for chain in chains)  # noqa: XR002
+        links = [", ".join(chain.links) for chain in chains]
+        known = "; ".join(links)
         if thumb is None:
             marked = [chain for chain in chains if chain.name == "thumb"]
         else:
@@ -182,7 +183,7 @@ class Hand:
             )
         why = "it can oppose the others" if scores[first] else "the two are alike"
         self._notes.append(
-            f"the thumb is the finger of {', '.join(chains[first].links)}: {why} (--thumb says another)"
+            f"the thumb is the finger of {links[first]}: {why} (--thumb says another)"
         )
         return chains[first]
 

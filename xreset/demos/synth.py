@@ -11,8 +11,9 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
-from typing import Literal, NamedTuple, TypeVar
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -27,7 +28,6 @@ from xreset.objects.rest import rest_height, resting_orientation
 from xreset.progress import unseen
 from xreset.spec import ObjectSpec
 
-T = TypeVar("T")
 SUBJECT = "synthetic"
 WORKSPACE = ((0.42, 0.72), (0.12, 0.40))
 """Ranges of x and y in which objects start [m]."""
@@ -120,12 +120,12 @@ def _sequence(
     """Make one sequence from the ways in which the object may start, each with the plans to hold it."""
     resting, plans = starts[int(rng.integers(len(starts)))]
     timing = _random_timing(fps, rng)
-    path = _best_of(
-        _GRASP_TRIES,
-        lambda: _clear_approach(_grasp(obj, resting, plans, side, rng), timing, rng),
-        is_good=lambda path: path.gap > 0,
-        cost=lambda path: -path.gap,
-    )
+    tries = []
+    for _ in range(_GRASP_TRIES):
+        tries.append(_clear_approach(_grasp(obj, resting, plans, side, rng), timing, rng))
+        if tries[-1].gap > 0:
+            break
+    path = max(tries, key=_gap)
     grasp = path.grasp
     solid = grasp.solid
     object_pos, object_rot = _object_path(solid.pos, solid.rotation, timing, rng)
@@ -170,9 +170,10 @@ def _start(obj: ObjectSpec, up: np.ndarray, side: str) -> tuple[Solid, list[Cont
 def _grasp(
     obj: ObjectSpec, resting: Solid, plans: Sequence[Contacts], side: str, rng: np.random.Generator
 ) -> Grasp:
-    """Return a grasp of the object somewhere on the table."""
+    """Return the best of some grasps of the object somewhere on the table; a good one is the last that is tried."""
 
-    def attempt() -> Grasp:
+    tries = []
+    for _ in range(_TRIES):
         plan = plans[int(rng.integers(len(plans)))]
         azimuth = rng.uniform(*CLOSING_AZIMUTH)
         if side == "left":
@@ -185,30 +186,15 @@ def _grasp(
             approach=yaw.apply(plan.approach),
             closing=yaw.apply(plan.closing),
         )
-        return fit_hand(Solid.of(obj, place + resting.pos, yaw * resting.rotation), contacts, side)
-
-    return _best_of(
-        _TRIES,
-        attempt,
-        is_good=lambda grasp: (
-            grasp.tip_error < _GOOD_TIP_ERROR and grasp.penetration < _GOOD_PENETRATION
-        ),
-        cost=lambda grasp: (
-            grasp.tip_error / _GOOD_TIP_ERROR + grasp.penetration / _GOOD_PENETRATION
-        ),
-    )
-
-
-def _best_of(
-    count: int, make: Callable[[], T], *, is_good: Callable[[T], bool], cost: Callable[[T], float]
-) -> T:
-    """Return the first good one of at most ``count`` random attempts, or else the one with the lowest cost."""
-    tries = []
-    for _ in range(count):
-        tries.append(make())
-        if is_good(tries[-1]):
+        solid = Solid.of(obj, place + resting.pos, yaw * resting.rotation)
+        grasp = fit_hand(solid, contacts, side)
+        tries.append(grasp)
+        if grasp.tip_error < _GOOD_TIP_ERROR and grasp.penetration < _GOOD_PENETRATION:
             break
-    return min(tries, key=cost)
+    return min(
+        tries,
+        key=lambda grasp: grasp.tip_error / _GOOD_TIP_ERROR + grasp.penetration / _GOOD_PENETRATION,
+    )
 
 
 # Motion ---------------------------------------------------------------------------------------------------------------
@@ -231,6 +217,9 @@ class _HandPath(NamedTuple):
     """T orientations."""
     angles: np.ndarray
     """[T, 17] joint angles."""
+
+
+_gap = attrgetter("gap")
 
 
 def _random_timing(fps: float, rng: np.random.Generator) -> _Timing:
@@ -269,12 +258,12 @@ def _object_path(
 def _clear_approach(grasp: Grasp, timing: _Timing, rng: np.random.Generator) -> _HandPath:
     """Return the first of some random approaches that stays clear of object and table, or else the one with the largest
     gap."""
-    return _best_of(
-        _TRIES,
-        lambda: _approach(grasp, timing, rng),
-        is_good=lambda path: path.gap > _CLEAR,
-        cost=lambda path: -path.gap,
-    )
+    tries = []
+    for _ in range(_TRIES):
+        tries.append(_approach(grasp, timing, rng))
+        if tries[-1].gap > _CLEAR:
+            break
+    return max(tries, key=_gap)
 
 
 def _approach(grasp: Grasp, timing: _Timing, rng: np.random.Generator) -> _HandPath:

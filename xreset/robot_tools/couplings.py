@@ -139,14 +139,8 @@ class Couplings:
         source = drives[0] if drives else group[0]
         followers = group[group != source]
         values = np.linspace(self.lower[source], self.upper[source], _SAMPLES)
-        straight = np.tile(self.start, (_SAMPLES, 1))
-        straight[:, source] = values
-        solved = straight.copy()
-        before = self.start
-        for q in solved:
-            q[followers] = before[followers]
-            q[followers] = self._closed(followers, q)
-            before = q
+        solved = self._followed(followers, source, values)
+        straight = solved.copy()
         lines = {}
         for follower in followers:
             track = solved[:, follower]
@@ -168,6 +162,17 @@ class Couplings:
         names = ", ".join(self.names[i] for i in followers)
         loops = f"; closed loops stay closed within {1e3 * opened:.2f} mm" if opened else ""
         self.notes.append(f"coupled joints: {names} with {self.names[source]}{loops}")
+
+    def _followed(self, followers: np.ndarray, source: int, values: np.ndarray) -> np.ndarray:
+        """[V, Q] positions of all joints while a joint goes through values [V] and others follow it."""
+        positions = np.tile(self.start, (len(values), 1))
+        positions[:, source] = values
+        before = self.start
+        for q in positions:
+            q[followers] = before[followers]  # so that the same solution is found
+            q[followers] = self._closed(followers, q)
+            before = q
+        return positions
 
     def _misfit(self, positions: np.ndarray, rows: np.ndarray) -> tuple[float, float]:
         """Return the widest gap of a closed loop [m], and the most that another equality is off [rad or m].

@@ -106,22 +106,22 @@ class Variation:
         def scaled(name: Parameter, limits: tuple[float, float]) -> Sample:
             return lambda generator: nominal[name] * sample_range(n, limits, generator)
 
-        parameters: dict[str, Tensor] = {}
-
-        def keep(name: Parameter, sample: Sample) -> None:
-            parameters[name] = drawn.keep(name, torch.zeros_like(nominal[name]), sample)
-
-        keep("friction", friction)
-        keep("object_mass", scaled("object_mass", c.mass_scale if c.enabled else (1.0, 1.0)))
+        samples: dict[Parameter, Sample] = {
+            "friction": friction,
+            "object_mass": scaled("object_mass", c.mass_scale if c.enabled else (1.0, 1.0)),
+        }
         if c.scales_drives:
-            keep("drives", partial(sample_drives, self._is_arm, n, c))
+            samples["drives"] = partial(sample_drives, self._is_arm, n, c)
         if c.draws("torsional_friction"):
-            keep("torsional_friction", scaled("torsional_friction", c.torsional_friction))
+            samples["torsional_friction"] = scaled("torsional_friction", c.torsional_friction)
         if c.draws("object_inertia"):
-            keep("object_inertia", scaled("object_inertia", c.object_inertia))
+            samples["object_inertia"] = scaled("object_inertia", c.object_inertia)
         if c.draws("object_com"):
-            keep("object_com", partial(sample_offset, n, c.object_com))
-        return parameters
+            samples["object_com"] = partial(sample_offset, n, c.object_com)
+        return {
+            name: drawn.keep(name, torch.zeros_like(nominal[name]), sample)
+            for name, sample in samples.items()
+        }
 
     def _sample_action_latency(self, generator: torch.Generator) -> Tensor:
         """[N, J] steps."""

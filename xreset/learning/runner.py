@@ -121,14 +121,10 @@ class TrainingRunner:
                 start = time.perf_counter()
                 share_of_time = (earlier + start - begin) / (earlier + seconds)
                 self._follow_schedule(max(self.iteration / total, share_of_time))
+                obs = self._roll_out(obs, log)
+                self._check_faults(steps)
+                collected = time.perf_counter()
                 with torch.no_grad():
-                    obs = self._roll_out(obs, log)
-                    self._check_finite(obs)
-                    self._check_faults(steps)
-                    # processes play other episodes of the same demonstrations
-                    rates = env.resets.success_rate
-                    rates.copy_(self.processes.sum(rates) / self.processes.count)
-                    collected = time.perf_counter()
                     self.alg.compute_returns(obs)
                 losses = self.alg.update()
                 now = time.perf_counter()
@@ -161,13 +157,18 @@ class TrainingRunner:
                     + self._resume_command
                 )
 
+    @torch.no_grad()
     def _roll_out(self, obs: TensorDict, log: TrainingLog | None) -> TensorDict:
-        """Let the policy act for a horizon; returns the last observations."""
+        """Let the policy act for a horizon, and return the last observations."""
         for _ in range(self.config.ppo.horizon):
             obs, reward, done, extras = self.env.step(self.alg.act(obs))
             self.alg.process_env_step(obs, reward, done, extras)
             if log is not None:
                 log.add(reward, done, extras["log"])
+        self._check_finite(obs)
+        # processes play other episodes of the same demonstrations
+        rates = self.env.resets.success_rate
+        rates.copy_(self.processes.sum(rates) / self.processes.count)
         return obs
 
     def _follow_schedule(self, progress: float) -> None:

@@ -7,7 +7,6 @@ when a configuration is made, instead of turning into NaN some minutes later.
 from __future__ import annotations
 
 import types
-import typing
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import MISSING, dataclass, fields, is_dataclass
@@ -19,7 +18,10 @@ from numbers import Integral, Real
 from typing import (
     Annotated,
     Any,
+    Literal,
     TypeVar,
+    Union,
+    cast,
     dataclass_transform,
     get_args,
     get_origin,
@@ -105,7 +107,7 @@ def marks_of(cls: type) -> dict[str, list[Any]]:
     return marks
 
 
-def _broken(marks: typing.Iterable[Any], value: Any) -> list[Rule]:
+def _broken(marks: Iterable[Any], value: Any) -> list[Rule]:
     if value is None:
         return []
     return [mark for mark in marks if isinstance(mark, Rule) and not _holds(mark, value)]
@@ -119,7 +121,7 @@ def _holds(rule: Rule, value: Any) -> bool:
 
 
 def _is_union(hint: Any) -> bool:
-    return get_origin(hint) in (typing.Union, types.UnionType)
+    return get_origin(hint) in (Union, types.UnionType)
 
 
 def is_rigid(T: np.ndarray) -> bool:
@@ -276,7 +278,7 @@ def _value(hint: Any, value: Any, where: str, problems: list[str]) -> Any:
     origin = get_origin(hint)
     arguments = get_args(hint)
     if is_dataclass(hint):
-        return _record(typing.cast(type, hint), value, where, problems)
+        return _record(cast(type, hint), value, where, problems)
     if hint is Any:
         return value
     if origin is Annotated:
@@ -310,7 +312,7 @@ def _value(hint: Any, value: Any, where: str, problems: list[str]) -> Any:
             name: _value(arguments[1], item, f"{where}.{name}", problems)
             for name, item in value.items()
         }
-    if origin is typing.Literal:
+    if origin is Literal:
         if value not in arguments:
             return wrong(f"one of {', '.join(map(repr, arguments))}")
         return value

@@ -187,15 +187,15 @@ class _FusedPointNet(torch.autograd.Function):
         b = len(low2)
         c = len(low3)
 
-        def partial(*shape: int) -> Tensor:
+        def partial_sums(*shape: int) -> Tensor:
             return torch.empty(programs, *shape, device=cloud.device)
 
         width = ctx.sizes["K"]
         columns = _columns(width)
-        d1 = partial(columns, a)
-        d2 = partial(a, b)
-        db2 = partial(columns, b)
-        d3 = partial(b, c)
+        d1 = partial_sums(columns, a)
+        d2 = partial_sums(a, b)
+        db2 = partial_sums(columns, b)
+        d3 = partial_sums(b, c)
         for lower in (False, True):
             _backward[(programs,)](
                 cloud, w1, b1, low2, b2, low3, gradient, winner, d1, d2, db2, d3, len(cloud),

@@ -37,18 +37,18 @@ def closing_states(
         For each state [M] the frame that it is or follows, ascending; how far it is on the way to the next frame, in
         [0, 1), where 0 is the frame itself; and joint positions [M, J], object positions [M, 3] and quaternions [M, 4].
     """
-    pieces = retargeted.valid.astype(int)
+    count = retargeted.valid.astype(int)  # states that are or follow each frame
     if config.spacing is not None:
         object_name = retargeted.object_name[retargeted.sequence_of_frame]
         poses = (retargeted.joint_pos, retargeted.object_pos, retargeted.object_quat_wxyz)
         fingers = fingers_of(robot, objects, object_name, *poses)
-        before = _frames_to_follow(retargeted, fingers, config.within)
-        step = retargeted.fingertip_pos[before + 1] - retargeted.fingertip_pos[before]
+        followed = _frames_to_follow(retargeted, fingers, config.within)
+        step = retargeted.fingertip_pos[followed + 1] - retargeted.fingertip_pos[followed]
         travel = np.linalg.norm(step, axis=-1).max(axis=-1)
-        pieces[before] = np.maximum(np.ceil(travel / config.spacing).astype(int), 1)
-    frame = np.repeat(np.arange(len(pieces)), pieces)
-    first = np.cumsum(pieces) - pieces
-    part = (np.arange(len(frame)) - first[frame]) / pieces[frame]
+        count[followed] = np.maximum(np.ceil(travel / config.spacing).astype(int), 1)
+    frame = np.repeat(np.arange(len(count)), count)
+    first = np.cumsum(count) - count
+    part = (np.arange(len(frame)) - first[frame]) / count[frame]
     joint_pos = positions_between(retargeted.joint_pos, frame, part)
     object_pos = positions_between(retargeted.object_pos, frame, part)
     object_quat = rotations_between(retargeted.object_quat_wxyz, frame, part)

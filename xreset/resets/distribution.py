@@ -215,21 +215,21 @@ class ResetDistribution:
         # versions.
         uniform = torch.rand(len(object_index), 6, generator=generator, device=generator.device)
         sequence = self._sequences_of_object.draw(object_index, uniform[:, 2])
-        share = self.config.adaptive_share
-        if share:
+        adaptive = self.config.adaptive_share
+        if adaptive:
             failure = (1.0 - self.success_rate).clamp_min(_LEAST_FAILURE)
             weak = self._sequences_of_object.draw_by_weight(object_index, uniform[:, 2], failure)
-            sequence = torch.where(uniform[:, 4] < share, weak, sequence)
+            sequence = torch.where(uniform[:, 4] < adaptive, weak, sequence)
         home = self.home(sequence, generator)
         states = self._states_of_object
         if not len(states.rows):
             return home
         from_bank = (uniform[:, 0] < self.demo_probability) & (states.count[object_index] > 0)
         row = states.draw(object_index, uniform[:, 1])
-        if share:
+        if adaptive:
             own = self._states_of_sequence
-            adapted = (uniform[:, 4] < share) & (own.count[sequence] > 0)
-            row = torch.where(adapted, own.draw(sequence, uniform[:, 1]), row)
+            has_own = (uniform[:, 4] < adaptive) & (own.count[sequence] > 0)
+            row = torch.where(has_own, own.draw(sequence, uniform[:, 1]), row)
         gravity = uniform[:, 3] if self.config.random_gravity else torch.ones_like(uniform[:, 3])
         return where(
             from_bank, replace(self._states[row], state=row, gravity_fraction=gravity), home

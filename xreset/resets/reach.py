@@ -39,19 +39,19 @@ class Reach:
         self._hand_joints = self._model.hand.home
         tips = self._model.hand.points(self._hand_joints, [tip.link for tip in robot.fingertips])
         self._center = (tips[0] + tips[1:].mean(dim=0)).numpy() / 2
-        whole = self._model.kinematics
-        root = whole.link_poses(whole.home, [robot.hand_root])[0, :3, :3]
+        kinematics = self._model.kinematics
+        root = kinematics.link_poses(kinematics.home, [robot.hand_root])[0, :3, :3]
         at_home = Rotation.from_matrix(root.numpy())
-        level = np.cross((0.0, 0.0, 1.0), at_home.apply(self._center))
-        level /= max(np.linalg.norm(level), 1e-9)
+        tilt_axis = np.cross((0.0, 0.0, 1.0), at_home.apply(self._center))
+        tilt_axis /= max(np.linalg.norm(tilt_axis), 1e-9)
         turns = np.radians(list(product(_TILTS, _YAWS)))
-        tilted = Rotation.from_rotvec(turns[:, :1] * level) * at_home
+        tilted = Rotation.from_rotvec(turns[:, :1] * tilt_axis) * at_home
         self._grasps = (Rotation.from_rotvec(turns[:, 1:] * (0.0, 0.0, 1.0)) * tilted).as_quat()
         self._base = np.array(robot.base_pos)
         self._stretch = float(np.linalg.norm(self._center)) + _THRESHOLDS.wrist_position
         link = robot.hand_root
-        while link != whole.root:
-            joint = whole.tree.above[link]
+        while link != kinematics.root:
+            joint = kinematics.tree.above[link]
             self._stretch += float(np.linalg.norm(joint.T_parent_joint[:3, 3]))
             if joint.type == "prismatic":
                 self._stretch += max(abs(joint.lower), abs(joint.upper))

@@ -339,24 +339,21 @@ class ManipulationEnv:
         for name, value in before.items():
             lasting[name][others] = value[others]
 
+    # The present state
+
     def reading(self) -> Reading:
         """Return the present physical state and what follows from it."""
         return Reading.of(self.backend, self._surface_points, self._bad_action, self._center)
 
-    def _palm_distance(self, reading: Reading) -> Tensor:
-        """[N] distance from the palm to the object's surface points [m]."""
-        state = reading.state
-        palm = quat_rotate_inverse(state.object_quat, reading.links.pos[:, 0] - state.object_pos)
-        return (self._surface_points - palm[:, None]).norm(dim=-1).amin(dim=-1)
+    @property
+    def joint_target(self) -> Tensor:
+        """[N, J] joint targets of the last action, before their delay on the way to the drives."""
+        return self._target
 
     @property
     def task_goal_pos(self) -> Tensor:
         """[N, 3] goal position of the object's origin in the task (``TaskConfig.object_frame``)."""
         return self._task_origin(self.goal_pos, self.goal_quat)
-
-    def _task_origin(self, pos: Tensor, quat: Tensor) -> Tensor:
-        """Return where the object's origin in the task is [N, 3] when its mesh frame has given poses."""
-        return pos if self._center is None else pos + quat_rotate(quat, self._center)
 
     def render(self, world: int = 0, size: tuple[int, int] = (640, 480)) -> np.ndarray:
         """Return a picture of one world, [H, W, 3] uint8, with the goal as a translucent object.
@@ -378,11 +375,6 @@ class ManipulationEnv:
             object_index=int(self.backend.object_index[world]),
         )
 
-    @property
-    def joint_target(self) -> Tensor:
-        """[N, J] present drive targets."""
-        return self._target
-
     def snapshot(self) -> dict[str, Tensor]:
         """Return the state of all worlds on the CPU, without random numbers and warm starts, for :meth:`restore`."""
         values = self._lasting | vars(self.backend.state())
@@ -396,13 +388,17 @@ class ManipulationEnv:
         self._set_worlds(State(**{f.name: snapshot[f.name] for f in fields(State)}).to(self.device))
         self._reset_mask.zero_()
 
+    # Parts
+
     @property
     def _lasting(self) -> dict[str, Any]:
         """Buffers that carry each world from step to step, in addition to the engine's state."""
         own = {name: getattr(self, name) for name in _LASTING}
         return own | self.drawn.lasting | dict(self._observations.items())
 
-    # Parts
+    def _task_origin(self, pos: Tensor, quat: Tensor) -> Tensor:
+        """Return positions [N, 3] of the object's origin in the task, given poses of its mesh frame."""
+        return pos if self._center is None else pos + quat_rotate(quat, self._center)
 
     def _apply_action(self, action: Tensor, push: Tensor | None = None) -> None:
         if not isinstance(action, Tensor):
@@ -443,36 +439,13 @@ class ManipulationEnv:
         self._faulty.copy_((broken | reading.health.overflow) & live)
         self.nonfinite_count += (self._faulty & broken).sum()
         self.overflow_count += (self._faulty & ~broken).sum()
-        state = reading.task_state
-        lost = (
-            out_of_bounds(state.object_pos, self.backend.scene.table, self.task.termination)
-            & ~broken
-        )
+        object_pos = reading.task_state.object_pos
+        lost = out_of_bounds(object_pos, self.backend.scene.table, self.task.termination) & ~broken
         reach = reading.tip_distance.mean(dim=-1)
         self._best_reach.copy_(
             torch.where(broken, self._best_reach, torch.minimum(self._best_reach, reach))
         )
-        start_pos, start_quat = self.resets.start_pose(self.sequence)
-        reward = compute_reward(
-            RewardInput(
-                tip_distance=reading.tip_distance,
-                best_reach=self._best_reach.clone(),
-                tip_force=reading.contacts.tip_force,
-                state=state,
-                goal_pos=self.task_goal_pos,
-                goal_quat=self.goal_quat,
-                start_pos=self._task_origin(start_pos, start_quat),
-                start_quat=start_quat,
-                action=self._action,
-                previous_action=self._previous_action,
-                out_of_bounds=lost,
-                palm_distance=self._palm_distance(reading),
-                points=self._metric_points,
-                is_arm=self.actions.is_arm,
-                success_position=self.success_position,
-            ),
-            self.task.reward,
-        )
+        reward = compute_reward(self._reward_input(reading, lost), self.task.reward)
         self._reward.copy_(torch.where(broken, 0.0, reward.total))
         if self.variation.pushes is not None:
             self.variation.pushes.gate.copy_(reward.gate & ~broken)
@@ -496,6 +469,33 @@ class ManipulationEnv:
             self._log_values = torch.zeros_like(values)
         self._log_values.copy_(values)
         return reading, reward
+
+    def _reward_input(self, reading: Reading, lost: Tensor) -> RewardInput:
+        """Return what the reward is computed from; ``lost`` [N] bool marks the worlds that are out of bounds."""
+        start_pos, start_quat = self.resets.start_pose(self.sequence)
+        return RewardInput(
+            tip_distance=reading.tip_distance,
+            best_reach=self._best_reach.clone(),
+            tip_force=reading.contacts.tip_force,
+            state=reading.task_state,
+            goal_pos=self.task_goal_pos,
+            goal_quat=self.goal_quat,
+            start_pos=self._task_origin(start_pos, start_quat),
+            start_quat=start_quat,
+            action=self._action,
+            previous_action=self._previous_action,
+            out_of_bounds=lost,
+            palm_distance=self._palm_distance(reading),
+            points=self._metric_points,
+            is_arm=self.actions.is_arm,
+            success_position=self.success_position,
+        )
+
+    def _palm_distance(self, reading: Reading) -> Tensor:
+        """[N] distance from the palm to the object's surface points [m]."""
+        state = reading.state
+        palm = quat_rotate_inverse(state.object_quat, reading.links.pos[:, 0] - state.object_pos)
+        return (self._surface_points - palm[:, None]).norm(dim=-1).amin(dim=-1)
 
     def _sample_resets(self, from_distribution: bool = True) -> None:
         """Draw a start for every world, so that nothing waits for the number of resets; the worlds to reset take it."""

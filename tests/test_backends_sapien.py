@@ -67,7 +67,7 @@ class SapienTest(EngineChecks, TestCase):
         first = link("first", palm)
         second = link("second", palm)
         joints = {"a": joint(first, link("a", first)), "b": joint(second, link("b", second))}
-        with self.assertRaisesRegex(RobotError, "'b' mimics 'a', but neither lies below"):
+        with self.assertRaisesRegex(RobotError, "'b' mimics 'a', but neither is below"):
             _couple(None, joints, MimicSpec(joint="b", source="a"))
 
 

@@ -225,7 +225,7 @@ class Toy(Robots):
         )
         self.assertRegex(
             warnings,
-            r"'f1_a' has the principal moments 0.1, 0.1, 0.1 .*placeholder.*do not lie along x of the palm 'palm_frame'",
+            r"'f1_a' has the principal moments 0.1, 0.1, 0.1 .*placeholder.*do not point along x of the palm 'palm_frame'",
         )
 
     def test_mjcf_is_the_same_hand(self):

@@ -147,7 +147,7 @@ def _joints(spec: RobotSpec, tree: RobotTree, wrong: list[str]) -> Problems:
             )
         elif (found.child in inside) != (joint.group == "hand"):
             where = "below" if found.child in inside else "not below"
-            text = f"{joint.name!r} is of group {joint.group!r} but lies {where} the hand's root {spec.hand_root!r}."
+            text = f"{joint.name!r} is of group {joint.group!r} but is {where} the hand's root {spec.hand_root!r}."
             yield "warning", text
 
 
@@ -187,7 +187,7 @@ def _links(spec: RobotSpec, tree: RobotTree, wrong: list[str]) -> Problems:
                 f"fingertip {tip.name!r}: none of {links} has a collision shape, so it can touch nothing.",
             )
         if tip.link not in inside:
-            text = f"{tip.link!r} does not lie below the hand's root {spec.hand_root!r}."
+            text = f"{tip.link!r} is not below the hand's root {spec.hand_root!r}."
             yield "error", f"fingertip {tip.name!r}: {text}"
     for link in spec.self_collision_links:
         if link not in solid:
@@ -249,8 +249,8 @@ def _frames(spec: RobotSpec, tree: RobotTree) -> Problems:
     if np.abs(along).argmax() != 0 or tips[:, 0].mean() <= 0:
         yield (
             "warning",
-            f"the fingers do not lie along x of the palm {spec.palm!r}. Its x should point towards them, its z out of "
-            "its inner side.",
+            f"the fingers do not point along x of the palm {spec.palm!r}. Its x should point towards them, its z out "
+            "of its inner side.",
         )
     palm_body = tree.moving_ancestor(spec.palm)
     if palm_body != tree.moving_ancestor(spec.hand_root):

@@ -139,7 +139,7 @@ class Hand:
         if not names <= set(_FINGERS) or len(names) < len(others):
             if len(others) > len(_FINGERS):
                 raise RobotError(
-                    f"the hand has {len(others)} fingers beside the thumb; xreset knows {', '.join(_FINGERS)}."
+                    f"the hand has {len(others)} fingers and a thumb; xreset knows {', '.join(_FINGERS)}."
                 )
             bases = np.array([chain.points[0] for chain in others])
             middle = bases.mean(axis=0)

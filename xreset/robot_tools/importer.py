@@ -128,7 +128,7 @@ def import_robot(
             offset = tuple((distance * ahead).tolist())
             if distance > 0:
                 notes.append(
-                    f"the hand's root lies {1e3 * distance:.0f} mm along {along}, so that its body begins there "
+                    f"the hand's root is {1e3 * distance:.0f} mm along {along}, so that its body begins there "
                     "(--offset)"
                 )
         T = pose(offset, rpy=rpy)

@@ -11,14 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.backends.conformance.harness import FRICTIONS, Bench, Worlds, replace_fields
-from xreset.backends.conformance.results import Error, Measured
+from xreset.backends.conformance.harness import FRICTIONS, SETTLE, Bench, Worlds, replace_fields
+from xreset.backends.conformance.results import Differences, Measured
 from xreset.backends.conformance.scene import ball, flat_objects
 from xreset.geometry.rotations import quat_angle
 from xreset.physics import Parameter, State
 from xreset.spec import GRAVITY, lowest_point
 
-_SETTLE = 120  # steps
 _FACTORS = torch.tensor([2.0, 0.5, 4.0, 0.25])
 
 Motion = Callable[[Bench, Worlds, Sequence[int]], tuple[State, Tensor]]
@@ -30,7 +29,7 @@ def resting_weight(bench: Bench) -> Measured:
     worlds = bench.worlds()
     start = bench.start()
     fresh = worlds.contacts()
-    worlds.step(_SETTLE)
+    worlds.step(SETTLE)
     contacts = worlds.contacts()
     moved = worlds.state().object_pos - start.object_pos
     weight = GRAVITY * bench.masses
@@ -55,7 +54,7 @@ def resting_on_a_side(bench: Bench) -> Measured:
     heights = [-lowest_point(thing.pieces, turn) for thing in bench.objects]
     start.object_pos[:, 2] = torch.tensor(heights)
     worlds = bench.worlds()
-    worlds.advance(start, _SETTLE)
+    worlds.advance(start, SETTLE)
     force = worlds.contacts().table_force / (GRAVITY * bench.masses)[:, None]
     stable = [i for i, thing in enumerate(bench.objects) if thing.name != "can"]  # a can rolls
     return {"vertical force": force[stable, 2] - 1.0, "horizontal force": force[stable, :2]}
@@ -126,7 +125,7 @@ def _against_built(
         for rows in ([3, 0], [1, 2]):
             worlds.set_parameter(name, value, rows)
     found = {name: move(bench, worlds, range(bench.NUM_WORLDS)) for name, move in motions.items()}
-    errors: dict[str, list[tuple[str, Error]]] = defaultdict(list)
+    errors: dict[str, list[tuple[str, Differences]]] = defaultdict(list)
     for i, thing in enumerate(bench.objects):
         given = {name: value[i].double().numpy() for name, value in parameters.items()}
         mass = float(given.get("object_mass", thing.mass))

@@ -7,20 +7,18 @@ import math
 import torch
 from torch import Tensor
 
-from xreset.backends.conformance.harness import Bench, Worlds
+from xreset.backends.conformance.harness import SETTLE, Bench, Worlds
 from xreset.backends.conformance.results import Measured
 from xreset.geometry.rotations import matrix_to_quat, quat_angle, relative_pose
 from xreset.physics import State
 from xreset.spec import GRAVITY
-
-_SETTLE = 120  # steps
 
 
 def held_object(bench: Bench) -> Measured:
     """Hold a brick between two jaws in the air: the fingers push against each other and carry the weight together."""
     worlds = bench.worlds()
     state, closing = grasp(bench)
-    end = worlds.advance(state, _SETTLE)
+    end = worlds.advance(state, SETTLE)
     held = bench.twins
     contacts = worlds.contacts()[held]
     force = contacts.tip_force
@@ -42,7 +40,7 @@ def shaken_grasp(bench: Bench) -> Measured:
     """Hold a brick for half a second, then shake it for two, up and down and sideways: it must stay in the palm."""
     worlds = bench.worlds()
     state, _ = grasp(bench)
-    worlds.advance(state, _SETTLE)
+    worlds.advance(state, SETTLE)
     names = bench.scene.robot.joint_names
     pos_before, quat_before = _in_palm(bench, worlds)
     for k in range(120):
@@ -74,7 +72,7 @@ def tip_friction(bench: Bench) -> Measured:
     friction[dropped, 0] = 0.05
     worlds.set_parameter("friction", friction)
     state, _ = grasp(bench)
-    fallen = state.object_pos[:, 2] - worlds.advance(state, _SETTLE).object_pos[:, 2]
+    fallen = state.object_pos[:, 2] - worlds.advance(state, SETTLE).object_pos[:, 2]
     return {
         "slip at mu = 0.9": fallen[held],
         "fall missing at mu = 0.05": max(0.0, 0.1 - float(fallen[dropped])),

@@ -32,6 +32,8 @@ REFINEMENT = 8
 """How much finer the steps are of the reference that the reference itself is compared with."""
 _HALVINGS = 6
 """How often a random configuration is moved half the way home while the robot reaches into the table."""
+SETTLE = 120
+"""Physics steps in which objects come to rest."""
 FRICTIONS = torch.tensor([[0.8, 0.4, 0.3], [0.7, 0.5, 0.9], [0.6, 0.3, 0.45], [0.9, 0.6, 0.2]])
 """[N, 3] friction of the pairs, different in each of the shared worlds."""
 

@@ -39,12 +39,11 @@ Verdict = Literal["passed", "known difference", "failed", "unsupported", "skippe
 Group = Literal["state", "worlds", "robot", "object", "contact"]
 """Part of the contract that a check belongs to."""
 
-Error = Tensor | np.ndarray | float
-"""Differences, of which the largest absolute value counts."""
-Errors = Error | Iterable[tuple[str, Error]]
-"""An error, or pairs of a name and an error, of which the largest counts and its name is shown."""
-
-Measured = Mapping[str, Errors]
+Differences = Tensor | np.ndarray | float
+"""The largest absolute value counts."""
+Found = Differences | Iterable[tuple[str, Differences]]
+"""Differences, or those of several named parts: the worst part counts, and its name is shown."""
+Measured = Mapping[str, Found]
 """What a check found, by the names of its measures."""
 
 
@@ -164,7 +163,7 @@ def share_of(measured: float, tolerance: float) -> float:
     return math.inf if measured else 0.0
 
 
-def largest(errors: Errors) -> tuple[float, str]:
+def largest(errors: Found) -> tuple[float, str]:
     """Return the largest error and its name; NaN if there is one."""
     if isinstance(errors, Tensor | np.ndarray | float | int):
         return float(np.abs(np.asarray(errors, dtype=np.float64)).max(initial=0.0)), ""

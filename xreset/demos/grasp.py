@@ -39,6 +39,13 @@ _GRID = 0.012  # spacing of the centers that are tried [m]
 _SIDE_TILTS = (0.6, 0.4, 0.15)
 _TILT_COST = 2.0  # of being less steep [1/rad]
 _LOW_OBJECT = 0.07  # objects up to this height are grasped from above [m]
+_ABOVE_TABLE = 0.007  # least height of a contact [m]
+_FACING_FINGERS = 0.6  # least cosine between the fingers' way and the surface's normal
+_FACING_THUMB = 0.75  # the same for the thumb
+_IN_LINE = (
+    0.025  # largest distance of a finger's contact from the middle fingers', along its way [m]
+)
+_DEPTH = (0.004, 0.055)  # range of how deep the hand reaches over the object [m]
 _TOUCH = 1e-4  # pieces of an object that are this close are one part [m]
 _RADII = np.full(40, 0.007)  # of the hand's flesh around joints and middles of bones [m]
 _RADII[np.array(TIPS) - 1] = 0.001
@@ -231,17 +238,27 @@ def _contacts_at(
     start, end, room_before, room_after, facing_fingers, facing_thumb = _part_around(
         solid, origins, closing
     )
-    above_table = origins[..., 2] > 0.007
-    fits = np.isfinite(start) & (room_before > _FINGER_ROOM) & (facing_fingers > 0.6) & above_table
+    above_table = origins[..., 2] > _ABOVE_TABLE
+    fits = (
+        np.isfinite(start)
+        & (room_before > _FINGER_ROOM)
+        & (facing_fingers > _FACING_FINGERS)
+        & above_table
+    )
     middle_start = np.median(np.where(fits, start, 0.0)[:, 1:3], axis=1, keepdims=True)
-    finger = fits & (np.abs(start - middle_start) < 0.025)
-    thumb = np.isfinite(end) & (room_after > _FINGER_ROOM) & (facing_thumb > 0.75) & above_table
+    finger = fits & (np.abs(start - middle_start) < _IN_LINE)
+    thumb = (
+        np.isfinite(end)
+        & (room_after > _FINGER_ROOM)
+        & (facing_thumb > _FACING_THUMB)
+        & above_table
+    )
     width = (end - start)[:, 0]
     # length of the object before each center, along the approach: how deep the hand must reach
     into, out, *_ = solid.crossings(centers, approach)
     depth = -np.where((into <= out) & (into < 0), into, 0.0).min(axis=0)
     good = thumb[:, 0] & finger[:, 1:3].all(axis=1)
-    good &= (width > MIN_WIDTH) & (width < MAX_OPENING) & (depth > 0.004) & (depth < 0.055)
+    good &= (width > MIN_WIDTH) & (width < MAX_OPENING) & (depth > _DEPTH[0]) & (depth < _DEPTH[1])
 
     found = []
     for i in np.flatnonzero(good):
@@ -250,7 +267,7 @@ def _contacts_at(
         points[0] = origins[i, 0] + (end[i, 0] + SKIN) * closing
         points[fingers] = origins[i, fingers] + (start[i, fingers] - SKIN)[:, None] * closing
         middle = (points[0] + points[fingers].mean(axis=0)) / 2
-        # of the weight about the grasp
+        # lever of the object's weight about the grasp; each term is divided by what makes a plan worse by 1
         lever = np.linalg.norm(np.cross(middle - solid.com, approach))
         cost = (
             effort

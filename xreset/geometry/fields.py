@@ -64,12 +64,14 @@ class DistanceFields(Tensors):
             nodes += len(part.values)
         return replace(DistanceFields.cat(parts), start=torch.cat(start))
 
-    def box_distance(self, points: Tensor, which: Tensor) -> Tensor:
+    def box_distance(self, points: Tensor, object_index: Tensor) -> Tensor:
         """[...] distance of points [..., 3] from the bounding box of their object [...]; 0 inside."""
-        nearest = points.clamp(self.low[which], self.high[which])
+        nearest = points.clamp(self.low[object_index], self.high[object_index])
         return (points - nearest).norm(dim=-1)
 
-    def nearer(self, points: Tensor, which: Tensor, limit: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def nearer(
+        self, points: Tensor, object_index: Tensor, limit: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Find the points that are nearer to their object than a limit.
 
         The bounding box rules most points out. One grid step is added, because next to an edge interpolated distances
@@ -77,36 +79,36 @@ class DistanceFields(Tensors):
 
         Args:
             points: [N, 3] in the mesh frame of their object.
-            which: [N] index of the object.
+            object_index: [N] index of the object.
             limit: [N] distance [m].
 
         Returns:
             Indices [A] of the near points, their signed distances [A] and gradients [A, 3].
         """
-        reachable = self.box_distance(points, which) <= (limit + self.spacing).clamp_min(0.0)
+        reachable = self.box_distance(points, object_index) <= (limit + self.spacing).clamp_min(0.0)
         candidates = reachable.nonzero()[:, 0]
-        distance, gradient = self.signed_distance(points[candidates], which[candidates])
+        distance, gradient = self.signed_distance(points[candidates], object_index[candidates])
         near = distance < limit[candidates]
         return candidates[near], distance[near], gradient[near]
 
-    def signed_distance(self, points: Tensor, which: Tensor) -> tuple[Tensor, Tensor]:
+    def signed_distance(self, points: Tensor, object_index: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance [N] and its gradient [N, 3] by trilinear interpolation.
 
         Beyond the grid, the distance to the grid is added to the value of the nearest point in it.
 
         Args:
             points: [N, 3] in the mesh frame of their object.
-            which: [N] index of the object.
+            object_index: [N] index of the object.
         """
-        counts = self.counts[which]
-        unclamped = (points - self.origin[which]) / self.spacing
+        counts = self.counts[object_index]
+        unclamped = (points - self.origin[object_index]) / self.spacing
         x = torch.minimum(unclamped.clamp_min(0.0), counts - 1.0001)
         beyond = unclamped - x
         excess = beyond.norm(dim=-1)
         cell = x.floor().long()
         step_y = counts[:, 2]
         step_x = counts[:, 1] * step_y
-        node = self.start[which] + cell[:, 0] * step_x + cell[:, 1] * step_y + cell[:, 2]
+        node = self.start[object_index] + cell[:, 0] * step_x + cell[:, 1] * step_y + cell[:, 2]
         corner = torch.stack((node, node + step_y, node + step_x, node + step_x + step_y), dim=-1)
         v = self.values[torch.stack((corner, corner + 1), dim=-1)].view(-1, 2, 2, 2)
         fx, fy, fz = (x - cell).unbind(1)

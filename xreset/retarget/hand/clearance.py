@@ -44,7 +44,7 @@ class Objects(NamedTuple):
     """[B, 3]"""
     rot: Tensor
     """[B, 3, 3]"""
-    which: Tensor
+    object_index: Tensor
     """[B] index into the objects of ``fields``."""
     fields: DistanceFields
 
@@ -54,13 +54,15 @@ class Objects(NamedTuple):
 
     def signed_distance(self, points: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`DistanceFields.signed_distance`; points [N, 3] of frames [N] and gradients [N, 3] in the world."""
-        distance, slope = self.fields.signed_distance(self.local(points, frame), self.which[frame])
+        distance, slope = self.fields.signed_distance(
+            self.local(points, frame), self.object_index[frame]
+        )
         return distance, matvec(self.rot[frame], slope)
 
     def nearer(self, points: Tensor, frame: Tensor, limit: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """See :meth:`DistanceFields.nearer`; points [N, 3] of frames [N] and gradients [A, 3] in the world."""
         near, distance, slope = self.fields.nearer(
-            self.local(points, frame), self.which[frame], limit
+            self.local(points, frame), self.object_index[frame], limit
         )
         return near, distance, matvec(self.rot[frame[near]], slope)
 
@@ -90,7 +92,9 @@ def too_near(
         bodies.rot[:, model.group_body], balls.bound_centers
     )
     every = torch.arange(len(bounds), device=bounds.device)[:, None].expand(bounds.shape[:2])
-    from_box = objects.fields.box_distance(objects.local(bounds, every), objects.which[every])
+    from_box = objects.fields.box_distance(
+        objects.local(bounds, every), objects.object_index[every]
+    )
 
     def below_table(centers: Tensor, frame: Tensor, radii: Tensor) -> tuple[Tensor, ...]:
         height = height_above_table(centers, radii, model.table)

@@ -5,7 +5,6 @@ Shape letters: N worlds, C cameras, H x W pixels, B bodies, P points.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import astuple
 from typing import Any
 
@@ -61,20 +60,17 @@ class Cameras:
         self.config = config
         self._scale = scale
         device = object_index.device
-        robot = scene.robot
-        self._kinematics = Kinematics(robot, dtype=torch.float32, device=device)
-        bodies = link_meshes(robot)
-        objects = [trimesh.Trimesh(o.vertices, o.faces, process=False) for o in scene.objects]
-        first_object = len(bodies) + 1
-        self._num_links = len(bodies)
-        mounts = [robot.palm if c.link == "palm" else c.link for c in config.cameras]
-        self._mounts = [None if name is None else len(bodies) + i for i, name in enumerate(mounts)]
-        self._links = [*bodies, *(name or self._kinematics.root for name in mounts)]
-        home = self._kinematics.link_poses(self._kinematics.home, self._links)
+
+        def tensor(values: Any) -> Tensor:
+            return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=device)
+
+        self._kinematics = Kinematics(scene.robot, dtype=torch.float32, device=device)
+        bodies = link_meshes(scene.robot)
         x, y, z = scene.table.half_size
         table = shape_mesh(box((*scene.table.center, -z), (2 * x, 2 * y, 2 * z)))
-        mounted = [transform(look_at(c.pos, c.target).T, c.pos) for c in config.cameras]
-        self._check_outside(mounted, home.cpu().numpy(), bodies, table)
+        self._mounted = tensor(self._mount(bodies, table))
+        objects = [trimesh.Trimesh(o.vertices, o.faces, process=False) for o in scene.objects]
+        first_object = len(bodies) + 1
         worlds = len(object_index)
         fixed = torch.arange(first_object, device=device).expand(worlds, -1)
         held = first_object + object_index[:, None]
@@ -89,16 +85,11 @@ class Cameras:
         self._goal_rays: RayCaster | None = None
         if config.goal_image:
             self._goal_rays = RayCaster(objects, object_index[:, None], *views)
-
-        def tensor(values: Any) -> Tensor:
-            return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=device)
-
         limits = tensor([(c.near, c.far) for c in config.cameras])
         self._near, self._far = limits.T[..., None, None]
         noise = tensor([astuple(c.noise) for c in config.cameras])
         self._spread, self._step, self._holes, self._edges, self._edge = noise.T[..., None, None]
         self._half_fov = tensor([c.fov / 2 for c in config.cameras])
-        self._mounted = tensor(mounted)
         y, x = torch.meshgrid(
             *(torch.arange(n, device=device) + 0.5 - n / 2 for n in size), indexing="ij"
         )
@@ -186,34 +177,41 @@ class Cameras:
         """[N] bool: whether the newest images show the object, if they had no errors."""
         return (self._on_object() & (self._in_range(self.rays.depth) > 0)).flatten(1).any(dim=1)
 
-    def _check_outside(
-        self,
-        mounted: Sequence[np.ndarray],
-        poses: np.ndarray,
-        bodies: dict[str, trimesh.Trimesh],
-        table: trimesh.Trimesh,
-    ) -> None:
-        """Refuse cameras inside the table or a link of the robot at home.
+    def _mount(
+        self, bodies: dict[str, trimesh.Trimesh], table: trimesh.Trimesh
+    ) -> list[np.ndarray]:
+        """Choose the links whose poses are needed, those of the bodies first.
 
-        Args:
-            mounted: [4, 4] pose of each camera in the frame of its link or of the world.
-            poses: [L, 4, 4] of the bodies, then of the cameras' links.
+        Returns:
+            The pose [4, 4] of each camera in the frame of its link or of the world.
+
+        Raises:
+            XResetError: a camera is inside the table or a link of the robot at home.
         """
+        cameras = self.config.cameras
+        kinematics = self._kinematics
+        names = [kinematics.robot.palm if c.link == "palm" else c.link for c in cameras]
+        self._num_links = len(bodies)
+        self._mounts = [None if name is None else len(bodies) + i for i, name in enumerate(names)]
+        self._links = [*bodies, *(name or kinematics.root for name in names)]
+        poses = kinematics.link_poses(kinematics.home, self._links).cpu().numpy()
+        mounted = [transform(look_at(c.pos, c.target).T, c.pos) for c in cameras]
         solids = {f"the robot's link {name!r}": mesh for name, mesh in bodies.items()}
         solids["the table"] = table
         places = [*poses[: len(bodies)], np.eye(4)]
-        for i, camera in enumerate(self.config.cameras):
-            mount = self._mounts[i]
-            eye = mounted[i][:, 3]
+        for number, camera in enumerate(cameras):
+            mount = self._mounts[number]
+            eye = mounted[number][:, 3]
             if mount is not None:
                 eye = poses[mount] @ eye
             for (name, mesh), pose in zip(solids.items(), places, strict=True):
                 local = np.linalg.inv(pose) @ eye
                 if winding_number(local[None, :3], mesh.vertices, mesh.faces)[0] > 0.5:
                     raise XResetError(
-                        f"Camera {i + 1} at {camera.pos} is inside {name} and sees nothing else. "
+                        f"Camera {number + 1} at {camera.pos} is inside {name} and sees nothing else. "
                         "Move it out (pos)."
                     )
+        return mounted
 
     def _on_object(self) -> Tensor:
         """[N, C, H, W] bool: whether a pixel's ray hits the object, which is a world's last body."""

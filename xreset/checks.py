@@ -316,10 +316,9 @@ def _value(hint: Any, value: Any, where: str, problems: list[str]) -> Any:
         if value not in arguments:
             return wrong(f"one of {', '.join(map(repr, arguments))}")
         return value
-    is_number = hint in (int, float)
     kinds = (int, float) if hint is float else hint
-    if not isinstance(value, kinds) or (is_number and isinstance(value, bool)):
-        return wrong(hint.__name__)
-    if isinstance(value, int) and abs(value) > _LARGEST:
+    is_bool = hint is not bool and isinstance(value, bool)
+    is_large = isinstance(value, int) and abs(value) > _LARGEST
+    if not isinstance(value, kinds) or is_bool or is_large:
         return wrong(hint.__name__)
     return float(value) if hint is float else value

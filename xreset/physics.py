@@ -127,9 +127,9 @@ class Parameters(Tensors):
     def given(self) -> dict[Parameter, Tensor]:
         """Return the parameters that are not None, by name."""
         return {
-            name: getattr(self, name)
+            name: value
             for name in get_args(Parameter)
-            if getattr(self, name) is not None
+            if (value := getattr(self, name)) is not None
         }
 
 

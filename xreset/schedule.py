@@ -72,8 +72,7 @@ def shared_worlds(
     """
     if not share:
         return None
-    unknown = sorted(set(share) - set(names))
-    if unknown:
+    if unknown := sorted(set(share) - set(names)):
         raise XResetError(
             f"object_share names {', '.join(unknown)}, but the objects are {', '.join(names)}. Use these names."
         )

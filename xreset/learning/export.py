@@ -129,10 +129,8 @@ def is_exported_from(policy: Path, checkpoint: Path) -> bool:
     from google.protobuf.message import DecodeError
 
     try:
-        entries = {
-            entry.key: entry.value
-            for entry in onnx.load(str(policy), load_external_data=False).metadata_props
-        }
+        model = onnx.load(str(policy), load_external_data=False)
     except DecodeError:
         return False
+    entries = {entry.key: entry.value for entry in model.metadata_props}
     return entries.get(_CHECKPOINT_KEY) == file_hash(checkpoint)

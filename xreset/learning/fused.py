@@ -191,7 +191,8 @@ class _FusedPointNet(torch.autograd.Function):
             return torch.empty(programs, *shape, device=cloud.device)
 
         width = ctx.sizes["K"]
-        columns = _columns(width)
+        # of _points: the least power of two that holds them, 16 or more
+        columns = max(16, 1 << (2 * width).bit_length())
         d1 = partial_sums(columns, a)
         d2 = partial_sums(a, b)
         db2 = partial_sums(columns, b)
@@ -211,12 +212,6 @@ class _FusedPointNet(torch.autograd.Function):
             d3.sum(dim=0).T,
             gradient.sum(dim=0),
         )
-
-
-def _columns(width: int) -> int:
-    """Columns of :func:`_points` for points of ``width`` numbers: the least power of two that holds them, 16 or
-    more."""
-    return max(16, 1 << (2 * width).bit_length())
 
 
 @functools.cache

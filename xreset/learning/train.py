@@ -341,7 +341,7 @@ def _train_alone(
     *,
     minutes: float,
     resumed: bool,
-    wandb: str | None = None,
+    wandb: str | None,
 ) -> None:
     """Train while this process alone writes the folder, and leave the process's global state as it was."""
     if not minutes > 0:

@@ -109,13 +109,11 @@ def _joints(robot: RobotSpec, task: TaskConfig) -> list[dict[str, Any]]:
         }
         for name in ("lower", "upper", "step", "lead", "zero", "below", "above"):
             row[name] = float(getattr(space, name)[i])
-        rows.append({name: _number(value) for name, value in row.items()})
+        # JSON has no infinite numbers
+        rows.append(
+            {name: None if value in (-math.inf, math.inf) else value for name, value in row.items()}
+        )
     return rows
-
-
-def _number(value: Any) -> Any:
-    """Return None for an infinite number, which JSON does not have."""
-    return None if isinstance(value, float) and math.isinf(value) else value
 
 
 def _chain(robot: RobotSpec) -> dict[str, Any]:

@@ -437,7 +437,8 @@ class RandomizationConfig(Checked):
 
     def longest(self, name: str) -> float:
         """Return the largest delay of a range [control steps]; 0: there is none."""
-        return (getattr(self, name) or (0.0, 0.0))[1] if self.enabled else 0.0
+        limits = getattr(self, name)
+        return limits[1] if self.enabled and limits else 0.0
 
     @property
     def has_faults(self) -> bool:

@@ -25,15 +25,15 @@ class Tracker:
         longest = config.longest("observation_latency")
         self._delays = DelayLine(drawn, "poses", 7, longest, delay)
         if c.has_errors:
-            bias = [c.position_bias] * 3 + [c.rotation_bias] * 3
-            noise = [c.position_noise] * 3 + [c.rotation_noise] * 3
-            limits = torch.tensor([bias, noise], device=drawn.device)
-            self._noise = limits[1]
             shape = (drawn.num_worlds, 6)
+            device = drawn.device
+            bias = torch.tensor([c.position_bias] * 3 + [c.rotation_bias] * 3, device=device)
+            noise = [c.position_noise] * 3 + [c.rotation_noise] * 3
+            self._noise = torch.tensor(noise, device=device)
             self._bias = drawn.keep(
                 "tracker.bias",
                 drawn.zeros(6),
-                lambda generator: limits[0] * symmetric(shape, generator),
+                lambda generator: bias * symmetric(shape, generator),
                 is_fault=True,
             )
         if c.skips_steps:

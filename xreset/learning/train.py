@@ -128,24 +128,11 @@ def train(
             f"The engine {engine!r} does not run on {device!r}. Omit --device, or choose another --backend."
         )
     data = _data_of(bank, goals)
-    loading = partial(load_inputs, robot=robot, objects=objects, accept=("bank", "goals"))
-    inputs = loading(data)
+    load = partial(load_inputs, robot=robot, objects=objects, accept=("bank", "goals"))
+    inputs = load(data)
     if isinstance(inputs.data, GoalSet):
         config = from_home(config)
-    if config.schedule.teacher and teacher is None:
-        raise RunError(
-            "schedule.teacher is for xreset distill, and this training has no teacher. Leave it empty."
-        )
-    if config.schedule.faults and not config.task.randomization.has_faults:
-        raise RunError(
-            "schedule.faults scales the faults of a real loop, and task.randomization has none. Set some, "
-            "or omit the schedule."
-        )
-    if config.uses_states and not inputs.bank.num_states:
-        raise RunError(
-            f"There is no state to reset to in {inputs.name}: every candidate was rejected. Look at its reasons "
-            "(xreset resets), or train without it: --config.task.reset.demo-probability 0"
-        )
+    _check_config(config, inputs, has_teacher=teacher is not None)
     start = None
     if weights is not None:
         start = _checkpoint_to_start_from(Path(weights), inputs, config)
@@ -153,10 +140,10 @@ def train(
         _copy_teacher(policy_file(teacher), out, inputs, config)
     if isinstance(data, GoalSet):
         write_goals(out / "goals.npz", data)
-        inputs = loading(out / "goals.npz")
+        inputs = load(out / "goals.npz")
     elif isinstance(data, ResetBank):
         write_bank(out / "resets.npz", data)
-        inputs = loading(out / "resets.npz")
+        inputs = load(out / "resets.npz")
     info = RunInfo(
         robot=str(inputs.robot_name),
         resets=str(inputs.path),
@@ -188,6 +175,24 @@ def _data_of(
     if given is None:
         raise RunError("A training needs a reset bank (--resets), a goal set (--goals), or both.")
     return given
+
+
+def _check_config(config: TrainConfig, inputs: Inputs, *, has_teacher: bool) -> None:
+    """Refuse, with ``RunError``, a schedule without effect, and bank states where there are none."""
+    if config.schedule.teacher and not has_teacher:
+        raise RunError(
+            "schedule.teacher is for xreset distill, and this training has no teacher. Leave it empty."
+        )
+    if config.schedule.faults and not config.task.randomization.has_faults:
+        raise RunError(
+            "schedule.faults scales the faults of a real loop, and task.randomization has none. Set some, "
+            "or omit the schedule."
+        )
+    if config.uses_states and not inputs.bank.num_states:
+        raise RunError(
+            f"There is no state to reset to in {inputs.name}: every candidate was rejected. Look at its reasons "
+            "(xreset resets), or train without it: --config.task.reset.demo-probability 0"
+        )
 
 
 def distill(

@@ -42,9 +42,7 @@ _LOW_OBJECT = 0.07  # objects up to this height are grasped from above [m]
 _ABOVE_TABLE = 0.007  # least height of a contact [m]
 _FACING_FINGERS = 0.6  # least cosine between the fingers' way and the surface's normal
 _FACING_THUMB = 0.75  # the same for the thumb
-_IN_LINE = (
-    0.025  # largest distance of a finger's contact from the middle fingers', along its way [m]
-)
+_IN_LINE = 0.025  # how far a finger's way may differ from that of the middle fingers [m]
 _DEPTH = (0.004, 0.055)  # range of how deep the hand reaches over the object [m]
 _TOUCH = 1e-4  # pieces of an object that are this close are one part [m]
 _RADII = np.full(40, 0.007)  # of the hand's flesh around joints and middles of bones [m]

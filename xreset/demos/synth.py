@@ -170,7 +170,7 @@ def _start(obj: ObjectSpec, up: np.ndarray, side: str) -> tuple[Solid, list[Cont
 def _grasp(
     obj: ObjectSpec, resting: Solid, plans: Sequence[Contacts], side: str, rng: np.random.Generator
 ) -> Grasp:
-    """Return the best of some grasps of the object somewhere on the table; a good one is the last that is tried."""
+    """Return the best of some random grasps of the object somewhere on the table; a good grasp ends the search."""
 
     tries = []
     for _ in range(_TRIES):

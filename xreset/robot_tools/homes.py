@@ -19,7 +19,7 @@ from xreset.spec import RobotSpec
 _STEPS = (-0.15, 0.0, 0.15)
 """[m] Steps along each axis to other places that are tried."""
 _CLEAR = 0.10
-"""[m] Height of a home above the table from which the spread around that home is clear of the table."""
+"""[m] A home that is higher than this above the table keeps the spread around it clear of the table."""
 
 
 def hold_near(robot: RobotSpec, T_world_root: np.ndarray) -> tuple[RobotSpec, str] | None:

@@ -47,7 +47,7 @@ _UPRIGHT = 45.0
 _SHRINK = 0.6
 """Factor by which the spread of candidates about the best shrinks from round to round."""
 _HOME_CLEAR = 0.02
-"""[m] Least height above the table at home, where the new home is the old one's joints."""
+"""[m] Least height above the table of a home that keeps the old joint positions."""
 
 
 @one_thread()

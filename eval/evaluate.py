@@ -77,7 +77,7 @@ def evaluate(
         settle=settle,
         episode_seconds=episode_seconds,
     )
-    length = trial.task.termination.episode_seconds
+    length = float(trial.task.termination.episode_seconds)  # JSON has no numbers of NumPy
     folder = Path(out) if out else policy.folder
     results = []
     tables = []

@@ -472,7 +472,7 @@ class TrainingTest(WithBank):
             ("many-objects has no critic .* Give a run folder", {"weights": "many-objects"}),
             ("000002.pt is a file. Give the folder", {"weights": latest_checkpoint(self.out)}),
             ("--num-envs is 0", {"num_envs": 0}),
-            ("--minutes is 0", {"minutes": 0.0}),
+            ("--minutes is 0", {"minutes": 0.0, "bank": toy_bank(self.robot)}),
             ("Unknown device 'quantum'", {"device": "quantum"}),
             ("'mujoco' does not run on 'cuda'", {"device": "cuda"}),
             ("needs a reset bank .--resets., a goal set .--goals., or both", {"bank": None}),
@@ -487,6 +487,14 @@ class TrainingTest(WithBank):
             with self.subTest(words), self.assertRaisesRegex(XResetError, words):
                 self.train("refused", **options)
             self.assertEqual(list(self.folder.glob("refused/*.npz")), [], words)
+        with (
+            patch(
+                "xreset.backends.mujoco.MujocoBackend.engine_version", side_effect=RunError("gone")
+            ),
+            self.assertRaisesRegex(RunError, "gone"),
+        ):
+            self.train("refused", bank=toy_bank(self.robot))
+        self.assertFalse((self.folder / "refused").exists())
         (self.folder / "refused").mkdir()
         with (
             claim(self.folder / "refused"),

@@ -123,6 +123,7 @@ def train(
         )
     if num_envs < 1:
         raise RunError(f"--num-envs is {num_envs}, expected at least 1.")
+    _check_minutes(minutes)
     if device_for(engine, device) != device:
         raise RunError(
             f"The engine {engine!r} does not run on {device!r}. Omit --device, or choose another --backend."
@@ -133,6 +134,7 @@ def train(
     if isinstance(inputs.data, GoalSet):
         config = from_home(config)
     _check_config(config, inputs, has_teacher=teacher is not None)
+    version = backend_class(engine).engine_version()  # fails where the engine is missing
     start = None
     if weights is not None:
         start = _checkpoint_to_start_from(Path(weights), inputs, config)
@@ -150,7 +152,7 @@ def train(
         resets_hash=str(inputs.hash),
         objects=str(inputs.objects_folder) if inputs.objects_folder else None,
         backend=engine,
-        backend_version=backend_class(engine).engine_version(),
+        backend_version=version,
         device=device,
         num_envs=num_envs,
         seed=seed,
@@ -175,6 +177,11 @@ def _data_of(
     if given is None:
         raise RunError("A training needs a reset bank (--resets), a goal set (--goals), or both.")
     return given
+
+
+def _check_minutes(minutes: float) -> None:
+    if not minutes > 0:
+        raise RunError(f"--minutes is {minutes}, expected more than 0.")
 
 
 def _check_config(config: TrainConfig, inputs: Inputs, *, has_teacher: bool) -> None:
@@ -310,6 +317,7 @@ def resume(
             does not fit, another process is training here, or there is too little memory.
         PolicyError: the robot has changed, or the policy observed something else in an earlier version of xreset.
     """
+    _check_minutes(minutes)
     out = Path(out)
     info = read_run(out)
     expected = info.config.task.reward.own
@@ -349,8 +357,6 @@ def _train_alone(
     wandb: str | None,
 ) -> None:
     """Train while this process alone writes the folder, and leave the process's global state as it was."""
-    if not minutes > 0:
-        raise RunError(f"--minutes is {minutes}, expected more than 0.")
     processes = Processes.of_environment()
     if info.device == "cpu" and info.num_envs > _MANY_ON_A_CPU:
         print(

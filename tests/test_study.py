@@ -127,6 +127,7 @@ class FileTest(Studied):
         for entry, words in (
             ("data = 3", "defaults, data and runs must be tables"),
             ("data.toy = 3", r"data\.toy is 3, expected an object"),
+            ("", "missing: data"),
         ):
             self.assertRaisesRegex(
                 FileFormatError, words, read_study, self.file(f"{entry}\n{HEAD}{text}")

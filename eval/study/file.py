@@ -222,7 +222,9 @@ def read_study(path: Path) -> Study:
     if not all(isinstance(table, dict) for table in (defaults, data, runs)):
         raise FileFormatError(f"{path}: defaults, data and runs must be tables.")
     of_data = {"resets": defaults.pop("resets", ())}
-    base = {"data": dict.fromkeys(data, of_data), "runs": dict.fromkeys(runs, defaults)}
+    base = {"runs": dict.fromkeys(runs, defaults)}
+    if data:
+        base["data"] = dict.fromkeys(data, of_data)
     study = from_dict(Study, merged(base, raw), str(path))
     try:
         _check_names(study)

@@ -309,7 +309,10 @@ class CommandTest(InFolder):
         (self.folder / "text").write_text("text")
         out = self.folder / "c.npz"
         for name, message in (
-            ("b.npz", "states schema 'xreset-resets/1', expected 'xreset-retargeted/1'"),
+            (
+                "b.npz",
+                r"'xreset-resets/1', expected 'xreset-retargeted/1' \(a file of xreset retarget\)",
+            ),
             ("text", "text cannot be read as a file of xreset retarget"),
             ("none.npz", r"none.npz \(a file of xreset retarget\). Check the path"),
         ):

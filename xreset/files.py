@@ -381,8 +381,12 @@ def must_exist(path: Path, what: str) -> None:
         raise FileFormatError(f"{path} is a folder or a device, expected a file ({what}).")
 
 
-def check_schema(path: Path, found: Any, expected: str) -> None:
-    """Refuse, with ``FileFormatError``, a file that states another schema than the one expected."""
+def check_schema(path: Path, found: Any, expected: str, what: str | None = None) -> None:
+    """Refuse, with ``FileFormatError``, a file that states another schema than the one expected.
+
+    Args:
+        what: what the file ought to be, for messages; default: its version, as the schema states it.
+    """
     if found == expected:
         return
     name, _, version = expected.rpartition("/")
@@ -392,6 +396,5 @@ def check_schema(path: Path, found: Any, expected: str) -> None:
             "again."
         )
     stated = f"states schema {shown(found)}" if found else "states no schema"
-    raise FileFormatError(
-        f"{path} {stated}, expected {expected!r} (version {version} of {name}). Is it the right file?"
-    )
+    what = what or f"version {version} of {name}"
+    raise FileFormatError(f"{path} {stated}, expected {expected!r} ({what}). Is it the right file?")

@@ -128,7 +128,7 @@ def read_npz(
     sizes: dict[str, int] = {}
     with _opened(path, what, f"cannot be read as {what}") as (archive, packed):
         if schema_name is not None:
-            check_schema(path, _stated_schema(archive, packed), schema_name)
+            check_schema(path, _stated_schema(archive, packed), schema_name, what)
             own |= {"schema": Field((), "U"), "meta": Field((), "U", required=False)}
         missing = [name for name, field in own.items() if field.required and name not in packed]
         if missing:

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from xreset.checks import from_dict, merged
 from xreset.demos.archive import read_demos
-from xreset.env import shared_worlds
 from xreset.errors import FileFormatError, RunError
 from xreset.eval.study.file import Data, Study
 from xreset.eval.study.steps import Run, Step, Subset, bank_todo, eval_todo, train_todo
@@ -17,6 +16,7 @@ from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import from_home, starting_config
 from xreset.objects.catalogue import canonical_names, object_names
 from xreset.plugins import backend_status
+from xreset.schedule import shared_worlds
 from xreset.task.config import TaskConfig, with_episodes_of
 from xreset.text import short_name
 

@@ -46,8 +46,8 @@ RECIPES = _read_recipes()
 def default_config(bank: Any, goals: Any, weights: str | Path | None) -> tuple[str, TrainConfig]:
     """Return where the configuration comes from if nothing is said, and the configuration.
 
-    A run that is fine-tuned on goals goes on with its own; without a bank, it leaves its schedule of demonstrated
-    states. Other trainings are the paper's.
+    Goals and the weights of a run: that run's configuration; without a bank, without its schedule of demonstrated
+    states. Everything else: the paper's.
     """
     if goals is None or weights is None or not (Path(weights) / "run.json").is_file():
         return "paper", TrainConfig()

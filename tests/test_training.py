@@ -37,7 +37,7 @@ from xreset.errors import FileFormatError, PolicyError, RunError, XResetError
 from xreset.files import claim, file_hash
 from xreset.learning.checkpoint import load_moments, read_checkpoint
 from xreset.learning.config import ScheduleConfig, TrainConfig
-from xreset.learning.recipes import RECIPES
+from xreset.learning.recipes import RECIPES, own_terms_flag
 from xreset.learning.run import (
     Candidate,
     Choice,
@@ -410,6 +410,8 @@ class TrainingTest(WithBank):
         self.assertIn("strangers_term", sys.modules)
         self.assertEqual(read_run(f"{self.folder}/with").config.task.reward.own, own)
         self.assertEqual(len(checkpoints(stranger)), 3)
+        number = own_terms_flag({"toy:term": 0.1 + 0.2}).split()[-1]
+        self.assertEqual(float(number), 0.1 + 0.2)
 
     def test_a_run_begins_with_the_networks_of_another(self):
         still = replace(ONE, ppo=replace(ONE.ppo, learning_rate=1e-12, schedule="fixed"))

@@ -103,7 +103,10 @@ def from_home(config: TrainConfig) -> TrainConfig:
 
 def own_terms_flag(own: dict[str, float]) -> str:
     """Return the option of ``xreset train`` that names reward terms of the user's own."""
-    terms = [f"{shlex.quote(plain(name))} {weight:.15g}" for name, weight in own.items()]
+    terms = []
+    for name, weight in own.items():
+        number = str(float(weight)).removesuffix(".0")  # reads back as the same weight
+        terms.append(f"{shlex.quote(plain(name))} {number}")
     return " ".join(["--config.task.reward.own", *terms])
 
 

@@ -483,6 +483,7 @@ class Synthetic(InFolder):
         for words, options in (
             ("per_object is 1000000000 .* 1 to 100000", {"per_object": 10**9}),
             ("fps is 1", {"fps": 1}),
+            ("side is 'top', expected", {"side": "top"}),
         ):
             self.assertRaisesRegex(DemoError, words, synthesize, ["soup"], **options)
 

@@ -87,13 +87,15 @@ def synthesize(
 
     Raises:
         ObjectError: unknown object.
-        DemoError: ``per_object`` or ``fps`` is out of range, or an object cannot be held.
+        DemoError: ``per_object`` or ``fps`` is out of range, the side is neither, or an object cannot be held.
     """
     if not 1 <= per_object <= MAX_SEQUENCES or not 5 <= fps <= 1000:
         raise DemoError(
             f"per_object is {per_object} and fps is {fps}, expected 1 to {MAX_SEQUENCES} sequences and 5 to 1000"
             " frames per second."
         )
+    if side not in ("right", "left"):
+        raise DemoError(f"side is {side!r}, expected 'right' or 'left'.")
     folder = Path(meshes) if meshes else None
     specs = load_objects(objects or object_names(folder), folder)
     parts = []

@@ -120,6 +120,9 @@ FIGURES = {
 def result_rows(summaries: Sequence[EvalResult]) -> list[tuple[str, ...]]:
     """Return one row of text for each figure: its name, then its value in each engine."""
     rows = [("version", *(s.backend_version for s in summaries))]
+    lengths = [_length_text(s) for s in summaries]
+    if len(set(lengths)) > 1:
+        rows.append(("episode length", *lengths))
     for name, figure in FIGURES.items():
         rows.append((name, *map(figure.text, summaries)))
         if figure.interval is not None:
@@ -129,6 +132,11 @@ def result_rows(summaries: Sequence[EvalResult]) -> list[tuple[str, ...]]:
         if name == "published success" and summaries[0].published_success_rate is not None:
             rows += _unseen_rows(summaries, lambda d: d.published_success_rate)
     return rows
+
+
+def _length_text(summary: EvalResult) -> str:
+    """Return the length of the episodes as text; an earlier version did not record it."""
+    return "missing" if summary.episode_seconds is None else f"{summary.episode_seconds:g} s"
 
 
 def _interval(interval: Interval | None) -> str:
@@ -155,7 +163,9 @@ def _unseen_rows(
 def results_table(summaries: Sequence[EvalResult]) -> Table:
     """Return the table of an evaluation: one column for each engine; four engines fit into 80 characters."""
     first = summaries[0]
-    length = "" if first.episode_seconds is None else f" of {first.episode_seconds:g} s"
+    length = ""
+    if first.episode_seconds is not None and len({s.episode_seconds for s in summaries}) == 1:
+        length = f" of {_length_text(first)}"
     counts = (
         f"episodes: {first.episodes}{length}, demonstrations: {len(first.per_demo)}, "
         f"seed: {first.seed}"

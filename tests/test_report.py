@@ -40,6 +40,7 @@ from xreset.eval.report.make import collect, count_failures, headline, make_repo
 from xreset.eval.results import TaskProgress, episode_table, recorded, write_results
 from xreset.eval.sensitivity import chosen
 from xreset.eval.stress import curve
+from xreset.eval.table import table_text
 from xreset.files import claim_folder, write_json
 from xreset.geometry.shapes import pose_matrix
 from xreset.learning.run import write_choice
@@ -423,6 +424,9 @@ class PageTest(Reported):
         self.assertIn(
             "4 in each engine, of 5 s in mujoco, of 12 s in pybullet: 2 demonstrations", both
         )
+        table = table_text(list(collect(self.folder).training.results.values()))
+        self.assertRegex(table, r"episodes: 4, demonstrations: 2")
+        self.assertRegex(table, r"episode length +│ +5 s │ +12 s")
         self.assertEqual(text.count('<td class="bad">1</td>'), 2, "faults of an engine stand out")
         self.assertNotIn("<video", text)
         self.assertNotIn("Training", Outline(text).text)

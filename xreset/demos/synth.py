@@ -11,7 +11,6 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from operator import attrgetter
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -122,12 +121,11 @@ def _sequence(
     """Make one sequence from the ways in which the object may start, each with the plans to hold it."""
     resting, plans = starts[int(rng.integers(len(starts)))]
     timing = _random_timing(fps, rng)
-    tries = []
-    for _ in range(_GRASP_TRIES):
-        tries.append(_clear_approach(_grasp(obj, resting, plans, side, rng), timing, rng))
-        if tries[-1].gap > 0:
-            break
-    path = max(tries, key=_gap)
+    approaches = (
+        _clear_approach(_grasp(obj, resting, plans, side, rng), timing, rng)
+        for _ in range(_GRASP_TRIES)
+    )
+    path = _first_clear(approaches, least_gap=0.0)
     grasp = path.grasp
     solid = grasp.solid
     object_pos, object_rot = _object_path(solid.pos, solid.rotation, timing, rng)
@@ -221,9 +219,6 @@ class _HandPath(NamedTuple):
     """[T, 17] joint angles."""
 
 
-_gap = attrgetter("gap")
-
-
 def _random_timing(fps: float, rng: np.random.Generator) -> _Timing:
     """Draw the timing of a demonstration of about 2.4 s whose object leaves the table after about 1.15 s."""
     spans = ((0.75, 0.95), (0.15, 0.25), (0.05, 0.1), (0.8, 1.0), (0.25, 0.45))
@@ -260,12 +255,17 @@ def _object_path(
 def _clear_approach(grasp: Grasp, timing: _Timing, rng: np.random.Generator) -> _HandPath:
     """Return the first of some random approaches that stays clear of object and table, or else the one with the largest
     gap."""
+    return _first_clear((_approach(grasp, timing, rng) for _ in range(_TRIES)), least_gap=_CLEAR)
+
+
+def _first_clear(paths: Iterable[_HandPath], least_gap: float) -> _HandPath:
+    """Return the first path whose gap is larger than ``least_gap`` [m], or else the path with the largest gap."""
     tries = []
-    for _ in range(_TRIES):
-        tries.append(_approach(grasp, timing, rng))
-        if tries[-1].gap > _CLEAR:
+    for path in paths:
+        tries.append(path)
+        if path.gap > least_gap:
             break
-    return max(tries, key=_gap)
+    return max(tries, key=lambda path: path.gap)
 
 
 def _approach(grasp: Grasp, timing: _Timing, rng: np.random.Generator) -> _HandPath:

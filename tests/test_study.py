@@ -31,6 +31,7 @@ from xreset.eval.study.report import write_page
 from xreset.eval.study.steps import Step, flags
 from xreset.eval.study.tables import fill
 from xreset.files import claim
+from xreset.learning.clock import read_lift, write_lift
 from xreset.learning.recipes import RECIPES
 from xreset.learning.run import checkpoints, latest_checkpoint
 
@@ -528,6 +529,19 @@ class WholeTest(InOneFolder):
             command[3:],
             ["train", "--out", f"{self.out}/x-reset-seed0", "--iterations", "4", "--resume"],
         )
+
+    def test_a_run_that_has_reached_its_target_is_done(self):
+        folder = self.out / "x-reset-seed0"
+        run = (folder / "run.json").read_text()
+        self.addCleanup((folder / "run.json").write_text, run)
+        config = json.loads(run)["config"] | {"target_success": 0.1}
+        (folder / "run.json").write_text(json.dumps(json.loads(run) | {"config": config}))
+        lift = read_lift(folder)
+        self.addCleanup(write_lift, folder, lift)
+        longer = ("steps = 128", "steps = 256\nconfig.target_success = 0.1")
+        for share, done in ((0.05, False), (0.12, True)):
+            write_lift(folder, replace(lift, success_from_home=share))
+            self.assertEqual(self.plan(longer).steps["train x-reset-seed0"].left() == "", done)
 
     def test_another_configuration_under_the_same_name_is_refused(self):
         before = latest_checkpoint(self.out / "x-reset-seed0").read_bytes()

@@ -36,6 +36,7 @@ from xreset.cli import main
 from xreset.errors import FileFormatError, PolicyError, RunError, XResetError
 from xreset.files import claim, file_hash
 from xreset.learning.checkpoint import load_moments, read_checkpoint
+from xreset.learning.clock import read_lift
 from xreset.learning.config import ScheduleConfig, TrainConfig
 from xreset.learning.recipes import RECIPES, own_terms_flag
 from xreset.learning.run import (
@@ -237,6 +238,25 @@ class TrainingTest(WithBank):
         self.assertGreater(done, stopped)
         self.resume(out, iterations=done + 1)
         self.assertEqual(newest(out).iteration, done + 1)
+
+    def test_a_run_ends_at_its_target(self):
+        shares = (0.0, 0.09, 0.2, 0.3)
+        config = replace(CONFIG, iterations=10, target_success=0.1)
+
+        def write(log, iteration, env_steps, elapsed, scalars):
+            log._lift = log._lift.after(
+                shares[iteration - 1], iteration=iteration, env_steps=env_steps, seconds=elapsed
+            )
+
+        with patch("xreset.learning.log.TrainingLog.write", write), quickly() as said:
+            out = train(self.bank, out=self.folder / "target", **OPTIONS | {"config": config})
+        self.assertEqual([c.name for c in checkpoints(out)][-1], "000003.pt")
+        lift = read_lift(out)
+        self.assertEqual((lift.iteration, lift.success_from_home), (3, 0.2))
+        self.assertIn("success from home is 20.0% and reaches its target", said.getvalue())
+        for wrong in (0.0, 1.5):
+            with self.assertRaisesRegex(ValueError, "target_success is .*above 0 and at most 1"):
+                replace(CONFIG, target_success=wrong)
 
     def test_rates_of_success_of_demonstrations_are_kept(self):
         reset = replace(ONE.task.reset, adaptive_share=0.5)

@@ -169,6 +169,11 @@ class TrainConfig(Checked):
     iterations: PositiveInt = 10000
     save_interval: PositiveInt = 50
     """Iterations between checkpoints."""
+    target_success: (
+        Annotated[float, Rule("a number above 0 and at most 1", lambda x: 0 < x <= 1)] | None
+    ) = None
+    """Share of success from home, such as 0.1, with which the training ends: the share of the steps of worlds that
+    started at home in which the object was at its goal, in one iteration. None: the training has no such end."""
 
     @property
     def uses_states(self) -> bool:

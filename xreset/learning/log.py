@@ -128,6 +128,11 @@ class TrainingLog:
         self._finished.zero_()
         self._steps.clear()
 
+    @property
+    def success_from_home(self) -> float:
+        """Share of success from home in the last iteration; 0 as long as a teacher acts in some worlds."""
+        return self._lift.success_from_home
+
     def write_lift(self) -> None:
         """Write the lift clock's file."""
         write_lift(self._folder, self._lift)

@@ -89,9 +89,10 @@ class TrainingRunner:
         self._resume_command = resume_command(folder, config.task.reward.own)
 
     def learn(self, total: int, *, seconds: float = math.inf) -> None:
-        """Train until a number of iterations is done in all, and write a checkpoint. Ctrl-C ends after an iteration.
+        """Train until a number of iterations is done in all, and write a checkpoint.
 
-        The first episodes start at random times, so that the worlds do not end them together.
+        The configuration's ``target_success`` ends the training earlier, and so does Ctrl-C, after an iteration. The
+        first episodes start at random times, so that the worlds do not end them together.
 
         Args:
             total: iterations in all, those of a resumed run included.
@@ -114,9 +115,12 @@ class TrainingRunner:
         steps = self.config.ppo.horizon * env.num_envs * self.processes.count
         earlier = self.elapsed
         begin = time.perf_counter()
+        target = self.config.target_success
+        reached = False
         with _stop_on_interrupt(say=self.processes.is_main) as requests:
             while self.iteration < total:
-                if self._agreed(bool(requests) or time.perf_counter() - begin > seconds):
+                over = time.perf_counter() - begin > seconds
+                if self._agreed(bool(requests) or reached or over):
                     break
                 start = time.perf_counter()
                 share_of_time = (earlier + start - begin) / (earlier + seconds)
@@ -142,6 +146,7 @@ class TrainingRunner:
                     if isinstance(self.alg, SequenceDistillation):
                         scalars["policy/teacher_share"] = self.alg.teacher_share
                     log.write(self.iteration, self.env_steps, self.elapsed, scalars)
+                    reached = target is not None and log.success_from_home >= target
                 if self.iteration % self.config.save_interval == 0:
                     self.save_checkpoint()
                     saved_at = self.iteration
@@ -151,7 +156,12 @@ class TrainingRunner:
             self.save_checkpoint()
         if log is not None:
             log.close()
-            if self.iteration < total:
+            if reached:
+                print(
+                    f"success from home is {log.success_from_home:.1%} and reaches its target: the training ends, "
+                    "and a checkpoint is written"
+                )
+            elif self.iteration < total:
                 print(
                     "stopped after the current iteration; a checkpoint is written. To continue: "
                     + self._resume_command

@@ -178,12 +178,30 @@ class MujocoTest(EngineChecks, TestCase):
     test_dry_friction_holds_against_a_weak_drive_only = None
 
 
+class Creep(TestCase):
+    def test_held_objects_hardly_sink_at_the_timestep_of_evaluations(self):
+        """At 120 Hz friction is softer, so that fewer Newton iterations are enough."""
+        for hz, low, high in ((240, 0.0, 2e-5), (120, 1e-4, 2e-4)):
+            timed = replace(scene(), timestep=1 / hz)
+            with MujocoBackend(timed, 1, object_index=tensor([0]), workers=0) as backend:
+                state, _ = grasp(Bench(MujocoBackend, timed))
+                backend.set_state(state[[0]])
+                heights = []
+                for seconds in (1, 4):
+                    backend.step(seconds * hz)
+                    heights.append(float(backend.state().object_pos[0, 2]))
+            speed = (heights[0] - heights[1]) / 4  # m/s
+            with self.subTest(hz=hz):
+                self.assertGreater(speed, low)
+                self.assertLess(speed, high)
+
+
 class BothBackends(TestCase):
     """MuJoCo C is the reference for MuJoCo-Warp. The worlds are built once: compiling kernels takes about a minute."""
 
     @classmethod
     def setUpClass(cls):
-        cls.scene = scene()
+        cls.scene = replace(scene(), timestep=1 / 120)  # as trainings have it
         index = tensor([0, 1, 2, 0])
         cls.warp = MujocoWarpBackend(cls.scene, 4, object_index=index)
         cls.c = MujocoBackend(cls.scene, 4, object_index=index, workers=0)

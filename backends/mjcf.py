@@ -186,8 +186,8 @@ def _impratio(timestep: float) -> float:
     """Return how many times harder a contact resists sliding than penetration, for a timestep [s].
 
     A held object creeps in proportion to the timestep and to 1 / impratio. At 240 Hz, with 100, objects stay where a
-    hand holds them for a minute, as in PyBullet and SAPIEN; with 10 they do not. At 120 Hz, with 100, half of the
-    worlds need more Newton iterations than MuJoCo-Warp takes, and policies learn more slowly (docs/lab-book.md).
+    hand holds them for a minute, as in PyBullet and SAPIEN; with 10 they do not. At 120 Hz, with 100, a third of the
+    steps need more Newton iterations than MuJoCo-Warp takes, and policies learn more slowly (docs/lab-book.md).
     """
     return 100.0 if timestep < _FINE else 10.0
 

@@ -522,8 +522,8 @@ class TrainingTest(WithBank):
             claim(self.folder / "refused"),
             self.assertRaisesRegex(XResetError, "nother (command|process) is writing"),
         ):
-            self.train("refused")
-        self.assertFalse((self.folder / "refused" / "run.json").exists())
+            self.train("refused", bank=toy_bank(self.robot))
+        self.assertEqual([f for f in (self.folder / "refused").rglob("*") if f.is_file()], [])
         self.assertRaisesRegex(RunError, "holds a run already.*--resume", self.train, "run")
         bank = self.folder / "changing.npz"
         write_bank(bank, toy_bank(self.robot))

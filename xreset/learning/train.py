@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import re
 import sys
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -138,31 +138,34 @@ def train(
     start = None
     if weights is not None:
         start = _checkpoint_to_start_from(Path(weights), inputs, config)
-    if teacher is not None:
-        _copy_teacher(policy_file(teacher), out, inputs, config)
-    if isinstance(data, GoalSet):
-        write_goals(out / "goals.npz", data)
-        inputs = load(out / "goals.npz")
-    elif isinstance(data, ResetBank):
-        write_bank(out / "resets.npz", data)
-        inputs = load(out / "resets.npz")
-    info = RunInfo(
-        robot=str(inputs.robot_name),
-        resets=str(inputs.path),
-        resets_hash=str(inputs.hash),
-        objects=str(inputs.objects_folder) if inputs.objects_folder else None,
-        backend=engine,
-        backend_version=version,
-        device=device,
-        num_envs=num_envs,
-        seed=seed,
-        config=config,
-        contract=policy_contract(inputs.robot, config.task, tuple(o.name for o in inputs.objects)),
-        weights=str(start) if start else None,
-        weights_hash=file_hash(start) if start else None,
-        teacher=str(teacher) if teacher else None,
-    )
-    _train_alone(out, info, inputs, minutes=minutes, resumed=False, wandb=wandb)
+    with _alone(out):
+        if teacher is not None:
+            _copy_teacher(policy_file(teacher), out, inputs, config)
+        if isinstance(data, GoalSet):
+            write_goals(out / "goals.npz", data)
+            inputs = load(out / "goals.npz")
+        elif isinstance(data, ResetBank):
+            write_bank(out / "resets.npz", data)
+            inputs = load(out / "resets.npz")
+        info = RunInfo(
+            robot=str(inputs.robot_name),
+            resets=str(inputs.path),
+            resets_hash=str(inputs.hash),
+            objects=str(inputs.objects_folder) if inputs.objects_folder else None,
+            backend=engine,
+            backend_version=version,
+            device=device,
+            num_envs=num_envs,
+            seed=seed,
+            config=config,
+            contract=policy_contract(
+                inputs.robot, config.task, tuple(o.name for o in inputs.objects)
+            ),
+            weights=str(start) if start else None,
+            weights_hash=file_hash(start) if start else None,
+            teacher=str(teacher) if teacher else None,
+        )
+        _train_cleanly(out, info, inputs, minutes=minutes, resumed=False, wandb=wandb)
     return out
 
 
@@ -337,7 +340,8 @@ def resume(
             f"{info.resets} is not the file that this run was started with. Put it back, or start a new run."
         )
     check_contract(str(out), info.contract, inputs.robot, info.config.task)
-    _train_alone(out, info, inputs, minutes=minutes, resumed=True, wandb=wandb)
+    with _alone(out):
+        _train_cleanly(out, info, inputs, minutes=minutes, resumed=True, wandb=wandb)
     return out
 
 
@@ -347,7 +351,17 @@ _NO_MEMORY = re.compile("Failed to allocate|out of memory")
 """How Warp reports too little memory, as a ``RuntimeError``."""
 
 
-def _train_alone(
+@contextmanager
+def _alone(out: Path) -> Iterator[None]:
+    """Let no other training write the run folder."""
+    with ExitStack() as stack:
+        if Processes.of_environment().is_main:
+            stack.enter_context(claim_folder(out))
+            stack.enter_context(claim_folder(out / "checkpoints"))
+        yield
+
+
+def _train_cleanly(
     out: Path,
     info: RunInfo,
     inputs: Inputs,
@@ -356,7 +370,7 @@ def _train_alone(
     resumed: bool,
     wandb: str | None,
 ) -> None:
-    """Train while this process alone writes the folder, and leave the process's global state as it was."""
+    """Train, say what to do if there is too little memory, and leave the process's global state as it was."""
     processes = Processes.of_environment()
     if info.device == "cpu" and info.num_envs > _MANY_ON_A_CPU:
         print(
@@ -368,9 +382,6 @@ def _train_alone(
         stack.callback(torch.set_float32_matmul_precision, torch.get_float32_matmul_precision())
         if not torch.distributed.is_initialized():
             stack.callback(leave)
-        if processes.is_main:
-            stack.enter_context(claim_folder(out))
-            stack.enter_context(claim_folder(out / "checkpoints"))
         try:
             _train(processes, out, info, inputs, minutes=minutes, resumed=resumed, wandb=wandb)
         except (MemoryError, RuntimeError) as error:

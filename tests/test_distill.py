@@ -166,6 +166,7 @@ class DistillTest(WithBank):
         ):
             with self.subTest(words), quickly(), self.assertRaisesRegex(error, words):
                 distill(**(two | options))
+            self.assertFalse((self.folder / "refused").exists(), words)
         words = "No camera shows 005_tomato_soup_can, 010_potted_meat_can"
         with quickly(), self.assertRaisesRegex(XResetError, words):
             self.distill("away", away)

@@ -138,9 +138,11 @@ def train(
     start = None
     if weights is not None:
         start = _checkpoint_to_start_from(Path(weights), inputs, config)
+    if teacher is not None:
+        _check_teacher(policy_file(teacher), inputs, config)
     with _alone(out):
         if teacher is not None:
-            _copy_teacher(policy_file(teacher), out, inputs, config)
+            write_whole(out / TEACHER, policy_file(teacher).read_bytes())
         if isinstance(data, GoalSet):
             write_goals(out / "goals.npz", data)
             inputs = load(out / "goals.npz")
@@ -259,8 +261,8 @@ def _camera(camera: str | CameraConfig) -> CameraConfig:
     return CAMERAS[camera]
 
 
-def _copy_teacher(teacher: Path, out: Path, inputs: Inputs, config: TrainConfig) -> None:
-    """Copy the policy of a teacher into a run folder, if it fits the robot and the task."""
+def _check_teacher(teacher: Path, inputs: Inputs, config: TrainConfig) -> None:
+    """Refuse the policy of a teacher that does not fit the robot and the task."""
     contract = OnnxPolicy(teacher).contract
     if contract.task.vision.cameras:
         raise PolicyError(
@@ -269,7 +271,6 @@ def _copy_teacher(teacher: Path, out: Path, inputs: Inputs, config: TrainConfig)
     check_contract(
         str(teacher), contract, inputs.robot, replace(config.task, vision=VisionConfig())
     )
-    write_whole(out / TEACHER, teacher.read_bytes())
 
 
 def _checkpoint_to_start_from(run: Path, inputs: Inputs, config: TrainConfig) -> Path:

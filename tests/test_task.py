@@ -43,7 +43,7 @@ from xreset.task.config import (
 )
 from xreset.task.latency import DelayLine
 from xreset.task.randomization import Drawn, pair_friction, sample_friction
-from xreset.task.rewards import RewardInput, compute_reward, contact_gate
+from xreset.task.rewards import RewardInput, compute_reward, contact_gate, presses_down
 from xreset.task.terminations import out_of_bounds
 
 IDENTITY = tensor([1.0, 0, 0, 0])
@@ -109,6 +109,8 @@ class RewardTest(TestCase):
         opposing = {"contact": "opposing"}
         press = FAR | {"tip_force": self.PRESS}
         squeeze = FAR | {"tip_force": [[3.0, 0, 1], [0, 0, 0], [-3.0, 0, 1]]}
+        pinch = FAR | {"tip_force": [[3.0, 0, -2], [0, 0, 0], [-3.0, 0, -2]]}
+        holding = {"contact": "holding"}
         held = {"grasp": 1.0, "position": 4.0, "rotation": 4.0, "success": 10.0}
         away = {"object_pos": [0.5, 0.36, 0.02], "object_quat": turned(60, (0.0, 0.6, 0.8))}
         moving = FAR | {"action": [1.0, -0.5, 0, 0], "previous_action": [1.0, 0.5, 0.2, 0]}
@@ -123,6 +125,10 @@ class RewardTest(TestCase):
             (wide, {}, {"reach": near(0.5), "reach_near": 0.5 * near(2.0)}),
             (opposing, press, {"grasp": 1.0}),
             (opposing, squeeze, held),
+            (opposing, pinch, held),
+            (holding, squeeze, held),
+            (holding, pinch, {"grasp": 1.0}),
+            (holding, press, {"grasp": 1.0}),
             ({}, FAR, {}),
             ({}, press, held),
             ({}, press | away, {"grasp": 1.0} | errors),
@@ -217,6 +223,15 @@ class RewardTest(TestCase):
             forces = tensor([hand])
             self.assertEqual(contact_gate(forces, 0.1), touches, hand)
             self.assertEqual(contact_gate(forces, 0.1, opposing=True), opposes, hand)
+
+    def test_a_hand_that_holds_does_not_press_down(self):
+        for hand, expected in (
+            (([-5.0, 0, -1], [5.0, 0, -1]), True),
+            (([-5.0, 0, -0.4], [5.0, 0, -0.4]), False),
+            (([-5.0, 0, -1], [5.0, 0, 2]), False),
+            (([0.0, 0, 0], [0.0, 0, 0]), False),
+        ):
+            self.assertEqual(presses_down(tensor([hand])), expected, hand)
 
 
 class TerminationTest(TestCase):

@@ -126,6 +126,18 @@ def contact_gate(tip_force: Tensor, threshold: float, *, opposing: bool = False)
     return pressing[:, 0] & others.any(dim=-1)
 
 
+def presses_down(tip_force: Tensor) -> Tensor:
+    """[N] bool: whether the fingertips together press the object down, with more than a tenth of their forces.
+
+    Hands that have lifted an object carry its weight, so that the sum points up. A policy that pinched scissors against
+    the table pressed down with 0.4 of the sum (docs/lab-book.md).
+
+    Args:
+        tip_force: [N, E, 3] contact forces on the object [N].
+    """
+    return tip_force[..., 2].sum(dim=-1) < -0.1 * tip_force.norm(dim=-1).sum(dim=-1)
+
+
 def point_distances(
     pos: Tensor, quat: Tensor, goal_pos: Tensor, goal_quat: Tensor, points: Tensor
 ) -> Tensor:
@@ -142,8 +154,10 @@ def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
     """The reward of one control step."""
     grasped = contact_gate(x.tip_force, c.contact_threshold)
     gate = grasped
-    if c.contact == "opposing":
+    if c.contact in ("opposing", "holding"):
         gate = contact_gate(x.tip_force, c.contact_threshold, opposing=True)
+    if c.contact == "holding":
+        gate = gate & ~presses_down(x.tip_force)
     if c.contact == "near":
         gate = (x.tip_distance.sum(dim=-1) <= c.near_tips) & (x.palm_distance <= c.near_palm)
     position_error = (x.object_pos - x.goal_pos).norm(dim=-1)

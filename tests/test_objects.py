@@ -314,6 +314,7 @@ class MeshImport(InFolder):
         )
         self.assertTrue(png.read_bytes().startswith(b"\x89PNG"))
         self.assertIn("brick", succeeds("objects", "import", out))
+        refused(*command, "--out", out, "--name", "[/bold]")
 
     def test_what_an_object_is_made_of_is_checked(self):
         path = self.write(BOX)

@@ -78,6 +78,7 @@ class RewardTest(TestCase):
             "tip_distance": [0.2] * 3,
             "best_reach": 0.2,
             "tip_force": torch.zeros(3, 3),
+            "table_force": torch.zeros(3),
             "action": torch.zeros(4),
             "previous_action": torch.zeros(4),
             "out_of_bounds": False,
@@ -109,7 +110,8 @@ class RewardTest(TestCase):
         opposing = {"contact": "opposing"}
         press = FAR | {"tip_force": self.PRESS}
         squeeze = FAR | {"tip_force": [[3.0, 0, 1], [0, 0, 0], [-3.0, 0, 1]]}
-        pinch = FAR | {"tip_force": [[3.0, 0, -2], [0, 0, 0], [-3.0, 0, -2]]}
+        in_palm = FAR | {"tip_force": [[3.0, 0, -2], [0, 0, 0], [-3.0, 0, -2]]}
+        pinch = in_palm | {"table_force": [0.0, 0, 6]}
         holding = {"contact": "holding"}
         held = {"grasp": 1.0, "position": 4.0, "rotation": 4.0, "success": 10.0}
         away = {"object_pos": [0.5, 0.36, 0.02], "object_quat": turned(60, (0.0, 0.6, 0.8))}
@@ -127,6 +129,7 @@ class RewardTest(TestCase):
             (opposing, squeeze, held),
             (opposing, pinch, held),
             (holding, squeeze, held),
+            (holding, in_palm, held),
             (holding, pinch, {"grasp": 1.0}),
             (holding, press, {"grasp": 1.0}),
             ({}, FAR, {}),
@@ -224,14 +227,16 @@ class RewardTest(TestCase):
             self.assertEqual(contact_gate(forces, 0.1), touches, hand)
             self.assertEqual(contact_gate(forces, 0.1, opposing=True), opposes, hand)
 
-    def test_a_hand_that_holds_does_not_press_down(self):
-        for hand, expected in (
-            (([-5.0, 0, -1], [5.0, 0, -1]), True),
-            (([-5.0, 0, -0.4], [5.0, 0, -0.4]), False),
-            (([-5.0, 0, -1], [5.0, 0, 2]), False),
-            (([0.0, 0, 0], [0.0, 0, 0]), False),
+    def test_a_hand_that_holds_does_not_press_onto_the_table(self):
+        for hand, table, expected in (
+            (([-5.0, 0, -1], [5.0, 0, -1]), 3.0, True),
+            (([-5.0, 0, -1], [5.0, 0, -1]), 0.5, False),
+            (([-5.0, 0, -0.4], [5.0, 0, -0.4]), 3.0, False),
+            (([-5.0, 0, -1], [5.0, 0, 2]), 3.0, False),
+            (([0.0, 0, 0], [0.0, 0, 0]), 3.0, False),
         ):
-            self.assertEqual(presses_down(tensor([hand])), expected, hand)
+            found = presses_down(tensor([hand]), tensor([[0.0, 0.0, table]]))
+            self.assertEqual(found, expected, hand)
 
 
 class TerminationTest(TestCase):

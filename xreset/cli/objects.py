@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from rich.text import Text
+
 from xreset.cli._common import Source
 from xreset.cli._terminal import console, show_table
 from xreset.errors import ObjectError
@@ -76,7 +78,7 @@ def import_(
     found = []
     with console.status("") as status:
         for object_name, file in files.items():
-            status.update(f"{object_name} ({file})")
+            status.update(Text(f"{object_name} ({file})"))
             if out is None:
                 result = meshes.import_with_notes(file, object_name)
             else:

@@ -36,6 +36,8 @@ class RewardInput:
     """[N] smallest mean fingertip distance of the episode, this step included [m]."""
     tip_force: Tensor
     """[N, E, 3] each finger's contact force on the object [N], world frame."""
+    table_force: Tensor
+    """[N, 3] force of the table on the object [N], world frame."""
     state: State
     """[N, ...] of joints and object, velocities included."""
     goal_pos: Tensor
@@ -126,16 +128,19 @@ def contact_gate(tip_force: Tensor, threshold: float, *, opposing: bool = False)
     return pressing[:, 0] & others.any(dim=-1)
 
 
-def presses_down(tip_force: Tensor) -> Tensor:
-    """[N] bool: whether the fingertips together press the object down, with more than a tenth of their forces.
+def presses_down(tip_force: Tensor, table_force: Tensor) -> Tensor:
+    """[N] bool: whether the fingertips press the object down and the table bears it.
 
-    Hands that have lifted an object carry its weight, so that the sum points up. A policy that pinched scissors against
-    the table pressed down with 0.4 of the sum (docs/lab-book.md).
+    Both forces must exceed a tenth of what the fingertips press with: fingertips press down, too, where a palm that
+    faces up holds the object from below, and a table bears what is only touched. A policy that pinched scissors against
+    the table pressed down with 0.4 of its forces (docs/lab-book.md).
 
     Args:
         tip_force: [N, E, 3] contact forces on the object [N].
+        table_force: [N, 3] force of the table on the object [N].
     """
-    return tip_force[..., 2].sum(dim=-1) < -0.1 * tip_force.norm(dim=-1).sum(dim=-1)
+    much = 0.1 * tip_force.norm(dim=-1).sum(dim=-1)
+    return (tip_force[..., 2].sum(dim=-1) < -much) & (table_force[:, 2] > much)
 
 
 def point_distances(
@@ -157,7 +162,7 @@ def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
     if c.contact in ("opposing", "holding"):
         gate = contact_gate(x.tip_force, c.contact_threshold, opposing=True)
     if c.contact == "holding":
-        gate = gate & ~presses_down(x.tip_force)
+        gate = gate & ~presses_down(x.tip_force, x.table_force)
     if c.contact == "near":
         gate = (x.tip_distance.sum(dim=-1) <= c.near_tips) & (x.palm_distance <= c.near_palm)
     position_error = (x.object_pos - x.goal_pos).norm(dim=-1)

@@ -131,9 +131,9 @@ def contact_gate(tip_force: Tensor, threshold: float, *, opposing: bool = False)
 def presses_down(tip_force: Tensor, table_force: Tensor) -> Tensor:
     """[N] bool: whether the fingertips press the object down and the table bears it.
 
-    Both forces must exceed a tenth of what the fingertips press with: fingertips press down, too, where a palm that
-    faces up holds the object from below, and a table bears what is only touched. A policy that pinched scissors against
-    the table pressed down with 0.4 of its forces (docs/lab-book.md).
+    Each of these two forces must exceed a tenth of the sum of the fingertips' forces. One alone does not count:
+    fingertips also press down on an object in a palm that faces up, and a table also bears an object that is only
+    touched. A policy that pinched scissors against the table pressed down with 0.4 of that sum (docs/lab-book.md).
 
     Args:
         tip_force: [N, E, 3] contact forces on the object [N].

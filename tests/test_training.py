@@ -244,7 +244,7 @@ class TrainingTest(WithBank):
         config = replace(CONFIG, iterations=10, target_success=0.1)
 
         def write(log, iteration, env_steps, elapsed, scalars):
-            log._lift = log._lift.after(
+            log.lift = log.lift.after(
                 shares[iteration - 1], iteration=iteration, env_steps=env_steps, seconds=elapsed
             )
 

@@ -241,9 +241,7 @@ def train_todo(run: Run) -> Todo:
     iterations = run.config.iterations
     left = f"{now.iteration} of {iterations} iterations" if now.iteration else "not begun"
     length = {"out": run.folder, "iterations": iterations}
-    target = run.config.target_success
-    is_enough = now.iteration >= iterations
-    is_enough = is_enough or (target is not None and now.success_from_home >= target)
+    is_enough = now.iteration >= iterations or now.reaches(run.config.target_success)
     if spec.minutes is not None:
         is_enough = is_enough or now.minutes >= _ENOUGH * spec.minutes
         length["minutes"] = f"{spec.minutes - now.minutes:.4g}"

@@ -44,6 +44,10 @@ class Lift:
     success_from_home: Share = 0.0
     """Share in the last iteration."""
 
+    def reaches(self, target: float | None) -> bool:
+        """Return whether success from home in the last iteration reaches a target; without one it never does."""
+        return target is not None and self.success_from_home >= target
+
     def up_to(self, iteration: int) -> Lift:
         """Return the contents without what came after an iteration."""
         return Lift(passed=tuple(p for p in self.passed if p.iteration <= iteration))

@@ -172,8 +172,8 @@ class TrainConfig(Checked):
     target_success: (
         Annotated[float, Rule("a number above 0 and at most 1", lambda x: 0 < x <= 1)] | None
     ) = None
-    """Share of success from home, such as 0.1, with which the training ends: the share of the steps of worlds that
-    started at home in which the object was at its goal, in one iteration. None: the training has no such end."""
+    """The training ends when success from home reaches this share, such as 0.1, in one iteration. It is the share of
+    the steps with the object at its goal, among the steps of worlds that started at home. None: no such end."""
 
     @property
     def uses_states(self) -> bool:

@@ -60,7 +60,8 @@ class TrainingLog:
                 reinit=True,
             )
         self._folder = folder
-        self._lift = read_lift(folder).up_to(done) if done else Lift()
+        self.lift = read_lift(folder).up_to(done) if done else Lift()
+        """The last iteration's success from home is 0 as long as a teacher acts in some worlds."""
         self._curves = SummaryWriter(str(folder))
         self._returns = torch.zeros(num_envs, device=device)
         self._lengths = torch.zeros(num_envs, device=device)
@@ -109,13 +110,13 @@ class TrainingLog:
         if self._online is not None:
             self._online.log(curves, step=iteration)
         from_home = means["task/success_from_home"]
-        before = self._lift
+        before = self.lift
         # while a teacher acts in some worlds, their success is not the student's
         if not scalars.get("policy/teacher_share"):
-            self._lift = before.after(
+            self.lift = before.after(
                 from_home, iteration=iteration, env_steps=env_steps, seconds=elapsed
             )
-        if self._lift.passed != before.passed:
+        if self.lift.passed != before.passed:
             self.write_lift()
         if time.monotonic() - self._last_line > _LINE_SECONDS or iteration == self._total:
             self._last_line = time.monotonic()
@@ -128,14 +129,9 @@ class TrainingLog:
         self._finished.zero_()
         self._steps.clear()
 
-    @property
-    def success_from_home(self) -> float:
-        """Share of success from home in the last iteration; 0 as long as a teacher acts in some worlds."""
-        return self._lift.success_from_home
-
     def write_lift(self) -> None:
         """Write the lift clock's file."""
-        write_lift(self._folder, self._lift)
+        write_lift(self._folder, self.lift)
 
     def close(self) -> None:
         """End the files."""

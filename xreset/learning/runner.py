@@ -115,7 +115,6 @@ class TrainingRunner:
         steps = self.config.ppo.horizon * env.num_envs * self.processes.count
         earlier = self.elapsed
         begin = time.perf_counter()
-        target = self.config.target_success
         reached = False
         with _stop_on_interrupt(say=self.processes.is_main) as requests:
             while self.iteration < total:
@@ -146,7 +145,7 @@ class TrainingRunner:
                     if isinstance(self.alg, SequenceDistillation):
                         scalars["policy/teacher_share"] = self.alg.teacher_share
                     log.write(self.iteration, self.env_steps, self.elapsed, scalars)
-                    reached = target is not None and log.success_from_home >= target
+                    reached = log.lift.reaches(self.config.target_success)
                 if self.iteration % self.config.save_interval == 0:
                     self.save_checkpoint()
                     saved_at = self.iteration
@@ -158,7 +157,7 @@ class TrainingRunner:
             log.close()
             if reached:
                 print(
-                    f"success from home is {log.success_from_home:.1%} and reaches its target: the training ends, "
+                    f"success from home is {log.lift.success_from_home:.1%} and reaches its target: the training ends, "
                     "and a checkpoint is written"
                 )
             elif self.iteration < total:

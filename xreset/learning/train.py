@@ -138,11 +138,12 @@ def train(
     start = None
     if weights is not None:
         start = _checkpoint_to_start_from(Path(weights), inputs, config)
-    if teacher is not None:
-        _check_teacher(policy_file(teacher), inputs, config)
+    teacher_file = None if teacher is None else policy_file(teacher)
+    if teacher_file is not None:
+        _check_teacher(teacher_file, inputs, config)
     with _alone(out):
-        if teacher is not None:
-            write_whole(out / TEACHER, policy_file(teacher).read_bytes())
+        if teacher_file is not None:
+            write_whole(out / TEACHER, teacher_file.read_bytes())
         if isinstance(data, GoalSet):
             write_goals(out / "goals.npz", data)
             inputs = load(out / "goals.npz")

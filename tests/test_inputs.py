@@ -10,6 +10,7 @@ from tests.data import InOneFolder
 from tests.toy_bank import SOUP, SPAM, toy_bank, toy_retargeted
 from xreset import (
     Retargeted,
+    distill,
     evaluate,
     load_object,
     make_bank,
@@ -98,6 +99,7 @@ class InputsTest(InOneFolder):
             (train, run, {"config": {"iterations": 5}}, "TrainConfig | None"),
             (train, run, {"seed": "3"}, "int"),
             (evaluate, playing, {"episodes": "5"}, "int"),
+            (evaluate, playing, {"seed": "4"}, "int"),
             (evaluate, playing, {"engines": 5}, "str | Sequence[str | Engine]"),
             (rehearse, {"policy": "soup-can", "demos": bank}, {"episodes": "5"}, "int"),
             (retarget_demos, {"demos": self.demos} | scene, {"config": {"arm": 1}}, "RetargetConfig | None"),
@@ -110,6 +112,8 @@ class InputsTest(InOneFolder):
                 self.assertRaisesRegex(XResetError, f"^{next(iter(wrong))} {words}"),
             ):
                 call(**given | wrong)
+        with self.assertRaisesRegex(XResetError, "^num_envs is '3', expected int"):
+            distill("many-objects", self.bank_file, out=self.folder / "run", num_envs="3")
 
     def test_functions_of_the_package_can_be_sent_to_other_processes(self):
         for function in (evaluate, make_env, train):

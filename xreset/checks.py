@@ -15,6 +15,7 @@ from functools import cache, wraps
 from inspect import signature
 from math import inf, isfinite
 from numbers import Integral, Real
+from types import SimpleNamespace
 from typing import (
     Annotated,
     Any,
@@ -140,13 +141,11 @@ def names_wrong_arguments(function: Callable[..., T]) -> Callable[..., T]:
     def call(*positional: Any, **named: Any) -> T:
         try:
             return function(*positional, **named)
-        except (AttributeError, TypeError, ValueError) as error:
-            # an unknown argument; a type that only type checkers know
-            with suppress(NameError, TypeError):
+        except (AttributeError, RuntimeError, TypeError, ValueError) as error:
+            with suppress(TypeError):  # an unknown argument
                 given = signature(function).bind(*positional, **named).arguments
-                hints = get_type_hints(function)
                 for name, value in given.items():
-                    if not _is_of(hints[name], value):
+                    if not _is_of(_hint_of(function, name), value):
                         raise XResetError(
                             f"{name} is {shown(value)}, expected {function.__annotations__[name]}. "
                             f"Look at help(xreset.{function.__name__})."
@@ -159,8 +158,20 @@ def names_wrong_arguments(function: Callable[..., T]) -> Callable[..., T]:
 _WIDER = {int: Integral, float: Real, Sequence: Iterable}
 
 
+def _hint_of(function: Callable[..., Any], name: str) -> Any:
+    """Return the type of an argument; Any if only type checkers know it."""
+    with suppress(NameError):
+        one = SimpleNamespace(__annotations__={name: function.__annotations__[name]})
+        return get_type_hints(one, globalns=getattr(function, "__globals__", None))[name]
+    return Any
+
+
 def _is_of(hint: Any, value: Any) -> bool:
     """Whether a value is of an annotated type; items of lists are not looked at."""
+    if hint is Any:
+        return True
+    if get_origin(hint) is Literal:
+        return value in get_args(hint)
     parts = get_args(hint) if _is_union(hint) else (hint,)
     kinds = [get_origin(part) or part for part in parts]
     return isinstance(value, tuple(_WIDER.get(kind, kind) for kind in kinds))

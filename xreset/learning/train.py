@@ -21,6 +21,7 @@ from xreset.cameras.config import (
     VisionConfig,
     check_each_once,
 )
+from xreset.checks import names_wrong_arguments
 from xreset.env import make_env
 from xreset.errors import PolicyError, RunError, XResetError
 from xreset.files import claim_folder, file_hash, write_whole
@@ -250,7 +251,8 @@ def distill(
             "A student needs a camera. Give one or two of: " + ", ".join(CAMERAS) + "."
         )
     check_each_once(config.task.vision.cameras)
-    return train(bank, out=out, config=config, teacher=teacher, **options)
+    checked_train = names_wrong_arguments(train)
+    return checked_train(bank, out=out, config=config, teacher=teacher, **options)
 
 
 def _camera(camera: str | CameraConfig) -> CameraConfig:

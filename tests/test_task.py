@@ -43,7 +43,7 @@ from xreset.task.config import (
 )
 from xreset.task.latency import DelayLine
 from xreset.task.randomization import Drawn, pair_friction, sample_friction
-from xreset.task.rewards import RewardInput, compute_reward, contact_gate, presses_down
+from xreset.task.rewards import RewardInput, compute_reward, contact_gate
 from xreset.task.terminations import out_of_bounds
 
 IDENTITY = tensor([1.0, 0, 0, 0])
@@ -78,7 +78,6 @@ class RewardTest(TestCase):
             "tip_distance": [0.2] * 3,
             "best_reach": 0.2,
             "tip_force": torch.zeros(3, 3),
-            "table_force": torch.zeros(3),
             "action": torch.zeros(4),
             "previous_action": torch.zeros(4),
             "out_of_bounds": False,
@@ -110,9 +109,6 @@ class RewardTest(TestCase):
         opposing = {"contact": "opposing"}
         press = FAR | {"tip_force": self.PRESS}
         squeeze = FAR | {"tip_force": [[3.0, 0, 1], [0, 0, 0], [-3.0, 0, 1]]}
-        in_palm = FAR | {"tip_force": [[3.0, 0, -2], [0, 0, 0], [-3.0, 0, -2]]}
-        pinch = in_palm | {"table_force": [0.0, 0, 6]}
-        holding = {"contact": "holding"}
         held = {"grasp": 1.0, "position": 4.0, "rotation": 4.0, "success": 10.0}
         away = {"object_pos": [0.5, 0.36, 0.02], "object_quat": turned(60, (0.0, 0.6, 0.8))}
         moving = FAR | {"action": [1.0, -0.5, 0, 0], "previous_action": [1.0, 0.5, 0.2, 0]}
@@ -127,11 +123,6 @@ class RewardTest(TestCase):
             (wide, {}, {"reach": near(0.5), "reach_near": 0.5 * near(2.0)}),
             (opposing, press, {"grasp": 1.0}),
             (opposing, squeeze, held),
-            (opposing, pinch, held),
-            (holding, squeeze, held),
-            (holding, in_palm, held),
-            (holding, pinch, {"grasp": 1.0}),
-            (holding, press, {"grasp": 1.0}),
             ({}, FAR, {}),
             ({}, press, held),
             ({}, press | away, {"grasp": 1.0} | errors),
@@ -226,17 +217,6 @@ class RewardTest(TestCase):
             forces = tensor([hand])
             self.assertEqual(contact_gate(forces, 0.1), touches, hand)
             self.assertEqual(contact_gate(forces, 0.1, opposing=True), opposes, hand)
-
-    def test_a_hand_that_holds_does_not_press_onto_the_table(self):
-        for hand, table, expected in (
-            (([-5.0, 0, -1], [5.0, 0, -1]), 3.0, True),
-            (([-5.0, 0, -1], [5.0, 0, -1]), 0.5, False),
-            (([-5.0, 0, -0.4], [5.0, 0, -0.4]), 3.0, False),
-            (([-5.0, 0, -1], [5.0, 0, 2]), 3.0, False),
-            (([0.0, 0, 0], [0.0, 0, 0]), 3.0, False),
-        ):
-            found = presses_down(tensor([hand]), tensor([[0.0, 0.0, table]]))
-            self.assertEqual(found, expected, hand)
 
 
 class TerminationTest(TestCase):

@@ -477,7 +477,6 @@ class ManipulationEnv:
             tip_distance=reading.tip_distance,
             best_reach=self._best_reach.clone(),
             tip_force=reading.contacts.tip_force,
-            table_force=reading.contacts.table_force,
             state=reading.task_state,
             goal_pos=self.task_goal_pos,
             goal_quat=self.goal_quat,

@@ -199,12 +199,11 @@ class RewardConfig(Checked):
     action_rate_arm: FiniteFloat | None = None
     """Weight of the arm's part of ``action_rate``; None: the same. The published paper has -0.05."""
     out_of_bounds: FiniteFloat = -500.0
-    contact: Literal["any", "opposing", "holding", "near"] = "any"
+    contact: Literal["any", "opposing", "near"] = "any"
     """What opens the gate of ``position``, ``rotation``, ``points`` and ``success``. ``any``: the thumb and another
     finger press (the paper). ``opposing``: their forces on the object are more than 90 degrees apart, as those of a
-    hand that holds it. ``holding``: they are, and the fingertips together do not press the object onto the table, as a
-    hand does that pinches a flat object against it. ``near``: fingertips and palm are near the object, whether or not
-    they touch it (the published paper). ``grasp`` is paid for ``any``."""
+    hand that holds it. ``near``: fingertips and palm are near the object, whether or not they touch it (the published
+    paper). ``grasp`` is paid for ``any``."""
     near_tips: PositiveFloat = 0.6
     """Largest sum of the fingertips' distances to the object [m] (the published paper)."""
     near_palm: PositiveFloat = 0.2

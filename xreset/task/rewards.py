@@ -36,8 +36,6 @@ class RewardInput:
     """[N] smallest mean fingertip distance of the episode, this step included [m]."""
     tip_force: Tensor
     """[N, E, 3] each finger's contact force on the object [N], world frame."""
-    table_force: Tensor
-    """[N, 3] force of the table on the object [N], world frame."""
     state: State
     """[N, ...] of joints and object, velocities included."""
     goal_pos: Tensor
@@ -128,21 +126,6 @@ def contact_gate(tip_force: Tensor, threshold: float, *, opposing: bool = False)
     return pressing[:, 0] & others.any(dim=-1)
 
 
-def presses_down(tip_force: Tensor, table_force: Tensor) -> Tensor:
-    """[N] bool: whether the fingertips press the object down and the table bears it.
-
-    Each of these two forces must exceed a tenth of the sum of the fingertips' forces. One alone does not count:
-    fingertips also press down on an object in a palm that faces up, and a table also bears an object that is only
-    touched. A policy that pinched scissors against the table pressed down with 0.4 of that sum (docs/lab-book.md).
-
-    Args:
-        tip_force: [N, E, 3] contact forces on the object [N].
-        table_force: [N, 3] force of the table on the object [N].
-    """
-    much = 0.1 * tip_force.norm(dim=-1).sum(dim=-1)
-    return (tip_force[..., 2].sum(dim=-1) < -much) & (table_force[:, 2] > much)
-
-
 def point_distances(
     pos: Tensor, quat: Tensor, goal_pos: Tensor, goal_quat: Tensor, points: Tensor
 ) -> Tensor:
@@ -159,10 +142,8 @@ def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
     """The reward of one control step."""
     grasped = contact_gate(x.tip_force, c.contact_threshold)
     gate = grasped
-    if c.contact in ("opposing", "holding"):
+    if c.contact == "opposing":
         gate = contact_gate(x.tip_force, c.contact_threshold, opposing=True)
-    if c.contact == "holding":
-        gate = gate & ~presses_down(x.tip_force, x.table_force)
     if c.contact == "near":
         gate = (x.tip_distance.sum(dim=-1) <= c.near_tips) & (x.palm_distance <= c.near_palm)
     position_error = (x.object_pos - x.goal_pos).norm(dim=-1)

@@ -89,6 +89,7 @@ class Data(Checked):
         _options(
             "--closing.",
             "--filter.",
+            "--lift.",
             "--squeeze.",
             "--settle",
             "--backend",

@@ -11,7 +11,7 @@ from tyro.conf import arg
 from xreset.cli._common import Device, Objects, Several, Source, show_accounts
 from xreset.cli._terminal import Progress, console, show_notes
 from xreset.files import file_hash
-from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
+from xreset.resets.config import ClosingConfig, FilterConfig, LiftConfig, SqueezeConfig
 
 
 def resets(
@@ -25,6 +25,7 @@ def resets(
     device: Device = "cpu",
     limits: Annotated[FilterConfig, arg(name="filter")] = FilterConfig(),
     closing: ClosingConfig = ClosingConfig(),
+    lift: LiftConfig = LiftConfig(),
     squeeze: SqueezeConfig = SqueezeConfig(),
     settle: bool = False,
 ) -> None:
@@ -39,6 +40,7 @@ def resets(
         num_envs: Worlds at a time.
         limits: Time and speeds by which states are judged.
         closing: States between frames where the hand closes in.
+        lift: States with grasps of later frames where the object starts.
         squeeze: Targets of states after contact that press.
         settle: Let objects come to rest (in the first engine) before episodes begin at home. Default: the recorded
             poses, as in the paper, from which one object in eight tips or rolls.
@@ -70,6 +72,7 @@ def resets(
             backends,
             limits=limits,
             closing=closing,
+            lift=lift,
             squeeze=squeeze,
             progress=bar.count(title),
             **where,
@@ -84,6 +87,7 @@ def resets(
         "num_envs": num_envs,
         "filter": asdict(limits),
         "closing": asdict(closing),
+        "lift": asdict(lift),
         "squeeze": asdict(squeeze),
         "settle": settle,
     }

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 from xreset.checks import (
     Checked,
     NonNegativeFloat,
     NonNegativeInt,
     PositiveFinite,
     PositiveInt,
+    Rule,
     frozen,
 )
 
@@ -34,6 +37,18 @@ class ClosingConfig(Checked):
     """Farthest that any fingertip moves from one state to the next [m], such as 0.005. None: no states are added."""
     within: PositiveFinite = 0.10
     """Only between frames of which one has a finger nearer than this to the object [m]."""
+
+
+@frozen
+class LiftConfig(Checked):
+    """More states where a hand lifts an object (:mod:`xreset.resets.lift`)."""
+
+    grasps: NonNegativeInt = 0
+    """Frames of each demonstration whose grasp is carried back to where the object starts. 0: no states are added."""
+    heights: Annotated[
+        tuple[float, ...], Rule("heights from 0 to 1 m", lambda x: all(0 <= h <= 1 for h in x))
+    ] = (0.0, 0.01, 0.02, 0.03)
+    """Heights above the start at which the object is grasped [m]."""
 
 
 @frozen

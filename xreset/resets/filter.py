@@ -12,16 +12,17 @@ from functools import partial
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from xreset.errors import DemoError
-from xreset.physics import Backend, State
+from xreset.physics import State
 from xreset.progress import Progress, unseen
 from xreset.resets.bank import ResetBank, starts_and_goals
 from xreset.resets.closing import closing_states
-from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
+from xreset.resets.config import ClosingConfig, FilterConfig, LiftConfig, SqueezeConfig
 from xreset.resets.fingers import fingers_of, squeeze_targets
-from xreset.resets.probe import probe
+from xreset.resets.lift import grasp_frames, lift_states
+from xreset.resets.probe import REASONS, probe, rejection
+from xreset.resets.settle import settled_poses
 from xreset.retarget.file import Retargeted
 from xreset.spec import (
     ObjectSpec,
@@ -31,37 +32,6 @@ from xreset.spec import (
     checked_objects,
     objects_named,
 )
-from xreset.task.config import TerminationConfig
-from xreset.task.terminations import out_of_bounds
-
-REASONS = (
-    "out of bounds",
-    "object linear velocity",
-    "object angular velocity",
-    "joint velocity",
-    "not finite",
-    "overflow",
-)
-"""Why a candidate is rejected. Where several reasons apply, the last one is stated."""
-
-
-def rejection(backend: Backend, start: State, limits: FilterConfig) -> Tensor:
-    """Return why the present states of an engine's worlds are rejected: [N] index into :data:`REASONS`, -1 where
-    accepted."""
-    state = backend.state()
-    health = backend.health()
-    tests = (
-        out_of_bounds(state.object_pos, backend.scene.table, TerminationConfig()),
-        state.object_linvel.norm(dim=-1) > limits.linear_velocity,
-        state.object_angvel.norm(dim=-1) > limits.angular_velocity,
-        state.joint_vel.abs().amax(dim=-1) > limits.joint_velocity,
-        health.nonfinite,
-        health.overflow,
-    )
-    reason = torch.full((backend.num_worlds,), -1, dtype=torch.long, device=backend.device)
-    for i, test in enumerate(tests):
-        reason[test] = i
-    return reason
 
 
 def make_bank(
@@ -74,6 +44,7 @@ def make_bank(
     device: str = "cpu",
     limits: FilterConfig | None = None,
     closing: ClosingConfig | None = None,
+    lift: LiftConfig | None = None,
     squeeze: SqueezeConfig | None = None,
     progress: Callable[[float, int], None] = unseen,
 ) -> ResetBank:
@@ -88,6 +59,7 @@ def make_bank(
         device: where engines run that can use it; the others run on the CPU.
         limits: time and speeds by which states are judged; None: the draft paper's.
         closing: states to add between frames; None: none.
+        lift: states to add where a hand lifts an object; None: none.
         squeeze: with which force the drive targets of states after contact press on the object; None: targets are the
             joints' positions. Accepted states are tried once more with the targets, and an engine that rejects this
             leaves the targets where they were.
@@ -111,6 +83,18 @@ def make_bank(
         )
     scene = SceneSpec(robot=robot, objects=tuple(used.values()))
     frame, part, poses = closing_states(retargeted, robot, objects, closing or ClosingConfig())
+    lifting = np.zeros(len(frame), dtype=bool)
+    if lift is not None and lift.grasps:
+        more, more_poses = _lift_states(retargeted, scene, lift, engines[0], num_envs, device)
+        frame = np.concatenate((frame, more))
+        order = frame.argsort(kind="stable")
+        frame = frame[order]
+        part = np.concatenate((part, np.zeros(len(more))))[order]
+        lifting = np.concatenate((lifting, np.ones(len(more), dtype=bool)))[order]
+        poses = tuple(
+            np.concatenate(values).astype(values[0].dtype)[order]
+            for values in zip(poses, more_poses, strict=True)
+        )
     sequence = owner[frame]
     post_contact = retargeted.post_contact[frame]
     object_name = retargeted.object_name[sequence]
@@ -159,6 +143,8 @@ def make_bank(
     }
     if part.any():
         columns["frame_part"] = part.astype(np.float32)
+    if lifting.any():
+        columns["lifting"] = lifting
     kept = {name: values[keep] for name, values in columns.items()}
     rejected = {f"rejected_{name}": values[~keep] for name, values in columns.items()}
     return replace(
@@ -173,4 +159,31 @@ def make_bank(
         reason_names=REASONS,
         **kept,
         **rejected,
+    )
+
+
+def _lift_states(
+    retargeted: Retargeted,
+    scene: SceneSpec,
+    config: LiftConfig,
+    engine: str,
+    num_envs: int,
+    device: str,
+) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Return :func:`~xreset.resets.lift.lift_states` with objects at rest, as an engine lets them come to rest."""
+    frames = grasp_frames(retargeted, scene.robot, scene.objects, config.grasps)
+    start_pos, start_quat = (pose.copy() for pose in retargeted.start_pose)
+    sequences = np.unique(retargeted.sequence_of_frame[frames])
+    if len(sequences):
+        start_pos[sequences], start_quat[sequences], _ = settled_poses(
+            scene,
+            retargeted.object_name[sequences],
+            start_pos[sequences].astype(np.float32),
+            start_quat[sequences].astype(np.float32),
+            engine,
+            num_envs=num_envs,
+            device=device,
+        )
+    return lift_states(
+        retargeted, scene.robot, scene.objects, frames, start_pos, start_quat, config
     )

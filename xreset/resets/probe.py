@@ -10,11 +10,23 @@ from torch import Tensor
 
 from xreset.physics import Backend, State
 from xreset.plugins import device_for, make_backend
+from xreset.resets.config import FilterConfig
 from xreset.schedule import schedule
 from xreset.spec import SceneSpec
+from xreset.task.config import TerminationConfig
+from xreset.task.terminations import out_of_bounds
 
 Judge = Callable[[Backend, State], Tensor]
 """Function that returns verdicts [N] or [N, K] on the worlds of an engine, given the states with which they started."""
+REASONS = (
+    "out of bounds",
+    "object linear velocity",
+    "object angular velocity",
+    "joint velocity",
+    "not finite",
+    "overflow",
+)
+"""Why a candidate is rejected. Where several reasons apply, the last one is stated."""
 
 
 def probe(
@@ -65,3 +77,22 @@ def probe(
             done += len(rows[-1])
             progress(done)
     return np.concatenate(verdicts)[np.argsort(np.concatenate(rows))]
+
+
+def rejection(backend: Backend, start: State, limits: FilterConfig) -> Tensor:
+    """Return why the present states of an engine's worlds are rejected: [N] index into :data:`REASONS`, -1 where
+    accepted."""
+    state = backend.state()
+    health = backend.health()
+    tests = (
+        out_of_bounds(state.object_pos, backend.scene.table, TerminationConfig()),
+        state.object_linvel.norm(dim=-1) > limits.linear_velocity,
+        state.object_angvel.norm(dim=-1) > limits.angular_velocity,
+        state.joint_vel.abs().amax(dim=-1) > limits.joint_velocity,
+        health.nonfinite,
+        health.overflow,
+    )
+    reason = torch.full((backend.num_worlds,), -1, dtype=torch.long, device=backend.device)
+    for i, test in enumerate(tests):
+        reason[test] = i
+    return reason

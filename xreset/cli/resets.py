@@ -100,6 +100,10 @@ def resets(
             force += f" and {squeeze.weight:g} times the object's weight"
         pressing = f"{bank.num_pressing} of {bank.post_contact.sum()} states after contact"
         console.print(f"{pressing} press with {force}")
+    if lift.grasps:
+        owners = [] if bank.lifting is None else bank.sequence_index[bank.lifting]
+        demonstrations = f"{len(set(owners))} of {len(bank.sequence_name)} demonstrations"
+        console.print(f"{len(owners)} lift states were added, from {demonstrations}")
     tried = bank.num_states + len(bank.rejected_reason)
     share = accounts[-1].kept / max(motion.annotated.sum(), 1)
     console.print(f"{share:.0%} of the annotated frames are kept")

@@ -96,7 +96,7 @@ def make_bank(
             for values in zip(poses, more_poses, strict=True)
         )
     sequence = owner[frame]
-    post_contact = retargeted.post_contact[frame]
+    post_contact = retargeted.post_contact[frame] | lifting
     object_name = retargeted.object_name[sequence]
     states = State.at_rest(*map(torch.as_tensor, poses))
     work = len(engines) * len(frame)

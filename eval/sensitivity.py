@@ -98,7 +98,7 @@ class Property:
         """
         drawn = value
         if self.unit == "ms":
-            drawn /= 1000 * task.timestep * task.substeps  # the task counts control steps
+            drawn /= 1000 * task.control_dt  # the task counts control steps
         try:
             changed = replace(task.randomization, **{self.changed_field: (drawn, drawn)})
             return replace(task, randomization=changed)

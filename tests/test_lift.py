@@ -47,11 +47,11 @@ def lifted(jaws=toy_grasp.OPEN, **changes):
 
 
 class LiftTest(TestCase):
-    def carried(self, motion, robot=ROBOT, *, shift=0.0, heights=(0.0, 0.01)):
+    def carried(self, motion, robot=ROBOT, *, shift=0.0, heights=(0.0, 0.01), grasps=8):
         """The lift states of a motion whose object rests higher by ``shift`` than where it starts."""
         start_pos, start_quat = motion.start_pose
-        frames = grasp_frames(motion, robot, BRICK, 8)
-        config = LiftConfig(grasps=8, heights=heights)
+        frames = grasp_frames(motion, robot, BRICK, grasps)
+        config = LiftConfig(grasps=grasps, heights=heights)
         start_pos = start_pos + np.array([0, 0, shift])
         return lift_states(motion, robot, BRICK, frames, start_pos, start_quat, config)
 
@@ -66,10 +66,10 @@ class LiftTest(TestCase):
         self.assertEqual(grasp_frames(far, ROBOT, BRICK, 8).tolist(), [])
 
     def test_the_hand_comes_along(self):
-        frame, (joints, pos, quat) = self.carried(lifted())
-        self.assertEqual(frame.tolist(), [2, 2, 3, 3, 4, 4, 5, 5])
+        sequence, (joints, pos, quat) = self.carried(lifted())
+        self.assertEqual(sequence.tolist(), [0] * 8)
         start, turned = toy_grasp.brick_pose()
-        above = np.tile([0.0, 0.01], 4)
+        above = np.repeat([0.0, 0.01], 4)
         assert_allclose(pos, start + above[:, None] * [0, 0, 1], atol=1e-12)
         assert_allclose(quat, np.tile(turned, (8, 1)), atol=1e-12)
         expected = np.tile(ROBOT.home, (8, 1))
@@ -83,15 +83,32 @@ class LiftTest(TestCase):
         low = replace(ROBOT, base_pos=(x, y, z - 0.24))
         motion = lifted()
         motion = replace(motion, object_pos=motion.object_pos - [0, 0, 0.24])
-        frame, (joints, *_) = self.carried(motion, low, shift=-0.02, heights=(0.0,))
-        self.assertEqual(frame.tolist(), [2, 3, 4, 5])
+        sequence, (joints, *_) = self.carried(motion, low, shift=-0.02, heights=(0.0,))
+        self.assertEqual(sequence.tolist(), [0] * 4)
         clearance = table_clearance(Kinematics(low), torch.as_tensor(joints), TableSpec())
         assert_allclose(clearance, 0.0, atol=2e-3)
         self.assertEqual(len(self.carried(motion, low, shift=-0.06, heights=(0.0,))[0]), 0)
 
     def test_a_motion_without_a_grasp_has_none(self):
-        frame, (joints, pos, quat) = self.carried(lifted(toy_grasp.OPEN + 0.02))
-        self.assertEqual((len(frame), len(joints), len(pos), len(quat)), (0, 0, 0, 0))
+        sequence, (joints, pos, quat) = self.carried(lifted(toy_grasp.OPEN + 0.02))
+        self.assertEqual((len(sequence), len(joints), len(pos), len(quat)), (0, 0, 0, 0))
+
+    def test_grasps_of_other_demonstrations_of_the_object_are_borrowed(self):
+        """The second demonstration starts 2 cm higher and its jaws never close."""
+        closed, apart = lifted(), lifted(toy_grasp.OPEN + 0.02)
+        names = ("joint_pos", "fingertip_pos", "object_pos", "object_quat_wxyz")
+        both = {
+            name: np.concatenate((getattr(closed, name), getattr(apart, name))) for name in names
+        }
+        both["object_pos"][len(HEIGHTS) :, 2] += 0.02
+        count = len(HEIGHTS)
+        contact = {"first_contact": np.array([1, 1])}
+        two = toy_retargeted(ROBOT, ["brick", "brick"], [0, count, 2 * count], **(both | contact))
+        sequence, (joints, pos, _) = self.carried(two, heights=(0.0,), grasps=3)
+        self.assertEqual(sequence.tolist(), [0] * 3 + [1] * 3)
+        assert_allclose(joints[:, JAW], toy_grasp.OPEN)
+        assert_allclose(joints[3:, LIFT] - joints[:3, LIFT], 0.02, atol=1e-3)
+        assert_allclose(pos[3:, 2] - pos[:3, 2], 0.02)
 
 
 @skipUnless(find_spec("mujoco"), "MuJoCo is not installed")
@@ -114,8 +131,8 @@ class BankTest(InFolder):
         told = succeeds("resets", f"{self.folder}/r.npz", "--out", str(out), *options)
         bank = read_bank(out)
         assert bank.lifting is not None
-        self.assertEqual(bank.frame_index.tolist(), [0, 1, 2, 2, 2, 3, 4, 5, 5, 5])
-        self.assertEqual(np.flatnonzero(bank.lifting).tolist(), [3, 4, 8, 9])
+        self.assertEqual(bank.frame_index.tolist(), [0] * 5 + [1, 2, 3, 4, 5])
+        self.assertEqual(np.flatnonzero(bank.lifting).tolist(), [1, 2, 3, 4])
         self.assertTrue(bank.post_contact[bank.lifting].all())
         self.assertEqual(bank.num_pressing, 9, "all but the first frame")
         self.assertEqual(bank.accounts()[-1].total, 6)
@@ -125,7 +142,7 @@ class BankTest(InFolder):
         ):
             self.assertIn(words, told)
         height = bank.object_pos[bank.lifting][:, 2] - bank.start_pos[0, 2]
-        assert_allclose(height, [0, 0.02, 0, 0.02], atol=1e-3)
+        assert_allclose(height, [0, 0, 0.02, 0.02], atol=1e-3)
         assert_array_equal(bank.with_states(bank.lifting).lifting, True)
         with np.load(out) as file:
             config = json.loads(str(file["meta"]))["config"]

@@ -40,7 +40,7 @@ def resets(
         num_envs: Worlds at a time.
         limits: Time and speeds by which states are judged.
         closing: States between frames where the hand closes in.
-        lift: States with grasps of later frames where the object starts.
+        lift: States with grasps from the air where the object starts.
         squeeze: Targets of states after contact that press.
         settle: Let objects come to rest (in the first engine) before episodes begin at home. Default: the recorded
             poses, as in the paper, from which one object in eight tips or rolls.

@@ -105,8 +105,8 @@ class ResetBank(Brief):
     """[L] how far a state is on the way from its frame to the next, in [0, 1); None: every state is a frame."""
     rejected_frame_part: Annotated[np.ndarray, Field(("C",), "f", within=(0.0, 1.0))] | None = None
     lifting: Annotated[np.ndarray, Field(("L",), "b")] | None = None
-    """[L] bool: whether a state has the grasp of its frame where the object starts (:mod:`xreset.resets.lift`); None:
-    none has."""
+    """[L] bool: whether a state has a grasp from the air where the object starts, or just above; its frame is then the
+    first (:mod:`xreset.resets.lift`). None: none has."""
     rejected_lifting: Annotated[np.ndarray, Field(("C",), "b")] | None = None
 
     @property

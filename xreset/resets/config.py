@@ -44,7 +44,7 @@ class LiftConfig(Checked):
     """More states where a hand lifts an object (:mod:`xreset.resets.lift`)."""
 
     grasps: NonNegativeInt = 0
-    """Frames of each demonstration whose grasp is carried back to where the object starts. 0: no states are added."""
+    """Largest number of grasps that are added to each demonstration at each height. 0: none."""
     heights: Annotated[
         tuple[float, ...], Rule("heights from 0 to 1 m", lambda x: all(0 <= h <= 1 for h in x))
     ] = (0.0, 0.01, 0.02, 0.03)

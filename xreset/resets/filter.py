@@ -20,7 +20,7 @@ from xreset.resets.bank import ResetBank, starts_and_goals
 from xreset.resets.closing import closing_states
 from xreset.resets.config import ClosingConfig, FilterConfig, LiftConfig, SqueezeConfig
 from xreset.resets.fingers import fingers_of, squeeze_targets
-from xreset.resets.lift import grasp_frames, lift_states
+from xreset.resets.lift import Poses, grasp_frames, lift_states
 from xreset.resets.probe import REASONS, probe, rejection
 from xreset.resets.settle import settled_poses
 from xreset.retarget.file import Retargeted
@@ -86,7 +86,7 @@ def make_bank(
     lifting = np.zeros(len(frame), dtype=bool)
     if lift is not None and lift.grasps:
         more, more_poses = _lift_states(retargeted, scene, lift, engines[0], num_envs, device)
-        frame = np.concatenate((frame, more))
+        frame = np.concatenate((frame, retargeted.frame_offsets[more]))
         order = frame.argsort(kind="stable")
         frame = frame[order]
         part = np.concatenate((part, np.zeros(len(more))))[order]
@@ -169,11 +169,12 @@ def _lift_states(
     engine: str,
     num_envs: int,
     device: str,
-) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+) -> tuple[np.ndarray, Poses]:
     """Return :func:`~xreset.resets.lift.lift_states` with objects at rest, as an engine lets them come to rest."""
     frames = grasp_frames(retargeted, scene.robot, scene.objects, config.grasps)
     start_pos, start_quat = (pose.copy() for pose in retargeted.start_pose)
-    sequences = np.unique(retargeted.sequence_of_frame[frames])
+    grasped = retargeted.object_name[retargeted.sequence_of_frame[frames]]
+    sequences = np.flatnonzero(np.isin(retargeted.object_name, grasped))
     if len(sequences):
         start_pos[sequences], start_quat[sequences], _ = settled_poses(
             scene,

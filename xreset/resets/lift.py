@@ -1,10 +1,11 @@
-"""More states where a hand lifts an object: grasps of later frames, carried back to where the object starts.
+"""More states where a hand lifts an object: grasps from the air, carried back to where the object starts.
 
 At 30 frames a second, a demonstration shows only a few frames between the table and a height of some centimetres, and
 in them the retargeted fingers often do not touch the object. So few states lead from the table to the grasps that hold
-in the air. Here a grasp from the air is moved to the object at rest on the table, and to small heights above it. The
+in the air. Here grasps from the air are moved to the object at rest on the table, and to small heights above it. The
 arm follows by inverse kinematics. A hand that would go into the table gives way, as long as the thumb and another
-finger stay at the object. Physics judges the new states like the others.
+finger stay at the object. As many grasps do not fit on the table, those of other demonstrations of the same object are
+tried, too. Physics judges the new states like the others.
 
 Shape letters: M states, S sequences, J joints, n joints of the arm.
 """
@@ -15,7 +16,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from xreset.geometry.rotations import matrix_to_quat
 from xreset.geometry.shapes import turn_of
@@ -31,8 +31,12 @@ from xreset.tensors import one_thread
 
 RAISED = 0.02
 """An object that is higher above its start than this is in the air [m]."""
+_BORROWED = 4
+"""How many times as many grasps of other demonstrations are tried as are kept of all."""
 _GIVES_WAY = Thresholds(wrist_position=0.02, wrist_orientation=float(np.radians(15.0)))
 """How far the hand may be from its place in the grasp, so that it clears the table."""
+_AT_A_TIME = 2048
+"""Number of states of which the arm's joints are found at a time; a thousand take half a gigabyte."""
 
 Poses = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Joint positions [M, J], object positions [M, 3] and quaternions [M, 4]."""
@@ -57,12 +61,7 @@ def grasp_frames(
     )
     names = retargeted.object_name[owner[frames]]
     frames = frames[_is_grasp(robot, objects, names, poses)]
-    chosen = []
-    for sequence in np.unique(owner[frames]):
-        own = frames[owner[frames] == sequence]
-        places = np.linspace(0, len(own) - 1, min(count, len(own)))
-        chosen.append(own[places.round().astype(int)])
-    return np.concatenate(chosen) if chosen else frames
+    return frames[_spread_in_groups(owner[frames], count)]
 
 
 def lift_states(
@@ -74,36 +73,74 @@ def lift_states(
     start_quat: np.ndarray,
     config: LiftConfig,
 ) -> tuple[np.ndarray, Poses]:
-    """Carry grasps back to where their objects start.
+    """Carry grasps to where the objects of all demonstrations start.
 
     Args:
         retargeted: the motion.
         robot: its robot.
         objects: its objects.
-        frames: frames of the motion with a grasp (:func:`grasp_frames`).
+        frames: ascending frames of the motion with a grasp (:func:`grasp_frames`).
         start_pos: [S, 3] where each sequence's object rests on the table [m].
         start_quat: [S, 4] its orientation there.
-        config: heights above the table.
+        config: heights above the table, and how many grasps are kept at each.
 
     Returns:
-        For each state the frame whose grasp it has [M], ascending, and the poses.
+        The sequence of each state [M], ascending, and the poses.
     """
-    frame = np.repeat(frames, len(config.heights))
-    sequence = retargeted.sequence_of_frame[frame]
+    sequence, grasp = _candidates(retargeted, frames, config.grasps)
+    count = len(config.heights)
+    group = np.repeat(sequence, count) * count + np.tile(np.arange(count), len(sequence))
+    order = group.argsort(kind="stable")
+    group = group[order]
+    grasp = np.repeat(grasp, count)[order]
+    sequence = group // count
     object_pos = start_pos[sequence].astype(np.float64)
-    object_pos[:, 2] += np.tile(config.heights, len(frames))
-    object_quat = start_quat[sequence]
+    object_pos[:, 2] += np.asarray(config.heights)[group % count]
+    object_quat = start_quat[sequence].astype(np.float64)
     model = ArmModel(robot)
-    joints = torch.as_tensor(retargeted.joint_pos[frame], dtype=torch.float64)
-    root = model.kinematics.link_poses(joints, [robot.hand_root])[:, 0].numpy()
-    moved = turn_of(object_quat) * turn_of(retargeted.object_quat_wxyz[frame]).inv()
-    root_pos = object_pos + moved.apply(root[:, :3, 3] - retargeted.object_pos[frame])
-    root_turn = torch.as_tensor(moved.as_matrix() @ root[:, :3, :3])
-    hand_joints = joints[:, torch.as_tensor(model.hand.joint_indices)]
-    arm, reached = _follow(model, torch.as_tensor(root_pos), matrix_to_quat(root_turn), hand_joints)
-    poses = (model.full(arm, hand_joints).numpy(), object_pos, object_quat)
-    kept = reached & _is_grasp(robot, objects, retargeted.object_name[sequence], poses)
-    return frame[kept], (poses[0][kept], poses[1][kept], poses[2][kept])
+    joint_pos = retargeted.joint_pos[grasp].astype(np.float64)
+    fits = np.zeros(len(sequence), dtype=bool)
+    for first in range(0, len(sequence), _AT_A_TIME):
+        rows = slice(first, first + _AT_A_TIME)
+        held = grasp[rows]
+        grasped = (
+            joint_pos[rows],
+            retargeted.object_pos[held],
+            retargeted.object_quat_wxyz[held],
+        )
+        joint_pos[rows], reached = _carried(model, grasped, object_pos[rows], object_quat[rows])
+        poses = (joint_pos[rows], object_pos[rows], object_quat[rows])
+        names = retargeted.object_name[sequence[rows]]
+        fits[rows] = reached & _is_grasp(robot, objects, names, poses)
+    kept = np.flatnonzero(fits)
+    kept = kept[_spread_in_groups(group[kept], config.grasps)]
+    return sequence[kept], (joint_pos[kept], object_pos[kept], object_quat[kept])
+
+
+def _candidates(
+    retargeted: Retargeted, frames: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return sequences, ascending, and the frames whose grasps each one tries: its own, then those of others."""
+    owner = retargeted.sequence_of_frame[frames]
+    name = retargeted.object_name
+    grasps = []
+    for sequence in range(len(name)):
+        others = frames[(owner != sequence) & (name[owner] == name[sequence])]
+        borrowed = others[_spread(len(others), _BORROWED * count)]
+        grasps.append(np.concatenate((frames[owner == sequence], borrowed)))
+    return np.repeat(np.arange(len(name)), [len(own) for own in grasps]), np.concatenate(grasps)
+
+
+def _spread(number: int, count: int) -> np.ndarray:
+    """Return up to ``count`` of the indices below ``number``, evenly spread."""
+    return np.linspace(0, number - 1, min(count, number)).round().astype(int)
+
+
+def _spread_in_groups(group: np.ndarray, count: int) -> np.ndarray:
+    """Return ascending indices of up to ``count`` entries of each group, evenly spread; groups are ascending."""
+    _, first, size = np.unique(group, return_index=True, return_counts=True)
+    chosen = [start + _spread(number, count) for start, number in zip(first, size, strict=True)]
+    return np.concatenate(chosen) if chosen else np.zeros(0, dtype=int)
 
 
 def _is_grasp(
@@ -117,10 +154,21 @@ def _is_grasp(
 
 
 @one_thread()
-def _follow(
-    model: ArmModel, root_pos: Tensor, root_quat: Tensor, hand_joints: Tensor
-) -> tuple[Tensor, np.ndarray]:
-    """Return the arm's joints [M, n], and whether the hand comes near enough to its pose, above the table [M]."""
+def _carried(
+    model: ArmModel, grasped: Poses, object_pos: np.ndarray, object_quat: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Carry grasps to objects at other poses [M, 3], [M, 4].
+
+    Returns:
+        Joint positions [M, J], and whether the hand comes near enough to its place, above the table [M].
+    """
+    joints = torch.as_tensor(grasped[0])
+    root = model.kinematics.link_poses(joints, [model.robot.hand_root])[:, 0].numpy()
+    moved = turn_of(object_quat) * turn_of(grasped[2]).inv()
+    root_pos = torch.as_tensor(object_pos + moved.apply(root[:, :3, 3] - grasped[1]))
+    root_quat = matrix_to_quat(torch.as_tensor(moved.as_matrix() @ root[:, :3, :3]))
+    hand_joints = joints[:, torch.as_tensor(model.hand.joint_indices)]
     targets = ArmTargets.of_poses(root_pos, root_quat, hand_joints[:, None])
     arm, measures = track(model, targets, _GIVES_WAY, QUICK)
-    return arm[:, 0], (classify(measures, _GIVES_WAY) == 0)[:, 0].numpy()
+    reached = (classify(measures, _GIVES_WAY) == 0)[:, 0].numpy()
+    return model.full(arm[:, 0], hand_joints).numpy(), reached

@@ -63,7 +63,8 @@ def make_bank(
         squeeze: with which force the drive targets of states after contact press on the object; None: targets are the
             joints' positions. Accepted states are tried once more with the targets, and an engine that rejects this
             leaves the targets where they were.
-        progress: called with (candidates tried, candidates in all).
+        progress: called with (candidates tried, candidates in all), and before that with (grasps carried to the table,
+            grasps in all) if there are lift states.
 
     Raises:
         DemoError: no frame is valid, or an object of a valid frame is not among ``objects``.
@@ -85,7 +86,9 @@ def make_bank(
     frame, part, poses = closing_states(retargeted, robot, objects, closing or ClosingConfig())
     lifting = np.zeros(len(frame), dtype=bool)
     if lift is not None and lift.grasps:
-        more, more_poses = _lift_states(retargeted, scene, lift, engines[0], num_envs, device)
+        more, more_poses = _lift_states(
+            retargeted, scene, lift, engines[0], num_envs, device, progress
+        )
         frame = np.concatenate((frame, retargeted.frame_offsets[more]))
         order = frame.argsort(kind="stable")
         frame = frame[order]
@@ -169,6 +172,7 @@ def _lift_states(
     engine: str,
     num_envs: int,
     device: str,
+    progress: Progress,
 ) -> tuple[np.ndarray, Poses]:
     """Return :func:`~xreset.resets.lift.lift_states` with objects at rest, as an engine lets them come to rest."""
     frames = grasp_frames(retargeted, scene.robot, scene.objects, config.grasps)
@@ -186,5 +190,5 @@ def _lift_states(
             device=device,
         )
     return lift_states(
-        retargeted, scene.robot, scene.objects, frames, start_pos, start_quat, config
+        retargeted, scene.robot, scene.objects, frames, start_pos, start_quat, config, progress
     )

@@ -19,6 +19,7 @@ import torch
 
 from xreset.geometry.rotations import matrix_to_quat
 from xreset.geometry.shapes import turn_of
+from xreset.progress import Progress, unseen
 from xreset.resets.config import LiftConfig, SqueezeConfig
 from xreset.resets.fingers import fingers_of
 from xreset.retarget.arm.config import QUICK
@@ -72,6 +73,7 @@ def lift_states(
     start_pos: np.ndarray,
     start_quat: np.ndarray,
     config: LiftConfig,
+    progress: Progress = unseen,
 ) -> tuple[np.ndarray, Poses]:
     """Carry grasps to where the objects of all demonstrations start.
 
@@ -83,6 +85,7 @@ def lift_states(
         start_pos: [S, 3] where each sequence's object rests on the table [m].
         start_quat: [S, 4] its orientation there.
         config: heights above the table, and how many grasps are kept at each.
+        progress: called with (poses tried, poses in all).
 
     Returns:
         The sequence of each state [M], ascending, and the poses.
@@ -112,6 +115,7 @@ def lift_states(
         poses = (joint_pos[rows], object_pos[rows], object_quat[rows])
         names = retargeted.object_name[sequence[rows]]
         fits[rows] = reached & _is_grasp(robot, objects, names, poses)
+        progress(first + len(held), len(sequence))
     kept = np.flatnonzero(fits)
     kept = kept[_spread_in_groups(group[kept], config.grasps)]
     return sequence[kept], (joint_pos[kept], object_pos[kept], object_quat[kept])

@@ -86,18 +86,14 @@ def make_bank(
     frame, part, poses = closing_states(retargeted, robot, objects, closing or ClosingConfig())
     lifting = np.zeros(len(frame), dtype=bool)
     if lift is not None and lift.grasps:
-        more, more_poses = _lift_states(
-            retargeted, scene, lift, engines[0], num_envs, device, progress
-        )
-        frame = np.concatenate((frame, retargeted.frame_offsets[more]))
+        starts, more = _lift_states(retargeted, scene, lift, engines[0], num_envs, device, progress)
+        frame = np.concatenate((frame, starts))
         order = frame.argsort(kind="stable")
         frame = frame[order]
-        part = np.concatenate((part, np.zeros(len(more))))[order]
-        lifting = np.concatenate((lifting, np.ones(len(more), dtype=bool)))[order]
-        poses = tuple(
-            np.concatenate(values).astype(values[0].dtype)[order]
-            for values in zip(poses, more_poses, strict=True)
-        )
+        part = np.concatenate((part, np.zeros(len(starts))))[order]
+        lifting = order >= len(lifting)
+        both = zip(poses, more, strict=True)
+        poses = tuple(np.concatenate(values).astype(values[0].dtype)[order] for values in both)
     sequence = owner[frame]
     post_contact = retargeted.post_contact[frame] | lifting
     object_name = retargeted.object_name[sequence]
@@ -174,7 +170,8 @@ def _lift_states(
     device: str,
     progress: Progress,
 ) -> tuple[np.ndarray, Poses]:
-    """Return :func:`~xreset.resets.lift.lift_states` with objects at rest, as an engine lets them come to rest."""
+    """Return states that lift, with objects as they come to rest in an engine: the first frame of the demonstration of
+    each [M], and the poses."""
     frames = grasp_frames(retargeted, scene.robot, scene.objects, config.grasps)
     start_pos, start_quat = (pose.copy() for pose in retargeted.start_pose)
     grasped = retargeted.object_name[retargeted.sequence_of_frame[frames]]
@@ -189,6 +186,7 @@ def _lift_states(
             num_envs=num_envs,
             device=device,
         )
-    return lift_states(
+    sequence, poses = lift_states(
         retargeted, scene.robot, scene.objects, frames, start_pos, start_quat, config, progress
     )
+    return retargeted.frame_offsets[sequence], poses

@@ -50,20 +50,19 @@ class LiftTest(TestCase):
     def carried(self, motion, robot=ROBOT, *, shift=0.0, heights=(0.0, 0.01), grasps=8):
         """The lift states of a motion whose object rests higher by ``shift`` than where it starts."""
         start_pos, start_quat = motion.start_pose
-        frames = grasp_frames(motion, robot, BRICK, grasps)
+        frames = grasp_frames(motion, robot, BRICK)
         config = LiftConfig(grasps=grasps, heights=heights)
         start_pos = start_pos + np.array([0, 0, shift])
         return lift_states(motion, robot, BRICK, frames, start_pos, start_quat, config)
 
     def test_grasps_are_frames_in_the_air_with_thumb_and_finger_at_the_object(self):
         motion = lifted()
-        self.assertEqual(grasp_frames(motion, ROBOT, BRICK, 8).tolist(), [2, 3, 4, 5])
-        self.assertEqual(grasp_frames(motion, ROBOT, BRICK, 2).tolist(), [2, 5])
+        self.assertEqual(grasp_frames(motion, ROBOT, BRICK).tolist(), [2, 3, 4, 5])
         valid = np.array([True] * 5 + [False])
         lost = replace(motion, valid=valid, reason=(~valid).astype(int))
-        self.assertEqual(grasp_frames(lost, ROBOT, BRICK, 2).tolist(), [2, 4])
+        self.assertEqual(grasp_frames(lost, ROBOT, BRICK).tolist(), [2, 3, 4])
         far = lifted(toy_grasp.OPEN + 0.02)
-        self.assertEqual(grasp_frames(far, ROBOT, BRICK, 8).tolist(), [])
+        self.assertEqual(grasp_frames(far, ROBOT, BRICK).tolist(), [])
 
     def test_the_hand_comes_along(self):
         sequence, (joints, pos, quat) = self.carried(lifted())
@@ -126,6 +125,8 @@ class BankTest(InFolder):
             return pos, quat, np.ones(len(pos), dtype=bool)
 
         self.enterContext(patch("xreset.resets.filter.settled_poses", held))
+        weak = make_bank(lifted(), ROBOT, BRICK, lift=LiftConfig(grasps=2))
+        self.assertIsNone(weak.lifting, "without squeezing no grasp carries the brick")
         out = self.folder / "b.npz"
         options = ("--lift.grasps", "2", "--lift.heights", "0", "0.02", "--squeeze.force", "2.5")
         told = succeeds("resets", f"{self.folder}/r.npz", "--out", str(out), *options)
@@ -155,7 +156,8 @@ class BankTest(InFolder):
         self.assertIsNone(plain.lifting)
         for name, value in vars(plain).items():
             assert_array_equal(getattr(off, name), value, name)
-        apart = make_bank(lifted(toy_grasp.OPEN + 0.02), ROBOT, BRICK, lift=LiftConfig(grasps=2))
+        lift = LiftConfig(grasps=2)
+        apart = make_bank(lifted(toy_grasp.OPEN + 0.02), ROBOT, BRICK, lift=lift, squeeze=squeeze)
         self.assertIsNone(apart.lifting, "no frame has a grasp")
         self.assertIsNone(toy_bank(ROBOT).lifting)
 

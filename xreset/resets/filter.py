@@ -20,7 +20,7 @@ from xreset.resets.bank import ResetBank, starts_and_goals
 from xreset.resets.closing import closing_states
 from xreset.resets.config import ClosingConfig, FilterConfig, LiftConfig, SqueezeConfig
 from xreset.resets.fingers import fingers_of, squeeze_targets
-from xreset.resets.lift import Poses, grasp_frames, lift_states
+from xreset.resets.lift import Poses, carries, grasp_frames, lift_states
 from xreset.resets.probe import REASONS, probe, rejection
 from xreset.resets.settle import settled_poses
 from xreset.retarget.file import Retargeted
@@ -86,7 +86,9 @@ def make_bank(
     frame, part, poses = closing_states(retargeted, robot, objects, closing or ClosingConfig())
     lifting = np.zeros(len(frame), dtype=bool)
     if lift is not None and lift.grasps:
-        starts, more = _lift_states(retargeted, scene, lift, engines[0], num_envs, device, progress)
+        starts, more = _lift_states(
+            retargeted, scene, lift, squeeze, engines[0], num_envs, device, progress
+        )
         frame = np.concatenate((frame, starts))
         order = frame.argsort(kind="stable")
         frame = frame[order]
@@ -165,28 +167,66 @@ def _lift_states(
     retargeted: Retargeted,
     scene: SceneSpec,
     config: LiftConfig,
+    squeeze: SqueezeConfig,
     engine: str,
     num_envs: int,
     device: str,
     progress: Progress,
 ) -> tuple[np.ndarray, Poses]:
-    """Return states that lift, with objects as they come to rest in an engine: the first frame of the demonstration of
-    each [M], and the poses."""
-    frames = grasp_frames(retargeted, scene.robot, scene.objects, config.grasps)
+    """Return states with grasps that carry their object in an engine, where objects come to rest in this engine.
+
+    Returns:
+        The first frame of the demonstration of each state [M], and the poses.
+    """
+    where = {"num_envs": num_envs, "device": device}
+    frames = grasp_frames(retargeted, scene.robot, scene.objects)
+    object_name = retargeted.object_name[retargeted.sequence_of_frame[frames]]
     start_pos, start_quat = (pose.copy() for pose in retargeted.start_pose)
-    grasped = retargeted.object_name[retargeted.sequence_of_frame[frames]]
-    sequences = np.flatnonzero(np.isin(retargeted.object_name, grasped))
-    if len(sequences):
+    sequences = np.flatnonzero(np.isin(retargeted.object_name, object_name))
+    if len(frames):
+        states = _pressing(retargeted, scene, frames, object_name, squeeze)
+        held = probe(
+            engine,
+            scene,
+            object_name,
+            states,
+            carries,
+            gravity=1.0,
+            steps=round(1.0 / scene.control_dt),
+            progress=lambda done: progress(done, len(frames)),
+            **where,
+        )
+        frames = frames[held]
         start_pos[sequences], start_quat[sequences], _ = settled_poses(
             scene,
             retargeted.object_name[sequences],
             start_pos[sequences].astype(np.float32),
             start_quat[sequences].astype(np.float32),
             engine,
-            num_envs=num_envs,
-            device=device,
+            **where,
         )
     sequence, poses = lift_states(
         retargeted, scene.robot, scene.objects, frames, start_pos, start_quat, config, progress
     )
     return retargeted.frame_offsets[sequence], poses
+
+
+def _pressing(
+    retargeted: Retargeted,
+    scene: SceneSpec,
+    frames: np.ndarray,
+    object_name: np.ndarray,
+    squeeze: SqueezeConfig,
+) -> State:
+    """Return the states of frames [M], whose drive targets press."""
+    poses = (
+        retargeted.joint_pos[frames],
+        retargeted.object_pos[frames],
+        retargeted.object_quat_wxyz[frames],
+    )
+    states = State.at_rest(*map(torch.as_tensor, poses))
+    if squeeze.presses:
+        fingers = fingers_of(scene.robot, scene.objects, object_name, *poses)
+        targets = squeeze_targets(scene.robot, fingers, poses[0], squeeze)
+        states.joint_target[:] = torch.as_tensor(targets, dtype=torch.float32)
+    return states

@@ -2,7 +2,7 @@
 
 At 30 frames a second, a demonstration shows only a few frames between the table and a height of some centimetres, and
 in them the retargeted fingers often do not touch the object. So few states lead from the table to the grasps that hold
-in the air. Here grasps from the air are moved to the object at rest on the table, and to small heights above it. The
+in the air. Here such grasps are moved to the object at rest on the table, and to small heights above it. The
 arm follows by inverse kinematics. A hand that would go into the table gives way, as long as the thumb and another
 finger stay at the object. As many grasps do not fit on the table, those of other demonstrations of the same object are
 tried, too. Physics judges the new states like the others.
@@ -12,13 +12,16 @@ Shape letters: M states, S sequences, J joints, n joints of the arm.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from xreset.geometry.rotations import matrix_to_quat
+from xreset.geometry.rotations import matrix_to_quat, quat_angle
 from xreset.geometry.shapes import turn_of
+from xreset.physics import Backend, State
 from xreset.progress import Progress, unseen
 from xreset.resets.config import LiftConfig, SqueezeConfig
 from xreset.resets.fingers import fingers_of
@@ -44,13 +47,9 @@ Poses = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def grasp_frames(
-    retargeted: Retargeted, robot: RobotSpec, objects: Sequence[ObjectSpec], count: int
+    retargeted: Retargeted, robot: RobotSpec, objects: Sequence[ObjectSpec]
 ) -> np.ndarray:
-    """Choose frames with a grasp in the air: the thumb and another finger are at the object.
-
-    Returns:
-        Ascending frames, at most ``count`` of each sequence, spread evenly over those that qualify.
-    """
+    """Return the frames with a grasp in the air, ascending: the thumb and another finger are at the object."""
     owner = retargeted.sequence_of_frame
     height = retargeted.object_pos[:, 2]
     raised = height - height[retargeted.frame_offsets[:-1]][owner] > RAISED
@@ -60,9 +59,15 @@ def grasp_frames(
         retargeted.object_pos[frames],
         retargeted.object_quat_wxyz[frames],
     )
-    names = retargeted.object_name[owner[frames]]
-    frames = frames[_is_grasp(robot, objects, names, poses)]
-    return frames[_spread_in_groups(owner[frames], count)]
+    return frames[_is_grasp(robot, objects, retargeted.object_name[owner[frames]], poses)]
+
+
+def carries(backend: Backend, start: State) -> Tensor:
+    """Return whether the object is still where the hand held it: [N] bool, within 2 cm and 30 degrees."""
+    state = backend.state()
+    moved = (state.object_pos - start.object_pos).norm(dim=-1)
+    turned = quat_angle(state.object_quat, start.object_quat)
+    return (moved < 0.02) & (turned < math.radians(30.0))
 
 
 def lift_states(
@@ -81,7 +86,8 @@ def lift_states(
         retargeted: the motion.
         robot: its robot.
         objects: its objects.
-        frames: ascending frames of the motion with a grasp (:func:`grasp_frames`).
+        frames: ascending frames of the motion with a grasp (:func:`grasp_frames`); of those of a sequence, as many as
+            are kept at a height are tried, evenly spread.
         start_pos: [S, 3] where each sequence's object rests on the table [m].
         start_quat: [S, 4] its orientation there.
         config: heights above the table, and how many grasps are kept at each.
@@ -90,6 +96,7 @@ def lift_states(
     Returns:
         The sequence of each state [M], ascending, and the poses.
     """
+    frames = frames[_spread_in_groups(retargeted.sequence_of_frame[frames], config.grasps)]
     sequence, grasp = _candidates(retargeted, frames, config.grasps)
     count = len(config.heights)
     group = np.repeat(sequence, count) * count + np.tile(np.arange(count), len(sequence))

@@ -162,6 +162,7 @@ class BankTest(InFolder):
         self.assertIsNone(toy_bank(ROBOT).lifting)
 
     def test_bad_heights_are_refused(self):
-        words = "heights is .2.0,., expected heights from 0 to 1 m"
+        words = "heights is .2.0,., expected one height or more, from 0 to 1 m"
         with self.assertRaisesRegex(ValueError, words):
             LiftConfig(heights=(2.0,))
+        self.assertRaisesRegex(ValueError, "heights is", LiftConfig, heights=())

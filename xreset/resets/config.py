@@ -46,7 +46,10 @@ class LiftConfig(Checked):
     grasps: NonNegativeInt = 0
     """Largest number of grasps that are added to each demonstration at each height. 0: none."""
     heights: Annotated[
-        tuple[float, ...], Rule("heights from 0 to 1 m", lambda x: all(0 <= h <= 1 for h in x))
+        tuple[float, ...],
+        Rule(
+            "one height or more, from 0 to 1 m", lambda x: x != () and all(0 <= h <= 1 for h in x)
+        ),
     ] = (0.0, 0.01, 0.02, 0.03)
     """Heights above the start at which the object is grasped [m]."""
 

@@ -145,6 +145,14 @@ class BankTest(InFolder):
         height = bank.object_pos[bank.lifting][:, 2] - bank.start_pos[0, 2]
         assert_allclose(height, [0, 0, 0.02, 0.02], atol=1e-3)
         assert_array_equal(bank.with_states(bank.lifting).lifting, True)
+        told = succeeds("resets", f"{self.folder}/r.npz", "--out", str(out), "--lift.grasps", "2")
+        for words in ("0 lift states were added", "add --squeeze.force 5"):
+            self.assertIn(words, told)
+
+    def test_the_file_states_the_options(self):
+        out = self.folder / "b.npz"
+        options = ("--lift.grasps", "2", "--lift.heights", "0", "0.02")
+        succeeds("resets", f"{self.folder}/r.npz", "--out", str(out), *options)
         with np.load(out) as file:
             config = json.loads(str(file["meta"]))["config"]
         self.assertEqual(config["lift"], {"grasps": 2, "heights": [0.0, 0.02]})

@@ -104,6 +104,8 @@ def resets(
         owners = [] if bank.lifting is None else bank.sequence_index[bank.lifting]
         demonstrations = f"{len(set(owners))} of {len(bank.sequence_name)} demonstrations"
         console.print(f"{len(owners)} lift states were added, from {demonstrations}")
+        if not len(owners) and not squeeze.presses:
+            show_notes(["no grasp carries its object unless fingers press: add --squeeze.force 5"])
     tried = bank.num_states + len(bank.rejected_reason)
     share = accounts[-1].kept / max(motion.annotated.sum(), 1)
     console.print(f"{share:.0%} of the annotated frames are kept")

@@ -59,9 +59,7 @@ def _frames_to_follow(retargeted: Retargeted, fingers: Fingers, within: float) -
     """Return the frames between which and their next ones states are added."""
     owner = retargeted.sequence_of_frame
     start = retargeted.frame_offsets[:-1][owner]
-    touch = (fingers.gap < TOUCH).numpy()
-    thumb = (fingers.finger == 0).numpy()
-    grasped = touch[:, thumb].any(axis=1) & touch[:, ~thumb].any(axis=1)
+    grasped = fingers.grasp(TOUCH).numpy()
     moved = np.linalg.norm(retargeted.object_pos - retargeted.object_pos[start], axis=-1) > MOVED
     over = grasped | moved
     count = np.cumsum(over)

@@ -127,10 +127,8 @@ def make_bank(
     reason = try_candidates(np.arange(len(frame)), progress)
     if squeeze.presses:
         rows = np.flatnonzero((reason < 0) & post_contact)
-        touching = [values[rows] for values in poses]
-        fingers = fingers_of(robot, scene.objects, object_name[rows], *touching)
-        targets = squeeze_targets(robot, fingers, touching[0], squeeze)
-        states.joint_target[rows] = torch.as_tensor(targets, dtype=torch.float32)
+        touching = tuple(values[rows] for values in poses)
+        states.joint_target[rows] = _pressing_targets(scene, object_name[rows], touching, squeeze)
         refused = rows[try_candidates(rows) >= 0]
         states.joint_target[refused] = states.joint_pos[refused]
     progress(work, work)
@@ -184,7 +182,14 @@ def _lift_states(
     start_pos, start_quat = (pose.copy() for pose in retargeted.start_pose)
     sequences = np.flatnonzero(np.isin(retargeted.object_name, object_name))
     if len(frames):
-        states = _pressing(retargeted, scene, frames, object_name, squeeze)
+        poses = (
+            retargeted.joint_pos[frames],
+            retargeted.object_pos[frames],
+            retargeted.object_quat_wxyz[frames],
+        )
+        states = State.at_rest(*map(torch.as_tensor, poses))
+        if squeeze.presses:
+            states.joint_target[:] = _pressing_targets(scene, object_name, poses, squeeze)
         held = probe(
             engine,
             scene,
@@ -211,22 +216,10 @@ def _lift_states(
     return retargeted.frame_offsets[sequence], poses
 
 
-def _pressing(
-    retargeted: Retargeted,
-    scene: SceneSpec,
-    frames: np.ndarray,
-    object_name: np.ndarray,
-    squeeze: SqueezeConfig,
-) -> State:
-    """Return the states of frames [M], whose drive targets press."""
-    poses = (
-        retargeted.joint_pos[frames],
-        retargeted.object_pos[frames],
-        retargeted.object_quat_wxyz[frames],
-    )
-    states = State.at_rest(*map(torch.as_tensor, poses))
-    if squeeze.presses:
-        fingers = fingers_of(scene.robot, scene.objects, object_name, *poses)
-        targets = squeeze_targets(scene.robot, fingers, poses[0], squeeze)
-        states.joint_target[:] = torch.as_tensor(targets, dtype=torch.float32)
-    return states
+def _pressing_targets(
+    scene: SceneSpec, object_name: np.ndarray, poses: tuple[np.ndarray, ...], squeeze: SqueezeConfig
+) -> torch.Tensor:
+    """Return drive targets that press [M, J], for joint positions and poses of objects [M, ...]."""
+    fingers = fingers_of(scene.robot, scene.objects, object_name, *poses)
+    targets = squeeze_targets(scene.robot, fingers, poses[0], squeeze)
+    return torch.as_tensor(targets, dtype=torch.float32)

@@ -52,6 +52,12 @@ class Fingers:
             lead.scatter_(1, mine[self.gap[:, mine].argmin(dim=-1)][:, None], True)
         return lead
 
+    def grasp(self, within: float) -> Tensor:
+        """Return whether the thumb and another finger are nearer to the object than a distance [m]: [M] bool."""
+        near = self.gap < within
+        thumb = self.finger == 0
+        return near[:, thumb].any(dim=1) & near[:, ~thumb].any(dim=1)
+
 
 def fingers_of(
     robot: RobotSpec,

@@ -97,15 +97,15 @@ def lift_states(
         The sequence of each state [M], ascending, and the poses.
     """
     frames = frames[_spread_in_groups(retargeted.sequence_of_frame[frames], config.grasps)]
-    sequence, grasp = _candidates(retargeted, frames, config.grasps)
     count = len(config.heights)
-    group = np.repeat(sequence, count) * count + np.tile(np.arange(count), len(sequence))
-    order = group.argsort(kind="stable")
-    group = group[order]
-    grasp = np.repeat(grasp, count)[order]
-    sequence = group // count
+    tried = []  # of every sequence, at every height
+    for grasps in _tried(retargeted, frames, config.grasps):
+        tried += [grasps] * count
+    grasp = np.concatenate(tried)
+    group = np.repeat(np.arange(len(tried)), [len(grasps) for grasps in tried])
+    sequence, height = np.divmod(group, count)
     object_pos = start_pos[sequence].astype(np.float64)
-    object_pos[:, 2] += np.asarray(config.heights)[group % count]
+    object_pos[:, 2] += np.asarray(config.heights)[height]
     object_quat = start_quat[sequence].astype(np.float64)
     model = ArmModel(robot)
     joint_pos = retargeted.joint_pos[grasp].astype(np.float64)
@@ -128,10 +128,8 @@ def lift_states(
     return sequence[kept], (joint_pos[kept], object_pos[kept], object_quat[kept])
 
 
-def _candidates(
-    retargeted: Retargeted, frames: np.ndarray, count: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return sequences, ascending, and the frames whose grasps each one tries: its own, then those of others."""
+def _tried(retargeted: Retargeted, frames: np.ndarray, count: int) -> list[np.ndarray]:
+    """Return for each sequence the frames whose grasps it tries: its own, then those of others."""
     owner = retargeted.sequence_of_frame[frames]
     name = retargeted.object_name
     grasps = []
@@ -139,7 +137,7 @@ def _candidates(
         others = frames[(owner != sequence) & (name[owner] == name[sequence])]
         borrowed = others[_spread(len(others), _BORROWED * count)]
         grasps.append(np.concatenate((frames[owner == sequence], borrowed)))
-    return np.repeat(np.arange(len(name)), [len(own) for own in grasps]), np.concatenate(grasps)
+    return grasps
 
 
 def _spread(number: int, count: int) -> np.ndarray:
@@ -159,9 +157,7 @@ def _is_grasp(
 ) -> np.ndarray:
     """Return whether the thumb and another finger are at the object [M]."""
     fingers = fingers_of(robot, objects, object_name, *poses)
-    at_object = fingers.gap < SqueezeConfig().reach
-    thumb = fingers.finger == 0
-    return (at_object[:, thumb].any(dim=1) & at_object[:, ~thumb].any(dim=1)).numpy()
+    return fingers.grasp(SqueezeConfig().reach).numpy()
 
 
 @one_thread()

@@ -36,7 +36,7 @@ from xreset.tensors import one_thread
 RAISED = 0.02
 """An object that is higher above its start than this is in the air [m]."""
 _BORROWED = 4
-"""How many times as many grasps of other demonstrations are tried as are kept of all."""
+"""For each grasp that may be kept, so many grasps of other demonstrations are tried."""
 _GIVES_WAY = Thresholds(wrist_position=0.02, wrist_orientation=float(np.radians(15.0)))
 """How far the hand may be from its place in the grasp, so that it clears the table."""
 _AT_A_TIME = 2048
@@ -86,8 +86,8 @@ def lift_states(
         retargeted: the motion.
         robot: its robot.
         objects: its objects.
-        frames: ascending frames of the motion with a grasp (:func:`grasp_frames`); of those of a sequence, as many as
-            are kept at a height are tried, evenly spread.
+        frames: ascending frames of the motion with a grasp (:func:`grasp_frames`). Of each sequence's frames up to
+            ``config.grasps`` are used, evenly spread.
         start_pos: [S, 3] where each sequence's object rests on the table [m].
         start_quat: [S, 4] its orientation there.
         config: heights above the table, and how many grasps are kept at each.

@@ -10,6 +10,7 @@ from pathlib import Path
 from unittest import mock, skipUnless
 
 import numpy as np
+import torch
 
 from tests.command import refused, succeeds
 from tests.data import InOneFolder
@@ -78,6 +79,21 @@ class OnnxPolicyTest(WithPolicy):
             OnnxPolicy(self.folder / "none.onnx")
         path.write_bytes(b"hello")
         self.assertRaisesRegex(PolicyError, "cannot be read as an ONNX policy", OnnxPolicy, path)
+
+    def test_a_training_checkpoint_is_called_one(self):
+        run = self.folder / "run"
+        checkpoint = run / "checkpoints" / "000100.pt"
+        checkpoint.parent.mkdir(parents=True)
+        torch.save({"iteration": 100}, checkpoint)
+        words = (
+            "000100.pt is a training checkpoint, expected a run folder, a .onnx file or the name"
+        )
+        self.assertRaisesRegex(
+            PolicyError, f"{words}.* run folder: its policy", OnnxPolicy, checkpoint
+        )
+        (run / "run.json").write_text("{}")
+        told = refused("eval", checkpoint, "--demos", "x.npz")
+        self.assertRegex(" ".join(told.split()), f"{words}.* run folder .{run}.: its policy")
 
 
 class ShippedTest(WithPolicy):

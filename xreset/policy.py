@@ -181,9 +181,7 @@ class OnnxPolicy:
             )
             metadata = self._session.get_modelmeta().custom_metadata_map
         except Exception as error:
-            raise PolicyError(
-                f"{path} cannot be read as an ONNX policy: {shown(str(error))}. Is it damaged?"
-            ) from error
+            raise PolicyError(_why_unreadable(path, error)) from error
         if METADATA_KEY not in metadata:
             raise PolicyError(
                 f"{path} is an ONNX file without xreset's contract: it was not exported by xreset."
@@ -245,6 +243,19 @@ class OnnxPolicy:
         values = (flat.cpu().numpy(), observations[picture].cpu().numpy(), *self._state)
         outputs: Any = self._session.run(OUTPUTS, dict(zip(INPUTS, values, strict=True)))
         return outputs
+
+
+def _why_unreadable(path: Path, error: Exception) -> str:
+    """Return what is wrong with a file that onnxruntime does not read, and what to give instead."""
+    if path.suffix != ".pt":
+        return f"{path} cannot be read as an ONNX policy: {shown(str(error))}. Is it damaged?"
+    run = path.parent.parent
+    named = f" ({run})" if (run / "run.json").is_file() else ""
+    return (
+        f"{path} is a training checkpoint, expected a run folder, a .onnx file or the name of a policy that ships with "
+        f"xreset. Give the checkpoint's run folder{named}: its policy is exported from its newest checkpoint, or from "
+        "the one that xreset select chose."
+    )
 
 
 class ZeroPolicy(Policy):

@@ -11,10 +11,8 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
 from tests import toy_grasp
-from tests.command import succeeds
-from tests.data import InFolder
-from tests.toy_bank import in_this_process, toy_bank, toy_retargeted
-from xreset import LiftConfig, SqueezeConfig, make_bank, read_bank
+from tests.toy_bank import toy_bank, toy_retargeted
+from xreset import LiftConfig, SqueezeConfig, make_bank
 from xreset.geometry.collision import table_clearance
 from xreset.geometry.kinematics import Kinematics
 from xreset.resets.lift import grasp_frames, lift_states
@@ -111,13 +109,10 @@ class LiftTest(TestCase):
 
 
 @skipUnless(find_spec("mujoco"), "MuJoCo is not installed")
-class BankTest(InFolder):
+class BankTest(toy_grasp.ResetsTest):
     def setUp(self):
         super().setUp()
-        self.enterContext(patch("xreset.description.load_robot", lambda _: ROBOT))
-        self.enterContext(in_this_process())
-        self.enterContext(patch("xreset.objects.catalogue.load_objects", lambda *_: BRICK))
-        write_retargeted(f"{self.folder}/r.npz", lifted())
+        write_retargeted(self.motion, lifted())
 
     def test_a_bank_marks_them_and_does_not_count_them_as_frames(self):
         def held(_scene, _names, pos, quat, *_, **__):
@@ -127,10 +122,8 @@ class BankTest(InFolder):
         self.enterContext(patch("xreset.resets.filter.settled_poses", held))
         weak = make_bank(lifted(), ROBOT, BRICK, lift=LiftConfig(grasps=2))
         self.assertIsNone(weak.lifting, "without squeezing no grasp carries the brick")
-        out = self.folder / "b.npz"
         options = ("--lift.grasps", "2", "--lift.heights", "0", "0.02", "--squeeze.force", "2.5")
-        told = succeeds("resets", f"{self.folder}/r.npz", "--out", str(out), *options)
-        bank = read_bank(out)
+        bank, told = self.resets(*options)
         assert bank.lifting is not None
         self.assertEqual(bank.frame_index.tolist(), [0] * 5 + [1, 2, 3, 4, 5])
         self.assertEqual(np.flatnonzero(bank.lifting).tolist(), [1, 2, 3, 4])
@@ -145,15 +138,13 @@ class BankTest(InFolder):
         height = bank.object_pos[bank.lifting][:, 2] - bank.start_pos[0, 2]
         assert_allclose(height, [0, 0, 0.02, 0.02], atol=1e-3)
         assert_array_equal(bank.with_states(bank.lifting).lifting, True)
-        told = succeeds("resets", f"{self.folder}/r.npz", "--out", str(out), "--lift.grasps", "2")
+        _, told = self.resets("--lift.grasps", "2")
         for words in ("0 lift states were added", "add --squeeze.force 5"):
             self.assertIn(words, told)
 
     def test_the_file_states_the_options(self):
-        out = self.folder / "b.npz"
-        options = ("--lift.grasps", "2", "--lift.heights", "0", "0.02")
-        succeeds("resets", f"{self.folder}/r.npz", "--out", str(out), *options)
-        with np.load(out) as file:
+        self.resets("--lift.grasps", "2", "--lift.heights", "0", "0.02")
+        with np.load(self.bank) as file:
             config = json.loads(str(file["meta"]))["config"]
         self.assertEqual(config["lift"], {"grasps": 2, "heights": [0.0, 0.02]})
 

@@ -251,8 +251,9 @@ def distill(
             "A student needs a camera. Give one or two of: " + ", ".join(CAMERAS) + "."
         )
     check_each_once(config.task.vision.cameras)
-    checked_train = names_wrong_arguments(train)
-    return checked_train(bank, out=out, config=config, teacher=teacher, **options)
+    # xreset.train, which is train with this wrapper, names an option of a wrong type; so does this call
+    public_train = names_wrong_arguments(train)
+    return public_train(bank, out=out, config=config, teacher=teacher, **options)
 
 
 def _camera(camera: str | CameraConfig) -> CameraConfig:

@@ -145,6 +145,7 @@ def train(
     with _alone(out):
         if teacher_file is not None:
             write_whole(out / TEACHER, teacher_file.read_bytes())
+        # the training reads its own file, so that it has the same data as a resumed one, and values are checked
         if isinstance(data, GoalSet):
             write_goals(out / "goals.npz", data)
             inputs = load(out / "goals.npz")

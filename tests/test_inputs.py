@@ -2,6 +2,7 @@
 
 import pickle
 import re
+from dataclasses import replace
 from unittest.mock import patch
 
 import numpy as np
@@ -26,6 +27,7 @@ from xreset import (
 from xreset.errors import DemoError, FileFormatError, XResetError
 from xreset.files import file_hash
 from xreset.inputs import load_inputs
+from xreset.resets.bank import check_objects
 
 
 class InputsTest(InOneFolder):
@@ -82,9 +84,15 @@ class InputsTest(InOneFolder):
             load_inputs(self.bank_file, accept=("demos", "motion"))
         other = toy_bank(self.robot, object_sources=("abc", "stand-in"))
         with self.assertRaisesRegex(
-            FileFormatError, "was made with an imported mesh of 005_tomato_soup_can"
+            FileFormatError,
+            "was made with an imported mesh of 005_tomato_soup_can, but the given one is the built-in stand-in. Give",
         ):
             load_inputs(other)
+        changed = (replace(load_object(SOUP), source="def"), load_object(SPAM))
+        with self.assertRaisesRegex(
+            FileFormatError, "an imported mesh of .*, but the given one is another mesh. Give the"
+        ):
+            check_objects("bank.npz", other, changed)
 
     def test_arguments_of_another_type_are_named(self):
         """Python's own errors come from deep inside."""

@@ -227,11 +227,17 @@ def check_objects(path: str | Path, bank: ResetBank, objects: tuple[ObjectSpec, 
     """Refuse objects whose geometry is not what the bank was made with; ``FileFormatError``."""
     given = {o.name: o.source for o in objects}
     for name, source in zip(bank.object_names, bank.object_sources, strict=True):
-        if given.get(name, source) != source:
-            raise FileFormatError(
-                f"{path} was made with {_described(source)} of {name}, but the given one is {_described(given[name])} "
-                "(or another mesh). Give the same --objects folder, or make it again."
-            )
+        given_source = given.get(name, source)
+        if given_source == source:
+            continue
+        used = _described(source)
+        found = _described(given_source)
+        if found == used:
+            found = "another mesh"
+        raise FileFormatError(
+            f"{path} was made with {used} of {name}, but the given one is {found}. Give the same --objects folder, or "
+            "make it again."
+        )
 
 
 def _described(source: str) -> str:

@@ -41,8 +41,8 @@ from xreset.text import Brief, shown
 
 SCHEMA = "xreset-resets/1"
 
-_KINDS = {"f": np.float32, "i": np.int32, "b": np.bool_, "U": np.str_}
-"""Types of arrays without rows."""
+_EMPTY_TYPES = {"f": np.float32, "i": np.int32, "b": np.bool_, "U": np.str_}
+"""Kind of a field -> type of its array in a bank without states."""
 
 StateJoints = Annotated[np.ndarray, Field(("L", "J"), "f", within=JOINT)]
 StateIndices = Annotated[np.ndarray, Field(("L",), "i", within=(0, inf))]
@@ -55,8 +55,8 @@ class ResetBank(Brief):
     """Contents of a reset bank: starts and goals of demonstrations [S], stable states [L] and rejected candidates
     [C].
 
-    A state is ``joint_pos`` [L, J], ``object_pos`` [L, 3] and ``object_quat_wxyz`` [L, 4], in the world frame; it is
-    of the frame ``frame_index`` [L] of the demonstration ``sequence_index`` [L].
+    A state is ``joint_pos`` [L, J], ``object_pos`` [L, 3] and ``object_quat_wxyz`` [L, 4], in the world frame. It was
+    made from the frame ``frame_index`` [L] of the demonstration ``sequence_index`` [L].
     """
 
     robot: OneText
@@ -162,7 +162,7 @@ def no_states(robot: RobotSpec) -> dict[str, Any]:
     for name, schema in schema_of(ResetBank).items():
         if schema.required and schema.shape[:1] in (("L",), ("C",)):
             shape = [lengths.get(size, size) for size in schema.shape]
-            empty[name] = np.zeros(shape, _KINDS[schema.kind])
+            empty[name] = np.zeros(shape, _EMPTY_TYPES[schema.kind])
     return empty
 
 

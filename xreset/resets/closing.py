@@ -1,7 +1,7 @@
 """More states where a hand closes in on an object.
 
-People's hands come in at 0.6 to 0.9 m/s. So at 30 frames a second a demonstration shows a hand two or three times
-between 10 cm and its grasp, where a policy learns whether to grasp or to press. Here the robot's joints are
+People's hands come in at 0.6 to 0.9 m/s. So at 30 frames a second, a demonstration has only two or three frames with
+the hand less than 10 cm from its grasp. There a policy learns whether to grasp or to press. Here the robot's joints are
 interpolated between two frames of one motion, so that fingertips move by a stated distance from state to state. Physics
 judges the new states like the others.
 """
@@ -30,14 +30,17 @@ def closing_states(
 ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Choose the valid frames of a motion, and states between them where the hand closes in.
 
-    That is where a finger is near the object, until the thumb and another finger touch the object or the object has
-    been moved. The human's first contact is not the end: there the robot's fingers are usually 5 to 10 mm away.
+    A hand closes in while a finger is near the object. It has closed in when the thumb and another finger touch the
+    object, or when the object has been moved. The human's first contact is too early for this end: the robot's fingers
+    are then usually 5 to 10 mm away.
 
     Returns:
         For each state [M] the frame that it is or follows, ascending; how far it is on the way to the next frame, in
         [0, 1), where 0 is the frame itself; and joint positions [M, J], object positions [M, 3] and quaternions [M, 4].
     """
-    count = retargeted.valid.astype(int)  # states that are or follow each frame
+    count = retargeted.valid.astype(
+        int
+    )  # number of states of each frame: itself, and those that follow it
     if config.spacing is not None:
         object_name = retargeted.object_name[retargeted.sequence_of_frame]
         poses = (retargeted.joint_pos, retargeted.object_pos, retargeted.object_quat_wxyz)
@@ -56,31 +59,32 @@ def closing_states(
 
 
 def _frames_to_follow(retargeted: Retargeted, fingers: Fingers, within: float) -> np.ndarray:
-    """Return the frames between which and their next ones states are added."""
+    """Return the frames after which states are added, on the way to the next frame."""
     owner = retargeted.sequence_of_frame
     start = retargeted.frame_offsets[:-1][owner]
     grasped = fingers.grasp(TOUCH).numpy()
     moved = np.linalg.norm(retargeted.object_pos - retargeted.object_pos[start], axis=-1) > MOVED
-    over = grasped | moved
-    count = np.cumsum(over)
+    ends = grasped | moved
+    num_ends = np.cumsum(ends)
+    before_sequence = (num_ends - ends)[start]
     # in this frame, or in an earlier one of the same sequence
-    over = count - (count - over)[start] > 0
+    has_ended = num_ends > before_sequence
     gap = fingers.gap.amin(dim=-1).numpy()
     near = np.minimum(gap[:-1], gap[1:]) < within
     same_sequence = owner[:-1] == owner[1:]
     return np.flatnonzero(
-        same_sequence & retargeted.valid[:-1] & retargeted.valid[1:] & ~over[:-1] & near
+        same_sequence & retargeted.valid[:-1] & retargeted.valid[1:] & ~has_ended[:-1] & near
     )
 
 
 def positions_between(values: np.ndarray, frame: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """[M, n] values on straight lines between frames [F, n]; frames stay the same."""
+    """[M, n] values on straight lines between frames [F, n]; those of the frames themselves stay the same."""
     following = values[np.minimum(frame + 1, len(values) - 1)]
     return values[frame] + part[:, None] * (following - values[frame])
 
 
 def rotations_between(quats: np.ndarray, frame: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """[M, 4] quaternions that turn evenly between frames [F, 4]; frames stay the same bit for bit."""
+    """[M, 4] quaternions that turn evenly between frames [F, 4]; those of the frames themselves keep every bit."""
     first = turn_of(quats[frame])
     second = turn_of(quats[np.minimum(frame + 1, len(quats) - 1)])
     step = Rotation.from_rotvec(part[:, None] * (first.inv() * second).as_rotvec())

@@ -20,7 +20,7 @@ class FilterConfig(Checked):
     """Limits of the physics filter (:mod:`xreset.resets.filter`); the velocities are those after the last step."""
 
     steps: PositiveInt = 8
-    """Control steps of 1/60 s with the drives holding. The published paper holds 48, a parallel jaw 240."""
+    """Control steps of 1/60 s with the drives holding. The published paper has 48, and 240 for a parallel jaw."""
     linear_velocity: PositiveFinite = 0.10
     """Largest speed of the object's origin [m/s]; published 0.5."""
     angular_velocity: PositiveFinite = 1.0
@@ -36,7 +36,7 @@ class ClosingConfig(Checked):
     spacing: PositiveFinite | None = None
     """Farthest that any fingertip moves from one state to the next [m], such as 0.005. None: no states are added."""
     within: PositiveFinite = 0.10
-    """Only between frames of which one has a finger nearer than this to the object [m]."""
+    """States are added between two frames if a finger is nearer than this to the object in one of them [m]."""
 
 
 @frozen
@@ -59,15 +59,15 @@ class SqueezeConfig(Checked):
     """Drive targets that press (:func:`xreset.resets.fingers.squeeze_targets`)."""
 
     force: NonNegativeFloat = 0.0
-    """Normal force of each finger that is at the object [N]. 0: targets are the joints' positions."""
+    """Normal force of each finger that presses [N]. 0: targets are the joints' positions."""
     weight: NonNegativeFloat = 0.0
-    """Further force, as a share of the object's weight, such as 1: heavy objects slip out of a grasp that tilts light
-    ones."""
+    """Further force, as a share of the object's weight, such as 1. With one force for all objects, heavy ones slip and
+    light ones tilt."""
     balanced: bool = False
-    """Whether the forces on an object nearly cancel, with the same mean: the thumb presses as hard as the fingers that
-    oppose it."""
+    """Whether the forces on an object nearly cancel: the thumb presses as hard as all fingers that oppose it together.
+    The mean force stays the same."""
     reach: PositiveFinite = 0.005
-    """A finger nearer than this to the object is at it [m]."""
+    """A finger presses if it is nearer than this to the object [m]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -104,7 +104,7 @@ class GoalConfig(Checked):
     goal_yaw: NonNegativeFloat = 30.0
     """Goals are turned about the vertical by U(-y, y) [degrees]."""
     upright: bool = False
-    """Whether objects start in the resting pose whose mesh direction z points up. Otherwise they start in any of
-    theirs, a broad face more often than a narrow one."""
+    """Whether objects start in the resting pose in which their mesh's z axis points up. Otherwise they start in any of
+    their resting poses, on a broad face more often than on a narrow one."""
     seed: NonNegativeInt = 0
     """The same seed gives the same goals."""

@@ -116,7 +116,7 @@ class _Grouped:
 
 
 _MEMORY = 0.05
-"""Share of a demonstration's rate of success that an episode replaces: the rate is over the last twenty or so."""
+"""Weight of an episode in its demonstration's rate of success, which is thus over the last twenty episodes or so."""
 _LEAST_FAILURE = 0.05
 """Demonstrations that always succeed are drawn as if one in twenty of their episodes failed."""
 
@@ -195,7 +195,8 @@ class ResetDistribution:
         task: TaskConfig,
         device: torch.device | str = "cpu",
     ) -> Self:
-        """Return the resets of a task: objects turn about their origins in the task (``TaskConfig.object_frame``)."""
+        """Return the resets of a task: objects turn about the origin of the frame that ``TaskConfig.object_frame``
+        names."""
         names = tuple(o.name for o in objects)
         pivots = {o.name: center(o) for o in objects} if task.object_frame == "center" else None
         return cls(bank, robot, names, task.reset, device, pivots)
@@ -236,7 +237,7 @@ class ResetDistribution:
         )
 
     def record(self, sequence: Tensor, success: Tensor, ended: Tensor) -> None:
-        """Take into account which demonstrations [N] have succeeded, for the episodes from home that have ended.
+        """Update the rates of success with the episodes from home that end now.
 
         Args:
             sequence: [N] demonstration of each world.
@@ -290,6 +291,7 @@ class ResetDistribution:
             return pos, quat
         uniform = torch.rand(len(pos), 4, generator=generator, device=generator.device)
         shift = (2.0 * uniform - 1.0) * self._goal_shift
+        # the shift lowers no pivot below its height at the start
         at_start = _turned(pos, quat, demos.start_quat, demos.pivot)
         above_start = (at_start - demos.start_pos)[:, 2]
         shift[:, 2] = torch.maximum(shift[:, 2], -above_start.clamp_min(0.0))

@@ -48,9 +48,9 @@ _START_SEED = 42
 _GOAL_SEED = 71
 """The published paper's seed bases of its start and goal offsets."""
 _DIRECTIONS = 16
-"""Mesh directions, at random, that are turned up to find an object's resting poses."""
+"""Number of random directions of a mesh that are turned up to find an object's resting poses."""
 _SAME_POSE = np.cos(np.radians(2.0))
-"""Resting poses whose up directions differ by less are one."""
+"""Cosine of the largest angle between the up directions of two resting poses that count as one."""
 _DRAWS = 12
 """Times that a goal is drawn before it is given up."""
 _FLOATING = 0.01
@@ -74,7 +74,7 @@ class _Episode:
     obj: ObjectSpec
     family: str
     number: int
-    """Of the object and family."""
+    """Number among the episodes of this object and family."""
     start: np.ndarray
     """[3] place of the centre of mass."""
     start_turn: Rotation
@@ -115,17 +115,17 @@ def make_goals(
         families = () if poses else FAMILIES
     if unknown := [family for family in families if family not in FAMILIES]:
         raise GoalError(f"Unknown family {unknown[0]!r}. Choose from: {', '.join(FAMILIES)}.")
-    specs = load_objects(objects or object_names(meshes), meshes)
-    spec = load_robot(robot)
+    loaded = load_objects(objects or object_names(meshes), meshes)
+    robot = load_robot(robot)
     own = [_own_pose(pose) for pose in poses]
-    for obj in specs:
+    for obj in loaded:
         for pos, quat in own:
             _check_above_table(obj.name, rest_height(obj, quat) - pos[2])
-    rests = _resting_poses(specs, spec, upright=config.upright)
-    reach = Reach(spec)
+    rests = _resting_poses(loaded, robot, upright=config.upright)
+    reach = Reach(robot)
     wanted = [*product(families, range(config.per_family)), *product([OWN], range(len(own)))]
     episodes = []
-    for obj in specs:
+    for obj in loaded:
         done = len(episodes)
         found: dict[tuple[str, int], _Episode] = {}
         for attempt in range(_DRAWS):
@@ -134,17 +134,17 @@ def make_goals(
                 if (family, number) not in found:
                     drawn.append(_draw(obj, rests[obj.name], own, config, family, number, attempt))
             found |= {(e.family, e.number): e for e in _reached(reach, drawn)}
-            progress(done + len(found), len(wanted) * len(specs))
+            progress(done + len(found), len(wanted) * len(loaded))
         if missing := [
             f"{family}_{number:03d}" for family, number in wanted if (family, number) not in found
         ]:
             raise GoalError(
-                f"{spec.name} cannot reach {len(missing)} of {len(wanted)} goals of {obj.name}, such as {missing[0]}: "
+                f"{robot.name} cannot reach {len(missing)} of {len(wanted)} goals of {obj.name}, such as {missing[0]}: "
                 "no grasp holds the object both at its start and there. Lower the lift or the angle, leave out the "
                 "family, or move the goal."
             )
         episodes += [found[item] for item in wanted]
-    return _goal_set(spec, episodes)
+    return _goal_set(robot, episodes)
 
 
 def write_goals(path: str | Path, goals: GoalSet, config: GoalConfig | None = None) -> None:
@@ -274,8 +274,9 @@ def _resting_poses(
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         turns = turn_of(np.array([resting_orientation(obj, up) for up in directions]))
         ups = turns.inv().apply(_Z)
-        # of each direction, the first one that leads to the same pose
-        poses, which = np.unique((ups @ ups.T > _SAME_POSE).argmax(axis=1), return_inverse=True)
+        # for each direction, the first one that leads to the same pose
+        first_alike = (ups @ ups.T > _SAME_POSE).argmax(axis=1)
+        poses, which = np.unique(first_alike, return_inverse=True)
         rows[obj.name] = len(episodes) + which
         for pose in poses:
             turn = turns[int(pose)]
@@ -285,14 +286,15 @@ def _resting_poses(
     settled, at_rest = settle_starts(_goal_set(robot, episodes), robot, objects)
     rests = {}
     for obj in objects:
-        own = rows[obj.name][at_rest[rows[obj.name]]]
-        if not len(own):
+        tried = rows[obj.name]
+        resting = tried[at_rest[tried]]
+        if not len(resting):
             raise GoalError(
                 f"{obj.name} does not come to rest on the table: it rolls or falls over in MuJoCo. Leave it"
                 " out, or make a side of its mesh flat."
             )
-        turns = turn_of(settled.start_quat_wxyz[own])
-        heights = settled.start_pos[own, 2] + turns.apply(obj.com)[:, 2]
+        turns = turn_of(settled.start_quat_wxyz[resting])
+        heights = settled.start_pos[resting, 2] + turns.apply(obj.com)[:, 2]
         rests[obj.name] = list(zip(heights, turns, strict=True))
     return rests
 

@@ -42,7 +42,7 @@ def probe(
     device: str,
     progress: Callable[[int], None],
 ) -> np.ndarray:
-    """Return the verdicts [M] or [M, K] on states, of which an engine tries as many at a time as it has worlds.
+    """Try states in an engine, as many at a time as it has worlds, and return the verdicts on them: [M] or [M, K].
 
     Args:
         engine: name of the engine.
@@ -76,7 +76,8 @@ def probe(
             verdicts.append(judge(backend, start).cpu().numpy()[fresh])
             done += len(rows[-1])
             progress(done)
-    return np.concatenate(verdicts)[np.argsort(np.concatenate(rows))]
+    order = np.argsort(np.concatenate(rows))
+    return np.concatenate(verdicts)[order]
 
 
 def rejection(backend: Backend, start: State, limits: FilterConfig) -> Tensor:

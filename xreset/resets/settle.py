@@ -78,7 +78,7 @@ def settled_poses(
 
     Args:
         scene: robot and objects.
-        object_name: [S] which of the scene's objects each one is.
+        object_name: [S] names of the objects, which the scene has.
         start_pos: [S, 3] where they are [m].
         start_quat: [S, 4] their orientations.
         engine: engine in which they come to rest.

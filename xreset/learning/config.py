@@ -46,7 +46,7 @@ class ModelConfig(Checked):
 
     @property
     def layers(self) -> dict[str, Any]:
-        """What two networks must share for one to take over the weights of the other."""
+        """The settings in which two networks must agree for one to take over the weights of the other."""
         layers = asdict(self)
         del layers["initial_std"]
         return layers
@@ -132,8 +132,9 @@ class ScheduleConfig(Checked):
     """Settings that change during a run.
 
     A schedule is a list of points: a share of the run and the setting's value there, such as ``0 0.9 1 0.25``. Values
-    between two points lie on a straight line. The share of the run counts iterations, or minutes if the run is limited
-    to some and more of them have passed. A run that is resumed continues where it stopped, not at share 0.
+    between two points lie on a straight line. The share of the run is that of its iterations, or that of its
+    minutes if these are limited and more of them have passed. A run that is resumed continues where it stopped, not at
+    share 0.
     """
 
     teacher: ShareSchedule = ()

@@ -1,7 +1,8 @@
-"""Distillation: a student that sees learns the actions of a teacher that is told (DAgger, Ross et al. 2011).
+"""Distillation: a student that sees the object learns the actions of a teacher that is told its pose and shape (DAgger,
+Ross et al. 2011).
 
 The student acts, the teacher says what it would do in the same states, and the student learns that. rsl-rl's own update
-takes one step of all worlds at a time and forgets the memory of a recurrent teacher; here minibatches are sequences of
+takes one step of all worlds at a time and forgets the memory of a recurrent teacher. Here minibatches are sequences of
 some worlds, as in :mod:`xreset.learning.ppo`.
 """
 
@@ -62,12 +63,12 @@ class SequenceDistillation(Distillation):
         """[N, J] the actions to take: the student's, and the teacher's in the first of the worlds."""
         transition = self.transition
         transition.hidden_states = (self.student.get_hidden_state(), None)
-        acted = self.student(obs, stochastic_output=True).detach()
-        taught = self.teacher(obs).clamp(-1.0, 1.0).detach()
-        led = int(self.teacher_share * len(taught))
+        student_actions = self.student(obs, stochastic_output=True).detach()
+        teacher_actions = self.teacher(obs).clamp(-1.0, 1.0).detach()
+        num_led = int(self.teacher_share * len(teacher_actions))
         transition.observations = obs
-        transition.privileged_actions = taught
-        transition.actions = torch.cat((taught[:led], acted[led:]))
+        transition.privileged_actions = teacher_actions
+        transition.actions = torch.cat((teacher_actions[:num_led], student_actions[num_led:]))
         return transition.actions
 
     def update(self) -> dict[str, float]:

@@ -42,7 +42,9 @@ class Processes:
 
     def device(self, wanted: str) -> str:
         """Return the device of this process: with several processes, each has its own GPU."""
-        return f"cuda:{self.local_rank}" if wanted.startswith("cuda") and self.count > 1 else wanted
+        if self.count > 1 and wanted.startswith("cuda"):
+            return f"cuda:{self.local_rank}"
+        return wanted
 
     def seed(self, seed: int) -> int:
         """Return the seed of this process."""

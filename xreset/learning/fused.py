@@ -191,7 +191,7 @@ class _FusedPointNet(torch.autograd.Function):
             return torch.empty(programs, *shape, device=cloud.device)
 
         width = ctx.sizes["K"]
-        # of _points: the least power of two that holds them, 16 or more
+        # columns of _points: the least power of two that holds 2 K + 1, and 16 at least
         columns = max(16, 1 << (2 * width).bit_length())
         d1 = partial_sums(columns, a)
         d2 = partial_sums(a, b)

@@ -20,8 +20,8 @@ _LINE_SECONDS = 10.0
 
 
 class TrainingLog:
-    """Sums on the device during an iteration, so that nothing waits for a GPU; one line and one set of curves after
-    it."""
+    """Sums the numbers of an iteration on the device, so that nothing waits for a GPU. Then it writes a line and the
+    curves."""
 
     def __init__(
         self,

@@ -46,8 +46,8 @@ RECIPES = _read_recipes()
 def default_config(bank: Any, goals: Any, weights: str | Path | None) -> tuple[str, TrainConfig]:
     """Return where the configuration comes from if nothing is said, and the configuration.
 
-    Goals and the weights of a run: that run's configuration; without a bank, without its schedule of demonstrated
-    states. Everything else: the paper's.
+    With goals and the weights of a run, it is that run's configuration. If there is no bank then, the schedule of
+    demonstrated states is left out. In all other cases it is the paper's configuration.
     """
     if goals is None or weights is None or not (Path(weights) / "run.json").is_file():
         return "paper", TrainConfig()
@@ -60,8 +60,8 @@ def default_config(bank: Any, goals: Any, weights: str | Path | None) -> tuple[s
 def starting_config(like: str) -> TrainConfig:
     """Return the configuration of a recipe, or of a run without the reward terms that its user added.
 
-    Such a term names code to import. A file must not decide that, so the terms have to be named again, which a note on
-    standard error says.
+    Such a term names code to import. A file must not decide that, so the user has to name the terms again. A note on
+    standard error says so.
 
     Args:
         like: name of a recipe, or a run folder.

@@ -5,7 +5,7 @@ RUN/checkpoints/000050.pt    model, optimizer and counters after 50 iterations
 RUN/lift.json                when success from home passed 1, 10 and 50 %
 RUN/policy.onnx              the policy, with its contract
 RUN/teacher.onnx             the policy that a distillation learned from
-RUN/choice.json              which checkpoint it is, if ``xreset select`` chose one
+RUN/choice.json              the checkpoint whose policy this is, if ``xreset select`` chose one
 RUN/events.out.tfevents.*    TensorBoard
 RUN/eval/, RUN/report/       made by ``xreset eval`` and ``xreset report``
 """
@@ -66,8 +66,10 @@ def write_run(folder: Path, info: RunInfo) -> None:
 
 
 def read_run(folder: str | Path, *, as_stated: bool = False) -> RunInfo:
-    """Read ``run.json``. Robot, bank and objects whose paths do not exist here are looked for below the folders above
-    the run, from one of which the training was probably started, unless ``as_stated``.
+    """Read ``run.json``.
+
+    The training was probably started from one of the folders above the run. So paths of robot, bank and objects that do
+    not exist here are looked for from these folders, unless ``as_stated``.
 
     Raises:
         RunError: the folder is not a run.
@@ -136,8 +138,8 @@ def policy_file(policy: str | Path, *, also: Sequence[str] = ()) -> Path:
 def _exported_policy(folder: Path) -> Path:
     """Return the run's ``policy.onnx``, exported if it is missing or old.
 
-    It is the policy of the checkpoint that ``xreset select`` chose, if there is none newer, else of the newest one. A
-    run that was copied without its checkpoints keeps its policy.
+    It is the policy of the newest checkpoint, unless ``xreset select`` chose one and the run has had no newer one
+    since. A run that was copied without its checkpoints keeps its policy.
     """
     policy = folder / "policy.onnx"
     if policy.exists() and not checkpoints(folder):

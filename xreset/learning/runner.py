@@ -175,13 +175,13 @@ class TrainingRunner:
             if log is not None:
                 log.add(reward, done, extras["log"])
         self._check_finite(obs)
-        # processes play other episodes of the same demonstrations
+        # each process plays its own episodes of the same demonstrations
         rates = self.env.resets.success_rate
         rates.copy_(self.processes.sum(rates) / self.processes.count)
         return obs
 
     def _follow_schedule(self, progress: float) -> None:
-        """Set what changes during a run to its values at a share of the run."""
+        """Give the settings that have a schedule their values at a share of the run."""
         schedule = self.config.schedule
         if schedule.demo_probability:
             share = value_at(schedule.demo_probability, progress)
@@ -268,12 +268,12 @@ class TrainingRunner:
 
     def _check_finite(self, obs: TensorDict) -> None:
         """Refuse observations that are not finite, once per iteration: they come from worlds whose health was sound."""
-        own = ", ".join(self.env.task.reward.own)
-        remedy = f"Continue from the last checkpoint: {self._resume_command}"
-        if own:
+        if own := ", ".join(self.env.task.reward.own):
             remedy = (
                 f"The critic observes the reward: do your own terms return finite numbers ({own})?"
             )
+        else:
+            remedy = f"Continue from the last checkpoint: {self._resume_command}"
         for group, value in obs.items():
             if not value.isfinite().all():
                 raise RunError(

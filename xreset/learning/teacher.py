@@ -78,7 +78,7 @@ def _weights(graph: GraphProto) -> dict[str, Tensor]:
     weights = {name: value for name, value in found.items() if name.startswith(("trunk.", "mlp."))}
     for node in graph.node:
         last = node.input[1] if len(node.input) > 1 else ""
-        # the exporter has transposed the weights of a linear layer
+        # the exporter has transposed and renamed the weights of a linear layer, whose bias has kept its name
         if node.op_type == "MatMul" and last in found:
             bias = next(
                 other.input[1]

@@ -82,9 +82,9 @@ def train(
             are no demonstrated states, and every episode begins at home.
         out: run folder to make.
         goals: goal set, or its file. With a bank, its starts and goals are added to the demonstrated ones.
-        recipe: where the configuration comes from: a recipe such as ``minutes``, or another run's folder, without
-            reward terms of the user's own, which must be named in ``config``. Default: ``paper``; with ``weights`` and
-            ``goals``, the run of ``weights``.
+        recipe: where the configuration comes from: a recipe such as ``minutes``, or another run's folder. Reward terms
+            of the user's own are not taken from a run: name them in ``config``. Default: ``paper``; with ``weights``
+            and ``goals``, the run of ``weights``.
         config: the whole configuration, instead of a recipe.
         robot: name or folder of the robot; default: the robot that the bank names.
         objects: folder of object meshes; default: the built-in stand-ins.
@@ -450,7 +450,7 @@ def _train(
 
 def _write_start(out: Path, info: RunInfo, iteration: int, *, is_new: bool, resumed: bool) -> None:
     """Write ``run.json``, and say where a resumed run continues."""
-    # before the first checkpoint a killed run leaves nothing worth keeping; files without a run are of others
+    # the curves of a run that was killed before its first checkpoint begin again; without run.json they are not a run's
     if is_new and (out / "run.json").is_file():
         for events in out.glob("events.out.tfevents.*"):
             events.unlink()

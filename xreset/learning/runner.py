@@ -112,7 +112,6 @@ class TrainingRunner:
                 self.folder, env.num_envs, self.device, total, self.wandb, done=self.iteration
             )
         saved_at = self.iteration
-        steps = self.config.ppo.horizon * env.num_envs * self.processes.count
         earlier = self.elapsed
         begin = time.perf_counter()
         reached = False
@@ -121,30 +120,10 @@ class TrainingRunner:
                 over = time.perf_counter() - begin > seconds
                 if self._agreed(bool(requests) or reached or over):
                     break
-                start = time.perf_counter()
-                share_of_time = (earlier + start - begin) / (earlier + seconds)
+                share_of_time = (earlier + time.perf_counter() - begin) / (earlier + seconds)
                 self._follow_schedule(max(self.iteration / total, share_of_time))
-                obs = self._roll_out(obs, log)
-                self._check_faults(steps)
-                collected = time.perf_counter()
-                with torch.no_grad():
-                    self.alg.compute_returns(obs)
-                losses = self.alg.update()
-                now = time.perf_counter()
-                self.iteration += 1
-                self.env_steps += steps
-                self.elapsed += now - start
+                obs = self._iterate(obs, log)
                 if log is not None:
-                    scalars = {f"loss/{name}": value for name, value in losses.items()} | {
-                        "policy/std": float(self.alg.get_policy().output_std.detach().mean()),
-                        "policy/learning_rate": self.alg.learning_rate,
-                        "speed/env_steps_per_second": steps / (now - start),
-                        "speed/collect_seconds": collected - start,
-                        "speed/learn_seconds": now - collected,
-                    }
-                    if isinstance(self.alg, SequenceDistillation):
-                        scalars["policy/teacher_share"] = self.alg.teacher_share
-                    log.write(self.iteration, self.env_steps, self.elapsed, scalars)
                     reached = log.lift.reaches(self.config.target_success)
                 if self.iteration % self.config.save_interval == 0:
                     self.save_checkpoint()
@@ -165,6 +144,35 @@ class TrainingRunner:
                     "stopped after the current iteration; a checkpoint is written. To continue: "
                     + self._resume_command
                 )
+
+    def _iterate(self, obs: TensorDict, log: TrainingLog | None) -> TensorDict:
+        """Collect a rollout, learn from it and write the log; return the last observations."""
+        steps = self.config.ppo.horizon * self.env.num_envs * self.processes.count
+        start = time.perf_counter()
+        obs = self._roll_out(obs, log)
+        self._check_faults(steps)
+        collected = time.perf_counter()
+        with torch.no_grad():
+            self.alg.compute_returns(obs)
+        losses = self.alg.update()
+        learned = time.perf_counter()
+        self.iteration += 1
+        self.env_steps += steps
+        self.elapsed += learned - start
+        if log is None:
+            return obs
+        scalars = {f"loss/{name}": value for name, value in losses.items()}
+        scalars |= {
+            "policy/std": float(self.alg.get_policy().output_std.detach().mean()),
+            "policy/learning_rate": self.alg.learning_rate,
+            "speed/env_steps_per_second": steps / (learned - start),
+            "speed/collect_seconds": collected - start,
+            "speed/learn_seconds": learned - collected,
+        }
+        if isinstance(self.alg, SequenceDistillation):
+            scalars["policy/teacher_share"] = self.alg.teacher_share
+        log.write(self.iteration, self.env_steps, self.elapsed, scalars)
+        return obs
 
     @torch.no_grad()
     def _roll_out(self, obs: TensorDict, log: TrainingLog | None) -> TensorDict:

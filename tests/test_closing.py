@@ -14,10 +14,10 @@ from torch import tensor
 from torch.testing import assert_close
 
 from tests import toy_grasp
-from tests.command import refused
+from tests.command import refused, succeeds
 from tests.data import InFolder
 from tests.engine_checks import with_drive
-from tests.toy_bank import toy_bank, toy_retargeted
+from tests.toy_bank import in_this_process, toy_bank, toy_retargeted
 from xreset import ClosingConfig, SqueezeConfig, read_bank, write_bank
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_rotate
@@ -261,10 +261,19 @@ class TargetsTest(InFolder):
 
 
 @skipUnless(find_spec("mujoco"), "MuJoCo is not installed")
-class CommandTest(toy_grasp.ResetsTest):
+class CommandTest(InFolder):
     def setUp(self):
         super().setUp()
-        write_retargeted(self.motion, grasp_and_lift())
+        self.enterContext(patch("xreset.description.load_robot", lambda _: ROBOT))
+        self.enterContext(in_this_process())
+        self.enterContext(
+            patch("xreset.objects.catalogue.load_objects", lambda *_: (toy_grasp.brick(),))
+        )
+        write_retargeted(f"{self.folder}/r.npz", grasp_and_lift())
+
+    def resets(self, *options):
+        out = succeeds("resets", f"{self.folder}/r.npz", "--out", f"{self.folder}/b.npz", *options)
+        return read_bank(f"{self.folder}/b.npz"), out
 
     def test_everything_at_once(self):
         """Jaws close by 30 mm (33 mm on one side): five states between; held by 2.5 N a side, and not without."""
@@ -282,7 +291,7 @@ class CommandTest(toy_grasp.ResetsTest):
         self.assertEqual(bank.num_pressing, 2)
         for words in ("2 of 2 states after contact press with 2.5 N", "8 states of 8"):
             self.assertIn(words, out)
-        with np.load(self.bank) as file:
+        with np.load(f"{self.folder}/b.npz") as file:
             config = json.loads(str(file["meta"]))["config"]
         self.assertEqual(config["closing"], {"spacing": 0.0056, "within": 0.1})
         self.assertEqual(config["squeeze"]["force"], 2.5)
@@ -290,8 +299,8 @@ class CommandTest(toy_grasp.ResetsTest):
     def test_other_meshes_than_those_of_the_motion_are_told(self):
         for source, told in ((toy_grasp.brick().source, 0), ("another mesh", 1)):
             inputs = {"object brick": source, "object robot": "a toy", "robot": "openarm"}
-            write_retargeted(self.motion, grasp_and_lift(), inputs=inputs)
-            self.assertEqual(object_sources(self.motion)["robot"], "a toy")
+            write_retargeted(f"{self.folder}/r.npz", grasp_and_lift(), inputs=inputs)
+            self.assertEqual(object_sources(f"{self.folder}/r.npz")["robot"], "a toy")
             words = "made with other meshes of brick. Give the same --objects folder"
             self.assertEqual(self.resets()[1].count(words), told)
 

@@ -3,16 +3,13 @@ decides whether half the friction, or half the drive's stiffness, is still enoug
 
 from dataclasses import replace
 from pathlib import Path
-from unittest.mock import patch
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from tests.command import succeeds
-from tests.data import InFolder
-from tests.toy_bank import in_this_process, toy_bank
-from xreset import PolicySpec, read_bank
+from tests.toy_bank import toy_bank
+from xreset import PolicySpec
 from xreset.backends.conformance.scene import gripper, objects
 from xreset.eval.engines.recording import Recording
 from xreset.eval.rollout import Trial
@@ -65,23 +62,6 @@ def start():
     return State.at_rest(
         torch.as_tensor(robot().home)[None], torch.as_tensor(pos)[None], torch.as_tensor(quat)[None]
     )
-
-
-class ResetsTest(InFolder):
-    """Tests of ``xreset resets`` with the gripper and the brick, whatever robot and object the motion names."""
-
-    def setUp(self):
-        super().setUp()
-        self.enterContext(patch("xreset.description.load_robot", lambda _: robot()))
-        self.enterContext(patch("xreset.objects.catalogue.load_objects", lambda *_: (brick(),)))
-        self.enterContext(in_this_process())
-        self.motion = f"{self.folder}/r.npz"
-        self.bank = f"{self.folder}/b.npz"
-
-    def resets(self, *options):
-        """The bank that the command makes of the file ``motion``, and all that it prints."""
-        told = succeeds("resets", self.motion, "--out", self.bank, *options)
-        return read_bank(self.bank), told
 
 
 def targets(step):

@@ -35,7 +35,6 @@ from xreset.resets.bank import write_bank as write_bank
 from xreset.resets.config import ClosingConfig as ClosingConfig
 from xreset.resets.config import FilterConfig as FilterConfig
 from xreset.resets.config import GoalConfig as GoalConfig
-from xreset.resets.config import LiftConfig as LiftConfig
 from xreset.resets.config import SqueezeConfig as SqueezeConfig
 from xreset.resets.filter import make_bank as make_bank
 from xreset.resets.goals import GoalSet as GoalSet

@@ -89,7 +89,6 @@ class Data(Checked):
         _options(
             "--closing.",
             "--filter.",
-            "--lift.",
             "--squeeze.",
             "--settle",
             "--backend",

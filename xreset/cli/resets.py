@@ -11,7 +11,7 @@ from tyro.conf import arg
 from xreset.cli._common import Device, Objects, Several, Source, show_accounts
 from xreset.cli._terminal import Progress, console, show_notes
 from xreset.files import file_hash
-from xreset.resets.config import ClosingConfig, FilterConfig, LiftConfig, SqueezeConfig
+from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
 
 
 def resets(
@@ -25,7 +25,6 @@ def resets(
     device: Device = "cpu",
     limits: Annotated[FilterConfig, arg(name="filter")] = FilterConfig(),
     closing: ClosingConfig = ClosingConfig(),
-    lift: LiftConfig = LiftConfig(),
     squeeze: SqueezeConfig = SqueezeConfig(),
     settle: bool = False,
 ) -> None:
@@ -40,7 +39,6 @@ def resets(
         num_envs: Worlds at a time.
         limits: Time and speeds by which states are judged.
         closing: States between frames where the hand closes in.
-        lift: States with grasps from the air where the object starts.
         squeeze: Targets of states after contact that press.
         settle: Let objects come to rest (in the first engine) before episodes begin at home. Default: the recorded
             poses, as in the paper, from which one object in eight tips or rolls.
@@ -72,7 +70,6 @@ def resets(
             backends,
             limits=limits,
             closing=closing,
-            lift=lift,
             squeeze=squeeze,
             progress=bar.count(title),
             **where,
@@ -87,7 +84,6 @@ def resets(
         "num_envs": num_envs,
         "filter": asdict(limits),
         "closing": asdict(closing),
-        "lift": asdict(lift),
         "squeeze": asdict(squeeze),
         "settle": settle,
     }
@@ -100,12 +96,6 @@ def resets(
             force += f" and {squeeze.weight:g} times the object's weight"
         pressing = f"{bank.num_pressing} of {bank.post_contact.sum()} states after contact"
         console.print(f"{pressing} press with {force}")
-    if lift.grasps:
-        owners = [] if bank.lifting is None else bank.sequence_index[bank.lifting]
-        demonstrations = f"{len(set(owners))} of {len(bank.sequence_name)} demonstrations"
-        console.print(f"{len(owners)} lift states were added, from {demonstrations}")
-        if not len(owners) and not squeeze.presses:
-            show_notes(["no grasp carries its object unless fingers press: add --squeeze.force 5"])
     tried = bank.num_states + len(bank.rejected_reason)
     share = accounts[-1].kept / max(motion.annotated.sum(), 1)
     console.print(f"{share:.0%} of the annotated frames are kept")

@@ -104,10 +104,6 @@ class ResetBank(Brief):
     frame_part: Annotated[np.ndarray, Field(("L",), "f", within=(0.0, 1.0))] | None = None
     """[L] how far a state is on the way from its frame to the next, in [0, 1); None: every state is a frame."""
     rejected_frame_part: Annotated[np.ndarray, Field(("C",), "f", within=(0.0, 1.0))] | None = None
-    lifting: Annotated[np.ndarray, Field(("L",), "b")] | None = None
-    """[L] bool: whether a state has a grasp from the air where the object starts, or just above; its frame is then the
-    first (:mod:`xreset.resets.lift`). None: none has."""
-    rejected_lifting: Annotated[np.ndarray, Field(("C",), "b")] | None = None
 
     @property
     def num_states(self) -> int:
@@ -125,7 +121,8 @@ class ResetBank(Brief):
         return int((self.targets != self.joint_pos).any(axis=1).sum())
 
     def accounts(self) -> list[Account]:
-        """Count the demonstrated frames that were kept and lost, by object and phase; added states do not count."""
+        """Count the demonstrated frames that were kept and lost, by object and phase; states between frames do not
+        count."""
         object_name = np.concatenate(
             (self.object_name, self.sequence_object[self.rejected_sequence_index])
         )
@@ -135,8 +132,6 @@ class ResetBank(Brief):
         is_frame = np.ones(len(reason), dtype=bool)
         if self.frame_part is not None and self.rejected_frame_part is not None:
             is_frame = np.concatenate((self.frame_part, self.rejected_frame_part)) == 0
-        if self.lifting is not None and self.rejected_lifting is not None:
-            is_frame &= ~np.concatenate((self.lifting, self.rejected_lifting))
         return accounts(object_name[is_frame], post_contact[is_frame], reason[is_frame])
 
     def with_states(self, rows: np.ndarray) -> ResetBank:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
 from xreset.checks import (
     Checked,
     NonNegativeFloat,
     NonNegativeInt,
     PositiveFinite,
     PositiveInt,
-    Rule,
     frozen,
 )
 
@@ -37,21 +34,6 @@ class ClosingConfig(Checked):
     """Farthest that any fingertip moves from one state to the next [m], such as 0.005. None: no states are added."""
     within: PositiveFinite = 0.10
     """States are added between two frames if a finger is nearer than this to the object in one of them [m]."""
-
-
-@frozen
-class LiftConfig(Checked):
-    """More states where a hand lifts an object (:mod:`xreset.resets.lift`)."""
-
-    grasps: NonNegativeInt = 0
-    """Largest number of grasps that are added to each demonstration at each height. 0: none."""
-    heights: Annotated[
-        tuple[float, ...],
-        Rule(
-            "one height or more, from 0 to 1 m", lambda x: x != () and all(0 <= h <= 1 for h in x)
-        ),
-    ] = (0.0, 0.01, 0.02, 0.03)
-    """Heights above the start at which the object is grasped [m]."""
 
 
 @frozen

@@ -18,11 +18,9 @@ from xreset.physics import State
 from xreset.progress import Progress, unseen
 from xreset.resets.bank import ResetBank, starts_and_goals
 from xreset.resets.closing import closing_states
-from xreset.resets.config import ClosingConfig, FilterConfig, LiftConfig, SqueezeConfig
+from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
 from xreset.resets.fingers import fingers_of, squeeze_targets
-from xreset.resets.lift import Poses, carries, grasp_frames, lift_states
 from xreset.resets.probe import REASONS, probe, rejection
-from xreset.resets.settle import settled_poses
 from xreset.retarget.file import Retargeted
 from xreset.spec import (
     ObjectSpec,
@@ -44,7 +42,6 @@ def make_bank(
     device: str = "cpu",
     limits: FilterConfig | None = None,
     closing: ClosingConfig | None = None,
-    lift: LiftConfig | None = None,
     squeeze: SqueezeConfig | None = None,
     progress: Callable[[float, int], None] = unseen,
 ) -> ResetBank:
@@ -59,12 +56,10 @@ def make_bank(
         device: where engines run that can use it; the others run on the CPU.
         limits: time and speeds by which states are judged; None: the draft paper's.
         closing: states to add between frames; None: none.
-        lift: states to add where a hand lifts an object; None: none.
         squeeze: with which force the drive targets of states after contact press on the object; None: targets are the
             joints' positions. Accepted states are tried once more with the targets, and an engine that rejects this
             leaves the targets where they were.
-        progress: called with (candidates tried, candidates in all), and before that with (grasps carried to the table,
-            grasps in all) if there are lift states.
+        progress: called with (candidates tried, candidates in all).
 
     Raises:
         DemoError: no frame is valid, or an object of a valid frame is not among ``objects``.
@@ -84,20 +79,8 @@ def make_bank(
         )
     scene = SceneSpec(robot=robot, objects=tuple(used.values()))
     frame, part, poses = closing_states(retargeted, robot, objects, closing or ClosingConfig())
-    lifting = np.zeros(len(frame), dtype=bool)
-    if lift is not None and lift.grasps:
-        starts, more = _lift_states(
-            retargeted, scene, lift, squeeze, engines[0], num_envs, device, progress
-        )
-        frame = np.concatenate((frame, starts))
-        order = frame.argsort(kind="stable")
-        frame = frame[order]
-        part = np.concatenate((part, np.zeros(len(starts))))[order]
-        lifting = order >= len(lifting)
-        both = zip(poses, more, strict=True)
-        poses = tuple(np.concatenate(values).astype(values[0].dtype)[order] for values in both)
     sequence = owner[frame]
-    post_contact = retargeted.post_contact[frame] | lifting
+    post_contact = retargeted.post_contact[frame]
     object_name = retargeted.object_name[sequence]
     states = State.at_rest(*map(torch.as_tensor, poses))
     work = len(engines) * len(frame)
@@ -127,8 +110,10 @@ def make_bank(
     reason = try_candidates(np.arange(len(frame)), progress)
     if squeeze.presses:
         rows = np.flatnonzero((reason < 0) & post_contact)
-        touching = tuple(values[rows] for values in poses)
-        states.joint_target[rows] = _pressing_targets(scene, object_name[rows], touching, squeeze)
+        touching = [values[rows] for values in poses]
+        fingers = fingers_of(robot, scene.objects, object_name[rows], *touching)
+        targets = squeeze_targets(robot, fingers, touching[0], squeeze)
+        states.joint_target[rows] = torch.as_tensor(targets, dtype=torch.float32)
         refused = rows[try_candidates(rows) >= 0]
         states.joint_target[refused] = states.joint_pos[refused]
     progress(work, work)
@@ -142,8 +127,6 @@ def make_bank(
     }
     if part.any():
         columns["frame_part"] = part.astype(np.float32)
-    if lifting.any():
-        columns["lifting"] = lifting
     kept = {name: values[keep] for name, values in columns.items()}
     rejected = {f"rejected_{name}": values[~keep] for name, values in columns.items()}
     return replace(
@@ -159,67 +142,3 @@ def make_bank(
         **kept,
         **rejected,
     )
-
-
-def _lift_states(
-    retargeted: Retargeted,
-    scene: SceneSpec,
-    config: LiftConfig,
-    squeeze: SqueezeConfig,
-    engine: str,
-    num_envs: int,
-    device: str,
-    progress: Progress,
-) -> tuple[np.ndarray, Poses]:
-    """Return states with grasps that carry their object in an engine, where objects come to rest in this engine.
-
-    Returns:
-        The first frame of the demonstration of each state [M], and the poses.
-    """
-    where = {"num_envs": num_envs, "device": device}
-    frames = grasp_frames(retargeted, scene.robot, scene.objects)
-    object_name = retargeted.object_name[retargeted.sequence_of_frame[frames]]
-    start_pos, start_quat = (pose.copy() for pose in retargeted.start_pose)
-    sequences = np.flatnonzero(np.isin(retargeted.object_name, object_name))
-    if len(frames):
-        poses = (
-            retargeted.joint_pos[frames],
-            retargeted.object_pos[frames],
-            retargeted.object_quat_wxyz[frames],
-        )
-        states = State.at_rest(*map(torch.as_tensor, poses))
-        if squeeze.presses:
-            states.joint_target[:] = _pressing_targets(scene, object_name, poses, squeeze)
-        held = probe(
-            engine,
-            scene,
-            object_name,
-            states,
-            carries,
-            gravity=1.0,
-            steps=round(1.0 / scene.control_dt),
-            progress=lambda done: progress(done, len(frames)),
-            **where,
-        )
-        frames = frames[held]
-        start_pos[sequences], start_quat[sequences], _ = settled_poses(
-            scene,
-            retargeted.object_name[sequences],
-            start_pos[sequences].astype(np.float32),
-            start_quat[sequences].astype(np.float32),
-            engine,
-            **where,
-        )
-    sequence, poses = lift_states(
-        retargeted, scene.robot, scene.objects, frames, start_pos, start_quat, config, progress
-    )
-    return retargeted.frame_offsets[sequence], poses
-
-
-def _pressing_targets(
-    scene: SceneSpec, object_name: np.ndarray, poses: tuple[np.ndarray, ...], squeeze: SqueezeConfig
-) -> torch.Tensor:
-    """Return drive targets that press [M, J], for joint positions and poses of objects [M, ...]."""
-    fingers = fingers_of(scene.robot, scene.objects, object_name, *poses)
-    targets = squeeze_targets(scene.robot, fingers, poses[0], squeeze)
-    return torch.as_tensor(targets, dtype=torch.float32)

@@ -38,6 +38,8 @@ def settle_starts(
 ) -> tuple[ResetBank, np.ndarray]:
     """Return a bank whose episodes from home begin with objects at rest.
 
+    The robot holds its home configuration meanwhile, in which it touches no object.
+
     Args:
         bank: starts of S demonstrations.
         robot: the robot of the bank.
@@ -50,54 +52,15 @@ def settle_starts(
     Returns:
         The bank, and whether each object came to rest on the table [S]; the others start as recorded.
     """
-    pos, quat, at_rest = settled_poses(
-        SceneSpec(robot=robot, objects=tuple(objects)),
-        bank.sequence_object,
-        bank.start_pos,
-        bank.start_quat_wxyz,
-        engine,
-        num_envs=num_envs,
-        device=device,
-        progress=progress,
-    )
-    return replace(bank, start_pos=pos, start_quat_wxyz=quat), at_rest
-
-
-def settled_poses(
-    scene: SceneSpec,
-    object_name: np.ndarray,
-    start_pos: np.ndarray,
-    start_quat: np.ndarray,
-    engine: str,
-    *,
-    num_envs: int,
-    device: str,
-    progress: Progress = unseen,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Let objects come to rest, while the robot holds its home configuration, in which it touches none.
-
-    Args:
-        scene: robot and objects.
-        object_name: [S] names of the objects, which the scene has.
-        start_pos: [S, 3] where they are [m].
-        start_quat: [S, 4] their orientations.
-        engine: engine in which they come to rest.
-        num_envs: worlds at a time.
-        device: where the engine runs if it can.
-        progress: called with (poses done, poses in all).
-
-    Returns:
-        Positions [S, 3], quaternions [S, 4], and whether each object came to rest on the table [S]; the others stay
-        where they were.
-    """
-    number = len(object_name)
-    home = torch.as_tensor(scene.robot.home, dtype=torch.float32).expand(number, -1)
-    start = State.at_rest(home, torch.as_tensor(start_pos), torch.as_tensor(start_quat))
+    scene = SceneSpec(robot=robot, objects=tuple(objects))
+    number = len(bank.sequence_name)
+    home = torch.as_tensor(robot.home, dtype=torch.float32).expand(number, -1)
+    poses = (torch.as_tensor(bank.start_pos), torch.as_tensor(bank.start_quat_wxyz))
     found = probe(
         engine,
         scene,
-        object_name,
-        start,
+        bank.sequence_object,
+        State.at_rest(home, *poses),
         _rest_pose,
         gravity=1.0,
         steps=round(SECONDS / scene.control_dt),
@@ -106,9 +69,9 @@ def settled_poses(
         progress=lambda done: progress(done, number),
     )
     at_rest = found[:, 7] > 0
-    pos = np.where(at_rest[:, None], found[:, :3], start_pos).astype(np.float32)
-    quat = np.where(at_rest[:, None], found[:, 3:7], start_quat).astype(np.float32)
-    return pos, quat, at_rest
+    pos = np.where(at_rest[:, None], found[:, :3], bank.start_pos).astype(np.float32)
+    quat = np.where(at_rest[:, None], found[:, 3:7], bank.start_quat_wxyz).astype(np.float32)
+    return replace(bank, start_pos=pos, start_quat_wxyz=quat), at_rest
 
 
 def _rest_pose(backend: Backend, start: State) -> Tensor:

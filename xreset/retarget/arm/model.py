@@ -47,8 +47,7 @@ class ArmTargets(Tensors):
 
     @staticmethod
     def of_poses(root_pos: Tensor, root_quat: Tensor, hand_joints: Tensor) -> ArmTargets:
-        """Return hand poses [S, 3], [S, 4], each a path of one frame, in which the hand has joints [J_hand], or joints
-        [S, 1, J_hand] of its own in each."""
+        """Return hand poses [S, 3], [S, 4], each a path of one frame, in which the hand has joints [J_hand]."""
         count = len(root_pos)
         zero = root_pos.new_zeros(count, 1)
         return ArmTargets(

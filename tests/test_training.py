@@ -493,6 +493,7 @@ class TrainingTest(WithBank):
             (r"layout .*--like .*run$", {"weights": self.out, "config": short}),
             ("many-objects has no critic .* Give a run folder", {"weights": "many-objects"}),
             ("000002.pt is a file. Give the folder", {"weights": latest_checkpoint(self.out)}),
+            (f"folder above has one: give {self.out}", {"weights": self.out / "checkpoints"}),
             ("--num-envs is 0", {"num_envs": 0}),
             ("--minutes is 0", {"minutes": 0.0, "bank": toy_bank(self.robot)}),
             ("Unknown device 'quantum'", {"device": "quantum"}),

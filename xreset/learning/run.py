@@ -79,9 +79,10 @@ def read_run(folder: str | Path, *, as_stated: bool = False) -> RunInfo:
     if os.path.isfile(folder):
         raise RunError(f"{folder} is a file. Give the folder of its run, which has a run.json.")
     if not os.path.isfile(folder / "run.json"):
-        raise RunError(
-            f"{folder} is not a run folder: it has no run.json. Make one with: xreset train --out {folder} ..."
-        )
+        to_do = f"Make one with: xreset train --out {folder} ..."
+        if os.path.isfile(folder.parent / "run.json"):
+            to_do = f"The folder above has one: give {folder.parent}."
+        raise RunError(f"{folder} is not a run folder: it has no run.json. {to_do}")
     data = read_json(folder / "run.json", SCHEMA, keep_version=True)
     where = f"{folder / 'run.json'} (of xreset {shown(data.pop('xreset', None))})"
     info = from_dict(RunInfo, data, where)

@@ -1,2 +1,2 @@
-"""The task: actions, observations, reward and ends of episodes as pure functions over batched tensors; and what differs
-between worlds and episodes (``variation``, ``vision``), in fixed buffers."""
+"""The task: actions, observations, reward and ends of episodes are pure functions over batched tensors. Differences
+between worlds and episodes (``variation``, ``vision``) are in fixed buffers."""

@@ -1,4 +1,4 @@
-"""From a policy's output to joint targets, and back."""
+"""Conversion of a policy's actions to joint targets, and back."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from xreset.spec import RobotSpec
 from xreset.task.config import ActionConfig
 
 FINGER_LEVER = 0.04
-"""[m] A hand joint that slides moves as far as a point at this distance from a joint that turns: the length of a
-finger's link."""
+"""Length of a finger's link [m]. A hand joint that slides moves as far as a point at this distance from a joint that
+turns."""
 
 
 class ActionSpace:
@@ -60,7 +60,7 @@ class ActionSpace:
         self.above = torch.where(is_arm, 1.0, above)
 
     def targets(self, action: Tensor, target: Tensor, joint_pos: Tensor) -> Tensor:
-        """Return new joint targets [N, J].
+        """Return new joint targets [N, J] for actions, old targets and joint positions, each [N, J].
 
         A relative target is the old target plus ``step`` times the action, at most ``lead`` away from the joint. It
         starts from the old target and not from the joint, because a loaded arm would otherwise sag with every step.
@@ -82,5 +82,6 @@ class ActionSpace:
 
     def absolute_action(self, joint_pos: Tensor) -> Tensor:
         """Return the actions [N, J] whose absolute targets are these positions of the hand's joints."""
-        above_zero = joint_pos - self.zero
-        return above_zero / torch.where(above_zero < 0, self.below, self.above).clamp_min(1e-9)
+        from_zero = joint_pos - self.zero
+        slope = torch.where(from_zero < 0, self.below, self.above)
+        return from_zero / slope.clamp_min(1e-9)

@@ -1,4 +1,4 @@
-"""Delays: the last values of each world, read back a number of steps later."""
+"""Delays of actions and observations."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class DelayLine:
         """Allocate.
 
         Args:
-            drawn: what lasts and is drawn; the line adds its buffers.
-            name: the buffers' name.
+            drawn: what is drawn at each reset; the line adds its buffers.
+            name: prefix of the buffers' names.
             width: D, numbers of a value.
             longest: largest delay [steps].
             sample: draws the delays [steps].
@@ -49,22 +49,24 @@ class DelayLine:
             """[N, 1] steps, or [N, D]."""
 
     def fill(self, fresh: Tensor, value: Tensor) -> None:
-        """Make a value [N, D] the whole past of the worlds of a mask [N]."""
+        """Make the value [N, D] the whole past of the worlds of a mask [N]."""
         if self.longest:
             self.values.copy_(where(fresh, value[:, None], self.values))
 
     def push(self, value: Tensor, delay: Tensor | None = None) -> Tensor:
-        """Add the newest value [N, D] and return the delayed one [N, D], interpolated between whole steps.
+        """Add the newest value and return the delayed one [N, D], interpolated between whole steps.
 
         Args:
-            delay: delay in this step, like :attr:`delay`; None: this attribute.
+            value: [N, D] the newest value.
+            delay: [N, 1] or [N, D] delay in this step; None: :attr:`delay`.
         """
         if not self.longest:
             return value
         self.values.copy_(torch.cat((value[:, None], self.values[:, :-1]), dim=1))
         delay = self.delay if delay is None else delay
         whole = delay.floor()
-        at = whole.long()[:, None].expand(-1, 1, value.shape[1])
-        newer = self.values.gather(1, at)[:, 0]
-        older = self.values.gather(1, (at + 1).clamp_max(self.values.shape[1] - 1))[:, 0]
+        index = whole.long()[:, None].expand(-1, 1, value.shape[1])
+        next_index = (index + 1).clamp_max(self.values.shape[1] - 1)
+        newer = self.values.gather(1, index)[:, 0]
+        older = self.values.gather(1, next_index)[:, 0]
         return newer + (delay - whole) * (older - newer)

@@ -34,9 +34,9 @@ class ObservationInput:
     state: State
     links: Links
     joint_target: Tensor
-    """[N, J] of the drives."""
+    """[N, J] targets of the drives [rad, m]."""
     joint_lower: Tensor
-    """[J]"""
+    """[J] joint limits [rad, m]."""
     joint_upper: Tensor
     """[J]"""
     points: Tensor
@@ -44,8 +44,11 @@ class ObservationInput:
     observed_pos: Tensor
     """[N, 3] object position as the policy observes it, possibly delayed."""
     observed_quat: Tensor
+    """[N, 4]"""
     goal_pos: Tensor
+    """[N, 3]"""
     goal_quat: Tensor
+    """[N, 4]"""
     start_quat: Tensor
     """[N, 4] object orientation at the start of the episode."""
     gravity_fraction: Tensor
@@ -55,7 +58,7 @@ class ObservationInput:
     tip_force: Tensor
     """[N, E, 3] force on the object [N]."""
     tip_distance: Tensor
-    """[N, E]"""
+    """[N, E] distance from each fingertip to the object's surface points [m]."""
     reward: Tensor
     """[N]"""
 
@@ -63,12 +66,15 @@ class ObservationInput:
 def layout(
     num_joints: int, num_tips: int, c: ObservationConfig, vision: VisionConfig | None = None
 ) -> dict[str, dict[str, int]]:
-    """Width of every term of the flat groups, in order; a policy fits a task only if this is equal.
+    """Return the number of values of every term, by group, in order. A policy fits a task only if its layout is equal.
 
-    ``perception`` is listed with its number of values H * P * K. A policy with cameras gets ``goal``, ``proprio`` and
-    ``view``.
+    ``perception`` has H * P * K values. With cameras the groups are ``goal``, ``proprio`` and ``view``.
     """
-    turn, width = ("quat", 4) if c.rotation == "quaternion" else ("rotation", 6)
+    turn = "rotation"
+    width = 6
+    if c.rotation == "quaternion":
+        turn = "quat"
+        width = 4
     if c.content == "published":
         policy = {"tip_to_object": 3 * num_tips, "palm_distance": 1}
         proprio = {"joint_pos": num_joints, "target_pos": num_joints}
@@ -108,13 +114,7 @@ def policy_group(x: ObservationInput, c: ObservationConfig, generator: torch.Gen
     point [m].
     """
     if c.content == "published":
-        offsets = _world_points(x)[:, None] - x.links.pos[:, :, None]
-        nearest = offsets.square().sum(dim=-1).argmin(dim=-1)
-        vectors = offsets.gather(2, nearest[:, :, None, None].expand(-1, -1, 1, 3))[:, :, 0]
-        square = vectors[:, 0].square().sum(dim=-1, keepdim=True)
-        # torch's root of float32 is rounded differently on some processors, and the runner's is not
-        palm_distance = square.double().sqrt().to(square.dtype)
-        return torch.cat((vectors[:, 1:].flatten(1), palm_distance), dim=-1)
+        return _vectors_to_object(x)
     pos = _noisy(x.observed_pos, c.noise.object_pos, generator)
     turn = quat_from_axis_angle(c.noise.object_rot * _normal(x.observed_pos, generator))
     quat = quat_multiply(turn, x.observed_quat)
@@ -126,11 +126,22 @@ def policy_group(x: ObservationInput, c: ObservationConfig, generator: torch.Gen
     return torch.cat((*poses, x.gravity_fraction[:, None], x.previous_action), dim=-1)
 
 
-def goal_group(x: ObservationInput, c: ObservationConfig) -> Tensor:
-    """[N, 7 + J] goal pose, previous action; 2 more as matrices.
+def _vectors_to_object(x: ObservationInput) -> Tensor:
+    """[N, 3 E + 1] vectors from the fingertips to the object's nearest points, and the palm's distance to its own."""
+    offsets = _world_points(x)[:, None] - x.links.pos[:, :, None]
+    nearest = offsets.square().sum(dim=-1).argmin(dim=-1)
+    vectors = offsets.gather(2, nearest[:, :, None, None].expand(-1, -1, 1, 3))[:, :, 0]
+    square = vectors[:, 0].square().sum(dim=-1, keepdim=True)
+    # Some processors round torch's square root of float32 differently; xreset.runtime always rounds correctly.
+    palm_distance = square.double().sqrt().to(square.dtype)
+    return torch.cat((vectors[:, 1:].flatten(1), palm_distance), dim=-1)
 
-    With ``rotation="to_goal"``, the goal's orientation is the rotation that leads to it from the start of the episode:
-    no image shows the axes in which a mesh was drawn.
+
+def goal_group(x: ObservationInput, c: ObservationConfig) -> Tensor:
+    """[N, 7 + J] goal pose, previous action. Without quaternions there are two numbers more.
+
+    With ``rotation="to_goal"``, the goal's orientation is given as the rotation from the start of the episode to the
+    goal, because no image shows the axes in which a mesh was drawn.
     """
     turn = x.goal_quat
     if c.rotation == "to_goal":
@@ -165,8 +176,8 @@ def proprio_group(x: ObservationInput, c: ObservationConfig, generator: torch.Ge
 def privileged_group(x: ObservationInput, c: ObservationConfig) -> Tensor:
     """[N, 15] object velocities, pose error, least fingertip distance, gravity fraction and reward (critic).
 
-    With ``content="published"``, [N, 15 + J + 3 E]: joint velocities and contact forces follow, which the policy does
-    not observe then.
+    With ``content="published"``, [N, 15 + J + 3 E]: joint velocities and contact forces follow, because the policy
+    does not observe them.
     """
     to_goal = quat_multiply(x.goal_quat, quat_conjugate(x.state.object_quat))
     terms = [
@@ -219,7 +230,7 @@ def _normal(like: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def _encoded(quat: Tensor, c: ObservationConfig) -> Tensor:
-    """[..., 4] or [..., 6] a rotation as the policy observes it: the same numbers for both of its quaternions."""
+    """[..., 4] or [..., 6] a rotation as the policy observes it: the same numbers for q and -q."""
     if c.rotation == "quaternion":
         return torch.where(quat[..., :1] < 0, -quat, quat)
     return quat_to_matrix(quat)[..., :2].mT.flatten(-2)

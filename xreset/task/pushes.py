@@ -14,7 +14,7 @@ from xreset.task.randomization import Drawn, sample_offset, sample_range, symmet
 
 
 class Pushes:
-    """Fixed buffers of N worlds.
+    """Pushes of N worlds, in fixed buffers.
 
     Attributes:
         force: [N, 3] force of this step's pushes at the object's centre of mass [N], world frame.
@@ -40,7 +40,7 @@ class Pushes:
             lambda generator: sample_range(drawn.num_worlds, (low, high), generator).exp(),
             is_fault=True,
         )
-        """[N] of a push in a control step."""
+        """[N] probability of a push in a control step."""
         self.force = drawn.zeros(3)
         self.torque = drawn.zeros(3)
         self.gate = drawn.keep("pushes.gate", drawn.zeros().bool())
@@ -52,15 +52,17 @@ class Pushes:
 
         Args:
             state: present state.
-            mass: [N] of the object [kg].
-            inertia_scale: [N] or number, factor on the object's inertia in addition to that of its mass.
+            mass: [N] mass of the object [kg].
+            inertia_scale: [N] or number, factor on the object's inertia in addition to the change with its mass.
             generator: random numbers.
         """
         c = self.config
         n = len(mass)
         happens = uniform((n, 3), generator) < self._probability[:, None]
         if c.moves_object:
-            allowed = happens[:, :2] if c.when == "always" else happens[:, :2] & self.gate[:, None]
+            allowed = happens[:, :2]
+            if c.when == "gated":
+                allowed = allowed & self.gate[:, None]
             velocity = sample_offset(n, (0.0, c.object_velocity), generator) * allowed[:, :1]
             self.force.copy_(mass[:, None] * velocity / self._control_dt)
             spin = sample_offset(n, (0.0, c.object_spin), generator) * allowed[:, 1:]

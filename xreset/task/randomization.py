@@ -15,11 +15,11 @@ Sample = Callable[[torch.Generator], Tensor]
 
 
 class Drawn:
-    """Buffers of N worlds, some of which are drawn again when an episode begins, in the order in which they were made.
+    """Buffers of N worlds. Those with a sample are drawn again when an episode begins, in the order of their creation.
 
     Attributes:
         lasting: all buffers by name, for a snapshot.
-        fault_scale: [] factor on what is drawn of the faults of a real loop.
+        fault_scale: [] factor on the drawn faults of a real control loop.
     """
 
     def __init__(self, num_worlds: int, device: torch.device) -> None:
@@ -40,6 +40,8 @@ class Drawn:
         """Add a buffer [N, ...], and return it.
 
         Args:
+            name: the buffer's name in a snapshot.
+            buffer: [N, ...] its first values.
             sample: draws its values; None: it is not drawn.
             is_fault: whether drawn values are multiplied by :attr:`fault_scale`.
         """
@@ -49,7 +51,7 @@ class Drawn:
         return buffer
 
     def draw(self, fresh: Tensor, generator: torch.Generator) -> None:
-        """Draw values for every world, so that nothing waits for a count; the worlds of a mask [N] take them."""
+        """Draw new values for the worlds of a mask [N]. All worlds draw, so that no GPU waits for a count."""
         for sample, buffer, is_fault in self._samples:
             values = sample(generator).view_as(buffer)
             if is_fault:
@@ -72,9 +74,9 @@ def pair_friction(
 
 
 def sample_friction(count: int, c: RandomizationConfig, generator: torch.Generator) -> Tensor:
-    """[M, 3] pair friction of objects whose material is one of ``friction_buckets`` evenly spaced ones.
+    """[M, 3] pair friction of objects, each of one of ``friction_buckets`` evenly spaced materials.
 
-    Without randomisation it is the material in the middle.
+    Without randomization it is the material in the middle.
     """
     low, high = c.friction
     if not c.enabled:
@@ -82,8 +84,11 @@ def sample_friction(count: int, c: RandomizationConfig, generator: torch.Generat
     bucket = torch.randint(
         c.friction_buckets, (count,), generator=generator, device=generator.device
     )
-    link = None if c.hand_friction is None else sample_range(count, c.hand_friction, generator)
-    return pair_friction(low + (high - low) * (bucket + 0.5) / c.friction_buckets, c, link)
+    material = low + (high - low) * (bucket + 0.5) / c.friction_buckets
+    link = None
+    if c.hand_friction is not None:
+        link = sample_range(count, c.hand_friction, generator)
+    return pair_friction(material, c, link)
 
 
 def own_friction(materials: Sequence[float | None], c: RandomizationConfig) -> Tensor:
@@ -92,18 +97,17 @@ def own_friction(materials: Sequence[float | None], c: RandomizationConfig) -> T
     The known coefficient replaces the middle of the range, and a pair's coefficient is the mean of two materials.
     """
     middle = sum(c.friction) / 2
-    return torch.tensor(
-        [[0.0 if material is None else (material - middle) / 2] for material in materials]
-    )
+    offsets = [0.0 if material is None else (material - middle) / 2 for material in materials]
+    return torch.tensor(offsets)[:, None]
 
 
 def uniform(shape: Sequence[int], generator: torch.Generator) -> Tensor:
-    """Uniform numbers in [0, 1)."""
+    """Return uniform numbers in [0, 1)."""
     return torch.rand(shape, generator=generator, device=generator.device)
 
 
 def symmetric(shape: Sequence[int], generator: torch.Generator) -> Tensor:
-    """Uniform numbers in [-1, 1)."""
+    """Return uniform numbers in [-1, 1)."""
     return 2.0 * uniform(shape, generator) - 1.0
 
 
@@ -115,10 +119,9 @@ def sample_range(count: int, limits: tuple[float, float], generator: torch.Gener
 
 def sample_offset(count: int, limits: tuple[float, float], generator: torch.Generator) -> Tensor:
     """[M, 3] vectors in any direction, of uniform lengths of a range."""
-    direction = torch.randn(count, 3, generator=generator, device=generator.device)
-    return sample_range(count, limits, generator)[:, None] * torch.nn.functional.normalize(
-        direction, dim=-1
-    )
+    normal = torch.randn(count, 3, generator=generator, device=generator.device)
+    direction = torch.nn.functional.normalize(normal, dim=-1)
+    return sample_range(count, limits, generator)[:, None] * direction
 
 
 def sample_drives(
@@ -129,6 +132,8 @@ def sample_drives(
     Args:
         is_arm: [J] bool.
         count: M.
+        c: ranges of the factors.
+        generator: random numbers.
     """
     rows = []
     for arm, hand in (

@@ -22,7 +22,7 @@ class Reading:
     links: Links
     contacts: Contacts
     health: Health
-    """Health of the engine. A world that was given an action that is not finite counts as not finite."""
+    """Health of the engine. A world whose action was not finite counts as not finite."""
     tip_distance: Tensor
     """[N, E] distance from each fingertip to the object's surface points [m]."""
     task_state: State
@@ -35,29 +35,31 @@ class Reading:
         """Read a backend.
 
         Args:
+            backend: the worlds.
             surface_points: [N, P, 3] on each world's object, in its mesh frame [m].
-            bad_action: [N] bool, worlds that were given an action that is not finite.
+            bad_action: [N] bool, worlds whose action was not finite.
             center: [N, 3] origin of each world's object in the task, in its mesh frame [m]; None: the mesh's origin.
         """
-        state = task_state = backend.state()
+        state = backend.state()
+        task_state = state
         if center is not None:
-            arm = quat_rotate(state.object_quat, center)
+            offset = quat_rotate(state.object_quat, center)
+            spin = torch.linalg.cross(state.object_angvel, offset)
             task_state = replace(
                 state,
-                object_pos=state.object_pos + arm,
-                object_linvel=state.object_linvel + torch.linalg.cross(state.object_angvel, arm),
+                object_pos=state.object_pos + offset,
+                object_linvel=state.object_linvel + spin,
             )
         links = backend.links()
         health = backend.health()
-        local = quat_rotate_inverse(
-            state.object_quat[:, None], links.pos[:, 1:] - state.object_pos[:, None]
-        )
+        from_object = links.pos[:, 1:] - state.object_pos[:, None]
+        tips_in_mesh_frame = quat_rotate_inverse(state.object_quat[:, None], from_object)
         return cls(
             state=state,
             links=links,
             contacts=backend.contacts(),
             health=replace(health, nonfinite=health.nonfinite | bad_action),
-            tip_distance=torch.cdist(local, surface_points).amin(dim=-1),
+            tip_distance=torch.cdist(tips_in_mesh_frame, surface_points).amin(dim=-1),
             task_state=task_state,
         )
 
@@ -65,14 +67,14 @@ class Reading:
 def step_log(
     reward: Reward, done: Tensor, *, sound: Tensor, from_home: Tensor, totals: dict[str, Tensor]
 ) -> tuple[tuple[str, ...], Tensor]:
-    """Return names and values [K] of a step's log: means over worlds, on the device, so that nothing waits for them.
+    """Return names and values [K] of a step's log: means over worlds. Values stay on the device, so nothing waits.
 
     Args:
         reward: rewards of N worlds. Its terms are averaged over the ``sound`` worlds.
         done: [N] bool, worlds whose episode has ended.
         sound: [N] bool, worlds whose simulation has not failed.
         from_home: [N] bool, worlds whose episode began at home.
-        totals: further numbers [], by name.
+        totals: further numbers [], by name, which follow the means.
     """
     all_worlds = torch.ones_like(sound)
     rows = {f"reward/{name}": (value, sound) for name, value in reward.terms.items()}
@@ -86,6 +88,5 @@ def step_log(
     values = torch.stack([value.float() for value, _ in rows.values()])
     masks = torch.stack([mask for _, mask in rows.values()])
     means = torch.where(masks, values, 0).sum(dim=-1) / masks.sum(dim=-1).clamp_min(1)
-    return (*rows, *totals), torch.cat(
-        (means, torch.stack([value.float() for value in totals.values()]))
-    )
+    further = torch.stack([value.float() for value in totals.values()])
+    return (*rows, *totals), torch.cat((means, further))

@@ -37,15 +37,19 @@ class RewardInput:
     tip_force: Tensor
     """[N, E, 3] each finger's contact force on the object [N], world frame."""
     state: State
-    """[N, ...] of joints and object, velocities included."""
+    """[N, ...] state of joints and object."""
     goal_pos: Tensor
+    """[N, 3]"""
     goal_quat: Tensor
+    """[N, 4]"""
     start_pos: Tensor
     """[N, 3] position of the object at the start of the demonstration."""
     start_quat: Tensor
+    """[N, 4]"""
     action: Tensor
-    """[N, J] this step's action, as it is penalised."""
+    """[N, J] this step's action, limited unless ``raw_actions`` is set."""
     previous_action: Tensor
+    """[N, J]"""
     out_of_bounds: Tensor
     """[N] bool"""
     palm_distance: Tensor
@@ -79,9 +83,9 @@ class Reward:
     grasped: Tensor
     """[N] bool: the thumb and at least one other finger press on the object."""
     gate: Tensor
-    """[N] bool: position, rotation and success are paid."""
+    """[N] bool: position, rotation, points and success are paid."""
     success: Tensor
-    """[N] bool, gated pose success."""
+    """[N] bool: the gate is open, and the object is at its goal (``success_shape``)."""
 
 
 OwnTerm = Callable[[RewardInput], Tensor]
@@ -91,7 +95,7 @@ ask for the value of a tensor (``if``, ``item``, ``nonzero``)."""
 
 @cache
 def own_term(name: str) -> OwnTerm:
-    """The function ``module:function`` of ``task.reward.own``.
+    """Return the function that ``task.reward.own`` names as ``module:function``.
 
     Raises:
         RunError: the module cannot be imported, or has no such function.
@@ -131,7 +135,8 @@ def point_distances(
 ) -> Tensor:
     """[N, P] distance |o_i - g_i| of each object-frame point [N, P, 3] from its place at the goal [m].
 
-    The draft's pose error is the largest one of four keypoints, the published paper's is the mean over surface points.
+    The draft's pose error is the largest distance of four keypoints, the published paper's is the mean over surface
+    points.
     """
     here = pos[:, None] + quat_rotate(quat[:, None], points)
     goal = goal_pos[:, None] + quat_rotate(goal_quat[:, None], points)
@@ -139,7 +144,7 @@ def point_distances(
 
 
 def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
-    """The reward of one control step."""
+    """Return the reward of one control step."""
     grasped = contact_gate(x.tip_force, c.contact_threshold)
     gate = grasped
     if c.contact == "opposing":

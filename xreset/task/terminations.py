@@ -12,7 +12,9 @@ def out_of_bounds(object_pos: Tensor, table: TableSpec, c: TerminationConfig) ->
     """[N] bool: the object has left the manipulation scene (the box above the table, with a margin).
 
     Args:
-        object_pos: [N, 3] origin of the object, world frame.
+        object_pos: [N, 3] origin of the object, world frame [m].
+        table: the table of the scene.
+        c: the bounds.
     """
     x, y, z = object_pos.unbind(dim=-1)
     is_far = (x - table.center[0]).abs() > table.half_size[0] + c.margin

@@ -1,4 +1,4 @@
-"""What a pose tracker reports of the object: poses that are late, wrong, or missing."""
+"""Object poses as a tracker reports them: late, wrong, or missing."""
 
 from __future__ import annotations
 
@@ -51,32 +51,44 @@ class Tracker:
             fresh: [N] bool, worlds that have just begun: their present pose is their whole past.
             generator: random numbers.
         """
-        c = self._config
-        if c.has_errors:
+        if self._config.has_errors:
             noise = self._fault_scale * self._noise * symmetric(self._bias.shape, generator)
             error = self._bias + noise
             pos = pos + error[:, :3]
             quat = quat_multiply(quat_from_axis_angle(error[:, 3:]), quat)
-        if c.skips_steps:
-            arrives = fresh | (self._wait <= 0)
-            pose = torch.where(arrives[:, None], torch.cat((pos, quat), dim=-1), self._last)
-            self._last.copy_(pose)
-            lost = uniform(self._wait.shape, generator) < c.loss * self._fault_scale
-            pause = sample_range(len(pos), c.loss_steps, generator).round()
-            until_next = sample_range(len(pos), c.interval, generator).round()
-            until_next = until_next + torch.where(lost, pause, 0.0)
-            self._wait.copy_(torch.where(arrives, until_next, self._wait) - 1.0)
+        if self._config.skips_steps:
+            pose = self._last_seen(torch.cat((pos, quat), dim=-1), fresh, generator)
             pos, quat = pose.split((3, 4), dim=-1)
-        if not self._delays.longest:
-            return pos, quat
-        last = self._delays.values[:, 0, 3:]
-        opposite = (quat * last).sum(dim=-1, keepdim=True) < 0
-        # Of a rotation's two quaternions the one near the last is kept, so that interpolation takes the short way.
-        pose = torch.cat((pos, torch.where(opposite, -quat, quat)), dim=-1)
+        if self._delays.longest:
+            pos, quat = self._delayed(pos, quat, fresh, generator)
+        return pos, quat
+
+    def _last_seen(self, pose: Tensor, fresh: Tensor, generator: torch.Generator) -> Tensor:
+        """Return the given poses [N, 7] where the tracker has a new one in this step, elsewhere its last ones."""
+        c = self._config
+        arrives = fresh | (self._wait <= 0)
+        pose = torch.where(arrives[:, None], pose, self._last)
+        self._last.copy_(pose)
+        lost = uniform(self._wait.shape, generator) < c.loss * self._fault_scale
+        pause = sample_range(len(pose), c.loss_steps, generator).round()
+        until_next = sample_range(len(pose), c.interval, generator).round()
+        until_next = until_next + torch.where(lost, pause, 0.0)
+        self._wait.copy_(torch.where(arrives, until_next, self._wait) - 1.0)
+        return pose
+
+    def _delayed(
+        self, pos: Tensor, quat: Tensor, fresh: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
+        """Return the positions [N, 3] and orientations [N, 4] that arrive in this step."""
+        last_quat = self._delays.values[:, 0, 3:]
+        is_opposite = (quat * last_quat).sum(dim=-1, keepdim=True) < 0
+        # q and -q are the same rotation. The one nearer to the last makes interpolation take the short way.
+        pose = torch.cat((pos, torch.where(is_opposite, -quat, quat)), dim=-1)
         self._delays.fill(fresh, pose)
         delay = self._delays.delay
-        if c.jitter:
-            delay = delay + self._fault_scale * c.jitter * symmetric(delay.shape, generator)
+        if self._config.jitter:
+            largest = self._fault_scale * self._config.jitter
+            delay = delay + largest * symmetric(delay.shape, generator)
             delay = delay.clamp(0.0, self._delays.longest)
         pos, quat = self._delays.push(pose, delay).split((3, 4), dim=-1)
         return pos, torch.nn.functional.normalize(quat, dim=-1)

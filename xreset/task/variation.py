@@ -29,7 +29,8 @@ from xreset.task.tracker import Tracker
 
 
 class Variation:
-    """Fixed buffers of N worlds. A range that has its default costs nothing and draws no random number.
+    """Differences between N worlds, in fixed buffers. A range that has its default costs nothing and draws no random
+    number.
 
     Attributes:
         parameters: physical parameters [N, ...] by name, without the gravity fraction, which belongs to the start of an
@@ -50,7 +51,9 @@ class Variation:
         """Allocate.
 
         Args:
-            drawn: what is drawn at each reset.
+            drawn: what is drawn at each reset; this object adds its buffers.
+            backend: the worlds.
+            config: what is drawn.
             is_arm: [J] bool.
             proprio_width: numbers in the observation group ``proprio``.
 
@@ -96,8 +99,8 @@ class Variation:
         n = drawn.num_worlds
         objects = backend.scene.objects
         nominal = Parameters.nominal(backend.scene, backend.object_index).to(backend.device).given()
-        of_material = own_friction([o.friction for o in objects], c).to(backend.device)
-        offset = of_material[backend.object_index]
+        offset_of_object = own_friction([o.friction for o in objects], c).to(backend.device)
+        offset = offset_of_object[backend.object_index]
 
         def friction(generator: torch.Generator) -> Tensor:
             drawn_friction = sample_friction(n, c, generator) + offset
@@ -124,7 +127,7 @@ class Variation:
         }
 
     def _sample_action_latency(self, generator: torch.Generator) -> Tensor:
-        """[N, J] steps."""
+        """[N, J] delays of the joints' targets [control steps]."""
         c = self._config
         n = len(self.parameters["object_mass"])
         of_arm = sample_range(n, c.action_latency, generator)[:, None]
@@ -134,7 +137,8 @@ class Variation:
         return torch.where(self._is_arm, of_arm, of_hand)
 
     def begin_episodes(self, fresh: Tensor, target: Tensor) -> None:
-        """Fill the delay line of the worlds of a mask [N] with the start's joint targets [N, J]."""
+        """Fill the delay line of the worlds of a mask [N] with the start's joint targets [N, J], and close the gate of
+        their pushes."""
         self._commands.fill(fresh, target)
         if self.pushes is not None:
             self.pushes.gate &= ~fresh
@@ -147,14 +151,13 @@ class Variation:
         return torch.where(lost, old, new)
 
     def sent_targets(self, target: Tensor, state: State, generator: torch.Generator) -> Tensor:
-        """[N, J] the joint targets that reach the drives in this step, moved where the arm is pushed."""
+        """[N, J] the joint targets that reach the drives in this step, with the offsets of pushes on the arm."""
         target = self._commands.push(target)
         if self.pushes is None:
             return target
         inertia_scale = self.parameters.get("object_inertia", 1.0)
-        return target + self.pushes.act(
-            state, self.parameters["object_mass"], inertia_scale, generator
-        )
+        mass = self.parameters["object_mass"]
+        return target + self.pushes.act(state, mass, inertia_scale, generator)
 
     def observed_proprio(self, proprio: Tensor, fresh: Tensor) -> Tensor:
         """[N, D] joints, links and forces as they are observed, possibly delayed.

@@ -1,4 +1,4 @@
-"""Depth cameras in the worlds of a task: their differences between episodes, and the age of what they show."""
+"""Depth cameras in the worlds of a task: their differences between episodes, and the age of their images."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from xreset.task.randomization import Drawn, sample_offset, sample_range
 
 
 class Vision:
-    """What N worlds see. A range that has its default costs nothing and draws no random number.
+    """Cameras of N worlds. A range that has its default costs nothing and draws no random number.
 
     Attributes:
         cameras: the cameras.
@@ -58,16 +58,22 @@ class Vision:
         self._delay = DelayLine(drawn, "delayed_views", width, longest, age, is_fault=False)
 
     def aim(self, state: State, goal_pos: Tensor, goal_quat: Tensor, episode_step: Tensor) -> None:
-        """Move the renderer's bodies and cameras to the present state; arguments as for :meth:`Cameras.aim`, and
-        control steps [N] since each world's reset."""
+        """Move the renderer's bodies and cameras to the present state.
+
+        Args:
+            state: [N, ...] as for :meth:`Cameras.aim`.
+            goal_pos: [N, 3] as for :meth:`Cameras.aim`.
+            goal_quat: [N, 4] as for :meth:`Cameras.aim`.
+            episode_step: [N] control steps since each world's reset.
+        """
         due = episode_step % self.cameras.config.interval == 0
         self.cameras.aim(state, goal_pos, goal_quat, due)
 
     def check_sees_objects(self) -> None:
-        """Refuse cameras that show some object in no world.
+        """Refuse cameras that never show one of the objects.
 
         Raises:
-            XResetError: names the objects.
+            XResetError: some objects are shown in no world. The message names them.
         """
         shown = self.cameras.shows_object()
         unseen = []
@@ -82,7 +88,8 @@ class Vision:
             )
 
     def observe(self, fresh: Tensor, generator: torch.Generator) -> Tensor:
-        """[N, ...] what the policy sees, of shape :attr:`~xreset.cameras.config.VisionConfig.view_shape`.
+        """[N, ...] images or points that the policy observes, of shape
+        :attr:`~xreset.cameras.config.VisionConfig.view_shape`.
 
         In the ``fresh`` worlds [N] the present view becomes the whole past.
         """

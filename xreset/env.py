@@ -1,7 +1,7 @@
 """The environment: N worlds of a physics backend, and the task's pure functions around them.
 
-It keeps rsl-rl's contract of vector environments (``step`` resets finished worlds itself) but needs rsl-rl only where a
-policy is trained. Evaluations run in the same class with another configuration.
+It has rsl-rl's interface of vector environments (``step`` resets finished worlds itself), but only training needs
+rsl-rl. Evaluations use the same class with another configuration.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def make_env(
         objects: the objects of the bank; world i holds object i modulo their number, unless
             ``task.reset.object_share`` gives some objects more worlds.
         bank: where episodes begin, and their goals.
-        task: what to observe, reward and end on; None: the paper's task.
+        task: observations, rewards and ends of episodes; None: the paper's task.
         engine: name of the engine, as ``xreset engines list`` prints it.
         num_envs: N.
         device: where the engine and all tensors live.
@@ -90,7 +90,7 @@ def make_env(
     Raises:
         FileFormatError: the bank's states are for another robot or other meshes.
         DemoError: the bank has no demonstration of an object.
-        XResetError: ``task.reset.object_share`` names an object that is not there, or an object gets no world.
+        XResetError: ``task.reset.object_share`` names an unknown object, or an object gets no world.
     """
     task = task or TaskConfig()
     objects = checked_objects(robot, objects)
@@ -112,7 +112,7 @@ class ManipulationEnv:
     """N worlds in which a robot brings an object to a goal pose.
 
     All tensors live on the backend's device. World i always holds the same object. Apart from physics, a step is a few
-    functions over fixed buffers without a branch on what a world is doing, so that a GPU replays them as graphs.
+    functions over fixed buffers that never branch on a world's state, so that a GPU replays them as graphs.
 
     Attributes:
         num_envs: N.
@@ -124,7 +124,7 @@ class ManipulationEnv:
         sequence: [N] demonstration of each world.
         bank_state: [N] bank state that each world's episode began with, -1 for home.
         gravity_fraction: [N] share of the object's weight that acts.
-        success_position: [] limit of success [m], ``task.reward.success_position`` until another is filled in.
+        success_position: [] limit of success [m]; a schedule may overwrite ``task.reward.success_position`` here.
         nonfinite_count: [] number of episodes that ended because a number was not finite.
         overflow_count: [] number of episodes that ended because the engine dropped contacts.
         drawn: what is drawn at each reset in addition to the start.
@@ -139,7 +139,7 @@ class ManipulationEnv:
 
         Args:
             backend: the worlds.
-            task: what to observe, reward and end on.
+            task: observations, rewards and ends of episodes.
             resets: where episodes start, on the backend's device.
             seed: seed of every random number that the environment draws.
         """
@@ -160,16 +160,17 @@ class ManipulationEnv:
         self._graphs = GraphRunner(self.device, self.generator)
         self.actions = ActionSpace(scene.robot, task.action, self.device)
 
-        def per_object(points: Callable[[ObjectSpec], np.ndarray]) -> Tensor:
-            found = [torch.as_tensor(points(o), dtype=torch.float32) for o in scene.objects]
-            return torch.stack(found).to(self.device)[backend.object_index]
+        def of_worlds(function: Callable[[ObjectSpec], np.ndarray]) -> Tensor:
+            """[N, ...] value of the function for each world's object."""
+            values = [torch.as_tensor(function(o), dtype=torch.float32) for o in scene.objects]
+            return torch.stack(values).to(self.device)[backend.object_index]
 
-        self._cloud_points = per_object(lambda o: surface_points(o, task.observation.cloud_points))
-        self._surface_points = per_object(lambda o: surface_points(o, task.distance_points))
-        self._metric_points = per_object(metric_points)
+        self._cloud_points = of_worlds(lambda o: surface_points(o, task.observation.cloud_points))
+        self._surface_points = of_worlds(lambda o: surface_points(o, task.distance_points))
+        self._metric_points = of_worlds(metric_points)
         self._center = None
         if task.object_frame == "center":
-            self._center = per_object(center)
+            self._center = of_worlds(center)
             self._cloud_points = self._cloud_points - self._center[:, None]
             self._metric_points = self._metric_points - self._center[:, None]
         self.success_position = torch.tensor(task.reward.success_position, device=self.device)
@@ -269,8 +270,8 @@ class ManipulationEnv:
 
         Args:
             action: [N, J], limited to [-1, 1]. A world whose numbers are not finite ends as if its engine had failed.
-            begin: [N] bool, worlds to reset instead; None: the worlds whose episode has ended. A world whose episode
-                has ended and that is not reset yet does not end again, and nothing is learned from it.
+            begin: [N] bool, worlds to reset; None: the worlds whose episode has ended. A world whose episode has ended
+                does not end again before it is reset.
 
         Returns:
             Observations (of the new episode where one has begun), reward [N], done [N] (0 or 1), and a dictionary with
@@ -278,7 +279,7 @@ class ManipulationEnv:
             simulation failed: learn nothing from this step) and ``log``.
 
         Raises:
-            XResetError: the action is no tensor, or has another shape.
+            XResetError: the action is not a tensor, or has another shape.
         """
         self._apply_action(action)
         self._graphs.run(self._compute_rewards)
@@ -302,12 +303,14 @@ class ManipulationEnv:
     # Stepping and resetting
 
     def advance(self, action: Tensor, push: Tensor | None = None) -> tuple[Reading, Reward]:
-        """Take one control step without any reset, for evaluation, which ends episodes itself.
+        """Take one control step without any reset. Evaluations end episodes themselves.
 
         Args:
             action: [N, J], limited to [-1, 1].
-            push: [N, J] what is added to the targets that the drives get [rad, m]: a torque from outside, divided by
-                the drive's stiffness.
+            push: [N, J] offset of the drives' targets [rad, m]: an external torque, divided by the drive's stiffness.
+
+        Raises:
+            XResetError: the action is not a tensor, or has another shape.
         """
         self._apply_action(action, push)
         reading, reward = self._compute_rewards()
@@ -385,7 +388,8 @@ class ManipulationEnv:
         for name, value in self._lasting.items():
             value.copy_(snapshot[name])
         self._reset_mask.fill_(True)
-        self._set_worlds(State(**{f.name: snapshot[f.name] for f in fields(State)}).to(self.device))
+        state = State(**{f.name: snapshot[f.name] for f in fields(State)})
+        self._set_worlds(state.to(self.device))
         self._reset_mask.zero_()
 
     # Parts
@@ -401,6 +405,7 @@ class ManipulationEnv:
         return pos if self._center is None else pos + quat_rotate(quat, self._center)
 
     def _apply_action(self, action: Tensor, push: Tensor | None = None) -> None:
+        """Step the physics with an action; arguments as for :meth:`advance`."""
         if not isinstance(action, Tensor):
             raise XResetError(
                 f"The actions are a {type(action).__name__}, expected a tensor: torch.as_tensor(actions)."
@@ -411,9 +416,8 @@ class ManipulationEnv:
             )
         self._action.copy_(action.detach())
         self._graphs.run(self._process_action)
-        self.backend.set_joint_targets(
-            self._sent_target if push is None else self._sent_target + push
-        )
+        target = self._sent_target if push is None else self._sent_target + push
+        self.backend.set_joint_targets(target)
         pushes = self.variation.pushes
         if pushes is not None and pushes.config.moves_object:
             self.backend.set_object_wrench(pushes.force, pushes.torque)
@@ -498,7 +502,7 @@ class ManipulationEnv:
         return (self._surface_points - palm[:, None]).norm(dim=-1).amin(dim=-1)
 
     def _sample_resets(self, from_distribution: bool = True) -> None:
-        """Draw a start for every world, so that nothing waits for the number of resets; the worlds to reset take it."""
+        """Draw new starts for the worlds to reset. All worlds draw, so that no GPU waits for the number of resets."""
         fresh = self._reset_mask
         start = self._new_start
         if from_distribution:
@@ -506,7 +510,8 @@ class ManipulationEnv:
         self.variation.begin_episodes(fresh, start.joint_target)
         self.drawn.draw(fresh, self.generator)
         self._episode.map(Tensor.copy_, where(fresh, start, self._episode))
-        for cleared in (self._episode_length, self._previous_action.T, self._reward, self._over):
+        self._previous_action.masked_fill_(fresh[:, None], 0)
+        for cleared in (self._episode_length, self._reward, self._over):
             cleared.masked_fill_(fresh, 0)
 
     def _write_resets(self) -> None:
@@ -538,7 +543,7 @@ class ManipulationEnv:
             )
 
     def _compute_observations(self) -> None:
-        """Refresh the observations. A fresh world's cloud history and best reach are the present ones."""
+        """Refresh the observations. In fresh worlds the present cloud and reach become the whole history."""
         reading = self.reading()
         state = reading.task_state
         c = self.task.observation

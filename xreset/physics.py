@@ -29,8 +29,8 @@ Parameter = Literal[
 ]
 """A physical parameter with a value per world, set by ``Backend.set_...``."""
 Capability = Literal[Parameter, "object_wrench", "overflow", "mass_properties"]
-"""What some backends cannot do: set a parameter per world, apply a wrench, count overflows, read back masses, centers
-of mass and inertias."""
+"""A feature that some backends lack: set a parameter per world, apply a wrench, count overflows, read back masses,
+centers of mass and inertias."""
 
 
 @frozen
@@ -98,20 +98,20 @@ class Parameters(Tensors):
     object_mass: Tensor | None = None
     """[N] kg."""
     object_inertia: Tensor | None = None
-    """[N] factor."""
+    """[N] factor on the object's inertia."""
     object_com: Tensor | None = None
-    """[N, 3] m."""
+    """[N, 3] offset of the object's centre of mass, mesh frame, m."""
     object_gravity: Tensor | None = None
-    """[N] fraction."""
+    """[N] share of the object's weight that acts."""
     drives: Tensor | None = None
-    """[N, 3, J] factors."""
+    """[N, 3, J] factors on stiffness, damping and effort limit."""
 
     @classmethod
     def nominal(cls, scene: SceneSpec, object_index: Tensor) -> Self:
-        """Return what the scene states for worlds with these objects [N]."""
+        """Return the parameters that the scene states for worlds with these objects [N]."""
         n = len(object_index)
         friction = scene.friction
-        # in single precision also where they are stated as whole numbers
+        # The dtype is stated because whole numbers would give integer tensors.
         masses = torch.tensor([spec.mass for spec in scene.objects], dtype=torch.float32)
         pairs = torch.tensor([friction.tip, friction.link, friction.table], dtype=torch.float32)
         return cls(
@@ -154,7 +154,7 @@ class Contacts(Tensors):
     tip_force: Tensor
     """[N, E, 3] net force of each finger's contact links on the object [N]."""
     tip_touch: Tensor
-    """[N, E] bool: whether any of them touches the object (a contact with a non-zero normal force)."""
+    """[N, E] bool: whether a contact link of the finger touches the object (with a non-zero normal force)."""
     table_force: Tensor
     """[N, 3] net force of the table on the object [N]; a resting object reads +m g along z."""
 
@@ -186,7 +186,7 @@ def no_readings(robot: RobotSpec, num_worlds: int) -> tuple[Links, Contacts, Hea
 
 @frozen
 class MassProperties(Tensors):
-    """Masses as the engine has them, of B moving bodies of the robot and then the object.
+    """Masses in the engine, of the robot's B moving bodies and then the object.
 
     Links that are fixed to one another are one body. The robot's bodies are in the order of
     :func:`xreset.backends.rigid.mechanism`, without the base.
@@ -236,7 +236,7 @@ class Backend(ABC):
     name: ClassVar[str]
     """Name in the registry."""
     capabilities: ClassVar[frozenset[Capability]]
-    """What this backend can do and others may not."""
+    """Features of this backend that others may lack."""
     known_differences: ClassVar[tuple[KnownDifference, ...]] = ()
     """Checks for which this engine has a wider tolerance."""
 
@@ -252,9 +252,14 @@ class Backend(ABC):
         centre.
 
         Args:
+            scene: robot, objects and table.
+            num_worlds: N.
             object_index: [N] which of ``scene.objects`` each world holds; default: world i holds object i modulo their
                 number.
             device: ``cpu`` or ``cuda[:i]``.
+
+        Raises:
+            ValueError: there is no world or no object, or an index is not one of an object.
         """
         if num_worlds < 1:
             raise ValueError(f"num_worlds is {num_worlds}, expected at least 1")
@@ -276,12 +281,15 @@ class Backend(ABC):
     @classmethod
     @abstractmethod
     def engine_version(cls) -> str:
-        """Version of the engine; ``BackendUnavailableError`` with reason and remedy if it cannot be imported or used
-        here."""
+        """Return the version of the engine.
+
+        Raises:
+            BackendUnavailableError: the engine cannot be imported or used here. The message has reason and remedy.
+        """
 
     @classmethod
     def devices(cls) -> list[str]:
-        """Kinds of devices that can be used here, the best first: ``cuda``, ``cpu``."""
+        """Return the kinds of devices that can be used here, the best first: ``cuda``, ``cpu``."""
         return ["cpu"]
 
     # State -----------------------------------------------------------------------------------------------------------
@@ -296,7 +304,7 @@ class Backend(ABC):
         """
 
     def state(self) -> State:
-        """State of all worlds."""
+        """Return the state of all worlds."""
         self._must_be_open()
         return self._state
 
@@ -313,26 +321,26 @@ class Backend(ABC):
     # Readings --------------------------------------------------------------------------------------------------------
 
     def links(self) -> Links:
-        """Poses and velocities of the tracked links, up to date with :meth:`state`."""
+        """Return poses and velocities of the tracked links, up to date with :meth:`state`."""
         self._must_be_open()
         return self._links
 
     def contacts(self) -> Contacts:
-        """Contact forces on the object."""
+        """Return contact forces on the object."""
         self._must_be_open()
         return self._contacts
 
     def health(self) -> Health:
-        """What went wrong since each world's state was last set."""
+        """Return what went wrong since each world's state was last set."""
         self._must_be_open()
         return self._health
 
     def mass_properties(self) -> MassProperties:
-        """Return masses, centres of mass and inertias as the engine has them now, after any change of them."""
+        """Return masses, centres of mass and inertias in the engine, with all changes of them."""
         self._require("mass_properties")
         raise NotImplementedError
 
-    # Physical parameters: each stays through set_state, except the wrench; CapabilityError where the backend lacks it
+    # Physical parameters: set_state keeps them, but ends the wrench. CapabilityError if the backend lacks one
 
     def set_object_mass(self, mass: Tensor, worlds: Tensor | None = None) -> None:
         """Set the object's mass [M] kg; its inertia scales with it, its centre of mass stays."""
@@ -347,13 +355,13 @@ class Backend(ABC):
         self._set("torsional_friction", torsional, worlds)
 
     def set_object_inertia(self, scale: Tensor, worlds: Tensor | None = None) -> None:
-        """Set the factor [M] on the object's inertia about its centre of mass, in addition to the change with its
-        mass; 1 is what the spec says."""
+        """Set the factor [M] on the object's inertia about its centre of mass, in addition to the change with its mass;
+        1 is the spec's inertia."""
         self._set("object_inertia", scale, worlds)
 
     def set_object_com(self, offset: Tensor, worlds: Tensor | None = None) -> None:
-        """Move the object's centre of mass by [M, 3] m from that of its spec, in its mesh frame; the inertia about it
-        stays.
+        """Move the object's centre of mass by [M, 3] m from its place in the spec, in the mesh frame. The inertia about
+        it stays.
 
         If the object moves, set its state again.
         """
@@ -367,8 +375,8 @@ class Backend(ABC):
         self._set("object_gravity", fraction, worlds)
 
     def set_drives(self, scale: Tensor, worlds: Tensor | None = None) -> None:
-        """Set factors on the drives: [M, 3, J] of stiffness, damping and effort limit; 1 is what the robot spec
-        says."""
+        """Set factors [M, 3, J] on the stiffness, damping and effort limit of the drives; 1 is the value of the robot
+        spec."""
         self._set("drives", scale, worlds)
 
     def set_object_wrench(self, force: Tensor, torque: Tensor) -> None:
@@ -414,7 +422,8 @@ class Backend(ABC):
         self.close()
 
     # For implementers ------------------------------------------------------------------------------------------------
-    # The getters return these tensors, and two setters write to them. A backend without such tensors overrides both.
+    # The getters return these tensors, and two setters write to them. A backend without these tensors overrides the
+    # getters and the two setters.
 
     _state: State
     _links: Links
@@ -429,21 +438,21 @@ class Backend(ABC):
             raise XResetError(f"The backend {self.name!r} is closed. Build a new one.")
 
     def _checked_state(self, state: State, rows: int) -> State:
-        """Return a state on the backend's device; ``ValueError`` if it does not have that many rows."""
+        """Return a state on the backend's device; ``ValueError`` if it has another number of rows."""
         checked = {}
         for name, present in vars(self._state).items():
             checked[name] = self._checked(name, getattr(state, name), (rows, *present.shape[1:]))
         return State(**checked)
 
     def _checked(self, name: str, value: Tensor, shape: tuple[int, ...]) -> Tensor:
-        """Return values on the backend's device; ``ValueError`` if their shape is another one."""
+        """Return values on the backend's device; ``ValueError`` if they have another shape."""
         value = torch.as_tensor(value, dtype=torch.float32, device=self.device).detach()
         if value.shape != shape:
             raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {tuple(shape)}")
         return value.contiguous()
 
     def _checked_substeps(self, substeps: int | None) -> int:
-        """Return the number of physics steps to take; default: one control step."""
+        """Return the number of physics steps to take; default: those of one control step."""
         if substeps is None:
             return self.scene.substeps
         if substeps < 1:
@@ -459,15 +468,15 @@ class Backend(ABC):
             )
 
     def _set(self, name: Parameter, value: Tensor, worlds: Tensor | None) -> None:
-        """Set a physical parameter [M, ...]. Every setter calls this, so a backend overrides either."""
+        """Set a physical parameter [M, ...]. A backend overrides this method, or the setters, which all call it."""
         self._require(name)
         raise NotImplementedError(
-            f"the backend {self.name!r} declares {name!r} and does not set it"
+            f"The backend {self.name!r} declares {name!r} but does not set it."
         )
 
 
 def unavailable(package: str, install: str, error: Exception) -> BackendUnavailableError:
-    """The error for an engine that cannot be imported; ``install`` is what follows ``pip install``."""
+    """Return the error for an engine that cannot be imported; ``install`` follows ``pip install`` in its message."""
     return BackendUnavailableError(
         f"{package} cannot be imported ({error}). Install it with: pip install {install}"
     )

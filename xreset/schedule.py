@@ -1,4 +1,4 @@
-"""Shares worlds among objects. A world always holds the same object."""
+"""Distribution of worlds over objects. A world always holds the same object."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Schedule:
 def schedule(item_object: np.ndarray, max_worlds: int) -> Schedule:
     """Spread items over worlds in the fewest rounds.
 
-    One world after the other goes to the object whose worlds have most to do, which keeps the longest queue shortest.
+    Each further world goes to the object with the most items per world, which keeps the longest queue shortest.
 
     Args:
         item_object: [I] object index of each item.
@@ -39,7 +39,7 @@ def schedule(item_object: np.ndarray, max_worlds: int) -> Schedule:
     worlds = np.ones_like(counts)
     for _ in range(min(max_worlds, len(item_object)) - len(objects)):
         worlds[np.argmax(counts / worlds)] += 1
-    num_rounds = np.max(-(-counts // worlds))
+    num_rounds = np.max(-(-counts // worlds))  # rounded up
     columns = []
     fresh = []
     for number, count, width in zip(objects, counts, worlds, strict=True):
@@ -59,11 +59,11 @@ def shared_worlds(
 ) -> np.ndarray | None:
     """Return the object [N] of each world; None: world i holds object i modulo their number.
 
-    Worlds that remain after rounding down go to the largest remainders, so that each object's practice is as near as
-    possible to its share. Training does not end, so there is no longest queue to shorten as in :func:`schedule`.
+    Worlds that remain after rounding down go to the largest remainders, so that each object's number of worlds is as
+    near as possible to its share. :func:`schedule` shortens the longest queue instead; a training has no queues.
 
     Args:
-        names: the objects.
+        names: names of the objects.
         num_envs: N.
         share: ``task.reset.object_share``.
 

@@ -17,7 +17,7 @@ _Batch = TypeVar("_Batch", bound="Tensor | Tensors")
 class Tensors:
     """Base of a dataclass whose tensors share their first dimension.
 
-    Fields of other kinds are unchanged, except that bundles inside move to another device too.
+    Other fields are kept. Only :meth:`to` also changes bundles inside a bundle.
     """
 
     def map(self, function: Callable[..., Tensor], *others: Self) -> Self:
@@ -52,7 +52,7 @@ class Tensors:
 
     @classmethod
     def cat(cls, parts: Sequence[Self], dim: int = 0) -> Self:
-        """Concatenate bundles."""
+        """Concatenate bundles. Fields that are not tensors are those of the first."""
         return parts[0].map(lambda *tensors: torch.cat(tensors, dim=dim), *parts[1:])
 
 
@@ -65,8 +65,8 @@ def where(mask: Tensor, yes: _Batch, no: _Batch) -> _Batch:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Let torch use one thread. For small batches a second one gains nothing and spins while it waits, which slows
-    other processes."""
+    """Let torch use one thread. For small batches a second thread gains nothing, and slows other processes because it
+    spins while it waits."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

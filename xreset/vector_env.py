@@ -1,4 +1,4 @@
-"""The environment as Gymnasium knows it: for learning code that is not this project's."""
+"""The environment with Gymnasium's vector interface, for other learning libraries."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     Observations are a dictionary of the environment's groups, [N, ...] float32 and always finite; actions are [N, J] in
     [-1, 1].
 
-    An episode is truncated when its time is over: a learner bootstraps its value from the last observation, which is
-    the one that the step returns. An episode is terminated when the object leaves the scene or the simulation fails. A
-    world whose simulation fails repeats its last sound observation, gives no reward, and is named by
+    An episode is truncated when its time is over: a learner bootstraps its value from the observation that the step
+    returns, which is the episode's last. An episode is terminated when the object leaves the scene or the simulation
+    fails. A world whose simulation fails repeats its last finite observation, gives no reward, and is marked in
     ``infos["faulty"]``.
 
     The step after an end ignores the world's action, gives no reward, and returns the first observation of the next
@@ -41,7 +41,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": []}  # noqa: RUF012
 
     def __init__(self, env: ManipulationEnv) -> None:
-        """Wrap an environment, which is this object's from then on."""
+        """Wrap an environment and reset it. :meth:`close` closes the environment."""
         self.env = env
         self.num_envs = env.num_envs
         env.reset()
@@ -56,13 +56,17 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Begin an episode in every world; a seed decides everything that is drawn from then on.
+        """Begin an episode in every world.
+
+        Args:
+            seed: seed of all random numbers from now on; None: the generator continues.
+            options: not used.
 
         Raises:
-            XResetError: there are several seeds: worlds share one generator.
+            XResetError: there are several seeds, but all worlds share one generator.
         """
         if isinstance(seed, list):
-            raise XResetError(f"there are {len(seed)} seeds, expected one for all worlds.")
+            raise XResetError(f"Got {len(seed)} seeds. Give one seed: all worlds share it.")
         super().reset(seed=seed)
         if seed is not None:
             self.env.generator.manual_seed(seed)
@@ -87,7 +91,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             XResetError: the actions have another shape, or are not real numbers.
         """
         action = checked_action(self.env, actions)
-        # ignored: the world begins a new episode
+        # A world that begins a new episode ignores its action.
         action = torch.where(self._ended[:, None], 0.0, action)
         observations, reward, done, extras = self.env.step(action, begin=self._ended)
         reward = torch.where(self._ended, 0.0, reward)
@@ -124,7 +128,9 @@ def checked_action(env: ManipulationEnv, actions: Any) -> torch.Tensor:
     Raises:
         XResetError: the actions have another shape, or are not real numbers.
     """
-    values = np.asarray(actions.detach().cpu() if isinstance(actions, torch.Tensor) else actions)
+    if isinstance(actions, torch.Tensor):
+        actions = actions.detach().cpu()
+    values = np.asarray(actions)
     expected = (env.num_envs, env.num_actions)
     if values.shape != expected or values.dtype.kind not in "fiu":
         raise XResetError(
@@ -135,7 +141,7 @@ def checked_action(env: ManipulationEnv, actions: Any) -> torch.Tensor:
 
 
 def with_sound_rows(observations: TensorDict, before: TensorDict) -> TensorDict:
-    """Replace the observations of every world that shows a number that is not finite with its observations before."""
+    """Return observations in which each world with a number that is not finite repeats its row of ``before``."""
     finite = [value.flatten(1).isfinite().all(dim=1) for value in observations.values()]
     sound = torch.stack(finite).all(dim=0)
     return observations.apply(lambda new, old: where(sound, new, old), before)

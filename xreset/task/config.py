@@ -27,16 +27,20 @@ from xreset.errors import XResetError
 from xreset.text import shown
 
 LONGEST_EPISODE = 1e6
-"""Largest length of an episode [s]: the largest time that a file of traces may hold."""
+"""Longest episode [s]: the largest time that a file of traces may hold."""
 
 PositiveRange = Annotated[Range, Rule("factors above 0", lambda x: x[0] > 0)]
 
 
 def _are_own_terms(own: dict[str, float]) -> bool:
-    return isinstance(own, dict) and all(
-        isinstance(name, str) and all(name.partition(":")[::2]) and isfinite(weight)
-        for name, weight in own.items()
-    )
+    return isinstance(own, dict) and all(_is_own_term(*term) for term in own.items())
+
+
+def _is_own_term(name: str, weight: float) -> bool:
+    if not isinstance(name, str):
+        return False
+    module, _, function = name.partition(":")
+    return bool(module) and bool(function) and isfinite(weight)
 
 
 def _are_shares(shares: dict[str, float]) -> bool:
@@ -78,7 +82,7 @@ class ActionConfig(Checked):
 
 @frozen
 class NoiseConfig(Checked):
-    """Standard deviations of the observation noise. The paper says what is noisy, not how much."""
+    """Standard deviations of the observation noise. The paper says which observations are noisy, not by how much."""
 
     joint_pos: NonNegativeFloat = 0.005
     """[rad]"""
@@ -112,8 +116,8 @@ class ObservationConfig(Checked):
     """``quaternion``: a quaternion with w >= 0, which jumps where w is 0. ``matrix``: the first two columns of the
     rotation matrix, which never jump (Zhou et al. 2019, On the Continuity of Rotation Representations). ``to_goal``: in
     place of the orientations of object and goal, the columns of the rotation that leads from one to the other, along
-    the world's axes. It does not depend on the axes in which a mesh was drawn. A policy with cameras observes the
-    rotation from the start of the episode to the goal."""
+    the world's axes. It does not depend on the axes of the mesh file. A policy with cameras observes the rotation
+    from the start of the episode to the goal."""
     cloud_scale: PositiveFinite = 1.0
     """Factor on the clouds' coordinates [1/m]."""
     contact_force_scale: NonNegativeFloat = 0.1
@@ -127,7 +131,7 @@ class ObservationConfig(Checked):
     """What the policy observes besides the points. ``draft``: poses of object and goal, previous action, joints and
     their velocities, palm, fingertips, forces. ``published``: joint positions and their drives' targets between the
     joint limits, the vectors from the fingertips to the nearest of the object's points, and the palm's distance to its
-    nearest one [m]. The published paper does not state the form of this geometry; the number of its inputs fits."""
+    nearest one [m]. The published paper does not state the form of this geometry, but its number of inputs agrees."""
     noise: NoiseConfig = field(default_factory=NoiseConfig)
 
     @property
@@ -155,14 +159,14 @@ class RewardConfig(Checked):
     reach_width: PositiveFloat = 0.1
     """Distance [m] at which 1 - tanh(d / width) falls to 0.24. Not in the paper."""
     reach_near: FiniteFloat = 0.0
-    """Weight of a second reach term with its own width. A width of 0.1 m pays nothing at home, 36 cm away. With 0.4 m
-    the last centimetres, in which fingers wrap around the object, are worth less than moving costs."""
+    """Weight of a second reach term with its own width. One width is too little: 0.1 m pays nothing at home, 36 cm
+    away, and with 0.4 m the last centimetres, in which fingers wrap around the object, pay less than moving costs."""
     reach_near_width: PositiveFloat = 0.05
     """[m]"""
     reach_distance: Literal["best", "present"] = "best"
     """Distance that both reach terms pay for. ``best``: the smallest of the episode (the paper), so that a hand that
-    moves away is still paid. ``present``: the present one (as in Isaac Lab's dexterous lift), so that a hand that has
-    missed stays near and tries again."""
+    moves away is still paid. ``present``: the present distance (as in Isaac Lab's dexterous lift), so that a hand that
+    has missed stays near and tries again."""
     grasp: FiniteFloat = 1.0
     position: FiniteFloat = 4.0
     position_width: PositiveFloat = 0.2
@@ -197,12 +201,12 @@ class RewardConfig(Checked):
     action: FiniteFloat = -0.005
     action_rate: FiniteFloat = -0.005
     action_rate_arm: FiniteFloat | None = None
-    """Weight of the arm's part of ``action_rate``; None: the same. The published paper has -0.05."""
+    """Weight of the arm's part of ``action_rate``; None: the weight ``action_rate``. The published paper has -0.05."""
     out_of_bounds: FiniteFloat = -500.0
     contact: Literal["any", "opposing", "near"] = "any"
     """What opens the gate of ``position``, ``rotation``, ``points`` and ``success``. ``any``: the thumb and another
-    finger press (the paper). ``opposing``: their forces on the object are more than 90 degrees apart, as those of a
-    hand that holds it. ``near``: fingertips and palm are near the object, whether or not they touch it (the published
+    finger press (the paper). ``opposing``: their forces on the object are also more than 90 degrees apart, as in a
+    grasp. ``near``: fingertips and palm are near the object, whether or not they touch it (the published
     paper). ``grasp`` is paid for ``any``."""
     near_tips: PositiveFloat = 0.6
     """Largest sum of the fingertips' distances to the object [m] (the published paper)."""
@@ -211,9 +215,9 @@ class RewardConfig(Checked):
     contact_threshold: NonNegativeFloat = 0.1
     """Force [N] from which a finger counts as in contact. Not in the paper."""
     raw_actions: bool = False
-    """Whether ``action`` and ``action_rate`` penalise actions as the policy gave them, instead of limited to [-1, 1].
-    Beyond the limit noise explores nothing, and only a penalty of the raw action pulls the mean back (as in Isaac Lab's
-    action terms)."""
+    """Whether ``action`` and ``action_rate`` penalise actions before they are limited to [-1, 1]. Beyond the limits
+    exploration noise has no effect, and only a penalty of the raw action pulls the mean back (as in Isaac Lab's action
+    terms)."""
     own: Annotated[
         dict[str, float], Rule("module:function and a finite number", _are_own_terms)
     ] = field(default_factory=dict)
@@ -227,13 +231,13 @@ class TerminationConfig(Checked):
     """When an episode ends. The paper names the out-of-bounds termination, not its bounds."""
 
     episode_seconds: float = 5.0
-    """Time limit [s], from one control step to 1,000,000 s; not a failure: its value is bootstrapped."""
+    """Time limit [s], from one control step to 1,000,000 s. Its end is not a failure: the value is bootstrapped."""
     object_low: FiniteFloat = -0.05
     """The object is out of bounds when its origin is below this height [m]: it has left the table."""
     object_high: FiniteFloat = 1.0
-    """... or above this height [m]."""
+    """The object is out of bounds when its origin is above this height [m]."""
     margin: FiniteFloat = 0.10
-    """... or farther than this outside the table's edges [m]."""
+    """The object is out of bounds when its origin is farther than this outside the table's edges [m]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -263,7 +267,7 @@ class ResetConfig(Checked):
     home_gravity_std: NonNegativeFloat = 1.0
     """Home resets: standard deviation of the object's gravity [m/s^2] around 9.81; 0 is exactly full gravity."""
     home_gravity_clip: NonNegativeFloat = 0.3
-    """Home resets: the gravity fraction stays within 1 +- this. The paper clips and does not say where."""
+    """Home resets: the gravity fraction is clipped to 1 +- this. The paper does not state its limits."""
     spawn_xy: NonNegativeFloat = 0.02
     """Home resets: the object is moved by U(-x, x) in both directions [m]."""
     spawn_yaw: NonNegativeFloat = 0.4363323129985824
@@ -271,7 +275,7 @@ class ResetConfig(Checked):
     home_noise: bool = True
     """Home resets: joints start around home with the robot's ``home_std``."""
     training_xy: NonNegativeFloat | None = None
-    """Replaces ``spawn_xy`` in trainings, so that starts are wider there than in evaluations [m]."""
+    """Replaces ``spawn_xy`` in trainings, so that starts vary more than in evaluations [m]; None: ``spawn_xy``."""
     goal_xy: NonNegativeFloat = 0.0
     """Home resets: the goal is moved by U(-x, x) in both directions [m]."""
     goal_z: NonNegativeFloat = 0.0
@@ -281,19 +285,19 @@ class ResetConfig(Checked):
     object_share: Annotated[
         dict[str, float], Rule("names of objects and numbers above 0", _are_shares)
     ] = field(default_factory=dict)
-    """Trainings: name of an object -> how many times as many worlds it has as an object that is not named. It gives
+    """Trainings: name of an object -> its number of worlds, relative to an object that is not named. More worlds give
     more practice with objects that are learned late."""
     adaptive_share: Share = 0.0
-    """Trainings: share of episodes whose demonstration is drawn in proportion to how often it has failed from home
-    lately, among those of the world's object, in place of evenly. Adaptive sampling as in BeyondMimic (Liao et al.
-    2025), there over the parts of a motion."""
+    """Trainings: share of episodes that draw one of their object's demonstrations in proportion to its recent failures
+    from home. The other episodes draw evenly. BeyondMimic (Liao et al. 2025) samples the parts of a motion in this
+    way."""
 
 
 @frozen
 class TrackerConfig(Checked):
     """Faults of the tracker that observes the object's pose. They move the observed pose and points together.
 
-    All are off by default. How late a pose is: ``observation_latency``.
+    All are off by default. The delay of a pose is ``observation_latency`` of the randomization.
     """
 
     interval: Range = (1.0, 1.0)
@@ -317,11 +321,10 @@ class TrackerConfig(Checked):
 
     @property
     def has_errors(self) -> bool:
-        """Whether poses are wrong."""
-        return (
-            max(self.position_bias, self.rotation_bias, self.position_noise, self.rotation_noise)
-            > 0
-        )
+        """Whether poses have a bias or noise."""
+        bias = (self.position_bias, self.rotation_bias)
+        noise = (self.position_noise, self.rotation_noise)
+        return max(*bias, *noise) > 0
 
     @property
     def skips_steps(self) -> bool:
@@ -344,7 +347,7 @@ class PushConfig(Checked):
     """Largest change of the object's angular velocity [rad/s], about any axis, by a torque."""
     arm_torque: NonNegativeFloat = 0.0
     """Largest torque on each joint of the arm, as a share of the joint's effort limit. The joint's target is moved by
-    torque / stiffness, which a drive feels like the torque itself until it reaches its effort limit."""
+    torque / stiffness, which acts like the torque itself until the drive reaches its effort limit."""
     when: Literal["always", "gated"] = "always"
     """``gated``: the object is pushed only while the gate of the reward is open (``task.reward.contact``). Pushes on
     the arm are never gated."""
@@ -359,8 +362,8 @@ class PushConfig(Checked):
 class RandomizationConfig(Checked):
     """Physical parameters, delays and faults drawn at each reset.
 
-    The first ones are the paper's (Table IX). The others differ between one robot and the next and are off by default;
-    docs/sim-to-sim.md has what each costs a policy between engines.
+    ``friction`` to ``mass_scale`` are the paper's (Table IX). The others differ between one robot and the next and are
+    off by default; docs/sim-to-sim.md has their effect on policies.
     """
 
     enabled: bool = True
@@ -388,18 +391,18 @@ class RandomizationConfig(Checked):
     arm_stiffness: Range = (1.0, 1.0)
     """Range of the factor on the stiffness of the arm's drives, the same for all of them."""
     arm_damping: Range = (1.0, 1.0)
-    """Range of the factor on their damping."""
+    """Range of the factor on the damping of the arm's drives."""
     hand_stiffness: Range = (1.0, 1.0)
     """Range of the factor on the stiffness of the hand's drives."""
     hand_damping: Range = (1.0, 1.0)
-    """Range of the factor on their damping."""
+    """Range of the factor on the damping of the hand's drives."""
     effort: Range = (1.0, 1.0)
     """Range of the factor on the effort limit of every drive."""
     action_latency: Range = (0.0, 0.0)
     """Range of the delay of actions [control steps]. Between whole steps the two targets are interpolated, which is
     their mean over the step; a physics step is 1 / ``substeps`` of a control step."""
     hand_latency: Range | None = None
-    """The same for the hand, drawn apart from the arm's; None: the hand has the arm's delay."""
+    """Range of the delay of the hand's actions [control steps]; None: the hand has the delay of the arm."""
     lost_actions: Annotated[Range, Rule("shares of at most 1", lambda x: x[1] <= 1)] = (0.0, 0.0)
     """Range of the share of actions that do not arrive: the targets stay where they are. Each episode draws one."""
     observation_latency: Range = (0.0, 0.0)
@@ -441,7 +444,7 @@ class RandomizationConfig(Checked):
 
     @property
     def has_faults(self) -> bool:
-        """Whether there is a fault of a real loop: something late, lost, wrong or pushed."""
+        """Whether there are faults of a real control loop: delays, losses, errors of poses, or pushes."""
         late = ("action_latency", "hand_latency", "observation_latency", "proprio_latency")
         tracker = self.tracker
         push = self.push
@@ -481,9 +484,9 @@ class TaskConfig(Checked):
     """Physics steps per control step: control at 60 Hz. Not in the paper."""
     object_frame: Literal["mesh", "center"] = "mesh"
     """Origin of the object in observations, rewards, ends of episodes, perturbed starts and goals, and the draft's
-    metrics. ``mesh``: the origin of the mesh file (the paper), so that it matters where somebody put it. ``center``:
-    the center of volume of the convex hull, the same point of the object whatever the file's origin and axes. With
-    ``observation.rotation="to_goal"`` and ``observation.cloud="paired"`` the file's axes have no effect either."""
+    metrics. ``mesh``: the origin of the mesh file (the paper). ``center``: the center of volume of the convex hull,
+    which does not depend on the file's origin and axes. With ``observation.rotation="to_goal"`` and
+    ``observation.cloud="paired"`` the file's axes have no effect either."""
     distance_points: PositiveInt = 256
     """Surface points per object for fingertip distances."""
 
@@ -501,7 +504,7 @@ class TaskConfig(Checked):
 
     @property
     def picture_shape(self) -> tuple[int, int, int]:
-        """Shape of the last of these groups for one world."""
+        """Shape of the last of :attr:`policy_groups` for one world."""
         return self.vision.view_shape if self.vision.cameras else self.observation.cloud_shape
 
     def __post_init__(self) -> None:
@@ -523,15 +526,15 @@ class TaskConfig(Checked):
 
 
 EVALUATION_TIMESTEP = 1.0 / 240.0
-"""Physics timestep of evaluations [s], whatever a policy was trained at."""
+"""Physics timestep of evaluations [s], also of policies that were trained with another one."""
 
 
 def evaluation_task(task: TaskConfig) -> TaskConfig:
     """Return the task in which a policy is evaluated: from home at full gravity, with nominal physics and no noise.
 
     Spawns stay perturbed by ``spawn_xy`` and ``spawn_yaw``; goals are the demonstrated ones. Physics takes steps of
-    :data:`EVALUATION_TIMESTEP` if a whole number of them makes a control step. Reward terms of the user are left out:
-    no figure rests on them, and their module need not be installed.
+    :data:`EVALUATION_TIMESTEP` if a whole number of them makes a control step. Reward terms of the user are removed: no
+    metric depends on them, and an evaluation does not need their module.
     """
     zero = NoiseConfig(joint_pos=0.0, joint_vel=0.0, object_pos=0.0, object_rot=0.0, cloud=0.0)
     substeps = round(task.control_dt / EVALUATION_TIMESTEP)
@@ -566,5 +569,5 @@ def with_episodes_of(task: TaskConfig, seconds: float) -> TaskConfig:
         return replace(task, termination=replace(task.termination, episode_seconds=seconds))
     except ValueError as error:
         raise XResetError(
-            f"{error}. Without it, episodes last as long as in the policy's training."
+            f"{error}. Give another length, or none to use the length of the policy's training."
         ) from None

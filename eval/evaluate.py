@@ -1,4 +1,4 @@
-"""Evaluation: a policy and demonstrations in, one result for each engine out."""
+"""Evaluate a policy or a baseline on demonstrations, in one or several physics engines."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def evaluate(
 
     Args:
         policy: the policy or its name, as for :func:`~xreset.eval.policy_spec.load_policy`.
-        demos: demonstrations, retargeted motion or a goal set, or a file of them: starts and goals.
+        demos: starts and goals: demonstrations, retargeted motion or a goal set, or a file of one of these.
         engines: name of a physics engine, or several.
         episodes: episodes of each demonstration, each with another perturbation of robot and object.
         seed: seed of the perturbations.
@@ -61,7 +61,7 @@ def evaluate(
 
     Raises:
         PolicyError: the policy is unknown, or the seed chose this checkpoint.
-        XResetError: another process is writing the folder, or a number makes no sense.
+        XResetError: another process is writing the folder, or a number is out of range.
     """
     if episodes < 1:
         raise XResetError(f"episodes is {episodes}, expected at least 1.")
@@ -83,7 +83,7 @@ def evaluate(
     tables = []
     with claim_folder(folder):
         files = [folder / f"{engine.name}.json" for engine in chosen]
-        _tell_what_is_replaced(files, trial.inputs, length)
+        _warn_of_replaced(files, trial.inputs, length)
         for engine in chosen:
             player = policy.start(trial.motion)
             rollouts = roll_out(
@@ -108,15 +108,15 @@ def evaluate(
     return Evaluation(results, tables)
 
 
-def _tell_what_is_replaced(files: Sequence[Path], inputs: dict[str, str], length: float) -> None:
-    """Name the results of other demonstrations, or of episodes of another length [s], that an evaluation will replace,
-    while it can still be stopped."""
+def _warn_of_replaced(files: Sequence[Path], inputs: dict[str, str], length: float) -> None:
+    """Warn, before any episode, of results that the evaluation will replace although they are of other demonstrations
+    or of episodes of another length [s]."""
     of_other_demos = []
     of_other_length = []
     for file in files:
         try:
             known = read_result(file)
-        except XResetError:  # there is none, or it is damaged
+        except XResetError:  # the file does not exist, or is damaged
             continue
         if known.inputs.get("demos") != inputs.get("demos"):
             of_other_demos.append(str(file))

@@ -1,4 +1,4 @@
-"""Films of a policy, from Python: one episode in one world of an environment."""
+"""Film one episode of a policy in one world of an environment."""
 
 from __future__ import annotations
 
@@ -26,35 +26,34 @@ def film(
 
     Args:
         policy: the policy or its name, as for :func:`~xreset.eval.policy_spec.load_policy`.
-        env: where it plays; all worlds are reset first. :meth:`PolicySpec.make_env` makes one.
+        env: environment, such as :meth:`PolicySpec.make_env` makes; all worlds are reset first.
         path: file to write.
-        world: index of the world to show. The goal is drawn as a translucent object. Below are the images of the
-            task's cameras.
-        fps: fewest frames per second; there are more if the control rate is no multiple of them.
-        size: width and height in pixels, both even.
+        world: index of the world to show. The goal is drawn as a translucent object. The images of the task's cameras
+            are below.
+        fps: least number of frames per second; the film has more if the control rate is not a multiple of it.
+        size: width and height [pixels], both even.
 
     Raises:
         PolicyError: the policy is unknown, or cannot play in this environment.
-        XResetError: there is no such world, or the film cannot be encoded.
+        XResetError: the world does not exist, or the film cannot be encoded.
     """
     if not 0 <= world < env.num_envs:
         raise XResetError(f"World {world} does not exist. Choose one from 0 to {env.num_envs - 1}.")
     policy = load_policy(policy)
     env.reset()
     player = policy.begin(env)
-    every = max(1, int(1.0 / (fps * env.backend.scene.control_dt) + 1e-6))
+    control_dt = env.backend.scene.control_dt
+    every = max(1, int(1.0 / (fps * control_dt) + 1e-6))  # control steps from one frame to the next
     frames = [_frame(env, world, size)]
     for step in range(1, env.max_episode_length + 1):
         env.advance(player.act(env.get_observations()))
         if step % every == 0:
             frames.append(_frame(env, world, size))
-    write_whole(
-        Path(path), encode_mp4(np.stack(frames), 1.0 / (every * env.backend.scene.control_dt))
-    )
+    write_whole(Path(path), encode_mp4(np.stack(frames), 1.0 / (every * control_dt)))
 
 
 def _frame(env: ManipulationEnv, world: int, size: tuple[int, int]) -> np.ndarray:
-    """Draw a world, above what the policy's cameras show of it."""
+    """Return an image [H, W, 3] of a world, with the images of the policy's cameras below."""
     picture = env.render(world, size)
     if env.vision is None:
         return picture

@@ -1,4 +1,4 @@
-"""Metrics of both versions of the paper, accumulated at every control step of an episode for N worlds.
+"""Metrics of both versions of the paper, updated at every control step of an episode in N worlds.
 
 The published paper (https://arxiv.org/abs/2609.35715, section V): an episode succeeds if the mean distance of 64
 surface points to the goal pose is at most 2 cm at any time, the start included, whether or not a hand holds the object.
@@ -27,35 +27,33 @@ from xreset.task.rewards import contact_gate, point_distances
 from xreset.tensors import Tensors
 
 STAGE_SCORES = (0.0, 0.33, 0.66, 1.0)
-"""Task progress of: no stage, approach, grasp, reorientation."""
-
-
+"""Task progress if the highest stage is: none, approach, grasp, reorientation."""
 PUBLISHED_DISTANCE = 0.02
-"""Largest mean distance of the surface points to the goal that is a success of the published paper [m]."""
+"""Largest mean distance of the surface points to the goal in a success of the published paper [m]."""
 APPROACH_DISTANCE = 0.05
-"""[m]"""
+"""Largest distance of a fingertip from the object in the stage approach [m]."""
 LIFT = 0.01
-"""[m]"""
+"""Least height of the object above its start in the stage grasp [m]."""
 CONTACT_FORCE = 0.1
-"""Force [N] from which a finger counts as in contact. Not in the paper."""
+"""Force from which a finger counts as in contact [N]. Not in the paper."""
 GOAL_DISTANCE = 0.02
-"""[m]"""
+"""Largest distance of the object's origin from the goal in the stage reorientation [m]."""
 GOAL_ANGLE = 0.2617993877991494
-"""[rad], 15 degrees."""
+"""Largest angle between the object and the goal in this stage [rad]: 15 degrees."""
 
 
 @frozen
 class MetricPoints(Tensors):
-    """Points of N objects, in their frames of the task."""
+    """Points of N objects, each in its object's frame in the task [m]."""
 
     keypoints: Tensor
-    """[N, 4, 3] of the draft's reorientation progress."""
+    """[N, 4, 3] keypoints, for the draft's reorientation progress."""
     surface: Tensor
-    """[N, 64, 3] of the published success."""
+    """[N, 64, 3] points of the surface, for the published success."""
 
     @classmethod
     def of(cls, objects: Sequence[ObjectSpec], frame: Frame = "mesh") -> Self:
-        """Return the points of some objects; ``frame``: ``object_frame`` of the task."""
+        """Return the points of some objects; ``frame``: the task's ``object_frame``."""
 
         def stacked(points: list[np.ndarray]) -> Tensor:
             return torch.as_tensor(np.stack(points), dtype=torch.float32)
@@ -67,7 +65,7 @@ class MetricPoints(Tensors):
 
 
 class EpisodeMetrics:
-    """Metrics of one episode in N worlds, accumulated step by step; a world that has ended no longer changes them."""
+    """Metrics of one episode in N worlds. Steps after a world has ended do not change its metrics."""
 
     def __init__(
         self, start: Reading, goal_pos: Tensor, goal_quat: Tensor, points: MetricPoints
@@ -76,26 +74,27 @@ class EpisodeMetrics:
 
         Args:
             start: reading before the first step.
-            goal_pos: [N, 3] of the object's origin in the task.
-            goal_quat: [N, 4]
-            points: of each world's object.
+            goal_pos: [N, 3] goal of the origin of the object's frame in the task [m].
+            goal_quat: [N, 4] goal of its orientation.
+            points: points of each world's object.
         """
         self._points = points
         self._goal_pos = goal_pos.clone()
         self._goal_quat = goal_quat.clone()
         self._start_height = start.task_state.object_pos[:, 2].clone()
-        self._start_distance = self._distances(start, points.keypoints).amax(dim=-1)
-        self._best = self._start_distance.clone()
-        far = torch.full_like(self._best, torch.inf)
+        self._start_keypoint_distance = self._distances(start, points.keypoints).amax(dim=-1)
+        self._least_keypoint_distance = self._start_keypoint_distance.clone()
+        far = torch.full_like(self._least_keypoint_distance, torch.inf)
         self.least_distance = far.clone()
         """[N] least mean distance of the surface points to the goal [m]."""
         self.final_distance = far.clone()
-        """[N] this distance at the end; of a world that has ended early, before its end [m]."""
+        """[N] mean distance of the surface points to the goal in the last reading, or the last before an early end
+        [m]."""
         self.final_position_error = far.clone()
-        """[N] distance of the object's origin from its place at the goal, likewise [m]."""
+        """[N] distance of the object's origin from the goal in the same reading [m]."""
         self.final_angle = far.clone()
-        """[N] angle between the object and the goal, likewise [rad]."""
-        no = torch.zeros_like(self._best, dtype=torch.bool)
+        """[N] angle between the object and the goal in the same reading [rad]."""
+        no = torch.zeros_like(self._least_keypoint_distance, dtype=torch.bool)
         self.approach = no.clone()
         self.grasp = no.clone()
         self.reorient = no.clone()
@@ -104,36 +103,42 @@ class EpisodeMetrics:
         self.overflow = no.clone()
         self.out_of_bounds = no.clone()
         self._ended = no.clone()
-        self._look(start)
+        self._add(start)
 
     def update(self, reading: Reading, out_of_bounds: Tensor) -> None:
-        """Add the reading after a step; out_of_bounds [N] bool ends a world, and so does a number that is not
-        finite."""
+        """Add the reading after a step.
+
+        Args:
+            reading: the reading; a number that is not finite ends a world.
+            out_of_bounds: [N] bool: whether the object has left the scene, which ends a world, too.
+        """
         self.nonfinite |= reading.health.nonfinite & ~self._ended
         self.overflow |= reading.health.overflow & ~self._ended
         self.out_of_bounds |= out_of_bounds & ~self._ended & ~self.nonfinite
         self._ended |= self.nonfinite | self.out_of_bounds
-        self._look(reading)
+        self._add(reading)
 
     @property
     def published_success(self) -> Tensor:
-        """[N] bool"""
+        """[N] bool: whether the episode is a success of the published paper."""
         return self.least_distance <= PUBLISHED_DISTANCE
 
     @property
     def reorientation_progress(self) -> Tensor:
-        """[N] in [0, 1]"""
-        return (1.0 - self._best / self._start_distance.clamp_min(1e-9)).clamp(0.0, 1.0)
+        """[N] reorientation progress, in [0, 1]."""
+        return (
+            1.0 - self._least_keypoint_distance / self._start_keypoint_distance.clamp_min(1e-9)
+        ).clamp(0.0, 1.0)
 
     @property
     def task_progress(self) -> Tensor:
-        """[N] score of the highest stage."""
+        """[N] score of the highest stage, one of :data:`STAGE_SCORES`."""
         stage = torch.where(
             self.reorient, 3, torch.where(self.grasp, 2, torch.where(self.approach, 1, 0))
         )
         return torch.tensor(STAGE_SCORES, device=stage.device)[stage]
 
-    def _look(self, reading: Reading) -> None:
+    def _add(self, reading: Reading) -> None:
         state = reading.task_state
         live = ~self._ended
         self.approach |= live & (reading.tip_distance.amin(dim=-1) <= APPROACH_DISTANCE)
@@ -146,7 +151,11 @@ class EpisodeMetrics:
         self.reorient = at_goal
         self.reorient_once |= at_goal
         farthest = self._distances(reading, self._points.keypoints).amax(dim=-1)
-        self._best = torch.where(live, torch.minimum(self._best, farthest), self._best)
+        self._least_keypoint_distance = torch.where(
+            live,
+            torch.minimum(self._least_keypoint_distance, farthest),
+            self._least_keypoint_distance,
+        )
         distance = self._distances(reading, self._points.surface).mean(dim=-1)
         self.final_distance = torch.where(live, distance, self.final_distance)
         self.final_position_error = torch.where(live, position_error, self.final_position_error)
@@ -154,7 +163,7 @@ class EpisodeMetrics:
         self.least_distance = torch.minimum(self.least_distance, self.final_distance)
 
     def _distances(self, reading: Reading, points: Tensor) -> Tensor:
-        """[N, P] distances of points [N, P, 3] of the objects from their places at the goal [m]."""
+        """[N, P] distances of the objects' points [N, P, 3] from the same points at the goal [m]."""
         state = reading.task_state
         return point_distances(
             state.object_pos, state.object_quat, self._goal_pos, self._goal_quat, points

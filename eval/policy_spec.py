@@ -1,4 +1,4 @@
-"""What a policy's name means: a run folder, an exported file, a policy that ships with xreset, or a baseline."""
+"""Find the policy that a name means: a run folder, an exported file, a policy that ships with xreset, or a baseline."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ class PolicySpec(Brief):
 
     name: str
     start: Callable[[Retargeted | None], Policy]
-    """Makes a fresh policy, one for each engine. Only the baseline ``ik`` needs motion, and follows it."""
+    """Makes a new policy for each engine. Only the baseline ``ik`` needs motion, and follows it."""
     robot: RobotSpec
     task: TaskConfig
     """The task of the training."""
     folder: Path
-    """Default folder of evaluations; what else is measured of the policy goes next to it."""
+    """Default folder of evaluations; other measurements of the policy go next to it."""
     objects_folder: Path | None = None
     """Folder of object meshes of the training; None: the stand-ins."""
     objects: tuple[str, ...] | None = None
@@ -70,10 +70,9 @@ class PolicySpec(Brief):
         return Path(objects) if objects else self.objects_folder
 
     def objects_of(self, folder: Path | None) -> tuple[str, ...]:
-        """Return the objects to take where nobody names any: those of the training that the folder has.
+        """Return the default objects: those of the training that the folder has, or else all objects of the folder.
 
-        A folder without any of them gives all of its objects. A policy may know shapes that were made for its training
-        only, so the folder need not have all of them.
+        The folder may lack some objects of the training, such as shapes that were made for this training only.
 
         Args:
             folder: folder of meshes; None: the stand-ins.
@@ -116,7 +115,7 @@ class PolicySpec(Brief):
         """Return the policy, ready to act in an environment whose episodes have just begun.
 
         Raises:
-            PolicyError: its observations or actions would mean something else there.
+            PolicyError: observations or actions have another meaning in this environment.
         """
         if self.follows_motion:
             raise PolicyError("The baseline 'ik' follows recorded motion. Use xreset.evaluate.")
@@ -134,7 +133,7 @@ class PolicySpec(Brief):
         """
         if self.file is None:
             raise PolicyError(
-                f"The baseline {self.name!r} is no exported policy. Give a run folder or a .onnx file."
+                f"The baseline {self.name!r} is not an exported policy. Give a run folder or a .onnx file."
             )
         return self.file
 
@@ -153,7 +152,7 @@ class PolicySpec(Brief):
 def load_policy(
     policy: str | Path | PolicySpec, *, robot: str | Path | None = None, seed: int = 0
 ) -> PolicySpec:
-    """Find the policy that a name means. A file or folder comes before a shipped policy of the same name.
+    """Load the policy that a name means. A file or folder comes before a shipped policy of the same name.
 
     Args:
         policy: run folder, exported policy (.onnx), name of a policy that ships with xreset, or one of
@@ -233,7 +232,7 @@ class KinematicRetargeting:
         self._motion = motion
 
     def begin(self, env: ManipulationEnv) -> None:
-        """Lay out the targets [N, steps, J] of the episodes that have just begun."""
+        """Compute the joint targets [N, steps, J] of the episodes that have just begun."""
         motion = self._motion
         dt = env.backend.scene.control_dt
         lead = max(1, round(LEAD_IN / dt))
@@ -243,11 +242,13 @@ class KinematicRetargeting:
         for world, sequence in enumerate(env.sequence.tolist()):
             first, last = motion.frame_offsets[sequence : sequence + 2]
             path = torch.as_tensor(motion.joint_pos[first:last], dtype=torch.float32)
-            position = ((time - lead * dt) * float(motion.fps)).clamp(0, len(path) - 1)
-            low = position.floor().long().clamp_max(max(len(path) - 2, 0))
-            share = (position - low)[:, None]
-            plan = path[low] * (1 - share) + path[(low + 1).clamp_max(len(path) - 1)] * share
-            plans.append(env.joint_target[world].cpu() * (1 - blend) + plan * blend)
+            frame = ((time - lead * dt) * float(motion.fps)).clamp(0, len(path) - 1)
+            before = frame.floor().long().clamp_max(max(len(path) - 2, 0))
+            after = (before + 1).clamp_max(len(path) - 1)
+            share = (frame - before)[:, None]
+            plan = path[before] * (1 - share) + path[after] * share
+            start = env.joint_target[world].cpu()
+            plans.append(start * (1 - blend) + plan * blend)
         self._plan = torch.stack(plans).to(env.device)
         self._step = 0
         self._env = env

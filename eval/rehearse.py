@@ -1,14 +1,15 @@
-"""Rehearse a policy for a robot: the same episodes through the loop of a robot, with one of its faults at a time.
+"""Rehearse a policy for a robot: play the same episodes through a robot's control loop, with one fault at a time.
 
-The loop is that of a real robot (:mod:`xreset.runtime`), the engines are its drivers, and the faults happen between the
-two (:mod:`xreset.live.faults`). The results are curves as in :mod:`xreset.eval.stress`.
+The loop is that of a real robot (:mod:`xreset.runtime`), and an engine takes the place of the robot's driver. Faults
+happen between the loop and the driver (:mod:`xreset.live.faults`). The results are curves as in
+:mod:`xreset.eval.stress`.
 """
 
 from __future__ import annotations
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, field, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,16 @@ from xreset.eval.policy_spec import PolicySpec, load_policy
 from xreset.eval.results import Episode
 from xreset.eval.rollout import Engine, Round, Trial, chosen_engines, load_trial, play_rounds
 from xreset.eval.sensitivity import FAULTS, SWEEPS, Property, amount, chosen, nominal_task
-from xreset.eval.stress import COSTLY, Stress, by_property, draw_curves, plot_size, sweep
+from xreset.eval.stress import (
+    COSTLY,
+    Curve,
+    Point,
+    Stress,
+    by_property,
+    draw_curves,
+    plot_size,
+    sweep,
+)
 from xreset.files import claim_folder, write_json, write_whole
 from xreset.inputs import Data
 from xreset.live.engine import make_controller
@@ -31,7 +41,6 @@ from xreset.runtime import OnnxActor, Runner
 
 SCHEMA = "xreset-rehearsal/1"
 
-
 _PHYSICAL = {prop.name: prop for prop in SWEEPS}
 PROPERTIES: tuple[Property, ...] = (
     *FAULTS,
@@ -39,8 +48,8 @@ PROPERTIES: tuple[Property, ...] = (
     _PHYSICAL["object friction"],
     replace(_PHYSICAL["force gain"], values=(0.0, 0.5, 2.0)),
 )
-"""All that is tried, in the order of the page. The physical properties are those of :mod:`xreset.eval.sensitivity`; a
-force gain of 0 is a robot that does not measure forces."""
+"""Faults and physical properties to try, in the order of the page. A force gain of 0 is a robot that does not measure
+forces."""
 
 
 @frozen
@@ -49,7 +58,7 @@ class Rehearsal(Stress):
 
     schema: str = SCHEMA
     stopped: dict[str, int] = field(default_factory=dict)
-    """Why the runner stopped robots, and how many episodes it stopped for this reason."""
+    """Reason why the runner stopped robots -> number of episodes that it stopped for this reason."""
 
 
 CRITERIA = (
@@ -58,10 +67,10 @@ CRITERIA = (
     ("action-delay", 133, 0.10),
     ("published-faults", 1.0, 0.10),
 )
-"""Fault, its value, and the share of task progress that it may cost at most. The ranges are those of the published
-training; the bounds are this project's choice."""
+"""Fault, its value, and the largest acceptable loss of task progress. The values are those of the published training;
+the losses are this project's choice."""
 LEAST = 0.5
-"""Task progress without faults, below which a policy is not worth a robot."""
+"""Least task progress without faults of a policy that may be tried on a robot."""
 
 
 def rehearse(
@@ -83,7 +92,7 @@ def rehearse(
     """Rehearse a policy for a robot: play the same episodes with each fault in each engine, and write the results.
 
     Args:
-        policy: the policy or its name, as for :func:`~xreset.eval.policy_spec.load_policy`; no baseline.
+        policy: the policy or its name, as for :func:`~xreset.eval.policy_spec.load_policy`; not a baseline.
         demos: demonstrations or retargeted motion, or a file of them: starts and goals. None: two synthetic
             demonstrations of each of the policy's objects.
         engines: name of a physics engine, or several.
@@ -136,7 +145,7 @@ def rehearse(
 
 
 def _setting(trial: Trial, prop: Property | None, value: float) -> tuple[Trial, Faults]:
-    """Return what is played with one property at a value.
+    """Return the trial and the faults of one property at a value; None: nothing is changed.
 
     Raises:
         XResetError: the property cannot have the value.
@@ -184,9 +193,9 @@ def _play(
 
 
 def judge(found: Sequence[Rehearsal]) -> tuple[str, list[str]]:
-    """Return whether the policy may be tried on a robot, in a sentence, and the reasons against it.
+    """Return a sentence that says whether the policy may be tried on a robot, and the reasons against it.
 
-    It may if no engine shows a loss beyond :data:`CRITERIA`, and each at least :data:`LEAST` without faults.
+    It may if every engine shows at least :data:`LEAST` without faults, and no loss beyond :data:`CRITERIA`.
     """
     against = []
     unsure = []
@@ -196,36 +205,40 @@ def judge(found: Sequence[Rehearsal]) -> tuple[str, list[str]]:
             against.append(
                 f"{card.backend}: only {100 * card.task_progress:.0f} % without any fault."
             )
-        curves = {each.property: each for each in card.curves}
-        for option, value, most in CRITERIA:
-            for point in curves[option].points if option in curves else ():
-                if point.value != value:
-                    continue
-                tried += 1
-                if -point.difference <= most:
-                    continue
-                low, high = (-100 * bound for bound in reversed(point.difference_ci95))
-                text = (
-                    f"{card.backend}: {option.replace('-', ' ')} {amount(curves[option].unit, value)} costs "
-                    f"{-100 * point.difference:.1f} points (95 %: {round(low)} to {round(high)}). "
-                    f"At most {100 * most:.0f} are wanted."
-                )
-                reasons = against if low > 100 * most else unsure
-                reasons.append(text)
+        for curve, point, most in _deciding_points(card):
+            tried += 1
+            if -point.difference <= most:
+                continue
+            low, high = (-100 * bound for bound in reversed(point.difference_ci95))
+            text = (
+                f"{card.backend}: {curve.property.replace('-', ' ')} {amount(curve.unit, point.value)} costs "
+                f"{-100 * point.difference:.1f} points (95 %: {round(low)} to {round(high)}). "
+                f"At most {100 * most:.0f} are wanted."
+            )
+            reasons = against if low > 100 * most else unsure
+            reasons.append(text)
     sentence = "Ready for a first, careful trial on a robot."
     if against:
         sentence = "Not ready for a robot."
     elif unsure:
-        sentence = (
-            "Not shown to be ready: some losses are too large, or chance. Play more episodes."
-        )
+        sentence = "Not shown to be ready: some losses may be too large. Play more episodes."
     elif tried < len(CRITERIA) * len(found):
         sentence = "No verdict: not every fault that decides was tried."
     return sentence, [*against, *unsure]
 
 
+def _deciding_points(card: Rehearsal) -> Iterator[tuple[Curve, Point, float]]:
+    """Yield the curve, the point and the largest acceptable loss of each of the :data:`CRITERIA` that was tried."""
+    curves = {curve.property: curve for curve in card.curves}
+    for option, value, most in CRITERIA:
+        if option in curves:
+            for point in curves[option].points:
+                if point.value == value:
+                    yield curves[option], point, most
+
+
 def limits(found: Sequence[Stress]) -> list[tuple[str, list[str]]]:
-    """Return name and, for each engine, the smallest value in words of every fault that costs ten points."""
+    """Return a row for each fault: its name and, for each engine, the smallest value that costs ten points, as text."""
     rows = []
     for name, curves in by_property(found).items():
         rows.append(

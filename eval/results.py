@@ -1,4 +1,4 @@
-"""Results of evaluations: their files, and one table with a row for each episode.
+"""Results of evaluations: their files, and a table with a row for each episode.
 
 ``ENGINE.json`` holds the summary of one engine, ``ENGINE.episodes.json`` its episodes and ``ENGINE.trace.npz`` recorded
 states.
@@ -60,7 +60,7 @@ _STACKED = {
 }
 """Field of :class:`Trace` -> array in the file."""
 _LARGEST_STATE = 1e6
-"""[m, rad] An object may fall for a while and a joint may run away, but not further."""
+"""Largest number in a state [m, rad]. An object may fall and a joint may run away, but not beyond this."""
 
 
 if TYPE_CHECKING:
@@ -91,36 +91,43 @@ class Episode:
     overflow: bool
     """Whether the engine dropped contacts or constraints."""
     published_success: bool | None = None
-    """Whether ``least_distance`` is at most 2 cm: the success of the published paper. None, as in the fields below:
-    recorded by an earlier version, which did not measure it."""
+    """Whether ``least_distance`` is at most 2 cm: the success of the published paper. This field and those below are
+    None in files of an earlier version, which did not measure them."""
     least_distance: NonNegativeFloat | None = None
     """Least mean distance of 64 surface points to the goal over the episode [m]."""
     final_distance: NonNegativeFloat | None = None
-    """This distance at the end; of an episode that ended early, before its end [m]."""
+    """This distance in the last reading, or the last before an early end [m]."""
     final_position_error: NonNegativeFloat | None = None
-    """Distance of the object's origin from its place at the goal, likewise [m]."""
+    """Distance of the object's origin from the goal in the same reading [m]."""
     final_angle: NonNegativeFloat | None = None
-    """Angle between the object and the goal, likewise [rad]."""
+    """Angle between the object and the goal in the same reading [rad]."""
 
 
 @frozen
 class Trace:
-    """States of one episode, for pictures, and the drives' targets, for replays."""
+    """States of one episode, for pictures, and the drives' targets, for replays. Poses are in the world frame, of the
+    object's mesh frame; quaternions are w x y z.
+
+    Shape letters: T states, C control steps, J joints.
+    """
 
     sequence: int
+    """Index of the demonstration."""
     object: str
     goal_pos: np.ndarray
+    """[3] m"""
     goal_quat: np.ndarray
+    """[4]"""
     time: np.ndarray
     """[T] s"""
     joint_pos: np.ndarray
-    """[T, J]"""
+    """[T, J] rad (m)"""
     object_pos: np.ndarray
-    """[T, 3]"""
+    """[T, 3] m"""
     object_quat: np.ndarray
     """[T, 4]"""
     joint_target: np.ndarray | None = None
-    """[C, J] of every control step; None in files of older versions."""
+    """[C, J] rad (m); None in files of older versions."""
 
     @property
     def finite(self) -> np.ndarray:
@@ -132,10 +139,10 @@ class Trace:
         """Return the targets [C, J] of every control step, and the number of control steps from one state to the next.
 
         Args:
-            source: what the trace was read from, for messages.
+            source: name of the trace's file, for messages.
 
         Raises:
-            FileFormatError: the trace has no targets, or fewer than states.
+            FileFormatError: the trace has no targets, or fewer targets than states.
         """
         if self.joint_target is None:
             raise FileFormatError(
@@ -239,7 +246,7 @@ class EvalResult(Checked):
     """Mean of :attr:`Episode.least_distance` [m]."""
 
     episode_seconds: PositiveFinite | None = None
-    """Length of an episode [s]. None: an earlier version did not state it, and played the policy's training's."""
+    """Length of an episode [s]. None: an earlier version did not state it; it was that of the policy's training."""
 
     def meshes(self, given: Path | None) -> Path | None:
         """Return the given folder of meshes, or else that of the evaluation; None: the stand-ins."""
@@ -273,8 +280,8 @@ def episode_table(result: EvalResult, episodes: Sequence[Episode], run: str = ""
     Columns: run, policy, engine, robot and seed, then the fields of :class:`Episode`: sequence
     (index of the demonstration), sequence_name, object, repetition, approach, grasp, reorient (at the goal at the end),
     reorient_once, reorientation_progress, task_progress, out_of_bounds, nonfinite, overflow, published_success,
-    least_distance, final_distance, final_position_error [m], final_angle [rad]. What an earlier version did not measure
-    is NaN.
+    least_distance, final_distance, final_position_error [m], final_angle [rad]. A metric that an earlier version did
+    not measure is NaN.
     """
     about = {
         "run": run or result.policy,
@@ -287,7 +294,7 @@ def episode_table(result: EvalResult, episodes: Sequence[Episode], run: str = ""
 
 
 def _table(episodes: Sequence[Episode], about: dict[str, Any]) -> Table:
-    """Return a row for each episode, with NaN for what was not measured; ``about``: columns before its own."""
+    """Return a row for each episode, after the columns ``about``; a metric that was not measured is NaN."""
     columns = [*about, *(f.name for f in fields(Episode))]
     table: Table = pd.DataFrame([about | asdict(e) for e in episodes], columns=columns)
     return table.astype({name: float for name in table if table[name].isna().any()})
@@ -394,7 +401,7 @@ def read_evaluation(folder: Path, run: str = "") -> Evaluation:
     """Read the results of every engine in an ``eval`` folder, in order of name, and their episodes.
 
     Args:
-        run: what the table of episodes calls the run; default: as the results name the policy.
+        run: name of the run in the table of episodes; default: the policy's name in the results.
 
     Raises:
         FileFormatError: a file is damaged, or the files are of different evaluations.
@@ -469,14 +476,15 @@ def read_traces(folder: Path, backend: str, joint_names: tuple[str, ...]) -> tup
 
 
 def recorded(episodes: Table, engine: str, traces: Sequence[Trace]) -> Table:
-    """Return the episodes that traces show, each with its ``trace``: the first repetition of a demonstration.
+    """Return the episodes that were recorded, each with its ``trace``. An evaluation records the first repetition of
+    each demonstration.
 
     Args:
         episodes: episodes, of any engines.
         traces: recorded episodes of the engine.
 
     Raises:
-        FileFormatError: a trace shows a demonstration of which no episode is known.
+        FileFormatError: a trace shows a demonstration without an episode.
     """
     own = episodes[episodes["engine"] == engine].sort_values("repetition", kind="stable")
     own = own.drop_duplicates("sequence").set_index("sequence", drop=False)
@@ -491,9 +499,9 @@ def recorded(episodes: Table, engine: str, traces: Sequence[Trace]) -> Table:
 
 
 def _trace_problem(arrays: dict[str, np.ndarray]) -> str | None:
-    """Return what no engine can have written, if there is such a thing.
+    """Return why no engine can have written these arrays; None if one can.
 
-    An engine that breaks down writes numbers that are not finite, from some frame after the first on.
+    An engine that breaks down may write numbers that are not finite, but not in the first frame.
     """
     time = arrays["time"]
     if len(time) < 2 or (np.diff(time) <= 0).any():

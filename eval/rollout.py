@@ -1,4 +1,4 @@
-"""Plays a policy in one engine: the same episodes, from the same states, in every engine.
+"""Play a policy in an engine. Every engine plays the same episodes from the same states.
 
 Shape letters: N worlds, J joints.
 """
@@ -53,9 +53,11 @@ class Engine:
     """An engine to play in."""
 
     name: str
+    """Name of its backend."""
     make: MakeBackend
     version: str
     device: str = "cpu"
+    """Device that its worlds run on: cpu or cuda."""
 
     @property
     def slow(self) -> bool:
@@ -64,11 +66,11 @@ class Engine:
 
 
 def engine(name: str, *, device: str = "cpu", **options: Any) -> Engine:
-    """Return an installed backend.
+    """Return the engine of an installed backend.
 
     Args:
         name: name of the backend.
-        device: where the backend runs if it can run there; else it runs on the CPU.
+        device: where the backend runs if it can; else it runs on the CPU.
         options: keywords of the backend.
 
     Raises:
@@ -86,7 +88,7 @@ def engine(name: str, *, device: str = "cpu", **options: Any) -> Engine:
 
 
 def chosen_engines(engines: str | Iterable[str | Engine], device: str) -> list[Engine]:
-    """Return engines, given by name or already loaded, each once."""
+    """Return engines, given by name or as such, each once."""
     names = (engines,) if isinstance(engines, str) else engines
     return [
         each if isinstance(each, Engine) else engine(each, device=device)
@@ -113,7 +115,7 @@ class Trial:
     objects_folder: Path | None = None
     """Folder of the object meshes; None: the stand-ins."""
     inputs: dict[str, str] = field(default_factory=dict)
-    """SHA-256 of the files of policy and data, by what they are."""
+    """SHA-256 of the policy and of the demos, or resets for a bank; and ``starts: settled`` if objects came to rest."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -126,7 +128,7 @@ class Trial:
 
     @contextmanager
     def worlds(self, engine: Engine, object_index: Tensor) -> Iterator[ManipulationEnv]:
-        """Open an environment in an engine; object_index: [N] index of the object in each world."""
+        """Make an environment in an engine; object_index: [N] index of the object in each world."""
         # The scene's friction is a placeholder, because the environment sets friction itself.
         scene = make_scene(self.robot, self.objects, self.task)
         with engine.make(scene, len(object_index), object_index) as backend:
@@ -147,8 +149,8 @@ def load_trial(
 
     Args:
         policy: the policy, whose robot and task are taken.
-        source: demonstrations, motion or a goal set, or a file of them; or a loaded bank. The starts of a goal set are
-            played as they are, because they are perturbed already; only the robot's joints are.
+        source: demonstrations, motion or a goal set, or a file of one of these; or a loaded bank. Objects of a goal set
+            start as stated, because these starts are perturbed already; only the robot's joints are perturbed.
         objects: folder of object meshes; default: the folder of the policy's training.
         seed: seed of the perturbations.
         num_envs: worlds that run at the same time.
@@ -191,7 +193,7 @@ def load_trial(
 
 
 def nominal_scene(robot: RobotSpec, objects: tuple[ObjectSpec, ...], task: TaskConfig) -> SceneSpec:
-    """Return the scene of a task with the pair friction of an evaluation, which draws none at random."""
+    """Return the scene of a task with the pair friction of an evaluation, where friction is not drawn at random."""
     scene = make_scene(robot, objects, task)
     nominal = replace(task.randomization, enabled=False)
     tip, link, table = sample_friction(1, nominal, torch.Generator())[0].tolist()
@@ -209,9 +211,9 @@ def roll_out(
     """Play demonstrations ``repetitions`` times each.
 
     Args:
-        policy: what acts.
-        engine: where it acts.
-        trial: what it plays.
+        policy: the policy.
+        engine: the engine.
+        trial: what is played.
         repetitions: episodes of each demonstration, each with another perturbation of robot and object.
         progress: called with (control steps done, control steps in all).
     """
@@ -259,8 +261,9 @@ class Round:
     repetition: np.ndarray
     """[N] number of the perturbation of its start."""
     fresh: list[int]
-    """Worlds whose episode was not played before; the others only keep busy."""
+    """Worlds that play a new episode; the others repeat one, because all worlds of an engine step together."""
     number: int
+    """Index of the round."""
     total: int
     """Number of rounds."""
 
@@ -313,7 +316,16 @@ def play_rounds(
 def episode_starts(
     distribution: ResetDistribution, sequence: np.ndarray, repetition: np.ndarray, seed: int
 ) -> Reset:
-    """Return one start for each world. Each has random numbers of its own, whatever the engine and number of worlds."""
+    """Return one start for each world, on the CPU.
+
+    A start depends only on the seed, the demonstration and the repetition, not on the engine and the number of worlds.
+
+    Args:
+        distribution: distribution of starts.
+        sequence: [N] index of each world's demonstration.
+        repetition: [N] number of the perturbation.
+        seed: seed of the perturbations.
+    """
     parts = []
     for s, r in zip(sequence.tolist(), repetition.tolist(), strict=True):
         state = np.random.SeedSequence([seed, s, r]).generate_state(1)
@@ -323,7 +335,7 @@ def episode_starts(
 
 
 def _episode(played: Round, world: int, bank: ResetBank) -> Episode:
-    """Return the result of one world: the metrics that have the names of fields of an episode."""
+    """Return the result of one world's episode. Its fields have the names of the metrics."""
     values: dict[str, Any] = {}
     for f in fields(Episode):
         if hasattr(played.metrics, f.name):
@@ -348,16 +360,16 @@ def _traces(
         env: the environment.
         worlds: indices of the worlds.
         every: control steps from one state to the next.
-        states: states of these worlds.
-        targets: their drive targets in each control step.
+        states: states of these worlds, one for each time.
+        targets: drive targets of these worlds, for each control step.
     """
     scene = env.backend.scene
     goal_pos = env.goal_pos[worlds].cpu().numpy()
     goal_quat = env.goal_quat[worlds].cpu().numpy()
-    of_all = State.cat([state[None] for state in states])
+    paths = State.cat([state[None] for state in states])
     joint_target = torch.stack(targets).numpy()
     for i, world in enumerate(worlds):
-        path = of_all[:, i]
+        path = paths[:, i]
         yield Trace(
             sequence=int(env.sequence[world]),
             object=scene.objects[int(env.backend.object_index[world])].name,

@@ -37,9 +37,9 @@ def candidates_in(folder: Path, most: int) -> list[Path]:
         most: largest number, spread evenly over all; the newest is among them.
 
     Raises:
-        RunError: there is none.
+        RunError: the folder has no checkpoint.
     """
-    latest_checkpoint(folder)  # refuses a folder without any
+    latest_checkpoint(folder)  # refuses a folder without checkpoints
     found = checkpoints(folder)
     picks = np.linspace(len(found) - 1, 0, min(most, len(found))).round().astype(int)
     return [found[i] for i in picks]
@@ -57,8 +57,8 @@ def select(
 ) -> Choice:
     """Play the checkpoints and write ``RUN/choice.json``; the run's ``policy.onnx`` becomes the chosen one.
 
-    The newest is played in all engines. Another is given up as soon as its score in one engine is below the best so
-    far, because its worst score can only become lower. The engine in which the best does worst comes first.
+    The newest checkpoint is played in all engines. Another is given up as soon as one of its scores is not above the
+    lowest score of the best checkpoint so far. The engine in which the best checkpoint scores lowest is played first.
 
     Args:
         folder: run folder.
@@ -68,9 +68,8 @@ def select(
         progress: called with (candidate, engine, task progress).
 
     Raises:
-        RunError: there is nothing to choose from.
+        RunError: the folder has no checkpoint.
     """
-    found = candidates_in(folder, most)
     run = read_run(folder)
     meshes = setting.objects or run.objects
     played: list[Candidate] = []
@@ -78,7 +77,7 @@ def select(
     order = engines
     with tempfile.TemporaryDirectory(prefix="xreset-") as scratch:
         chosen = Path(scratch)
-        for path in found:
+        for path in candidates_in(folder, most):
             file = Path(scratch) / f"{path.stem}.onnx"
             export_checkpoint(folder, run, path, file)
             policy = load_policy(file, robot=setting.robot)
@@ -86,16 +85,16 @@ def select(
                 policy, demos, objects=meshes, seed=setting.seed, num_envs=setting.num_envs
             )
             scores: dict[str, float] = {}
-            bar = best.worst if best else -1.0
+            score_to_beat = best.worst if best else -1.0
             for engine in order:
                 rollouts = roll_out(policy.start(None), engine, trial, repetitions=episodes)
                 scores[engine.name] = float(np.mean([e.task_progress for e in rollouts.episodes]))
                 progress(path.name, engine.name, scores[engine.name])
-                if scores[engine.name] <= bar:  # the newer of two equal ones wins
+                if scores[engine.name] <= score_to_beat:  # the newer of two equal ones wins
                     break
             candidate = Candidate(name=path.name, task_progress=scores)
             played.append(candidate)
-            if candidate.worst > bar:
+            if candidate.worst > score_to_beat:
                 best = candidate
                 chosen = file
                 order = sorted(engines, key=lambda engine: scores[engine.name])

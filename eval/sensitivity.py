@@ -1,4 +1,4 @@
-"""How a change of the world changes a policy's score, and the physical properties that are changed.
+"""The physical properties of the world that can be changed, and the effect of a change on a policy's score.
 
 Sweeps (:mod:`xreset.eval.stress`), rehearsals (:mod:`xreset.eval.rehearse`) and the attribution to differences of
 engines (:mod:`xreset.eval.engines.attribution`) share both.
@@ -25,7 +25,7 @@ from xreset.task.config import RandomizationConfig, TaskConfig
 
 @frozen
 class Effect:
-    """Task progress of some episodes, and its difference to the same episodes as they are; intervals of 95 %."""
+    """Task progress of some episodes, and its difference to the same episodes unchanged; intervals of 95 %."""
 
     task_progress: float
     ci95: Interval
@@ -37,7 +37,7 @@ class Effect:
 
     @classmethod
     def of(cls, episodes: Sequence[Episode], nominal: Sequence[Episode]) -> Effect:
-        """Compare episodes one by one; whole demonstrations are drawn for the intervals."""
+        """Compare episodes one by one. The intervals are bootstraps over demonstrations."""
         score = np.array([e.task_progress for e in episodes])
         difference = score - np.array([e.task_progress for e in nominal])
         groups = np.array([e.sequence for e in episodes])
@@ -51,7 +51,7 @@ class Effect:
 
     @property
     def is_certain(self) -> bool:
-        """Whether the interval of the difference leaves out zero."""
+        """Whether the interval of the difference excludes zero."""
         low, high = self.difference_ci95
         return low > 0 or high < 0
 
@@ -86,7 +86,7 @@ class Property:
         return self.task_field or self.name.replace(" ", "_")
 
     def shown(self, value: float) -> str:
-        """Return a measured number in the unit in which it reads best."""
+        """Return a measured number as text, in ``shown_unit``."""
         scale = 1e3 if self.shown_unit in ("mm", "ms") else 1.0
         return f"{value * scale:.3g} {self.shown_unit}".rstrip()
 
@@ -139,7 +139,7 @@ COMPARED = {p.name: p for p in PROPERTIES if p.measured}
 
 
 def chosen(wanted: Sequence[str], properties: Sequence[Property] = SWEEPS) -> tuple[Property, ...]:
-    """Return some of the properties, by ``NAME`` or ``NAME=VALUE,VALUE...``; all if nothing is wanted.
+    """Return the wanted properties, given as ``NAME`` or ``NAME=VALUE,VALUE...``; all if ``wanted`` is empty.
 
     Raises:
         XResetError: a property is unknown, or a value is impossible.
@@ -162,7 +162,7 @@ def _values(text: str, values: str, prop: Property) -> tuple[float, ...]:
         numbers = sorted({float(v) for v in values.split(",")} - {prop.nominal})
     except ValueError:
         raise XResetError(
-            f"{text!r} holds values that are no numbers. Write {prop.option}=VALUE,VALUE..."
+            f"{text!r} holds values that are not numbers. Write {prop.option}=VALUE,VALUE..."
         ) from None
     if not numbers or not all(0 <= v < math.inf for v in numbers):
         raise XResetError(
@@ -172,7 +172,7 @@ def _values(text: str, values: str, prop: Property) -> tuple[float, ...]:
 
 
 def nominal_task(task: TaskConfig) -> TaskConfig:
-    """Return an evaluation's task in which :meth:`Property.set_in` can set properties: nothing is drawn at random."""
+    """Return the task without random draws, so that :meth:`Property.set_in` can set its properties."""
     r = task.randomization
     middle = sum(r.friction) / 2
     still = RandomizationConfig(

@@ -65,16 +65,18 @@ def crossed_bootstrap_ci95(values: np.ndarray, runs: np.ndarray, groups: np.ndar
 
 
 def difference_ci95(one: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> Interval:
-    """Return the 95 % interval of the mean of ``other`` minus that of ``one``: crossed bootstraps with the same
-    draws of demonstrations, and each with its own draws of trainings. Episodes are drawn in place of demonstrations
-    where there is one training and one demonstration.
+    """Return the 95 % interval of the mean of ``other`` minus the mean of ``one``.
+
+    Both are crossed bootstraps, with the same draws of demonstrations and different draws of trainings. With one
+    training and one demonstration, episodes are drawn instead.
 
     Args:
         one: values, runs and groups, as of :func:`crossed_bootstrap_ci95`.
         other: the same of trainings that were evaluated on the same demonstrations.
     """
     rng = np.random.default_rng(0)
-    first, second = (_means(each, rng, np.random.default_rng(1)) for each in (one, other))
+    first = _means(one, rng, np.random.default_rng(1))
+    second = _means(other, rng, np.random.default_rng(1))
     return _interval(second - first)
 
 
@@ -83,7 +85,8 @@ def _means(
     run_rng: np.random.Generator,
     group_rng: np.random.Generator,
 ) -> np.ndarray:
-    """Return the mean of values in each draw of runs and groups; of episodes, where there is one of both [draws]."""
+    """Return the mean of the values in each draw of runs and groups [DRAWS]. With one run and one group, episodes are
+    drawn instead."""
     values, runs, groups = crossed
     run_names, run = np.unique(runs, return_inverse=True)
     group_names, group = np.unique(groups, return_inverse=True)
@@ -94,12 +97,15 @@ def _means(
     np.add.at(counts, (run, group), 1)
     if (counts == 0).any():
         raise ValueError("every training needs episodes of every demonstration")
-    run_times, group_times = (
-        rng.multinomial(n, np.full(n, 1 / n), size=DRAWS)
-        for rng, n in zip((run_rng, group_rng), counts.shape, strict=True)
-    )
+    run_times = _times_drawn(run_rng, len(run_names))
+    group_times = _times_drawn(group_rng, len(group_names))
     means = ((run_times @ sums) * group_times).sum(axis=1)
     return means / ((run_times @ counts) * group_times).sum(axis=1)
+
+
+def _times_drawn(rng: np.random.Generator, count: int) -> np.ndarray:
+    """[DRAWS, count] how often each of some items is drawn, in draws of as many items with replacement."""
+    return rng.multinomial(count, np.full(count, 1 / count), size=DRAWS)
 
 
 def _interval(means: np.ndarray) -> Interval:

@@ -1,7 +1,7 @@
-"""How robust a policy is: the same episodes while one property of the world at a time is swept over a range.
+"""Measure how robust a policy is: play the same episodes while one property of the world is swept over a range.
 
-A property is a field of the task's randomization, held at one value: what a training may draw at random and what is
-tried here are one list. Everything else is as in an evaluation.
+A property is a field of the task's randomization that is held at one value, so every property that a training can draw
+at random can be swept. Everything else is as in an evaluation.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 SCHEMA = "xreset-stress/1"
 COSTLY = 0.10
-"""Loss of task progress that limits the range in which a policy counts as robust."""
+"""Loss of task progress that ends the range in which a policy counts as robust."""
 
 
 @frozen
@@ -53,12 +53,12 @@ class Curve:
     points: tuple[Point, ...]
     """In ascending order of the value, the nominal one included."""
     lower: float | None
-    """Value below the nominal one at which ten points are lost, interpolated; None: no tried value loses as much."""
+    """Value below the nominal one at which ten points are lost, interpolated; None: no tried value loses them."""
     upper: float | None
     """The same above the nominal value."""
 
     def costs(self) -> str:
-        """Return the values nearest to the nominal one that cost ten points, in words."""
+        """Return the values nearest to the nominal one that cost ten points, as text."""
         values = [value for value in (self.lower, self.upper) if value is not None]
         if not values:
             return "none that was tried"
@@ -114,9 +114,9 @@ def stress(
     keeps its results.
 
     Args:
-        policy: what is tried.
+        policy: the policy.
         trial: what is played, from :func:`~xreset.eval.rollout.load_trial`.
-        engines: where it is tried.
+        engines: the engines.
         out: folder for the results.
         sweeps: properties and values.
         repetitions: episodes of each demonstration, the same for every value.
@@ -159,16 +159,16 @@ def sweep(
     out: Path,
     progress: NamedProgress,
 ) -> Card:
-    """Play episodes with each value of the properties that an engine can set, and write the card before the first and
-    after each property.
+    """Play episodes with each value of the properties that an engine can set. Write the results (the card) before the
+    first property and after each.
 
     Args:
         card_type: type of the card.
-        policy: named in the card.
-        trial: named in the card.
+        policy: policy that the card names.
+        trial: trial whose robot, seed and inputs the card states.
         engine: where episodes are played.
         properties: properties and values.
-        play: plays the episodes in an engine with one property at a value; with None: with nothing changed.
+        play: plays the episodes in an engine with one property at a value; None instead of a property: unchanged.
         out: folder of the card.
         progress: called with (engine, runs done, runs in all).
     """
@@ -207,7 +207,7 @@ def sweep(
 
 
 def read_stress(folder: Path, policy: str | None = None) -> tuple[Stress, ...]:
-    """Read the results ``FOLDER/ENGINE.json``, in order of name; none if there is no such folder.
+    """Read the results ``FOLDER/ENGINE.json``, in order of name; none if the folder does not exist.
 
     Args:
         folder: folder that ``xreset stress`` wrote.
@@ -226,7 +226,7 @@ def read_stress(folder: Path, policy: str | None = None) -> tuple[Stress, ...]:
 def curve(
     prop: Property, nominal: Sequence[Episode], swept: dict[float, Sequence[Episode]]
 ) -> Curve:
-    """Compare the episodes of each value with the nominal ones."""
+    """Return the curve of a property: the episodes of each value, compared with the nominal ones."""
     every = {prop.nominal: nominal} | swept
     points = tuple(Point(value=v, **vars(Effect.of(every[v], nominal))) for v in sorted(every))
     return Curve(
@@ -240,7 +240,8 @@ def curve(
 
 
 def _limit(outwards: Sequence[Point]) -> float | None:
-    """Return the value at which ten points are lost on the way outwards, between two values that were tried."""
+    """Return the value at which ten points are lost, interpolated between two of the points, which are ordered from the
+    nominal value outwards; None if they lose less."""
     for near, far in pairwise(outwards):
         if far.difference <= -COSTLY < near.difference:
             share = (near.difference + COSTLY) / (near.difference - far.difference)
@@ -271,7 +272,9 @@ _COLUMNS = 4
 def plot_size(found: Sequence[Stress]) -> tuple[float, float]:
     """Return the size of the drawing of :func:`draw_curves` [inches]."""
     count = len(by_property(found))
-    return max(2.9 * min(_COLUMNS, count), 5.0), 0.8 + 2.3 * math.ceil(count / _COLUMNS)
+    width = max(2.9 * min(_COLUMNS, count), 5.0)
+    height = 0.8 + 2.3 * math.ceil(count / _COLUMNS)
+    return width, height
 
 
 def draw_curves(figure: Figure, found: Sequence[Stress]) -> None:

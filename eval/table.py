@@ -55,16 +55,16 @@ VERSIONS = (
     "Published success and distance (mean of 64 surface points, least over the episode) are the published paper's. "
     "The others are its draft's."
 )
-"""Says of every table which version of the paper a figure refers to."""
+"""Note under every table: the version of the paper that each metric is from."""
 OPEN_LOOP = (
     "Task progress of ik near 33 % means that the hand gets to the object and does not grasp it. It does not rank "
     "hands: `xreset robots judge` does."
 )
-"""Says how to read the figure of the baseline ``ik``."""
+"""Note under tables with the baseline ``ik``: how to read its task progress."""
 
 
 def caption(policies: Iterable[str]) -> str:
-    """Return how to read figures of these policies."""
+    """Return the notes under a table of these policies."""
     return f"{VERSIONS} {OPEN_LOOP}" if "ik" in policies else VERSIONS
 
 
@@ -76,15 +76,15 @@ def success_text(share: float | None) -> str:
 def estimate_text(metric: str, mean: float, low: float, high: float) -> str:
     """Return an estimate and its interval as percent, such as ``93.2 (88-98)``, or cm, such as ``0.6 (0.5-0.8)``; ``-``
     if it is not known."""
+    if isnan(mean):
+        return "-"
     digits = 1 if metric == "least_distance" else 0
-    return (
-        "-" if isnan(mean) else f"{100 * mean:.1f} ({100 * low:.{digits}f}-{100 * high:.{digits}f})"
-    )
+    return f"{100 * mean:.1f} ({100 * low:.{digits}f}-{100 * high:.{digits}f})"
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure of an evaluation: a row of the terminal's table, a column of the report's table."""
+    """A number of an evaluation: a row of the terminal's table, a column of the report's table."""
 
     text: Callable[[EvalResult], str]
     interval: Callable[[EvalResult], Interval | None] | None = None

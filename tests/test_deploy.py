@@ -240,7 +240,7 @@ class ContractTest(InFolder):
 
     def test_a_baseline_and_cameras_are_refused(self):
         self.assertIn(
-            "The baseline 'zero' is no exported policy",
+            "The baseline 'zero' is not an exported policy",
             refused("export", "deploy", "zero", "--robot", "openarm", "--out", f"{self.folder}/x"),
         )
         seeing = replace(self.task, vision=VisionConfig(cameras=(CameraConfig(),)))

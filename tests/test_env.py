@@ -589,7 +589,7 @@ class ObjectFrameTest(WithEnv, InFolder):
             metrics.final_distance,
             metrics.final_position_error,
             metrics.final_angle,
-            metrics._best,
+            metrics._least_keypoint_distance,
         ]
 
     def test_the_frame_of_a_mesh_does_not_matter(self):

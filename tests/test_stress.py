@@ -53,7 +53,7 @@ class StressedTest(TestCase):
     def test_refusals(self):
         for text, words in (
             ("colour", "Unknown property 'colour'. Choose from: object-friction, "),
-            ("effort=much", "holds values that are no numbers. Write effort=VALUE"),
+            ("effort=much", "holds values that are not numbers. Write effort=VALUE"),
             ("effort=-1", "expected finite values of at least 0, other than the nominal 1"),
             ("effort=nan", "expected finite values"),
         ):

@@ -1,4 +1,4 @@
-"""Studies: a file names trainings, evaluations and tables; ``xreset study FILE`` does what is missing of them.
+"""Studies: a file names trainings, evaluations and tables; ``xreset study FILE`` makes those that are missing.
 
     file.py      what a study file may hold
     plan.py      the runs of a study, and its steps: reset banks, trainings, evaluations
@@ -7,6 +7,6 @@
     tables.py    tables of what the runs reach, next to the paper's figures (paper.py, paper.toml)
     report.py    the page: tables, and what makes them unfair or incomplete
 
-A run is a folder that a command of ``xreset`` writes. Its files say what is done, so the same
-command continues a study.
+A run is a folder that a command of ``xreset`` writes. Its files show which steps are done, so the same command
+continues a study.
 """

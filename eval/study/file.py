@@ -62,8 +62,8 @@ Robot = Annotated[
 
 
 def _options(*allowed: str) -> Rule:
-    """Return the rule for options of a command that a study may give. None names a file: a study writes only into
-    ``--out``."""
+    """Return the rule that a study gives only certain options of a command. No such option names a file, because a
+    study writes only into ``--out``."""
 
     def holds(texts: tuple[str, ...]) -> bool:
         given = [text.replace("_", "-") for text in texts if re.match(r"-\D", text)]
@@ -98,8 +98,8 @@ class Data(Checked):
     ] = ()
     """Further options of ``xreset resets``."""
     goals: Annotated[tuple[str, ...], _options("--family", "--draw.")] | None = None
-    """Options of ``xreset goals``, which may be none: the data are starts and goals of the meshes, without
-    demonstrations. Trainings with them begin every episode at home."""
+    """Options of ``xreset goals``; may be empty. The data are then starts and goals of the meshes, without
+    demonstrations, and trainings begin every episode at home."""
 
     @property
     def states(self) -> Literal["resets", "goals"]:
@@ -116,7 +116,7 @@ class Evaluation(Checked):
     objects: tuple[str, ...] = ()
     """Only these objects, where a run has them; empty: all objects of the run."""
     unseen: bool = False
-    """Whether the objects are played by every run, also by those that have not trained with them."""
+    """Whether every run plays the objects, also a run that was not trained with them."""
     per_object: PositiveInt | None = None
     """Largest number of demonstrations of each object; None: all (of the run's own data: as many as in training)."""
     episodes: PositiveInt = 5
@@ -156,8 +156,8 @@ class Runs(Checked):
     """Environment steps of all worlds. With minutes and steps, the first limit ends the training; with neither, the
     recipe's iterations."""
     weights: str | None = None
-    """An earlier run of the study, from whose networks this one begins: of the same seed, and of the same object if
-    both train alone."""
+    """An earlier run of the study, whose networks this run begins with: the training of the same seed, and of the same
+    object if both train alone."""
     backend: str = "mujoco-warp"
     device: Literal["cuda", "cpu"] = "cuda"
     num_envs: PositiveInt = 4096
@@ -196,7 +196,11 @@ class Study:
 
 
 def study_path(name: str) -> Path:
-    """Return the file of a study, by path or, if the study ships with xreset, by name."""
+    """Return the file of a study, given its path or the name of a study that ships with xreset.
+
+    Raises:
+        RunError: the file does not exist, and no such study ships with xreset.
+    """
     path = Path(name)
     shipped = {file.stem: file for file in sorted(SHIPPED.glob("*.toml"))}
     if os.path.isfile(path):
@@ -221,10 +225,10 @@ def read_study(path: Path) -> Study:
     runs = raw.get("runs", {})
     if not all(isinstance(table, dict) for table in (defaults, data, runs)):
         raise FileFormatError(f"{path}: defaults, data and runs must be tables.")
-    of_data = {"resets": defaults.pop("resets", ())}
+    data_defaults = {"resets": defaults.pop("resets", ())}
     base = {"runs": dict.fromkeys(runs, defaults)}
     if data:
-        base["data"] = dict.fromkeys(data, of_data)
+        base["data"] = dict.fromkeys(data, data_defaults)
     study = from_dict(Study, merged(base, raw), str(path))
     try:
         _check_names(study)
@@ -234,7 +238,7 @@ def read_study(path: Path) -> Study:
 
 
 def _check_names(study: Study) -> None:
-    """Raise ``ValueError`` if something is named that a study does not define, or cannot be the name of a folder."""
+    """Raise ``ValueError`` if the study uses a name that it does not define, or that cannot be the name of a folder."""
     for name in (*study.data, *study.runs, *study.evaluations):
         if not _NAME.fullmatch(name):
             raise ValueError(
@@ -269,7 +273,7 @@ def _check_names(study: Study) -> None:
 
 
 def _expect(where: str, known: Collection[str], *names: str | None) -> None:
-    """Refuse names that are given and not known."""
+    """Raise ``ValueError`` if one of the names, where it is not None, is unknown."""
     for name in names:
         if name is not None and name not in known:
             listing = ", ".join(map(repr, known)) or "none"

@@ -12,7 +12,7 @@ from xreset.checks import from_dict, frozen
 
 FILE = Path(__file__).parent / "paper.toml"
 ALL = "all"
-"""In place of an object: the mean over all of them."""
+"""Name that stands for the mean over all objects."""
 
 TRAINING = "10,000 iterations of 16 steps in 4,096 worlds on four GPUs (Table VIII), an unstated number of seeds"
 """How long the paper's policies were trained, in the paper's words."""
@@ -22,7 +22,7 @@ Axis = Literal["object", "method", "metric"]
 
 @frozen
 class PaperTable:
-    """A table of the paper; or, without figures, one of a study.
+    """A table of the paper; or a table of a study, which has no figures.
 
     Objects have their official names, metrics those of :data:`xreset.eval.table.METRICS`.
     """
@@ -35,7 +35,8 @@ class PaperTable:
     values: dict[str, tuple[float, ...]]
     """Row -> a figure for each column, percent."""
     standard_error: dict[str, tuple[float, ...]] = field(default_factory=dict)
-    """Row -> standard errors, for the rows that have them; 1.96 of it on either side is the 95 % interval."""
+    """Row -> a standard error for each column, percent, for the rows that have them. The 95 % interval is 1.96 standard
+    errors on either side."""
     object: str = ALL
     """The object of all figures, where objects are not an axis."""
     metric: str = "task_progress"

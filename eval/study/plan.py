@@ -40,10 +40,10 @@ class Plan:
     played: dict[tuple[str, str], set[str]] = field(default_factory=dict)
     """Run of the study and evaluation -> the objects that it is evaluated with."""
     parts: dict[Path, object] = field(default_factory=dict)
-    """Folder -> the part of the study that writes it."""
+    """Folder -> the part of the study that writes into it."""
 
     def own(self, folder: Path, part: object) -> None:
-        """Note which part of the study writes a folder; refuse a second one."""
+        """Note which part of the study writes into a folder; refuse a second part with ``RunError``."""
         if self.parts.setdefault(folder, part) != part:
             raise RunError(
                 f"Two parts of the study would both write {folder}. Give one of them another name."
@@ -94,14 +94,14 @@ class Plan:
         self.add(Step(name, "train", run.folder, partial(train_todo, run), needs, gpu))
 
     def evaluate(self, run: Run, key: str) -> None:
-        """Add the step of an evaluation, if the run has objects of it and an engine is installed."""
+        """Add the step of an evaluation, if the run can play some of its objects and an engine is installed."""
         spec = self.study.evaluations[key]
         data = spec.data or run.spec.data
         known = self.objects[data]
         wanted = canonical_names(spec.objects, known) or known
         objects = [name for name in wanted if spec.unseen or name in run.objects]
         has_goals = self.study.data[data].goals is not None
-        if has_goals and run.spec.policy == "ik":  # there is no motion to follow
+        if has_goals and run.spec.policy == "ik":  # goals have no motion to follow
             return
         engines = [engine for engine in spec.engines if engine not in self.unavailable]
         if not objects:
@@ -136,7 +136,8 @@ def make_plan(study: Study, name: str, *, given: Path, out: Path, only: Iterable
         RunError: a run is unknown, or the folder of a run or an evaluation has another configuration.
         FileFormatError: a file of the data is missing or damaged, or a change of the recipe names an unknown key.
         ObjectError: the data do not have an object.
-        XResetError: a run cannot share its worlds as it wants, or an evaluation's episodes are too short.
+        XResetError: a run cannot share its worlds among its objects as configured, or an evaluation's episodes are too
+            short.
     """
     unknown = sorted(set(only) - set(study.runs))
     if unknown:
@@ -207,9 +208,10 @@ def _runs(plan: Plan, group: str) -> Iterator[Run]:
     if spec.steps is not None:
         iterations = round(spec.steps / (spec.num_envs * config.ppo.horizon))
         config = replace(config, iterations=max(1, iterations))
-    for chosen in [(name,) for name in objects] if spec.alone else [objects]:
+    trained_together = [(name,) for name in objects] if spec.alone else [objects]
+    for chosen in trained_together:
         share = config.task.reset.object_share
-        shared_worlds(chosen, spec.num_envs, share)  # refuses an object that is not there
+        shared_worlds(chosen, spec.num_envs, share)  # refuses an unknown object
         for seed in spec.seeds:
             yield Run(
                 group=group,

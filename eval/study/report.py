@@ -1,4 +1,4 @@
-"""A study's page: its tables next to the paper's figures, what makes them unfair, and what is missing."""
+"""Write a study's page: tables next to the paper's figures, and notes on unfair comparisons and missing results."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def write_page(plan: Plan, out: Path) -> tuple[Path, list[str]]:
     """Write ``study.md``, its tables as pictures and CSV, and comparisons of the trainings of each object.
 
     Returns:
-        The page, and what makes its figures incomparable, doubtful or incomplete.
+        The page, and its notes: what makes figures incomparable, doubtful or incomplete.
     """
     tables = [fill(plan, table) for table in plan.study.tables]
     metrics: list[TableSpec] = []
@@ -83,7 +83,7 @@ def _incomplete(plan: Plan) -> Iterator[str]:
 
 
 def _unfair(plan: Plan, table: FilledTable) -> Iterator[str]:
-    """Yield what makes a table's figures incomparable, with one another and with the paper's."""
+    """Yield why a table's figures are not comparable, with one another or with the paper's."""
     by_objects = defaultdict(list)
     for training in chain(*table.trainings.values()):
         by_objects[frozenset(training.episodes["object"])].append(training)
@@ -127,7 +127,7 @@ def _clocks(plan: Plan) -> dict[str, list[Lift]]:
 
 
 def _compare(plan: Plan, out: Path) -> list[str]:
-    """Compare the trainings that have the same objects, in a folder for each, and return the names of the folders."""
+    """Compare the trainings of the same objects, one folder for each set of objects; return the folders' names."""
     by_objects = defaultdict(list)
     for run in plan.runs:
         has_curves = any(run.folder.glob("events.out.tfevents.*"))

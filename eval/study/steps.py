@@ -1,4 +1,4 @@
-"""What is left to do of a study, and the commands of ``xreset`` that do it.
+"""The steps of a study that are left to do, and the commands of ``xreset`` that do them.
 
     OUT/data/SUBSET/demos.npz               demonstrations of a subset of the data, and its definition (subset.json)
     OUT/data/SUBSET/ROBOT/resets.npz        reset bank, made by xreset retarget and xreset resets
@@ -35,7 +35,7 @@ from xreset.text import shown
 
 SUBSET_SCHEMA = "xreset-subset/1"
 _ENOUGH = 0.97
-"""Share of the minutes from which a training counts as done: to start again would cost more than what is left."""
+"""Share of the minutes from which a training counts as done, because a new start would take longer than the rest."""
 
 Todo = tuple[str, list[list[str]]]
 """What is left to do, in words, and the commands to run next, in order; both are empty if nothing is left."""
@@ -131,7 +131,7 @@ class Subset:
         return file.is_file() and (self.data.goals is not None or self.demos.is_file())
 
     def make(self) -> None:
-        """Write the archive, unless it exists; a command writes goals."""
+        """Write the archive, unless it exists. Goals have no archive; ``xreset goals`` writes the goal set."""
         if self.is_made():
             return
         data = self.data
@@ -196,7 +196,7 @@ def _without_length(config: TrainConfig) -> dict[str, Any]:
 
 
 def _refuse_other(problem: str, what: str, found: dict[str, Any], wanted: dict[str, Any]) -> None:
-    """Refuse what has the study's name if it is not what the study describes.
+    """Refuse files whose description differs from the study's.
 
     Raises:
         RunError: an entry differs; the message names it.
@@ -215,7 +215,7 @@ def _refuse_other(problem: str, what: str, found: dict[str, Any], wanted: dict[s
 
 
 def bank_todo(subset: Subset, robot: str) -> Todo:
-    """Return what is left to do from demonstrations to the reset bank of a robot, or to its goal set."""
+    """Return what is left to do for a robot's reset bank, or for its goal set."""
     folder = subset.robot(robot)
     motion = folder / "retargeted.npz"
     bank = subset.bank(robot)
@@ -234,7 +234,7 @@ def bank_todo(subset: Subset, robot: str) -> Todo:
 
 
 def train_todo(run: Run) -> Todo:
-    """Return what is left to do of a training, from the beginning or from its newest checkpoint."""
+    """Return what is left to do of a training: start it, or continue from its newest checkpoint."""
     spec = run.spec
     now = read_lift(run.folder)
     assert run.config is not None
@@ -269,7 +269,7 @@ def train_todo(run: Run) -> Todo:
 
 
 def eval_todo(run: Run, folder: Path, spec: Evaluation, subset: Subset, engines: list[str]) -> Todo:
-    """Return in which engines an evaluation is missing: there is no result, or one of other episodes or files."""
+    """Return the engines in which an evaluation has no result, or a result of other episodes or files."""
     policy = run.spec.policy
     demos = subset.starts(run.spec.robot)
     if policy == "ik":

@@ -1,4 +1,4 @@
-"""A study's tables: what its runs reach, by engine, next to the paper's figures."""
+"""A study's tables: the results of its runs in each engine, next to the paper's figures."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ class FilledTable:
     trainings: dict[str, list[Training]]
     """Run of the study -> its evaluated trainings."""
     episodes: dict[str, Table]
-    """Run of the study -> all episodes; a seed has one name, also where it trained each object alone."""
+    """Run of the study -> all episodes. Trainings of one seed have the same name, also if each trained one object."""
     paper: bool
-    """Whether it has figures of the paper."""
+    """Whether the table has figures of the paper."""
 
     def as_rows(self, engine: str) -> Rows:
         """Return the table of one engine."""
@@ -49,7 +49,7 @@ class FilledTable:
         return [(self.unit, *text.columns), *text.itertuples(name=None)]
 
     def counts(self, engine: str) -> str:
-        """Return how much of each run was evaluated in an engine."""
+        """Return the numbers of episodes, demonstrations and seeds of each run in an engine, as text."""
         texts = []
         for name, every in self.episodes.items():
             own = every[every["engine"] == engine] if len(every) else every
@@ -96,7 +96,7 @@ def fill(plan: Plan, table: TableSpec) -> FilledTable:
     engines = {}
     for engine in sorted(set().union(*(t.results for t in chain(*trainings.values())))):
         cells = [cell(engine, row, column) for row, column in product(rows, columns)]
-        if cells:  # none, if no planned run plays what the results are of
+        if cells:  # empty if no planned run plays the objects of the results
             found = pd.DataFrame(cells, columns=_CELL)
             engines[engine] = found.set_index(["row", "column"]).unstack(sort=False)
     return FilledTable(
@@ -110,7 +110,7 @@ def fill(plan: Plan, table: TableSpec) -> FilledTable:
 
 
 def _layout(table: TableSpec, known: list[str]) -> tuple[PaperTable, dict[str, list[str]]]:
-    """Return rows and columns of a table, those of the paper or its own; and for each axis what the study has.
+    """Return the layout of a table, the paper's or its own, and for each axis the names that the study has.
 
     Args:
         known: objects that are played.
@@ -149,8 +149,8 @@ def trainings_of(plan: Plan, group: str, evaluation: str) -> list[Training]:
 
 
 def _episodes(trainings: Sequence[Training], alone: bool) -> Table:
-    """Join the episodes of trainings. Where objects were trained alone, the demonstrations of all of them are numbered
-    together."""
+    """Join the episodes of trainings. If each object was trained alone, demonstrations get new numbers over all
+    objects."""
     every: Table = pd.concat([pd.DataFrame(), *(t.episodes for t in trainings)], ignore_index=True)
     if alone and len(every):
         every["sequence"] = every.groupby(["object", "sequence_name"]).ngroup()

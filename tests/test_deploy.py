@@ -145,7 +145,7 @@ class ContractTest(InFolder):
             with self.subTest(words), self.assertRaisesRegex(LiveError, words):
                 load_controller(self.out)
         file.write_text(original[:100])
-        self.assertRaisesRegex(LiveError, "is no exported policy", load_controller, self.out)
+        self.assertRaisesRegex(LiveError, "is not an exported policy", load_controller, self.out)
 
     @skipUnless(find_spec("websockets"), "websockets is not installed")
     def test_served_it_acts_alike_and_a_lost_server_stops_the_robot(self):

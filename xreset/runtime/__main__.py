@@ -15,7 +15,7 @@ _STEPS = 1000
 
 
 def main() -> None:
-    """Take steps of a robot at home, and print their time and the memory of the process."""
+    """Take steps with a robot at home, and print the time of a step and the memory of the process."""
     try:
         controller = load_controller(Path(__file__).parents[1])
     except LiveError as error:

@@ -18,7 +18,7 @@ POLICY = "policy.onnx"
 
 
 class LiveError(XResetError):  # pyright: ignore
-    """A deployed policy cannot be read, or a robot cannot go on."""
+    """A deployed policy cannot be read, or cannot act."""
 
 
 _KNOWN = {
@@ -28,11 +28,11 @@ _KNOWN = {
     },
     "action": {"arm_step", "arm_lead", "hand", "hand_step", "hand_lead", "hand_zero"},
 }  # fmt: skip
-"""Options of observations and actions that this package carries out."""
+"""Options of observations and actions that this package supports."""
 
 
 def check_contract(contract: dict[str, Any], source: str) -> None:
-    """Refuse, with ``LiveError``, a contract of another schema or with options that this package does not carry out."""
+    """Raise ``LiveError`` for a contract of another schema or with options that this package does not support."""
     problem = ""
     for part, known in _KNOWN.items():
         if unknown := sorted(set(contract.get(part, {})) - known):
@@ -49,7 +49,7 @@ def read_contract(folder: str | Path) -> dict[str, Any]:
     """Read the contract of a folder that ``xreset export deploy`` wrote.
 
     Raises:
-        LiveError: the folder is incomplete, of another version, or its policy is another file than the contract names.
+        LiveError: the folder is incomplete or of another version, or its policy's hash is not the contract's.
     """
     folder = Path(folder)
     path = folder / CONTRACT
@@ -58,7 +58,7 @@ def read_contract(folder: str | Path) -> dict[str, Any]:
         content = (folder / POLICY).read_bytes()
     except (OSError, ValueError) as error:
         raise LiveError(
-            f"{folder} is no exported policy ({error}). Make one: xreset export deploy"
+            f"{folder} is not an exported policy ({error}). Make one: xreset export deploy"
         ) from error
     check_contract(contract, str(path))
     found = hashlib.sha256(content).hexdigest()

@@ -1,4 +1,4 @@
-"""From a reading to joint targets, as the environment does it.
+"""Joint targets from readings, computed as in the environment.
 
 Shape letters: N robots that act in step (one, except in rehearsals), J joints, E fingertips, P points.
 """
@@ -17,10 +17,10 @@ from .rotations import multiply, rotate
 
 
 class OnnxActor:
-    """The network of an exported policy with its recurrent state. It runs on one core, so that its time is even."""
+    """The network of an exported policy with its recurrent state. It uses one core, so that its time varies little."""
 
     def __init__(self, content: bytes) -> None:
-        """Load the content of a policy's ONNX file."""
+        """Load the content of a policy's ONNX file; ``LiveError`` if it cannot be read."""
         import onnxruntime
 
         options = onnxruntime.SessionOptions()
@@ -38,7 +38,7 @@ class OnnxActor:
         self._state: list[Array] = []
 
     def begin(self, robots: int) -> None:
-        """Forget everything."""
+        """Zero the recurrent state of that many robots."""
         self._state = [
             np.zeros((1, robots, given.shape[2]), np.float32) for given in self._inputs[2:]
         ]
@@ -47,8 +47,9 @@ class OnnxActor:
         """[N, J] actions for observations [N, F] and clouds [N, H, P, K]."""
         values = (flat, cloud, *self._state)
         feed = {given.name: value for given, value in zip(self._inputs, values, strict=True)}
-        actions, *self._state = map(np.asarray, self._session.run(None, feed))
-        return np.clip(actions, -1.0, 1.0)
+        outputs = [np.asarray(value) for value in self._session.run(None, feed)]
+        self._state = outputs[1:]
+        return np.clip(outputs[0], -1.0, 1.0)
 
 
 class Controller:
@@ -70,7 +71,7 @@ class Controller:
 
         Args:
             contract: what the policy expects.
-            actor: its network.
+            actor: the policy's network; None: a subclass acts itself.
         """
         self.contract = contract
         self.dt: float = contract["control_dt"]
@@ -109,6 +110,9 @@ class Controller:
             target: [N, J] or [J] present joint targets of the robot.
             center: [N, 3] or [3] origin that the object has for the policy, in its frame; see :meth:`center`. Needed
                 where the contract's ``object_frame`` is ``center``.
+
+        Raises:
+            LiveError: the number of points is not the contract's, or ``center`` is missing.
         """
         self.target = np.atleast_2d(np.asarray(target, dtype=np.float32))
         expected = self.contract["observation"]["cloud_points"]
@@ -143,11 +147,11 @@ class Controller:
         return pos if self._center is None else pos + rotate(quat, self._center)
 
     def points(self, name: str) -> Array:
-        """[P, 3] points of an object of the contract."""
+        """[P, 3] points of an object, in its frame; ``LiveError`` if the contract has no such object."""
         return self._of_object(name, "points")
 
     def center(self, name: str) -> Array:
-        """[3] center of an object of the contract, in its frame."""
+        """[3] center of an object, in its frame; ``LiveError`` if the contract has no such object."""
         return self._of_object(name, "center")
 
     def _of_object(self, name: str, entry: str) -> Array:
@@ -191,7 +195,7 @@ class Controller:
             force = np.zeros_like(links.tip_pos)
         terms = [
             *poses,
-            np.ones((count, 1), np.float32),  # the share of its weight that the object has
+            np.ones((count, 1), np.float32),  # gravity fraction: the object has its full weight
             self.action,
             self._scaled(reading.joint_pos),
             np.float32(o["joint_vel_scale"]) * reading.joint_vel,
@@ -232,11 +236,12 @@ class Controller:
         return rotate(quat[:, None], np.eye(3, dtype=np.float32)[:2]).reshape(len(quat), 6)
 
     def _world_points(self, reading: Reading) -> Array:
-        """[N, P, 3] the object's points."""
+        """[N, P, 3] the object's points in the world frame."""
         origin = self._origin(reading.object_pos, reading.object_quat)
         return rotate(reading.object_quat[:, None], self._points) + origin[:, None]
 
     def _observe_cloud(self, reading: Reading) -> Array:
+        """[N, H, P, K] the cloud's history with this reading, or the paired points of this reading."""
         o = self.contract["observation"]
         scale = np.float32(o["cloud_scale"])
         cloud = self._world_points(reading)
@@ -250,6 +255,7 @@ class Controller:
         return self._cloud
 
     def _targets(self, action: Array, joint_pos: Array) -> Array:
+        """[N, J] as :meth:`xreset.task.actions.ActionSpace.targets`."""
         m = self._mapping
         new = self.target + m["step"] * action
         new = np.clip(new, joint_pos - m["lead"], joint_pos + m["lead"])

@@ -1,4 +1,4 @@
-"""The interface of a robot: what is read, and what is sent.
+"""The interface of a robot: readings and joint targets.
 
 Shape letters: N robots that act in step (one, except in rehearsals), J joints, E fingertips. Units are SI and radians,
 quaternions (w, x, y, z), the frame is the world's: z up, the table's top at z = 0, the robot's base as the contract
@@ -21,15 +21,15 @@ class Links:
     """Palm and fingertips in the world frame."""
 
     palm_pos: Array
-    """[N, 3]"""
+    """[N, 3] m"""
     palm_quat: Array
     """[N, 4]"""
     palm_linvel: Array
-    """[N, 3]"""
+    """[N, 3] m/s"""
     palm_angvel: Array
-    """[N, 3]"""
+    """[N, 3] rad/s"""
     tip_pos: Array
-    """[N, E, 3]"""
+    """[N, E, 3] m"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +47,7 @@ class Reading:
     object_quat: Array
     """[N, 4]"""
     object_time: float | Array
-    """[N] when the pose was true: the camera's time, not the time of its arrival [s]."""
+    """[N] when the image was taken, not when the pose arrived, on the driver's clock [s]."""
     tip_force: Array | None = None
     """[N, E, 3] force of each fingertip on the object, world frame [N]; None: the robot does not measure it."""
     links: Links | None = None
@@ -68,9 +68,8 @@ class Reading:
                     f"{name} is None. Without a new value, give the last one and its time"
                 )
             if value is not None:
-                rows[name] = np.asarray(
-                    value, dtype=np.float64 if name.endswith("_time") else np.float32
-                )[None]
+                dtype = np.float64 if name.endswith("_time") else np.float32
+                rows[name] = np.asarray(value, dtype=dtype)[None]
         return Reading(**rows)
 
 
@@ -94,5 +93,5 @@ class Driver(ABC):
         return time.monotonic()
 
     def wait_until(self, moment: float) -> None:
-        """Return at that time on the clock."""
+        """Wait until that time on the clock of :meth:`now` [s]."""
         time.sleep(max(0.0, moment - self.now()))

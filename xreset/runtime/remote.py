@@ -1,4 +1,4 @@
-"""A policy that another computer runs: the client of ``xreset serve``. It needs websockets."""
+"""The client of ``xreset serve``. It needs websockets."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class RemoteController(Controller):
             timeout: longest time to wait for an answer [s].
 
         Raises:
-            LiveError: there is no such server, or it is of another version.
+            LiveError: no policy is served there, or the server has another version.
         """
         from websockets.sync.client import connect
 
@@ -40,7 +40,8 @@ class RemoteController(Controller):
         hello = self._receive()
         if hello.get("schema") != LIVE_SCHEMA:
             raise LiveError(
-                f"{url} speaks {str(hello.get('schema'))[:60]!r}, this runtime speaks {LIVE_SCHEMA!r}."
+                f"{url} has schema {str(hello.get('schema'))[:60]!r}, this runtime reads {LIVE_SCHEMA!r}. "
+                "Use the same version of xreset on both computers."
             )
         check_contract(hello["contract"], url)
         super().__init__(hello["contract"])
@@ -53,7 +54,7 @@ class RemoteController(Controller):
         target: Array,
         center: Array | None = None,
     ) -> None:
-        """Begin an episode of one robot."""
+        """Begin an episode of one robot; arguments as for :meth:`Controller.begin`, without the axis N."""
         self.target = np.atleast_2d(np.asarray(target, dtype=np.float32))
         values = {
             "points": object_points,
@@ -74,8 +75,8 @@ class RemoteController(Controller):
         for name in ("joint_pos", "joint_vel", "object_pos", "object_quat", "tip_force"):
             rows = getattr(reading, name)
             values[name] = None if rows is None else rows[0]
-        found = self._ask({"step": _lists(values)})
-        self.target = np.array([found["target"]], dtype=np.float32)
+        answer = self._ask({"step": _lists(values)})
+        self.target = np.array([answer["target"]], dtype=np.float32)
         return self.target
 
     def close(self) -> None:
@@ -102,5 +103,5 @@ class RemoteController(Controller):
 
 
 def _lists(values: dict[str, Any]) -> dict[str, Any]:
-    """Return arrays as lists, which JSON can hold; None is left out."""
+    """Return arrays as lists, for JSON, without entries that are None."""
     return {name: np.asarray(value).tolist() for name, value in values.items() if value is not None}

@@ -23,7 +23,7 @@ class Limits:
     joint_margin: float = 0.1
     """How far a joint may be beyond its limit [rad, m]."""
     late: float = 0.5
-    """Longest time that one control step may take, and that the clock may stand still [s]."""
+    """How late a control step may end, and how long the clock may stand still [s]."""
     slow_down: float = 0.25
     """Time in which targets come to rest [s]."""
 
@@ -37,7 +37,7 @@ class Outcome:
     steps: int = 0
     """Control steps that the policy took."""
     missed: int = 0
-    """Control steps that were left out, because the one before took too long."""
+    """Control steps that were skipped because the step before took too long."""
     refused: Array = field(default_factory=lambda: np.zeros(0, dtype=int))
     """[N] poses that were not used: not finite, or with a time stamp that ran backwards."""
 
@@ -92,9 +92,15 @@ class Runner:
             self.driver.stop()
         return self.outcome
 
+    @property
+    def _running(self) -> Array:
+        """[N] bool: robots that have not been stopped."""
+        return np.isinf(self._stopped_at)
+
     def _loop(self, end: float) -> None:
-        due = seen = self.driver.now()  # seen: when the last step ended
-        still = 0.0  # time for which the clock has stood still
+        due = self.driver.now()
+        last_end = due
+        stalled = 0.0  # time for which the clock has stood still
         while self.driver.now() < min(end, self._stopped_at.max() + self.limits.slow_down):
             if not self._tick():
                 return
@@ -103,14 +109,14 @@ class Runner:
             late = now - due
             if late > 0:
                 self.outcome.missed += 1
-                due += late  # the rate is kept from here on; no step is made up for
+                due += late  # skipped steps are not made up for
             if late > self.limits.late:
                 self._stop_all(f"A control step took {late:.2f} s too long.")
             self.driver.wait_until(due)
-            ended = self.driver.now()
-            still = 0.0 if ended > seen else still + (due - now)
-            seen = ended
-            if still > self.limits.late:
+            step_end = self.driver.now()
+            stalled = 0.0 if step_end > last_end else stalled + (due - now)
+            last_end = step_end
+            if stalled > self.limits.late:
                 self._stop_all(
                     "The driver's clock stands still. Override now() and wait_until() together."
                 )
@@ -120,16 +126,11 @@ class Runner:
         """Read, act and send once; return whether the driver still takes targets."""
         now = self.driver.now()
         target = self._sent
-        if np.isinf(self._stopped_at).any():
+        if self._running.any():
             target = self._act(now)
-        going = np.isinf(self._stopped_at)[:, None]
-        self._move = np.where(going, target - self._sent, self._move)
-        # A target that moves by steps slows down; one that jumps, as an absolute hand target does, stays.
-        share = np.clip(1.0 - (now - self._stopped_at) / self.limits.slow_down, 0.0, 1.0)[:, None]
-        step = self.controller.step_size
-        slowed = self._sent + (share * np.clip(self._move, -step, step)).astype(np.float32)
-        slowed = np.clip(slowed, self.controller.lower, self.controller.upper)
-        self._sent = np.where(going, target, slowed)
+        running = self._running[:, None]
+        self._move = np.where(running, target - self._sent, self._move)
+        self._sent = np.where(running, target, self._slowed(now))
         try:
             self.driver.send(self._sent[0] if self._one_robot else self._sent)
         except Exception as error:
@@ -137,8 +138,18 @@ class Runner:
             return False
         return True
 
+    def _slowed(self, now: float) -> Array:
+        """[N, J] targets of robots that come to rest: the last move, shrinking to 0 within ``slow_down``.
+
+        Joints with absolute targets stay: their targets jump, and ``step_size`` is 0.
+        """
+        share = np.clip(1.0 - (now - self._stopped_at) / self.limits.slow_down, 0.0, 1.0)[:, None]
+        step = self.controller.step_size
+        slowed = self._sent + (share * np.clip(self._move, -step, step)).astype(np.float32)
+        return np.clip(slowed, self.controller.lower, self.controller.upper)
+
     def _act(self, now: float) -> Array:
-        """Return the policy's targets; where it cannot act, the last ones."""
+        """[N, J] targets of the policy, or the last ones for robots for which it cannot act."""
         try:
             newest = self.driver.read()
             self._one_robot = np.ndim(newest.joint_pos) == 1
@@ -148,9 +159,9 @@ class Runner:
             self._stop_all(f"The driver could not read: {error}.")
             return self._sent
         self._check(reading, now)
-        going = np.isinf(self._stopped_at)
-        has_come = np.isfinite(reading.object_time) & np.isfinite(reading.joint_time)
-        if not going.any() or not has_come[going].all():
+        running = self._running
+        has_data = np.isfinite(reading.object_time) & np.isfinite(reading.joint_time)
+        if not running.any() or not has_data[running].all():
             return self._sent
         try:
             target = self.controller.step(reading)
@@ -159,12 +170,12 @@ class Runner:
             return self._sent
         self.outcome.steps += 1
         sound = np.isfinite(target).all(axis=1)
-        for robot in np.flatnonzero(going & ~sound):
+        for robot in np.flatnonzero(running & ~sound):
             self._stop(int(robot), "The policy gave numbers that are not finite.")
         return np.where(sound[:, None], target, self._sent)
 
     def _merged(self, new: Reading, now: float) -> Reading:
-        """Return what is sound of a reading, and the last sound values of the rest."""
+        """Return a reading with the last sound values in place of its faulty ones."""
         joints_sound = _finite(new.joint_pos) & _finite(new.joint_vel)
         if new.tip_force is not None:
             joints_sound &= _finite(new.tip_force.reshape(len(joints_sound), -1))
@@ -174,17 +185,14 @@ class Runner:
         if old is None:
             nothing = np.full(len(joints_sound), -np.inf)
             old = replace(new, joint_time=nothing, object_time=nothing)
-        usable = np.ones_like(pose_sound)
-        for fine, problem in (
-            (
-                new.object_time <= now + 0.1,
-                "newer ones have time stamps ahead of the robot's clock",
-            ),
-            (new.object_time >= old.object_time, "the time stamps of newer ones run backwards"),
-            (pose_sound, "newer ones hold numbers that are not finite, or no unit quaternion"),
-        ):
-            usable &= fine
-            self._refusals[~fine] = problem
+        not_ahead = new.object_time <= now + 0.1
+        in_order = new.object_time >= old.object_time
+        self._refusals[~not_ahead] = "newer ones have time stamps ahead of the robot's clock"
+        self._refusals[~in_order] = "the time stamps of newer ones run backwards"
+        self._refusals[~pose_sound] = (
+            "newer ones hold numbers that are not finite, or no unit quaternion"
+        )
+        usable = not_ahead & in_order & pose_sound
         self.outcome.refused += ~usable
         self._refusals[usable & (new.object_time > old.object_time)] = _NO_NEWER
         kept = {}
@@ -196,25 +204,20 @@ class Runner:
     def _check(self, reading: Reading, now: float) -> None:
         """Stop the robots whose data are too old, or whose joints are beyond a limit."""
         limits = self.limits
-        for time_of, limit, text in (
-            (
-                reading.object_time,
-                limits.pose_age,
-                "The pose of the object is {age:.2f} s old: {refusal}.",
-            ),
-            (
-                reading.joint_time,
-                limits.joint_age,
-                "The joint positions are {age:.2f} s old, or not finite.",
-            ),
-        ):
-            age = now - np.maximum(time_of, self._begun)
-            for robot in np.flatnonzero(age > limit):
-                self._stop(int(robot), text.format(age=age[robot], refusal=self._refusals[robot]))
-        below = reading.joint_pos < self.controller.lower - limits.joint_margin
-        above = reading.joint_pos > self.controller.upper + limits.joint_margin
+        lower = self.controller.lower
+        upper = self.controller.upper
+        age = now - np.maximum(reading.object_time, self._begun)
+        for robot in np.flatnonzero(age > limits.pose_age):
+            refusal = self._refusals[robot]
+            self._stop(int(robot), f"The pose of the object is {age[robot]:.2f} s old: {refusal}.")
+        age = now - np.maximum(reading.joint_time, self._begun)
+        for robot in np.flatnonzero(age > limits.joint_age):
+            reason = f"The joint positions are {age[robot]:.2f} s old, or not finite."
+            self._stop(int(robot), reason)
+        below = reading.joint_pos < lower - limits.joint_margin
+        above = reading.joint_pos > upper + limits.joint_margin
         for robot, joint in np.argwhere(below | above):
-            bound = (self.controller.lower if below[robot, joint] else self.controller.upper)[joint]
+            bound = lower[joint] if below[robot, joint] else upper[joint]
             name = self.controller.contract["joints"][joint]["name"]
             found = reading.joint_pos[robot, joint]
             self._stop(int(robot), f"Joint {name} is at {found:.2f}, beyond its limit {bound:.2f}.")

@@ -218,7 +218,7 @@ class ContractTest(InFolder):
         }
         for message, words in (
             ('{"a":' * 5000, "is not JSON"),
-            ("[]", "one of the keys begin, goal, step"),
+            ("[]", "exactly one key. Choose from: begin, goal, step"),
             ({"step": {}}, "no episode yet. Send begin first"),
             ({"begin": 3}, "begin is not an object"),
             ({"begin": begin | {"object": ["hat"]}}, "no object"),
@@ -244,7 +244,7 @@ class ContractTest(InFolder):
             refused("export", "deploy", "zero", "--robot", "openarm", "--out", f"{self.folder}/x"),
         )
         seeing = replace(self.task, vision=VisionConfig(cameras=(CameraConfig(),)))
-        with self.assertRaisesRegex(PolicyError, "looks through cameras"):
+        with self.assertRaisesRegex(PolicyError, "The policy has cameras"):
             deploy_contract(toy_grasp.robot(), seeing, [])
 
 

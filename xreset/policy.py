@@ -1,7 +1,7 @@
 """Policies for evaluation: objects that turn observations into actions, world by world.
 
-A trained policy is an ONNX file that carries its own contract: robot, joint order, observation layout, action mapping
-and control rate. Running one needs neither warp nor rsl-rl.
+A trained policy is an ONNX file with its contract: robot, joint order, observation layout, action mapping and control
+rate. Running a policy needs neither warp nor rsl-rl.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def check_contract(source: str, contract: Contract, robot: RobotSpec, task: Task
 
 
 def _meaning(contract: Contract) -> dict[str, dict[str, Any]]:
-    """Return what gives observations and actions their meaning: entries by name, by part of the contract."""
+    """Return the entries that define what observations and actions mean, by part of the contract and name."""
     task = asdict(contract.task)
     del task["observation"]["noise"]
     widths = {}
@@ -131,7 +131,7 @@ def observation_shapes(contract: Contract, source: str) -> dict[str, tuple[int, 
     """Return the shape of one world's observations, by group, in the order of ``TaskConfig.policy_groups``.
 
     Raises:
-        PolicyError: the contract, which is of ``source``, does not state the width of a group.
+        PolicyError: the contract, which comes from ``source``, does not state the width of a group.
     """
     *flat, picture = contract.task.policy_groups
     if missing := [name for name in flat if name not in contract.observation_layout]:
@@ -168,7 +168,7 @@ class OnnxPolicy:
             import onnxruntime
         options = onnxruntime.SessionOptions()
         options.log_severity_level = 3
-        # Its threads would otherwise spin between the steps, which costs as much as the physics.
+        # Otherwise onnxruntime's threads spin between the steps, which costs as much as the physics.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         try:
             content = path.read_bytes()
@@ -182,17 +182,7 @@ class OnnxPolicy:
             metadata = self._session.get_modelmeta().custom_metadata_map
         except Exception as error:
             raise PolicyError(_why_unreadable(path, error)) from error
-        if METADATA_KEY not in metadata:
-            raise PolicyError(
-                f"{path} is an ONNX file without xreset's contract: it was not exported by xreset."
-            )
-        try:
-            contract = parse_json(metadata[METADATA_KEY])
-        except ValueError as error:
-            raise PolicyError(
-                f"{path} holds a contract that is not valid JSON ({error}). Export it again."
-            ) from error
-        self.contract = parsed_contract(str(path), contract)
+        self.contract = _read_contract(path, metadata)
         self._state: list[np.ndarray] | None = None
         self._try_step(path)
         self.name = path.stem if path.stem != "policy" else path.resolve().parent.name
@@ -245,8 +235,23 @@ class OnnxPolicy:
         return outputs
 
 
+def _read_contract(path: Path, metadata: dict[str, str]) -> Contract:
+    """Return the contract in an ONNX file's metadata; ``PolicyError`` if there is none, or it is damaged."""
+    if METADATA_KEY not in metadata:
+        raise PolicyError(
+            f"{path} is an ONNX file without xreset's contract: it was not exported by xreset."
+        )
+    try:
+        contract = parse_json(metadata[METADATA_KEY])
+    except ValueError as error:
+        raise PolicyError(
+            f"{path} holds a contract that is not valid JSON ({error}). Export it again."
+        ) from error
+    return parsed_contract(str(path), contract)
+
+
 def _why_unreadable(path: Path, error: Exception) -> str:
-    """Return what is wrong with a file that onnxruntime does not read, and what to give instead."""
+    """Return what is wrong with a file that onnxruntime cannot read, and what to give instead."""
     if path.suffix != ".pt":
         return f"{path} cannot be read as an ONNX policy: {shown(str(error))}. Is it damaged?"
     run = path.parent.parent
@@ -259,7 +264,7 @@ def _why_unreadable(path: Path, error: Exception) -> str:
 
 
 class ZeroPolicy(Policy):
-    """Action zero: the arm stays, the hand goes where action zero sends it. A baseline and a smoke test."""
+    """Action zero: the arm stays, the hand moves to its targets under action zero. A baseline and a smoke test."""
 
     def __init__(self, num_actions: int) -> None:
         self._num_actions = num_actions

@@ -43,21 +43,21 @@ UNITS = {
 def deploy_contract(
     robot: RobotSpec, task: TaskConfig, objects: Sequence[ObjectSpec], policy: Path | None = None
 ) -> dict[str, Any]:
-    """Return all that :mod:`xreset.runtime` needs to know of a policy, as JSON.
+    """Return everything that :mod:`xreset.runtime` needs to know about a policy, as JSON.
 
     Args:
         robot: robot of the policy.
         task: task of the policy's training.
         objects: objects whose points the contract lists.
-        policy: exported policy, of which the contract states the hash; None: the contract stays in this process.
+        policy: exported policy, whose hash the contract states; None: the contract stays in this process.
 
     Raises:
-        PolicyError: the policy looks through cameras.
-        LiveError: the task has options that the runtime does not carry out.
+        PolicyError: the policy has cameras.
+        LiveError: the task has options that the runtime does not support.
     """
     if task.vision.cameras:
         raise PolicyError(
-            "The policy looks through cameras, which the runtime cannot do. Use a policy without cameras."
+            "The policy has cameras, which the runtime does not support. Use a policy without cameras."
         )
     trained = policy_contract(robot, task, tuple(o.name for o in objects))
     listed = {}
@@ -94,7 +94,7 @@ def deploy_contract(
 
 
 def _joints(robot: RobotSpec, task: TaskConfig) -> list[dict[str, Any]]:
-    """Return names, limits and the mapping of actions of every joint, in joint order."""
+    """Return name, limits and action mapping of every joint, in joint order."""
     space = ActionSpace(robot, task.action)
     tree = robot_tree(robot)
     rows = []
@@ -109,15 +109,15 @@ def _joints(robot: RobotSpec, task: TaskConfig) -> list[dict[str, Any]]:
         }
         for name in ("lower", "upper", "step", "lead", "zero", "below", "above"):
             row[name] = float(getattr(space, name)[i])
-        # JSON has no infinite numbers
-        rows.append(
-            {name: None if value in (-math.inf, math.inf) else value for name, value in row.items()}
-        )
+        for name, value in row.items():
+            if value in (-math.inf, math.inf):
+                row[name] = None  # JSON has no infinite numbers
+        rows.append(row)
     return rows
 
 
 def _chain(robot: RobotSpec) -> dict[str, Any]:
-    """Return the joints from the root to the palm and the fingertips."""
+    """Return the joints from the root to the palm and the fingertips, each after its parent."""
     tree = robot_tree(robot)
     mimics = {mimic.joint: mimic for mimic in robot.mimics}
     index = {tree.root: 0}
@@ -126,6 +126,7 @@ def _chain(robot: RobotSpec) -> dict[str, Any]:
         if set(robot.tracked_links).isdisjoint(tree.below(joint.child)):
             continue
         index[joint.child] = len(index)
+        # A joint without a source follows itself, with multiplier 1 and offset 0.
         mimic = mimics.get(joint.name, MimicSpec(joint=joint.name, source=joint.name))
         step = {
             "link": joint.child,

@@ -1,4 +1,4 @@
-"""An engine as a robot: the worlds of an environment behind the interface of a driver."""
+"""An engine in place of a robot: the worlds of an environment as a driver."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class EngineDriver(Driver):
         Args:
             env: the worlds.
             look: called after every control step.
-            real_time: whether the simulation waits for the wall clock.
+            real_time: whether the simulation runs no faster than the wall clock.
         """
         self.env = env
         self._look = look
@@ -47,7 +47,7 @@ class EngineDriver(Driver):
         return self._substeps * self.env.backend.scene.timestep
 
     def wait_until(self, moment: float) -> None:
-        """Let the simulation run until that time."""
+        """Let the simulation run until that time [s]."""
         scene = self.env.backend.scene
         due = round((moment - self.now()) / scene.timestep)
         while due > 0:

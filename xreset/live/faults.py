@@ -1,4 +1,4 @@
-"""What goes wrong between a policy and a robot: late and wrong poses, late and lost targets, pushes.
+"""Faults between a policy and a robot: late and wrong poses, late and lost targets, pushes.
 
 Shape letters: N worlds, C control steps, J joints.
 """
@@ -19,6 +19,7 @@ from xreset.live.engine import EngineDriver
 from xreset.runtime import Reading
 
 _NEVER = np.iinfo(np.int64).max
+"""Physics step in which a target takes effect that is lost, or that has taken effect already."""
 
 
 @frozen
@@ -31,16 +32,16 @@ class Faults(Checked):
     """
 
     LOSS_PERIOD: ClassVar[float] = 2.0
-    """The tracker loses the object once in every such time [s]."""
+    """The tracker loses the object once in each interval of this length [s]."""
     PUSH_PERIOD: ClassVar[float] = 1.5
-    """There is one push in every such time [s]."""
+    """There is one push in each interval of this length [s]."""
 
     tracker_interval: NonNegativeFloat = 0.0
     """Time from one pose to the next [s], rounded to control steps; 0: every control step."""
     pose_delay: NonNegativeFloat = 0.0
     """Time from the moment of a pose to its arrival [s]."""
     pose_jitter: NonNegativeFloat = 0.0
-    """The delay of each pose differs by up to this [s]. Poses may therefore overtake each other."""
+    """Largest difference of a pose's delay from ``pose_delay`` [s]. Poses may therefore overtake each other."""
     position_noise: NonNegativeFloat = 0.0
     """Largest error of each pose, along each axis [m]."""
     position_bias: NonNegativeFloat = 0.0
@@ -50,13 +51,13 @@ class Faults(Checked):
     angle_bias: NonNegativeFloat = 0.0
     """Largest error that lasts for the episode, about each axis [rad]."""
     lost_frames: NonNegativeFloat = 0.0
-    """How long the tracker loses the object each time [s]."""
+    """Time for which the tracker loses the object, once per :attr:`LOSS_PERIOD` [s]."""
     arm_delay: NonNegativeFloat = 0.0
     """Time from sending the arm's targets to their effect [s], rounded to physics steps."""
     hand_delay: NonNegativeFloat = 0.0
-    """The same for the hand [s]."""
+    """Time from sending the hand's targets to their effect [s], rounded to physics steps."""
     missed_deadlines: Share = 0.0
-    """Share of the targets that come too late to be used, so that the drives keep the ones before."""
+    """Share of the targets that come too late to be used, so that the drives keep the last ones."""
     object_push: NonNegativeFloat = 0.0
     """Change of the object's velocity by each push [m/s]: a force in a random direction for one control step."""
     arm_push: NonNegativeFloat = 0.0
@@ -84,7 +85,7 @@ class FaultyDriver(EngineDriver):
             faults: faults of all worlds.
             seeds: seed of each world's draws.
             look: called after every control step.
-            real_time: whether the simulation waits for the wall clock.
+            real_time: whether the simulation runs no faster than the wall clock.
         """
         super().__init__(env, look, real_time=real_time)
         scene = env.backend.scene
@@ -121,9 +122,16 @@ class FaultyDriver(EngineDriver):
         self._applied = env.joint_target.cpu().numpy().copy()
 
     def _lost_steps(self, length: float, draws: np.ndarray, steps: int) -> np.ndarray:
-        """[N, C] whether the pose of a step is lost, for gaps of a length [s] whose times are drawn in [-1, 1)."""
+        """[N, C] whether the pose of a step is lost.
+
+        Args:
+            length: length of a gap [s].
+            draws: [N, gaps] place of each gap in its interval, in [-1, 1).
+            steps: C.
+        """
         period = Faults.LOSS_PERIOD
-        start = period * np.arange(draws.shape[1]) + (draws + 1.0) / 2.0 * max(0.0, period - length)
+        latest = max(0.0, period - length)
+        start = period * np.arange(draws.shape[1]) + (draws + 1.0) / 2.0 * latest
         time = np.arange(steps)[None, :, None] * self._dt
         inside = (time >= start[:, None]) & (time < start[:, None] + length)
         return inside.any(axis=2)
@@ -155,8 +163,8 @@ class FaultyDriver(EngineDriver):
         reading = super().read()
         k = self._step
         now = self.now()
-        seen = k % self._interval == 0
-        arrival = np.where(seen & ~self._lost[:, k], now + self._pose_delay[:, k], np.inf)
+        has_pose = (k % self._interval == 0) & ~self._lost[:, k]
+        arrival = np.where(has_pose, now + self._pose_delay[:, k], np.inf)
         if k == 0:  # the tracker has watched the object before
             arrival = np.zeros_like(arrival)
         self._frames.append({"arrival": arrival, **self._with_errors(reading, k)})
@@ -164,25 +172,23 @@ class FaultyDriver(EngineDriver):
             arrived = frame["arrival"] <= now + 1e-9
             for name in ("object_pos", "object_quat", "object_time"):
                 old = self._observed.get(name, frame[name])
-                self._observed[name] = np.where(
-                    arrived.reshape(-1, *[1] * (old.ndim - 1)), frame[name], old
-                )
+                rows = arrived.reshape(-1, *[1] * (old.ndim - 1))
+                self._observed[name] = np.where(rows, frame[name], old)
             frame["arrival"][arrived] = np.inf
         self._frames = [frame for frame in self._frames if np.isfinite(frame["arrival"]).any()]
         return replace(reading, **self._observed)
 
     def _with_errors(self, reading: Reading, k: int) -> dict[str, np.ndarray]:
-        """Return the pose as the tracker sees it in step k."""
+        """Return the pose that the tracker measures in step k. Without an error it is exactly the true one."""
         error = self._error[:, k]
-        wrong = error.any(axis=1)[:, None]
+        has_error = error.any(axis=1)[:, None]
         pos = (reading.object_pos + error[:, :3]).astype(np.float32)
-        turned = Rotation.from_rotvec(error[:, 3:]) * Rotation.from_quat(
-            reading.object_quat, scalar_first=True
-        )
+        rotation = Rotation.from_quat(reading.object_quat, scalar_first=True)
+        turned = Rotation.from_rotvec(error[:, 3:]) * rotation
         quat = turned.as_quat(scalar_first=True).astype(np.float32)
         return {
-            "object_pos": np.where(wrong, pos, reading.object_pos),
-            "object_quat": np.where(wrong, quat, reading.object_quat),
+            "object_pos": np.where(has_error, pos, reading.object_pos),
+            "object_quat": np.where(has_error, quat, reading.object_quat),
             "object_time": np.asarray(reading.object_time),
         }
 
@@ -193,6 +199,7 @@ class FaultyDriver(EngineDriver):
         self._pending.append((due, target))
 
     def _advance(self, substeps: int) -> None:
+        """Advance within one control step, and stop in between to apply the targets that become due."""
         backend = self.env.backend
         k = self._step
         if self._velocity.any():
@@ -201,18 +208,17 @@ class FaultyDriver(EngineDriver):
                 self._velocity[:, k], dtype=torch.float32, device=backend.device
             )
             backend.set_object_wrench(mass * velocity / self._dt, torch.zeros_like(velocity))
-        at = self._substeps
-        end = at + substeps
-        while at < end:
-            following = end
+        now = self._substeps
+        end = now + substeps
+        while now < end:
+            next_due = end
             for due, target in self._pending:
-                arrived = due <= at
-                self._applied = np.where(arrived, target, self._applied)
-                due[arrived] = _NEVER
-                following = min(following, int(due.min()))
-            self._target = torch.as_tensor(
-                (self._applied + self._offset[:, k]).astype(np.float32), device=backend.device
-            )
-            super()._advance(following - at)
-            at = following
+                is_due = due <= now
+                self._applied = np.where(is_due, target, self._applied)
+                due[is_due] = _NEVER
+                next_due = min(next_due, int(due.min()))
+            pushed = (self._applied + self._offset[:, k]).astype(np.float32)
+            self._target = torch.as_tensor(pushed, device=backend.device)
+            super()._advance(next_due - now)
+            now = next_due
         self._pending = [(due, target) for due, target in self._pending if (due < _NEVER).any()]

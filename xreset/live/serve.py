@@ -21,10 +21,9 @@ with needs("websockets", "serve"):
     from websockets.exceptions import ConnectionClosed
     from websockets.sync.server import Server, ServerConnection, serve
 
-_LARGEST = 1 << 20
-"""Bytes of a message."""
-_PATIENCE = 5.0
-"""Time after which a client that does not answer a ping has gone [s]."""
+_MAX_MESSAGE_BYTES = 1 << 20
+_PING_TIMEOUT = 5.0
+"""Time in which a client must answer a ping, and time between pings [s]."""
 
 
 Message = dict[str, Any]
@@ -40,10 +39,10 @@ class PolicyServer:
         """Start listening.
 
         Args:
-            contract: what the policy expects.
+            contract: the policy's contract.
             policy: content of its ONNX file.
             host: address to listen at. Any other than 127.0.0.1 lets other computers use the policy.
-            port: port to listen at; 0: any that is free.
+            port: port to listen at; 0: any free port.
 
         Raises:
             XResetError: the port is taken, or the address is not this machine's.
@@ -58,10 +57,10 @@ class PolicyServer:
                 host,
                 port,
                 origins=[None],  # no page in a browser
-                max_size=_LARGEST,
+                max_size=_MAX_MESSAGE_BYTES,
                 compression=None,
-                ping_interval=_PATIENCE,
-                ping_timeout=_PATIENCE,
+                ping_interval=_PING_TIMEOUT,
+                ping_timeout=_PING_TIMEOUT,
                 close_timeout=1.0,
             )
         except OSError as error:
@@ -89,9 +88,9 @@ class PolicyServer:
             client.send(json.dumps({"schema": LIVE_SCHEMA, "contract": self._contract}))
             for message in client:
                 client.send(json.dumps(episode.answer(message)))
-            self._log.warning("%s has left.", who)
+            self._log.warning("%s has disconnected.", who)
         except ConnectionClosed:
-            self._log.warning("%s has gone without a word.", who)
+            self._log.warning("The connection to %s was lost.", who)
         finally:
             self._clients.discard(client)
 
@@ -109,14 +108,15 @@ class _Episode:
         }
 
     def answer(self, message: str | bytes) -> Message:
-        """Return the answer to a message; what is wrong with it, if it cannot be answered."""
+        """Return the answer to a message, or ``{"error": SENTENCE}`` if it cannot be answered."""
         try:
             try:
                 data = json.loads(message)
             except (ValueError, RecursionError) as error:
                 raise LiveError(f"The message is not JSON ({error}).") from error
             if not isinstance(data, dict) or len(data) != 1 or not set(data) <= set(self._verbs):
-                raise LiveError(f"A message has one of the keys {', '.join(self._verbs)}.")
+                keys = ", ".join(self._verbs)
+                raise LiveError(f"The message needs exactly one key. Choose from: {keys}.")
             (verb,) = data
             if not isinstance(data[verb], dict):
                 raise LiveError(f"{verb} is not an object.")
@@ -173,7 +173,8 @@ def _numbers(given: Message, name: str, *shape: int) -> np.ndarray:
         raise LiveError(f"{name} holds something that is not a number.") from None
     if value.shape != shape or not np.isfinite(value).all():
         raise LiveError(
-            f"{name} has shape {value.shape}, or a number too large. Expected finite numbers {shape}."
+            f"{name} has shape {value.shape}, or numbers that are not finite. "
+            f"Expected finite numbers of shape {shape}."
         )
     return value
 

@@ -437,12 +437,9 @@ class ManipulationEnv:
     def _compute_rewards(self) -> tuple[Reading, Reward]:
         """Compute rewards, ends of episodes and the numbers to log."""
         reading = self.reading()
-        # A failed world ends and is counted, and nothing is learned from it.
         broken = reading.health.nonfinite
         live = ~self._over
-        self._faulty.copy_((broken | reading.health.overflow) & live)
-        self.nonfinite_count += (self._faulty & broken).sum()
-        self.overflow_count += (self._faulty & ~broken).sum()
+        self._mark_faults(reading, live)
         object_pos = reading.task_state.object_pos
         lost = out_of_bounds(object_pos, self.backend.scene.table, self.task.termination) & ~broken
         reach = reading.tip_distance.mean(dim=-1)
@@ -461,18 +458,29 @@ class ManipulationEnv:
         if self.resets.config.adaptive_share:
             ended = self._reset_mask & ~self.from_bank & ~self._faulty
             self.resets.record(self.sequence, reward.success, ended)
+        self._log_step(reward, ~broken)
+        return reading, reward
+
+    def _mark_faults(self, reading: Reading, live: Tensor) -> None:
+        """Mark and count the ``live`` worlds [N] whose simulation failed. They end, and training ignores them."""
+        broken = reading.health.nonfinite
+        self._faulty.copy_((broken | reading.health.overflow) & live)
+        self.nonfinite_count += (self._faulty & broken).sum()
+        self.overflow_count += (self._faulty & ~broken).sum()
+
+    def _log_step(self, reward: Reward, sound: Tensor) -> None:
+        """Keep the names and values of this step's log; ``sound`` [N] bool marks worlds that have not failed."""
         totals = {
             "health/nonfinite_total": self.nonfinite_count,
             "health/overflow_total": self.overflow_count,
         }
         names, values = step_log(
-            reward, self._reset_mask, sound=~broken, from_home=~self.from_bank, totals=totals
+            reward, self._reset_mask, sound=sound, from_home=~self.from_bank, totals=totals
         )
         if not self._log_names:
             self._log_names = names
             self._log_values = torch.zeros_like(values)
         self._log_values.copy_(values)
-        return reading, reward
 
     def _reward_input(self, reading: Reading, lost: Tensor) -> RewardInput:
         """Return what the reward is computed from; ``lost`` [N] bool marks the worlds that are out of bounds."""

@@ -394,8 +394,8 @@ class Backend(ABC):
     def set_where(self, mask: Tensor, state: State, parameters: Parameters) -> None:
         """Set state and physical parameters of the worlds of a mask, as the single setters do.
 
-        Values are given for all worlds, and those outside the mask are ignored: a backend on a GPU overrides this so
-        that nothing waits for the number of worlds.
+        Values are given for all worlds, and ignored outside the mask. A backend on a GPU overrides this method so that
+        the GPU does not wait for the number of worlds.
 
         Args:
             mask: [N] bool.

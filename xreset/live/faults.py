@@ -63,7 +63,7 @@ class Faults(Checked):
     arm_push: NonNegativeFloat = 0.0
     """Torque of each push on every joint of the arm for one control step, at most this share of the drive's limit."""
     drawn_delays: bool = False
-    """Whether each episode draws its delays between 0 and those above."""
+    """Whether each episode draws each of its delays between 0 and the configured one."""
 
 
 class FaultyDriver(EngineDriver):
@@ -91,34 +91,37 @@ class FaultyDriver(EngineDriver):
         scene = env.backend.scene
         self._dt = scene.control_dt
         steps = env.max_episode_length + 1
-        seconds = steps * self._dt
         generators = [np.random.default_rng(list(seed)) for seed in seeds]
 
         def drawn(*shape: int) -> np.ndarray:
-            """[N, ...] uniform numbers in [-1, 1); the same ones whatever the faults are."""
+            """[N, ...] uniform numbers in [-1, 1), which do not depend on the faults."""
             return np.stack([generator.uniform(-1.0, 1.0, shape) for generator in generators])
 
-        share = (drawn(3, 1) + 1.0) / 2.0
+        delay_share = (drawn(3, 1) + 1.0) / 2.0
         if not faults.drawn_delays:
-            share = np.ones_like(share)
+            delay_share = np.ones_like(delay_share)
+        pose_share, arm_share, hand_share = delay_share.swapaxes(0, 1)
         self._interval = max(1, round(faults.tracker_interval / self._dt))
-        self._pose_delay = np.maximum(
-            0.0, faults.pose_delay * share[:, 0] + faults.pose_jitter * drawn(steps)
-        )
+        pose_delay = faults.pose_delay * pose_share + faults.pose_jitter * drawn(steps)
+        self._pose_delay = np.maximum(0.0, pose_delay)
+        """[N, C] s"""
         bias = np.repeat((faults.position_bias, faults.angle_bias), 3)
         noise = np.repeat((faults.position_noise, faults.angle_noise), 3)
         self._error = bias * drawn(1, 6) + noise * drawn(steps, 6)
-        self._lost = self._lost_steps(
-            faults.lost_frames, drawn(int(seconds / Faults.LOSS_PERIOD) + 1), steps
-        )
+        """[N, C, 6] position [m], then rotation vector [rad]."""
+        gaps = int(steps * self._dt / Faults.LOSS_PERIOD) + 1
+        self._lost = self._lost_steps(faults.lost_frames, drawn(gaps), steps)
         is_arm = env.actions.is_arm.cpu().numpy()
-        delay = np.where(is_arm, faults.arm_delay * share[:, 1], faults.hand_delay * share[:, 2])
+        delay = np.where(is_arm, faults.arm_delay * arm_share, faults.hand_delay * hand_share)
         self._delay = np.round(delay / scene.timestep).astype(np.int64)
+        """[N, J] physics steps."""
         self._missed = (drawn(steps) + 1.0) / 2.0 < faults.missed_deadlines
         self._plan_pushes(faults, drawn, steps)
         self._frames: list[dict[str, np.ndarray]] = []
+        """Poses that have not arrived in every world, with their time of arrival."""
         self._observed: dict[str, np.ndarray] = {}
         self._pending: list[tuple[np.ndarray, np.ndarray]] = []
+        """Targets [N, J] that have not taken effect in every joint, each after the physics step [N, J] when it does."""
         self._applied = env.joint_target.cpu().numpy().copy()
 
     def _lost_steps(self, length: float, draws: np.ndarray, steps: int) -> np.ndarray:

@@ -80,6 +80,7 @@ class PolicyServer:
             client.close()
 
     def _talk(self, client: ServerConnection) -> None:
+        """Answer a client until it disconnects."""
         who = "{}:{}".format(*client.remote_address[:2])
         try:
             self._clients.add(client)

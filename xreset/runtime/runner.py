@@ -98,6 +98,7 @@ class Runner:
         return np.isinf(self._stopped_at)
 
     def _loop(self, end: float) -> None:
+        """Take control steps until a time [s], or until all robots have stopped and slowed down."""
         due = self.driver.now()
         last_end = due
         stalled = 0.0  # time for which the clock has stood still

@@ -153,15 +153,17 @@ def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
         gate = (x.tip_distance.sum(dim=-1) <= c.near_tips) & (x.palm_distance <= c.near_palm)
     position_error = (x.object_pos - x.goal_pos).norm(dim=-1)
     rotation_error = quat_angle(x.object_quat, x.goal_quat)
-    success = gate & (position_error < x.success_position) & (rotation_error < c.success_rotation)
-    success_reward = c.success * success
-    distance = position_error
+    points_error = position_error  # replaced below if a term needs the mean over the points
     if c.points or c.success_shape == "points":
         distances = point_distances(x.object_pos, x.object_quat, x.goal_pos, x.goal_quat, x.points)
-        distance = distances.mean(dim=-1)
+        points_error = distances.mean(dim=-1)
     if c.success_shape == "points":
-        success = gate & (distance <= x.success_position)
-        success_reward = c.success * success / (1.0 + 10.0 * distance)
+        success = gate & (points_error <= x.success_position)
+        success_reward = c.success * success / (1.0 + 10.0 * points_error)
+    else:
+        is_near = position_error < x.success_position
+        success = gate & is_near & (rotation_error < c.success_rotation)
+        success_reward = c.success * success
     change = (x.action - x.previous_action).square()
     if c.action_rate_arm is None:
         action_rate = c.action_rate * change.sum(dim=-1)
@@ -184,7 +186,7 @@ def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
     if c.palm_proximity:
         terms["palm_proximity"] = c.palm_proximity * x.palm_distance.clamp_max(c.palm_proximity_cap)
     if c.points:
-        terms["points"] = c.points * gate * (1.0 - distance / c.points_zero)
+        terms["points"] = c.points * gate * (1.0 - points_error / c.points_zero)
     for name, weight in c.own.items():
         terms[name] = weight * _checked(name, own_term(name)(x), position_error)
     total = c.scale * torch.stack(list(terms.values())).sum(dim=0)

@@ -1,4 +1,4 @@
-"""Draw recorded episodes without an engine: one as a film in every engine, and failures as strips of pictures."""
+"""Draw recorded episodes, without an engine: one as a film in every engine, and failures as strips of pictures."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ FRAMES_PER_SECOND = 10.0
 STRIP_SIZE = (240, 180)
 """Width and height of one picture of a strip [pixels]."""
 FAILURES = 4
-"""Most failures that a report shows."""
+"""Largest number of failures that a report shows."""
 MOMENTS = 6
-"""Pictures in a strip, evenly over the episode, first and last state included."""
+"""Pictures in a strip, evenly spread over the episode from its first to its last state."""
 
 
 @frozen
@@ -105,28 +105,35 @@ def camera_for(trace: Trace, obj: ObjectSpec, *, distance: float = 1.0) -> Camer
     center = (start + goal) / 2 + (0.0, 0.0, 0.06)
     default = Camera()
     away = np.subtract(default.eye, default.target)
-    away *= (
-        distance
-        * np.clip(0.75 + 1.2 * np.linalg.norm(goal - start), 0.85, 1.3)
-        / np.linalg.norm(away)
-    )
+    wanted = distance * np.clip(0.75 + 1.2 * np.linalg.norm(goal - start), 0.85, 1.3)  # [m]
+    away *= wanted / np.linalg.norm(away)
     return Camera(eye=tuple((center + away).tolist()), target=tuple(center.tolist()))
 
 
 def draw_state(
-    renderer: Renderer, trace: Trace, row: int, eyes: Cameras | None = None
+    renderer: Renderer, trace: Trace, row: int, cameras: Cameras | None = None
 ) -> np.ndarray:
-    """Draw one state of a trace, with the goal as a translucent object, above what the policy's cameras show."""
+    """Return an image [H, W, 3] uint8 of one state of a trace, with the goal as a translucent object.
+
+    The images of the policy's cameras, if it has any, are below.
+    """
     pose = (trace.object_pos[row], trace.object_quat[row])
     goal = (trace.goal_pos, trace.goal_quat)
     picture = renderer.draw(trace.joint_pos[row], pose, goal_pose=goal)
-    if eyes is None:
+    if cameras is None:
         return picture
-    return np.vstack((picture, draw_view(eyes, trace, row, picture.shape[1])))
+    return np.vstack((picture, draw_view(cameras, trace, row, picture.shape[1])))
 
 
-def draw_view(eyes: Cameras, trace: Trace, row: int, width: int) -> np.ndarray:
-    """Draw what cameras of one world show of one state of a trace; see :meth:`Cameras.picture`."""
+def draw_view(cameras: Cameras, trace: Trace, row: int, width: int) -> np.ndarray:
+    """Return the images of one state of a trace that cameras of one world show, joined as by :meth:`Cameras.picture`.
+
+    Args:
+        cameras: cameras of one world.
+        trace: the episode.
+        row: index of the state.
+        width: width of the joined image [pixels].
+    """
     now = (
         trace.joint_pos[row],
         trace.object_pos[row],
@@ -137,19 +144,20 @@ def draw_view(eyes: Cameras, trace: Trace, row: int, width: int) -> np.ndarray:
     joints, pos, quat, goal_pos, goal_quat = (
         torch.as_tensor(value, dtype=torch.float32)[None] for value in now
     )
-    eyes.aim(State.at_rest(joints, pos, quat), goal_pos, goal_quat, torch.ones(1, dtype=torch.bool))
-    eyes.cast()
-    eyes.observe(torch.Generator().manual_seed(row))
-    return eyes.picture(0, width)
+    state = State.at_rest(joints, pos, quat)
+    cameras.aim(state, goal_pos, goal_quat, torch.ones(1, dtype=torch.bool))
+    cameras.cast()
+    cameras.observe(torch.Generator().manual_seed(row))
+    return cameras.picture(0, width)
 
 
 def policy_cameras(
     robot: RobotSpec, obj: ObjectSpec, vision: VisionConfig | None
 ) -> Cameras | None:
-    """Return the cameras of a policy that sees, to draw what they show."""
+    """Return the cameras of a policy, for one world; None if it has none."""
     if vision is None or not vision.cameras:
         return None
-    from xreset.cameras.sensor import Cameras  # Warp, which other policies do not need
+    from xreset.cameras.sensor import Cameras  # imports Warp, which other policies do not need
 
     return Cameras(SceneSpec(robot=robot, objects=(obj,)), torch.zeros(1, dtype=torch.long), vision)
 
@@ -162,13 +170,14 @@ def draw_clips(
     *,
     strips: bool = False,
 ) -> list[Clip]:
-    """Draw recorded episodes: films of one demonstration, all from the same place; or strips, each from its own.
+    """Draw recorded episodes: as films, all with the camera of the first; or as strips, each with its own camera.
 
     Args:
         episodes: rows of :func:`xreset.eval.results.recorded`.
+        robot: the robot.
         meshes: folder of object meshes; None: the stand-ins.
-        vision: cameras of a policy that sees, whose images are drawn below.
-        strips: draw :data:`MOMENTS` states of each episode, evenly over it, in place of a film.
+        vision: cameras of the policy, whose images are drawn below.
+        strips: draw :data:`MOMENTS` states of each episode instead of a film.
     """
     rows = list(episodes.itertuples())
     clips = []
@@ -185,17 +194,18 @@ def draw_clips(
             size = SIZE
             camera = camera_for(rows[0].trace, obj)
             shown = np.arange(0, len(trace.time), every)
-        ends = np.flatnonzero(~trace.finite)
-        drawn = np.minimum(shown, ends[0] - 1 if len(ends) else len(trace.time)).tolist()
+        broken = np.flatnonzero(~trace.finite)
+        last = broken[0] - 1 if len(broken) else len(trace.time)
+        drawn = np.minimum(shown, last).tolist()
         renderer = Renderer(SceneSpec(robot=robot, objects=(obj,)), size=size, camera=camera)
-        eyes = policy_cameras(robot, obj, vision)
-        pictures = {row: draw_state(renderer, trace, row, eyes) for row in set(drawn)}
+        cameras = policy_cameras(robot, obj, vision)
+        pictures = {row: draw_state(renderer, trace, row, cameras) for row in set(drawn)}
         clip = Clip(
             episode=episode,
             frames=np.stack([pictures[row] for row in drawn]),
             times=trace.time[shown],
             fps=1.0 / (every * interval),
-            finite=not len(ends),
+            finite=not len(broken),
         )
         clips.append(clip)
     return clips
@@ -219,7 +229,7 @@ def draw_report(data: ReportData) -> tuple[list[Clip], list[Clip]]:
 
 
 def make_film(data: ReportData, out: Path) -> tuple[str, ...]:
-    """Write an mp4 with the episode of each object that went best over all engines, all at their own speed.
+    """Write an mp4 with the best episode of each object in every engine (:func:`best_everywhere`), at its own speed.
 
     Returns:
         The objects, from the left; the engines are in the order of the results, from above.
@@ -244,7 +254,8 @@ def make_film(data: ReportData, out: Path) -> tuple[str, ...]:
     for name, clips in columns.items():
         column = []
         for clip in clips:
-            half = clip.frames[np.minimum(np.arange(length), len(clip.frames) - 1), ::2, ::2]
+            shown = np.minimum(np.arange(length), len(clip.frames) - 1)  # ends with a still
+            half = clip.frames[shown, ::2, ::2]
             label = f"{short_name(name)}, {clip.episode.engine}"
             column.append(np.stack([add_caption(picture, [label], 1) for picture in half]))
         films.append(np.concatenate(column, axis=1))
@@ -257,7 +268,8 @@ def encode_mp4(frames: np.ndarray, fps: float, *, keyframes: int | None = None) 
 
     Args:
         frames: [T, H, W, 3] uint8 with even H and W.
-        keyframes: distance of the frames that can be shown without others; None: the encoder's choice.
+        fps: frames per second.
+        keyframes: number of frames from one keyframe to the next; None: the encoder's choice.
 
     Raises:
         XResetError: the encoder is not installed or fails.
@@ -269,7 +281,7 @@ def encode_mp4(frames: np.ndarray, fps: float, *, keyframes: int | None = None) 
         settings += f" -g {keyframes}"
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "clip.mp4"
-        writer = imageio_ffmpeg.write_frames(  # its annotations are narrower than what it takes
+        writer = imageio_ffmpeg.write_frames(  # it accepts more types than its annotations say
             str(path),
             frames.shape[2:0:-1],
             fps=fps,  # pyright: ignore[reportArgumentType]

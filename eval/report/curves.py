@@ -1,9 +1,9 @@
-"""Progress of trainings: how far they had come at each iteration, and their mean curves.
+"""Learning curves: the amount of training at each iteration, and the mean curves of several trainings.
 
-Steps and minutes are sums of what every iteration logged: ``speed/collect_seconds`` + ``speed/learn_seconds``, and
-these times ``speed/env_steps_per_second``. Not counted are pauses between a run and its continuation, iterations that
-were lost and done again, and the time before the first iteration; steps are summed over all processes. An iteration
-without a log counts like the next one with a log.
+The seconds of an iteration are its logged ``speed/collect_seconds`` + ``speed/learn_seconds``, and its steps are these
+seconds times ``speed/env_steps_per_second``, over all processes. Pauses before a run is continued, iterations that were
+lost and repeated, and the time before the first iteration do not count. An iteration without a log counts like the
+next one with a log.
 """
 
 from __future__ import annotations
@@ -30,8 +30,7 @@ _SPEED = ["speed/collect_seconds", "speed/learn_seconds", "speed/env_steps_per_s
 
 
 def amounts(training: Training, x: X) -> Table:
-    """Return how much of ``x`` had been done after each iteration, in the unit of :data:`AXES`, with the iteration as
-    index, rising.
+    """Return the amount of ``x`` after each iteration, in the unit of :data:`AXES`; the index is the iteration, rising.
 
     Raises:
         RunError: the training did not log its speed.
@@ -51,7 +50,7 @@ def amounts(training: Training, x: X) -> Table:
 
 
 def line(members: Sequence[Training], tag: str, x: X) -> Table | None:
-    """Return the curve of one training; or mean, minimum and maximum of several, where all of them have logged.
+    """Return the curve of one training; or mean, minimum and maximum of several, in the range that all have logged.
 
     Trainings without such a curve are left out; None if no training has one.
 

@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 
 _CONDITIONS = ("objects", "robot", "object meshes", "number of episodes", "seed of the evaluation")
 _PLAYED_TASK = ("task.termination.", "task.reset.spawn_", "task.reset.home_noise", "task.timestep")
-"""Fields of a training's task that its evaluation keeps (:func:`xreset.task.config.evaluation_task`), unless it states
-another length of episodes, and that make it easier or harder."""
+"""Fields of a training's task that make its evaluation easier or harder, because the evaluation keeps them
+(:func:`xreset.task.config.evaluation_task`). An evaluation may only change the length of episodes."""
 _LENGTH = "task.termination.episode_seconds"
 _SAME_NAMES = " Their sequences have the same names: if one was made from the other, as for ik, they are comparable."
 
 
 def uneven(trainings: Sequence[Training]) -> list[str]:
-    """Return a sentence for each condition in which evaluations differ; none if all were evaluated alike. A single
-    training has the same policy in all engines; several have their own."""
+    """Return a sentence for each condition in which the evaluations of trainings differ. For a single training, the
+    policy is one of the conditions, because all engines must have played the same one."""
     table = _condition_table(trainings)
     if table.empty:
         return []
@@ -59,7 +59,7 @@ def _condition_table(trainings: Sequence[Training]) -> Table:
                 "policy file": result.inputs.get("policy", "")[:12],
                 "robot": result.robot,
                 "objects": ", ".join(sorted(map(short_name, episodes["object"].unique()))),
-                # one path, whether it was given from here or in full
+                # the absolute path, because a relative one may mean the same folder
                 "object meshes": str(Path(folder).resolve()) if folder else "stand-ins",
                 "demonstrations": result.inputs.get("demos", "")[:12],
                 "sequences": tuple(
@@ -71,15 +71,15 @@ def _condition_table(trainings: Sequence[Training]) -> Table:
             for name, text in training.facts.items():
                 if name.startswith(_PLAYED_TASK):
                     row[name] = text
-            if result.episode_seconds is not None:  # it need not be that of the training
+            if result.episode_seconds is not None:  # may differ from the training's
                 row[_LENGTH] = f"{result.episode_seconds:.6g}"
             rows.append(row)
     return pd.DataFrame(rows)
 
 
 def _difference(table: Table, column: str, what: str, advice: str = "") -> list[str]:
-    """Return a sentence if a condition differs: which value in which evaluation. A training with one value in all of
-    its engines is named without the engines."""
+    """Return a sentence that lists the evaluations with each value of a condition; none if all have the same value.
+    A training with one value in all of its engines is named without the engines."""
     if table[column].nunique() < 2:
         return []
     parts = []
@@ -94,8 +94,8 @@ def _difference(table: Table, column: str, what: str, advice: str = "") -> list[
 
 
 def begun(trainings: Sequence[Training]) -> list[str]:
-    """Return a sentence for each training that began with the networks of another: its curves are not all of its
-    learning."""
+    """Return a sentence for each training that began with the networks of another, because its curves do not show all
+    of its policy's learning."""
     found = []
     for training in trainings:
         weights = training.facts.get("weights", "new")
@@ -108,8 +108,8 @@ def begun(trainings: Sequence[Training]) -> list[str]:
 
 
 def missed_by_student(student: Table, teacher: Table) -> str:
-    """Return in words which objects a policy misses in episodes that its teacher ends at the goal, and how often only
-    the rotation is wrong.
+    """Return a text about the episodes that the teacher ends at the goal and the student does not: their objects, and
+    how often only the rotation is wrong.
 
     Args:
         student: episodes of the policy.
@@ -134,7 +134,7 @@ def health(label: str, episodes: Iterable[tuple[Any, Table]]) -> list[str]:
     """Return a sentence for each engine in which it broke down or dropped contacts.
 
     Args:
-        label: whose episodes they are.
+        label: name of the training.
         episodes: :func:`xreset.eval.report.groups.by_engine`.
     """
     sentences = []

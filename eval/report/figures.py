@@ -1,4 +1,4 @@
-"""Figures of results and trainings: of a report's page, and the picture of a comparison."""
+"""Draw results and learning curves, for the page of a report and the picture of a comparison."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ TITLES = {
 }
 """Title of a curve's panel; other curves have their TensorBoard name."""
 _STYLES = ("-", (0, (5, 2)), (0, (1, 1.5)), (0, (5, 2, 1, 2)))
-"""The line changes where the colors begin again: with the ninth training, the seventeenth, and so on."""
+"""Line styles; the next one begins when the colors repeat: at the ninth training, the seventeenth, and so on."""
 _WIDTH = 10.0
-"""[inches]"""
+"""Width of a comparison's picture [inches]."""
 _PANEL = 2.9
 """Height of a row of panels [inches]."""
 
@@ -43,10 +43,13 @@ def color(index: int) -> str:
 
 
 def draw_bars(ax: Axes, mean: Table, low: Table, high: Table) -> None:
-    """Draw a group of bars for each row of a table and in it a bar for each column, in percent; NaN gives no bar.
+    """Draw a group of bars for each row of a table, with a bar for each column, in percent; NaN gives no bar.
 
     Args:
-        low: lower ends of intervals; ``high``: their upper ends.
+        ax: axes to draw in.
+        mean: heights of the bars, in [0, 1].
+        low: lower ends of the intervals.
+        high: their upper ends.
     """
     width = min(0.84, 0.28 * len(mean.columns))  # groups are 1 apart
     each = width / len(mean.columns)
@@ -77,10 +80,11 @@ def draw_training(curves: Table) -> str:
 
 
 def draw_lines(ax: Axes, tag: str, lines: Mapping[str, Table], x: X, order: Sequence[str]) -> None:
-    """Draw one line for each group, with a band from ``low`` to ``high`` where they differ; curves of the task, which
-    are shares, in percent.
+    """Draw one line for each group, with a band from ``low`` to ``high`` where they differ. Curves of the task are
+    shares, and are drawn in percent.
 
     Args:
+        ax: axes to draw in.
         tag: name of the curve.
         lines: label -> :func:`xreset.eval.report.curves.line`.
         x: kind of the horizontal axis.
@@ -118,8 +122,13 @@ def _finish_panel(ax: Axes, title: str, percent: bool) -> None:
 
 
 def draw_scores(ax: Axes, found: Table, order: Sequence[str]) -> None:
-    """Draw task progress with its 95 % interval: engines side by side, in each a bar for every group, in the color of
-    its curve."""
+    """Draw task progress with its 95 % interval: for each engine, a bar for every group, in the color of its curve.
+
+    Args:
+        ax: axes to draw in.
+        found: :func:`xreset.eval.report.groups.scores`.
+        order: labels of all groups: the position decides the color.
+    """
     own = found[found["metric"] == "task_progress"].pivot(index="engine", columns="group")
     values = (own[name].reindex(columns=order) for name in ("mean", "low", "high"))
     draw_bars(ax, *values)
@@ -132,8 +141,11 @@ def write_picture(path: Path, groups: Groups, tags: Sequence[str], found: Table,
     """Write the picture of a comparison.
 
     Args:
+        path: PNG to write.
+        groups: the groups, each with a color of its own.
         tags: curves that at least one training has, one panel each; may be empty if ``found`` is not.
         found: :func:`xreset.eval.report.groups.scores`; may be empty if ``tags`` is not.
+        x: horizontal axis of the curves.
     """
     from matplotlib.lines import Line2D
 
@@ -164,5 +176,5 @@ def write_picture(path: Path, groups: Groups, tags: Sequence[str], found: Table,
 
 
 def _style(index: int) -> Any:
-    """Return the line of a training."""
+    """Return the line style of a training."""
     return _STYLES[index // len(COLORS) % len(_STYLES)]

@@ -1,4 +1,4 @@
-"""Group trainings that differ in their seed only, and score each group in each engine."""
+"""Group trainings that differ only in their seed, and score each group in each engine."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from xreset.eval.stats import crossed_bootstrap_ci95, difference_ci95
 from xreset.eval.table import METRICS
 
 Groups = dict[str, Sequence[Training]]
-"""Label -> one training, or several that differ in their seed only: one line of the picture, rows of the table."""
+"""Label -> one training, or several that differ only in their seed. A group is a line of the picture."""
 
 
 def grouped(trainings: Sequence[Training]) -> tuple[Groups, list[str]]:
@@ -61,7 +61,7 @@ def _whole_label(members: Sequence[Training]) -> str:
 
 
 def _label(members: Sequence[Training]) -> str:
-    """Return what the names have in common: ``soup-seed0`` and ``soup-seed1`` are ``soup``."""
+    """Return the common part of the names, without the seed: ``soup`` for ``soup-seed0`` and ``soup-seed1``."""
     labels = [member.label for member in members]
     if len(labels) == 1:
         return labels[0]
@@ -89,7 +89,7 @@ def by_engine(members: Iterable[Training]) -> Sequence[tuple[Any, Table]]:
 
 
 COUNTED = "episodes / demonstrations / seeds"
-"""What :func:`counted` gives."""
+"""Name of the numbers that :func:`counted` returns."""
 
 
 def counted(episodes: Table) -> str:
@@ -98,8 +98,8 @@ def counted(episodes: Table) -> str:
 
 
 def estimate(episodes: Table, metric: str) -> tuple[float, float, float]:
-    """Return the mean of a metric over all episodes of several trainings on the same demonstrations, and its 95 %
-    interval; NaN without episodes.
+    """Return the mean of a metric over all episodes of trainings that were evaluated on the same demonstrations, and
+    the lower and upper end of its 95 % interval; NaN without episodes.
 
     The interval is a bootstrap over demonstrations, as in ``xreset eval``, and for several trainings over trainings,
     too (:func:`xreset.eval.stats.crossed_bootstrap_ci95`).
@@ -110,14 +110,14 @@ def estimate(episodes: Table, metric: str) -> tuple[float, float, float]:
 
 
 def difference(one: Table, other: Table) -> str:
-    """Return task progress of ``other`` minus that of ``one``, episodes on the same demonstrations, in points with its
-    95 % interval (:func:`xreset.eval.stats.difference_ci95`)."""
+    """Return task progress of ``other`` minus that of ``one`` as text: percentage points, with the 95 % interval
+    (:func:`xreset.eval.stats.difference_ci95`). Both have episodes on the same demonstrations."""
     low, high = difference_ci95(_crossed(one, "task_progress"), _crossed(other, "task_progress"))
     value = mean(other, "task_progress") - mean(one, "task_progress")
     return f"{100 * value:+.1f} ({100 * low:+.1f} to {100 * high:+.1f})"
 
 
 def _crossed(episodes: Table, metric: str) -> list[np.ndarray]:
-    """Return a metric, the training and the demonstration of each episode."""
+    """Return the metric, the index of the training and the demonstration of each episode, [E] each."""
     runs = pd.factorize(episodes["run"])[0]
     return [episodes[metric].to_numpy(float), runs, episodes["sequence"].to_numpy()]

@@ -1,6 +1,6 @@
-"""From folders to pages and pictures: the report of a run, and the comparison of several.
+"""Make the report of a run, and the comparison of several runs.
 
-A report is one HTML page that needs nothing else: no network, no other files.
+A report is one HTML page that needs no network and no other files.
 """
 
 from __future__ import annotations
@@ -66,7 +66,9 @@ def make_report(
         strips = []
         try:
             clips, strips = draw_report(data)
-        except XResetError as error:  # numbers are worth a page without films; the page says why
+        except (
+            XResetError
+        ) as error:  # the page has the numbers all the same, and says why films are missing
             data = replace(data, notes=(*data.notes, f"There are no clips: {error}"))
         write_whole(out / "index.html", page(data, clips, strips))
     return out / "index.html", data
@@ -92,7 +94,9 @@ def collect(folder: Path, robot: str | None = None, objects: Path | None = None)
     if training.facts:
         try:
             run = read_run(folder)
-        except FileFormatError as error:  # results outlive a change of the training's configuration
+        except (
+            FileFormatError
+        ) as error:  # results are shown even if an older configuration is unreadable
             not_described.append(f"The training is not described here: {error}")
     place = training.results_folder.parent
     choice = read_choice(place)
@@ -121,7 +125,7 @@ def collect(folder: Path, robot: str | None = None, objects: Path | None = None)
 
 
 def page(data: ReportData, clips: Sequence[Clip], strips: Sequence[Clip] = ()) -> str:
-    """Return the whole page; clips, and strips of failures, may be empty. The page runs no script but its own."""
+    """Return the whole page; clips, and strips of failures, may be empty. The page allows no script but its own."""
     script = render("report.js")
     episodes = data.training.episodes
     first = episodes[episodes["engine"] == data.training.first.backend]
@@ -160,7 +164,7 @@ def _base64(content: bytes) -> str:
 
 
 def count_failures(episodes: Table) -> dict[str, int]:
-    """Return the number of episodes that ended below each stage, by what was missing."""
+    """Return the number of episodes that failed in each stage, keyed by the failure in words."""
     missed = {
         "never near the object": ~episodes["approach"],
         "near it, but no grasp": episodes["approach"] & ~episodes["grasp"],
@@ -194,9 +198,10 @@ def compare(
 
     Args:
         runs: folders, as ``FOLDER`` or ``LABEL=FOLDER``.
+        out: folder to write into.
         x: horizontal axis of the learning curves.
         curves: names of curves as in TensorBoard; default: :data:`DEFAULT_CURVES`.
-        apart: show trainings that differ in their seed only one by one, not as a group.
+        apart: show trainings that differ only in their seed separately, not as a group.
 
     Raises:
         RunError: there is nothing to compare, labels are not unique, or a curve is unknown.
@@ -233,7 +238,8 @@ def compare(
 
 
 def choose_curves(trainings: Sequence[Training], wanted: Sequence[str]) -> tuple[str, ...]:
-    """Return the curves to draw: the wanted ones, without repetition; none if no training has any.
+    """Return the names of the curves to draw: the wanted ones, or else :data:`DEFAULT_CURVES`, each once; none if no
+    training has curves.
 
     Raises:
         RunError: no training has one of the wanted curves.

@@ -1,4 +1,4 @@
-"""Read what reports and comparisons show: configuration, learning curves and evaluations, from folders of runs and of
+"""Read configurations, learning curves and evaluations, for reports and comparisons, from run folders and folders of
 results."""
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Training:
     """Configuration by name of the field, such as ``task.reset.demo_probability``, as tables show it; empty without
     ``run.json``."""
     curves: Table
-    """What :func:`read_curves` returns."""
+    """Learning curves, see :func:`read_curves`."""
     results: dict[str, EvalResult]
     """Engine -> result."""
     episodes: Table
@@ -76,7 +76,7 @@ class ReportData:
     stress: tuple[Stress, ...] = ()
     """Robustness of the policy in every engine in which it was measured."""
     notes: tuple[str, ...]
-    """What the reader must know before comparing engines, or what is missing."""
+    """Sentences about unfair comparisons and missing results."""
     robot: str
     """Name or folder of the robot."""
     meshes: Path | None
@@ -108,7 +108,7 @@ def results_in(folder: Path) -> Path:
 
 
 def name_of(folder: Path) -> str:
-    """Return the name of a run, or of the owner of a folder of results."""
+    """Return the name of a run folder, also for the ``eval`` folder in it."""
     whole = folder.resolve()
     return whole.parent.name if whole.name == "eval" else whole.name
 
@@ -128,7 +128,7 @@ def read_curves(folder: Path) -> Table:
     for file in sorted(folder.glob("events.out.tfevents.*")):
         scalars += _scalars(file)
     table: Table = pd.DataFrame(scalars, columns=["tag", "iteration", "value"])
-    # A resumed run repeats the steps after its checkpoint: the later value counts.
+    # A resumed run repeats the iterations after its checkpoint; the later values count.
     return table.drop_duplicates(["tag", "iteration"], keep="last").pivot(
         index="iteration", columns="tag", values="value"
     )
@@ -243,7 +243,7 @@ def read_training(label: str, folder: Path, results: Path | None = None) -> Trai
 
 
 def how_to_evaluate(folder: Path) -> str:
-    """Return what to do where results are missing."""
+    """Return a sentence that says how to make the missing results."""
     if (folder / "run.json").is_file():
         return f"Make them first: xreset eval {folder} --demos DEMOS"
     return f"Make them first: xreset eval POLICY --demos DEMOS --out {folder}"
@@ -260,11 +260,14 @@ _RUN_TYPES = {
 
 
 def run_facts(run: dict[str, Any], file: Path) -> dict[str, str]:
-    """Return the content of ``run.json``, flat, as text.
+    """Return the entries of ``run.json`` as text, by name; names of nested entries are joined by dots.
 
-    The content is not checked against this version's configuration, so that trainings of different versions of xreset
-    can be compared. What does not matter to a training is left out: the folder of meshes, because the bank was made
+    The entries are not checked against this version's configuration, so that trainings of different versions of xreset
+    can be compared. Entries that do not change a training are left out: the folder of meshes, because the bank was made
     with certain meshes; the number of a GPU; the commit of xreset.
+
+    Raises:
+        FileFormatError: an entry is missing or has another type.
     """
     contract = run.get("contract") or {}
     names = contract.get("objects") or [] if isinstance(contract, dict) else None

@@ -18,17 +18,19 @@ from xreset.learning.clock import SHARES, Lift
 
 
 def results(groups: Groups, found: Table) -> dict[str, dict[str, dict[str, str]]]:
-    """Return group -> name of a row -> engine -> text: how much was evaluated, every metric, and the difference to the
-    first group where both were evaluated alike.
+    """Return group -> name of a row -> engine -> text. The rows are the numbers of episodes, every metric, and the
+    difference to the first group where both were evaluated alike.
 
     Args:
+        groups: the groups.
         found: :func:`xreset.eval.report.groups.scores`.
     """
     first, *_ = groups
     reference = dict(by_engine(groups[first]))
     texts = {}
     for label, members in groups.items():
-        own = texts[label] = defaultdict(dict)
+        own = defaultdict(dict)
+        texts[label] = own
         alike = label != first and not uneven([*groups[first], *members])
         for engine, episodes in by_engine(members):
             own[COUNTED][engine] = counted(episodes)
@@ -43,11 +45,10 @@ def results(groups: Groups, found: Table) -> dict[str, dict[str, dict[str, str]]
 
 
 def lifted(clocks: Mapping[str, Sequence[Lift]], x: X) -> Rows:
-    """Return one row for each group of trainings, one column for each share of success: how many of its trainings
-    passed it, and when each did.
+    """Return a table of first success: a row for each group of trainings, a column for each share of success.
 
     Args:
-        clocks: label -> the lift clock of each training; one without iterations has none.
+        clocks: label -> the lift clock of each training. Trainings without iterations are left out.
         x: unit of the times.
     """
     rows = [["", "runs", *(f"{100 * share:g} %" for share in SHARES)]]
@@ -60,6 +61,8 @@ def lifted(clocks: Mapping[str, Sequence[Lift]], x: X) -> Rows:
 
 
 def _lifted(clocks: Sequence[Lift], share: float, x: X) -> str:
+    """Return as text how many trainings passed a share of success, with the 95 % Wilson interval, and when each did;
+    ``>``: not until then."""
     _, digits, field, scale = AXES[x]
     times = []
     hits = 0
@@ -73,7 +76,7 @@ def _lifted(clocks: Sequence[Lift], share: float, x: X) -> str:
 
 
 def different(groups: Groups) -> Rows:
-    """Return the fields in which trainings differ, a column for each group, and how long each was trained.
+    """Return a table of the fields in which trainings differ, with a column for each group, and their lengths.
 
     Baselines, which have no configuration, have no column.
     """
@@ -100,9 +103,11 @@ def different(groups: Groups) -> Rows:
 
 
 def _lengths(member: Training) -> dict[str, str]:
-    """Return how long was trained; nothing that was not logged."""
+    """Return the length of a training on each of :data:`AXES`, as text, where it was logged."""
     lengths = {}
-    for x, (label, digits, *_) in AXES.items() if len(member.curves) else ():
+    if not len(member.curves):
+        return lengths
+    for x, (label, digits, *_) in AXES.items():
         try:
             lengths[label] = f"{amounts(member, x).iloc[-1]:,.{digits}f}"
         except RunError:

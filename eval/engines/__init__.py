@@ -1,4 +1,5 @@
-"""How far engines agree on grasps and on one action sequence, and which difference costs a policy its skill.
+"""Compare physics engines: how far they agree on grasps and on an action sequence, and which of their differences costs
+a policy its skill.
 
 .. code-block:: python
 

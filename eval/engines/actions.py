@@ -1,9 +1,7 @@
-"""An action sequence that can be replayed anywhere: a state, the drives' target at each control step, and the physics
-meant.
+"""An action sequence that every engine can replay: a start state, joint targets for each control step, and the physics.
 
-Actions are kept as joint targets, not as a policy's outputs: what a policy's output becomes depends on where the joints
-are (see :mod:`xreset.task.actions`), and would no longer be the same in every engine. Shape letters: T control steps, J
-joints.
+Joint targets are stored, not a policy's outputs, because an output means another target where the joints are elsewhere
+(see :mod:`xreset.task.actions`), so engines would not get the same targets. Shape letters: T control steps, J joints.
 """
 
 from __future__ import annotations
@@ -42,14 +40,14 @@ _STATE_KEYS = {
 }
 
 _SPEED = (-1e4, 1e4)
-"""[rad/s, m/s]"""
+"""Range of velocities [rad/s, m/s]."""
 Joints = Annotated[np.ndarray, Field(("J",), "f", within=JOINT)]
 Velocity = Annotated[np.ndarray, Field((3,), "f", within=_SPEED)]
 
 
 @frozen
 class ActionFile:
-    """Contents of a file of actions, except what engines did with them. Poses in the world frame."""
+    """Contents of a file of actions, except the recordings of engines. Poses are in the world frame."""
 
     robot: OneText
     robot_fingerprint: OneText
@@ -60,7 +58,7 @@ class ActionFile:
     timestep: Annotated[float, Field((), "f", within=(1e-6, 1.0))]
     substeps: Annotated[int, Field((), "i", within=(1, 1e6))]
     friction: Annotated[np.ndarray, Field((3,), "f", within=(0.0, 100.0))]
-    """Of fingertips, other links and the table."""
+    """Pair friction of the object with fingertips, other links and the table."""
     joint_target: Annotated[np.ndarray, Field(("T", "J"), "f", within=JOINT)]
     start_joint_pos: Joints
     start_joint_vel: Annotated[np.ndarray, Field(("J",), "f", within=_SPEED)]
@@ -76,13 +74,13 @@ class Actions:
     """One action sequence from one state."""
 
     scene: SceneSpec
-    """With one object."""
+    """Scene with one object."""
     label: str
     """Description for people."""
     start: State
-    """[1, ...]"""
+    """[1, ...] state of one world."""
     joint_target: torch.Tensor
-    """[T, J] rad (m): the drives' targets from the beginning of each control step."""
+    """[T, J] targets of the joints' drives in each control step [rad (m)]."""
 
     @property
     def robot(self) -> RobotSpec:
@@ -96,17 +94,17 @@ class Actions:
 
 
 def from_file(source: Path, place: Place, thing: str | None = None, episode: int = 0) -> Actions:
-    """Return an open-loop grasp and lift of a grasp in the file; or recorded actions, also those of an evaluation.
+    """Load actions from a file: its recorded actions, or an open-loop grasp and lift of one of its grasps.
 
     Args:
-        source: demonstrations, motion, the trace of an evaluation, or recorded actions.
+        source: recorded actions, the trace of an evaluation, or demonstrations or motion with grasps.
         place: robot and meshes.
         thing: name of an object of the file; default: its first.
-        episode: which of the object's grasps or recorded episodes.
+        episode: index among the object's grasps or recorded episodes.
 
     Raises:
         FileFormatError: the file is of another kind, or for another robot.
-        DemoError: the file shows no such grasp.
+        DemoError: the file has no such object, grasp or episode.
     """
     schema = npz_schema(source)
     if schema == SCHEMA:
@@ -154,7 +152,7 @@ def _check_episode(episode: int, count: int, found: str) -> None:
 
 
 def grasp_and_lift(robot: RobotSpec, thing: ObjectSpec, grasp: Grasps) -> Actions:
-    """Return the open-loop try of one grasp: the hand, open around the object at rest, closes, lifts and shakes."""
+    """Return the actions of :func:`~xreset.eval.engines.grasps.closing_episode` for one grasp."""
     scene = SceneSpec(robot=robot, objects=(thing,))
     start, targets = closing_episode(scene, grasp)
     label = f"grasp and lift of {thing.name}, {grasp.label[0]}"
@@ -162,11 +160,10 @@ def grasp_and_lift(robot: RobotSpec, thing: ObjectSpec, grasp: Grasps) -> Action
 
 
 def recorded_actions(robot: RobotSpec, thing: ObjectSpec, trace: Trace, *, label: str) -> Actions:
-    """Return the actions of an episode that an evaluation has recorded; it began at rest, with the physics of an
-    evaluation.
+    """Return the actions of an episode that an evaluation recorded: from rest, with the physics of an evaluation.
 
     Raises:
-        FileFormatError: the trace has too few actions, or its control step is no whole number of physics steps.
+        FileFormatError: the trace has too few actions, or its control step is not a whole number of physics steps.
     """
     targets, every = trace.actions(label)
     dt = float(trace.time[1] - trace.time[0]) / every
@@ -185,7 +182,7 @@ def recorded_actions(robot: RobotSpec, thing: ObjectSpec, trace: Trace, *, label
 def write_actions(
     path: str | Path, actions: Actions, replays: Mapping[str, Recording] | None = None
 ) -> None:
-    """Write an action sequence, and what engines did with it, by name: the first world of each recording."""
+    """Write an action sequence and, for each engine by name, the first world of its recording."""
     scene = actions.scene
     friction = scene.friction
     start = {key: getattr(actions.start, name)[0].numpy() for name, key in _STATE_KEYS.items()}

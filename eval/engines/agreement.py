@@ -1,7 +1,7 @@
-"""The comparison of engines: they try the same grasps, and are measured against a reference.
+"""Compare engines: they try the same grasps, and are measured against a reference.
 
-Where two recordings of the same episode are compared, the first is of the tested engine, the second of the reference.
-Shape letters as in :mod:`xreset.eval.engines.recording`.
+Where two recordings of the same episode are compared, the first is from the tested engine, the second from the
+reference. Shape letters as in :mod:`xreset.eval.engines.recording`.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ SURFACE_POINTS = 64
 FRICTIONS = (0.5, 0.8)
 """Pair frictions of hand and object in the holds."""
 IN_AIR = 1 / 3
-"""Share of the common states that demonstrations show in the air; the others come from closings."""
+"""Share of the common states that come from demonstrations in the air; the others come from closings."""
 PRESS_MASS = 1e6
-"""Factor on the mass of an object that nothing shall move."""
+"""Factor on the mass of an object that nothing can move."""
 PRESS_FLOOR = 0.5
-"""Forces below this [N] in both engines are no press."""
+"""Forces below this in both engines are not compared [N]."""
 PRESS_TIME = 0.25
-"""Forces are averaged over the last of these seconds of a press."""
+"""Forces are averaged over this time at the end of a press [s]."""
 
 _METRICS = tomllib.loads(Path(__file__).with_name("metrics.toml").read_text())
 
@@ -62,15 +62,15 @@ class Metric:
     sense: str
     target: float
     measured: float | None
-    """None if nothing could be compared."""
+    """Median or mean; None if nothing could be compared."""
     n: int
-    """How many numbers it is taken over."""
+    """Number of values of this median or mean."""
     verdict: str
-    """``met`` or ``missed``; a number that could not be measured does not meet the target."""
+    """``met`` or ``missed``. The target is missed if nothing could be compared."""
 
     @classmethod
     def of(cls, name: str, values: Tensor, mean: bool = False) -> Metric:
-        """Judge the median, or the mean, of some numbers [n]."""
+        """Return the row of a metric, for the median, or the mean, of some values [n]."""
         row = _METRICS[name]
         numbers = values.double().flatten()
         measured = math.nan
@@ -92,11 +92,11 @@ class Metric:
 
 
 def try_closings(tested: Engine, scene: SceneSpec, grasps: Grasps) -> dict[str, Recording]:
-    """Close each hand at the scene's frictions.
+    """Close each hand, with the scene's friction.
 
     Returns:
-        ``press``: the closing around objects too heavy to move, up to the lift; ``closing``: the whole try around
-        objects at rest on the table.
+        ``closing``: the hand closes around an object at rest on the table, lifts and shakes it. ``press``: the hand
+        closes around an object that is too heavy to move.
     """
     start, targets = closing_episode(scene, grasps)
     with tested.make(scene, len(grasps), grasps.object_index) as backend:
@@ -109,7 +109,7 @@ def try_closings(tested: Engine, scene: SceneSpec, grasps: Grasps) -> dict[str, 
 
 
 def try_holds(tested: Engine, scene: SceneSpec, common: Grasps) -> dict[str, Recording]:
-    """Lift and shake, once with each of the frictions."""
+    """Lift and shake the objects from common states, once with each of :data:`FRICTIONS`."""
     targets = lifting_targets(scene, common.start)
     recordings = {}
     with tested.make(scene, len(common), common.object_index) as backend:
@@ -124,7 +124,7 @@ def common_states(
     scene: SceneSpec, table: Grasps, air: Grasps, closings: Mapping[str, Recording], count: int
 ) -> Grasps:
     """Return grasps that favor no engine: some from demonstrations in the air, the others from the closings of all
-    engines in turn. Their labels say which.
+    engines in turn. Labels state the origin.
 
     A closing counts if a fingertip touches the object when the hand has closed.
 
@@ -133,7 +133,7 @@ def common_states(
         table: grasps of the closings.
         air: grasps in the air.
         closings: whole closings, by engine.
-        count: largest number of grasps; there are fewer where hands have closed on nothing.
+        count: largest number of grasps; there are fewer if hands have closed on nothing.
     """
     shown = air[: round(count * IN_AIR)]
     held = shown.start
@@ -164,7 +164,7 @@ class EngineParity:
     metrics: tuple[Metric, ...]
     """Against the reference; empty for the reference itself."""
     carried: dict[str, tuple[bool, ...]]
-    """For each kind of try (``closing``, ``hold 0.5``, ...), which grasps carried their object."""
+    """Kind of try (``closing``, ``hold 0.5``, ...) -> whether each grasp carried its object."""
     broken_worlds: int
     """Worlds that were not finite or dropped contacts, over all tries."""
 
@@ -180,10 +180,10 @@ class Parity:
     """Name and source of each object."""
     reference: EngineParity
     floor: EngineParity
-    """The reference with half its timestep: how far two honest solutions of the same equations differ."""
+    """The reference with half its timestep: how far two valid solutions of the same equations differ."""
     engines: tuple[EngineParity, ...]
     grasps: dict[str, list[dict[str, str]]]
-    """Label and object of each grasp, of the closings and of the holds."""
+    """``closing`` and ``hold`` -> label and object of each grasp."""
 
     @property
     def missed(self) -> list[str]:
@@ -213,7 +213,7 @@ def compare(
         engines: the engines to measure.
         grasps: number of closings, and of holds from common states.
         reference: default: the backend ``mujoco``.
-        progress: called with (what is being done, tries done, tries in all).
+        progress: called with (current try, tries done, tries in all).
 
     Raises:
         DemoError: the motion shows no grasp.
@@ -241,31 +241,13 @@ def compare(
         torch.as_tensor(surface_points(o, SURFACE_POINTS), dtype=torch.float32) for o in objects
     ]
     points = torch.stack(surfaces)[common.object_index]
+    window = round(PRESS_TIME / scene.control_dt)
     results = []
     for tested, own in tries.items():
         metrics: tuple[Metric, ...] = ()
         if tested is not reference:
-            window = round(PRESS_TIME / scene.control_dt)
             metrics = tuple(_metrics(own, tries[reference], points, window))
-        result = EngineParity(
-            backend=tested.name,
-            version=tested.version,
-            device=tested.device,
-            metrics=metrics,
-            carried={
-                name: tuple(carried(tried).tolist())
-                for name, tried in own.items()
-                if name != "press"
-            },
-            broken_worlds=sum(int(tried.broken.sum()) for tried in own.values()),
-        )
-        results.append(result)
-    named = {}
-    for kind, tried in (("closing", table), ("hold", common)):
-        held = [objects[i].name for i in tried.object_index.tolist()]
-        named[kind] = [
-            {"grasp": label, "object": name} for label, name in zip(tried.label, held, strict=True)
-        ]
+        results.append(_engine_parity(tested, own, metrics))
     return Parity(
         robot=robot.name,
         robot_fingerprint=robot.fingerprint,
@@ -273,8 +255,31 @@ def compare(
         reference=results[0],
         floor=results[1],
         engines=tuple(results[2:]),
-        grasps=named,
+        grasps={"closing": _listed(table, objects), "hold": _listed(common, objects)},
     )
+
+
+def _engine_parity(
+    tested: Engine, tries: dict[str, Recording], metrics: tuple[Metric, ...]
+) -> EngineParity:
+    return EngineParity(
+        backend=tested.name,
+        version=tested.version,
+        device=tested.device,
+        metrics=metrics,
+        carried={
+            name: tuple(carried(tried).tolist()) for name, tried in tries.items() if name != "press"
+        },
+        broken_worlds=sum(int(tried.broken.sum()) for tried in tries.values()),
+    )
+
+
+def _listed(grasps: Grasps, objects: Sequence[ObjectSpec]) -> list[dict[str, str]]:
+    """Return label and object of each grasp."""
+    names = [objects[i].name for i in grasps.object_index.tolist()]
+    return [
+        {"grasp": label, "object": name} for label, name in zip(grasps.label, names, strict=True)
+    ]
 
 
 def _at_half_timestep(base: Engine) -> Engine:
@@ -311,7 +316,7 @@ def _metrics(
 
 
 def press_metrics(found: Recording, reference: Recording, steps: int) -> list[Metric]:
-    """Compare the forces of a hand on an object that does not move, averaged over the last control steps."""
+    """Compare the fingertip forces on an object that does not move, averaged over the last ``steps`` control steps."""
     force = found.tip_force[-steps:].mean(0)
     expected = reference.tip_force[-steps:].mean(0)
     press = force.norm(dim=-1)
@@ -324,12 +329,12 @@ def press_metrics(found: Recording, reference: Recording, steps: int) -> list[Me
 
 
 def carried(recording: Recording) -> Tensor:
-    """[G] bool: whether the object ends at least half as far above its start as the palm was lifted."""
+    """[G] bool: whether the object was lifted by more than half of the palm's lift, and its world is not broken."""
     return (recording.lifted > LIFT_HEIGHT / 2) & ~recording.broken
 
 
 def outcome_metric(name: str, pairs: Iterable[tuple[Recording, Recording]]) -> Metric:
-    """Return the share of the tries that end alike in both of a pair, carried or not."""
+    """Return the share of the tries with the same outcome, carried or not, in both recordings of a pair."""
     same = [carried(a) == carried(b) for a, b in pairs]
     return Metric.of(name, torch.cat(same), mean=True)
 

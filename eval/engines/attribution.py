@@ -1,7 +1,7 @@
-"""What a policy's score owes to differences of engines: the policy plays in engine A, in A with one property of B at a
-time, with all of these at once, and in B.
+"""Attribute the difference between a policy's scores in two engines to their physical properties.
 
-Every run plays the same episodes from the same starts, so runs are compared episode by episode.
+The policy plays in engine A, in A with one property of B at a time, in A with all of these properties, and in B. Every
+run plays the same episodes from the same starts, so runs are compared episode by episode.
 """
 
 from __future__ import annotations
@@ -47,12 +47,12 @@ class Row:
     """One run of the policy."""
 
     kind: Kind
-    """``as it is``: A. ``towards``: one property changed to B's value. ``all``: all of them. ``other``: B."""
+    """``as it is``: A. ``towards``: A with one property of B. ``all``: A with all of these properties. ``other``: B."""
     name: str
-    """Property, or engine."""
+    """Name of the property or of the engine."""
     episodes: tuple[Episode, ...]
     effect: Effect
-    """Against A as it is."""
+    """Task progress, and its difference to A as it is."""
 
     def mean(self, metric: str) -> float:
         """Mean of one metric over the episodes."""
@@ -66,7 +66,7 @@ class Attribution:
     a: str
     b: str
     measured: dict[str, tuple[float, float]]
-    """What was measured of each property in A and in B; NaN where that was impossible."""
+    """Property -> its values in A and in B; NaN where it could not be measured."""
     rows: tuple[Row, ...]
     """The first is A as it is, the last B."""
     skipped: dict[str, str]
@@ -78,12 +78,12 @@ class Attribution:
         return self.rows[-1].effect
 
     def share(self, row: Row) -> float:
-        """Return the share of the gap that a run brings about; NaN where A and B do not differ for sure."""
+        """Return the run's share of the gap; NaN if the interval of the gap includes zero."""
         return row.effect.difference / self.gap.difference if self.gap.is_certain else math.nan
 
     def costs(self) -> Row | None:
-        """Return the property that brings about most of the gap when it is changed to B's value; None if none does for
-        sure."""
+        """Return the run with the one changed property that has the largest share of the gap, among the runs whose
+        difference is certain; None if there are none."""
         found = []
         for row in self.rows:
             if row.kind == "towards" and row.effect.is_certain and self.share(row) > 0:
@@ -91,7 +91,7 @@ class Attribution:
         return max(found, key=self.share, default=None)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return JSON-able content."""
+        """Return the content of ``attribution.json``."""
         properties = []
         for name, values in self.measured.items():
             a, b = map(_number, values)
@@ -136,7 +136,7 @@ def attribute(
     """Measure both engines, and play the policy in A, in A changed towards B, and in B.
 
     Args:
-        policy: what plays.
+        policy: the policy.
         a: engine that is changed.
         b: engine towards which A is changed.
         trial: what is played; the mass and inertia of its first object are measured.
@@ -207,17 +207,17 @@ def attribute(
 def change_towards(
     prop: Property, a: float, b: float, task: TaskConfig, engine: str
 ) -> TaskConfig | str:
-    """Return the task in which a property of engine A has the value of engine B, or why there is none.
+    """Return the task in which a property of engine A has the value of engine B, or a text that says why there is none.
 
     A pair's friction is the mean of two materials, of which the one that is not the object's is changed. Other
     properties are changed by the factor B / A. MuJoCo's contacts, which count time in timesteps, become stiffer with a
     finer timestep, and its friction becomes harder below 1/200 s.
 
     Args:
-        prop: what is changed.
+        prop: the property.
         a: value that was measured in A.
         b: value that was measured in B.
-        task: what is played, from :func:`~xreset.eval.sensitivity.nominal_task`.
+        task: task from :func:`~xreset.eval.sensitivity.nominal_task`.
         engine: name of A.
     """
     unknown = [which for which, value in (("A", a), ("B", b)) if not math.isfinite(value)]
@@ -248,7 +248,7 @@ def change_towards(
 
 
 def rich_table(found: Attribution, title: str) -> Table:
-    """One row for each run: change, score, and difference to A as it is. Bold: the interval leaves out zero."""
+    """Return a table with a row for each run. A row is bold if the interval of its difference to A excludes zero."""
     table = Table("", title=title, title_justify="left")
     names = (
         "value",
@@ -266,31 +266,34 @@ def rich_table(found: Attribution, title: str) -> Table:
         low, high = effect.ci95
         least, most = effect.difference_ci95
         share = found.share(row)
-        first = row is found.rows[0]
+        values = " -> ".join(_shown(row.name, found)) if row.kind == "towards" else ""
+        difference = ""
+        share_text = ""
+        if row is not found.rows[0]:
+            difference = f"{100 * effect.difference:+.1f}\n{100 * least:+.1f} to {100 * most:+.1f}"
+            share_text = "" if math.isnan(share) else f"{share:.0%}"
         table.add_row(
             row.name,
-            " -> ".join(_shown(row.name, found)) if row.kind == "towards" else "",
+            values,
             f"{effect.task_progress:.1%}\n{100 * low:.0f}-{100 * high:.0f}",
             f"{row.mean('grasp'):.0%}",
             f"{row.mean('reorient'):.0%}",
             success_text(effect.published_success),
-            ""
-            if first
-            else f"{100 * effect.difference:+.1f}\n{100 * least:+.1f} to {100 * most:+.1f}",
-            "" if first or math.isnan(share) else f"{share:.0%}",
+            difference,
+            share_text,
             style="bold" if effect.is_certain else None,
         )
     return table
 
 
 def _shown(name: str, found: Attribution) -> list[str]:
-    """Return what was measured of a property in A and in B, in words."""
+    """Return the measured values of a property in A and in B, as text."""
     shown = COMPARED[name].shown
     return [shown(value) if math.isfinite(value) else "unknown" for value in found.measured[name]]
 
 
 def not_tried(found: Attribution) -> Iterator[str]:
-    """Yield a line for each property that was not changed towards B: its value in both engines, and the reason."""
+    """Yield a line for each property that was not changed: its value in both engines, and the reason."""
     for name, reason in found.skipped.items():
         a, b = _shown(name, found)
         yield f"not tried: {name} ({a} in {found.a}, {b} in {found.b}): {reason}"

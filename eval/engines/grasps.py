@@ -1,8 +1,8 @@
-"""Grasps that demonstrations show, and episodes that try them: close the hand, lift, shake.
+"""Find grasps in retargeted motion, and make the episodes that try them: close the hand, lift, shake.
 
-A grasp is a frame in which the hand is at the object, whatever an engine makes of it. The episodes are open loop, in
-joint targets, made without any engine. The hand closes along the line between thumb and fingers, which any hand with a
-thumb and another finger has, whatever its joints are. Shape letters: G grasps (one per world), J joints, H joints of
+A grasp is a frame in which the hand is at the object; it may fail in an engine. An episode is a sequence of joint
+targets, made without an engine. The hand closes along the line between thumb and fingers, so the same code works for
+every hand with a thumb and another finger. Shape letters: G grasps (one per world), J joints, H joints of
 the hand, E fingertips, T control steps, R rows (chosen frames).
 """
 
@@ -31,15 +31,15 @@ from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, lowest_point
 from xreset.tensors import Tensors
 
 REST_DISTANCE = 0.010
-"""Distance [m] from its start up to which an object counts as at rest on the table."""
+"""Largest distance from its start of an object that counts as at rest on the table [m]."""
 REST_ANGLE = np.radians(10.0)
-"""Angle [rad] from its start up to which it does."""
+"""Largest angle from its start of such an object [rad]."""
 LIFTED = 0.030
-"""Height [m] above its start from which an object counts as lifted."""
+"""Least height above its start of an object that counts as lifted [m]."""
 CLEARANCE = 0.0005
-"""Least height [m] of an object above the table. Demonstrated poses may be sunk into it; engines eject such objects."""
+"""Least height of an object above the table [m]. Demonstrated objects may be sunk into it, and engines eject them."""
 NEAR = 0.025
-"""A fingertip nearer than this [m] to the object's collision surface may touch it once the hand closes."""
+"""A fingertip nearer than this to the object's collision surface may touch it when the hand closes [m]."""
 
 
 @frozen
@@ -73,19 +73,19 @@ def find_grasps(
     """Choose grasps, equally many of each object and spread over the sequences; the same arguments give the same
     grasps.
 
-    In the frames that count, the thumb's tip and another tip are near the object's surface. ``table``: the object is
-    still where it started; of a sequence, the last such frame comes first, in which the person is about to lift.
-    ``air``: the object is lifted; the middle frame comes first.
+    A frame counts if the thumb's tip and another tip are near the object's surface. ``table``: the object must be
+    where it started; the last such frame of a sequence, just before the lift, is preferred. ``air``: the object must be
+    lifted; the middle frame is preferred.
 
     Args:
-        motion: where to look, in the valid frames after first contact.
+        motion: motion, of which valid frames after first contact are used.
         robot: the robot.
-        objects: geometry; frames of other objects are left out.
-        count: largest G; there are fewer grasps where the frames show fewer.
+        objects: geometry; frames of other objects are ignored.
+        count: largest number of grasps.
         where: the object's place.
 
     Raises:
-        DemoError: there is no grasp on the table.
+        DemoError: no frame shows a grasp on the table.
     """
     names = [o.name for o in objects]
     rows = np.flatnonzero(motion.valid & motion.post_contact)
@@ -144,7 +144,7 @@ def _at_hand(
 
 
 def _in_turns(motion: Retargeted, rows: np.ndarray, *, last_first: bool) -> np.ndarray:
-    """Order rows [R]: objects take turns, then an object's sequences; a sequence's best frame comes first."""
+    """Order rows [R] so that objects take turns, then the sequences of an object; the best frame of each is first."""
     sequence = motion.sequence_of_frame[rows]
     table = pd.DataFrame(
         {"row": rows, "sequence": sequence, "object": motion.object_name[sequence]}
@@ -160,19 +160,17 @@ def _in_turns(motion: Retargeted, rows: np.ndarray, *, last_first: bool) -> np.n
 # Trying grasps --------------------------------------------------------------------------------------------------------
 
 OPENING = 0.025
-"""Distance of the fingertips at the start from where they hold, away from the opposite fingertips [m]."""
+"""Distance by which the fingertips are opened at the start, away from the opposite fingertips [m]."""
 REACH = 0.010
-"""Distance that they move on towards the opposite ones [m]: demonstrated tips may not touch the robot's object."""
+"""Distance that they close beyond the demonstrated grasp, in which they may not touch the object yet [m]."""
 LIFT_HEIGHT = 0.10
 """Height by which the palm is lifted [m]."""
 AMPLITUDE = 0.015
 """Amplitude of the shake [m]."""
 _FREQUENCY = 2.5
-"""Frequency of the shake [Hz]; its amplitude grows from nothing and fades again."""
-
-
+"""Frequency of the shake [Hz]; its amplitude grows from zero and fades to zero."""
 SQUEEZE = 12.0
-"""Force with which thumb and fingers press against each other if the object is there [N]."""
+"""Force with which thumb and fingers press against each other through the object [N]."""
 SETTLE_TIME = 0.2
 """Time for the object to come to rest before the hand moves [s]."""
 CLOSE_TIME = 0.6
@@ -191,8 +189,8 @@ def closing_steps(dt: float) -> int:
 
 
 def closing_episode(scene: SceneSpec, grasps: Grasps) -> tuple[State, Tensor]:
-    """Return start [G, ...] and targets [T, G, J] of a whole try: the open hand around an object at rest closes, lifts
-    and shakes."""
+    """Return the start [G, ...] and the joint targets [T, G, J] of an episode: the hand, open around an object at rest,
+    closes, lifts and shakes."""
     kinematics = Kinematics(scene.robot)
     dt = scene.control_dt
     held = grasps.start.joint_pos.double()
@@ -210,7 +208,7 @@ def closing_episode(scene: SceneSpec, grasps: Grasps) -> tuple[State, Tensor]:
 
 
 def lifting_targets(scene: SceneSpec, start: State) -> Tensor:
-    """[T, G, J] targets that lift and shake what the hand holds in states [G, ...], from the targets of each state."""
+    """[T, G, J] joint targets that lift and shake the held object, from the targets of the states [G, ...] on."""
     targets = start.joint_target.double()
     still = targets.expand(round(HOLD_TIME / scene.control_dt), *targets.shape)
     lifted = _carried(Kinematics(scene.robot), targets, scene.control_dt)
@@ -237,12 +235,12 @@ def _carried(kinematics: Kinematics, closed: Tensor, dt: float) -> Tensor:
 
 _FINGER_STEPS = 4
 _FINGER_DAMPING = 0.02
-"""[m] Small against a finger's length, by which one radian moves its tip."""
+"""Damping of a finger step [m]: small against a finger's length, by which one radian moves its tip."""
 _ARM_ITERATIONS = 2
 _ARM_DAMPING = 0.01
-"""[m]"""
+"""Damping of an arm step [m]."""
 _TURN_LENGTH = 0.3
-"""[m] Makes turning the palm comparable to moving it."""
+"""Length that makes turns of the palm comparable to shifts [m]."""
 
 
 def moved_fingertips(kinematics: Kinematics, joint_pos: Tensor, distance: float) -> Tensor:
@@ -268,8 +266,9 @@ def moved_fingertips(kinematics: Kinematics, joint_pos: Tensor, distance: float)
 def squeezed(kinematics: Kinematics, joint_pos: Tensor) -> Tensor:
     """Return joint targets [G, J] with which the hand reaches and squeezes.
 
-    Held where the reach ends, each joint's drive gives the torque J^T f of the fingertip forces f, because its target
-    is K^-1 J^T f away. The thumb presses as much as the other fingers together, and each of these as much as another.
+    The targets are K^-1 J^T f beyond the end of the reach. If the object stops the fingers there, the drives give the
+    torques J^T f of the fingertip forces f. The thumb presses as much as the other fingers together, which press
+    equally.
 
     Args:
         kinematics: of the robot.
@@ -300,13 +299,13 @@ def _tip_jacobian(kinematics: Kinematics, q: Tensor) -> Tensor:
 
 
 def carried_palm(kinematics: Kinematics, joint_pos: Tensor, offset: Tensor) -> Tensor:
-    """Return joint positions [T, G, J] that move the palm without turning it; each step starts from the arm's last
-    pose.
+    """Return joint positions [T, G, J] that move the palm without turning it. The inverse kinematics of a step starts
+    from the joints of the step before.
 
     Args:
         kinematics: of the robot.
-        joint_pos: [G, J] where to begin (rad, m); the hand's joints stay.
-        offset: [T, 3] of the palm from where it begins, world frame [m].
+        joint_pos: [G, J] first joint positions (rad, m); the hand's joints stay.
+        offset: [T, 3] shift of the palm from its first position, world frame [m].
     """
     robot = kinematics.robot
     q = joint_pos

@@ -1,8 +1,8 @@
-"""The physics that an engine really has, measured through the interface by short experiments.
+"""Measure the physical properties of an engine through its interface, by short experiments.
 
-Nothing here knows any engine, so plugins and altered engines are measured alike. What ``xreset engines check`` proves
-of every engine, such as masses and the absence of delays, is not measured again. Gravity is off except where an object
-rests on the table.
+No experiment depends on the engine, so plugins and altered engines are measured in the same way. Properties that
+``xreset engines check`` tests, such as masses and the absence of delays, are not measured again. Gravity is off except
+where an object rests on the table.
 """
 
 from __future__ import annotations
@@ -40,43 +40,45 @@ class Measured:
     table_friction: float
     """Pair friction of object and table."""
     torsional_friction: float
-    """Torsional friction of object and table touching in one point [m]; NaN where it stops the object at once."""
+    """Torsional friction of object and table that touch in one point [m]; NaN if it stops the object at once."""
     arm_stiffness: float
     """Share of kp, median over the arm's joints."""
     arm_damping: float
-    """Share of kd."""
+    """Share of kd, median over the arm's joints."""
     hand_stiffness: float
     """Share of kp, median over the hand's joints."""
     hand_damping: float
-    """Share of kd."""
+    """Share of kd, median over the hand's joints."""
     timestep: float
     """Step with which motion is integrated [s]."""
 
 
 _SLAB_HALF = (0.06, 0.06, 0.02)
-"""[m] of a box that slides."""
+"""Half sizes of the slab and of the paddle [m]."""
 _SLAB_MASS = 0.5
+"""[kg]"""
 _SPEED = 0.5
-"""[m/s] of a slab that slides."""
+"""Speed of the slab at the start [m/s]."""
 _PRESS = 3.0
-"""[N] of the paddle on a link."""
+"""Force of the paddle on a link [N]."""
 _PULL = 3.0
-"""Pull along the link, as a factor on what friction should carry."""
+"""Pull along the link, as a factor on the force that friction should carry."""
 _STEP = 0.03
-"""[rad, m] of the drives, where that is within two fifths of their effort."""
+"""Step of a drive's target [rad, m]; it is smaller where it would need more than two fifths of the drive's effort."""
 _SETTLE = 0.25
-"""[s] before pulls."""
+"""Time before the pulls begin [s]."""
 _TIME = 0.40
-"""[s] of all experiments."""
+"""Duration of every experiment [s]."""
 _PULL_WINDOW = (0.05, 0.12)
-"""[s] after the pull begins."""
+"""Time after the begin of the pull in which impulses are measured [s]."""
 _PUSH_STEPS = 24
 """Physics steps of constant force on the free object."""
 _TOP_HEIGHT = 0.04
-"""[m] of a cone on its point."""
+"""Height of the top, a cone on its point [m]."""
 _TOP_RADIUS = 0.02
+"""[m]"""
 _TOP_INERTIA = (1.0, 1.0, 1e-3)
-"""[kg m^2] The cone can hardly fall, and turns easily."""
+"""Moments of inertia of the top [kg m^2]: it can hardly fall, and spins easily."""
 
 _SLAB = 0
 _PADDLE = 1
@@ -95,26 +97,27 @@ _AT = {name: i for i, name in enumerate(_WORLDS)}
 
 
 def measure(engine: Engine, scene: SceneSpec) -> Measured:
-    """Put an engine through the experiments.
+    """Measure an engine with these experiments:
 
-    - A slab slides over the table from 0.5 m/s: its way d tells the friction, (v0^2 - v1^2) / (2 g (d + v0 h / 2)) with
-      h the step of the integration. (Its deceleration does not tell it: MuJoCo's contacts lift what slides, so it
-      patters.)
-    - A top that can hardly fall spins on its point: what it loses, I dw, tells the torsional friction, I dw / int(N) dt
-      with the load's impulse from the momentum (contacts may patter).
-    - A paddle that can hardly turn is pressed onto a fingertip, and onto the farthest other link, with 3 N and then
-      pulled sideways with three times what friction should carry: the friction is the ratio of the impulses that were
-      missing along and across.
-    - A constant force on the free object: its distance x = a t (t + h) / 2 and velocity a t tell the step h of the
+    - A slab slides over the table from 0.5 m/s. Its path d gives the friction, (v0^2 - v1^2) / (2 g (d + v0 h / 2)),
+      with h the step of the integration. The deceleration would not do, because MuJoCo's contacts lift a sliding object
+      again and again.
+    - A top that can hardly fall spins on its point. Its loss of spin dw gives the torsional friction, I dw / int(N) dt.
+      The impulse of the load N follows from the momentum, because contacts may come and go.
+    - A paddle that can hardly turn is pressed with 3 N onto a fingertip, and another onto the farthest other link. Then
+      it is pulled sideways with three times the force that friction should carry. The friction is the impulse of the
+      link on the paddle along its face, divided by the impulse across it.
+    - A constant force pushes the free object. Its distance x = a t (t + h) / 2 and velocity a t give the step h of the
       integration.
-    - Every drive gets a small step of its target q*. M v = kp int(q* - q) dt - kd (q - q0), fitted over the response,
-      tells kp and kd (of what moves, so an integrator's numerical damping counts as damping).
+    - Every drive gets a small step of its target q*. The fit of M v = kp int(q* - q) dt - kd (q - q0) over the response
+      gives kp and kd. An integrator's numerical damping counts as damping.
 
     Args:
-        scene: robot and object (the first) of the skill, and its friction and timestep.
+        engine: engine to measure.
+        scene: robot, friction, timestep, and the object that is pushed: the first.
 
     Raises:
-        XResetError: the state is not finite, or no link can be reached from outside.
+        XResetError: a state is not finite, or a paddle cannot reach a link.
     """
     experiments = _Experiments(scene)
     objects = torch.tensor(list(_WORLDS.values()))
@@ -173,7 +176,7 @@ class _Experiments:
         return log
 
     def measured(self, log: State) -> Measured:
-        """Return what the worlds' states say of the engine."""
+        """Return the engine's properties, from the states [T, N, ...] of all experiments."""
         dt = self._dt
         t = _PUSH_STEPS * dt
         row = _AT["force"]
@@ -196,7 +199,7 @@ class _Experiments:
         )
 
     def _pulled(self, log: State, name: str) -> float:
-        """Return the friction of a paddle, from the impulses that were missing along and across the link."""
+        """Return the friction of a paddle, from the link's impulses on it along and across its face."""
         _, normal, along = self._presses[name]
         begin = round((_SETTLE + _PULL_WINDOW[0]) / self._dt)
         end = round((_SETTLE + _PULL_WINDOW[1]) / self._dt)
@@ -208,7 +211,7 @@ class _Experiments:
         return carried / pressed if pressed > 0.05 * _PRESS * time else float("nan")
 
     def _slid(self, log: State, step: float) -> float:
-        """Return the friction from how far the slab has slid."""
+        """Return the friction from the path of the slab; step: that of the integration [s]."""
         world = _AT["slide"]
         end = log.object_linvel[-1, world, :2].norm()
         way = (log.object_pos[-1, world, :2] - log.object_pos[0, world, :2]).norm()
@@ -224,7 +227,7 @@ class _Experiments:
         steps = int((spin > spin[0] / 2).long().cumprod(0).sum()) - 1
         if steps < 1:
             return float("nan")
-        # its impulse, for the mass
+        # impulse of the load, divided by the mass
         load = GRAVITY * steps * self._dt + float(log.object_linvel[steps, world, 2])
         return _TOP_INERTIA[2] / _SLAB_MASS * float(spin[0] - spin[steps]) / load
 
@@ -262,7 +265,7 @@ class _Experiments:
         return np.where(upper - home < home - lower, -steps, steps).astype(np.float32)
 
     def _drives(self, log: State) -> np.ndarray:
-        """[2, J] shares of kp and kd, after a step of the targets."""
+        """[2, J] shares of kp and kd, fitted over the response to a step of the targets."""
         position = log.joint_pos[:, _AT["drives"]].numpy()
         velocity = log.joint_vel[:, _AT["drives"]].numpy()
         armature = np.diag(drive_values(self._robot, "armature"))
@@ -286,13 +289,15 @@ def _solid(name: str, piece: Shape, inertia: ArrayLike) -> ObjectSpec:
 
 
 def _reachable(scene: SceneSpec, *, tip: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find where a paddle can be pressed on a fingertip (or on another link) of the robot at home, with nothing else in
-    its way.
+    """Find a point where a free way leads a paddle onto a fingertip (or onto another link) of the robot at home.
 
-    Of many directions, the one in which the link sticks out farthest beyond links of the other kind.
+    The point is in the one of many directions in which links of this kind stick out farthest beyond the others.
 
     Returns:
-        The point [3] that sticks out, the direction [3] it sticks out in, and a direction [3] along the paddle's face.
+        The point [3], this direction [3], and a direction [3] along the paddle's face.
+
+    Raises:
+        XResetError: no link of this kind sticks out.
     """
     robot = scene.robot
     kinematics = Kinematics(robot)
@@ -348,5 +353,5 @@ def _z_to(direction: np.ndarray) -> np.ndarray:
 
 
 def _median(values: np.ndarray) -> float:
-    """NaN if there are none."""
+    """Return the median; NaN without values."""
     return float(np.median(values)) if len(values) else float("nan")

@@ -1,6 +1,6 @@
-"""The support matrix: a page of what was measured of the engines, made from files of ``xreset engines check``.
+"""Make the page of engine checks (the support matrix) from files of ``xreset engines check``.
 
-Nothing on the page is written by hand: every number is read from a file, and every file names the command that made it.
+Every number on the page is read from a file, and every file names the command that made it.
 """
 
 from __future__ import annotations
@@ -61,11 +61,11 @@ def page(files: Sequence[Json]) -> str:
     A later check replaces one of the same engine, version, device and robot.
     """
     capabilities: dict[str, set[str]] = {}
-    """Of each engine on each device, by title of its column."""
+    """Title of a column, an engine on a device -> capabilities."""
     robots: dict[str, dict[str, dict[str, Json]]] = {}
     """Robot -> name of a check -> title of a column -> the check as in the file."""
     tested: dict[str, set[str]] = {}
-    """Robot -> columns."""
+    """Robot -> titles of the columns with checks of the robot."""
     for run in chain(*(data["runs"] for data in files)):
         column = f"{run['engine']} {run['engine_version']}"
         if run["device"] != "cpu":
@@ -92,18 +92,23 @@ def page(files: Sequence[Json]) -> str:
 
 
 def _verdict(check: Json | None) -> str:
+    """Return the verdict as text, with the measure's largest share of its tolerance."""
     if check is None or check["verdict"] == "skipped":
         return "-"
     if check["verdict"] == "unsupported":
         return "none"
     shares = [share_of(float(m["measured"]), m["tolerance"]) for m in check["measures"]]
     worst = max(shares, default=0.0)
-    share = "< 0.01" if 0 < worst < 0.01 else f"{worst:.2f}" if worst < 10 else f"{worst:.3g}"
-    return {"passed": share, "known difference": f"known, {share}"}.get(
-        check["verdict"], f"**failed, {share}**"
-    )
+    share = f"{worst:.2f}" if worst < 10 else f"{worst:.3g}"
+    if 0 < worst < 0.01:
+        share = "< 0.01"
+    if check["verdict"] == "passed":
+        return share
+    if check["verdict"] == "known difference":
+        return f"known, {share}"
+    return f"**failed, {share}**"
 
 
 def _amount(measure: Json, entry: str) -> str:
-    """Two digits that matter, with the unit; numbers that are not finite are text in the file."""
+    """Return a number with two significant digits and its unit; a number that is not finite is a text in the file."""
     return f"{float(measure[entry]):.2g} {measure['unit']}".rstrip()

@@ -1,4 +1,4 @@
-"""What an engine does with an open-loop episode: starts of G worlds, and the joint targets of each control step.
+"""Play an open-loop episode in an engine, and record it: starts of G worlds, and joint targets of each control step.
 
 Shape letters: G worlds, J joints, E fingertips, T control steps, P surface points.
 """
@@ -17,24 +17,24 @@ from xreset.physics import Backend, State
 
 @frozen
 class Recording:
-    """What an engine did with an episode, after each control step, on the CPU."""
+    """States of an episode in an engine, after each control step, on the CPU. Poses are in the world frame."""
 
     start: State
     """[G, ...] the start of the episode."""
     joint_pos: Tensor
     """[T, G, J] rad (m)"""
     joint_target: Tensor
-    """[T, G, J]"""
+    """[T, G, J] rad (m)"""
     object_pos: Tensor
-    """[T, G, 3]"""
+    """[T, G, 3] m"""
     object_quat: Tensor
     """[T, G, 4]"""
     palm_pos: Tensor
-    """[T, G, 3]"""
+    """[T, G, 3] m"""
     palm_quat: Tensor
     """[T, G, 4]"""
     tip_force: Tensor
-    """[T, G, E, 3] on the object, world frame [N]."""
+    """[T, G, E, 3] force of each fingertip on the object, world frame [N]."""
     tip_touch: Tensor
     """[T, G, E] bool"""
     broken: Tensor
@@ -55,13 +55,13 @@ class Recording:
         )
 
     def in_palm(self, points: Tensor) -> Tensor:
-        """Return where points [G, P, 3] of the objects' mesh frames are at the end, in the palm's frame [m]."""
+        """Transform points [G, P, 3] from the objects' mesh frames to the palm's frame at the end [m]."""
         world = self.object_pos[-1, :, None] + quat_rotate(self.object_quat[-1, :, None], points)
         return quat_rotate_inverse(self.palm_quat[-1, :, None], world - self.palm_pos[-1, :, None])
 
 
 def play(backend: Backend, start: State, targets: Tensor) -> Recording:
-    """Set each world to its start [G, ...] and give the drives the targets [T, G, J]."""
+    """Set each world to its start [G, ...], give the drives the targets [T, G, J], and record every control step."""
     backend.set_state(start.to(backend.device))
     frames: dict[str, list[Tensor]] = defaultdict(list)
     for target in targets.to(backend.device):

@@ -1,6 +1,6 @@
-"""Replaying an action sequence in several engines: when, where and by how much they diverge from a reference.
+"""Replay an action sequence in several engines, and find when, where and by how much they diverge from a reference.
 
-The reference also starts from states that differ by next to nothing. Shape letters: T control steps, J joints, E
+The reference also replays the sequence from slightly perturbed starts. Shape letters: T control steps, J joints, E
 fingertips.
 """
 
@@ -30,10 +30,10 @@ from xreset.spec import SceneSpec
 
 SCHEMA = "xreset-divergence/1"
 PERTURBED = 4
-"""Perturbed starts in the reference. Long contact is chaotic: what such a start does to the reference itself is no
-fault of an engine."""
+"""Number of perturbed starts in the reference. Long contact is chaotic, so an engine that diverges no more than the
+reference from such a start is not at fault."""
 PERTURBATION = 1e-6
-"""Each joint [rad, m] and each coordinate of the object [m] is moved by plus or minus this."""
+"""Change of each joint [rad, m] and of each coordinate of the object [m] in a perturbed start, with random sign."""
 THRESHOLDS = {
     "joints": 0.02,
     "object position": 0.005,
@@ -41,15 +41,15 @@ THRESHOLDS = {
     "contacts": 1.0,
     "contact force": 2.0,
 }
-"""Differences from which engines count as diverged: of the joint that differs most [rad; 1 m of a prismatic joint
-counts as 10 rad], of the object's origin [m] and orientation [rad], the number of fingers that touch in one engine
-only, and of the magnitude of a fingertip's force [N]."""
+"""Least difference of engines that have diverged: of the joint that differs most [rad; 1 m of a prismatic joint counts
+as 10 rad], of the object's origin [m] and orientation [rad], the number of fingers that touch in one engine only, and
+of the magnitude of a fingertip's force [N]."""
 WINDOW = 0.05
-"""Forces are averaged over the last of these seconds: the contact force of one step says little."""
+"""Time over which forces are averaged [s], because the contact force of a single step is noisy."""
 TOUCH = 0.1
-"""Averaged force [N] from which a fingertip counts as touching."""
+"""Averaged force from which a fingertip counts as touching [N]."""
 CONTACT_TIME = 0.05
-"""How long other fingers than in the reference must touch for the contacts to have diverged [s]."""
+"""Contacts have diverged if other fingers than in the reference touch for this time [s]."""
 
 
 @frozen
@@ -58,9 +58,9 @@ class Divergence:
 
     quantity: str
     time: float | None
-    """When the difference first reaches the threshold [s]; None if never."""
+    """Time at which the difference first reaches the threshold [s]; None if never."""
     where: str
-    """Which joint, or which fingers, at that time; empty if never, or where there is no choice."""
+    """Joint or fingers that differ at that time; empty if never, and for quantities of the object."""
     end: float
     """Difference at the end."""
     largest: float
@@ -69,15 +69,15 @@ class Divergence:
 
 @frozen
 class EngineTrace:
-    """What one engine did, and how it differs from the reference."""
+    """The recording of one engine, and how it differs from the reference."""
 
     engine: Engine
     recording: Recording
-    """Its first world is the sequence's own."""
+    """Recording whose first world starts from the unperturbed state."""
     steps: int
-    """Control steps up to the last at which both engines are finite."""
+    """Number of control steps before the first that is not finite in one of both engines."""
     divergences: tuple[Divergence, ...]
-    """How each quantity diverges; empty if no step is finite."""
+    """Divergence of each quantity; empty if no step is finite."""
 
     @property
     def lifted(self) -> float | None:
@@ -96,7 +96,7 @@ def compared(
         found: the recording.
         reference: the reference's recording.
         scene: scene of both.
-        world: world of ``found``.
+        world: index of the world of ``found``.
     """
     robot = scene.robot
     dt = scene.control_dt
@@ -159,7 +159,7 @@ def compared(
 
 
 def _averaged(force: np.ndarray, dt: float) -> np.ndarray:
-    """[T, E] mean over the window that ends at each step; shorter at the beginning."""
+    """[T, E] mean over the window that ends at each step; the window is shorter at the beginning."""
     steps = max(1, round(WINDOW / dt))
     return pd.DataFrame(force).rolling(steps, min_periods=1).mean().to_numpy()
 
@@ -173,7 +173,7 @@ class TraceResult:
     engines: tuple[EngineTrace, ...]
     """The other engines."""
     noise: tuple[EngineTrace, ...]
-    """The reference from each perturbed start against itself."""
+    """The reference from each perturbed start, compared with the reference."""
 
     @property
     def worst_noise(self) -> tuple[Divergence, ...]:
@@ -187,14 +187,14 @@ class TraceResult:
         return tuple(out)
 
     def within_noise(self, found: Divergence) -> bool:
-        """Whether the reference diverges as far from itself, and no later, from a start that hardly differs."""
+        """Return whether the reference diverges at least as far and as early from itself, from the perturbed starts."""
         for noise in self.worst_noise:
             if noise.quantity == found.quantity and found.largest <= noise.largest:
                 return found.time is None or (noise.time or math.inf) <= found.time
         return False
 
     def as_dict(self) -> dict[str, Any]:
-        """Return JSON-able content."""
+        """Return the content of ``trace.json``."""
         actions = self.actions
         engines = []
         for e in (self.reference, *self.engines):
@@ -268,7 +268,7 @@ def trace(
 
 
 def _perturbed(start: State, seed: int) -> State:
-    """[1 + PERTURBED] the start itself, then perturbed copies."""
+    """Return states [1 + PERTURBED, ...]: the start, then perturbed copies."""
     generator = torch.Generator().manual_seed(seed)
     copies = {name: value.expand(1 + PERTURBED, -1).clone() for name, value in vars(start).items()}
     for name in ("joint_pos", "object_pos"):
@@ -286,17 +286,17 @@ _SHOWN = {
     "contacts": ("fingers", 1.0),
     "contact force": ("N", 1.0),
 }
-"""Unit in which a quantity reads best, and the factor to it."""
+"""Unit of a quantity in texts, and the factor to it."""
 
 
 def shown(quantity: str, value: float) -> str:
-    """Return a difference in the unit in which it reads best, with two digits and without an exponent."""
+    """Return a difference as text, with two significant digits and without an exponent."""
     unit, scale = _SHOWN[quantity]
     return f"{float(f'{value * scale:.2g}'):g} {unit}"
 
 
 def rich_table(result: TraceResult) -> Table:
-    """One column for each engine and one for the reference's noise; a row for each quantity."""
+    """Return a table with a column for each engine and one for the reference's noise, and a row for each quantity."""
     reference = result.reference.engine.name
     title = f"{result.actions.label}\n{result.actions.robot.name}: when, where and by how much engines diverge"
     table = Table("", title=f"{title} from {reference}", title_justify="left", show_lines=True)
@@ -334,7 +334,7 @@ def _height(engine: EngineTrace) -> str:
 
 
 def sentences(result: TraceResult) -> Iterator[str]:
-    """Yield one sentence for each engine: where it diverges first."""
+    """Yield a sentence for each engine that says where it diverges first."""
     same = result.reference.engine.name
     for traced in result.engines:
         name = traced.engine.name

@@ -70,7 +70,7 @@ def check_contract(source: str, contract: Contract, robot: RobotSpec, task: Task
     """Refuse to run a policy where its observations or actions would mean something else.
 
     Raises:
-        PolicyError: names the first thing that differs.
+        PolicyError: a part of the contract differs. The message names the first such part.
     """
     here = policy_contract(robot, task, ())
     if robot.like and contract.robot_fingerprint == robot.like:
@@ -146,7 +146,7 @@ class OnnxPolicy:
     """A trained policy from an ONNX file, with its recurrent state.
 
     Attributes:
-        name: the file's name, or that of the run folder.
+        name: name of the file, or of its folder if the file is called ``policy.onnx``.
         contract: see :func:`policy_contract`.
         hash: SHA-256 of the file.
     """

@@ -51,7 +51,7 @@ class Faults(Checked):
     angle_bias: NonNegativeFloat = 0.0
     """Largest error that lasts for the episode, about each axis [rad]."""
     lost_frames: NonNegativeFloat = 0.0
-    """Time for which the tracker loses the object, once per :attr:`LOSS_PERIOD` [s]."""
+    """Time for which the tracker loses the object, once per ``LOSS_PERIOD`` [s]."""
     arm_delay: NonNegativeFloat = 0.0
     """Time from sending the arm's targets to their effect [s], rounded to physics steps."""
     hand_delay: NonNegativeFloat = 0.0

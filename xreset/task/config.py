@@ -33,7 +33,9 @@ PositiveRange = Annotated[Range, Rule("factors above 0", lambda x: x[0] > 0)]
 
 
 def _are_own_terms(own: dict[str, float]) -> bool:
-    return isinstance(own, dict) and all(_is_own_term(*term) for term in own.items())
+    if not isinstance(own, dict):
+        return False
+    return all(_is_own_term(name, weight) for name, weight in own.items())
 
 
 def _is_own_term(name: str, weight: float) -> bool:
@@ -156,53 +158,61 @@ class RewardConfig(Checked):
     }
 
     reach: FiniteFloat = 1.0
+    """Weight of 1 - tanh(d / ``reach_width``), with d the mean distance of the fingertips to the object."""
     reach_width: PositiveFloat = 0.1
     """Distance [m] at which 1 - tanh(d / width) falls to 0.24. Not in the paper."""
     reach_near: FiniteFloat = 0.0
     """Weight of a second reach term with its own width. One width is too little: 0.1 m pays nothing at home, 36 cm
     away, and with 0.4 m the last centimetres, in which fingers wrap around the object, pay less than moving costs."""
     reach_near_width: PositiveFloat = 0.05
-    """[m]"""
+    """Width of ``reach_near`` [m]."""
     reach_distance: Literal["best", "present"] = "best"
     """Distance that both reach terms pay for. ``best``: the smallest of the episode (the paper), so that a hand that
     moves away is still paid. ``present``: the present distance (as in Isaac Lab's dexterous lift), so that a hand that
     has missed stays near and tries again."""
     grasp: FiniteFloat = 1.0
+    """Reward while the thumb and another finger press on the object."""
     position: FiniteFloat = 4.0
+    """Weight of 1 - tanh(position error / ``position_width``), gated (``contact``)."""
     position_width: PositiveFloat = 0.2
     """[m]"""
     rotation: FiniteFloat = 4.0
+    """Weight of 1 - tanh(rotation error / ``rotation_width``), gated."""
     rotation_width: PositiveFloat = 1.5
     """[rad]"""
     proximity: FiniteFloat = 0.0
     """Weight of the sum over fingertips of their distances to the object's surface points [m], at most
     ``proximity_cap``. The published paper has -2.5."""
     proximity_cap: PositiveFloat = 3.0
-    """[m] (the published paper)"""
+    """Largest sum that ``proximity`` counts [m] (the published paper)."""
     palm_proximity: FiniteFloat = 0.0
     """Weight of the palm's distance to the object's surface points [m], at most ``palm_proximity_cap``. The published
     paper has -2.5."""
     palm_proximity_cap: PositiveFloat = 0.5
-    """[m] (the published paper)"""
+    """Largest distance that ``palm_proximity`` counts [m] (the published paper)."""
     points: FiniteFloat = 0.0
     """Weight of 1 - d / ``points_zero``, gated, with d the mean distance of 64 surface points to the goal. The
     published paper's 3 (1.4 - 3 d) is 4.2 with ``points_zero`` 1.4 / 3."""
     points_zero: PositiveFinite = 1.4 / 3
     """Distance d beyond which ``points`` is negative [m]."""
     success: FiniteFloat = 10.0
+    """Weight of success, gated."""
     success_shape: Literal["pose", "points"] = "pose"
     """``pose``: paid while position and rotation are within the next two limits (the draft). ``points``: paid times
     1 / (1 + 10 d) while d, the mean distance of 64 surface points to the goal [m], is at most ``success_position`` (the
     published paper)."""
     success_position: PositiveFloat = 0.02
-    """[m] (section V)"""
+    """Largest position error [m] (section V)."""
     success_rotation: PositiveFloat = 0.2617993877991494
-    """[rad], 15 degrees (section V)"""
+    """Largest rotation error [rad]: 15 degrees (section V)."""
     action: FiniteFloat = -0.005
+    """Weight of the sum of squares of the action."""
     action_rate: FiniteFloat = -0.005
+    """Weight of the sum of squares of the action's change since the last step."""
     action_rate_arm: FiniteFloat | None = None
     """Weight of the arm's part of ``action_rate``; None: the weight ``action_rate``. The published paper has -0.05."""
     out_of_bounds: FiniteFloat = -500.0
+    """Reward when the object leaves the scene (``task.termination``)."""
     contact: Literal["any", "opposing", "near"] = "any"
     """What opens the gate of ``position``, ``rotation``, ``points`` and ``success``. ``any``: the thumb and another
     finger press (the paper). ``opposing``: their forces on the object are also more than 90 degrees apart, as in a

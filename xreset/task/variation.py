@@ -65,16 +65,7 @@ class Variation:
         self._is_arm = is_arm
         self._config = config
         self.parameters = self._keep_parameters(drawn, backend)
-        pushed = c.draws("push")
-        needed = list(self.parameters)
-        if pushed and c.push.moves_object:
-            needed.append("object_wrench")
-        missing = [name.replace("_", " ") for name in needed if name not in backend.capabilities]
-        if missing:
-            raise CapabilityError(
-                f"The backend {backend.name!r} cannot set {', '.join(missing)} in each world, which this task draws. "
-                "Use another backend, or in a training leave these ranges of task.randomization at their defaults."
-            )
+        self._check_capabilities(backend)
         self.force_gain: Tensor | float = 1.0
         if c.draws("force_gain"):
             gain = partial(sample_range, n, c.force_gain)
@@ -91,7 +82,19 @@ class Variation:
         if c.draws("lost_actions"):
             share = partial(sample_range, n, c.lost_actions)
             self._lost_actions = drawn.keep("lost_actions", drawn.zeros(1), share, is_fault=True)
-        self.pushes = Pushes(drawn, backend, c.push, is_arm) if pushed else None
+        self.pushes = Pushes(drawn, backend, c.push, is_arm) if c.draws("push") else None
+
+    def _check_capabilities(self, backend: Backend) -> None:
+        """Raise ``CapabilityError`` if the engine cannot set a parameter that is drawn."""
+        needed = list(self.parameters)
+        if self._config.draws("push") and self._config.push.moves_object:
+            needed.append("object_wrench")
+        missing = [name.replace("_", " ") for name in needed if name not in backend.capabilities]
+        if missing:
+            raise CapabilityError(
+                f"The backend {backend.name!r} cannot set {', '.join(missing)} in each world, which this task draws. "
+                "Use another backend, or in a training leave these ranges of task.randomization at their defaults."
+            )
 
     def _keep_parameters(self, drawn: Drawn, backend: Backend) -> dict[str, Tensor]:
         """Return the physical parameters that are drawn, by name."""

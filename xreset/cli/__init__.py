@@ -1,10 +1,11 @@
 """The command line: ``xreset COMMAND ...``.
 
-The first word selects a module of this package, which is imported only then, so that ``xreset --help`` is instant. A
+The first word selects a module of this package. Only this module is imported, so that ``xreset --help`` is instant. A
 command module holds typed functions; tyro turns their signatures and docstrings into flags.
 
-The help of a command must be instant too. Therefore command modules import at their top only what is light, such as
-configurations and errors; their functions import the rest."""
+The help of a command must be instant, too. Therefore command modules import only light modules at their top, such as
+configurations and errors; their functions import the rest.
+"""
 
 from __future__ import annotations
 
@@ -38,21 +39,25 @@ COMMANDS = {
 }
 """Command -> one line of help.
 
-The module ``xreset.cli.NAME`` has ``COMMAND``, a function or a dictionary of sub-commands; or ``command_for``, which
-makes the function from the arguments, if defaults depend on them."""
+The module ``xreset.cli.NAME`` has ``COMMAND``, a function or a dictionary of sub-commands. If defaults depend on the
+arguments, it has ``command_for`` instead, which returns the function for some arguments."""
 
 INVOCATION: list[str] = []
 """Arguments of the command that is running."""
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the command line. Exits with 1 after an error of the user, 2 after wrong usage, 130 after Ctrl-C."""
+    """Run the command line. It exits with 1 after an error, 2 after wrong usage, 130 after Ctrl-C.
+
+    Args:
+        argv: arguments, without the program; default: those of this process.
+    """
     from xreset.errors import XResetError
 
     argv = sys.argv[1:] if argv is None else argv
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
-            # write an escape for a character that the terminal lacks
+            # characters that the terminal lacks are written as escapes
             stream.reconfigure(errors="backslashreplace")
     if argv[:1] == ["--version"]:
         from xreset.files import code_version
@@ -70,7 +75,7 @@ def main(argv: list[str] | None = None) -> None:
     except BrokenPipeError:  # `xreset ... | head`
         sys.stderr.close()
         raise SystemExit(0) from None
-    except OSError as error:  # a name too long, a folder that may not be read, a port that is taken
+    except OSError as error:  # such as a file name that is too long, a folder without permission, or a taken port
         if error.strerror is None:
             raise
         _fail(argv, f"{error.strerror}: {error.filename}" if error.filename else error.strerror)

@@ -1,4 +1,4 @@
-"""Types of arguments and steps that several commands share."""
+"""Types of arguments, and functions, that several commands share."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ Port = Annotated[int, arg(help="Port to serve at; if it is taken, the next free 
 
 
 def usable_engines() -> list[str]:
-    """Return the names of the engines that can be used here, and print why others cannot."""
+    """Return the names of the engines that can be used here, and print why the others cannot."""
     statuses = [backend_status(name) for name in backend_names()]
     for status in statuses:
         if status.reason is not None:
@@ -83,26 +83,27 @@ def quick_engines(names: Sequence[str], device: str) -> list[rollout.Engine]:
 
 
 def given_flags() -> list[str]:
-    """Return the flags of the command that is running, such as ``--num-envs``; its defaults are not among them."""
+    """Return the flags that the user gave to the running command, such as ``--num-envs``."""
     return [word.partition("=")[0].replace("_", "-") for word in INVOCATION]
 
 
 def refuse_changes(out: Path, **options: Any) -> None:
-    """Refuse options of a run that is resumed, if it was started with others.
+    """Refuse to resume a run with other options than it was started with. Options that the user did not give are
+    ignored.
 
     Args:
         out: the run's folder.
-        options: values by name of the option, also those that were not given; ``resets`` and ``goals``: files;
-            ``teacher``: empty if it was not given.
+        options: values by name of the option. ``resets`` and ``goals`` are files; ``teacher`` is empty if it was not
+            given.
 
     Raises:
-        RunError: names the first option that differs.
+        RunError: an option differs; the message names the first.
     """
     from xreset.learning import run
 
     info = run.read_run(out)
     files = ("resets", "goals")
-    # a bank and a goal set are joined in a file of the run
+    # A run with both a bank and a goal set has joined them in a file of its own with another hash.
     is_joined = Path(info.resets).resolve().parent == out.resolve()
     joined = is_joined and None not in [options.get(name) for name in files]
     for name, value in options.items():
@@ -115,7 +116,7 @@ def refuse_changes(out: Path, **options: Any) -> None:
             is_same = value is not None and file_hash(value) == info.resets_hash
         else:
             found = getattr(info, name)
-            # a folder may be written in several ways; names and numbers are compared by their text
+            # compares folders by their absolute path, and names and numbers by their text
             is_same = Path(str(value)).resolve() == Path(str(found)).resolve()
         if not is_same:
             raise RunError(
@@ -125,7 +126,7 @@ def refuse_changes(out: Path, **options: Any) -> None:
 
 
 def write_measured(path: Path | None, content: dict[str, Any]) -> None:
-    """Write results with the version and the command that measured them; None: nothing is written."""
+    """Write results with the version and the command that measured them; path None: write nothing."""
     if path is not None:
         made_by = {"xreset_version": code_version(), "command": this_command()}
         write_json(path, content | made_by)
@@ -133,17 +134,17 @@ def write_measured(path: Path | None, content: dict[str, Any]) -> None:
 
 
 def this_command() -> str:
-    """Return the command to type for the same numbers: without the folders of files, and without ``--json FILE``."""
+    """Return the running command as text, without the folders of files and without ``--json FILE``."""
     words = list(INVOCATION)
     if "--json" in words:
-        del words[(i := words.index("--json")) : i + 2]
-    return shlex.join(
-        ["xreset", *(Path(word).name if Path(word).exists() else word for word in words)]
-    )
+        i = words.index("--json")
+        del words[i : i + 2]
+    names = [Path(word).name if Path(word).exists() else word for word in words]
+    return shlex.join(["xreset", *names])
 
 
 def show_accounts(rows: Sequence[Account], title: str) -> None:
-    """Print how many frames or states of each object and phase are kept, and why the others are not."""
+    """Print how many frames or states of each object and phase are kept, and why the others are rejected."""
     table = [("object", "phase", "in all", "kept", "others")]
     for row in rows:
         kept = f"{row.kept} ({row.kept / row.total:.0%})" if row.total else "0"

@@ -1,4 +1,4 @@
-"""Check the options of a command before it begins, by the names of the options."""
+"""Check the options of a command, by their names, before the command begins."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _INDICES = {"seed", "episode", "repetition", "sequence", "frame", "port"}
 _WRITTEN = ("out", "rest", "png", "mp4", "picture", "json")
 """Files or folders that a command writes."""
 _IN_PLACE = {"policy"}
-"""Options whose file a command may replace by its output."""
+"""Options that may name the same file as the output."""
 _LARGEST = 2**32 - 1
 """The largest seed that numpy, torch and all engines accept; also an upper limit for counts."""
 _LONGEST = 1000
-"""Most characters of a text or a file name; messages repeat them."""
+"""Largest number of characters of a text or a file name, because messages repeat them."""
 
 
 def checked(command: Callable[..., None]) -> Callable[..., None]:
@@ -46,7 +46,7 @@ def checked(command: Callable[..., None]) -> Callable[..., None]:
         with ExitStack() as claims:
             for name in _WRITTEN:
                 path = options.get(name)
-                # a folder is claimed by what writes into it
+                # the function that writes into a folder claims it
                 if isinstance(path, Path) and path.suffix and path.parent.is_dir():
                     claims.enter_context(claim(path))
             command(*positional, **named)
@@ -59,11 +59,12 @@ def _check(options: dict[str, Any]) -> None:
         flag = f"--{name.replace('_', '-')}"
         if isinstance(value, bool) or value is None:
             continue
-        low = 1 if name in _COUNTS else 0 if name in _INDICES else None
-        if low is not None and not low <= value <= _LARGEST:
-            raise XResetError(
-                f"{flag} is {value}, expected a whole number from {low} to {_LARGEST}."
-            )
+        if name in _COUNTS or name in _INDICES:
+            low = 1 if name in _COUNTS else 0
+            if not low <= value <= _LARGEST:
+                raise XResetError(
+                    f"{flag} is {value}, expected a whole number from {low} to {_LARGEST}."
+                )
         for text in value if isinstance(value, tuple) else (value,):
             if isinstance(text, str | Path) and len(str(text)) > _LONGEST:
                 raise XResetError(

@@ -1,6 +1,5 @@
-"""Console and progress bars of the commands. Text comes from files, so square brackets are shown and not read as
-markup.
-"""
+"""Console and progress bars of the commands. Square brackets are shown and not read as markup, because texts come from
+files."""
 
 from __future__ import annotations
 
@@ -17,9 +16,7 @@ from rich.text import Text
 
 
 class Console(rich.console.Console):
-    """A console without markup, which leaves the breaking of lines to the terminal; a file or a pipe gets tables of 160
-    columns.
-    """
+    """A console without markup. The terminal breaks the lines; tables in a file or a pipe have 160 columns."""
 
     def __init__(self, **options: Any) -> None:
         known = sys.stdout.isatty() or os.environ.get("COLUMNS")
@@ -38,11 +35,11 @@ console = Console()
 
 
 _FIGURES = ("", *"-+.0123456789")
-"""How the text of a figure begins."""
+"""First characters of a cell with a number; an empty cell counts as one."""
 
 
 class Progress(rich.progress.Progress):
-    """Progress bars, which vanish at the end. Where there is no terminal, lines once a minute in their place."""
+    """Progress bars, which vanish at the end. Without a terminal, a line once a minute."""
 
     def __init__(self, where: Console = console) -> None:
         super().__init__(
@@ -67,12 +64,12 @@ class Progress(rich.progress.Progress):
             print(f"{task.description}: {task.percentage:.0f} %", file=sys.stderr)
 
     def count(self, what: str) -> Callable[[float, float], None]:
-        """Add a bar; returns the function that moves it: (done, in all)."""
+        """Add a bar, and return the function that moves it: (done, in all)."""
         task = self.add_task(what, total=None)
         return lambda done, total: self.update(task, completed=done, total=total)
 
     def stages(self) -> Callable[..., None]:
-        """Add a bar that shows one stage after another; returns the function that moves it: (stage, done, in all)."""
+        """Add a bar for one stage after another, and return the function that moves it: (stage, done, in all)."""
         task = self.add_task("", total=None)
 
         def move(stage: str, done: float = 0, total: float | None = None) -> None:
@@ -88,7 +85,12 @@ def show_notes(notes: Iterable[str]) -> None:
 
 
 def show_table(rows: Sequence[Sequence[str | Text]], **options: Any) -> None:
-    """Print a table whose first row is its head, with columns of figures to the right; ``options`` are rich's."""
+    """Print a table whose first row is its head. Columns of numbers are aligned to the right.
+
+    Args:
+        rows: texts of the cells.
+        options: options of :class:`rich.table.Table`.
+    """
     table = Table(**options)
     for number, name in enumerate(rows[0]):
         figures = number > 0 and all(str(row[number])[:1] in _FIGURES for row in rows[1:])

@@ -19,8 +19,8 @@ def compare(
 ) -> None:
     """Compare trainings: learning curves, first success from home, task progress in every engine, and configurations.
 
-    Runs that differ only in their seed become one curve, with a band from the lowest to the highest, and one row of the
-    table. Notes say what makes the comparison unfair, such as other demonstrations or another version of an engine.
+    Runs that differ only in their seed share a curve, with a band from the lowest to the highest run, and a row of the
+    table. Notes say what makes the comparison unfair, such as different demonstrations or versions of an engine.
 
     Args:
         runs: Run folders, folders of results (of a baseline, for example) or names of policies that ship with xreset;

@@ -35,8 +35,8 @@ def import_dexycb(folder: Source, *, out: Path) -> None:
 
 
 def import_ho3d(folder: Source, *, out: Path, fps: float, cameras: Path) -> None:
-    """Read HO-3D (versions 2 and 3) in its own layout and write an archive of demonstrations. Not yet tried on the
-    original files.
+    """Read HO-3D (versions 2 and 3) in its own layout and write an archive of demonstrations. This was not yet tried on
+    the original files.
 
     Args:
         folder: The folder that holds `train`.
@@ -80,9 +80,9 @@ def import_keypoints(
         coordinates: Frame of all positions: the table's (z up, table top at z = 0) or that of a fixed camera.
         table_from_camera: File with the camera's pose in the table frame: 4x4, metres, as text.
         fps: Frames per second; files with times are resampled to it.
-        object: The grasped object, if the files do not state it.
-        side: The hand, if the files do not state it.
-        subject: Who demonstrated, if the files do not state it.
+        object: Name of the grasped object, if the files do not state it.
+        side: Side of the hand, if the files do not state it.
+        subject: Name of the person, if the files do not state it.
     """
     from xreset.demos.keypoints import Convention, read_keypoints, read_transform
 
@@ -103,7 +103,8 @@ def import_keypoints(
         **vars(convention),
         "table_from_camera": None if T is None else T.tolist(),
     }
-    _save(demos, out, config, **({"keypoints": path} if path.is_file() else {}))
+    inputs = {"keypoints": path} if path.is_file() else {}
+    _save(demos, out, config, **inputs)
 
 
 def synth(
@@ -163,7 +164,7 @@ class Selection(Options):
     sequences: tuple[str, ...] = ()
     """Only the sequences of these names."""
     subjects: tuple[str, ...] = ()
-    """Only sequences of these persons."""
+    """Only sequences that these persons demonstrated."""
     side: Side = "both"
     """Only sequences of this hand."""
     per_object: int | None = None
@@ -277,7 +278,7 @@ def add_noise(
         out: Archive to write.
         tier: The hand is off by at most 10, 20 or 40 mm along each axis, and each keypoint of its fingers by 3, 6 or
             12 mm, before the bones get their lengths back.
-        seed: Chooses the errors.
+        seed: Seed of the errors.
     """
     from xreset.demos.noise import TIERS, with_noise
 
@@ -290,7 +291,7 @@ def add_noise(
 
 
 def describe(file: Source) -> None:
-    """Describe an archive of demonstrations, object by object, and warn of what looks wrong.
+    """Describe an archive of demonstrations, object by object, and warn of implausible sequences.
 
     Args:
         file: The archive.
@@ -305,7 +306,7 @@ def _read(file: Path) -> Demos:
 
 
 def _save(made: Demos, out: Path, config: dict[str, Any], **inputs: Path) -> None:
-    """Write and describe demonstrations that were made from some files."""
+    """Write demonstrations and print their summary; inputs: the files that they were made from, by kind."""
     from xreset.demos.archive import write_demos
 
     write_demos(

@@ -33,12 +33,12 @@ def distill(
         out: Run folder to make, or to continue.
         resets: Reset bank, made by `xreset resets`.
         camera: front, side, or wrist; give it again for two cameras. Default: front.
-        vision: Images, their timing, and what the policy gets of them.
+        vision: Images, their timing, and what the policy gets from them.
         backend: Physics engine to train on.
         device: cpu or cuda; default: cuda where there is a GPU and the engine can use it.
         num_envs: Worlds to simulate (per GPU).
-        iterations: Iterations in all; default: 2000.
-        minutes: Most time to train now. Then the run stops as with Ctrl-C, and --resume continues it.
+        iterations: Total number of iterations; default: 2000.
+        minutes: Longest time to train now. Then the run stops as with Ctrl-C, and --resume continues it.
         seed: Seed of every random number.
         resume: Continue the run in --out from its newest checkpoint.
     """

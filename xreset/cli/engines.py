@@ -71,7 +71,7 @@ def check(
     for name in dict.fromkeys(backend) or usable_engines():
         status = backend_status(name)
         used = device if device.split(":")[0] in status.device else "cpu"
-        make = _maker(name, used)  # before the headline: it refuses an unknown engine
+        make = _maker(name, used)  # refuses an unknown engine, so it comes before the headline
         what = f" {status.version}, {spec.name}, {used}: verdict, check, and what came nearest to its tolerance"
         console.print(Text.assemble((name, "bold"), what))
         results = conformance.run(
@@ -97,7 +97,8 @@ def check(
 
 
 def _maker(name: str, device: str) -> conformance.MakeBackend:
-    """Return what builds worlds on a device. A few worlds run in this process, which is faster than to start others."""
+    """Return the function that makes worlds on a device. A few worlds run in this process, which is faster than in new
+    ones."""
     from xreset.backends import conformance, pool
 
     pooled = issubclass(backend_class(name), pool.PoolBackend)
@@ -178,7 +179,7 @@ def compare(
             motion, robot=robot, objects=objects, only=only, accept=("demos", "motion")
         )
         grasped = loaded.motion(partial(move, "retargeting"))
-        # now: after minutes of work the file may be another, or gone
+        # hashed now, because after minutes of work the file may have changed
         inputs = {"motion": file_hash(motion)}
         result = agreement.compare(
             loaded.robot, loaded.objects, grasped, engines, grasps=grasps, progress=move
@@ -246,7 +247,7 @@ def trace(
         object: Object, if the source has several; default: the first.
         episode: Which of the object's grasps or recorded episodes.
         place: Robot, meshes, seed, device.
-        out: Folder for trace.json, and actions.npz: the actions, and what every engine did.
+        out: Folder for trace.json, and for actions.npz with the actions and the states of every engine.
     """
     from xreset.eval import rollout
     from xreset.eval.engines import actions, replay
@@ -289,9 +290,9 @@ def attribute(
         demos: Demonstrations (xreset demos) or retargeted trajectories (xreset retarget): starts and goals, and the
             path of ik. `xreset demos select` makes a file of some objects.
         towards: Engine towards which the properties are changed, usually the one in which the policy does worse.
-        backend: Engine in which they are changed.
+        backend: Engine in which the properties are changed.
         only: Property to change; give it again for more. Default: all in which the engines differ.
-        episodes: Episodes per demonstration.
+        episodes: Episodes of each demonstration.
         setting: Robot, meshes, seed of the perturbations of the starts, device and worlds.
         out: Folder for attribution.json; default: attribute/ next to the policy's results.
     """
@@ -336,11 +337,11 @@ def page(
     source: Annotated[tuple[Path, ...], arg(name="from"), UseAppendAction],
     out: Path | None = None,
 ) -> None:
-    """Make a Markdown page of what was measured of the engines.
+    """Make a Markdown page of the checks of engines.
 
     Args:
-        source: File of `xreset engines check --json`; give it again for more. Of two results of the same check,
-            engine, device and robot, the later one counts.
+        source: File of `xreset engines check --json`; give it again for more. If two files have the same check of the
+            same engine, device and robot, the later file counts.
         out: File to write; default: print it.
     """
     from xreset.eval.engines import page as matrix

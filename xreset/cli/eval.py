@@ -23,12 +23,12 @@ def evaluate(
 ) -> None:
     """Evaluate a policy or a baseline in one or several engines.
 
-    Near 33 % task progress, the baseline ik gets to the object and does not grasp it.
+    A task progress of the baseline ik near 33 % means that the hand gets to the object and does not grasp it.
 
     Args:
-        demos: Demonstrations (xreset demos), retargeted trajectories (xreset retarget) or a goal set (xreset goals):
-            starts and goals, and the path of ik.
-        episodes: Episodes per demonstration, each with another perturbation of robot and object.
+        demos: Starts and goals, and the path of ik: demonstrations (xreset demos), retargeted trajectories (xreset
+            retarget) or a goal set (xreset goals).
+        episodes: Episodes of each demonstration, each with another perturbation of robot and object.
         settle: Let objects come to rest before episodes begin. Default: the recorded poses, as in the paper, from which
             one object in eight tips or rolls.
         episode_seconds: Length of an episode [s], such as 12, as in the published paper. Default: as in the policy's

@@ -35,7 +35,7 @@ def goals(
         out: Goal set to write.
         family: Kind of goal: lift, yaw, tilt-x, tilt-y (lifted, and turned by 60 degrees about an axis of the world) or
             random; give it again for more. Default: all of them, or none with --pose.
-        pose: Goal of your own: x y z [m] and quaternion w x y z of the mesh frame; give it again for more.
+        pose: Goal of your own, a pose of the mesh frame: x y z [m] and quaternion w x y z; give it again for more.
         draw: Number, sizes, offsets and seed.
     """
     from xreset.resets import goals as goal_sets

@@ -41,15 +41,15 @@ def import_(
 ) -> None:
     """Cut a mesh, or every mesh of a folder, into convex pieces, and keep them for later runs.
 
-    A mesh file goes into a folder of objects (--out), which other commands take as --objects. NAME.toml there holds
-    mass and friction.
+    A mesh file goes into a folder of objects (--out), which other commands take as --objects. NAME.toml in this folder
+    holds mass and friction.
 
     Args:
         path: A mesh file; or a folder with NAME.obj, NAME/textured_simple.obj or NAME/textured.obj, in metres, in the
             frame of the object poses.
         out: Folder of objects, for a mesh file.
-        name: The object's name there; default: the file's.
-        scale: Metres in a unit of the file: 0.001 for millimetres.
+        name: Name of the object in this folder; default: the name of the file.
+        scale: Length of a unit of the file in metres: 0.001 for millimetres.
         mass: Mass in kg.
         density: Density in kg/m^3, instead of the mass.
         friction: Friction coefficient: the middle of the range that training and evaluation draw from.
@@ -124,7 +124,7 @@ def make(*, out: Path, count: int = 40, seed: int = 0) -> None:
     Args:
         out: Folder of objects to write; it must not exist.
         count: Number of shapes.
-        seed: Chooses sizes and masses.
+        seed: Seed of sizes and masses.
     """
     from xreset.objects import procedural
 

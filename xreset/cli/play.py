@@ -26,7 +26,7 @@ def play(
         backend: Physics engine to begin with.
         demos: Starts and goals: demonstrations, robot motion, reset states or a goal set. Default: synthetic
             demonstrations.
-        seed: Chooses starts and goals.
+        seed: Seed of starts and goals.
     """
     from xreset.eval.play import page
 

@@ -1,4 +1,4 @@
-"""``xreset policies``: the cards of those that ship with xreset."""
+"""``xreset policies``: the cards of the policies that ship with xreset."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from xreset.policies import card, shipped
 
 
 def list_() -> None:
-    """List the policies that ship with xreset. Every command that takes a policy takes their names."""
+    """List the policies that ship with xreset. Every command with a policy argument accepts their names."""
     from xreset import policy as policy_files
 
     for name, file in shipped().items():
@@ -33,7 +33,7 @@ def list_() -> None:
 
 
 def _objects(trained: tuple[str, ...]) -> str:
-    """Name the objects of the catalogue, and count the shapes that have names of one training only."""
+    """Return the names of the catalogue's objects, and the number of other shapes, which one training was made with."""
     from xreset.objects.catalogue import object_names
 
     known = [name for name in trained if name in object_names()]

@@ -23,8 +23,8 @@ def rehearse(
     """Rehearse a policy for a robot: late and wrong poses, late actions, lost frames, pushes, one fault at a time.
 
     Args:
-        demos: Demonstrations whose starts and goals are played. Default: two synthetic ones of each of the policy's
-            objects.
+        demos: Demonstrations whose starts and goals are played. Default: two synthetic demonstrations of each of the
+            policy's objects.
         backend: Physics engine; give it again for more engines. Default: all that can be used here, but not
             MuJoCo-Warp on a CPU, where it is slow.
         fault: Fault to try, or NAME=VALUE,VALUE... for values of your own (delays in ms, errors in mm or degrees,

@@ -28,18 +28,18 @@ def resets(
     squeeze: SqueezeConfig = SqueezeConfig(),
     settle: bool = False,
 ) -> None:
-    """Try retargeted states in physics and keep the stable ones.
+    """Test retargeted states in physics and keep the stable ones.
 
     Args:
         retargeted: File made by `xreset retarget`.
         out: Reset bank to write.
-        backend: Physics engine to try the states in; give it again to keep only states that are stable in all of them.
+        backend: Physics engine to test the states in; give it again to keep only states that are stable in all engines.
             Default: mujoco.
-        robot: Folder of the robot, if it is not one that is known by name.
+        robot: Folder of the robot, if it is not known by name.
         num_envs: Worlds at a time.
-        limits: Time and speeds by which states are judged.
-        closing: States between frames where the hand closes in.
-        squeeze: Targets of states after contact that press.
+        limits: Duration of the test, and the largest speeds of a stable state.
+        closing: Extra states between frames in which the hand closes in on the object.
+        squeeze: How hard fingers press in states after contact, and which fingers.
         settle: Let objects come to rest (in the first engine) before episodes begin at home. Default: the recorded
             poses, as in the paper, from which one object in eight tips or rolls.
     """

@@ -94,8 +94,8 @@ def import_(
         out: Folder to make.
         name: Name of the robot; default: the folder's.
         flange: Link of the arm that carries the hand; default: one that makers call so, or the arm's last link.
-        offset: Position of the hand's root link in the flange's frame [m]; default: the origin, or as far out of the
-            arm as keeps the hand's body before the flange.
+        offset: Position of the hand's root link in the flange's frame [m]; default: the origin, moved out of the arm
+            until the hand's body is in front of the flange.
         rpy: Roll, pitch and yaw of the hand about the flange's fixed axes [rad]; default: as in the hand's file, or
             turned so that the fingers point out of the arm, along its last joint's axis.
         thumb: A link or joint of the thumb, if the import chooses another finger.

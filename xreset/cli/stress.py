@@ -58,7 +58,7 @@ def stress(
     swept = sweeps.by_property(found)
     tried = set(swept).union(*(result.left_out for result in found))
     for prop in properties:
-        if prop.option not in tried:  # a property of cameras, which the policy does not have
+        if prop.option not in tried:  # a property of cameras, and the policy has none
             continue
         for i, value in enumerate(sorted({*prop.values, prop.nominal})):
             cells = []
@@ -80,7 +80,7 @@ def stress(
 
 
 def _cell(point: sweeps.Point, nominal: bool) -> str:
-    """Return task progress; beyond the nominal value also the difference to it, with its interval."""
+    """Return task progress as text; at other than the nominal value, with the difference to it and its interval."""
     text = f"{100 * point.task_progress:.1f} %"
     if nominal:
         return text

@@ -34,9 +34,9 @@ def study(
         data: Folder with the study's demonstrations and meshes.
         out: Folder for all output.
         run: Only these runs of the study; give it again for more. Default: all.
-        only: Which steps: reset banks, trainings, evaluations or tables.
+        only: Kind of steps to run: reset banks, trainings, evaluations or tables.
         per_gpu: Number of simultaneous trainings on each GPU of this machine.
-        dry_run: Print the plan and its commands, and do nothing.
+        dry_run: Print the plan and its commands, and run nothing.
     """
     from xreset.eval.study import launch, plan, report
 

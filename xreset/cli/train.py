@@ -44,16 +44,16 @@ def train(
         backend: Physics engine to train on.
         device: cpu or cuda; default: cuda where there is a GPU and the engine can use it.
         num_envs: Worlds to simulate (per GPU).
-        iterations: Iterations in all; default: the configuration's.
-        minutes: Most time to train now. Then the run stops as with Ctrl-C, and --resume continues it. Compiling kernels
-            is not counted.
+        iterations: Total number of iterations; default: the configuration's.
+        minutes: Longest time to train now. Then the run stops as with Ctrl-C, and --resume continues it. Compiling
+            kernels is not counted.
         seed: Seed of every random number.
-        resume: Continue the run in --out from its newest checkpoint. Reward terms of your own must be named again.
+        resume: Continue the run in --out from its newest checkpoint. Name reward terms of your own again.
         like: Where the configuration starts from: a recipe (paper, published, minutes, robust, live) or another
             run's folder. Flags change what they name. Reward terms of your own are not taken from a run; name them
             again. Default: paper; with --weights and --goals, the run of --weights.
-        weights: Another run's folder: start with the networks of its newest checkpoint, with their standard deviation
-            and, if it adapts, their learning rate.
+        weights: Another run's folder: start with the networks of its newest checkpoint, including the standard
+            deviation of the actions and, if it adapts, the learning rate.
         wandb: Project of Weights & Biases to which learning curves are sent as well. Needs the package wandb, and a
             login.
         config: Task, model and algorithm. The defaults shown are those of --like.
@@ -117,7 +117,7 @@ def command_for(arguments: list[str]) -> Callable[..., None]:
     """Return :func:`train` with the defaults of ``--like``, which must be known before the other flags are read."""
     parser = ArgumentParser(add_help=False, allow_abbrev=False)
     for flag in ("--like", "--weights", "--goals", "--resets"):
-        parser.add_argument(flag, nargs="?")  # a missing value is for the real parser to say
+        parser.add_argument(flag, nargs="?")  # tyro reports a missing value
     given = parser.parse_known_args(arguments)[0]
     like = given.like
     if like:

@@ -29,14 +29,15 @@ def view(
 ) -> None:
     """Show demonstrations, robot motion, a reset bank or a goal set in a browser, or write pictures of them.
 
-    In a frame that is not valid, the robot has the color of the reason. The object's goal is translucent. Human
-    keypoints are pink, keypoints in contact yellow. The robot's fingertips are blue.
+    In an invalid frame, the robot has the color of the reason. The object's goal is translucent. Human keypoints are
+    pink, keypoints in contact are yellow, the robot's fingertips are blue.
 
     Args:
-        file: Demonstrations, or what `xreset retarget`, `xreset resets` or `xreset goals` made.
-        demos: Demonstrations of the file, to show the human hand over the robot.
-        sequence: Which sequence, counted from 0. Default: the first; of a bank, all.
-        frame: Which frame of the sequence (state of the bank). Default: the first; for --png the middle one.
+        file: Demonstrations, or a file of `xreset retarget`, `xreset resets` or `xreset goals`.
+        demos: Demonstrations that the file was made from, to show the human hand with the robot.
+        sequence: Index of the sequence, from 0. Default: the first; in a bank, all sequences.
+        frame: Index of the frame in the sequence (or of the state in the bank). Default: the first; for --png the
+            middle one.
         png: Picture to write, instead of a page.
         mp4: Film of the sequence to write, instead of a page.
     """

@@ -1,4 +1,4 @@
-"""The file between retargeting and reset bank: robot trajectories and the validity of every frame.
+"""The file that retargeting writes, for the reset bank: robot trajectories and the validity of every frame.
 
 Shape letters: S sequences, F frames of all sequences, J joints, E fingertips, R reasons.
 """
@@ -102,8 +102,8 @@ class Retargeted(ObjectMotions):
 
     @property
     def untouched(self) -> np.ndarray:
-        """[S] bool: whether the human mostly does not touch the object while it is more than 5 cm from its start. No
-        sequence of DexYCB is like that."""
+        """[S] bool: whether the human does not touch the object in most of the annotated frames in which the object is
+        more than 5 cm from its start. This is true of no sequence of DexYCB."""
         owner = self.sequence_of_frame
         moved = np.linalg.norm(self.object_pos - self.start_pose[0][owner], axis=1) > 0.05
         touching = np.bincount(owner, moved & self.contact)
@@ -122,7 +122,7 @@ def write_retargeted(
     config: Mapping[str, Any] | None = None,
     inputs: Mapping[str, str] | None = None,
 ) -> None:
-    """Write trajectories. The file states the configuration that made them, and name -> SHA-256 of the input files."""
+    """Write trajectories, the configuration that made them, and the inputs: name -> SHA-256 of a file."""
     write_record(path, SCHEMA, retargeted, config=config, inputs=inputs)
 
 
@@ -136,11 +136,11 @@ def read_retargeted(path: str | Path) -> Retargeted:
 
 
 _TOLERANCE = 1e-4
-"""[rad or m] How far single precision may carry a joint beyond its limits."""
+"""Largest excess over a joint limit that is put down to single precision [rad or m]."""
 
 
 def check_retargeted(path: str | Path, data: Retargeted, robot: RobotSpec) -> None:
-    """Refuse trajectories of another robot, or with joints outside this robot's limits; ``FileFormatError``."""
+    """Raise ``FileFormatError`` if trajectories are of another robot, or have joints outside this robot's limits."""
     check_robot(path, "retargeted file", data, robot)
     lower, upper = joint_limits(robot)
     outside = np.maximum(lower - data.joint_pos, data.joint_pos - upper)
@@ -154,7 +154,8 @@ def check_retargeted(path: str | Path, data: Retargeted, robot: RobotSpec) -> No
 
 
 def object_sources(path: str | Path) -> dict[str, str]:
-    """Return object name -> :attr:`~xreset.spec.ObjectSpec.source` when the file was made, where it states them."""
+    """Return object name -> :attr:`~xreset.spec.ObjectSpec.source` of the objects that the file was made with; empty if
+    it does not state them."""
     meta = read_npz(path, SCHEMA, {}, what="a file of xreset retarget").get("meta")
     try:
         inputs = json.loads(str(meta))["inputs"]

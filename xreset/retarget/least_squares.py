@@ -1,7 +1,6 @@
-"""Levenberg-Marquardt with projected steps for a batch of independent problems, and the linear systems of a chain in
-time.
+"""Levenberg-Marquardt with projected steps for a batch of independent problems, and block-tridiagonal linear systems.
 
-Shape letters: B problems, R of them that are not done; S chains (sequences), T blocks (frames), n unknowns per block.
+Shape letters: B problems, R problems that are not done; S chains (sequences), T blocks (frames), n unknowns per block.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from xreset.tensors import Tensors, where
 
 @dataclass(frozen=True)
 class Quadratic(Tensors):
-    """Costs [B], and their Gauss-Newton approximation by n variables."""
+    """Costs [B], and their Gauss-Newton approximation as a function of n variables."""
 
     cost: Tensor
     """[B]"""
@@ -54,16 +53,16 @@ def minimize(
     *,
     damping_range: tuple[float, float] = (0.0, inf),
 ) -> Any:
-    """Take damped Gauss-Newton steps; a problem keeps those that lower its cost, and takes no more time when it is
-    done.
+    """Take damped Gauss-Newton steps. A problem keeps a step if it lowers the cost, and is left out when it is done.
 
     Args:
         x: first guess: a tensor, or a bundle of tensors (:class:`~xreset.tensors.Tensors`), of B rows.
-        evaluate: returns costs and their approximation, a bundle with ``cost`` [R], at x [R, ...] of the problems [R].
-        step: returns where a damped step leads, given x, the approximation and the damping [R].
-        done: returns whether problems are done [R], given x before, x tried, both costs [R], and the damping [R] of the
-            next step.
-        iterations: most steps.
+        evaluate: returns costs and their approximation, a bundle with ``cost`` [R], given x [R, ...] and the indices
+            [R] of the problems.
+        step: returns x after a damped step, given x, the approximation and the damping [R].
+        done: returns whether problems are done [R], given x before and after the step, both costs [R], and the damping
+            [R] of the next step.
+        iterations: largest number of steps.
         damping_range: smallest and largest damping.
 
     Returns:
@@ -95,7 +94,7 @@ def minimize(
 
 
 def free_to_move(x: Tensor, gradient: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Return 1 for variables that may move, 0 for those at a bound while the cost pulls them outwards (Bertsekas'
+    """Return 1 for variables that may move, and 0 for variables at a bound that the cost pulls outwards (Bertsekas'
     projection)."""
     at_lower = (x <= lower) & (gradient > 0)
     at_upper = (x >= upper) & (gradient < 0)
@@ -107,9 +106,9 @@ def damped(here: Quadratic, size: Tensor, damping: Tensor, free: Tensor) -> tupl
 
     Args:
         here: the cost.
-        size: [..., n] what the damping [...] of each variable is relative to.
-        damping: larger for shorter steps.
-        free: [..., n] see :func:`free_to_move`. A variable that may not move has a row of the identity.
+        size: [..., n] scale of each variable, by which its damping is multiplied.
+        damping: [...] larger for shorter steps.
+        free: [..., n] see :func:`free_to_move`. A variable that may not move gets a row of the identity.
     """
     ridge = damping[..., None] * size * free + (1.0 - free)
     matrix = here.curvature * free[..., :, None] * free[..., None, :] + torch.diag_embed(ridge)

@@ -1,4 +1,4 @@
-"""From human demonstrations to robot trajectories: contacts, hand, arm, validity (the paper, appendix D.b).
+"""Retarget human demonstrations to robot trajectories: contacts, hand, arm, validity (the paper, appendix D.b).
 
 Shape letters: F frames of all sequences, S sequences of a batch padded to T frames.
 """
@@ -31,7 +31,7 @@ from xreset.spec import ObjectSpec, RobotSpec, checked_objects, objects_named
 from xreset.tensors import one_thread
 
 _SEQUENCES_PER_BATCH = 24
-"""Enough to make batching pay; few enough to keep memory below about 1 GB and progress visible."""
+"""Enough to use the processor well; few enough to keep memory below about 1 GB and to show progress."""
 _THUMB = slice(1, 5)
 """Keypoints of the thumb."""
 _FINGERS = slice(5, None)
@@ -40,7 +40,7 @@ _FINGERS = slice(5, None)
 
 @frozen
 class RetargetConfig:
-    """Everything that decides the result, besides robot, objects and demonstrations."""
+    """Weights and limits of retargeting. With robot, objects and demonstrations they determine the result."""
 
     hand: HandConfig = field(default_factory=HandConfig)
     arm: ArmConfig = field(default_factory=ArmConfig)
@@ -58,7 +58,7 @@ def retarget_demos(
     progress: Callable[[float, int], None] = unseen,
     device: str = "cpu",
 ) -> Retargeted:
-    """Retarget demonstrations. Sequences are independent of one another, and only the arguments decide the result.
+    """Retarget demonstrations. Sequences are independent of one another; the same arguments give the same result.
 
     Args:
         demos: human demonstrations; they need not rest on the table yet.
@@ -69,7 +69,8 @@ def retarget_demos(
         device: where hand retargeting runs; the arm runs on the CPU.
 
     Returns:
-        Trajectories of every sequence; a sequence whose hand was never annotated stays at home, without a valid frame.
+        Trajectories of every sequence. In a sequence without an annotated hand the robot stays at home and no frame is
+        valid.
 
     Raises:
         DemoError: an object of the demonstrations is not among ``objects``.
@@ -96,8 +97,6 @@ def retarget_demos(
 
     links = arm.kinematics.link_poses(torch.as_tensor(joint_pos), robot.tracked_links)
     contact = np.asarray(hands.touching.any(axis=1))
-    touches = [contact[demos.frames(sequence)] for sequence in range(len(demos))]
-    first_contact = np.array([own.argmax() if own.any() else -1 for own in touches], dtype=np.int32)
     goal_pos, goal_quat = demos.goal_pose
     return Retargeted(
         robot=robot.name,
@@ -122,10 +121,20 @@ def retarget_demos(
         reason=reason,
         reason_names=REASONS,
         contact=contact,
-        first_contact=first_contact,
+        first_contact=_first_contact(demos, contact),
         hand_error=hand_error,
         wrist_error=wrist_error,
     )
+
+
+def _first_contact(demos: Demos, contact: np.ndarray) -> np.ndarray:
+    """Return the first frame [S] within each sequence that has ``contact`` [F]; -1 if no frame has."""
+    first = np.full(len(demos), -1, dtype=np.int32)
+    for sequence in range(len(demos)):
+        own = contact[demos.frames(sequence)]
+        if own.any():
+            first[sequence] = own.argmax()
+    return first
 
 
 def wrist_paths(
@@ -135,7 +144,7 @@ def wrist_paths(
     *,
     progress: Progress = unseen,
 ) -> list[ArmTargets]:
-    """Return the paths that hand retargeting demands of the arm, in batches. Arguments and errors as in
+    """Return the paths of the hand root that the arm has to follow, in batches. Arguments and errors as in
     :func:`retarget_demos`."""
     hands = HandMotions(demos, robot, objects)
     arm = ArmModel(robot)
@@ -146,7 +155,7 @@ def wrist_paths(
 
 
 class HandMotions:
-    """Hands that follow demonstrations: the demonstrations on the table, and the contacts of human hands in them."""
+    """Demonstrations on the table, the contacts of the human hands, and the robot hand's motions that follow them."""
 
     def __init__(
         self,
@@ -170,17 +179,17 @@ class HandMotions:
         self._contact_points, self.touching = human_contacts(
             demos, surfaces, config.contact_distance
         )
-        """Contact points [F, 21, 3] of the human keypoints, and which of them [F, 21] touch the object."""
+        """Contact points [F, 21, 3] of the human keypoints, and whether each keypoint [F, 21] touches the object."""
         self._keypoints = np.where(demos.hand_valid[:, None, None], demos.hand_keypoints, 0.0)
 
     def batches(
         self, progress: Progress = unseen
     ) -> Iterator[tuple[np.ndarray, np.ndarray, HandTargets, HandState]]:
-        """Retarget the hand alone, in batches of those sequences that have a hand.
+        """Retarget the hand alone, in batches of sequences with an annotated hand.
 
         Yields:
-            For each batch of S sequences, padded to T frames: the rows [B] of its frames among all frames, the places
-            [S, T] bool in the batch that they fill, the hand's targets, and the hand's motion.
+            For each batch of S sequences, padded to T frames: the indices [B] of its frames among all frames; whether
+            each element [S, T] of the batch is one of these frames; the hand's targets; the hand's motion.
         """
         owner = self.demos.sequence_of_frame
         lengths = np.diff(self.demos.frame_offsets)
@@ -266,7 +275,7 @@ def rest_on_table(demos: Demos, objects: Sequence[ObjectSpec]) -> Demos:
 def _arm_targets(
     hand: HandModel, arm: ArmModel, targets: HandTargets, motion: HandState
 ) -> ArmTargets:
-    """Return the path that a hand's motion demands of the arm."""
+    """Return the path that the arm has to follow for a motion of the hand."""
     followed = hand.keypoints(motion.to(hand.device)).to(targets.keypoints.device)
     tips_off = (followed - targets.keypoints)[:, :, hand.is_tip.cpu()].norm(dim=-1)
     return ArmTargets(

@@ -1,7 +1,7 @@
-"""Which retargeted frames may be used, and why the others may not.
+"""Decide which retargeted frames are valid, and the reason why others are not.
 
-The paper (appendix D.b): frames are valid only when wrist position and orientation error, retargeting error and
-arm-joint jumps stay below thresholds. Collisions and missing annotations count as well. Every invalid frame has one
+As in the paper (appendix D.b), wrist position and orientation error, retargeting error and arm-joint jumps must stay
+below thresholds. Frames with collisions and frames without annotation are invalid, too. Every invalid frame has one
 reason, the first that applies.
 """
 
@@ -23,8 +23,8 @@ REASONS = (
     "table collision",
     "self collision",
 )
-"""Reasons why a frame is invalid, in the order of precedence. ``joint limit``: the wrist is off with an arm joint at
-its limit."""
+"""Reasons why a frame is invalid, in the order of precedence. ``joint limit``: the wrist misses its target, and an arm
+joint is at its limit."""
 
 
 @frozen
@@ -54,17 +54,17 @@ class Measures:
     hand_error: Tensor
     """Mean fingertip distance [m]."""
     wrist_position: Tensor
-    """[m]"""
+    """Distance of the hand root from its target [m]."""
     wrist_orientation: Tensor
-    """[rad]"""
+    """Angle of the hand root to its target [rad]."""
     at_limit: Tensor
     """bool: whether an arm joint is at its limit."""
     arm_jump: Tensor
-    """[rad or m]; 0 in the first annotated frame."""
+    """Largest change of an arm joint since the frame before [rad or m]; 0 after a frame without annotation."""
     table_clearance: Tensor
-    """Lowest height of the robot's shapes above the table, 2 cm where it is more [m]."""
+    """Lowest height of the robot's shapes above the table, at most 2 cm [m]."""
     self_clearance: Tensor
-    """Smallest signed distance between the robot's shapes, 2 cm where it is more [m]."""
+    """Smallest signed distance between the robot's shapes, at most 2 cm [m]."""
 
 
 def classify(measures: Measures, thresholds: Thresholds) -> Tensor:
@@ -82,5 +82,5 @@ def classify(measures: Measures, thresholds: Thresholds) -> Tensor:
         "table collision": ~(measures.table_clearance >= -thresholds.table_depth),
         "self collision": ~(measures.self_clearance >= -thresholds.self_depth),
     }
-    # the first that applies, and where none does the row of valid frames
+    # argmax returns the first reason that applies, and 0 (valid) if none does
     return torch.stack([applies[reason] for reason in REASONS]).long().argmax(dim=0)

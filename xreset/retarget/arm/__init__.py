@@ -1,1 +1,1 @@
-"""Arm inverse kinematics along a retargeted hand's path: ``solve``, on ``model`` and ``config``."""
+"""Arm inverse kinematics along a retargeted hand's path. ``solve`` is the entry; it uses ``model`` and ``config``."""

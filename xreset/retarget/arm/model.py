@@ -1,4 +1,4 @@
-"""A robot as its arm's inverse kinematics sees it, the path that the arm should follow, and how well joints do it.
+"""The model of a robot for its arm's inverse kinematics, the path that the arm should follow, and measures of a path.
 
 Shape letters: S sequences, T frames, B batch, n arm joints, J_hand hand joints, J all joints, L links, C carriers, G
 links with support points.
@@ -23,7 +23,7 @@ from xreset.spec import RobotSpec, TableSpec
 from xreset.tensors import Tensors
 
 _SEARCH = 0.02
-"""Distances between shapes, and heights above the table, are measured up to here [m]."""
+"""Distances between shapes, and heights above the table, are measured up to this one [m]."""
 _AT_LIMIT = 1e-6
 """A joint this near its limit is at it [rad or m]."""
 
@@ -37,9 +37,9 @@ class ArmTargets(Tensors):
     root_quat: Tensor
     """[S, T, 4] orientation of the hand root."""
     hand_joints: Tensor
-    """[S, T, J_hand]"""
+    """[S, T, J_hand] rad (m)"""
     annotated: Tensor
-    """[S, T] bool"""
+    """[S, T] bool: whether the human hand was annotated."""
     hand_error: Tensor
     """[S, T] mean fingertip error of the hand's retargeting [m]."""
     hand_clearance: Tensor
@@ -47,7 +47,7 @@ class ArmTargets(Tensors):
 
     @staticmethod
     def of_poses(root_pos: Tensor, root_quat: Tensor, hand_joints: Tensor) -> ArmTargets:
-        """Return hand poses [S, 3], [S, 4], each a path of one frame, in which the hand has joints [J_hand]."""
+        """Return a path of one frame for each pose [S, 3], [S, 4] of the hand root; the hand has joints [J_hand]."""
         count = len(root_pos)
         zero = root_pos.new_zeros(count, 1)
         return ArmTargets(
@@ -73,13 +73,13 @@ class LowPoints(Tensors):
     carrier: Tensor
     """[A] index of the link that carries the point."""
     height: Tensor
-    """[A] height of the robot's shape there above the table [m]."""
+    """[A] height of the robot's shape above the table at this point [m]."""
     lever: Tensor
     """[A, 3] from the carrier's origin to the center of the lowest ball, along the world's axes [m]."""
 
 
 class ArmModel:
-    """A robot as its arm's inverse kinematics sees it."""
+    """The model of a robot for its arm's inverse kinematics."""
 
     def __init__(self, robot: RobotSpec) -> None:
         """Prepare the arm.
@@ -106,8 +106,7 @@ class ArmModel:
         in_hand = self.hand.link_names
         names = self.kinematics.link_names
         self.carriers = (robot.hand_root, *(link for link in names if link not in in_hand))
-        """Links whose motion the arm's joints determine: the hand root, which carries the hand, then the arm's
-        links."""
+        """Links that only the arm's joints move: the hand root, which carries the hand, then the arm's links."""
         carrier_of = {link: 0 if link in in_hand else self.carriers.index(link) for link in names}
         self.arm_collision = SelfCollision(self.kinematics, moved_by_arm=True)
         """Distances that the arm's joints change."""
@@ -116,21 +115,21 @@ class ArmModel:
         support = table_points(self.kinematics)
         links = sorted(support, key=lambda link: link not in in_hand)
         self._supported_in_hand = [link for link in links if link in in_hand]
-        """Links with support points; those of the hand come first."""
+        """Links of the hand with support points. They come first among all links with support points."""
         self._carrier = torch.tensor([carrier_of[link] for link in links], dtype=torch.long)
         """[G] carrier of each link with support points."""
         points = [support[link][0] for link in links]
         radii = [support[link][1] for link in links]
         self._count = torch.tensor([len(own) for own in radii], dtype=torch.long)
-        """[G] number of support points of each link; those of one link follow one another."""
+        """[G] number of support points of each link. The points are stored link by link."""
         self._points = joined(points, 3)
         self._radii = joined(radii)
         self._middles, self._reach = bounding_balls(points, radii)
-        """A ball around the support points of each link, in the link's frame."""
+        """Center [G, 3], in the link's frame, and radius [G] of a ball around the support points of each link [m]."""
 
     def hand_poses(self, hand_joints: Tensor) -> Tensor:
-        """[..., G, 4, 4] links with support points in the frames of their carriers: only those of the hand move
-        there."""
+        """[..., G, 4, 4] poses of the links with support points in their carriers' frames, in which only links of the
+        hand move."""
         poses = torch.eye(4, dtype=hand_joints.dtype).repeat(
             *hand_joints.shape[:-1], len(self._carrier), 1, 1
         )
@@ -145,7 +144,7 @@ class ArmModel:
             pos: [B, C, 3] carriers' origins.
             rot: [B, C, 3, 3] their orientations.
             hand_poses: [B, G, 4, 4] see :meth:`hand_poses`.
-            below: [m]
+            below: largest height above the table [m].
         """
         turn = hand_poses[..., :3, :3]
         shift = hand_poses[..., :3, 3]
@@ -171,14 +170,14 @@ class ArmModel:
         return low[order[is_first]]
 
     def hand_clearance(self, hand_joints: Tensor) -> Tensor:
-        """[...] smallest signed distance between those of the hand's shapes that collide in physics [m]."""
+        """[...] smallest signed distance between the hand's shapes that can collide in physics [m]."""
         poses = self.hand.link_poses(hand_joints.flatten(0, -2)).numpy()
         return torch.as_tensor(self._hand_collision.clearance(poses, _SEARCH)).view(
             hand_joints.shape[:-1]
         )
 
     def full(self, arm: Tensor, hand_joints: Tensor | float) -> Tensor:
-        """[..., J] all joints in joint order."""
+        """[..., J] all joints in the robot's order, given those of the arm [..., n] and of the hand [..., J_hand]."""
         q = arm.new_zeros(*arm.shape[:-1], len(self.robot.joints))
         q[..., self.arm] = arm
         q[..., torch.as_tensor(self.hand.joint_indices)] = hand_joints
@@ -187,7 +186,7 @@ class ArmModel:
 
 @frozen
 class ArmProblem(ArmTargets):
-    """Targets that paths are searched for. An index selects sequences, or some of their frames."""
+    """Targets, and everything else that the search for a path needs. An index selects sequences, or frames of them."""
 
     hand_poses: Tensor
     """[S, T, G, 4, 4] see :meth:`ArmModel.hand_poses`; computed once from the targets."""

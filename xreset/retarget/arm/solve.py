@@ -39,11 +39,11 @@ _CONVERGED = 1e-5
 _WRIST_MISSED = torch.tensor(
     [REASONS.index(name) for name in ("joint limit", "wrist position", "wrist orientation")]
 )
-"""Reasons of frames whose wrist is not where it should be."""
+"""Reasons of frames in which the wrist misses its target."""
 _HOME_BIAS = 1e-3
 """Preference among solutions of the first frame for those near home [1/rad^2]."""
 _DISTINCT = 0.5
-"""Solutions of the first frame differ if a joint differs by this much [rad or m]."""
+"""Solutions of a first frame are distinct if a joint differs by more than this [rad or m]."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def track(
         config: weights and effort.
 
     Returns:
-        [S, T, n] arm joints, and the measures of every frame ([S, T] each).
+        Arm joints [S, T, n], and the measures [S, T] of every frame.
     """
     problem = ArmProblem(
         **vars(targets),
@@ -88,13 +88,13 @@ def track(
 
 
 def _rescued(problem: ArmProblem, paths: Paths, joints: Tensor, worth: Tensor) -> Tensor:
-    """[S, T, n] better paths than ``joints`` [S, T, n], where there are any, for sequences with frames that fail.
+    """[S, T, n] better paths than ``joints`` for sequences with failing frames; ``joints`` where none is found.
 
     Args:
         problem: the problem of these sequences.
-        paths: their paths from the first frame.
-        joints: the best of those.
-        worth: [S] its worth.
+        paths: paths of these sequences from the first frame.
+        joints: [S, T, n] the best of these paths.
+        worth: [S] worth of the best path.
     """
     if problem.annotated.shape[1] > 1:
         turned = problem.reversed()
@@ -115,7 +115,8 @@ def _rescued(problem: ArmProblem, paths: Paths, joints: Tensor, worth: Tensor) -
 
 
 def follow(problem: ArmProblem, start: Tensor) -> Tensor:
-    """[S, T, n] joints along the path, every frame started from the one before; the first from ``start`` [S, n]."""
+    """[S, T, n] joints along the path. Every frame is solved from the joints of the frame before, the first from
+    ``start`` [S, n]."""
     config = problem.config
     path = [solve(problem[:, 0], start, config.first_iterations)]
     for t in range(1, problem.annotated.shape[1]):
@@ -131,10 +132,10 @@ def branches(problem: ArmProblem) -> Paths:
 
 
 def judged_paths(problem: ArmProblem, paths: Tensor) -> Paths:
-    """Return paths [S, K, T, n] with which of their frames are good.
+    """Return the paths [S, K, T, n], and which of their frames are sound.
 
-    A jump depends on the frame before, and so on the direction and on where paths are spliced; everything else depends
-    on the frame alone and is measured once.
+    Only jumps depend on the frame before, and thus on the direction of a path and on splices. The other measures depend
+    on the frame alone, so they are taken once.
     """
     measures = problem.repeated(paths.shape[1]).measures(paths.flatten(0, 1))
     no_jumps = replace(measures, arm_jump=torch.zeros_like(measures.arm_jump))
@@ -143,7 +144,7 @@ def judged_paths(problem: ArmProblem, paths: Tensor) -> Paths:
 
 
 def best_path(problem: ArmProblem, paths: Paths) -> tuple[Tensor, Tensor]:
-    """Return the path [S, T, n] that is worth most, and its worth [S]: see the config."""
+    """Return the path [S, T, n] of the highest worth, and its worth [S]: valid frames less the cost of the detour."""
     jump = arm_jump(paths.joints, problem.annotated[:, None])
     valid = (paths.sound & (jump <= problem.thresholds.arm_jump)).sum(-1)
     detour = (paths.joints - problem.model.home).square().sum(-1).mean(-1)
@@ -152,10 +153,10 @@ def best_path(problem: ArmProblem, paths: Paths) -> tuple[Tensor, Tensor]:
 
 
 def repaired(problem: ArmProblem, known: Paths, missed: Tensor) -> Tensor:
-    """[S, T, n] the best path from pieces of known paths and of new ones.
+    """[S, T, n] the best path from pieces of known and of new paths.
 
-    The new paths lead both ways from some of the frames that are ``missed`` [S, T], solved again: a path from either
-    end may be stuck at a limit there, on the wrong side of the arm's null space.
+    New paths lead both ways from some of the ``missed`` frames [S, T], which are solved again. Known paths may be stuck
+    at a limit in these frames, on the wrong side of the arm's null space.
     """
     config = problem.config
     owner, paths = _reseeded(problem, missed)
@@ -181,9 +182,14 @@ def repaired(problem: ArmProblem, known: Paths, missed: Tensor) -> Tensor:
 
 
 def _reseeded(problem: ArmProblem, missed: Tensor) -> tuple[Tensor, Tensor]:
-    """Follow paths both ways from distinct solutions of missed frames [S, T] that can be solved.
+    """Follow paths both ways from distinct valid solutions of some missed frames.
 
-    Returns the sequences [B] of the paths, ascending, and the paths [B, T, n].
+    Args:
+        problem: the problem.
+        missed: [S, T] bool: the frames.
+
+    Returns:
+        The sequences [B] of the paths, ascending, and the paths [B, T, n].
     """
     owner, seed = spread_over(missed, problem.config.reseeds)
     alone = problem[owner[:, None], seed[:, None]]  # [C, 1, ...]
@@ -207,26 +213,18 @@ def _reseeded(problem: ArmProblem, missed: Tensor) -> tuple[Tensor, Tensor]:
     both_ways = torch.cat((seed[:, None] + steps, seed[:, None] - steps)).clamp(0, frames - 1)
     followed = follow(problem[owner.repeat(2)[:, None], both_ways], start.repeat(2, 1))
     row = torch.arange(len(owner)).repeat(2)
-    for step in reversed(steps.tolist()):  # the first visit of a frame is the one that stays
+    for step in reversed(steps.tolist()):  # backwards, so that the first visit of a frame is kept
         paths[row, both_ways[:, step]] = followed[:, step]
     return owner, paths
 
 
 def _first_frames(problem: ArmProblem) -> Tensor:
-    """[S, K, n] distinct solutions of the first frame: the one that home leads to, then the best others. The last one
-    is repeated where there are fewer than K."""
-    model = problem.model
+    """[S, K, n] distinct solutions of the first frame: the solution from home, then the best others. If there are fewer
+    than K, the last one is repeated."""
     config = problem.config
-    home = model.home
+    home = problem.model.home
     sequences = len(problem.hand_poses)
-    generator = torch.Generator().manual_seed(config.seed)  # every sequence gets the same starts
-    spread = (
-        torch.rand(config.restarts, len(home), generator=generator, dtype=home.dtype) * 2.0 - 1.0
-    )
-    spread[0] = 0.0
-    lower = torch.maximum(model.lower, home - torch.pi)
-    upper = torch.minimum(model.upper, home + torch.pi)
-    start = home + spread * torch.where(spread < 0, home - lower, upper - home)
+    start = _random_starts(problem.model, config)
     frame = problem.repeated(config.restarts)[:, 0]
     solved = solve(frame, start.repeat(sequences, 1), config.first_iterations)
     cost = system(frame, solved).cost
@@ -236,15 +234,36 @@ def _first_frames(problem: ArmProblem) -> Tensor:
     number = min(config.branches, config.restarts)
     chosen = []
     for solutions, ranking in zip(solved, order, strict=True):
-        kept = [solutions[0]]  # the one that home leads to
-        for candidate in solutions[ranking]:
-            if len(kept) < number and all(
-                (candidate - other).abs().max() > _DISTINCT for other in kept
-            ):
-                kept.append(candidate)
-        kept += [kept[-1]] * number
-        chosen.append(torch.stack(kept[:number]))
+        from_home = solutions[0]
+        chosen.append(_distinct(from_home, solutions[ranking], number))
     return torch.stack(chosen) if chosen else home.new_zeros(0, number, len(home))
+
+
+def _random_starts(model: ArmModel, config: ArmConfig) -> Tensor:
+    """[restarts, n] starts of a first frame, the same for every sequence: home, then random ones within the limits and
+    within half a turn of home."""
+    home = model.home
+    generator = torch.Generator().manual_seed(config.seed)
+    spread = (
+        torch.rand(config.restarts, len(home), generator=generator, dtype=home.dtype) * 2.0 - 1.0
+    )
+    spread[0] = 0.0
+    lower = torch.maximum(model.lower, home - torch.pi)
+    upper = torch.minimum(model.upper, home + torch.pi)
+    return home + spread * torch.where(spread < 0, home - lower, upper - home)
+
+
+def _distinct(first: Tensor, candidates: Tensor, number: int) -> Tensor:
+    """[number, n] the first solution [n], then those of the candidates [..., n] that differ from all before. If there
+    are fewer, the last one is repeated."""
+    kept = [first]
+    for candidate in candidates:
+        if len(kept) == number:
+            break
+        if all((candidate - other).abs().max() > _DISTINCT for other in kept):
+            kept.append(candidate)
+    kept += [kept[-1]] * number
+    return torch.stack(kept[:number])
 
 
 def splice(
@@ -256,18 +275,18 @@ def splice(
     jump: float,
     switch_cost: float,
 ) -> Tensor:
-    """Return the best path that follows one of the given ones in every frame, by dynamic programming over the frames.
+    """Return the best path that follows one of the given paths in every frame, by dynamic programming over the frames.
 
         maximize sum_t worth[k_t, t] [not a jump at t] - cost[k_t, t] - switch_cost [k_t != k_{t-1}]
 
-    A jump is a joint's change by more than ``jump`` since an annotated frame before.
+    A jump at t is a joint's change by more than ``jump`` since frame t - 1, if frame t - 1 is annotated.
 
     Args:
         paths: [S, K, T, n] joints.
-        worth: [S, K, T] of a frame of a path, if the joints do not jump there.
-        cost: [S, K, T] of a frame of a path, jump or not.
+        worth: [S, K, T] worth of each frame of a path without a jump.
+        cost: [S, K, T] cost of each frame of a path.
         annotated: [S, T] bool.
-        jump: [rad or m].
+        jump: largest change of a joint that is not a jump [rad or m].
         switch_cost: cost of a change from one path to another.
 
     Returns:
@@ -293,8 +312,8 @@ def splice(
 
 
 def spread_over(flags: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Choose at most ``count`` of the set frames of each row of ``flags`` [S, T], evenly spread: rows [C], ascending,
-    and frames [C]."""
+    """Choose at most ``count`` of the true elements of each row of ``flags`` [S, T], evenly spread. Return their rows
+    [C], ascending, and columns [C]."""
     rows = []
     frames = []
     for row, flagged in enumerate(flags):
@@ -310,15 +329,15 @@ def spread_over(flags: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 
 def solve(frame: ArmProblem, q: Tensor, iterations: int, previous: Tensor | None = None) -> Tensor:
-    """[B, n] minimizer of one frame's cost, from ``q``: Levenberg-Marquardt, each element of the batch with its own
-    damping.
+    """[B, n] joints that minimize the cost of one frame, by Levenberg-Marquardt from ``q``. Every element of the batch
+    has its own damping.
 
-    A joint at a limit stays there while the cost pulls it outwards; steps beyond a limit are cut off there.
+    A joint at a limit stays there while the cost pulls it outwards. Steps are clamped to the limits.
 
     Args:
         frame: the problem of one frame, without the axis T.
         q: [B, n] first guess.
-        iterations: most steps.
+        iterations: largest number of steps.
         previous: [B, n] joints of the frame before; None where there is none.
     """
     model = frame.model
@@ -333,7 +352,7 @@ def solve(frame: ArmProblem, q: Tensor, iterations: int, previous: Tensor | None
         return moved.clamp(model.lower, model.upper)
 
     def done(before: Tensor, after: Tensor, *_: Tensor) -> Tensor:
-        # all together: the batch keeps its size
+        # the whole batch ends together, so it keeps its size
         return ((after - before).abs() < _CONVERGED).all().expand(len(before))
 
     return minimize(q, evaluate, step, done, iterations, damping_range=(1e-9, 1e9))

@@ -1,2 +1,2 @@
-"""Hand retargeting over whole trajectories: ``solve``, on ``cost``, ``terms``, ``clearance``, ``model`` and
-``config``."""
+"""Hand retargeting over whole trajectories. ``solve`` is the entry; it uses ``cost``, ``terms``, ``clearance``,
+``model`` and ``config``."""

@@ -1,5 +1,5 @@
-"""Contacts of a hand: which of its balls come too near to the object, the table or each other, and how far a jaw's pads
-are from the object.
+"""Distances of a hand's balls that are too near to the object, the table or each other, and of a jaw's pads from the
+object.
 
 Shape letters: B frames, G links with balls, A distances that count, H frames with a held object, N balls of pads, n
 variables.
@@ -34,7 +34,7 @@ class Distances(Tensors):
     slope: Tensor
     """[A, n] derivative."""
     number: Tensor
-    """[A] position within the frame; it fixes the order of sums, which shows in their last digits."""
+    """[A] rank within the frame. It fixes the order of sums, and so their last digits."""
 
 
 class Objects(NamedTuple):
@@ -77,7 +77,7 @@ def too_near(
 ) -> Distances:
     """Find balls too near to the object, below the table's top, or too deep in each other.
 
-    One ball around each link rules most of them out.
+    A bounding ball around each link excludes most links at once.
 
     Args:
         model: the hand.
@@ -136,8 +136,8 @@ def _outside(
         model: the hand.
         bodies: its B configurations.
         candidates: [B, G] the links that may be too near.
-        measure: returns which of some balls are too near, their distances and the directions away from the thing,
-            given their centers [N, 3], frames [N] and radii [N].
+        measure: returns the indices of the balls that are too near, their distances, and the directions away from the
+            other body, given centers [N, 3], frames [N] and radii [N] of balls.
         first: number of the first ball.
     """
     balls = model.balls

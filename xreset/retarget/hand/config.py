@@ -19,42 +19,42 @@ class HandConfig(Checked):
     """Weights and limits of hand retargeting; weights are the paper's (appendix D.b) unless a field says otherwise."""
 
     jaw: Literal["fingertips", "analytic"] = "fingertips"
-    """What a parallel jaw follows. ``fingertips``: the human's, like every hand. ``analytic``: the published paper's
-    map, without the costs below. Other hands ignore it."""
+    """What a parallel jaw follows. ``fingertips``: the human's fingertips, like every hand. ``analytic``: the published
+    paper's map (:mod:`xreset.retarget.hand.jaw`), without the costs below. Other hands ignore this field."""
     local_weight: NonNegativeFloat = 10.0
-    """Bone vectors and bone directions, averaged over the pairs of keypoints."""
+    """Weight of bone vectors and bone directions, averaged over the pairs of keypoints."""
     global_weight: NonNegativeFloat = 1.0
-    """Positions of the keypoints, per keypoint."""
+    """Weight of each keypoint's position."""
     tip_factor: NonNegativeFloat = 10.0
     """Factor on the weight of a fingertip's position (not the paper's)."""
     contact_weight: NonNegativeFloat = 5.0
-    """Contact points, per keypoint in contact."""
+    """Weight of each contact point."""
     contact_margin: NonNegativeFloat = 0.01
     """Distance between contact link and contact point that costs nothing [m]."""
     contact_knee: PositiveFloat = 0.002
     """Excess over the margin below which the contact cost is quadratic [m]."""
     clearance_weight: NonNegativeFloat = 2000.0
-    """Depth of the hand in the object, the table and itself beyond the allowed one (not the paper's)."""
+    """Weight of the hand's depth in the object, the table and itself beyond the allowed depth (not the paper's)."""
     object_clearance: FiniteFloat = 0.0005
     """Distance that the hand keeps from the object [m]. Physics pushes deeper grasps apart."""
     self_depth: FiniteFloat = 0.002
     """Allowed depth of the hand's links in one another [m]."""
     pad_weight: NonNegativeFloat = 1000.0
-    """Distance of a jaw's pads from the held object, averaged over each pad (not the paper's). Other hands have no
-    pads."""
+    """Weight of the distance of a jaw's pads from the held object, averaged over each pad (not the paper's). Other
+    hands have no pads."""
     pad_reach: PositiveFloat = 0.015
     """Distance from the object beyond which a point of a pad is not attracted [m]."""
     smoothness_weight: PositiveFloat = 2.0
-    """Change of joints and root between neighboring frames. It must be positive, because it alone determines what no
-    keypoint does."""
+    """Weight of the change of joints and root between neighboring frames. It must be positive, because it alone
+    determines joints that no keypoint depends on."""
     jump_limit: PositiveFloat = 0.17
     """Change of a hand joint between neighboring frames beyond which ``jump_weight`` applies [rad or m] (not the
     paper's)."""
     jump_weight: NonNegativeFloat = 1000.0
-    """Change of a hand joint between neighboring frames beyond ``jump_limit``."""
+    """Weight of a hand joint's change between neighboring frames beyond ``jump_limit``."""
     length_scale: PositiveFloat = 0.10
     """Length that counts as much as one radian [m]: about a finger's length."""
     iterations: NonNegativeInt = 40
-    """Most Levenberg-Marquardt steps with the full weight."""
+    """Largest number of Levenberg-Marquardt steps with the full weight of the clearance."""
     tolerance: NonNegativeFloat = 1e-3
     """A sequence is done when a step lowers its cost by less than this fraction."""

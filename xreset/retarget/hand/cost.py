@@ -29,7 +29,7 @@ from xreset.retarget.hand.model import HandModel, HandState, HandTargets
 from xreset.retarget.least_squares import Quadratic
 
 _FRAMES_PER_CHUNK = {"cpu": 256, "cuda": 2048}
-"""On a CPU as many as fit its caches; on a GPU enough to fill it."""
+"""On a CPU, as many frames as fit its caches; on a GPU, enough frames to fill it."""
 
 
 @dataclass(frozen=True)

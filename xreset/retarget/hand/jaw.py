@@ -20,12 +20,12 @@ from xreset.spec import KEYPOINTS
 _OPPOSING = ("index4", "middle4")
 """Fingertips that oppose the thumb."""
 _OPENINGS = 1025
-"""Joint positions among which the one with the wanted opening is chosen."""
+"""Number of joint positions that are tried for the wanted opening."""
 
 
 def jaw_keypoints(model: HandModel, keypoints: np.ndarray) -> np.ndarray:
-    """[F, P, 3] what a jaw follows of human keypoints [F, 21, 3]: the thumb's tip, and the middle of the opposing
-    fingertips."""
+    """[F, P, 3] points that a jaw follows, from human keypoints [F, 21, 3]: its fingertips follow the thumb's tip and
+    the middle of the opposing fingertips."""
     chosen = keypoints[:, model.keypoint_indices]
     for tip, followed in zip(model.robot.fingertips, (("thumb4",), _OPPOSING), strict=True):
         point = keypoints[:, [KEYPOINTS.index(name) for name in followed]].mean(axis=1)
@@ -34,10 +34,10 @@ def jaw_keypoints(model: HandModel, keypoints: np.ndarray) -> np.ndarray:
 
 
 def jaw_state(model: HandModel, keypoints: Tensor) -> HandState:
-    """Return the joint and the root's pose that put a jaw where human keypoints [S, T, P, 3] from
-    :func:`jaw_keypoints` are.
+    """Return the joint and the root's pose that put a jaw's fingertips onto human keypoints [S, T, P, 3] from
+    :func:`jaw_keypoints`.
 
-    Where they are farther apart than the jaw opens, it is open and in their middle.
+    If the keypoints are farther apart than the jaw opens, the jaw is open, in their middle.
 
     Raises:
         RobotError: no link follows the wrist or a fingertip.
@@ -63,9 +63,8 @@ def jaw_state(model: HandModel, keypoints: Tensor) -> HandState:
     )
     across = human_finger - human_thumb
     middle = (human_thumb + human_finger) / 2
-    chosen = order[
-        torch.searchsorted(opening, across.norm(dim=-1).contiguous()).clamp_max(_OPENINGS - 1)
-    ]
+    wanted = across.norm(dim=-1).contiguous()
+    chosen = order[torch.searchsorted(opening, wanted).clamp_max(_OPENINGS - 1)]
     rot = _axes(across, middle - wrist) @ own.mT
     return HandState(
         joints=tried[chosen],

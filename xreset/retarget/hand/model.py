@@ -1,5 +1,5 @@
-"""A hand as retargeting sees it: a floating tree, the links that follow human keypoints, and the balls that keep it out
-of other things.
+"""The model of a hand for retargeting: a floating tree, the links that follow human keypoints, and the balls that keep
+the hand out of the object, the table and itself.
 
 Shape letters: S sequences padded to T frames, B frames, P mapped keypoints, C pairs of keypoints, J hand joints, n = J
 + 6 variables, L links, Q balls, N balls of pads.
@@ -26,7 +26,7 @@ from xreset.spec import FINGERS, KEYPOINTS, RobotSpec, TableSpec
 from xreset.tensors import Tensors
 
 _PAD_DEPTH = 1e-3
-"""A finger's pad are its balls that come within this of the foremost one, towards the other finger [m]."""
+"""A finger's pad consists of its balls at most this far behind the foremost one, towards the other finger [m]."""
 
 
 @frozen
@@ -34,9 +34,9 @@ class HandTargets(Tensors):
     """Human motion that the hand follows; all tensors on one device."""
 
     keypoints: Tensor
-    """[S, T, P, 3] human keypoints; any finite values where not annotated."""
+    """[S, T, P, 3] human keypoints [m]; any finite values where not annotated."""
     annotated: Tensor
-    """[S, T] bool: frames with keypoints. The other frames are held by smoothness alone."""
+    """[S, T] bool: whether a frame has keypoints. Smoothness alone determines the other frames."""
     contact_points: Tensor
     """[S, T, P, 3] object surface points that the keypoints touch."""
     in_contact: Tensor
@@ -141,12 +141,11 @@ class HandModel:
         return torch.tensor(indices, dtype=torch.long, device=self.device)
 
     def _pads(self) -> list[Tensor]:
-        """Return the balls of the two pads of a jaw, a hand whose one joint moves two fingers: where these face each
-        other at home.
+        """Return the balls of a jaw's two pads, the sides of its fingers that face each other at home; empty for other
+        hands.
 
-        Thumb and fingers of a human press on an object wherever their joints let them; a jaw presses along one axis.
-        Drawn to the human's fingertips alone it touches the object at an angle, with an edge of each pad, and squeezes
-        it out.
+        A jaw presses along one axis only. If it followed only the human's fingertips, it would touch the object at an
+        angle, with an edge of each pad, and squeeze it out.
         """
         none = [torch.zeros(0, dtype=torch.long, device=self.device)]
         if not self.is_jaw:
@@ -168,11 +167,11 @@ class HandModel:
         return pads
 
     def keypoints(self, state: HandState) -> Tensor:
-        """[..., P, 3] positions of the keypoint links."""
+        """[..., P, 3] positions of the links that follow keypoints [m]."""
         return self.kinematics.points(state.joints, self.keypoint_links, base=state.root)
 
     def bodies(self, state: HandState) -> PointJacobian:
-        """Compute the links of the hand in B frames, and their Jacobians.
+        """Compute the poses of the hand's links in B frames, and their Jacobians.
 
         Variables: joints, then translation of the root, then rotation of the root about its origin (both along the
         world's axes).
@@ -227,7 +226,7 @@ def keypoint_pairs(names: Sequence[str], links: Sequence[str]) -> list[tuple[int
     """Choose pairs of mapped keypoints: along each finger from the wrist, between neighboring knuckles, and thumb tip
     to other tips.
 
-    Any subset of the 21 keypoints will do. Pairs on the same link carry no information and are omitted.
+    Any subset of the 21 keypoints is possible. Pairs on the same link carry no information and are omitted.
     """
     from_base = sorted(range(len(names)), key=names.__getitem__)
     wrist = [i for i in from_base if names[i] == "wrist"]

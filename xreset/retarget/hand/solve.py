@@ -1,10 +1,9 @@
 """Hand retargeting: hand joints and hand pose that follow human keypoints, over whole trajectories at once (the paper,
 appendix D.b).
 
-The variables of a frame are the hand's joints and the pose of the link that carries the hand; ``cost`` gives the cost.
-It is minimized by Levenberg-Marquardt with analytic Jacobians and exact joint limits (projected steps). Neighboring
-frames are coupled only through the changes between them, so each step solves a block-tridiagonal system. All of it runs
-on the hand model's device.
+The variables of a frame are the hand's joints and the pose of the link that carries the hand. The cost (``cost``) is
+minimized by Levenberg-Marquardt with analytic Jacobians and exact joint limits (projected steps). Only neighboring
+frames are coupled, so each step solves a block-tridiagonal system. The work runs on the hand model's device.
 
 Shape letters: S sequences padded to T frames, P mapped keypoints, J hand joints, n = J + 6.
 """
@@ -30,10 +29,10 @@ from xreset.retarget.hand.model import HandModel, HandState, HandTargets
 from xreset.retarget.least_squares import damped, free_to_move, minimize, solve_chain
 
 _CLEARANCE_GROWTH = (0.01, 0.1)
-"""Shares of the clearance's weight in earlier stages, each of which starts the next. A hand that may pass through the
-object at first finds the right side of a handle or a rim."""
+"""Shares of the clearance's weight in the earlier stages; each stage starts from the result of the one before. A hand
+that may pass through the object at first finds the right side of a handle or a rim."""
 _GROWTH_STEPS = 6
-"""Most Levenberg-Marquardt steps of each earlier stage."""
+"""Largest number of Levenberg-Marquardt steps of each earlier stage."""
 
 
 def retarget_hand(
@@ -42,8 +41,8 @@ def retarget_hand(
     """Find hand motions that minimize the cost; sequences are independent of one another.
 
     Args:
-        model: the hand; its device does the work.
-        targets: what to follow; a sequence must have at least one annotated frame.
+        model: the hand.
+        targets: human motion to follow; a sequence must have at least one annotated frame.
         config: weights and limits.
 
     Returns:
@@ -69,7 +68,7 @@ def retarget_hand(
 def _minimize(
     model: HandModel, targets: HandTargets, config: HandConfig, start: HandState
 ) -> HandState:
-    """Return the best state that is found from a first guess."""
+    """Return the best state that Levenberg-Marquardt finds from a first guess."""
 
     def evaluate(state: HandState, rows: Tensor) -> HandSystem:
         return system(model, targets[rows], config, state)

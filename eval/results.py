@@ -491,7 +491,7 @@ def recorded(episodes: Table, engine: str, traces: Sequence[Trace]) -> Table:
     for trace in traces:
         if trace.sequence not in own.index:
             raise FileFormatError(
-                f"{engine}.trace.npz has a trace of demonstration {trace.sequence}, of which no episode is known. "
+                f"{engine}.trace.npz has a trace of demonstration {trace.sequence}, but no episode of it. "
                 "Evaluate again."
             )
     shown = own.loc[[trace.sequence for trace in traces]]

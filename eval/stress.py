@@ -240,8 +240,8 @@ def curve(
 
 
 def _limit(outwards: Sequence[Point]) -> float | None:
-    """Return the value at which ten points are lost, interpolated between two of the points, which are ordered from the
-    nominal value outwards; None if they lose less."""
+    """Return the value at which ten points are lost, interpolated; None if none of the points loses as much. The points
+    are in order from the nominal value outwards."""
     for near, far in pairwise(outwards):
         if far.difference <= -COSTLY < near.difference:
             share = (near.difference + COSTLY) / (near.difference - far.difference)

@@ -114,7 +114,7 @@ FIGURES = {
     "left the scene": Figure(lambda s: str(s.health.out_of_bounds)),
     "control steps/s": Figure(lambda s: f"{s.control_steps_per_second:,.0f}"),
 }
-"""What is shown of every engine, by name."""
+"""Numbers that tables show of every engine, by name."""
 
 
 def result_rows(summaries: Sequence[EvalResult]) -> list[tuple[str, ...]]:

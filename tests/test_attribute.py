@@ -134,7 +134,9 @@ class ChangeTest(TestCase):
         for name, prop in COMPARED.items():
             same = getattr(STATED, prop.measured)
             self.assertEqual(
-                self.change(name, same), "the same in both, as far as is measured", name
+                self.change(name, same),
+                "the same in both, within the resolution of the measurement",
+                name,
             )
 
     def test_a_property_gets_the_other_value(self):

@@ -88,7 +88,7 @@ class ReadTest(Compared):
             ([str(a), str(other)], f"(?s)both be called 'a'.*a-1={a} a-2=.*other/a"),
             ([f"={a}"], "a name is missing"),
             (["x="], "a folder is missing"),
-            ([f"{self.folder}/nowhere"], "there is no folder .*nowhere"),
+            ([f"{self.folder}/nowhere"], "The folder .*nowhere does not exist"),
             ([str(bare)], without),
         ):
             with self.subTest(message), self.assertRaisesRegex(RunError, message):
@@ -450,10 +450,12 @@ class WrittenTest(Compared):
         self.assertNotIn("## Evaluation", self.compare("a"))
         self.write_results("ik")
         for name, curve, words in (
-            ("a", "task/sucess", r"speed/.*task/success, task/success_from_home\. "),
+            ("a", "task/sucess", r"speed/.*task/success, task/success_from_home\.$"),
             ("ik", "task/success", "none"),
         ):
-            with self.assertRaisesRegex(RunError, f"no curve {curve}; there are {words}"):
+            with self.assertRaisesRegex(
+                RunError, f"Unknown curve {curve}. Choose with --curve from: {words}"
+            ):
                 self.compare(name, curves=[curve])
 
     def test_nothing_is_half_written(self):
@@ -521,5 +523,5 @@ class CommandTest(Compared):
     def test_mistakes_are_one_line(self):
         self.assertRegex(
             refused("compare", f"{self.folder}/x").strip(),
-            "^xreset compare: there is no folder[^\n]*$",
+            "^xreset compare: The folder [^\n]* does not exist[^\n]*$",
         )

@@ -94,7 +94,7 @@ class PageTest(InFolder):
     def test_wrong_files(self):
         for data, message in (
             ({"schema": "xreset-eval/1"}, "xreset-eval/1.*expected '" + SCHEMA),
-            ({"schema": SCHEMA, "runs": [{}]}, "no complete " + SCHEMA),
+            ({"schema": SCHEMA, "runs": [{}]}, "not a complete " + SCHEMA),
         ):
             with self.subTest(message), self.assertRaisesRegex(FileFormatError, message):
                 self.page_of(data)

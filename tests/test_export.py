@@ -81,7 +81,7 @@ class Episodes(Case):
                 RunError,
                 "different rates.*20 in.*10 in",
             ),
-            ([self.folder / "nowhere"], RunError, "no folder"),
+            ([self.folder / "nowhere"], RunError, "The folder .*nowhere does not exist"),
         ):
             with self.subTest(words), self.assertRaisesRegex(error, words):
                 read_recorded(folders)
@@ -89,7 +89,7 @@ class Episodes(Case):
             read_recorded([self.evaluate()], backends=["pybullet"])
         stray = self.evaluate("stray", change=self.change_first(sequence=1_000_000))
         with self.assertRaisesRegex(
-            FileFormatError, "a trace of demonstration 1000000, of which no episode is known"
+            FileFormatError, "a trace of demonstration 1000000, but no episode of it"
         ):
             read_recorded([stray])
 

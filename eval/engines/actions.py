@@ -93,13 +93,13 @@ class Actions:
         return self.scene.objects[0]
 
 
-def from_file(source: Path, place: Place, thing: str | None = None, episode: int = 0) -> Actions:
+def from_file(source: Path, place: Place, wanted: str | None = None, episode: int = 0) -> Actions:
     """Load actions from a file: its recorded actions, or an open-loop grasp and lift of one of its grasps.
 
     Args:
         source: recorded actions, the trace of an evaluation, or demonstrations or motion with grasps.
         place: robot and meshes.
-        thing: name of an object of the file; default: its first.
+        wanted: name of an object of the file; default: its first.
         episode: index among the object's grasps or recorded episodes.
 
     Raises:
@@ -110,16 +110,16 @@ def from_file(source: Path, place: Place, thing: str | None = None, episode: int
     if schema == SCHEMA:
         return read_actions(source, place.robot, lambda name: load_object(name, place.objects))
     if schema == TRACE_SCHEMA:
-        return _from_evaluation(source, place, thing, episode)
+        return _from_evaluation(source, place, wanted, episode)
     inputs = load_inputs(
         source,
         robot=place.robot,
         objects=place.objects,
-        only=(thing,) if thing else (),
+        only=(wanted,) if wanted else (),
         accept=("demos", "motion"),
     )
     motion = inputs.motion()
-    grasped = next(o for o in inputs.objects if thing or o.name == motion.object_name[0])
+    grasped = next(o for o in inputs.objects if wanted or o.name == motion.object_name[0])
     grasps = find_grasps(motion, inputs.robot, (grasped,), len(motion.valid), where="table")
     _check_episode(
         episode, len(grasps), f"{source} shows {len(grasps)} grasps of {grasped.name} on the table"
@@ -140,9 +140,9 @@ def _from_evaluation(source: Path, place: Place, wanted: str | None, episode: in
         raise DemoError(f"{source} has no {chosen}; it has {', '.join(names)}.")
     _check_episode(episode, len(mine), f"{source} records {len(mine)} episodes of {chosen}")
     found = mine[episode]
-    thing = load_object(chosen, summary.meshes(place.objects))
+    obj = load_object(chosen, summary.meshes(place.objects))
     return recorded_actions(
-        spec, thing, found, label=f"{summary.policy} in {name}, demonstration {found.sequence}"
+        spec, obj, found, label=f"{summary.policy} in {name}, demonstration {found.sequence}"
     )
 
 
@@ -151,15 +151,15 @@ def _check_episode(episode: int, count: int, found: str) -> None:
         raise DemoError(f"{found}, so --episode is at most {count - 1}.")
 
 
-def grasp_and_lift(robot: RobotSpec, thing: ObjectSpec, grasp: Grasps) -> Actions:
+def grasp_and_lift(robot: RobotSpec, obj: ObjectSpec, grasp: Grasps) -> Actions:
     """Return the actions of :func:`~xreset.eval.engines.grasps.closing_episode` for one grasp."""
-    scene = SceneSpec(robot=robot, objects=(thing,))
+    scene = SceneSpec(robot=robot, objects=(obj,))
     start, targets = closing_episode(scene, grasp)
-    label = f"grasp and lift of {thing.name}, {grasp.label[0]}"
+    label = f"grasp and lift of {obj.name}, {grasp.label[0]}"
     return Actions(scene=scene, label=label, start=start, joint_target=targets[:, 0])
 
 
-def recorded_actions(robot: RobotSpec, thing: ObjectSpec, trace: Trace, *, label: str) -> Actions:
+def recorded_actions(robot: RobotSpec, obj: ObjectSpec, trace: Trace, *, label: str) -> Actions:
     """Return the actions of an episode that an evaluation recorded: from rest, with the physics of an evaluation.
 
     Raises:
@@ -175,7 +175,7 @@ def recorded_actions(robot: RobotSpec, thing: ObjectSpec, trace: Trace, *, label
     poses = (trace.joint_pos, trace.object_pos, trace.object_quat)
     first = [torch.as_tensor(pose[:1]) for pose in poses]
     target = torch.as_tensor(targets).float()
-    scene = nominal_scene(robot, (thing,), TaskConfig(substeps=substeps))
+    scene = nominal_scene(robot, (obj,), TaskConfig(substeps=substeps))
     return Actions(scene=scene, label=label, start=State.at_rest(*first), joint_target=target)
 
 
@@ -225,16 +225,16 @@ def read_actions(
     made = read_record(ActionFile, path, SCHEMA, what="an action sequence", check=_check)
     spec = load_robot(robot or made.robot)
     check_robot(path, "action sequence", made, spec)
-    thing = objects(made.object_name)
-    if thing.source != made.object_source:
+    obj = objects(made.object_name)
+    if obj.source != made.object_source:
         raise FileFormatError(
-            f"{path} was made with another geometry of {thing.name} ({made.object_source}, here {thing.source}). "
+            f"{path} was made with another geometry of {obj.name} ({made.object_source}, here {obj.source}). "
             "Give the same --objects folder."
         )
     tip, link, table = made.friction.tolist()
     scene = SceneSpec(
         robot=spec,
-        objects=(thing,),
+        objects=(obj,),
         friction=PairFriction(tip=tip, link=link, table=table),
         timestep=made.timestep,
         substeps=int(made.substeps),

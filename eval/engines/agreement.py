@@ -101,7 +101,7 @@ def try_closings(tested: Engine, scene: SceneSpec, grasps: Grasps) -> dict[str, 
     start, targets = closing_episode(scene, grasps)
     with tested.make(scene, len(grasps), grasps.object_index) as backend:
         whole = play(backend, start, targets)
-        mass = torch.tensor([thing.mass for thing in scene.objects])[grasps.object_index]
+        mass = torch.tensor([obj.mass for obj in scene.objects])[grasps.object_index]
         backend.set_object_mass(PRESS_MASS * mass.to(backend.device))
         backend.set_object_gravity(torch.zeros_like(mass, device=backend.device))
         press = play(backend, start, targets[: closing_steps(scene.control_dt)])

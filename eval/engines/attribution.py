@@ -224,7 +224,7 @@ def change_towards(
     if unknown:
         return f"could not be measured in {' and '.join(unknown)}"
     if abs(a - b) < prop.resolution * (1.0 if prop.absolute else max(abs(a), abs(b))):
-        return "the same in both, as far as is measured"
+        return "the same in both, within the resolution of the measurement"
     if prop.needs is not None and prop.needs not in backend_class(engine).capabilities:
         return f"cannot be set in {engine}"
     if prop.name == "timestep":

@@ -97,7 +97,7 @@ def find_grasps(
         fits = (np.linalg.norm(moved, axis=1) < REST_DISTANCE) & (turned < REST_ANGLE)
     else:
         fits = moved[:, 2] > LIFTED
-    near = [_at_hand(motion, rows[fits], robot, thing) for thing in objects]
+    near = [_at_hand(motion, rows[fits], robot, obj) for obj in objects]
     chosen = _in_turns(motion, np.sort(np.concatenate(near)), last_first=where == "table")[:count]
     if not len(chosen) and where == "table":
         raise DemoError(
@@ -122,11 +122,9 @@ def find_grasps(
     )
 
 
-def _at_hand(
-    motion: Retargeted, rows: np.ndarray, robot: RobotSpec, thing: ObjectSpec
-) -> np.ndarray:
+def _at_hand(motion: Retargeted, rows: np.ndarray, robot: RobotSpec, obj: ObjectSpec) -> np.ndarray:
     """Return the rows [R] of an object in which the thumb's tip and another tip are near it."""
-    rows = rows[motion.object_name[motion.sequence_of_frame[rows]] == thing.name]
+    rows = rows[motion.object_name[motion.sequence_of_frame[rows]] == obj.name]
     if not len(rows):
         return rows
     links = robot.tracked_links[1:]
@@ -138,7 +136,7 @@ def _at_hand(
     local = quat_rotate_inverse(quat.expand(-1, len(links), -1), tips - pos)
     points = local.flatten(0, 1)
     only = torch.zeros(len(points), dtype=torch.long)
-    distance, _ = Surface(thing).field.signed_distance(points, only)
+    distance, _ = Surface(obj).field.signed_distance(points, only)
     near = (distance < NEAR).view(len(rows), len(links)).numpy()
     return rows[near[:, 0] & near[:, 1:].any(axis=1)]
 

@@ -284,8 +284,8 @@ class _Experiments:
 
 def _solid(name: str, piece: Shape, inertia: ArrayLike) -> ObjectSpec:
     """Return an object of the slab's mass whose centre of mass is its origin; inertia [3] along the axes."""
-    thing = solid(name, _SLAB_MASS, (piece,))
-    return replace(thing, com=np.zeros(3), inertia=np.diag(inertia))
+    obj = solid(name, _SLAB_MASS, (piece,))
+    return replace(obj, com=np.zeros(3), inertia=np.diag(inertia))
 
 
 def _reachable(scene: SceneSpec, *, tip: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -45,7 +45,7 @@ def read(paths: Iterable[Path]) -> list[Json]:
         ) as error:
             what = f"{type(error).__name__} {shown(str(error))}"
             raise FileFormatError(
-                f"{path} is no complete {CONFORMANCE}: {what}. Make it again."
+                f"{path} is not a complete {CONFORMANCE}: {what}. Make it again."
             ) from error
         files.append(data)
     if not files:

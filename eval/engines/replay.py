@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -140,22 +141,35 @@ def compared(
         )
 
     divergences = []
-    for quantity, value in values.items() if steps else ():
-        beyond = value >= THRESHOLDS[quantity]
-        if quantity == "contacts":
-            beyond = binary_opening(beyond, np.ones(max(1, round(CONTACT_TIME / dt))))
-        step = int(beyond.argmax())
-        diverges = bool(beyond[step])
-        divergences.append(
-            Divergence(
-                quantity=quantity,
-                time=(step + 1) * dt if diverges else None,
-                where=where(quantity, step) if diverges else "",
-                end=float(value[-1]),
-                largest=float(value.max()),
-            )
-        )
+    if steps:
+        for quantity, value in values.items():
+            divergences.append(_divergence(quantity, value, dt, partial(where, quantity)))
     return EngineTrace(engine=engine, recording=found, steps=steps, divergences=tuple(divergences))
+
+
+def _divergence(
+    quantity: str, value: np.ndarray, dt: float, where: Callable[[int], str]
+) -> Divergence:
+    """Return the divergence of a quantity.
+
+    Args:
+        quantity: its name.
+        value: [T] difference after each control step.
+        dt: control step [s].
+        where: returns the joint or the fingers that differ, given a step.
+    """
+    beyond = value >= THRESHOLDS[quantity]
+    if quantity == "contacts":
+        beyond = binary_opening(beyond, np.ones(max(1, round(CONTACT_TIME / dt))))
+    step = int(beyond.argmax())
+    diverges = bool(beyond[step])
+    return Divergence(
+        quantity=quantity,
+        time=(step + 1) * dt if diverges else None,
+        where=where(step) if diverges else "",
+        end=float(value[-1]),
+        largest=float(value.max()),
+    )
 
 
 def _averaged(force: np.ndarray, dt: float) -> np.ndarray:

@@ -72,8 +72,11 @@ def _label(members: Sequence[Training]) -> str:
 
 
 def scores(groups: Groups) -> Table:
-    """Return a row for each group, engine and metric of :data:`~xreset.eval.table.METRICS`: group (its label), engine,
-    metric, mean, low and high (:func:`estimate`); NaN where an earlier version did not measure the metric."""
+    """Return a row for each group, engine and metric of :data:`~xreset.eval.table.METRICS`.
+
+    Columns: group (its label), engine, metric, and mean, low and high (:func:`estimate`), which are NaN where an
+    earlier version did not measure the metric.
+    """
     rows = []
     for label, members in groups.items():
         for engine, own in by_engine(members):

@@ -250,7 +250,6 @@ def choose_curves(trainings: Sequence[Training], wanted: Sequence[str]) -> tuple
     chosen = tuple(dict.fromkeys(wanted or DEFAULT_CURVES))
     if unknown := set(chosen) - set(known):
         raise RunError(
-            f"there is no curve {', '.join(sorted(unknown))}; there are {', '.join(known) or 'none'}. "
-            "Choose with --curve."
+            f"Unknown curve {', '.join(sorted(unknown))}. Choose with --curve from: {', '.join(known) or 'none'}."
         )
     return chosen

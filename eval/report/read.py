@@ -99,8 +99,8 @@ def results_in(folder: Path) -> Path:
     """
     if not folder.is_dir():
         raise RunError(
-            f"there is no folder {folder}. Give a run folder, or a folder that xreset eval wrote results into. "
-            "Of a policy that ships, make results first: xreset eval NAME --demos DEMOS"
+            f"The folder {folder} does not exist. Give a run folder, or a folder that xreset eval wrote results into. "
+            "For a policy that ships with xreset, make results first: xreset eval NAME --demos DEMOS"
         )
     if (folder / "eval").is_dir() or (folder / "run.json").is_file():
         return folder / "eval"

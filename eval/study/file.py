@@ -103,7 +103,7 @@ class Data(Checked):
 
     @property
     def states(self) -> Literal["resets", "goals"]:
-        """What trainings begin with: a reset bank, or a goal set."""
+        """Kind of the file that trainings begin with: a reset bank, or a goal set."""
         return "resets" if self.goals is None else "goals"
 
 

@@ -182,7 +182,7 @@ def _objects_of(data: Data, given: Path) -> tuple[str, ...]:
         return object_names()
     if not (given / data.demos).is_file():
         raise FileFormatError(
-            f"there is no {given / data.demos}, an archive of the study. Put it there, or give the folder of the "
+            f"The archive {given / data.demos} of the study does not exist. Put it there, or give the folder of the "
             "study's data (--data). Comments in the study file say how archives are made."
         )
     return tuple(sorted(set(read_demos(given / data.demos).object_name.tolist())))

@@ -172,7 +172,7 @@ class Selection(Options):
     share: float = 1.0
     """Keep this share of each object's sequences, at least one: a number from 0 to 1."""
     pick: Literal["first", "spread", "random"] = "first"
-    """Which sequences --per-object and --share keep: the first, or some from all over the archive."""
+    """Which sequences --per-object and --share keep: the first, sequences spread over the archive, or random ones."""
     seed: int = 0
     """Seed of --pick random."""
 

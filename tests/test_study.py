@@ -253,7 +253,7 @@ class PlanTest(Studied):
         with self.assertRaisesRegex(RunError, "has no runs b; it has a"):
             self.plan(BASE + "[runs.a]\n", only=("b",))
         climbing = f"{HEAD}[data.toy]\ndemos = 'climbs.npz'\n[runs.a]\ndata = 'toy'\nalone = true\n"
-        words = r"there is no .*climbs\.npz, .*\(--data\)"
+        words = r"The archive .*climbs\.npz of the study does not exist\. .*\(--data\)"
         self.assertRaisesRegex(FileFormatError, words, self.plan, climbing)
         share = "[runs.a]\nconfig.task.reset.object_share = { mug = 3.0 }\n"
         with self.assertRaisesRegex(XResetError, "object_share names mug, but the objects are"):

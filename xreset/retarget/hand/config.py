@@ -20,7 +20,7 @@ class HandConfig(Checked):
 
     jaw: Literal["fingertips", "analytic"] = "fingertips"
     """What a parallel jaw follows. ``fingertips``: the human's fingertips, like every hand. ``analytic``: the published
-    paper's map (:mod:`xreset.retarget.hand.jaw`), without the costs below. Other hands ignore this field."""
+    paper's map, without the costs below. Other hands ignore this field."""
     local_weight: NonNegativeFloat = 10.0
     """Weight of bone vectors and bone directions, averaged over the pairs of keypoints."""
     global_weight: NonNegativeFloat = 1.0

@@ -295,14 +295,13 @@ def eval_todo(run: Run, folder: Path, spec: Evaluation, subset: Subset, engines:
     missing = []
     for engine in engines:
         file = folder / f"{engine}.json"
-        result = read_result(file) if file.is_file() else None
-        if (
-            result is None
-            or (result.seed, result.episodes_per_demo, result.episode_seconds or trained) != wanted
-            or not hashes.items() <= result.inputs.items()
-        ):
-            missing.append(engine)
-            command += ["--backend", engine]
+        if file.is_file():
+            result = read_result(file)
+            played = (result.seed, result.episodes_per_demo, result.episode_seconds or trained)
+            if played == wanted and hashes.items() <= result.inputs.items():
+                continue
+        missing.append(engine)
+        command += ["--backend", engine]
     return (f"in {', '.join(missing)}", [command]) if missing else ("", [])
 
 

@@ -79,6 +79,10 @@ class UsageTest(TestCase):
                 "demos synth --out x.npz --seed -1",
             ),
             (r"--seed is 9{20}, expected", "eval zero --demos none.npz --seed " + "9" * 20),
+            (
+                r"--port is 87990, expected a whole number from 0 to 65535",
+                "view none.npz --port 87990",
+            ),
             (r"--num-envs is 0, expected a whole number from 1", "train --out x --num-envs 0"),
             (
                 r"episode_seconds is -1.0, expected a number from 0.0167, which is one control step",

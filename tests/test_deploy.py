@@ -19,7 +19,7 @@ from tests.test_live import Scripted
 from tests.toy_bank import SOUP
 from tests.toy_policy import write_policy
 from xreset import CameraConfig, TaskConfig, VisionConfig, load_policy, synthesize
-from xreset.errors import PolicyError
+from xreset.errors import PolicyError, XResetError
 from xreset.eval.rollout import engine, episode_starts, load_trial
 from xreset.live.deploy import deploy_contract, write_deployed
 from xreset.live.engine import EngineDriver
@@ -154,6 +154,8 @@ class ContractTest(InFolder):
 
         from xreset.live.serve import PolicyServer
 
+        with self.assertRaisesRegex(XResetError, "port is 65536, expected"):
+            PolicyServer(self.contract, b"", port=65536)
         server = PolicyServer(self.contract, (self.out / "policy.onnx").read_bytes(), port=0)
         thread = threading.Thread(target=server.serve)
         thread.start()

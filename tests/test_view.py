@@ -332,6 +332,18 @@ class OwnPageOnly(WithFiles):
         with connect(f"ws://{address}", origin=f"http://{address}"):
             pass
 
+    def test_a_port_that_no_machine_has(self):
+        from xreset.pictures.view.server import WebPage
+
+        with (
+            mock.patch("viser.ViserServer") as server,
+            self.assertRaisesRegex(
+                XResetError, "port is 87990, expected a whole number from 0 to 65535"
+            ),
+        ):
+            WebPage("127.0.0.1", 87990, "page")
+        server.assert_not_called()
+
     def test_a_server_that_cannot_be_restricted_is_stopped(self):
         from xreset.pictures.view.page import Page
 

@@ -133,6 +133,15 @@ def is_rigid(T: np.ndarray) -> bool:
     return bool(is_orthogonal and np.array_equal(T[3], (0, 0, 0, 1)) and np.linalg.det(R) > 0)
 
 
+LAST_PORT = 65535
+
+
+def check_port(port: int) -> None:
+    """Refuse, with ``XResetError``, a port that no machine has."""
+    if not 0 <= port <= LAST_PORT:
+        raise XResetError(f"port is {port}, expected a whole number from 0 to {LAST_PORT}.")
+
+
 def names_wrong_arguments(function: Callable[..., T]) -> Callable[..., T]:
     """Return a function that raises ``XResetError`` in place of Python's own errors if an argument is of another type
     than its annotation says."""

@@ -10,7 +10,7 @@ from inspect import signature
 from pathlib import Path
 from typing import Any
 
-from xreset.checks import Options
+from xreset.checks import LAST_PORT, Options
 from xreset.errors import XResetError
 from xreset.files import claim
 from xreset.plugins import existing_device
@@ -61,9 +61,10 @@ def _check(options: dict[str, Any]) -> None:
             continue
         if name in _COUNTS or name in _INDICES:
             low = 1 if name in _COUNTS else 0
-            if not low <= value <= _LARGEST:
+            high = LAST_PORT if name == "port" else _LARGEST
+            if not low <= value <= high:
                 raise XResetError(
-                    f"{flag} is {value}, expected a whole number from {low} to {_LARGEST}."
+                    f"{flag} is {value}, expected a whole number from {low} to {high}."
                 )
         for text in value if isinstance(value, tuple) else (value,):
             if isinstance(text, str | Path) and len(str(text)) > _LONGEST:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from xreset.checks import check_port
 from xreset.errors import XResetError, needs
 from xreset.runtime import Controller, LiveError, OnnxActor, Reading
 from xreset.runtime.remote import LIVE_SCHEMA
@@ -45,8 +46,9 @@ class PolicyServer:
             port: port to listen at; 0: any free port.
 
         Raises:
-            XResetError: the port is taken, or the address is not this machine's.
+            XResetError: the port is taken or impossible, or the address is not this machine's.
         """
+        check_port(port)
         self._contract = contract
         self._policy = policy
         self._clients: set[ServerConnection] = set()

@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import torch
 
+from xreset.checks import check_port
 from xreset.errors import XResetError, needs
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matrix_to_quat
@@ -33,8 +34,9 @@ class WebPage:
             label: title of the page.
 
         Raises:
-            XResetError: viser is not installed, or the server does not start.
+            XResetError: viser is not installed, the port is impossible, or the server does not start.
         """
+        check_port(port)
         with needs("viser, without which --png and --mp4 of xreset view work,", "viewer"):
             import viser
         try:

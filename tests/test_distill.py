@@ -167,6 +167,14 @@ class DistillTest(WithBank):
             with self.subTest(words), quickly(), self.assertRaisesRegex(error, words):
                 distill(**(two | options))
             self.assertFalse((self.folder / "refused").exists(), words)
+        with self.assertRaisesRegex(XResetError, r"no critic.* xreset train .*--resume"):
+            train(
+                self.bank,
+                out=self.folder / "refused",
+                weights=self.run_folder,
+                config=CONFIG,
+                **OPTIONS,
+            )
         words = "No camera shows 005_tomato_soup_can, 010_potted_meat_can"
         with quickly(), self.assertRaisesRegex(XResetError, words):
             self.distill("away", away)

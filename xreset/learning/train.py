@@ -196,7 +196,8 @@ def _check_config(config: TrainConfig, inputs: Inputs, *, has_teacher: bool) -> 
     """Refuse, with ``RunError``, a schedule without effect, and bank states where there are none."""
     if config.schedule.teacher and not has_teacher:
         raise RunError(
-            "schedule.teacher is for xreset distill, and this training has no teacher. Leave it empty."
+            "schedule.teacher is for xreset distill, and this training has no teacher. Leave it empty: "
+            "--config.schedule.teacher without a value"
         )
     if config.schedule.faults and not config.task.randomization.has_faults:
         raise RunError(
@@ -285,6 +286,11 @@ def _checkpoint_to_start_from(run: Path, inputs: Inputs, config: TrainConfig) ->
             f"{run} has no critic and no checkpoint, so no training can start from it. Give a run folder (--weights)."
         )
     other = read_run(run)
+    if other.teacher is not None:
+        raise RunError(
+            f"{run} is a run of xreset distill and has no critic, so no training can start from it. Give a run of "
+            f"xreset train (--weights), or continue the distillation: --out {run} --resume"
+        )
     start = f"Start from its configuration: --like {run}"
     try:
         check_contract(str(run), other.contract, inputs.robot, config.task)

@@ -148,6 +148,7 @@ def chosen(wanted: Sequence[str], properties: Sequence[Property] = SWEEPS) -> tu
     found = []
     for text in wanted:
         name, _, values = text.partition("=")
+        name = name.replace("_", "-")
         if name not in known:
             raise XResetError(f"Unknown property {name!r}. Choose from: {', '.join(known)}.")
         prop = known[name]

@@ -48,6 +48,7 @@ class StressedTest(TestCase):
     def test_values_of_ones_own(self):
         (prop,) = chosen(["arm-stiffness=2,0.5,1"])
         self.assertEqual((prop.option, prop.values), ("arm-stiffness", (0.5, 2.0)))
+        self.assertEqual(chosen(["arm_stiffness=2,0.5"]), (prop,), "as the field is written")
         self.assertEqual(chosen([]), SWEEPS)
 
     def test_refusals(self):

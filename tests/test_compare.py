@@ -258,6 +258,16 @@ class GroupTest(Compared):
             words = f"a, {name} have the same configuration and are not grouped. .*{reason}"
             self.assertRegex(notes, words)
 
+    def test_one_training_evaluated_differently_in_its_engines(self):
+        self.run_and_results("a")
+        self.write_results("a", engines=("pybullet",), inputs={"demos": "cd", "policy": "ef"})
+        found, notes = self.groups("a")
+        self.assertEqual(found, [("a", 1)])
+        self.assertRegex(notes, "not the same policy file .*not the same demonstrations")
+        self.assertNotIn("not grouped", notes)
+        page = self.compare("a")
+        self.assertEqual(page.count("not the same demonstrations"), 1)
+
 
 class ScoreTest(Compared):
     def scored(self, *progress, engines=("mujoco",)):

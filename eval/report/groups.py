@@ -26,7 +26,7 @@ def grouped(trainings: Sequence[Training]) -> tuple[Groups, list[str]]:
 
     Returns:
         The groups, in the order of their first trainings, and sentences about trainings of the same configuration that
-        are not grouped.
+        are not grouped, and about one that was evaluated differently in its engines.
     """
     alike: dict[object, list[Training]] = {}
     for training in trainings:
@@ -39,7 +39,10 @@ def grouped(trainings: Sequence[Training]) -> tuple[Groups, list[str]]:
         seeds = {m.facts.get("seed") for m in members}
         if len(seeds) < len(members):
             reasons = ["Some have the same seed, too."]
-        if reasons:
+        if len(members) == 1:
+            found.append(members)
+            notes += reasons
+        elif reasons:
             found += singles(members).values()
             names = ", ".join(m.label for m in members)
             notes.append(f"{names} have the same configuration and are not grouped. {reasons[0]}")

@@ -212,7 +212,8 @@ def compare(
     groups, reasons = (singles(trainings), []) if apart else grouped(trainings)
     tags = choose_curves(trainings, curves)
     found = scores(groups)
-    notes = [*reasons, *fairness.uneven(trainings), *fairness.begun(trainings)]
+    uneven = fairness.uneven(trainings)
+    notes = [*(r for r in reasons if r not in uneven), *uneven, *fairness.begun(trainings)]
     policies = []
     clocks = {}
     for label, members in groups.items():

@@ -78,7 +78,7 @@ def rehearse(
     demos: str | Path | Data | None = None,
     engines: str | Sequence[str | Engine] = "mujoco",
     *,
-    faults: Sequence[str] = (),
+    faults: str | Sequence[str] = (),
     episodes: int = 1,
     seed: int = 0,
     robot: str | Path | None = None,

@@ -138,7 +138,9 @@ COMPARED = {p.name: p for p in PROPERTIES if p.measured}
 """The properties in which engines are compared, by name."""
 
 
-def chosen(wanted: Sequence[str], properties: Sequence[Property] = SWEEPS) -> tuple[Property, ...]:
+def chosen(
+    wanted: str | Sequence[str], properties: Sequence[Property] = SWEEPS
+) -> tuple[Property, ...]:
     """Return the wanted properties, given as ``NAME`` or ``NAME=VALUE,VALUE...``; all if ``wanted`` is empty.
 
     Raises:
@@ -146,7 +148,7 @@ def chosen(wanted: Sequence[str], properties: Sequence[Property] = SWEEPS) -> tu
     """
     known = {prop.option: prop for prop in properties}
     found = []
-    for text in wanted:
+    for text in (wanted,) if isinstance(wanted, str) else wanted:
         name, _, values = text.partition("=")
         name = name.replace("_", "-")
         if name not in known:

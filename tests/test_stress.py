@@ -49,6 +49,7 @@ class StressedTest(TestCase):
         (prop,) = chosen(["arm-stiffness=2,0.5,1"])
         self.assertEqual((prop.option, prop.values), ("arm-stiffness", (0.5, 2.0)))
         self.assertEqual(chosen(["arm_stiffness=2,0.5"]), (prop,), "as the field is written")
+        self.assertEqual(chosen("arm-stiffness=2,0.5"), (prop,), "one")
         self.assertEqual(chosen([]), SWEEPS)
 
     def test_refusals(self):

@@ -308,6 +308,7 @@ class MeshImport(InFolder):
         png = self.folder / "a.png"
         command = ("objects", "import", path, "--scale", 0.001, "--mass", 0.2)
         self.assertIn("Add --out", refused(*command))
+        self.assertIn("There is no no.stl.", refused("objects", "import", "no.stl"))
         self.assertRegex(
             succeeds(*command, "--out", out, "--name", "brick", "--png", png),
             r"brick\W+0.200\W+100x60x40\W+1 hull",

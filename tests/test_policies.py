@@ -79,6 +79,9 @@ class OnnxPolicyTest(WithPolicy):
             OnnxPolicy(self.folder / "none.onnx")
         path.write_bytes(b"hello")
         self.assertRaisesRegex(PolicyError, "cannot be read as an ONNX policy", OnnxPolicy, path)
+        (other := self.folder / "demos.npz").write_bytes(b"hello")
+        words = "demos.npz is not an exported policy, expected a run folder, a .onnx file"
+        self.assertRaisesRegex(PolicyError, words, OnnxPolicy, other)
 
     def test_a_training_checkpoint_is_called_one(self):
         run = self.folder / "run"

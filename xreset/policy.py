@@ -252,14 +252,16 @@ def _read_contract(path: Path, metadata: dict[str, str]) -> Contract:
 
 def _why_unreadable(path: Path, error: Exception) -> str:
     """Return what is wrong with a file that onnxruntime cannot read, and what to give instead."""
+    expected = "a run folder, a .onnx file or the name of a policy that ships with xreset"
+    if path.suffix not in (".pt", ".onnx"):
+        return f"{path} is not an exported policy, expected {expected}."
     if path.suffix != ".pt":
         return f"{path} cannot be read as an ONNX policy: {shown(str(error))}. Is it damaged?"
     run = path.parent.parent
     named = f" ({run})" if (run / "run.json").is_file() else ""
     return (
-        f"{path} is a training checkpoint, expected a run folder, a .onnx file or the name of a policy that ships with "
-        f"xreset. Give the checkpoint's run folder{named}: its policy is exported from its newest checkpoint, or from "
-        "the one that xreset select chose."
+        f"{path} is a training checkpoint, expected {expected}. Give the checkpoint's run folder{named}: "
+        "its policy is exported from its newest checkpoint, or from the one that xreset select chose."
     )
 
 

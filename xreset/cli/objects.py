@@ -70,6 +70,8 @@ def import_(
                 " mesh file. For a folder, write these properties into NAME.toml next to each mesh."
             )
         files = catalogue.mesh_files(path)
+    elif not path.exists():
+        raise ObjectError(f"There is no {path}. Expected a mesh file, or a folder of objects.")
     elif out is None:
         raise ObjectError("A mesh file needs a folder of objects to go into. Add --out.")
     else:

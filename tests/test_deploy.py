@@ -127,6 +127,23 @@ class ContractTest(InFolder):
         with self.assertRaisesRegex(LiveError, "has no object 'hat'. Choose from: brick"):
             load_controller(self.out).points("hat")
 
+    def test_an_episode_that_does_not_fit_is_refused(self):
+        controller = load_controller(self.out)
+        brick = self.contract["objects"]["brick"]
+        good = {
+            "object_points": brick["points"], "center": brick["center"], "target": self.home,
+            "goal_pos": [0.5, 0.3, 0.2], "goal_quat": [1, 0, 0, 0],
+        }  # fmt: skip
+        for name, value, words in (
+            ("target", self.home[1:], r"target has shape \(4,\), expected \(5,\)"),
+            ("goal_pos", [0.5, 0.3], r"shape \(2,\), expected \(3,\)"),
+            ("goal_quat", [1, 0, 0, 1], "expected a unit quaternion"),
+            ("goal_quat", [float("nan")] * 4, "expected a unit quaternion"),
+        ):
+            with self.subTest(name), self.assertRaisesRegex(LiveError, words):
+                controller.begin(**good | {name: value})
+        controller.begin(**good)
+
     def test_another_version_and_damage_are_one_sentence(self):
         file = self.out / "contract.json"
         original = file.read_text()

@@ -112,9 +112,13 @@ class Controller:
                 where the contract's ``object_frame`` is ``center``.
 
         Raises:
-            LiveError: the number of points is not the contract's, or ``center`` is missing.
+            LiveError: a shape is not the contract's, a quaternion has another length than 1, or ``center`` is missing.
         """
-        self.target = np.atleast_2d(np.asarray(target, dtype=np.float32))
+        given = np.atleast_2d(np.asarray(target, dtype=np.float32))
+        joints = len(self.contract["joints"])
+        if given.ndim != 2 or given.shape[1] != joints:
+            raise LiveError(f"target has shape {np.shape(target)}, expected ({joints},).")
+        self.target = given
         expected = self.contract["observation"]["cloud_points"]
         shape = np.shape(object_points)
         if shape[-2:] != (expected, 3):
@@ -134,13 +138,20 @@ class Controller:
         self._actor.begin(len(self.target))
 
     def set_goal(self, pos: Array, quat: Array) -> None:
-        """Set the goal pose, also while the policy acts; shapes as for :meth:`begin`."""
-        self._goal_quat = self._of_each(quat, 4)
-        self._goal_pos = self._origin(self._of_each(pos, 3), self._goal_quat)
+        """Set the goal pose, also while the policy acts; shapes and errors as for :meth:`begin`."""
+        goal_quat = self._of_each(quat, 4)
+        if not (np.abs(np.linalg.norm(goal_quat, axis=-1) - 1.0) <= 0.01).all():
+            raise LiveError(f"The goal has {quat}, expected a unit quaternion (w, x, y, z).")
+        self._goal_pos = self._origin(self._of_each(pos, 3), goal_quat)
+        self._goal_quat = goal_quat
 
     def _of_each(self, values: Array, *shape: int) -> Array:
         """[N, ...] values of every robot in float32, given those [N, ...] or one robot's [...]."""
-        return np.broadcast_to(np.asarray(values, np.float32), (len(self.target), *shape))
+        array = np.asarray(values, np.float32)
+        try:
+            return np.broadcast_to(array, (len(self.target), *shape))
+        except ValueError:
+            raise LiveError(f"Found numbers of shape {array.shape}, expected {shape}.") from None
 
     def _origin(self, pos: Array, quat: Array) -> Array:
         """[N, 3] where the policy's origin of the object is, for poses [N, 3], [N, 4] of the object's frame."""

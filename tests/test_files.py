@@ -21,7 +21,15 @@ from numpy.testing import assert_array_equal
 from tests.data import InFolder as WithFolder
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_hand_arm
-from xreset import TaskConfig, __version__, read_bank, write_bank
+from xreset import (
+    TaskConfig,
+    __version__,
+    read_bank,
+    write_bank,
+    write_demos,
+    write_goals,
+    write_retargeted,
+)
 from xreset.checks import from_dict
 from xreset.errors import FileFormatError, XResetError
 from xreset.files import (
@@ -486,6 +494,21 @@ class BankTest(InFolder):
             config={"steps": 8},
             inputs={"retargeted": "ab"},
         )
+
+    def test_another_record_is_not_written(self):
+        """The file could not be read."""
+        self.write()
+        content = self.file.read_bytes()
+        bank = toy_bank(self.robot)
+        for write, name in (
+            (write_demos, "Demos"), (write_retargeted, "Retargeted"), (write_goals, "GoalSet"),
+        ):  # fmt: skip
+            words = f"Found ResetBank.*, expected {name}. Nothing was written"
+            with self.subTest(name), self.assertRaisesRegex(XResetError, words):
+                write(self.file, bank)
+        with self.assertRaisesRegex(XResetError, "expected ResetBank. Nothing"):
+            write_bank(self.file, content)
+        self.assertEqual(self.file.read_bytes(), content)
 
     def test_a_bank_prints_shapes(self):
         text = repr(toy_bank(self.robot))

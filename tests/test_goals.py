@@ -79,6 +79,7 @@ class MadeTest(TestCase):
             ),
             (GoalError, "is not a pose", {"poses": [(0.5, 0.3, 0.2)]}),
             (GoalError, "Unknown family 'turn'. Choose from: lift, ", {"families": ["turn"]}),
+            (GoalError, "Unknown family 'turn'. Choose from: lift, ", {"families": "turn"}),
         ):
             with (
                 self.subTest(message),

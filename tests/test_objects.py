@@ -64,6 +64,8 @@ class Names(TestCase):
     def test_other_spellings(self):
         papers = "cheez-its soup mustard tuna spam banana pitcher powerdrill scissors"
         self.assertEqual(canonical_names(papers.split()), object_names())
+        with self.assertRaisesRegex(ObjectError, "Found 3, expected the name of an object"):
+            canonical_names([3])  # type: ignore[list-item]
         for name in ("035_power_drill", "power_drill", "Power Drill"):
             self.assertEqual(canonical_name(name), "035_power_drill")
         with self.assertRaisesRegex(

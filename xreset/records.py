@@ -333,10 +333,19 @@ def schema_of(cls: type) -> Schema:
     return schema
 
 
-def write_record(path: str | Path, schema_name: str, record: Any, **provenance: Any) -> None:
+def write_record(
+    cls: type, path: str | Path, schema_name: str, record: Any, **provenance: Any
+) -> None:
     """Write a dataclass of :func:`schema_of`'s kind; fields that are None are left out. See :func:`write_npz` for
-    ``provenance``."""
+    ``provenance``. ``XResetError`` if it is of another class."""
+    must_be(cls, record)
     write_npz(path, schema_name, arrays_of(record), **provenance)
+
+
+def must_be(cls: type, record: Any) -> None:
+    """Refuse, with ``XResetError``, to write a record of another class: its file could not be read."""
+    if not isinstance(record, cls):
+        raise XResetError(f"Found {shown(record)}, expected {cls.__name__}. Nothing was written.")
 
 
 def arrays_of(record: Any) -> Arrays:

@@ -27,6 +27,7 @@ from xreset.records import (
     Arrays,
     Field,
     arrays_of,
+    must_be,
     offsets_problem,
     read_record,
     schema_of,
@@ -420,8 +421,9 @@ def write_demos(
     Raises:
         DemoError: the demonstrations hold a value that the archive may not hold.
     """
+    must_be(Demos, demos)
     _check(demos)
-    write_record(path, SCHEMA_NAME, demos, config=config, inputs=inputs)
+    write_record(Demos, path, SCHEMA_NAME, demos, config=config, inputs=inputs)
 
 
 def demo_objects(demos: Demos, folder: Path | None = None) -> dict[str, ObjectSpec]:

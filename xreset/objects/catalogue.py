@@ -64,6 +64,8 @@ def canonical_names(names: Iterable[str], known: Iterable[str] = STAND_INS) -> t
     found = []
     unknown = []
     for name in names:
+        if not isinstance(name, str):
+            raise ObjectError(f"Found {shown(name)}, expected the name of an object.")
         key = _key(name)
         matches = [name] if name in known else [other for other in known if key in _keys(other)]
         if len(matches) == 1:

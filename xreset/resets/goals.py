@@ -87,7 +87,7 @@ def make_goals(
     *,
     robot: str | Path | RobotSpec,
     meshes: str | Path | None = None,
-    families: Sequence[str] | None = None,
+    families: str | Sequence[str] | None = None,
     poses: Sequence[Sequence[float]] = (),
     config: GoalConfig | None = None,
     progress: Callable[[float, int], None] = unseen,
@@ -111,6 +111,8 @@ def make_goals(
         GoalError: an object does not come to rest, or a goal is inside the table or out of the robot's reach.
     """
     config = config or GoalConfig()
+    if isinstance(families, str):
+        families = (families,)
     if families is None:
         families = () if poses else FAMILIES
     if unknown := [family for family in families if family not in FAMILIES]:
@@ -149,7 +151,7 @@ def make_goals(
 
 def write_goals(path: str | Path, goals: GoalSet, config: GoalConfig | None = None) -> None:
     """Write a goal set; see :func:`xreset.records.write_record`."""
-    write_record(path, SCHEMA, goals, config=asdict(config) if config else None)
+    write_record(GoalSet, path, SCHEMA, goals, config=asdict(config) if config else None)
 
 
 def read_goals(path: str | Path) -> GoalSet:

@@ -162,6 +162,13 @@ def _setting(trial: Trial, prop: Property | None, value: float) -> tuple[Trial, 
         raise prop.impossible(value, error) from None
 
 
+class SimulatedRunner(Runner):
+    """Runs simulated robots: Ctrl-C is raised, because an episode that it cuts short must not count."""
+
+    def _interrupted(self) -> None:
+        raise KeyboardInterrupt
+
+
 def _play(
     actor: OnnxActor,
     engine: Engine,
@@ -183,7 +190,7 @@ def _play(
         driver = FaultyDriver(
             env, fault, seeds, lambda: played.update_metrics(env.reading()), real_time=real_time
         )
-        outcome = Runner(controller, driver).run(env.max_episode_length * controller.dt)
+        outcome = SimulatedRunner(controller, driver).run(env.max_episode_length * controller.dt)
         for world in played.fresh:
             reason = outcome.reasons[world]
             if reason is not None:

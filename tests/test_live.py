@@ -10,6 +10,7 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
 from tests import toy_grasp
+from xreset.eval.rehearse import SimulatedRunner
 from xreset.eval.rollout import engine, episode_starts
 from xreset.learning.recipes import RECIPES
 from xreset.live.engine import EngineDriver, make_controller
@@ -171,6 +172,10 @@ class FaultTest(TestCase):
         driver = Scripted()
         with self.assertLogs("xreset"):
             self.assertEqual(self.stopped(driver, Steady(interrupted)), "Ctrl-C was pressed.")
+        driver = Scripted()
+        with self.assertRaises(KeyboardInterrupt):
+            SimulatedRunner(Steady(interrupted), driver).run(30)
+        self.assertEqual(driver.stops, 1)
 
     def test_a_clock_that_moves_when_the_driver_reads(self):
         driver = Scripted()

@@ -86,11 +86,14 @@ class Runner:
         try:
             self._loop(self.driver.now() + seconds - self.controller.dt / 2)
         except KeyboardInterrupt:
-            self._stop_all("Ctrl-C was pressed.")
-            self._loop(float("inf"))
+            self._interrupted()
         finally:
             self.driver.stop()
         return self.outcome
+
+    def _interrupted(self) -> None:
+        self._stop_all("Ctrl-C was pressed.")
+        self._loop(float("inf"))
 
     @property
     def _running(self) -> Array:

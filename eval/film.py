@@ -27,7 +27,7 @@ def film(
     Args:
         policy: the policy or its name, as for :func:`~xreset.eval.policy_spec.load_policy`.
         env: environment, such as :meth:`PolicySpec.make_env` makes; all worlds are reset first.
-        path: file to write.
+        path: file to write, which ends in ``.mp4``.
         world: index of the world to show. The goal is drawn as a translucent object. The images of the task's cameras
             are below.
         fps: least number of frames per second; the film has more if the control rate is not a multiple of it.
@@ -35,8 +35,10 @@ def film(
 
     Raises:
         PolicyError: the policy is unknown, or cannot play in this environment.
-        XResetError: the world does not exist, or the film cannot be encoded.
+        XResetError: the path does not end in ``.mp4``, the world does not exist, or the film cannot be encoded.
     """
+    if Path(path).suffix.lower() != ".mp4":
+        raise XResetError(f"{path} is not the name of a film. Expected a name that ends in .mp4.")
     if not 0 <= world < env.num_envs:
         raise XResetError(f"World {world} does not exist. Choose one from 0 to {env.num_envs - 1}.")
     policy = load_policy(policy)

@@ -61,6 +61,12 @@ class BuiltIn(TestCase):
             self.assertEqual({finding.level for finding in check(name)}, {"ok"}, name)
 
 
+class Folder(Copied):
+    def test_a_file_in_the_folder_is_refused_with_the_folder(self):
+        with self.assertRaisesRegex(RobotError, f"is a file. Give .*: {self.folder}$"):
+            load(self.folder / "robot.toml")
+
+
 class Fingerprint(Copied):
     def test_a_changed_mesh_makes_another_robot(self):
         folder = self.folder

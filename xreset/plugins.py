@@ -76,13 +76,15 @@ def robot_folder(name_or_folder: str | Path) -> Path:
     """Return the folder of a robot, given its registered name or its path.
 
     Raises:
-        RobotError: no robot and no folder has that name, or its package does not load.
+        RobotError: no robot and no folder has that name, a file has it, or the robot's package does not load.
     """
     name = str(name_or_folder)
     if name not in plugins(ROBOTS):
         folder = Path(name_or_folder)
         if os.path.isdir(folder):
             return folder.resolve()
+        if os.path.isfile(folder):
+            raise RobotError(f"{folder} is a file. Give the robot's folder: {folder.parent}")
         known = known_plugins(ROBOTS)
         raise RobotError(
             f"Unknown robot {shown(name)}, and no folder has that name. Choose from: {known}; or give the robot's "

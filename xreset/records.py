@@ -338,20 +338,19 @@ def write_record(
 ) -> None:
     """Write a dataclass of :func:`schema_of`'s kind; fields that are None are left out. See :func:`write_npz` for
     ``provenance``. ``XResetError`` if it is of another class."""
-    must_be(cls, record)
-    write_npz(path, schema_name, arrays_of(record), **provenance)
+    write_npz(path, schema_name, arrays_of(cls, record), **provenance)
 
 
-def must_be(cls: type, record: Any) -> None:
-    """Refuse, with ``XResetError``, to write a record of another class: its file could not be read."""
+def arrays_of(cls: type, record: Any) -> Arrays:
+    """Return the arrays of a dataclass of :func:`schema_of`'s kind, as they are written.
+
+    Raises:
+        XResetError: the record is of another class, so that its file could not be read.
+    """
     if not isinstance(record, cls):
         raise XResetError(f"Found {shown(record)}, expected {cls.__name__}. Nothing was written.")
-
-
-def arrays_of(record: Any) -> Arrays:
-    """Return the arrays of a dataclass of :func:`schema_of`'s kind, as they are written."""
     arrays = {}
-    for name, field in schema_of(type(record)).items():
+    for name, field in schema_of(cls).items():
         value = getattr(record, name)
         if value is not None:
             default = np.str_ if field.kind == "U" else None

@@ -199,7 +199,7 @@ def write_actions(
         joint_target=actions.joint_target.numpy(),
         **start,
     )
-    arrays = arrays_of(content)
+    arrays = arrays_of(ActionFile, content)
     if replays:
         arrays["engine"] = np.array(list(replays))
         for name in ("joint_pos", "object_pos", "object_quat", "tip_force"):

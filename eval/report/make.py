@@ -66,9 +66,8 @@ def make_report(
         strips = []
         try:
             clips, strips = draw_report(data)
-        except (
-            XResetError
-        ) as error:  # the page has the numbers all the same, and says why films are missing
+        except XResetError as error:
+            # the page has the numbers all the same, and says why films are missing
             data = replace(data, notes=(*data.notes, f"There are no clips: {error}"))
         write_whole(out / "index.html", page(data, clips, strips))
     return out / "index.html", data
@@ -94,9 +93,8 @@ def collect(folder: Path, robot: str | None = None, objects: Path | None = None)
     if training.facts:
         try:
             run = read_run(folder)
-        except (
-            FileFormatError
-        ) as error:  # results are shown even if an older configuration is unreadable
+        except FileFormatError as error:
+            # results are shown even if an older configuration is unreadable
             not_described.append(f"The training is not described here: {error}")
     place = training.results_folder.parent
     choice = read_choice(place)
@@ -212,8 +210,8 @@ def compare(
     groups, reasons = (singles(trainings), []) if apart else grouped(trainings)
     tags = choose_curves(trainings, curves)
     found = scores(groups)
-    uneven = fairness.uneven(trainings)
-    notes = [*(r for r in reasons if r not in uneven), *uneven, *fairness.begun(trainings)]
+    notes = [*reasons, *fairness.uneven(trainings), *fairness.begun(trainings)]
+    notes = list(dict.fromkeys(notes))  # each sentence once
     policies = []
     clocks = {}
     for label, members in groups.items():

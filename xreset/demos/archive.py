@@ -27,7 +27,6 @@ from xreset.records import (
     Arrays,
     Field,
     arrays_of,
-    must_be,
     offsets_problem,
     read_record,
     schema_of,
@@ -421,7 +420,6 @@ def write_demos(
     Raises:
         DemoError: the demonstrations hold a value that the archive may not hold.
     """
-    must_be(Demos, demos)
     _check(demos)
     write_record(Demos, path, SCHEMA_NAME, demos, config=config, inputs=inputs)
 
@@ -460,7 +458,7 @@ def sequences_problem(arrays: Arrays) -> str | None:
 
 
 def _check(demos: Demos) -> None:
-    arrays = arrays_of(demos)
+    arrays = arrays_of(Demos, demos)
     problem = wrong_value(arrays, schema_of(Demos)) or _problem(arrays)
     if problem:
         raise DemoError(f"The demonstrations cannot be used: {problem}")

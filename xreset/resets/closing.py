@@ -38,9 +38,8 @@ def closing_states(
         For each state [M] the frame that it is or follows, ascending; how far it is on the way to the next frame, in
         [0, 1), where 0 is the frame itself; and joint positions [M, J], object positions [M, 3] and quaternions [M, 4].
     """
-    count = retargeted.valid.astype(
-        int
-    )  # number of states of each frame: itself, and those that follow it
+    # number of states of each frame: itself, and those that follow it
+    count = retargeted.valid.astype(int)
     if config.spacing is not None:
         object_name = retargeted.object_name[retargeted.sequence_of_frame]
         poses = (retargeted.joint_pos, retargeted.object_pos, retargeted.object_quat_wxyz)

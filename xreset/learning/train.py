@@ -253,7 +253,7 @@ def distill(
             "A student needs a camera. Give one or two of: " + ", ".join(CAMERAS) + "."
         )
     check_each_once(config.task.vision.cameras)
-    # xreset.train, which is train with this wrapper, names an option of a wrong type; so does this call
+    # names an option of a wrong type, as xreset.train does
     public_train = names_wrong_arguments(train)
     return public_train(bank, out=out, config=config, teacher=teacher, **options)
 
@@ -456,7 +456,8 @@ def _train(
 
 def _write_start(out: Path, info: RunInfo, iteration: int, *, is_new: bool, resumed: bool) -> None:
     """Write ``run.json``, and say where a resumed run continues."""
-    # the curves of a run that was killed before its first checkpoint begin again; without run.json they are not a run's
+    # A run that was killed before its first checkpoint begins again, so its curves are deleted. Curves in a folder
+    # without run.json are somebody else's.
     if is_new and (out / "run.json").is_file():
         for events in out.glob("events.out.tfevents.*"):
             events.unlink()

@@ -353,6 +353,7 @@ class ResultsTest(InFolder):
         for file, words, changes in (
             ("mujoco.json", "missing: grasp_rate", {}),
             ("mujoco.json", "unknown: later", {"later": 1}),
+            ("mujoco.json", "unknown(.|\n)*by xreset '9.9'", {"later": 1, "xreset": "9.9"}),
             ("mujoco.json", "policy is 5, expected str", {"policy": 5}),
             ("mujoco.json", "mean is 7, expected a number from 0 to 1", {"task_progress": wide}),
             ("mujoco.json", "ci95 has 1 entries", {"task_progress": short}),

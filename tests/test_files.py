@@ -441,6 +441,25 @@ class TypedTest(TestCase):
         del data["timestep"], data["reset"]
         self.assertEqual(from_dict(TaskConfig, data), TaskConfig())
 
+    def test_only_a_newer_version_is_named(self):
+        for version, is_newer in (
+            ("9.9+g1a2b3c4d5e6f", True),
+            (f"{__version__}.1", True),
+            (f"{__version__}+g1a2b3c4d5e6f", False),
+            ("0.1.0", False),
+            (None, False),
+            (9, False),
+        ):
+            with self.subTest(version), self.assertRaises(FileFormatError) as caught:
+                from_dict(Inner, {"size": 1.0, "sise": 2.0}, "a.json", version)
+            expected = "a.json does not fit Inner (unknown: sise (size?); known: size, mode)."
+            if is_newer:
+                expected += (
+                    f"\nIt was written by xreset {version!r}, and this is xreset {__version__}. "
+                    "Update xreset."
+                )
+            self.assertEqual(str(caught.exception), expected)
+
     def test_refusals_name_the_entry(self):
         good = asdict(self.GOOD)
         for words, data in (

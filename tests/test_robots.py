@@ -160,7 +160,7 @@ class Registry(Copied):
         self.edit("robot.toml", 'keypoint = "index4"', 'keypoint = "index5"')
         self.edit("robot.toml", "pos = [0.45, 0.60, 0.55]", "pos = [0.45, 0.60]")
         self.refused(
-            "unknown: hand.plam; missing: palm",
+            "unknown: hand.plam; missing: hand.palm; known: name, urdf, joints, mimics, base.pos, ",
             "joints[0].home",
             "joints[0].kp",
             "index5",

@@ -62,8 +62,11 @@ class FileTest(Studied):
         a = "[runs.a]\n"
         none = "states schema None, expected 'xreset-study/1'"
         for text, message in (
-            (f"{a}minuets = 3", r"runs\.a does not fit Runs \(unknown: minuets \(minutes\?\)\)"),
-            (f"{a}worlds = 3", r"\(unknown: worlds; known: data, .*, num_envs, "),
+            (
+                f"{a}minuets = 3",
+                r"runs\.a does not fit Runs \(unknown: minuets \(minutes\?\); known: minutes, data, .*\)\.$",
+            ),
+            (f"{a}worlds = 3", r"\(unknown: worlds; known: data, .*, num_envs, .*\)\.$"),
             (f"{a}seeds = [0, 0]", r"runs\.a\.seeds is \[0, 0\], expected one or more"),
             (f"{a}seeds = [{10**14}]", rf"runs\.a\.seeds\[0\] is {10**14}, expected a whole"),
             (f"{a}minutes = inf", r"runs\.a\.minutes is inf"),

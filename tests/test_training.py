@@ -641,7 +641,10 @@ class TrainingTest(WithBank):
             (r"config\.task\.action.*unknown: gripper", {"config": config}),
             ("num_envs is -5", {"num_envs": -5}),
             ("contract.joint_names is 3", {"contract": contract}),
-            (r"\(of xreset '9.9'\).*unknown: later", {"later": 1, "xreset": "9.9"}),
+            (
+                r"\(of xreset '9.9'\).*unknown: later.*\nIt was written by xreset '9.9'.* Update xreset",
+                {"later": 1, "xreset": "9.9"},
+            ),
         ):
             self.changed_run(out, **good | changes)
             with self.subTest(words), self.assertRaisesRegex(FileFormatError, words):

@@ -6,6 +6,7 @@ when a configuration is made, instead of turning into NaN some minutes later.
 
 from __future__ import annotations
 
+import re
 import types
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
@@ -31,6 +32,7 @@ from typing import (
 
 import numpy as np
 
+from xreset import __version__
 from xreset.errors import FileFormatError, XResetError
 from xreset.text import Brief, shown
 
@@ -202,20 +204,36 @@ def merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     return result
 
 
-def from_dict(cls: type[T], data: Any, where: str = "configuration") -> T:
+def from_dict(cls: type[T], data: Any, where: str = "configuration", version: Any = None) -> T:
     """Build a dataclass from nested dictionaries, as :func:`dataclasses.asdict` and JSON make them.
 
     A missing entry takes its default, so files stay readable when a field is added: its default must be what was done
     before. A class may list the fields that it no longer has, with the values that mean what is done now: ``REMOVED:
     ClassVar[dict[str, Any]]``. Entries with these values are ignored.
 
+    Args:
+        cls: the dataclass.
+        data: nested dictionaries.
+        where: name of the data in messages.
+        version: the version of xreset that wrote the data, if they state it.
+
     Raises:
         FileFormatError: names every entry that is unknown, missing, of the wrong type or out of range.
     """
     value, problems = parsed(cls, data, where)
     if value is None:
+        if _release(version) > _release(__version__):
+            problems.append(
+                f"It was written by xreset {shown(version)}, and this is xreset {__version__}. Update xreset."
+            )
         raise FileFormatError("\n".join(problems))
     return value
+
+
+def _release(version: Any) -> list[int]:
+    """Return the numbers of a version such as ``0.2.0+g1a2b3c4d5e6f``; none if it is no version."""
+    release = version.partition("+")[0] if isinstance(version, str) else ""
+    return [int(number) for number in re.findall(r"\d{1,9}", release)]
 
 
 def parsed(cls: type[T], data: Any, where: str) -> tuple[T | None, list[str]]:
@@ -249,17 +267,20 @@ def _record(cls: type, data: Any, where: str, problems: list[str]) -> Any:
     missing = sorted(required - set(data))
     unknown = sorted(set(data) - set(names))
     found = []
+    nearest: list[str] = []
     if unknown:
-        guesses = [_with_guess(name, names) for name in _first(unknown)]
-        found.append(f"unknown: {', '.join(guesses)}")
-        if not missing and guesses == unknown:
-            found.append(f"known: {', '.join(names)}")
+        keys = []
+        for key in _first([str(key)[:100] for key in unknown]):
+            guesses = get_close_matches(key, names, 1, 0.75)
+            nearest += guesses
+            keys.append(f"{key} ({guesses[0]}?)" if guesses else key)
+        found.append(f"unknown: {', '.join(keys)}")
     if missing:
         found.append(f"missing: {', '.join(missing)}")
+    if unknown:
+        found.append(f"known: {', '.join(dict.fromkeys([*nearest, *names]))}")
     if found:
-        problems.append(
-            f"{where} does not fit {cls.__name__} ({'; '.join(found)}). Was it written by another version of xreset?"
-        )
+        problems.append(f"{where} does not fit {cls.__name__} ({'; '.join(found)}).")
     hints = get_type_hints(cls, include_extras=True)
     values = {
         name: _value(hints[name], data[name], f"{where}.{name}", problems)
@@ -281,12 +302,6 @@ def _first(texts: list[str]) -> list[str]:
     if others <= 0:
         return texts
     return [*texts[:_MOST_NAMED], f"and {others} more"]
-
-
-def _with_guess(name: str, names: list[str]) -> str:
-    name = str(name)[:100]
-    guesses = get_close_matches(name, names, cutoff=0.75)
-    return f"{name} ({guesses[0]}?)" if guesses else name
 
 
 def _value(hint: Any, value: Any, where: str, problems: list[str]) -> Any:

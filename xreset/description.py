@@ -119,7 +119,9 @@ def _as_written(problem: str) -> str:
     """Return a problem with the names that the file has."""
     written = {field: entry for entry, field in _FIELDS.items()}
     problem = problem.removeprefix("the file.").replace("].drive", "]")
-    return re.sub(r"^\w+", lambda match: written.get(match[0], match[0]), problem)
+    return re.sub(
+        r"(^|[:,] |\()(\w+)", lambda match: match[1] + written.get(match[2], match[2]), problem
+    )
 
 
 def _contradictions(spec: RobotSpec) -> list[str]:

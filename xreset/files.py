@@ -296,8 +296,9 @@ def read_typed(cls: type[T], path: Path, schema: str) -> T:
     Raises:
         FileFormatError: the file is damaged, of another schema, or an entry does not fit; the message names the entry.
     """
-    data = read_json(path, schema)
-    return from_dict(cls, data, str(path))
+    data = read_json(path, schema, keep_version=True)
+    version = data.pop("xreset", None)
+    return from_dict(cls, data, str(path), version)
 
 
 def read_toml(

@@ -84,8 +84,9 @@ def read_run(folder: str | Path, *, as_stated: bool = False) -> RunInfo:
             to_do = f"The folder above has one: give {folder.parent}."
         raise RunError(f"{folder} is not a run folder: it has no run.json. {to_do}")
     data = read_json(folder / "run.json", SCHEMA, keep_version=True)
-    where = f"{folder / 'run.json'} (of xreset {shown(data.pop('xreset', None))})"
-    info = from_dict(RunInfo, data, where)
+    version = data.pop("xreset", None)
+    where = f"{folder / 'run.json'} (of xreset {shown(version)})"
+    info = from_dict(RunInfo, data, where, version)
     if as_stated:
         return info
     found = {}

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +31,9 @@ from xreset.eval.stress import (
     draw_curves,
     plot_size,
     sweep,
+    write_card,
 )
-from xreset.files import claim_folder, write_json, write_whole
+from xreset.files import claim_folder, write_whole
 from xreset.inputs import Data
 from xreset.live.engine import make_controller
 from xreset.live.faults import Faults, FaultyDriver
@@ -138,7 +139,7 @@ def rehearse(
         for place in opened:
             card = sweep(Rehearsal, spec, trial, place, properties, play, folder, progress)
             card = replace(card, stopped=dict(stopped[place.name]))
-            write_json(folder / f"{place.name}.json", asdict(card))
+            write_card(folder, card)
             found.append(card)
             write_whole(folder / "index.html", page(found))
     return found

@@ -23,7 +23,7 @@ from xreset.eval.results import Episode
 from xreset.eval.rollout import Engine, Trial, roll_out
 from xreset.eval.sensitivity import SWEEPS, Effect, Property, amount, nominal_task
 from xreset.eval.stats import Interval
-from xreset.files import read_typed, write_json
+from xreset.files import claim_folder, read_typed, write_json
 from xreset.plugins import backend_class
 from xreset.progress import NamedProgress, unseen
 
@@ -110,8 +110,7 @@ def stress(
     repetitions: int = 2,
     progress: NamedProgress = unseen,
 ) -> list[Stress]:
-    """Sweep properties in each engine and write ``OUT/BACKEND.json`` after each property, so that a stopped command
-    keeps its results.
+    """Sweep properties in each engine, and write ``OUT/BACKEND.json`` when an engine has played all of them.
 
     Args:
         policy: the policy.
@@ -127,7 +126,7 @@ def stress(
 
     Raises:
         PolicyError: the seed chose this checkpoint.
-        XResetError: a property cannot have a value; nothing was played then.
+        XResetError: a property cannot have a value, or another command is writing there; nothing was played then.
     """
     policy.check_seed(trial.seed)
     if not trial.task.vision.cameras:
@@ -146,7 +145,12 @@ def stress(
         player = policy.start(trial.motion)
         return roll_out(player, engine, changed, repetitions=repetitions).episodes
 
-    return [sweep(Stress, policy, trial, each, sweeps, play, out, progress) for each in engines]
+    found = []
+    with claim_folder(out):
+        for engine in engines:
+            found.append(sweep(Stress, policy, trial, engine, sweeps, play, out, progress))
+            write_card(out, found[-1])
+    return found
 
 
 def sweep(
@@ -159,8 +163,9 @@ def sweep(
     out: Path,
     progress: NamedProgress,
 ) -> Card:
-    """Play episodes with each value of the properties that an engine can set. Write the results (the card) before the
-    first property and after each.
+    """Play episodes with each value of the properties that an engine can set, and return the results (the card).
+
+    ``ENGINE.partial`` has the results so far, in case that the command is stopped; :func:`write_card` removes it.
 
     Args:
         card_type: type of the card.
@@ -193,8 +198,6 @@ def sweep(
         curves=(),
         left_out=tuple(prop.option for prop in properties if prop not in usable),
     )
-    file = out / f"{engine.name}.json"
-    write_json(file, asdict(card))
     for prop in usable:
         swept = {}
         for value in prop.values:
@@ -202,8 +205,14 @@ def sweep(
             done += 1
             progress(engine.name, done, total)
         card = replace(card, curves=(*card.curves, curve(prop, nominal, swept)))
-        write_json(file, asdict(card))
+        write_json(out / f"{engine.name}.partial", asdict(card))
     return card
+
+
+def write_card(folder: Path, card: Stress) -> None:
+    """Write complete results as ``ENGINE.json``."""
+    write_json(folder / f"{card.backend}.json", asdict(card))
+    (folder / f"{card.backend}.partial").unlink(missing_ok=True)
 
 
 def read_stress(folder: Path, policy: str | None = None) -> tuple[Stress, ...]:

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from importlib.util import find_spec
-from unittest import TestCase, skipUnless
+from unittest import TestCase, mock, skipUnless
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from tests.command import refused, succeeds
 from tests.data import InFolder
 from tests.toy_bank import SOUP
 from tests.toy_results import episodes, toy_card
-from xreset.eval.rehearse import PROPERTIES, Rehearsal, judge, page
+from xreset.eval.rehearse import PROPERTIES, Rehearsal, judge, page, rehearse
 from xreset.eval.rollout import engine, play_rounds
 from xreset.eval.stress import curve
 from xreset.files import read_json
@@ -191,6 +191,18 @@ class CommandTest(InFolder):
         self.assertEqual(list(found["stopped"].values()), [1])
         self.assertIn("pose of the object is ... s old", next(iter(found["stopped"])))
         self.assertTrue((self.folder / "index.html").is_file())
+        self.assertFalse((self.folder / "mujoco.partial").exists())
+        before = (self.folder / "mujoco.json").read_bytes()
+        played = [episodes([0.8] * 5)] * 2
+        with (
+            mock.patch("xreset.eval.rehearse._play", side_effect=[*played, KeyboardInterrupt]),
+            self.assertRaises(KeyboardInterrupt),
+        ):
+            rehearse("soup-can", demos, faults=("pose-delay=1", "lost-frames"), out=self.folder)
+        after = (self.folder / "mujoco.json").read_bytes()
+        self.assertEqual(after, before, "results of a whole rehearsal stay")
+        partial = read_json(self.folder / "mujoco.partial", "xreset-rehearsal/1")
+        self.assertEqual([c["property"] for c in partial["curves"]], ["pose-delay"])
         err = refused(
             "rehearse", shipped()["soup-can"], *options, "--fault", "missed-deadlines=150"
         )

@@ -1,19 +1,20 @@
 """Sweeps of one property at a time: what is swept, what is found, and what is refused. No physics but for one short run."""
 
+import json
 from dataclasses import asdict, replace
 from unittest import TestCase, mock
 
 import numpy as np
 from numpy.testing import assert_allclose
 
-from tests.command import succeeds
+from tests.command import refused, succeeds, xreset
 from tests.data import InFolder
 from tests.toy_bank import SOUP
 from tests.toy_results import episodes, toy_card
 from xreset.errors import XResetError
 from xreset.eval.sensitivity import SWEEPS, chosen, nominal_task
 from xreset.eval.stress import curve, read_stress
-from xreset.files import write_json
+from xreset.files import claim, write_json
 from xreset.task.config import RandomizationConfig, TaskConfig, evaluation_task
 
 
@@ -151,3 +152,14 @@ class CommandTest(InFolder):
         ):
             self.assertIn(expected, out)
         self.assertNotIn("camera", out)
+        before = (self.folder / "mujoco.json").read_bytes()
+        played = [mock.Mock(episodes=episodes([0.8] * 2))] * 2
+        options = (*options[:-4], "--out", self.folder, *sweeps)
+        stop = mock.patch("xreset.eval.stress.roll_out", side_effect=[*played, KeyboardInterrupt])
+        with claim(self.folder):
+            self.assertIn("another command is writing", refused("stress", "zero", *options))
+        with stop:
+            self.assertEqual(xreset("stress", "zero", *options)[0], 130)
+        self.assertEqual((self.folder / "mujoco.json").read_bytes(), before, "complete results")
+        partial = json.loads((self.folder / "mujoco.partial").read_text())
+        self.assertEqual([c["property"] for c in partial["curves"]], ["arm-stiffness"])

@@ -24,6 +24,8 @@ _INDICES = {"seed", "episode", "repetition", "sequence", "frame", "port"}
 """Whole numbers from 0."""
 _WRITTEN = ("out", "rest", "png", "mp4", "picture", "json")
 """Files or folders that a command writes."""
+_SUFFIXES = {"png": ".png", "mp4": ".mp4", "picture": ".png"}
+"""How the name of a file ends that can be written in one format only."""
 _IN_PLACE = {"policy"}
 """Options that may name the same file as the output."""
 _LARGEST = 2**32 - 1
@@ -66,6 +68,9 @@ def _check(options: dict[str, Any]) -> None:
                 raise XResetError(
                     f"{flag} is {value}, expected a whole number from {low} to {high}."
                 )
+        suffix = _SUFFIXES.get(name)
+        if suffix and value.suffix.lower() != suffix:
+            raise XResetError(f"{flag} is {value}, expected a name that ends in {suffix}.")
         for text in value if isinstance(value, tuple) else (value,):
             if isinstance(text, str | Path) and len(str(text)) > _LONGEST:
                 raise XResetError(

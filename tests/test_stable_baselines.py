@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from tests.test_env import TASK, BreakableBackend, N, WithEnv
+from xreset.errors import XResetError
 from xreset.task.config import TerminationConfig
 
 try:
@@ -22,6 +23,10 @@ class StableBaselinesTest(WithEnv):
         env = StableBaselinesEnv(self.make(task, **options))
         self.addCleanup(env.close)
         return env
+
+    def test_what_is_no_environment_is_named(self):
+        words = "^env is None, expected ManipulationEnv"
+        self.assertRaisesRegex(XResetError, words, StableBaselinesEnv, None)
 
     def test_the_last_observation_of_a_truncated_episode_is_given(self):
         env = self.wrapped(0.1)

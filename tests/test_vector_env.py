@@ -25,6 +25,10 @@ class VectorEnvTest(WithEnv):
         self.addCleanup(envs.close)
         return envs
 
+    def test_what_is_no_environment_is_named(self):
+        words = r"^env is 'x', expected ManipulationEnv\. Look at help\(xreset\.VectorEnv\.__init__\)\.$"
+        self.assertRaisesRegex(XResetError, words, VectorEnv, "x")
+
     def test_episodes_are_truncated_and_begin_anew_a_step_later(self):
         env = self.vector_env(0.1)
         env.reset(seed=1)

@@ -21,6 +21,7 @@ from typing import (
     Annotated,
     Any,
     Literal,
+    ParamSpec,
     TypeVar,
     Union,
     cast,
@@ -36,6 +37,7 @@ from xreset import __version__
 from xreset.errors import FileFormatError, XResetError
 from xreset.text import Brief, shown
 
+P = ParamSpec("P")
 T = TypeVar("T")
 
 
@@ -144,12 +146,12 @@ def check_port(port: int) -> None:
         raise XResetError(f"port is {port}, expected a whole number from 0 to {LAST_PORT}.")
 
 
-def names_wrong_arguments(function: Callable[..., T]) -> Callable[..., T]:
+def names_wrong_arguments(function: Callable[P, T]) -> Callable[P, T]:
     """Return a function that raises ``XResetError`` in place of Python's own errors if an argument is of another type
     than its annotation says."""
 
     @wraps(function)
-    def call(*positional: Any, **named: Any) -> T:
+    def call(*positional: P.args, **named: P.kwargs) -> T:
         try:
             return function(*positional, **named)
         except (AttributeError, RuntimeError, TypeError, ValueError) as error:
@@ -159,7 +161,7 @@ def names_wrong_arguments(function: Callable[..., T]) -> Callable[..., T]:
                     if not _is_of(_hint_of(function, name), value):
                         raise XResetError(
                             f"{name} is {shown(value)}, expected {function.__annotations__[name]}. "
-                            f"Look at help(xreset.{function.__name__})."
+                            f"Look at help(xreset.{function.__qualname__})."
                         ) from error
             raise
 
@@ -170,8 +172,8 @@ _WIDER = {int: Integral, float: Real, Sequence: Iterable}
 
 
 def _hint_of(function: Callable[..., Any], name: str) -> Any:
-    """Return the type of an argument; Any if only type checkers know it."""
-    with suppress(NameError):
+    """Return the type of an argument; Any if there is none (``self``), or only type checkers know it."""
+    with suppress(KeyError, NameError):
         one = SimpleNamespace(__annotations__={name: function.__annotations__[name]})
         return get_type_hints(one, globalns=getattr(function, "__globals__", None))[name]
     return Any

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from xreset.checks import names_wrong_arguments
 from xreset.env import ManipulationEnv
 from xreset.errors import needs
 from xreset.vector_env import (
@@ -33,8 +34,13 @@ class StableBaselinesEnv(VecEnv):
         log: as of :class:`~xreset.vector_env.VectorEnv`.
     """
 
+    @names_wrong_arguments
     def __init__(self, env: ManipulationEnv) -> None:
-        """Wrap an environment, which belongs to this object from then on."""
+        """Wrap an environment, such as ``xreset.make_env`` makes. It belongs to this object from then on.
+
+        Raises:
+            XResetError: ``env`` is no environment.
+        """
         self.env = env
         self.log: dict[str, torch.Tensor] = {}
         self._action = torch.zeros(env.num_envs, env.num_actions, device=env.device)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from xreset.checks import names_wrong_arguments
 from xreset.env import ManipulationEnv
 from xreset.errors import XResetError, needs
 from xreset.tensors import where
@@ -40,8 +41,13 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": []}  # noqa: RUF012
 
+    @names_wrong_arguments
     def __init__(self, env: ManipulationEnv) -> None:
-        """Wrap an environment and reset it. :meth:`close` closes the environment."""
+        """Wrap an environment, such as ``xreset.make_env`` makes, and reset it. :meth:`close` closes it.
+
+        Raises:
+            XResetError: ``env`` is no environment.
+        """
         self.env = env
         self.num_envs = env.num_envs
         env.reset()

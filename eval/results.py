@@ -20,7 +20,6 @@ from xreset.checks import (
     Checked,
     NonNegativeFloat,
     NonNegativeInt,
-    PositiveFinite,
     PositiveFloat,
     PositiveInt,
     Range,
@@ -245,7 +244,7 @@ class EvalResult(Checked):
     least_distance: NonNegativeFloat | None = None
     """Mean of :attr:`Episode.least_distance` [m]."""
 
-    episode_seconds: PositiveFinite | None = None
+    episode_seconds: PositiveFloat | None = None
     """Length of an episode [s]. None: an earlier version did not state it; it was that of the policy's training."""
 
     def meshes(self, given: Path | None) -> Path | None:

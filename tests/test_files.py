@@ -263,6 +263,12 @@ class NpzTest(InFolder):
         self.assertEqual(json.loads(str(found["meta"]))["config"], {"p": 0.5})
         self.assertEqual(json.loads(str(found["meta"]))["inputs"], {"a": "ff"})
 
+    def test_a_configuration_may_hold_infinity(self):
+        config = {"limits": {"error": np.inf, "jump": 0.1}}
+        write_npz(self.file, "test/1", ARRAYS, config=config)
+        found = json.loads(str(self.read()["meta"]), parse_constant=self.fail)
+        self.assertEqual(found["config"], {"limits": {"error": "Infinity", "jump": 0.1}})
+
     def test_the_same_content_gives_the_same_bytes(self):
         self.write()
         first = self.file.read_bytes()

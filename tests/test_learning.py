@@ -296,6 +296,7 @@ class ConfigTest(TestCase):
             ),
             (PpoConfig, {"discount": 1.01}, "discount is 1.01, expected a number from 0 to 1"),
             (PpoConfig, {"entropy": float("nan")}, "entropy is nan"),
+            (PpoConfig, {"grad_norm": float("inf")}, "grad_norm is inf, expected .* finite"),
             (ModelConfig, {"initial_std": 0.0}, "initial_std is 0.0, expected a number above 0"),
             (
                 TrainConfig,

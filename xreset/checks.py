@@ -59,14 +59,13 @@ def _is_whole(value: Any) -> bool:
     return isinstance(value, Integral)
 
 
-Positive = Annotated[T, Rule("a number above 0", lambda x: 0 < x <= inf)]
-"""Infinity is allowed, and means no limit; otherwise write :data:`PositiveFinite`."""
+Positive = Annotated[T, Rule("a number above 0 and finite", lambda x: 0 < x < inf)]
+"""JSON, and so a run's configuration, has no infinity."""
 NotNegative = Annotated[T, Rule("a number from 0 to 1e15", lambda x: 0 <= x <= 1e15)]
 """No time, number of steps or distance is larger: such a number in a file is damage."""
 Finite = Annotated[T, Rule("a finite number", isfinite)]
 PositiveFloat = Positive[float]
 PositiveInt = Annotated[int, Rule("a whole number above 0", lambda x: _is_whole(x) and x > 0)]
-PositiveFinite = Positive[Finite[float]]
 NonNegativeFloat = NotNegative[float]
 NonNegativeInt = Annotated[
     int, Rule("a whole number from 0 to 1e15", lambda x: _is_whole(x) and 0 <= x <= 1e15)

@@ -80,13 +80,14 @@ def write_npz(
         path: file to write; appears whole or not at all.
         schema_name: such as ``xreset-resets/1``.
         arrays: name -> array (numbers, bool or text; never objects).
-        config: JSON-able configuration that made the content.
+        config: JSON-able configuration that made the content; numbers that are not finite are written as text.
         inputs: name -> SHA-256 of each input.
     """
     meta = {"xreset": code_version(), "config": dict(config or {}), "inputs": dict(inputs or {})}
+    as_json = json.loads(json.dumps(meta, sort_keys=True), parse_constant=str)
     out = {
         "schema": np.array(schema_name),
-        "meta": np.array(json.dumps(meta, sort_keys=True, allow_nan=False)),
+        "meta": np.array(json.dumps(as_json)),
     }
     for name, value in arrays.items():
         array = np.asarray(value)

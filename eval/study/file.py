@@ -36,7 +36,7 @@ from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from xreset.checks import Checked, PositiveFinite, PositiveInt, Rule, from_dict, frozen, merged
+from xreset.checks import Checked, PositiveFloat, PositiveInt, Rule, from_dict, frozen, merged
 from xreset.errors import FileFormatError, RunError
 from xreset.eval.study.paper import paper_tables
 from xreset.eval.table import METRICS
@@ -121,7 +121,7 @@ class Evaluation(Checked):
     """Largest number of demonstrations of each object; None: all (of the run's own data: as many as in training)."""
     episodes: PositiveInt = 5
     """Episodes of each demonstration, each with a perturbed start."""
-    episode_seconds: PositiveFinite | None = None
+    episode_seconds: PositiveFloat | None = None
     """Length of an episode [s]; None: as in the policy's training."""
     seed: Seed = 0
     engines: tuple[str, ...] = ("mujoco", "mujoco-warp", "pybullet", "sapien")
@@ -150,9 +150,9 @@ class Runs(Checked):
     seeds: Annotated[
         tuple[Seed, ...], Rule("one or more, each once", lambda x: 0 < len(x) == len(set(x)))
     ] = (0,)
-    minutes: PositiveFinite | None = None
+    minutes: PositiveFloat | None = None
     """Minutes of training, without compiling."""
-    steps: PositiveFinite | None = None
+    steps: PositiveFloat | None = None
     """Environment steps of all worlds. With minutes and steps, the first limit ends the training; with neither, the
     recipe's iterations."""
     weights: str | None = None

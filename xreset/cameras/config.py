@@ -10,7 +10,6 @@ from typing import Annotated, Literal
 from xreset.checks import (
     Checked,
     NonNegativeFloat,
-    PositiveFinite,
     PositiveFloat,
     PositiveInt,
     Rule,
@@ -63,7 +62,7 @@ class CameraConfig(Checked):
     """Vertical field of view [rad]."""
     near: NonNegativeFloat = 0.1
     """Least depth that the camera measures [m]."""
-    far: PositiveFinite = 2.0
+    far: PositiveFloat = 2.0
     """Largest depth that the camera measures [m]."""
     noise: DepthNoise = field(default_factory=DepthNoise)
 

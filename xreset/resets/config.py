@@ -6,7 +6,7 @@ from xreset.checks import (
     Checked,
     NonNegativeFloat,
     NonNegativeInt,
-    PositiveFinite,
+    PositiveFloat,
     PositiveInt,
     frozen,
 )
@@ -18,11 +18,11 @@ class FilterConfig(Checked):
 
     steps: PositiveInt = 8
     """Control steps of 1/60 s with the drives holding. The published paper has 48, and 240 for a parallel jaw."""
-    linear_velocity: PositiveFinite = 0.10
+    linear_velocity: PositiveFloat = 0.10
     """Largest speed of the object's origin [m/s]; published 0.5."""
-    angular_velocity: PositiveFinite = 1.0
+    angular_velocity: PositiveFloat = 1.0
     """Largest angular speed of the object [rad/s]; published 15."""
-    joint_velocity: PositiveFinite = 2.0
+    joint_velocity: PositiveFloat = 2.0
     """Largest joint speed [rad/s or m/s]; published 10."""
 
 
@@ -30,9 +30,9 @@ class FilterConfig(Checked):
 class ClosingConfig(Checked):
     """More states where a hand closes in on an object (:mod:`xreset.resets.closing`)."""
 
-    spacing: PositiveFinite | None = None
+    spacing: PositiveFloat | None = None
     """Farthest that any fingertip moves from one state to the next [m], such as 0.005. None: no states are added."""
-    within: PositiveFinite = 0.10
+    within: PositiveFloat = 0.10
     """States are added between two frames if a finger is nearer than this to the object in one of them [m]."""
 
 
@@ -48,7 +48,7 @@ class SqueezeConfig(Checked):
     balanced: bool = False
     """Whether the forces on an object nearly cancel: the thumb presses as hard as all fingers that oppose it together.
     The mean force stays the same."""
-    reach: PositiveFinite = 0.005
+    reach: PositiveFloat = 0.005
     """A finger presses if it is nearer than this to the object [m]."""
 
     def __post_init__(self) -> None:
@@ -71,7 +71,7 @@ class GoalConfig(Checked):
 
     per_family: PositiveInt = 20
     """Goals of each object and family."""
-    lift: PositiveFinite = 0.20
+    lift: PositiveFloat = 0.20
     """Height of the goal above the start [m]."""
     angle: NonNegativeFloat = 60.0
     """Angle of the families ``yaw``, ``tilt-x`` and ``tilt-y`` [degrees]."""

@@ -15,7 +15,6 @@ from xreset.checks import (
     Checked,
     FiniteFloat,
     NonNegativeFloat,
-    PositiveFinite,
     PositiveFloat,
     PositiveInt,
     Range,
@@ -120,7 +119,7 @@ class ObservationConfig(Checked):
     place of the orientations of object and goal, the columns of the rotation that leads from one to the other, along
     the world's axes. It does not depend on the axes of the mesh file. A policy with cameras observes the rotation
     from the start of the episode to the goal."""
-    cloud_scale: PositiveFinite = 1.0
+    cloud_scale: PositiveFloat = 1.0
     """Factor on the clouds' coordinates [1/m]."""
     contact_force_scale: NonNegativeFloat = 0.1
     """Factor on fingertip forces [1/N] before they are limited to [-1, 1]."""
@@ -193,7 +192,7 @@ class RewardConfig(Checked):
     points: FiniteFloat = 0.0
     """Weight of 1 - d / ``points_zero``, gated, with d the mean distance of 64 surface points to the goal. The
     published paper's 3 (1.4 - 3 d) is 4.2 with ``points_zero`` 1.4 / 3."""
-    points_zero: PositiveFinite = 1.4 / 3
+    points_zero: PositiveFloat = 1.4 / 3
     """Distance d beyond which ``points`` is negative [m]."""
     success: FiniteFloat = 10.0
     """Weight of success, gated."""
@@ -232,7 +231,7 @@ class RewardConfig(Checked):
         dict[str, float], Rule("module:function and a finite number", _are_own_terms)
     ] = field(default_factory=dict)
     """Reward terms of the user: ``module:function`` -> weight (docs/own-reward.md)."""
-    scale: PositiveFinite = 0.01
+    scale: PositiveFloat = 0.01
     """Factor on the total (Table VIII)."""
 
 
@@ -488,7 +487,7 @@ class TaskConfig(Checked):
     reset: ResetConfig = field(default_factory=ResetConfig)
     randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
     vision: VisionConfig = field(default_factory=VisionConfig)
-    timestep: PositiveFinite = 1.0 / 240.0
+    timestep: PositiveFloat = 1.0 / 240.0
     """Physics timestep [s]."""
     substeps: PositiveInt = 4
     """Physics steps per control step: control at 60 Hz. Not in the paper."""

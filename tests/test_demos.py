@@ -145,6 +145,7 @@ class Archive(InFolder):
         names = self.demos.sequence_name
         for options, indices in (
             ({"objects": ["banana"]}, [2, 3]),
+            ({"objects": "banana", "sides": "right"}, [2, 3]),
             ({"max_per_object": 1}, [0, 2]),
             ({"indices": [3, 0]}, [3, 0]),
             ({"names": names[1:2], "sides": ["right"], "subjects": ["synthetic"]}, [1]),

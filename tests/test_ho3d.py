@@ -72,6 +72,12 @@ class Ho3d(InFolder):
         self.assertEqual((found.sequence_name[0], found.hand_side[0]), ("SM2", "right"))
         self.assertEqual(found.object_name[0], self.demos.object_name[0])
 
+    def test_numbers_of_frames_need_no_zeros(self):
+        self.write()
+        for path in self.meta.glob("*.pkl"):
+            path.rename(self.meta / f"{int(path.stem)}.pkl")
+        assert_same_motion(self.demos, self.read(), angle=1e-3)
+
     def test_the_command_names_sequences_without_a_camera(self):
         self.write()
         shutil.copytree(self.meta, self.meta.parents[1] / "MC1" / "meta")

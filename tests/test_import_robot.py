@@ -273,6 +273,13 @@ class Toy(Robots):
             joint = tree.joint(name)
             self.assertEqual([joint.effort, joint.stiffness], drive)
 
+    def test_an_actuator_of_a_floating_base_is_left_out(self):
+        text = MJCF.replace('<body name="base">', '<body name="base"><freejoint name="float"/>', 1)
+        text = text.replace("<actuator>", '<actuator><motor name="thrust" joint="float"/>', 1)
+        tree, notes = self.read("floating.xml", text)
+        self.assertIn("left out: the actuator 'thrust'", notes)
+        self.assertEqual(tree.joint("f1_1").stiffness, 3.0)
+
     def test_a_joint_that_follows_a_follower_follows_its_source(self):
         chain = HAND.replace('joint="f2_1" multiplier="0.8"', 'joint="f1_2" multiplier="0.5"')
         mimic = self.read("chain.urdf", chain)[0].joint("f2_2").mimic

@@ -54,6 +54,13 @@ RING = trimesh.creation.annulus(0.036, 0.04, 0.02, sections=32)
 CUTS = skipUnless(importlib.util.find_spec("manifold3d"), "manifold3d is not installed")
 
 
+def _specks(edge):
+    """Text of a mesh of two small cubes that are far apart."""
+    cubes = [trimesh.creation.box((edge, edge, edge)) for _ in range(2)]
+    cubes[1].apply_translation((0.01, 0.004, 0.006))
+    return trimesh.util.concatenate(cubes).export(file_type="obj")
+
+
 def distance_to_pieces(points, pieces):
     """Signed distance to the union of convex pieces (a lower bound outside)."""
     heights = [plane_heights(np.array(points), half_spaces(piece)) for piece in pieces]
@@ -345,6 +352,8 @@ class MeshImport(InFolder):
             (obj.replace("v ", "v nan ", 1), "finite|cannot be read"),
             (square, "flat"),
             (CUBE.copy().apply_scale(1000).export(file_type="obj"), "millimetres"),
+            (_specks(1e-4), "smaller than a cube of 0.2 mm"),
+            (_specks(1.9e-4), "smaller than a cube of 0.2 mm"),
         ):
             path = self.folder / "bad.obj"
             path.write_text(text)

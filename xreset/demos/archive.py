@@ -154,7 +154,7 @@ class Demos(ObjectMotions):
         spread: bool = False,
         seed: int | None = None,
     ) -> Demos:
-        """Return the sequences that meet every given condition.
+        """Return the sequences that meet every given condition. A single name need not be in a list.
 
         Args:
             indices: sequence indices; the result has their order.
@@ -221,7 +221,7 @@ class Demos(ObjectMotions):
 
     def _known(self, field: str, wanted: Iterable[str]) -> list[str]:
         """Return the wanted values of a field, all of which exist."""
-        wanted = list(wanted)
+        wanted = [wanted] if isinstance(wanted, str) else list(wanted)
         known = np.unique(getattr(self, field)).tolist()
         if missing := [name for name in wanted if name not in known]:
             what = field.removesuffix("_name").replace("_", " ")

@@ -82,7 +82,7 @@ def _read_sequence(folder: Path, fps: float) -> Arrays:
         if not (path.stem.isdecimal() and len(path.stem) < 10):
             raise DemoError(f"{path} is not named by a frame's number, such as 0000.pkl.")
         paths[int(path.stem)] = path
-    frames = {number: _read_frame(path) for number, path in paths.items()}
+    frames = {number: _read_frame(path) for number, path in sorted(paths.items())}
     known = [number for number, (_, pose, _) in frames.items() if np.isfinite(pose).all()]
     if not known:
         raise DemoError(f"{folder} has no frame with an object's pose (objRot and objTrans).")

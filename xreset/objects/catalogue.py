@@ -55,11 +55,12 @@ def canonical_name(name: str, known: Iterable[str] = STAND_INS) -> str:
 
 
 def canonical_names(names: Iterable[str], known: Iterable[str] = STAND_INS) -> tuple[str, ...]:
-    """Return the names of known objects; see :func:`canonical_name`.
+    """Return the names of known objects, or of the one of a single name; see :func:`canonical_name`.
 
     Raises:
         ObjectError: names every unknown object.
     """
+    names = (names,) if isinstance(names, str) else names
     known = tuple(known)
     found = []
     unknown = []

@@ -109,7 +109,8 @@ def decompose(mesh: trimesh.Trimesh, settings: Settings = Settings()) -> Pieces:
         mesh: closed or not (:func:`as_solid`).
 
     Raises:
-        ObjectError: the mesh is concave and manifold3d, which cuts it, is not installed.
+        ObjectError: the mesh is concave and manifold3d, which cuts it, is not installed; or the mesh encloses nothing,
+            or specks only.
         QhullError: the mesh spans no volume.
     """
     surface = _Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces))
@@ -325,19 +326,25 @@ class _Cutter:
     against the whole solid."""
 
     def __init__(self, whole: Manifold, settings: Settings) -> None:
+        """Prepare a solid; ``ObjectError`` if it consists of specks."""
         self.surface = _Solid(whole)
         self.effort = settings.effort
         """Triangles that may still be handled."""
-        self._solid = _Solid(whole.simplify(_QUICK * settings.tolerance / 10))
+        simple = whole.simplify(_QUICK * settings.tolerance / 10)
+        self._parts = [part for part in simple.decompose() if part.volume() > _SPECK]
+        if not self._parts:
+            raise ObjectError(
+                "Every part of the mesh is smaller than a cube of 0.2 mm. Scale it up."
+            )
+        self._solid = _Solid(simple)
         self._settings = settings
 
     def shapes(self) -> tuple[list[Shape], float]:
         """Return the pieces and their largest deviation [m]."""
         most = self._settings.max_pieces
         tolerance = _QUICK * self._settings.tolerance
-        parts = [part for part in self._solid.solid.decompose() if part.volume() > _SPECK]
         cut = self._cut_worst(
-            parts, self._quick_excess, self._best_cut, tolerance, int(2 * _FEW * most)
+            self._parts, self._quick_excess, self._best_cut, tolerance, int(2 * _FEW * most)
         )
         pieces = [part.hull() for *_, part in cut]
         tolerance = max(tolerance, *(-excess for excess, *_ in cut))

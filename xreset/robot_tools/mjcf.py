@@ -125,7 +125,8 @@ def _pulls(model: mujoco.MjModel, problems: list[str], notes: list[str]) -> dict
     for actuator in range(model.nu):
         kind = mujoco.mjtTrn(int(model.actuator_trntype[actuator]))
         target = int(model.actuator_trnid[actuator, 0])
-        if kind in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
+        is_joint = kind in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+        if is_joint and model.jnt_type[target] >= SLIDE:
             pulls[actuator] = {target: 1.0}
         elif kind == mujoco.mjtTrn.mjTRN_TENDON:
             begin = model.tendon_adr[target]
@@ -140,7 +141,7 @@ def _pulls(model: mujoco.MjModel, problems: list[str], notes: list[str]) -> dict
                 )
         else:
             notes.append(
-                f"left out: the actuator {model.actuator(actuator).name!r}, which drives no joint"
+                f"left out: the actuator {model.actuator(actuator).name!r}, which drives no hinge and no slide"
             )
     return pulls
 

@@ -214,3 +214,7 @@ class DistillTest(WithBank):
             "Of 3 episodes that the teacher ends at the goal, the student misses 2: can 1 of 2, box 1 of 1. "
             "In 1 of these the object ends within 2 cm of its place, but is turned wrongly.",
         )
+        unsolved = teacher.assign(reorient=False)
+        words = "The teacher ends none of 4 episodes at the goal."
+        self.assertEqual(missed_by_student(student, unsolved), words)
+        self.assertEqual(missed_by_student(student.assign(engine="sapien"), teacher), "")

@@ -130,9 +130,24 @@ class CollectTest(Reported):
         self.assertEqual(collect(self.folder).notes, ())
         write_results(self.folder / "teacher", toy_summary(), toy_rollouts(), ("a", "b", "c"))
         [note] = collect(self.folder).notes
-        self.assertIn("that the teacher ends at the goal, the student misses 0. In 0 of", note)
+        words = "Of 1 episodes that the teacher ends at the goal, the student misses 0."
+        self.assertEqual(note, words)
         self.write_soup()
         self.assertIsNone(collect(self.folder).vision, "the run's configuration has no camera")
+
+    def test_a_teacher_that_played_other_episodes_is_not_compared(self):
+        self.write(("mujoco",))
+        self.write_run("", contract=CONTRACT, teacher="soup-can")
+        for engine in (None, "sapien", "mujoco"):
+            if engine is not None:
+                summary = toy_summary(engine)
+                write_results(self.folder / "teacher", summary, toy_rollouts(), ("a", "b", "c"))
+            [note] = collect(self.folder).notes
+            with self.subTest(engine):
+                self.assertEqual(
+                    note.startswith("The teacher was not evaluated from the same starts. Make"),
+                    engine != "mujoco",
+                )
 
     def test_nothing_to_report(self):
         self.folder.mkdir()

@@ -109,23 +109,27 @@ def begun(trainings: Sequence[Training]) -> list[str]:
 
 def missed_by_student(student: Table, teacher: Table) -> str:
     """Return a text about the episodes that the teacher ends at the goal and the student does not: their objects, and
-    how often only the rotation is wrong.
+    how often only the rotation is wrong. It is empty if no episode is of both.
 
     Args:
         student: episodes of the policy.
-        teacher: episodes of its teacher from the same starts, in the same engines.
+        teacher: episodes of its teacher; those from the same starts, in the same engines, are compared.
     """
     same = ["engine", "sequence_name", "repetition", "object"]
     both = student.merge(teacher, on=same, suffixes=("", "_teacher"))
     solved = both[both["reorient_teacher"]]
+    if not len(solved):
+        return f"The teacher ends none of {len(both)} episodes at the goal." if len(both) else ""
     missed = solved[~solved["reorient"]]
+    text = f"Of {len(solved)} episodes that the teacher ends at the goal, the student misses {len(missed)}"
+    if not len(missed):
+        return f"{text}."
     parts = []
     for name, count in missed["object"].value_counts().items():
         parts.append(f"{name} {count} of {int((solved['object'] == name).sum())}")
-    where = f": {', '.join(parts)}" if parts else ""
     turned = int((missed["final_position_error"] <= GOAL_DISTANCE).sum())
     return (
-        f"Of {len(solved)} episodes that the teacher ends at the goal, the student misses {len(missed)}{where}. "
+        f"{text}: {', '.join(parts)}. "
         f"In {turned} of these the object ends within {100 * GOAL_DISTANCE:.0f} cm of its place, but is turned wrongly."
     )
 

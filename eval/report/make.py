@@ -104,8 +104,11 @@ def collect(folder: Path, robot: str | None = None, objects: Path | None = None)
     stress = read_stress(place / "stress", training.first.inputs.get("policy"))
     taught = read_evaluation(folder / "teacher")
     notes = fairness.uneven([training]) + not_described
+    missed = ""
     if taught:
-        notes.append(fairness.missed_by_student(training.episodes, taught.to_frame()))
+        missed = fairness.missed_by_student(training.episodes, taught.to_frame())
+    if missed:
+        notes.append(missed)
     elif run is not None and run.teacher is not None:
         notes.append(
             "The teacher was not evaluated from the same starts. Make its results first: "

@@ -9,12 +9,19 @@ import statistics
 import sys
 import time
 
+from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
 
 def main(url: str = "ws://127.0.0.1:8765", steps: int = 300) -> None:
     """Ask for targets of a robot that stands at home, and print how long the answers take."""
-    with connect(url, max_size=None, compression=None) as server:
+    try:
+        connection = connect(url, max_size=None, compression=None)
+    except (OSError, WebSocketException) as error:
+        raise SystemExit(
+            f"No policy is served at {url} ({error}). Start it: xreset serve POLICY"
+        ) from None
+    with connection as server:
 
         def ask(**message: dict) -> dict:
             server.send(json.dumps(message))

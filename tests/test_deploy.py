@@ -204,6 +204,9 @@ class ContractTest(InFolder):
         self.assertEqual(
             (outcome.reason, driver.stops), ("The policy could not act: the server has gone.", 1)
         )
+        words = rf"No policy is served at {server.url} \(.*\). Start it: xreset serve POLICY"
+        with self.assertRaisesRegex(SystemExit, words):
+            run("12_served_policy", server.url)
 
     def test_the_example_of_a_driver(self):
         rows = 11

@@ -21,7 +21,7 @@ from xreset.eval.plots import COLORS, svg
 from xreset.eval.policy_spec import PolicySpec, load_policy
 from xreset.eval.results import Episode
 from xreset.eval.rollout import Engine, Round, Trial, chosen_engines, load_trial, play_rounds
-from xreset.eval.sensitivity import FAULTS, SWEEPS, Property, amount, chosen, nominal_task
+from xreset.eval.sensitivity import REHEARSED, Property, amount, chosen, nominal_task
 from xreset.eval.stress import (
     COSTLY,
     Curve,
@@ -41,16 +41,6 @@ from xreset.progress import unseen
 from xreset.runtime import OnnxActor, Runner
 
 SCHEMA = "xreset-rehearsal/1"
-
-_PHYSICAL = {prop.name: prop for prop in SWEEPS}
-PROPERTIES: tuple[Property, ...] = (
-    *FAULTS,
-    _PHYSICAL["object mass"],
-    _PHYSICAL["object friction"],
-    replace(_PHYSICAL["force gain"], values=(0.0, 0.5, 2.0)),
-)
-"""Faults and physical properties to try, in the order of the page. A force gain of 0 is a robot that does not measure
-forces."""
 
 
 @frozen
@@ -97,7 +87,8 @@ def rehearse(
         demos: demonstrations or retargeted motion, or a file of them: starts and goals. None: two synthetic
             demonstrations of each of the policy's objects.
         engines: name of a physics engine, or several.
-        faults: faults to try, as ``NAME`` or ``NAME=VALUE,VALUE...``; default: all of :data:`PROPERTIES`.
+        faults: faults to try, as ``NAME`` or ``NAME=VALUE,VALUE...``; default: all that
+            :data:`~xreset.eval.sensitivity.REHEARSED` lists.
         episodes: episodes of each demonstration, the same for every fault.
         seed: seed of starts and faults.
         robot: name or folder of the robot; default: the policy's own.
@@ -115,7 +106,7 @@ def rehearse(
         PolicyError: the policy is a baseline, or the seed chose this checkpoint.
         XResetError: a fault is unknown or cannot have a value; nothing was played then.
     """
-    properties = chosen(faults, PROPERTIES)
+    properties = chosen(faults, REHEARSED)
     spec = load_policy(policy, robot=robot, seed=seed)
     spec.check_seed(seed)
     actor = OnnxActor(spec.exported().read_bytes())

@@ -11,16 +11,18 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from xreset.checks import frozen
 from xreset.errors import XResetError
-from xreset.eval.results import Episode
 from xreset.eval.stats import Interval, bootstrap_ci95, mean_of_known
-from xreset.physics import Capability
 from xreset.task.config import RandomizationConfig, TaskConfig
+
+if TYPE_CHECKING:  # a command checks names of properties before it loads torch
+    from xreset.eval.results import Episode
+    from xreset.physics import Capability
 
 
 @frozen
@@ -136,6 +138,15 @@ SWEEPS = tuple(p for p in PROPERTIES if p.values)
 """The properties that can be swept."""
 COMPARED = {p.name: p for p in PROPERTIES if p.measured}
 """The properties in which engines are compared, by name."""
+_PHYSICAL = {prop.name: prop for prop in SWEEPS}
+REHEARSED: tuple[Property, ...] = (
+    *FAULTS,
+    _PHYSICAL["object mass"],
+    _PHYSICAL["object friction"],
+    replace(_PHYSICAL["force gain"], values=(0.0, 0.5, 2.0)),
+)
+"""Faults and physical properties of a rehearsal, in the order of its page. A force gain of 0 is a robot that does not
+measure forces."""
 
 
 def chosen(

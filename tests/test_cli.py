@@ -56,6 +56,19 @@ class LightnessTest(TestCase):
         )
         self.assertFalse(modules_after(code) & HEAVY)
 
+    def test_a_misspelt_fault_or_property_is_refused_before_anything_heavy_is_loaded(self):
+        for words in (
+            "rehearse soup-can --fault pose-dely",
+            "stress soup-can --demos x.npz --property pose-dely",
+        ):
+            code = (
+                "from xreset.cli import main\n"
+                f"try: main({words.split()})\n"
+                "except SystemExit as end: assert end.code == 1\n"
+            )
+            with self.subTest(words):
+                self.assertFalse(modules_after(code) & HEAVY)
+
 
 class UsageTest(TestCase):
     def test_version(self):
@@ -94,6 +107,10 @@ class UsageTest(TestCase):
             (r"--png is x\.xyz, expected a name that ends in \.png", "view d.npz --png x.xyz"),
             (r"--mp4 is x, expected a name that ends in \.mp4", "view d.npz --mp4 x"),
             (r"--picture is x\.jpg, expected", "robots check openarm --picture x.jpg"),
+            (
+                r"Unknown property 'pose-dely'\. Choose from: tracker-interval, pose-delay",
+                "rehearse soup-can --fault pose-dely",
+            ),
             (r"Nothing was overwritten", "retarget d.npz --robot openarm --out ./d.npz"),
         ):
             with self.subTest(arguments[:80]):

@@ -13,8 +13,9 @@ from tests.command import refused, succeeds
 from tests.data import InFolder
 from tests.toy_bank import SOUP
 from tests.toy_results import episodes, toy_card
-from xreset.eval.rehearse import PROPERTIES, Rehearsal, judge, page, rehearse
+from xreset.eval.rehearse import Rehearsal, judge, page, rehearse
 from xreset.eval.rollout import engine, play_rounds
+from xreset.eval.sensitivity import REHEARSED
 from xreset.eval.stress import curve
 from xreset.files import read_json
 from xreset.live.engine import EngineDriver
@@ -127,7 +128,7 @@ class VerdictTest(TestCase):
     def card(self, backend="mujoco", **losses):
         """A card; ``action_delay_67=0.2`` is a loss of 20 points in every episode."""
         curves = []
-        for prop in PROPERTIES:
+        for prop in REHEARSED:
             name = prop.option.replace("-", "_")
             swept = {}
             for value in prop.values:
@@ -164,7 +165,7 @@ class VerdictTest(TestCase):
             "<svg",
         ):
             self.assertIn(expected, text)
-        for prop in PROPERTIES:
+        for prop in REHEARSED:
             self.assertIn(prop.option.replace("-", " "), text)
 
 

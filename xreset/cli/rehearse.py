@@ -34,6 +34,9 @@ def rehearse(
         setting: Robot, meshes, seed, device and worlds.
         out: Folder for the results; default: rehearsal/ in the run folder or next to the policy.
     """
+    from xreset.eval import sensitivity
+
+    sensitivity.chosen(fault, sensitivity.REHEARSED)  # refuses wrong ones before torch is loaded
     from xreset.eval import policy_spec
     from xreset.eval import rehearse as rehearsal
 

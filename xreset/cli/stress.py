@@ -33,10 +33,12 @@ def stress(
         setting: Robot, meshes, seed, device and worlds.
         out: Folder for the results; default: stress/ in the run folder or next to the policy.
     """
-    from xreset.eval import policy_spec, rollout, sensitivity
+    from xreset.eval import sensitivity
+
+    properties = sensitivity.chosen(property)  # refuses wrong ones before torch is loaded
+    from xreset.eval import policy_spec, rollout
     from xreset.eval import stress as sweeps
 
-    properties = sensitivity.chosen(property)
     engines = rollout.chosen_engines(backend or "mujoco", setting.device)
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
     folder = out or spec.folder.parent / "stress"

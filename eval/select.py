@@ -79,7 +79,7 @@ def select(
         chosen = Path(scratch)
         for path in candidates_in(folder, most):
             file = Path(scratch) / f"{path.stem}.onnx"
-            export_checkpoint(folder, run, path, file)
+            export_checkpoint(path, file)
             policy = load_policy(file, robot=setting.robot)
             trial = load_trial(
                 policy, demos, objects=meshes, seed=setting.seed, num_envs=setting.num_envs

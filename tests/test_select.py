@@ -46,7 +46,7 @@ class SelectTest(InFolder):
             self.played.append((policy, engine.name, trial.seed))
             return SimpleNamespace(episodes=episodes([SCORES[policy][engine.name]] * repetitions))
 
-        def export(folder, run, checkpoint, file):
+        def export(checkpoint, file):
             file.write_bytes(checkpoint.read_bytes())
 
         engines = [SimpleNamespace(name=name, version="1") for name in "abc"]

@@ -25,6 +25,7 @@ from tests.toy_goals import toy_goals
 from tests.toy_training import CONFIG, OPTIONS, WithBank, quickly
 from xreset import (
     OnnxPolicy,
+    export_checkpoint,
     read_bank,
     resume,
     robots,
@@ -472,6 +473,18 @@ class TrainingTest(WithBank):
         write_choice(out, choice)
         first = policy_file(out).read_bytes()
         self.assertNotEqual(first, newest_policy)
+        own = self.folder / "first.onnx"
+        export_checkpoint(out / "checkpoints" / "000001.pt", own)
+        self.assertEqual(own.read_bytes(), first)
+        moved = shutil.copy(latest_checkpoint(out), self.folder)
+        for checkpoint, target, problem in (
+            (latest_checkpoint(out), "policy.pt", "Expected a name that ends in .onnx"),
+            (out / "checkpoints" / "9.pt", own, "there is no .*9.pt .checkpoint"),
+            (out, own, "is a folder or a device, expected a file .checkpoint"),
+            (moved, own, "is not a run folder"),
+        ):
+            with self.subTest(problem), self.assertRaisesRegex(XResetError, problem):
+                export_checkpoint(checkpoint, target)
         written = policy.stat().st_mtime_ns
         os.utime(latest_checkpoint(out), (2e9, 2e9))  # copied: its time says nothing
         policy_file(out)

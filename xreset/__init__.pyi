@@ -22,6 +22,7 @@ from xreset.eval.results import EvalResult as EvalResult
 from xreset.eval.results import Evaluation as Evaluation
 from xreset.eval.rollout import Engine as Engine
 from xreset.learning.config import TrainConfig as TrainConfig
+from xreset.learning.export import export_checkpoint as export_checkpoint
 from xreset.learning.train import distill as distill
 from xreset.learning.train import resume as resume
 from xreset.learning.train import train as train

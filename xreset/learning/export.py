@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING
 import torch
 from tensordict import TensorDict
 
-from xreset.files import atomic_write, code_version, file_hash
+from xreset.errors import XResetError
+from xreset.files import atomic_write, code_version, file_hash, must_exist
 from xreset.learning.checkpoint import must_fit, read_checkpoint
 from xreset.learning.model import ExportedPolicy, PointNetLstmModel, make_actor
+from xreset.learning.run import read_run
 from xreset.policy import INPUTS, METADATA_KEY, OUTPUTS, Contract, observation_shapes
 
 if TYPE_CHECKING:
     from onnx import ModelProto
-
-    from xreset.learning.run import RunInfo
 
 _VERSION_KEY = "xreset-version"
 """Key of the ONNX metadata entry that holds the version and commit of xreset."""
@@ -111,8 +111,29 @@ def _quiet() -> Iterator[None]:
         logger.setLevel(level)
 
 
-def export_checkpoint(folder: Path, run: RunInfo, checkpoint: Path, policy: Path) -> None:
-    """Write the policy of one of the checkpoints in a run's folder as an ONNX file."""
+def export_checkpoint(checkpoint: str | Path, policy: str | Path) -> None:
+    """Write the policy of one checkpoint of a training as an ONNX file.
+
+    :func:`~xreset.eval.policy_spec.load_policy` with a run folder exports the newest one, or the one that
+    ``xreset select`` chose.
+
+    Args:
+        checkpoint: file ``RUN/checkpoints/NUMBER.pt`` in the training's run folder.
+        policy: file to write, which ends in ``.onnx``.
+
+    Raises:
+        RunError: the checkpoint is not in a run folder, or does not fit the run.
+        FileFormatError: there is no such checkpoint, or it or the run's description is damaged.
+        XResetError: the name of the policy does not end in ``.onnx``, or the file cannot be written.
+    """
+    checkpoint = Path(checkpoint)
+    if Path(policy).suffix != ".onnx":
+        raise XResetError(
+            f"{policy} is not the name of a policy. Expected a name that ends in .onnx."
+        )
+    must_exist(checkpoint, "checkpoint")
+    folder = checkpoint.parent.parent
+    run = read_run(folder)
     shapes = observation_shapes(run.contract, str(folder))
     example = TensorDict(
         {name: torch.zeros(1, *shape) for name, shape in shapes.items()}, batch_size=[1]

@@ -155,7 +155,7 @@ def _exported_policy(folder: Path) -> Path:
     from xreset.learning.export import export_checkpoint, is_exported_from
 
     if not policy.exists() or not is_exported_from(policy, checkpoint):
-        export_checkpoint(folder, read_run(folder), checkpoint, policy)
+        export_checkpoint(checkpoint, policy)
     return policy
 
 

@@ -146,6 +146,16 @@ class UsageTest(TestCase):
                 count(done, 8)
         self.assertEqual(err.getvalue(), "sequences: 25 %\nsequences: 50 %\n")
 
+    def test_training_without_its_packages_says_what_to_install(self):
+        code = (
+            "import sys; sys.modules['rsl_rl'] = None; sys.stderr = sys.stdout\n"
+            "from xreset.cli import main\n"
+            "try: main(['train', '--out', 'x', '--resets', 'x.npz'])\n"
+            "except SystemExit as end: assert end.code == 1"
+        )
+        words = r"^xreset train: rsl-rl-lib cannot .* pip install 'xreset\[train\]'"
+        self.assertRegex(output_of(code), words)
+
     def test_a_missing_engine_is_named_with_the_command_that_mends_it(self):
         code = "import sys; sys.modules['pybullet'] = None; from xreset.cli import main; main(['engines', 'list'])"
         self.assertRegex(output_of(code), r"pybullet .* no: .*pip install 'xreset\[pybullet\]'")

@@ -1,7 +1,10 @@
 """The documentation names commands and options that exist, and fits on the page."""
 
+import ast
 import re
 import shlex
+import sys
+import tomllib
 from functools import cache
 from pathlib import Path
 from unittest import TestCase
@@ -111,6 +114,18 @@ class PageTest(TestCase):
         version = re.search(r'(?m)^version = "(.*)"$', (ROOT / "pyproject.toml").read_text())
         assert version
         self.assertIn(f"\nversion: {version[1]}\n", (ROOT / "CITATION.cff").read_text())
+
+    def test_what_an_environment_imports_is_installed_without_extras(self):
+        project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+        names = {re.split(r"\W", text)[0] for text in project["dependencies"]}
+        imported = set()
+        for node in ast.walk(ast.parse((ROOT / "xreset/env.py").read_text())):
+            if isinstance(node, ast.Import):
+                imported |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                imported.add(node.module)
+        packages = {name.partition(".")[0] for name in imported} - {"xreset"}
+        self.assertLessEqual(packages - sys.stdlib_module_names, names)
 
     def test_every_public_name_is_in_the_reference(self):
         import xreset

@@ -14,13 +14,16 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from rsl_rl.models import MLPModel
-from rsl_rl.modules import CNN, EmpiricalNormalization, HiddenState
-from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from xreset.errors import needs
 from xreset.learning.config import ModelConfig, TrainConfig
+
+with needs("rsl-rl-lib", "train"):
+    from rsl_rl.models import MLPModel
+    from rsl_rl.modules import CNN, EmpiricalNormalization, HiddenState
+    from rsl_rl.modules.distribution import GaussianDistribution
 
 LstmState = tuple[Tensor, Tensor]
 

@@ -7,6 +7,7 @@ import threading
 from dataclasses import asdict, replace
 from importlib.util import find_spec
 from unittest import skipUnless
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -143,6 +144,29 @@ class ContractTest(InFolder):
             with self.subTest(name), self.assertRaisesRegex(LiveError, words):
                 controller.begin(**good | {name: value})
         controller.begin(**good)
+
+    @skipUnless(find_spec("websockets"), "websockets is not installed")
+    def test_controller_server_and_runner_judge_quaternions_alike(self):
+        from xreset.live.serve import _Episode
+
+        episode = _Episode(load_controller(self.out))
+        controller = episode._controller
+        goal = {"goal_pos": [0.5, 0.3, 0.2], "goal_quat": [1, 0, 0, 0]}
+        begin = {"begin": goal | {"object": "brick", "target": self.home}}
+        self.assertEqual(episode.answer(json.dumps(begin)), {"begun": True})
+        long = [1.3, 0, 0, 0]
+        message = json.dumps({"goal": goal | {"goal_quat": long}})
+        driver = Robot(
+            self.home, lambda time, reading: replace(reading, object_quat=np.array(long))
+        )
+        self.assertIn("expected a unit quaternion", episode.answer(message)["error"])
+        with self.assertRaisesRegex(LiveError, "expected a unit quaternion"):
+            controller.set_goal(goal["goal_pos"], long)
+        self.assertTrue(Runner(controller, driver).run(0.05).refused.all())
+        with patch("xreset.runtime.rotations.UNIT_TOLERANCE", 0.5):
+            self.assertEqual(episode.answer(message), {"goal": True})
+            controller.set_goal(goal["goal_pos"], long)
+            self.assertFalse(Runner(controller, driver).run(0.05).refused.any())
 
     def test_another_version_and_damage_are_one_sentence(self):
         file = self.out / "contract.json"

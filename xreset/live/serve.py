@@ -17,6 +17,7 @@ from xreset.checks import check_port
 from xreset.errors import XResetError, needs
 from xreset.runtime import Controller, LiveError, OnnxActor, Reading
 from xreset.runtime.remote import LIVE_SCHEMA
+from xreset.runtime.rotations import is_unit
 
 with needs("websockets", "serve"):
     from websockets.exceptions import ConnectionClosed
@@ -188,7 +189,7 @@ def _goal(given: Message) -> tuple[np.ndarray, np.ndarray]:
 
 def _quaternion(given: Message, name: str) -> np.ndarray:
     value = _numbers(given, name, 4)
-    if abs(np.linalg.norm(value) - 1.0) > 0.01:
+    if not is_unit(value):
         raise LiveError(
             f"{name} has length {np.linalg.norm(value):.3f}, expected a unit quaternion (w, x, y, z)."
         )

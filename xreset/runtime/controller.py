@@ -13,7 +13,7 @@ import numpy as np
 from .contract import POLICY, LiveError, read_contract
 from .driver import Array, Links, Reading
 from .kinematics import Kinematics
-from .rotations import multiply, rotate
+from .rotations import is_unit, multiply, rotate
 
 
 class OnnxActor:
@@ -140,7 +140,7 @@ class Controller:
     def set_goal(self, pos: Array, quat: Array) -> None:
         """Set the goal pose, also while the policy acts; shapes and errors as for :meth:`begin`."""
         goal_quat = self._of_each(quat, 4)
-        if not (np.abs(np.linalg.norm(goal_quat, axis=-1) - 1.0) <= 0.01).all():
+        if not is_unit(goal_quat).all():
             raise LiveError(f"The goal has {quat}, expected a unit quaternion (w, x, y, z).")
         self._goal_pos = self._origin(self._of_each(pos, 3), goal_quat)
         self._goal_quat = goal_quat

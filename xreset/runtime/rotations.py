@@ -9,6 +9,14 @@ import numpy as np
 
 Array = np.ndarray
 
+UNIT_TOLERANCE = 0.01
+"""How far the length of a quaternion may be from 1."""
+
+
+def is_unit(quat: Array) -> Array:
+    """[...] bool: whether quaternions [..., 4] have length 1, and no number that is not finite."""
+    return np.abs(np.linalg.norm(quat, axis=-1) - 1.0) <= UNIT_TOLERANCE
+
 
 def _fused(a: Array, b: Array, c: Array) -> Array:
     """Return a * b + c in float32, rounded once."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from .controller import Controller
 from .driver import Array, Driver, Links, Reading
+from .rotations import is_unit
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,8 +184,7 @@ class Runner:
         joints_sound = _finite(new.joint_pos) & _finite(new.joint_vel)
         if new.tip_force is not None:
             joints_sound &= _finite(new.tip_force.reshape(len(joints_sound), -1))
-        length = np.linalg.norm(new.object_quat, axis=1)
-        pose_sound = _finite(new.object_pos) & (np.abs(length - 1.0) < 0.01)
+        pose_sound = _finite(new.object_pos) & is_unit(new.object_quat)
         old = self._reading
         if old is None:
             nothing = np.full(len(joints_sound), -np.inf)

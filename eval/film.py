@@ -10,7 +10,7 @@ from xreset.env import ManipulationEnv
 from xreset.errors import XResetError
 from xreset.eval.policy_spec import PolicySpec, load_policy
 from xreset.eval.report.clips import encode_mp4
-from xreset.files import write_whole
+from xreset.files import check_suffix, write_whole
 
 
 def film(
@@ -37,8 +37,7 @@ def film(
         PolicyError: the policy is unknown, or cannot play in this environment.
         XResetError: the path does not end in ``.mp4``, the world does not exist, or the film cannot be encoded.
     """
-    if Path(path).suffix.lower() != ".mp4":
-        raise XResetError(f"{path} is not the name of a film. Expected a name that ends in .mp4.")
+    check_suffix("path", path, ".mp4")
     if not 0 <= world < env.num_envs:
         raise XResetError(f"World {world} does not exist. Choose one from 0 to {env.num_envs - 1}.")
     policy = load_policy(policy)

@@ -478,7 +478,11 @@ class TrainingTest(WithBank):
         self.assertEqual(own.read_bytes(), first)
         moved = shutil.copy(latest_checkpoint(out), self.folder)
         for checkpoint, target, problem in (
-            (latest_checkpoint(out), "policy.pt", "Expected a name that ends in .onnx"),
+            (
+                latest_checkpoint(out),
+                "policy.pt",
+                "^policy is policy.pt, expected a name that ends in .onnx",
+            ),
             (out / "checkpoints" / "9.pt", own, "there is no .*9.pt .checkpoint"),
             (out, own, "is a folder or a device, expected a file .checkpoint"),
             (moved, own, "is not a run folder"),

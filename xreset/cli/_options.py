@@ -12,7 +12,7 @@ from typing import Any
 
 from xreset.checks import LAST_PORT, Options
 from xreset.errors import XResetError
-from xreset.files import claim
+from xreset.files import check_suffix, claim
 from xreset.plugins import existing_device
 
 _COUNTS = {
@@ -68,9 +68,8 @@ def _check(options: dict[str, Any]) -> None:
                 raise XResetError(
                     f"{flag} is {value}, expected a whole number from {low} to {high}."
                 )
-        suffix = _SUFFIXES.get(name)
-        if suffix and value.suffix.lower() != suffix:
-            raise XResetError(f"{flag} is {value}, expected a name that ends in {suffix}.")
+        if name in _SUFFIXES:
+            check_suffix(flag, value, _SUFFIXES[name])
         for text in value if isinstance(value, tuple) else (value,):
             if isinstance(text, str | Path) and len(str(text)) > _LONGEST:
                 raise XResetError(

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING
 import torch
 from tensordict import TensorDict
 
-from xreset.errors import XResetError
-from xreset.files import atomic_write, code_version, file_hash, must_exist
+from xreset.files import atomic_write, check_suffix, code_version, file_hash, must_exist
 from xreset.learning.checkpoint import must_fit, read_checkpoint
 from xreset.learning.model import ExportedPolicy, PointNetLstmModel, make_actor
 from xreset.learning.run import read_run
@@ -127,10 +126,7 @@ def export_checkpoint(checkpoint: str | Path, policy: str | Path) -> None:
         XResetError: the name of the policy does not end in ``.onnx``, or the file cannot be written.
     """
     checkpoint = Path(checkpoint)
-    if Path(policy).suffix != ".onnx":
-        raise XResetError(
-            f"{policy} is not the name of a policy. Expected a name that ends in .onnx."
-        )
+    check_suffix("policy", policy, ".onnx")
     must_exist(checkpoint, "checkpoint")
     folder = checkpoint.parent.parent
     run = read_run(folder)

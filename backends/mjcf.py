@@ -51,7 +51,7 @@ _FINE = 1.0 / 200.0
 _SOLIMP = (0.95, 0.99, 0.001, 0.5, 2.0)
 _SOLIMP_MIMIC = (0.99, 0.999, 0.001, 0.5, 2.0)
 _STIFF_MIMIC = 0.8
-"""Share of a mimic joint's lag that the next step takes away; its rate goes wholly."""
+"""Share of a mimic joint's lag behind its source that one step removes. The lag's rate is removed as a whole."""
 _CONDIM = 4
 _ROLLING = 1e-4  # MuJoCo wants a positive number although condim 4 does not use it
 _ARENA = 16 << 20  # bytes for contacts and constraints of one MjData
@@ -62,6 +62,10 @@ _GEOM_TYPES = {
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
     "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
     "hull": mujoco.mjtGeom.mjGEOM_MESH,
+}
+_JOINT_TYPES = {
+    "revolute": mujoco.mjtJoint.mjJNT_HINGE,
+    "prismatic": mujoco.mjtJoint.mjJNT_SLIDE,
 }
 _PARKED_SIZE = 1e-6
 # in the object's frame: out of everything's reach wherever the object is
@@ -130,15 +134,7 @@ def compile_scene(
     _add_drives(spec, scene, joints, names)
     frames = TrackedFrames(robot)
     sensed = add_sensors(spec, robot, frames, roles) if sensors else []
-    try:
-        model = spec.compile()
-    except ValueError as error:
-        thing = scene.objects[object_index].name
-        raise XResetError(
-            f"MuJoCo refuses the robot {scene.robot.name!r} with the object {thing!r}: {error}"
-        ) from error
-    _let_com_move(model, model.body("object").id)
-    model.body_gravcomp[model.body("object").id] = 0.0
+    model = _compiled(spec, scene, scene.objects[object_index])
     geoms = [model.geom(i).name for i in range(model.ngeom)]
     bodies = [model.body(body_name(body)).id for body in robot.bodies]
     joint_ids = [model.joint(name).id for name in names]
@@ -160,6 +156,20 @@ def compile_scene(
         parked=np.array([name in parked for name in geoms]),
         sensed_tip=np.array(sensed, dtype=np.int64),
     )
+
+
+def _compiled(spec: mujoco.MjSpec, scene: SceneSpec, obj: ObjectSpec) -> mujoco.MjModel:
+    """Return the model, whose object has its weight and its own centre of mass."""
+    try:
+        model = spec.compile()
+    except ValueError as error:
+        raise XResetError(
+            f"MuJoCo refuses the robot {scene.robot.name!r} with the object {obj.name!r}: {error}"
+        ) from error
+    body = model.body("object").id
+    _let_com_move(model, body)
+    model.body_gravcomp[body] = 0.0
+    return model
 
 
 # Options --------------------------------------------------------------------------------------------------------------
@@ -268,9 +278,7 @@ def _add_joint(element: mujoco.MjsBody, joint: Joint, scene: SceneSpec) -> None:
     limited = bool(np.isfinite(joint.lower) and np.isfinite(joint.upper))
     element.add_joint(
         name=joint.name,
-        type=mujoco.mjtJoint.mjJNT_HINGE
-        if joint.type == "revolute"
-        else mujoco.mjtJoint.mjJNT_SLIDE,
+        type=_JOINT_TYPES[joint.type],
         axis=joint.axis,
         limited=limited,
         range=(joint.lower, joint.upper) if limited else (0.0, 0.0),
@@ -289,13 +297,9 @@ def _limit_self_collision(
     MuJoCo excludes whole bodies. Where only some links of two bodies may collide, the bodies are excluded and the geoms
     of those links are paired.
     """
-    friction = (
-        scene.friction.link,
-        scene.friction.link,
-        scene.friction.torsional,
-        _ROLLING,
-        _ROLLING,
-    )
+    contact = _contact(scene.friction.link, scene)
+    slide, spin, roll = contact["friction"]
+    contact["friction"] = (slide, slide, spin, roll, roll)
     for i, j in combinations(range(len(geoms)), 2):
         pairs = list(product(geoms[i], geoms[j]))
         allowed = [(a, b) for a, b in pairs if robot.may_collide(geoms[i][a], geoms[j][b])]
@@ -303,14 +307,7 @@ def _limit_self_collision(
             continue
         spec.add_exclude(bodyname1=body_name(robot.bodies[i]), bodyname2=body_name(robot.bodies[j]))
         for a, b in allowed:
-            spec.add_pair(
-                geomname1=a,
-                geomname2=b,
-                condim=_CONDIM,
-                friction=friction,
-                solref=_solref(scene),
-                solimp=_SOLIMP,
-            )
+            spec.add_pair(geomname1=a, geomname2=b, **contact)
 
 
 def _add_drives(
@@ -354,9 +351,10 @@ def _add_drives(
 
 
 def _padded(values: Sequence[float], length: int = mujoco.mjNGAIN) -> np.ndarray:
-    out = np.zeros(length)
-    out[: len(values)] = values
-    return out
+    """Return values, followed by zeros, as MuJoCo stores the parameters of an element."""
+    padded = np.zeros(length)
+    padded[: len(values)] = values
+    return padded
 
 
 # Object ---------------------------------------------------------------------------------------------------------------
@@ -366,7 +364,7 @@ def _add_object(
     spec: mujoco.MjSpec, scene: SceneSpec, index: int, slots_for: Sequence[int]
 ) -> set[str]:
     """Add the object and empty slots; return the names of the geoms that are parked."""
-    thing = scene.objects[index]
+    obj = scene.objects[index]
     hulls: dict[int, list[str]] = {}
     slots: Counter[str] = Counter()
     for i in sorted({*slots_for, index}):
@@ -377,7 +375,7 @@ def _add_object(
 
     # MuJoCo ignores gravcomp unless it is set while compiling.
     body = spec.worldbody.add_body(name="object", gravcomp=1.0, explicitinertial=True)
-    inertia = object_inertia(thing)
+    inertia = object_inertia(obj)
     _set_inertia(body, replace(inertia, com=inertia.com + _ASIDE))
     body.add_joint(
         name="object", type=mujoco.mjtJoint.mjJNT_FREE, align=mujoco.mjtAlignFree.mjALIGNFREE_FALSE
@@ -385,7 +383,7 @@ def _add_object(
     parked = set()
     common = {"contype": _HIT_OBJECT, "conaffinity": 0, **_contact(0.0, scene)}
     for kind, geom_type in _GEOM_TYPES.items():
-        pieces = [piece for piece in thing.pieces if piece.geometry.kind == kind]
+        pieces = [piece for piece in obj.pieces if piece.geometry.kind == kind]
         for slot in range(slots[kind]):
             name = f"object/{kind}/{slot}"
             if slot < len(pieces):
@@ -405,10 +403,10 @@ def _add_object(
     return parked
 
 
-def _add_hulls(spec: mujoco.MjSpec, thing: ObjectSpec, index: int) -> list[str]:
-    if not thing.pieces:
-        raise ObjectError(f"object {thing.name!r} has no collision piece; it needs at least one.")
-    hulls = [piece.geometry for piece in thing.pieces if piece.geometry.kind == "hull"]
+def _add_hulls(spec: mujoco.MjSpec, obj: ObjectSpec, index: int) -> list[str]:
+    if not obj.pieces:
+        raise ObjectError(f"object {obj.name!r} has no collision piece; it needs at least one.")
+    hulls = [piece.geometry for piece in obj.pieces if piece.geometry.kind == "hull"]
     return [_add_mesh(spec, f"object/{index}/{i}", hull) for i, hull in enumerate(hulls)]
 
 

@@ -71,12 +71,12 @@ class SceneModel:
 
 
 def body_name(body: Body) -> str:
-    """The name of a body of the robot."""
+    """Return the name of a body of the robot."""
     return f"robot/{body.name}"
 
 
 def pos_quat(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Position [3] and quaternion [4] (w, x, y, z) of a pose [4, 4]."""
+    """Return position [3] and quaternion [4] (w, x, y, z) of a pose [4, 4]."""
     return T[:3, 3], matrix_to_quat(T[:3, :3])
 
 

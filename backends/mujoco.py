@@ -50,7 +50,7 @@ class MujocoWorld(World):
         self._model = model = copy(at.model)  # each world has parameters of its own
         self._data = data = mujoco.MjData(model)
         self._option = model.opt
-        # A broken world must be seen, not put back silently. Sensors are read on demand, not in each step.
+        # A broken world must be reported, not reset silently. Sensors are read on demand, not in each step.
         self._sensing = model.opt.disableflags | mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self._silent = self._sensing | mujoco.mjtDisableBit.mjDSBL_SENSOR
         self._option.disableflags = self._silent
@@ -109,7 +109,7 @@ class MujocoWorld(World):
             "object_pos": self._object_pos,
             "object_quat": self._object_quat,
             "object_linvel": self._object_linvel,
-            # a free joint's is in the body's frame
+            # MuJoCo has the angular velocity of a free joint in the body's frame
             "object_angvel": _rotate(self._object_quat, self._object_spin),
         }
 
@@ -145,11 +145,16 @@ class MujocoWorld(World):
         return not finite, self._overflowed
 
     def mass_properties(self) -> list[Inertia]:
-        m = self._model
+        model = self._model
         found = []
         for i in (*self._at.moving_bodies, self._at.object_body):
-            com, quat, moments = (x[i] for x in (m.body_ipos, m.body_iquat, m.body_inertia))
-            found.append(Inertia(mass=m.body_mass[i], com=com, quat=quat, moments=moments))
+            inertia = Inertia(
+                mass=model.body_mass[i],
+                com=model.body_ipos[i],
+                quat=model.body_iquat[i],
+                moments=model.body_inertia[i],
+            )
+            found.append(inertia)
         return found
 
     def set_object_inertia(self, inertia: Inertia) -> None:

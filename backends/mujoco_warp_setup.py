@@ -115,12 +115,8 @@ def fill_batched(
                 value[scene.parked] = -1  # no mesh in this world
             values.append(value)
         view = wp.to_torch(getattr(model, name))
-        table = (
-            torch.as_tensor(np.stack(values), device=row.device)
-            .to(view.dtype)
-            .reshape(len(order), *view.shape[1:])
-        )
-        view.copy_(table[row])
+        table = torch.as_tensor(np.stack(values), dtype=view.dtype, device=row.device)
+        view.copy_(table.view(len(order), *view.shape[1:])[row])
 
 
 @contextmanager

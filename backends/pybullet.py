@@ -190,10 +190,11 @@ class PybulletWorld(World):
             _, first, second, first_link, second_link, _, _, normal, _, press, *friction = contact
             if self._object not in (first, second):
                 continue
+            along, along_direction, across, across_direction = friction
             force = (
                 press * np.array(normal)
-                + friction[0] * np.array(friction[1])
-                + friction[2] * np.array(friction[3])
+                + along * np.array(along_direction)
+                + across * np.array(across_direction)
             )
             link = second_link
             if first != self._object:  # the force is on the first body
@@ -210,10 +211,10 @@ class PybulletWorld(World):
         found = [
             self._inertia_of(self._robot, link) for link in range(1, len(self._mechanism.bodies))
         ]
-        thing = self._inertia_of(self._object, -1)
+        obj = self._inertia_of(self._object, -1)
         own = self._inertia
         in_mesh = replace(
-            thing, com=own.com + rotate(own.quat, thing.com), quat=multiply(own.quat, thing.quat)
+            obj, com=own.com + rotate(own.quat, obj.com), quat=multiply(own.quat, obj.quat)
         )
         return [*found, in_mesh]
 

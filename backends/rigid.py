@@ -329,7 +329,7 @@ def sum_contacts(tips: int, contacts: Iterable[tuple[int, np.ndarray]]) -> Conta
     return tip_force, tip_touch, table_force
 
 
-# Few quaternions ------------------------------------------------------------------------------------------------------
+# Quaternions ----------------------------------------------------------------------------------------------------------
 # For one or a handful of vectors [3] or [n, 3], where numpy's and scipy's own functions cost more than the arithmetic.
 
 

@@ -154,8 +154,13 @@ class SapienWorld(World):
         found = []
         for body in (*self._bodies[1:], self._object):
             frame = body.cmass_local_pose
-            com, quat, moments = (x.astype(float) for x in (frame.p, frame.q, body.inertia))
-            found.append(Inertia(mass=body.mass, com=com, quat=quat, moments=moments))
+            inertia = Inertia(
+                mass=body.mass,
+                com=frame.p.astype(float),
+                quat=frame.q.astype(float),
+                moments=body.inertia.astype(float),
+            )
+            found.append(inertia)
         return found
 
     def set_object_inertia(self, inertia: Inertia) -> None:
@@ -420,7 +425,7 @@ def _configured(physx: Any) -> Iterator[None]:
 
 
 def _engine() -> Any:
-    """The module ``sapien``; ``BackendUnavailableError`` if it cannot be imported."""
+    """Return the module ``sapien``; ``BackendUnavailableError`` if it cannot be imported."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about Vulkan, which nothing here renders with

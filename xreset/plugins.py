@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 ENGINES = "xreset.backends"
 """Entry-point group of engines: ``name = "package.module:BackendClass"``."""
 ROBOTS = "xreset.robots"
-"""Entry-point group of robots: ``name = "package.module"``, the module beside a ``robot.toml``."""
+"""Entry-point group of robots: ``name = "package.module"``, the module next to a ``robot.toml``."""
 _KINDS = {ENGINES: ("backend", BackendUnavailableError), ROBOTS: ("robot", RobotError)}
 """What messages call a plugin of a group, and the class of its errors."""
 

@@ -16,7 +16,7 @@ from xreset.backends.conformance.results import Differences, Measured
 from xreset.backends.conformance.scene import ball, flat_objects
 from xreset.geometry.rotations import quat_angle
 from xreset.physics import Parameter, State
-from xreset.spec import GRAVITY, lowest_point
+from xreset.spec import GRAVITY, SceneSpec, lowest_point
 
 _FACTORS = torch.tensor([2.0, 0.5, 4.0, 0.25])
 
@@ -51,19 +51,19 @@ def resting_on_a_side(bench: Bench) -> Measured:
     quat = torch.tensor([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])  # by 90 degrees about x
     turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     start = replace_fields(bench.start(), object_quat=quat)
-    heights = [-lowest_point(thing.pieces, turn) for thing in bench.objects]
+    heights = [-lowest_point(obj.pieces, turn) for obj in bench.objects]
     start.object_pos[:, 2] = torch.tensor(heights)
     worlds = bench.worlds()
     worlds.advance(start, SETTLE)
     force = worlds.contacts().table_force / (GRAVITY * bench.masses)[:, None]
-    stable = [i for i, thing in enumerate(bench.objects) if thing.name != "can"]  # a can rolls
+    stable = [i for i, obj in enumerate(bench.objects) if obj.name != "can"]  # a can rolls
     return {"vertical force": force[stable, 2] - 1.0, "horizontal force": force[stable, :2]}
 
 
 def rest_and_bounce(bench: Bench) -> Measured:
     """Put flat objects on the table, then drop them from 30 mm: their height after a second, and their bounce."""
     objects = flat_objects()
-    names = [thing.name for thing in objects]
+    names = [obj.name for obj in objects]
     scene = replace(bench.scene, objects=objects)
     object_index = range(len(objects))
     start = bench.initial(scene, object_index)
@@ -126,21 +126,10 @@ def _against_built(
             worlds.set_parameter(name, value, rows)
     found = {name: move(bench, worlds, range(bench.NUM_WORLDS)) for name, move in motions.items()}
     errors: dict[str, list[tuple[str, Differences]]] = defaultdict(list)
-    for i, thing in enumerate(bench.objects):
+    for i, obj in enumerate(bench.objects):
         given = {name: value[i].double().numpy() for name, value in parameters.items()}
-        mass = float(given.get("object_mass", thing.mass))
-        growth = given.get("object_inertia", 1.0) * mass / thing.mass
-        thing = replace(
-            thing,
-            mass=mass,
-            inertia=growth * np.asarray(thing.inertia),
-            com=np.asarray(thing.com) + given.get("object_com", 0.0),
-        )
-        scene = replace(bench.scene, objects=(thing,))
-        if "friction" in given:
-            tip, link, table = given["friction"].tolist()
-            friction = replace(scene.friction, tip=tip, link=link, table=table)
-            scene = replace(scene, friction=friction)
+        scene = _built_with(replace(bench.scene, objects=(obj,)), given)
+        weight = GRAVITY * scene.objects[0].mass
         with bench.other(scene) as other:
             for motion, move in motions.items():
                 state, force = found[motion]
@@ -149,11 +138,29 @@ def _against_built(
                 off = {
                     "pos": state.object_pos[i] - built.object_pos[0],
                     "angle": quat_angle(quat, built.object_quat[0].double()),
-                    "force": (force[i] - force_built[0]) / (GRAVITY * thing.mass),
+                    "force": (force[i] - force_built[0]) / weight,
                 }
                 for what, error in off.items():
-                    errors[f"{motion}, {what}"].append((thing.name, error))
+                    errors[f"{motion}, {what}"].append((obj.name, error))
     return errors
+
+
+def _built_with(scene: SceneSpec, given: dict[Parameter, np.ndarray]) -> SceneSpec:
+    """Return a scene of one object that states the values that a world of another scene is given."""
+    (obj,) = scene.objects
+    mass = float(given.get("object_mass", obj.mass))
+    growth = given.get("object_inertia", 1.0) * mass / obj.mass
+    changed = replace(
+        obj,
+        mass=mass,
+        inertia=growth * obj.inertia,
+        com=obj.com + given.get("object_com", 0.0),
+    )
+    friction = scene.friction
+    if "friction" in given:
+        tip, link, table = given["friction"].tolist()
+        friction = replace(friction, tip=tip, link=link, table=table)
+    return replace(scene, objects=(changed,), friction=friction)
 
 
 def _slide(bench: Bench, worlds: Worlds, rows: Sequence[int]) -> tuple[State, Tensor]:
@@ -267,8 +274,8 @@ def _spin_lost(
     bench: Bench, count: int, seconds: float, prepare: Callable[[Worlds], None]
 ) -> Tensor:
     """[count] what balls on the table lose of their spin, as a share of what the scene's torsional friction takes."""
-    thing = ball()
-    scene = replace(bench.scene, objects=(thing,))
+    obj = ball()
+    scene = replace(bench.scene, objects=(obj,))
     object_index = [0] * count
     start = replace_fields(
         bench.initial(scene, object_index), object_angvel=torch.tensor([0.0, 0.0, 10.0])
@@ -277,7 +284,7 @@ def _spin_lost(
     with bench.other(scene, object_index) as worlds:
         prepare(worlds)
         lost = 10.0 - worlds.advance(start, steps).object_angvel[:, 2]
-    braking = scene.friction.torsional * thing.mass * GRAVITY / float(thing.inertia[2, 2])
+    braking = scene.friction.torsional * obj.mass * GRAVITY / float(obj.inertia[2, 2])
     return lost / (braking * steps * scene.timestep)
 
 

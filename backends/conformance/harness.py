@@ -156,7 +156,7 @@ class Bench:
     @property
     def masses(self) -> Tensor:
         """[N] mass of each shared world's object."""
-        return torch.tensor([thing.mass for thing in self.objects])
+        return torch.tensor([obj.mass for obj in self.objects])
 
     @property
     def twins(self) -> list[int]:

@@ -57,8 +57,8 @@ def free_spin(bench: Bench) -> Measured:
     end = bench.worlds().advance(start, _STEPS).map(Tensor.double)
     t = _STEPS * bench.scene.timestep
     gravity = np.array([0.0, 0.0, -GRAVITY])
-    com = np.array([thing.com for thing in bench.objects])
-    spins = np.array([_spin(thing, quat, angvel, t) for thing in bench.objects])
+    com = np.array([obj.com for obj in bench.objects])
+    spins = np.array([_spin(obj, quat, angvel, t) for obj in bench.objects])
     turn = turn_of(spins[:, :4])
     omega = turn.apply(spins[:, 4:])
     arm_at_start = turn_of(quat).apply(com)
@@ -104,8 +104,8 @@ def object_wrench(bench: Bench) -> Measured:
     state = worlds.state()
     after = worlds.advance(bench.in_the_air(), steps)
     t = steps * bench.scene.timestep
-    com = torch.tensor(np.stack([thing.com for thing in bench.objects])).float()
-    inertia = torch.tensor(np.stack([thing.inertia for thing in bench.objects])).float()
+    com = torch.tensor(np.stack([obj.com for obj in bench.objects])).float()
+    inertia = torch.tensor(np.stack([obj.inertia for obj in bench.objects])).float()
     inertia = factor[:, None, None] * inertia
     gained = force / (factor * bench.masses)[:, None] * t - torch.tensor([0.0, 0.0, GRAVITY * t])
     omega = torch.linalg.solve(inertia, twist.expand_as(com)) * t  # the object has hardly turned
@@ -123,9 +123,8 @@ def _share(found: Tensor, expected: Tensor) -> Tensor:
     return (found - expected).abs().amax(dim=1) / expected.abs().amax(dim=1)
 
 
-def _spin(thing: ObjectSpec, quat: np.ndarray, angvel: np.ndarray, t: float) -> np.ndarray:
+def _spin(obj: ObjectSpec, quat: np.ndarray, angvel: np.ndarray, t: float) -> np.ndarray:
     """[7] orientation, and angular velocity in the body's frame, after a time t without torque: Euler's equations."""
-    inertia = np.asarray(thing.inertia)
     body = turn_of(quat)
 
     def motion(_, y: np.ndarray) -> np.ndarray:
@@ -133,7 +132,9 @@ def _spin(thing: ObjectSpec, quat: np.ndarray, angvel: np.ndarray, t: float) -> 
         v = y[1:4]
         omega = y[4:]
         turn = 0.5 * np.array([-v @ omega, *(w * omega + np.cross(v, omega))])
-        return np.concatenate((turn, np.linalg.solve(inertia, -np.cross(omega, inertia @ omega))))
+        return np.concatenate(
+            (turn, np.linalg.solve(obj.inertia, -np.cross(omega, obj.inertia @ omega)))
+        )
 
     start = np.concatenate((quat, body.inv().apply(angvel)))
     return solve_ivp(motion, (0.0, t), start, rtol=1e-9, atol=1e-9).y[:, -1]

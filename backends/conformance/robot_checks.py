@@ -35,8 +35,8 @@ def mass_properties(bench: Bench) -> Measured:
     bodies = mechanism(bench.scene.robot).bodies[1:]
     robot = [(body.name, body.inertia) for body in bodies]
     errors = defaultdict(list)
-    for world, thing in enumerate(bench.objects):
-        for i, (name, expected) in enumerate([*robot, (thing.name, object_inertia(thing))]):
+    for world, obj in enumerate(bench.objects):
+        for i, (name, expected) in enumerate([*robot, (obj.name, object_inertia(obj))]):
             matrix = found.inertia[world, i].numpy()
             off = {
                 "mass": found.mass[world, i] / expected.mass - 1.0,

@@ -12,7 +12,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from xreset.description import read_description
-from xreset.geometry.shapes import mass_properties, surface_of, transform
+from xreset.geometry.shapes import mass_properties, mesh_arrays, surface_of, transform
 from xreset.spec import Geometry, ObjectSpec, PairFriction, RobotSpec, SceneSpec, Shape
 
 
@@ -81,9 +81,8 @@ def shape(
     geometry = Geometry(kind=kind, size=tuple(size))  # pyright: ignore[reportArgumentType]
     if kind == "hull":
         mesh = trimesh.creation.box(extents=2.0 * np.array(size))
-        geometry = Geometry(
-            kind="hull", vertices=np.asarray(mesh.vertices), faces=np.asarray(mesh.faces)
-        )
+        vertices, faces = mesh_arrays(mesh)
+        geometry = Geometry(kind="hull", vertices=vertices, faces=faces)
     turn = Rotation.from_euler("z", yaw).as_matrix()
     return Shape(geometry=geometry, T_body_shape=transform(turn, pos))
 

@@ -88,13 +88,13 @@ def objects_in_a_batch(bench: Bench) -> Measured:
 
     together, forces = drop(bench.worlds(), bench.start())
     errors = {}
-    for i, thing in enumerate(bench.scene.objects):
+    for i, obj in enumerate(bench.scene.objects):
         with bench.other(bench.scene, [i]) as alone:
             state, force = drop(alone, bench.initial(bench.scene, [i]))
         difference = state_errors(together[[i]], state)
-        errors[f"pos of {thing.name}"] = difference["object_pos"]
-        errors[f"quat of {thing.name}"] = difference["object_quat"]
-        errors[f"weight of {thing.name}"] = float(forces[i] - force[0]) / (thing.mass * GRAVITY)
+        errors[f"pos of {obj.name}"] = difference["object_pos"]
+        errors[f"quat of {obj.name}"] = difference["object_quat"]
+        errors[f"weight of {obj.name}"] = float(forces[i] - force[0]) / (obj.mass * GRAVITY)
     return errors
 
 

@@ -274,7 +274,11 @@ def surface_of(pieces: Sequence[Shape]) -> tuple[np.ndarray, np.ndarray]:
     solid."""
     import trimesh
 
-    mesh = trimesh.util.concatenate([shape_mesh(piece) for piece in pieces])
+    return mesh_arrays(trimesh.util.concatenate([shape_mesh(piece) for piece in pieces]))
+
+
+def mesh_arrays(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices [V, 3] and triangles [F, 3] of a mesh as plain arrays, not as those that trimesh watches."""
     return np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=np.int64)
 
 

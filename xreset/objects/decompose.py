@@ -22,6 +22,7 @@ from xreset.geometry.shapes import (
     half_spaces,
     hull,
     mass_properties,
+    mesh_arrays,
     plane_heights,
     shape_mesh,
     triangle_normals,
@@ -113,7 +114,7 @@ def decompose(mesh: trimesh.Trimesh, settings: Settings = Settings()) -> Pieces:
             or specks only.
         QhullError: the mesh spans no volume.
     """
-    surface = _Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    surface = _Surface(*mesh_arrays(mesh))
     around = mesh.convex_hull
     finished = True
     depth = settings.hull_depth * np.linalg.norm(mesh.extents) or settings.tolerance
@@ -123,7 +124,7 @@ def decompose(mesh: trimesh.Trimesh, settings: Settings = Settings()) -> Pieces:
         deviation = surface.deviation(piece.vertices, piece.faces)
         solid = mesh if mesh.is_volume else around
         volume = solid.volume
-        com, inertia = mass_properties(np.asarray(solid.vertices), np.asarray(solid.faces), 1.0)
+        com, inertia = mass_properties(*mesh_arrays(solid), 1.0)
     else:
         cutter = _Cutter(as_solid(mesh), settings)
         shapes, deviation = cutter.shapes()

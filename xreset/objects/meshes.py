@@ -16,7 +16,7 @@ from scipy.spatial import QhullError
 from xreset.checks import frozen
 from xreset.errors import ObjectError
 from xreset.files import file_hash, write_whole
-from xreset.geometry.shapes import load_mesh, shell_properties
+from xreset.geometry.shapes import load_mesh, mesh_arrays, shell_properties
 from xreset.objects.cache import cached_pieces
 from xreset.objects.decompose import WALL, Pieces, Settings, openings
 from xreset.objects.properties import Properties, properties_of
@@ -111,42 +111,28 @@ def import_with_notes(path: str | Path, name: str) -> Import:
             f"{path} spans no volume: it is flat, or damaged. A solid object is needed."
         ) from error
     notes = [] if mesh.is_volume else [_how_closed(mesh, pieces)]
-    mass = own.mass
-    mass_source = "stated"
-    if mass is None and own.density is None and name in MASSES:
-        mass = MASSES[name]
-        mass_source = "published (YCB)"
+    mass, mass_source = _mass(path, name, own, pieces.volume, notes)
     com = pieces.com
-    if mass is None:
-        density = own.density or DEFAULT_DENSITY
-        mass = density * pieces.volume
-        mass_source = f"{density:g} kg/m^3"
-        inertia = pieces.inertia * mass
-        if own.density is None:
-            notes.append(
-                f"its mass is unknown: {mass:.3f} kg is assumed, by a density of"
-                f" {DEFAULT_DENSITY:.0f} kg/m^3. State `mass` in {path.with_suffix('.toml').name}"
-            )
-    elif mesh.is_volume and mass / pieces.volume < _HOLLOW:
-        com, inertia = shell_properties(np.asarray(mesh.vertices), np.asarray(mesh.faces), mass)
+    inertia = pieces.inertia * mass
+    if own.density is None and mesh.is_volume and mass / pieces.volume < _HOLLOW:
+        com, inertia = shell_properties(*mesh_arrays(mesh), mass)
         litres = pieces.volume * 1e3
         notes.append(
             f"{mass:.3f} kg in {litres:.2f} l is a hollow object: its mass is put on its surface"
         )
-    else:
-        inertia = pieces.inertia * mass
     if not pieces.finished:
         notes.append(
             "cutting took too long and was stopped: a mesh with fewer triangles would fit better"
         )
+    vertices, faces = mesh_arrays(mesh)
     obj = ObjectSpec(
         name=name,
         pieces=pieces.shapes,
         mass=float(mass),
         com=com,
         inertia=inertia,
-        vertices=np.asarray(mesh.vertices, dtype=float),
-        faces=np.asarray(mesh.faces, dtype=np.int64),
+        vertices=vertices,
+        faces=faces,
         source=source,
         friction=own.friction,
     )
@@ -157,6 +143,24 @@ def import_with_notes(path: str | Path, name: str) -> Import:
         mass_source=mass_source,
         tolerance=own.tolerance,
     )
+
+
+def _mass(
+    path: Path, name: str, own: Properties, volume: float, notes: list[str]
+) -> tuple[float, str]:
+    """Return an object's mass [kg] and its source in words; a guess is noted. The volume is that of the solid [m^3]."""
+    if own.mass is not None:
+        return own.mass, "stated"
+    density = own.density
+    if density is None:
+        if name in MASSES:
+            return MASSES[name], "published (YCB)"
+        density = DEFAULT_DENSITY
+        notes.append(
+            f"its mass is unknown: {density * volume:.3f} kg is assumed, by a density of"
+            f" {density:.0f} kg/m^3. State `mass` in {path.with_suffix('.toml').name}"
+        )
+    return density * volume, f"{density:g} kg/m^3"
 
 
 def _how_closed(mesh: trimesh.Trimesh, pieces: Pieces) -> str:

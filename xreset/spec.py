@@ -22,6 +22,7 @@ GRAVITY = 9.81
 """Magnitude of gravity in m/s^2; it points along -z."""
 
 FINGERS = ("thumb", "index", "middle", "ring", "little")
+"""Fingers of the human hand, in the order of the keypoints."""
 
 KEYPOINTS = ("wrist", *(f"{finger}{i}" for finger in FINGERS for i in range(1, 5)))  # noqa: XR002
 """The 21 human hand keypoints in the order of the demonstrations: the wrist, then each finger from base (1) to tip
@@ -88,9 +89,12 @@ class MimicSpec:
     """A joint that follows an actuated one: q = multiplier * q_source + offset."""
 
     joint: Text
+    """URDF joint that follows."""
     source: Text
+    """The actuated joint."""
     multiplier: Number = 1.0
     offset: Number = 0.0
+    """[rad or m]"""
 
 
 @frozen
@@ -133,7 +137,7 @@ class RobotSpec:
     base_quat: tuple[Number, Number, Number, Number]
     """Orientation of the URDF's root link in the world (w, x, y, z)."""
     palm: Text
-    """Link that stands for the hand: origin near the palm's centre, x towards the fingers, z out of the palm's inner
+    """Link whose frame is the hand's: origin near the palm's centre, x towards the fingers, z out of the palm's inner
     side."""
     fingertips: tuple[FingertipSpec, ...]
     """Fingertips, thumb first (length E)."""
@@ -150,7 +154,7 @@ class RobotSpec:
     gravity_compensated: bool = True
     """Whether the robot's own weight is taken off (as an arm's controller does); the object's load stays."""
     home_std: tuple[Number, Number] = (0.075, 0.10)
-    """Spread of the home configuration: standard deviation of arm and hand joints [rad], the paper's Table IX."""
+    """Standard deviation of arm and hand joints around home where episodes begin [rad]: the paper's Table IX."""
     meshes: tuple[Path, ...] = field(default=(), repr=False, compare=False)
     """Mesh files of the URDF's collision shapes."""
     like: str = field(default="", repr=False)
@@ -281,7 +285,11 @@ class SceneSpec:
 
 
 def checked_objects(robot: Any, objects: Any) -> tuple[ObjectSpec, ...]:
-    """Return the objects. Names in place of robot and objects are refused; ``XResetError``."""
+    """Return one or several objects as a tuple.
+
+    Raises:
+        XResetError: names are given in place of the robot or the objects.
+    """
     if not isinstance(robot, RobotSpec):
         raise XResetError(
             f"robot is {shown(robot)}, expected a RobotSpec: xreset.load_robot(NAME)."
@@ -298,10 +306,16 @@ def checked_objects(robot: Any, objects: Any) -> tuple[ObjectSpec, ...]:
 
 
 def check_robot(path: str | Path, what: str, data: Any, robot: RobotSpec) -> None:
-    """Refuse data that were made for another robot, or for another version of this robot; ``FileFormatError``.
+    """Refuse data that were made for another robot, or for another version of this robot.
 
     Args:
+        path: file of the data, for messages.
+        what: what messages call the data.
         data: anything with ``robot``, ``robot_fingerprint`` and ``joint_names``.
+        robot: the robot that the data must fit.
+
+    Raises:
+        FileFormatError: the data do not fit.
     """
     if data.robot != robot.name or data.joint_names != robot.joint_names:
         raise FileFormatError(
@@ -325,7 +339,7 @@ def check_joints(what: str, data: Any, robot: RobotSpec) -> None:
 
 
 def objects_named(objects: Sequence[ObjectSpec], names: Iterable[str]) -> dict[str, ObjectSpec]:
-    """Return the objects with these names, in the order of their names; ``DemoError`` states the missing ones."""
+    """Return the objects with these names, sorted by name; ``DemoError`` lists the missing ones."""
     given = {spec.name: spec for spec in objects}
     needed = sorted(set(names))
     if missing := [name for name in needed if name not in given]:
@@ -336,7 +350,12 @@ def objects_named(objects: Sequence[ObjectSpec], names: Iterable[str]) -> dict[s
 
 
 def lowest_point(shapes: Sequence[Shape], turn: np.ndarray | None = None) -> float:
-    """Smallest z of the shapes above the origin of their body, which is turned by a rotation matrix [3, 3] [m]."""
+    """Return the height of the lowest point of the shapes above the origin of their body [m].
+
+    Args:
+        shapes: shapes in the body's frame.
+        turn: [3, 3] rotation of the body; None: none.
+    """
     up = np.array([0.0, 0.0, 1.0]) if turn is None else turn[2]
     return min(_lowest(shape, up) for shape in shapes)
 

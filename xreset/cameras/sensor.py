@@ -93,7 +93,7 @@ class Cameras:
         y, x = torch.meshgrid(
             *(torch.arange(n, device=device) + 0.5 - n / 2 for n in size), indexing="ij"
         )
-        # at half a field of view of 45 deg
+        # tangents of the rays' angles where half a field of view is 45 degrees
         self._pixels = torch.stack((x, y), dim=-1).flatten(0, 1) * 2 / config.height
         self.shift = torch.zeros(worlds, count, 3, device=device)
         self.turn = torch.zeros_like(self.shift)
@@ -227,10 +227,10 @@ class Cameras:
     def _with_errors(self, depth: Tensor, generator: torch.Generator) -> Tensor:
         """Return depths [N, C, H, W] as a camera measures them; 0 where it does not."""
         scale = self.noise_scale.view(-1, 1, 1, 1)
-        seen = self._in_range(depth)
-        inverse = torch.where(seen > 0, 1.0 / seen.clamp_min(1e-6), 0.0)
+        in_range = self._in_range(depth)
+        inverse = torch.where(in_range > 0, 1.0 / in_range.clamp_min(1e-6), 0.0)
         lost = torch.where(
-            _bend(inverse) * seen.square() > self._edge,
+            _bend(inverse) * in_range.square() > self._edge,
             self._edges.maximum(self._holes),
             self._holes,
         )
@@ -239,7 +239,7 @@ class Cameras:
         measured = inverse + scale * self._spread * error
         step = scale * self._step
         measured = torch.where(step > 0, (measured / step.clamp_min(1e-9)).round() * step, measured)
-        is_measured = (seen > 0) & (chance >= scale * lost) & (measured > 0)
+        is_measured = (in_range > 0) & (chance >= scale * lost) & (measured > 0)
         return torch.where(is_measured, self._in_range(1.0 / measured.clamp_min(1e-6)), 0.0)
 
     def _points(self, image: Tensor, is_object: Tensor, generator: torch.Generator) -> Tensor:

@@ -378,8 +378,8 @@ def on_something(demos: Demos, objects: Mapping[str, ObjectSpec]) -> np.ndarray:
 def grounded(demos: Demos, objects: Mapping[str, ObjectSpec]) -> Demos:
     """Shift every sequence along z so that its object's lowest vertex is at z = 0 in the first frame.
 
-    A sequence whose object starts on top of something else stays where it is: its hand would else reach into the table.
-    The scene does not have the thing below the object, so in physics the object first drops by that height.
+    A sequence whose object starts on top of something stays where it is, or its hand would reach into the table. The
+    scene does not have what is below the object, so in physics the object first drops by that height.
     """
     height = _start_height(demos, objects)
     height[height > _ON_TABLE] = 0.0

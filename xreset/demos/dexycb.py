@@ -107,7 +107,8 @@ def _read(folder: Path, meta: Mapping[str, Any], extrinsics: _Poses) -> Demos:
 def _read_joints(folder: Path, frame: int, cameras: _Poses) -> np.ndarray:
     """[21, 3] hand joints in the world frame, from the first camera with labels of this frame; NaN without a hand.
 
-    DexYCB's joint order is this project's keypoint order. All cameras' labels come from one fit: one camera is enough.
+    DexYCB's joint order is this project's keypoint order. One fit gave the labels of all cameras, so one camera is
+    enough.
     """
     for serial, pose in cameras.items():
         path = folder / serial / f"labels_{frame:06d}.npz"
@@ -123,7 +124,7 @@ def _read_joints(folder: Path, frame: int, cameras: _Poses) -> np.ndarray:
 
 
 def _read_meta(path: Path) -> dict[str, Any]:
-    """Return the entries of a sequence's meta.yml: texts, and the numbers as integers."""
+    """Return the entries of a sequence's meta.yml, with its numbers as integers."""
     meta = _read_yaml(path)
     try:
         meta["ycb_ids"] = [int(number) for number in meta["ycb_ids"]]

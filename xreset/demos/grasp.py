@@ -76,7 +76,7 @@ class Solid:
         return cls(planes=tuple(planes), vertices=vertices, com=com, pos=pos, rotation=rotation)
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """[...] signed distance of points [..., 3] to the surface, negative inside; outside it is a lower bound near
+        """[...] signed distance of points [..., 3] to the surface [m], negative inside; a lower bound outside, near
         edges."""
         distances = [plane_heights(points, planes).max(axis=-1) for planes in self.planes]
         return np.min(distances, axis=0)
@@ -190,13 +190,13 @@ def _centers(
 
 
 def _part_around(solid: Solid, origins: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Find the part of the object around each point of a line: the pieces that hold the point, and those that overlap
-    them on the line.
+    """Find the part of the object around points, along lines through them: the pieces that hold a point, and those that
+    overlap these pieces on the line.
 
     Args:
         solid: the object.
         origins: [n, 5, 3] points.
-        direction: [3] of all lines.
+        direction: [3] unit vector along all lines.
 
     Returns:
         [6, n, 5] where the part starts and ends on the line, inf and -inf where no piece holds the point [m]; the free

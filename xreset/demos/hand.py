@@ -86,12 +86,12 @@ def _chain(base: np.ndarray, bones: np.ndarray) -> np.ndarray:
 
 
 def hand_axes(direction: np.ndarray, palm: np.ndarray, side: str) -> np.ndarray:
-    """[3, 3] orientation of a hand whose fingers point along ``direction`` and whose palm faces ``palm`` (orthogonal
-    unit vectors)."""
+    """[3, 3] orientation of a hand whose fingers point along ``direction`` [3] and whose palm faces ``palm`` [3], two
+    orthogonal unit vectors."""
     x = -direction if side == "right" else direction
     return np.stack((x, -palm, np.cross(x, -palm)), axis=-1)
 
 
 def bone_lengths(points: np.ndarray) -> np.ndarray:
-    """[F, 20] lengths of the bones between keypoints [F, 21, 3]."""
+    """[F, 20] lengths of the bones between keypoints [F, 21, 3] [m]."""
     return np.linalg.norm(points[:, 1:] - points[:, PARENTS], axis=-1)

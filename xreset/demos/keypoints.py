@@ -177,7 +177,7 @@ def read_transform(path: str | Path) -> np.ndarray:
     return T
 
 
-# Files
+# Files ----------------------------------------------------------------------------------------------------------------
 
 
 def _read_csv(path: Path, name: str) -> Iterator[Arrays]:
@@ -231,7 +231,7 @@ def _numbers(cells: Sequence[str]) -> np.ndarray:
     return np.array([float(cell.strip() or "nan") for cell in cells])
 
 
-# One sequence
+# One sequence ---------------------------------------------------------------------------------------------------------
 
 
 def sequence_of(arrays: Arrays, what: str, convention: Convention) -> Demos:

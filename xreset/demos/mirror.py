@@ -117,8 +117,8 @@ def mirrored(demos: Demos, symmetries: Mapping[str, Symmetry], *, tolerance: flo
 def _plane(
     parameters: np.ndarray, axis: np.ndarray, center: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Return normal and offset of the plane through the center across an axis, tilted by two angles [rad] and moved by
-    a length [0.1 m]."""
+    """Return normal [3] and offset [m] of a plane through the center, across an axis, which is tilted by two angles
+    [rad] and moved by a length [0.1 m]."""
     u = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     u /= np.linalg.norm(u)
     normal = axis + parameters[0] * u + parameters[1] * np.cross(axis, u)

@@ -17,15 +17,14 @@ from xreset.demos.hand import PARENTS
 from xreset.geometry.shapes import turn_of
 
 MEMORY = math.exp(-1 / 8)
-"""Correlation of a finger's error with that of the frame before."""
-
+"""Correlation of a finger's error with its error in the frame before."""
 
 TIERS = {
     "low": {"wrist": 0.010, "finger": 0.0015, "cap": 0.003},
     "medium": {"wrist": 0.020, "finger": 0.003, "cap": 0.006},
     "high": {"wrist": 0.040, "finger": 0.006, "cap": 0.012},
 }
-"""The paper's tiers."""
+"""The paper's tiers: options of :func:`with_noise` [m]."""
 
 
 def with_noise(demos: Demos, *, wrist: float, finger: float, cap: float, seed: int = 0) -> Demos:
@@ -48,16 +47,16 @@ def with_noise(demos: Demos, *, wrist: float, finger: float, cap: float, seed: i
         errors = _wandering(random.normal(0.0, finger, (count, 20, 3)))
         size = np.linalg.norm(errors, axis=-1, keepdims=True)
         errors *= np.minimum(1.0, cap / np.maximum(size, 1e-12))
-        seen = demos.hand_valid[frames]
-        hand = keypoints[frames][seen]
-        palm = turn_of(demos.wrist_quat_wxyz[frames][seen]).as_matrix()
-        moved = _with_bones(hand, np.einsum("fij,fkj->fki", palm, errors[seen]))
-        keypoints[frames][seen] = moved + offset
+        valid = demos.hand_valid[frames]
+        hand = keypoints[frames][valid]
+        palm = turn_of(demos.wrist_quat_wxyz[frames][valid]).as_matrix()
+        moved = _with_bones(hand, np.einsum("fij,fkj->fki", palm, errors[valid]))
+        keypoints[frames][valid] = moved + offset
     return replace(demos, hand_keypoints=keypoints.astype(demos.hand_keypoints.dtype))
 
 
 def _wandering(steps: np.ndarray) -> np.ndarray:
-    """Return errors [F, ...] of the steps' standard deviation that remember the frame before."""
+    """Return errors [F, ...] that remember the frame before, with the standard deviation of the steps [F, ...]."""
     steps = steps.copy()
     steps[1:] *= math.sqrt(1.0 - MEMORY**2)
     return np.asarray(lfilter([1.0], [1.0, -MEMORY], steps, axis=0))

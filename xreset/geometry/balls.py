@@ -56,15 +56,15 @@ class Balls(Tensors):
     centers: Tensor
     """[Q, 3] in the link's frame."""
     radii: Tensor
-    """[Q]"""
+    """[Q] [m]; 0 for edges and corners."""
     bound_centers: Tensor
     """[G, 3] center, in the link's frame, of a ball around all balls of the link."""
     bound_radii: Tensor
-    """[G]"""
+    """[G] [m]"""
     guards: Tensor
     """[R] balls that keep out of other links; two of one link are at least :data:`APART` apart."""
     guard_radii: Tensor
-    """[R] their radii against other links: larger where they represent other balls."""
+    """[R] their radii against other links [m]: larger where they represent other balls."""
     guard_slices: tuple[slice, ...]
     """Guards of each link (length G)."""
     fields: DistanceFields
@@ -135,7 +135,7 @@ def bounding_balls(
 
 
 def _apart(centers: np.ndarray, radii: np.ndarray, spacing: float) -> np.ndarray:
-    """Choose balls that are farther from each other than ``spacing``, larger ones first; return their rows,
+    """Choose balls that are farther from each other than ``spacing`` [m], larger ones first; return their rows,
     ascending."""
     kept = []
     for ball in np.argsort(-radii, kind="stable").tolist():
@@ -145,7 +145,7 @@ def _apart(centers: np.ndarray, radii: np.ndarray, spacing: float) -> np.ndarray
 
 
 def inscribed_balls(geometry: Geometry) -> tuple[np.ndarray, float]:
-    """Fill a shape with balls: centers [n, 3] in the shape's frame and their radius.
+    """Fill a shape with balls: centers [n, 3] in the shape's frame and their radius [m].
 
     A capsule or a long cylinder gets a row along its axis, a sphere itself. A box gets layers of balls as thick as its
     thinnest side, at distances of their radius or :data:`SPACING`. A flat cylinder is filled like the box through the
@@ -184,8 +184,8 @@ def _grid(half: Iterable[float], radius: float) -> np.ndarray:
 
 
 def sharp_points(geometry: Geometry, spacing: float) -> np.ndarray:
-    """[n, 3] points where a shape stands out of the balls in it: a box's edges, a cylinder's rims, a hull's
-    vertices."""
+    """[n, 3] points where a shape reaches beyond the balls in it: on a box's edges at most ``spacing`` [m] apart, on a
+    cylinder's rims, and a hull's vertices."""
     points, radius = support_points(Shape(geometry=geometry))
     if radius > 0:
         return np.zeros((0, 3))
@@ -208,8 +208,8 @@ def shell_balls(geometry: Geometry, centers: np.ndarray, radius: float) -> tuple
         radius: radius of the balls that fill the shape.
 
     Returns:
-        Centers [n, 3] of the small balls and their radius, with which they come within :data:`BARE` of a right-angled
-        edge.
+        Centers [n, 3] of the small balls, and their radius [m], with which they come within :data:`BARE` of a
+        right-angled edge.
     """
     from trimesh.remesh import subdivide_to_size
 
@@ -231,7 +231,7 @@ def shell_balls(geometry: Geometry, centers: np.ndarray, radius: float) -> tuple
 
 
 def link_balls(shapes: Sequence[Shape]) -> tuple[np.ndarray, np.ndarray]:
-    """Fill the shapes of a link with balls: centers [n, 3] in the link's frame and radii [n]."""
+    """Fill the shapes of a link with balls: centers [n, 3] in the link's frame and radii [n] [m]."""
     centers = []
     radii = []
     for shape in shapes:

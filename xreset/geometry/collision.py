@@ -1,8 +1,7 @@
 """How far a robot is from the table and from itself.
 
 The table needs no collision library: the lowest point of a convex shape is one of a few support points, less a radius.
-Self-collision asks coal for signed distances, but only for pairs of shapes whose bounding spheres are
-near.
+Self-collision asks coal for signed distances, but only for pairs of shapes whose bounding spheres are near.
 
 Shape letters: B configurations, L links, G shapes, H support points, A pairs of shapes that are near each other.
 """
@@ -168,8 +167,12 @@ class SelfCollision:
         self._pairs = np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
     def near(self, link_poses: np.ndarray, margin: float) -> dict[tuple[int, str, str], float]:
-        """Return the signed distance [m], negative where they overlap, of every pair of links nearer than ``margin``
-        [m], by (configuration, link, link), in link poses [B, L, 4, 4] of all links of the kinematics."""
+        """Return the signed distance [m] of every pair of links nearer than ``margin``, by (configuration, link, link).
+
+        Args:
+            link_poses: [B, L, 4, 4] poses of all links of the kinematics.
+            margin: distance [m]; negative where links overlap.
+        """
         request = self._coal.DistanceRequest()
         request.enable_signed_distance = True
         result = self._coal.DistanceResult()

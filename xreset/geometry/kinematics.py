@@ -52,9 +52,9 @@ class _Step(NamedTuple):
 class Kinematics:
     """Kinematics of a robot, or of the part of it below one link.
 
-    Every method takes joint positions ``q`` [..., J] with any leading dimensions and returns tensors with the same
-    ones. There is no loop over the batch. The loop over links is short, because only the requested links and their
-    ancestors are computed.
+    Every method takes joint positions ``q`` [..., J] with any leading dimensions, and its results have the same leading
+    dimensions. There is no loop over the batch. The loop over links is short, because only the requested links and
+    their ancestors are computed.
     """
 
     def __init__(
@@ -264,8 +264,12 @@ class Kinematics:
         return torch.as_tensor(np.asarray(values), dtype=self.dtype).to(self.device)
 
     def _forward(self, q: Tensor, base: Tensor | None, wanted: Sequence[int]):
-        """Return rotations [B, n, 3, 3] and positions [B, n, 3] of the wanted links, and the axes and origins [B, 3] of
-        the joints above them, by row among the moving joints."""
+        """Compute the wanted links, and the joints above them.
+
+        Returns:
+            Rotations [B, n, 3, 3] and positions [B, n, 3] of the links; axes and origins [B, 3] of the joints, by their
+            row among the moving joints.
+        """
         if q.shape[-1] != len(self.joint_names):
             raise ValueError(
                 f"q has {q.shape[-1]} joint positions, expected {len(self.joint_names)}: {self.joint_names}"

@@ -31,7 +31,7 @@ class Surface:
     frame.
 
     It is the surface of the union of the collision pieces, which is what the robot touches in physics. The pieces of an
-    imported mesh may stand out of the mesh by some millimeters; a grasp that fits the mesh would be pushed apart.
+    imported mesh may reach some millimeters beyond the mesh: physics would push a hand that touches the mesh away.
     """
 
     def __init__(self, obj: ObjectSpec) -> None:

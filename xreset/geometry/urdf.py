@@ -33,15 +33,16 @@ if TYPE_CHECKING:
 JointType = Literal["revolute", "prismatic", "fixed"]
 
 HULL_TOLERANCE = 5e-4
-"""How far points of a mesh may stand out of its hull [m]: makers' meshes have thousands of points, engines accept
+"""How far points of a mesh may be outside its hull [m]: makers' meshes have thousands of points, engines accept
 hundreds."""
 _LARGEST = 1e6
 """Larger numbers in a URDF are errors: masses [kg], positions [m], inertias [kg m^2], but not limits."""
 _SMALLEST = 1e-6
 """[m] Smallest size of a shape."""
 _SHORTEST_AXIS = 1e-9
+"""Length of a vector that still states a direction."""
 _FOLDERS_ABOVE = 3
-"""Folders above the URDF's own in which meshes may lie: those of a ROS package and of its workspace, never the root."""
+"""Folders above the URDF's own that may hold meshes: those of a ROS package and of its workspace, never the root."""
 
 
 @frozen
@@ -134,7 +135,7 @@ class RobotTree:
         return by_name[name]
 
     def below(self, root: str) -> list[str]:
-        """Return the link ``root`` and all links that it carries."""
+        """Return the link ``root`` and all links that it carries, parents before children."""
         found = [root]
         for joint in self.joints:
             if joint.parent in found:
@@ -162,7 +163,11 @@ def robot_tree(robot: RobotSpec) -> RobotTree:
 
 
 def mismatches(robot: RobotSpec, tree: RobotTree) -> dict[str, list[str]]:
-    """Return what is wrong with the joints and the links of a description, given the tree of its URDF."""
+    """Compare a description with the tree of its URDF.
+
+    Returns:
+        A sentence for each contradiction, under ``joints`` and ``links``.
+    """
     moving = [joint.name for joint in tree.moved_by.values()]
     fixed = {joint.name for joint in tree.joints if joint.type == "fixed"}
     described = [*robot.joint_names, *(mimic.joint for mimic in robot.mimics)]

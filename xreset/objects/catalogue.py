@@ -1,4 +1,4 @@
-"""The known objects, by any of their names."""
+"""Load the known objects by any of their names."""
 
 from __future__ import annotations
 

@@ -100,7 +100,7 @@ class Pieces:
     inertia: np.ndarray
     """[3, 3] about it, of 1 kg of uniform density [m^2]."""
     finished: bool = True
-    """Whether the effort sufficed."""
+    """Whether cutting ended before :attr:`Settings.effort` was spent."""
 
 
 def decompose(mesh: trimesh.Trimesh, settings: Settings = Settings()) -> Pieces:
@@ -151,7 +151,7 @@ def openings(mesh: trimesh.Trimesh) -> list[tuple[np.ndarray, np.ndarray]]:
     return [(np.asarray(loop), edges[np.isin(edges[:, 0], loop)]) for loop in loops]
 
 
-# Solids
+# Solids ---------------------------------------------------------------------------------------------------------------
 
 
 def as_solid(mesh: trimesh.Trimesh) -> Manifold:
@@ -319,7 +319,7 @@ class _Solid(_Surface):
         return measure(*_arrays(outside))
 
 
-# Cutting and joining
+# Cutting and joining --------------------------------------------------------------------------------------------------
 
 
 class _Cutter:
@@ -409,8 +409,11 @@ class _Cutter:
         return [part.hull() for part in self._best_cut(piece ^ self._solid.solid)]
 
     def _best_cut(self, part: Manifold) -> list[Manifold]:
-        """Return the parts by the planes that take away most of the hulls' volume for each further part; one if none
-        cuts it."""
+        """Cut a part by the planes that remove most of the hulls' volume for each further part.
+
+        Returns:
+            The smaller parts; the part alone if no plane cuts it.
+        """
         best = [part]
         best_gain = -np.inf
         whole = part.hull().volume()
@@ -430,9 +433,11 @@ class _Cutter:
         return best
 
     def _joined(self, hulls: Sequence[Manifold], tolerance: float) -> list[Manifold]:
-        """Join pieces wherever the hull of two keeps to the surface; those first that lose least volume by it.
+        """Join two pieces wherever their common hull keeps to the surface. Pairs whose hull adds the least volume come
+        first.
 
         Args:
+            hulls: convex pieces.
             tolerance: largest deviation by the quick measure [m].
         """
         batch_hull = _manifold3d().Manifold.batch_hull
@@ -449,8 +454,8 @@ class _Cutter:
                     self.effort -= max(self._solid.solid.num_tri(), _LEAST_EFFORT)
                     both = batch_hull([piece, neighbour])
                     if self._solid.excess(both, quick=True) <= tolerance:
-                        loss = both.volume() - piece.volume() - neighbour.volume()
-                        heapq.heappush(queue, (loss, other, number, both))
+                        added = both.volume() - piece.volume() - neighbour.volume()
+                        heapq.heappush(queue, (added, other, number, both))
             boxes[number] = np.stack((low, high))
             alive[number] = piece
 
@@ -504,7 +509,7 @@ def _manifold3d() -> Any:
     return manifold3d
 
 
-# Hulls
+# Hulls ----------------------------------------------------------------------------------------------------------------
 
 
 def _shape(piece: Manifold) -> Shape:

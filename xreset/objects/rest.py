@@ -20,7 +20,7 @@ def rest_height(obj: ObjectSpec, quat: np.ndarray) -> np.ndarray | float:
     """
     w, x, y, z = np.moveaxis(np.asarray(quat, dtype=float), -1, 0)
     norm = w * w + x * x + y * y + z * z
-    # of the rotation matrix
+    # last row of the rotation matrix: the world's z axis in the mesh frame
     last_row = (2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z)
     up = np.stack(last_row, axis=-1) / norm[..., None]
     height = -(up @ obj.vertices.T).min(axis=-1)
@@ -28,7 +28,7 @@ def rest_height(obj: ObjectSpec, quat: np.ndarray) -> np.ndarray | float:
 
 
 def resting_orientation(obj: ObjectSpec, up: np.ndarray) -> np.ndarray:
-    """[4] the stable pose on a plane that comes nearest to the mesh direction ``up`` [3] pointing up.
+    """[4] orientation of a stable pose on a plane: the one in which the mesh direction ``up`` [3] points up the most.
 
     An object rests on a face of its convex hull if its center of mass projects into that face.
     """
@@ -37,9 +37,9 @@ def resting_orientation(obj: ObjectSpec, up: np.ndarray) -> np.ndarray:
     convex = ConvexHull(obj.vertices)
     corners = obj.vertices[convex.simplices]
     normals = convex.equations[:, :3]
-    # of the center of mass, negative as it is inside
-    distance = normals @ obj.com + convex.equations[:, 3]
-    foot = obj.com - distance[:, None] * normals
+    # height of the center of mass above each face, negative because it is inside
+    height = normals @ obj.com + convex.equations[:, 3]
+    foot = obj.com - height[:, None] * normals
     stable = (points_to_barycentric(corners, foot) >= -1e-9).all(axis=1)
     top = -normals[stable][np.argmin(normals[stable] @ up)]
     axis = np.cross(top, (0.0, 0.0, 1.0))

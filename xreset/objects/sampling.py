@@ -15,6 +15,7 @@ Frame = Literal["mesh", "center"]
 METRIC_POINTS = 64
 """Points of the published success (the published paper, section V)."""
 _CANDIDATES_PER_POINT = 8
+"""Samples of the surface that each wanted point is chosen from."""
 _PROBE = 2e-4
 """Distance from the surface at which a sample is tested [m]: above rounding, below any feature."""
 

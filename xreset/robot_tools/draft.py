@@ -17,13 +17,14 @@ from xreset.geometry.urdf_writer import urdf_text, write_meshes
 from xreset.spec import DriveSpec, FingertipSpec, JointSpec, KeypointSpec, RobotSpec
 
 _BASE = ((0.85, 0.85, 0.10), (0.6427876, 0.0, 0.0, -0.7660444))
-"""Where the arm stands until `robots place` finds better: on the table, beside the person, its x turned by -100
-degrees. Five published hands on xArm7 and iiwa 14 follow 98 % or more of five DexYCB sequences from there."""
+"""Where the arm stands until `robots place` finds better: on the table, next to the person, its x turned by
+-100 degrees. Five published hands on xArm7 and iiwa 14 follow 98 % or more of five DexYCB sequences from there."""
 _ARMATURE = 0.1
 """[kg m^2] Rotor inertia of the arm's joints, as in the built-in robots."""
 
 
 Positions = float | np.ndarray
+"""Joint positions or limits [rad or m]."""
 
 
 def rounded(positions: Positions, lower: Positions, upper: Positions) -> np.ndarray:
@@ -71,7 +72,8 @@ def draft_spec(
 
 
 def link_places(spec: RobotSpec, positions: dict[str, float]) -> dict[str, np.ndarray]:
-    """Link -> pose [4, 4] in the frame of the hand's root, at joint positions; others are at home."""
+    """Return link -> pose [4, 4] in the frame of the hand's root, with some joints at positions and the others at
+    home."""
     kinematics = Kinematics(spec)
     q = torch.tensor(
         [positions.get(joint.name, joint.home) for joint in spec.joints], dtype=torch.float64
@@ -82,7 +84,7 @@ def link_places(spec: RobotSpec, positions: dict[str, float]) -> dict[str, np.nd
 
 
 def description_text(spec: RobotSpec, notes: Sequence[str]) -> str:
-    """The robot's ``robot.toml``, every part explained; ``notes`` say what was guessed."""
+    """Return the robot's ``robot.toml``, every part explained; ``notes`` say what was guessed."""
     loader = jinja2.FileSystemLoader(Path(__file__).with_name("templates"))
     pages = jinja2.Environment(
         loader=loader, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True

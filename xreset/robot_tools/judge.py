@@ -58,7 +58,9 @@ _MOVE_STEPS = 45
 _REST_STEPS = 15
 """Control steps in which a phase moves the arm and lets it rest, a second together."""
 _WAYPOINTS = 15
+"""Waypoints of the arm in a motion."""
 _ITERATIONS = 3
+"""Steps of damped least squares to each waypoint."""
 _REACHED = (0.02, 0.15)
 """[m], [rad] Largest errors of the arm at the end of a motion that it can make."""
 _TILE = (224, 176)

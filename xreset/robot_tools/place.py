@@ -218,7 +218,7 @@ def _placed(robot: RobotSpec, parameters: np.ndarray) -> RobotSpec:
 
 
 def _parameters(robot: RobotSpec) -> np.ndarray:
-    """The inverse of :func:`_placed`."""
+    """[6] parameters of a robot's base, as :func:`_placed` takes them."""
     turn = turn_of(robot.base_quat)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of an upright base, whose azimuth is 0
@@ -230,7 +230,7 @@ def _with_home(placed: RobotSpec, robot: RobotSpec) -> tuple[RobotSpec, str]:
     """Return the placed robot with a home of its arm, and how it was chosen; empty if none is found.
 
     The first of these that the arm can reach, clear of the table and of itself: the pose of the hand at the
-    description's home; the nearest of poses beside and above it; the description's joints.
+    description's home; the nearest of poses next to and above it; the description's joints.
     """
     if placed == robot:
         return robot, "as described"

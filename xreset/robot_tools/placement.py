@@ -18,7 +18,7 @@ class PlaceConfig:
     """What is searched, and how hard."""
 
     x: tuple[float, float] = (-0.3, 1.4)
-    """Range of the base's position [m]; the defaults are the table and what is beside it."""
+    """Range of the base's position [m]; the defaults are the table and what is next to it."""
     y: tuple[float, float] = (-0.5, 1.2)
     z: tuple[float, float] = (0.0, 0.8)
     tilt: tuple[float, float] | None = None

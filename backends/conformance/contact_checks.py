@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 
@@ -145,7 +145,7 @@ def _against_built(
     return errors
 
 
-def _built_with(scene: SceneSpec, given: dict[Parameter, np.ndarray]) -> SceneSpec:
+def _built_with(scene: SceneSpec, given: Mapping[str, np.ndarray]) -> SceneSpec:
     """Return a scene of one object that states the values that a world of another scene is given."""
     (obj,) = scene.objects
     mass = float(given.get("object_mass", obj.mass))

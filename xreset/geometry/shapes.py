@@ -10,7 +10,7 @@ import os
 import zipfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -277,8 +277,8 @@ def surface_of(pieces: Sequence[Shape]) -> tuple[np.ndarray, np.ndarray]:
     return mesh_arrays(trimesh.util.concatenate([shape_mesh(piece) for piece in pieces]))
 
 
-def mesh_arrays(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices [V, 3] and triangles [F, 3] of a mesh as plain arrays, not as those that trimesh watches."""
+def mesh_arrays(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices [V, 3] and triangles [F, 3] of a trimesh as plain arrays, without the hooks of trimesh."""
     return np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=np.int64)
 
 

@@ -117,22 +117,13 @@ def import_robot(
     with atomic_folder(out) as work:
         found = Hand(hand_tree, work, thumb, notes)
         if rpy is None:
-            rpy = _turned(found.palm[:3, 0], ahead)
-            if any(rpy):
-                angles = " ".join(f"{angle:g}" for angle in rpy)
-                notes.append(
-                    f"the hand is turned by --rpy {angles}: its fingers point along {along}"
-                )
+            rpy = _guessed_rpy(found, ahead, along, notes)
         if offset is None:
-            distance = _stand_off(found, rpy, ahead)
-            offset = tuple((distance * ahead).tolist())
-            if distance > 0:
-                notes.append(
-                    f"the hand's root is {1e3 * distance:.0f} mm along {along}, so that its body begins there "
-                    "(--offset)"
-                )
-        T = pose(offset, rpy=rpy)
-        whole = combined(arm_tree, _with_rotors(found, notes), flange, T, name or out.name)
+            offset = _guessed_offset(found, rpy, ahead, along, notes)
+        T_flange_hand = pose(offset, rpy=rpy)
+        whole = combined(
+            arm_tree, _with_rotors(found, notes), flange, T_flange_hand, name or out.name
+        )
         spec = draft_spec(
             whole, found.root, work, tips=found.tips, keypoints=found.keypoints, bent=found.bent
         )
@@ -145,7 +136,7 @@ def import_robot(
         spec = replace(spec, collision_exclude=tuple(pairs))
         (work / DESCRIPTION).write_text(description_text(spec, notes))
         load_robot(work)
-    T_flange_palm = T @ found.palm
+    T_flange_palm = T_flange_hand @ found.palm
     mounting = (
         f"how the hand is mounted (--offset, --rpy): its fingers point along ({_vector(T_flange_palm[:3, 0])}) of "
         f"{flange!r}, its inner side along ({_vector(T_flange_palm[:3, 2])}). The angle about {along} is yours to know"
@@ -173,15 +164,21 @@ def _out_of_flange(arm: RobotTree, flange: str) -> np.ndarray:
     return sign * axis.round() + 0.0
 
 
-def _turned(fingers: np.ndarray, ahead: np.ndarray) -> tuple[float, float, float]:
-    """Return roll, pitch and yaw of the shortest turn of the fingers' direction to the one ahead; zeros where they
-    nearly point there."""
+def _guessed_rpy(
+    hand: Hand, ahead: np.ndarray, along: str, notes: list[str]
+) -> tuple[float, float, float]:
+    """Return roll, pitch and yaw of the shortest turn of the fingers to the direction ahead; zeros where they nearly
+    point there. ``along`` names the direction in the note."""
+    fingers = hand.palm[:3, 0]
     if fingers @ ahead > _ALONG:
         return (0.0, 0.0, 0.0)
     if np.abs(fingers).max() > 0.95:
         fingers = fingers.round()  # along an axis, as far as fingers are straight
     turn = Rotation.align_vectors([ahead], [fingers])[0]
     roll, pitch, yaw = (np.round(roll_pitch_yaw(turn.as_matrix()), 4) + 0.0).tolist()
+    notes.append(
+        f"the hand is turned by --rpy {roll:g} {pitch:g} {yaw:g}: its fingers point along {along}"
+    )
     return roll, pitch, yaw
 
 
@@ -189,10 +186,18 @@ def _vector(values: np.ndarray) -> str:
     return ", ".join(f"{value:.2f}" for value in values.round(2) + 0.0)
 
 
-def _stand_off(hand: Hand, rpy: tuple[float, float, float], ahead: np.ndarray) -> float:
-    """Distance [m] by which a hand's body would reach behind the flange's origin if its root were there."""
+def _guessed_offset(
+    hand: Hand, rpy: tuple[float, float, float], ahead: np.ndarray, along: str, notes: list[str]
+) -> tuple[float, float, float]:
+    """Return the position of the hand's root in the flange's frame where no part of it is behind the flange [m]."""
     depth = -(hand.body @ pose(rpy=rpy)[:3, :3].T @ ahead)
-    return round(float(depth.max(initial=0.0)), 3)
+    distance = round(float(depth.max(initial=0.0)), 3)
+    if distance > 0:
+        notes.append(
+            f"the hand's root is {1e3 * distance:.0f} mm along {along}, so that its body begins there (--offset)"
+        )
+    x, y, z = (distance * ahead).tolist()
+    return x, y, z
 
 
 def _with_rotors(hand: Hand, notes: list[str]) -> RobotTree:

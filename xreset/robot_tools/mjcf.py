@@ -149,7 +149,7 @@ def _pulls(model: mujoco.MjModel, problems: list[str], notes: list[str]) -> dict
 def _tree(path: Path, model: mujoco.MjModel, couplings: Couplings) -> RobotTree:
     """Return links and joints of a model, from its poses where the joints are at 0 or held.
 
-    The frame of a link lies in its joint, which may be away from the body's origin.
+    The origin of a link is at its joint, which may be away from the body's origin.
     """
     names = [model.body(i).name or f"body{i}" for i in range(model.nbody)]
     tops = [names[i] for i in range(1, model.nbody) if model.body_parentid[i] == 0]

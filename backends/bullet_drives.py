@@ -21,8 +21,8 @@ class BulletDrives:
     so it does the same when given tau' = tau - B a. Mimic joints are coupled by a stiff spring and damper, which add
     J^T (dt^2 k + dt b) J to B; a drive's torque, and its dt kd, are shared with those that follow its joint.
 
-    In contact that alone is wrong: a held joint does not move with a, and would lack the torque B a. So the torque r of
-    contacts and limits in the last step, seen as r = M dv / dt - (tau' - c), is expected again:
+    In contact that alone is wrong: a held joint does not move with a, and would lack the torque B a. So this step is
+    assumed to have the torque r that contacts and limits gave in the last step, r = M dv / dt - (tau' - c):
     a = (M + B)^-1 (tau - c + r). A held joint then gets the whole of tau, and an impact delivers the momentum of M + B,
     both after about 1 + B / M steps. That is one or two for ordinary drives; it is far too many where B dwarfs M, as
     with armature on the light links of a hand.

@@ -2,10 +2,10 @@
 
 Where a flat face or an edge is on a face, both engines clip the one with the other and place contacts at the corners of
 what is left (multi-CCD). Often one corner alone is in the other body: of a finger, say, across the rim of a can. MuJoCo
-takes place and depth of such a contact from that corner. MuJoCo-Warp 4.0.0 takes its place, but the depth of the pair's
-deepest point, which is elsewhere: 82, 186 and 211 um where 34, 126 and 156 um are right, in three of five grasps. Held
-objects part within one step. With the corner's depth the joints follow MuJoCo's to 1.6e-5 rad (median over a second)
-instead of 6.9e-4.
+takes place and depth of such a contact from that corner. MuJoCo-Warp 4.0.0 takes the place from the corner, but the
+depth from the pair's deepest point, which is elsewhere. In three of five grasps the depths were 82, 186 and 211 um
+instead of 34, 126 and 156 um, and the held objects moved differently in the two engines within one step. With the
+corner's depth the joints follow MuJoCo's to 1.6e-5 rad (median over a second) instead of 6.9e-4.
 
 No setting changes the depth, and no place in the step between collision and constraints still knows it. So the engine's
 function is wrapped before any kernel is made of it. This module reads the engine's private modules.

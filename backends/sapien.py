@@ -381,7 +381,7 @@ def _material(owner: int) -> str:
 
 
 def _rotation(quat: np.ndarray) -> np.ndarray:
-    """[3, 3] rotation matrix, in double precision, of a unit quaternion [4], whose products are rounded to its own."""
+    """[3, 3] rotation matrix, in double precision, of a unit quaternion [4], whose products keep its precision."""
     products = np.outer(quat, quat)
     squares = products[1:, 1:].astype(np.float64)
     turn = cross(products[0, 1:], np.eye(3)).T

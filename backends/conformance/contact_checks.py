@@ -96,8 +96,8 @@ def rest_and_bounce(bench: Bench) -> Measured:
 def set_as_built(bench: Bench) -> Measured:
     """Set mass and friction in some worlds and build others with them: objects must do the same in both.
 
-    Masses change by powers of two, which every product and every eigenvector carries without rounding. Contacts make
-    much of a last bit, and its rounding depends on the processor's matrix kernels.
+    Masses change by powers of two, so that no product is rounded. Contacts amplify a rounding error, and rounding
+    depends on the processor's matrix kernels.
     """
     mass = _FACTORS * bench.masses
     parameters: dict[Parameter, Tensor] = {"object_mass": mass, "friction": FRICTIONS}
@@ -164,7 +164,7 @@ def _built_with(scene: SceneSpec, given: Mapping[str, np.ndarray]) -> SceneSpec:
 
 
 def _slide(bench: Bench, worlds: Worlds, rows: Sequence[int]) -> tuple[State, Tensor]:
-    """Let objects slide and turn on the table for a moment; later, contacts have made much of a last bit."""
+    """Let objects slide and turn on the table, only for a moment, because contacts amplify rounding errors."""
     start = bench.start()[list(rows)]
     start = replace_fields(
         start,
@@ -249,7 +249,7 @@ def torsional_friction(bench: Bench) -> Measured:
     I domega/dt = -t m g, with t the torsional friction, a length.
     """
     friction = _pairs(torch.tensor([0.3, 1.0]))
-    # A long time, so that what an unsteady contact takes and gives evens out.
+    # The time is long, so that the variations of an unsteady contact average out.
     lost = _spin_lost(bench, 2, 0.8, lambda worlds: worlds.set_parameter("friction", friction))
     return {"spin lost": lost - 1.0}
 
@@ -257,7 +257,7 @@ def torsional_friction(bench: Bench) -> Measured:
 def torsional_friction_set(bench: Bench) -> Measured:
     """Spin balls whose torsional friction was set world by world, then a state: each is braked by its own.
 
-    I domega/dt = -t m g, with none, half, all and twice of what the scene says.
+    I domega/dt = -t m g, with t from none to twice the scene's torsional friction.
     """
     factors = torch.tensor([0.0, 0.5, 1.0, 2.0])
 
@@ -273,7 +273,7 @@ def torsional_friction_set(bench: Bench) -> Measured:
 def _spin_lost(
     bench: Bench, count: int, seconds: float, prepare: Callable[[Worlds], None]
 ) -> Tensor:
-    """[count] what balls on the table lose of their spin, as a share of what the scene's torsional friction takes."""
+    """[count] spin that balls on the table lose, as a share of the loss by the scene's torsional friction."""
     obj = ball()
     scene = replace(bench.scene, objects=(obj,))
     object_index = [0] * count

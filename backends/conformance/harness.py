@@ -228,8 +228,8 @@ class Bench:
 
         Every field is away from its default: joints are within their limits, the object spinning in the air.
 
-        A robot that would reach into the table is moved towards home until it does not: an arm deep inside the table is
-        thrown out, and no two engines need do that alike.
+        A robot that would reach into the table is moved towards home until it does not: engines may differ in how they
+        push an arm out of the table.
         """
         random = torch.Generator().manual_seed(seed)
 

@@ -108,7 +108,7 @@ def twins(bench: Bench) -> Measured:
 def repeatable(bench: Bench) -> Measured:
     """Do the same twice, with something else in between, and once in new worlds: every bit must be the same.
 
-    The shared worlds will not do: the masses that another check has put back in them are rounded to single precision.
+    The shared worlds are not used, because masses that another check has restored are rounded to single precision.
     """
     with bench.other(bench.scene, bench.object_index) as worlds:
         if worlds.backend.device.type != "cpu":

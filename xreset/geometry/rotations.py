@@ -41,7 +41,7 @@ def quat_rotate_inverse(q: Tensor, v: Tensor) -> Tensor:
 def relative_pose(
     pos: Tensor, quat: Tensor, frame_pos: Tensor, frame_quat: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return poses [..., 3] and [..., 4] in the frames that have other poses."""
+    """Return positions [..., 3] and orientations [..., 4] in the frames that have the poses ``frame_...``."""
     relative = quat_rotate_inverse(frame_quat, pos - frame_pos)
     return relative, quat_multiply(quat_conjugate(frame_quat), quat)
 

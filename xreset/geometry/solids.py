@@ -44,7 +44,7 @@ def link_field(shapes: Sequence[Shape]) -> DistanceFields:
     if len(shapes) > 1:
         slope = np.stack([*np.gradient(values, _SPACING)], axis=-1)
         steepness = np.linalg.norm(slope, axis=-1)
-        # On a flat ridge between two shapes the slope says nothing; other nodes are near.
+        # On a flat ridge between two shapes the slope has no direction; other nodes are near.
         rim = (values > reach) & (values <= reach + 2 * _SPACING) & (steepness > 0.5)
         beyond = (values[rim] - reach) / steepness[rim]
         # points at ``reach`` from the shapes

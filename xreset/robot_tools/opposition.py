@@ -18,6 +18,8 @@ _FACING = -0.3
 _STEP = 0.02
 """[rad or m] Step of the joints that gives this direction."""
 _LOPSIDED = 0.4
+"""Distance of the middle of a joint's range from its position nearest to 0, as a share of half the range, beyond which
+the joint bends a finger and does not spread it."""
 
 
 def closing_range(lower: float, upper: float) -> float | None:
@@ -32,8 +34,10 @@ def closing_range(lower: float, upper: float) -> float | None:
 
 def opposition(robot: RobotSpec, links: Sequence[str], offsets: np.ndarray) -> np.ndarray:
     """Return for each pair of fingertips [E, E] the share of random joint positions in which they are near each other
-    and close towards each other. The sum of the square roots of a row says how much a fingertip opposes the others, and
-    as many of them as possible.
+    and close towards each other.
+
+    The sum of the square roots of a row measures how much a fingertip opposes the others; it is larger if the fingertip
+    opposes many of them.
 
     Args:
         robot: the robot; only what is below its hand root counts.

@@ -1,23 +1,26 @@
-"""The documentation names commands and options that exist, and fits on the page."""
+"""The documentation names commands, options, functions and files that exist, and fits on the page."""
 
 import ast
+import importlib
+import inspect
 import re
 import shlex
 import sys
 import tomllib
 from functools import cache
 from pathlib import Path
+from textwrap import dedent
+from types import ModuleType
 from unittest import TestCase
 
+import xreset
+import xreset.runtime
 from tests.command import succeeds
 from xreset.cli import COMMANDS
-from xreset.cli.engines import COMMAND as ENGINES
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [*(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "AGENTS.md", "SECURITY.md"))]
 PAGES += sorted((ROOT / "docs").glob("*.md"))
-GROUPS = ("demos", "objects", "robots", "policies", "export")
-"""Commands whose second word is a verb."""
 
 
 def blocks(page):
@@ -32,7 +35,20 @@ def commands(page):
     found = [line.strip() for line in blocks(page)]
     found += re.findall(r"`(xreset [^`]+)`", text)
     found = [re.sub(r"^.*-m (?=xreset )", "", line) for line in found]
-    return [shlex.split(line, comments=True)[1:] for line in found if line.startswith("xreset ")]
+    words = [shlex.split(line, comments=True)[1:] for line in found if line.startswith("xreset ")]
+    return [each for each in words if each and re.fullmatch(r"[a-z]+", each[0])]
+
+
+def command_of(words):
+    """Return the words that name a command: one, or two or three in a group; or those of a group alone."""
+    name, *others = words
+    command = getattr(importlib.import_module(f"xreset.cli.{name}"), "COMMAND", None)
+    if not isinstance(command, dict) or not others:
+        return (name,)
+    verbs = [verb for verb in command if verb.split() == others[: len(verb.split())]]
+    group = [verb for verb in command if verb.split()[0] == others[0]] if len(others) == 1 else []
+    assert verbs or group, f"xreset {' '.join(words)}: there is no such command"
+    return (name, *(verbs[0].split() if verbs else others))
 
 
 @cache
@@ -43,41 +59,75 @@ def help_of(words):
     return out
 
 
-def command_of(words):
-    """Return the words that name a command: one, or two or three in a group."""
-    if words[0] in GROUPS:
-        return tuple(words[:3] if words[:2] == ["demos", "import"] else words[:2])
-    return tuple(words[:2] if words[0] == "engines" else words[:1])
+def programs(page):
+    """Return the page's Python programs: blocks that are called Python, and others that begin with an import."""
+    text = page.read_text()
+    found = re.findall(r"(?ms)^```python\n(.*?)^```", text)
+    indented = [dedent(block) for block in re.findall(r"(?m)(?:^    .*\n|^\n)+", text)]
+    return found + [block for block in indented if re.match(r"\s*(import|from) ", block)]
 
 
-class DocumentedCommandsTest(TestCase):
+def unknown_names(program):
+    """Return the names that xreset lacks: what a program imports, attributes of modules, arguments of functions."""
+    known = {"xreset": xreset, "runtime": xreset.runtime}
+    nodes = list(ast.walk(ast.parse(program)))
+    for node in nodes:
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("xreset"):
+            module = importlib.import_module(node.module)
+            for alias in node.names:
+                known[alias.name] = getattr(module, alias.name, None)
+    unknown = [name for name, value in known.items() if value is None]
+
+    def value_of(node):
+        """What a name, or an attribute of a module, stands for; None: something else."""
+        if isinstance(node, ast.Name):
+            return known.get(node.id)
+        if isinstance(node, ast.Attribute):
+            owner = value_of(node.value)
+            return getattr(owner, node.attr, None) if isinstance(owner, ModuleType) else None
+        return None
+
+    for node in nodes:
+        if isinstance(node, ast.Attribute) and isinstance(value_of(node.value), ModuleType):
+            module = value_of(node.value)
+            public = getattr(module, "__all__", dir(module))
+            if node.attr not in public and not isinstance(value_of(node), ModuleType):
+                unknown.append(f"{module.__name__}.{node.attr}")
+        if isinstance(node, ast.Call) and callable(value_of(node.func)):
+            accepted = inspect.signature(value_of(node.func)).parameters
+            given = {keyword.arg for keyword in node.keywords if keyword.arg}
+            unknown += [f"{ast.unparse(node.func)}({name}=)" for name in given - set(accepted)]
+    return unknown
+
+
+class DocumentedTest(TestCase):
     def test_every_command_and_option_exists(self):
         seen = 0
         for page in PAGES:
             for words in commands(page):
-                if (
-                    not words
-                    or not re.fullmatch(r"[a-z]+", words[0])
-                    or (words[0] in GROUPS and len(words) < 2)
-                ):
-                    continue
                 with self.subTest(page=page.name, command=" ".join(words)):
                     self.assertIn(words[0], COMMANDS)
-                    if words[0] == "engines" and len(words) > 1:
-                        self.assertIn(words[1], ENGINES)
+                    help_text = help_of(command_of(words))
                     options = {
                         word.partition("=")[0] for word in words if re.match(r"--[a-z]", word)
                     }
-                    if options:
-                        help_text = help_of(command_of(words))
-                        missing = {
-                            option
-                            for option in options
-                            if not re.search(rf"{option}(?![\w-])", help_text)
-                        }
-                        self.assertFalse(missing)
-                        seen += len(options)
+                    missing = {
+                        option
+                        for option in options
+                        if not re.search(rf"{option}(?![\w-])", help_text)
+                    }
+                    self.assertFalse(missing)
+                    seen += len(options)
         self.assertGreater(seen, 100)
+
+    def test_every_name_and_argument_of_a_program_exists(self):
+        seen = 0
+        for page in PAGES:
+            for program in programs(page):
+                seen += 1
+                with self.subTest(page=page.name, program=program[:60]):
+                    self.assertEqual(unknown_names(program), [])
+        self.assertGreater(seen, 6)
 
 
 class PageTest(TestCase):

@@ -12,7 +12,7 @@ import torch
 from numpy.testing import assert_allclose
 from torch import tensor
 
-from tests.command import xreset
+from tests.command import succeeds, xreset
 from tests.data import InFolder
 from tests.toy_retarget import FLOAT, arm_targets, double
 from xreset import robots, synthesize, write_demos
@@ -272,6 +272,21 @@ class WritePlacementTest(InFolder):
         self.assertEqual(load(self.folder), self.robot)
         self.write(self.own)
         self.assertNotIn(stated, self.file.read_text())
+
+    def test_the_command_shows_and_writes_the_best_placement(self):
+        write_demos(f"{self.folder}/demos.npz", synthesize(["soup"], 1, seed=0))
+        found = [self.best, self.own]
+        with (
+            patch("xreset.retarget.pipeline.wrist_paths", return_value=[]),
+            patch.object(placing, "place", return_value=found) as place,
+        ):
+            command = ("robots", "place", self.folder, "--demos", f"{self.folder}/demos.npz")
+            said = succeeds(*command, "--write", "--search.rounds", "1")
+        self.assertEqual(place.call_args.args[3], PlaceConfig(rounds=1))
+        rows = r"87\.6%\W+91\.2%\W+0\.500\W+0\.1000, 0\.2000, 0\.3000[\s\S]*75\.0%"
+        self.assertRegex(said, rows)
+        self.assertEqual(load(self.folder).base_pos, self.best.robot.base_pos)
+        self.assertIn("--write --search.rounds 1", self.lines(True)[0])
 
     def test_refusals(self):
         with self.assertRaisesRegex(

@@ -4,13 +4,15 @@ import json
 import math
 from dataclasses import fields, replace
 from unittest import TestCase
+from unittest.mock import patch
 
 import torch
 
 from tests import toy_grasp
-from tests.command import printed, refused
+from tests.command import printed, refused, succeeds
+from tests.data import InFolder
 from tests.toy_results import episodes
-from xreset import XResetError
+from xreset import XResetError, synthesize, write_demos
 from xreset.eval.engines.attribution import (
     Attribution,
     Row,
@@ -226,18 +228,15 @@ A = row("as it is", "mujoco", *[0.66] * 8)
 B = row("other", "sapien", *[0.33] * 8)
 
 
-class OutcomeTest(TestCase):
-    def found(self, *rows):
-        return Attribution(
-            a="mujoco",
-            b="sapien",
-            measured={"arm stiffness": (1.0, 0.8)},
-            rows=rows,
-            skipped={},
-        )
+def outcome(*rows):
+    return Attribution(
+        a="mujoco", b="sapien", measured={"arm stiffness": (1.0, 0.8)}, rows=rows, skipped={}
+    )
 
+
+class OutcomeTest(TestCase):
     def test_shares_of_the_gap(self):
-        found = self.found(
+        found = outcome(
             A,
             row("towards", "tip friction", *[0.33] * 4, *[0.66] * 4),
             row("towards", "arm stiffness", *[0.33] * 6, *[0.66] * 2),
@@ -248,12 +247,39 @@ class OutcomeTest(TestCase):
         self.assertAlmostEqual(found.share(found.rows[3]), -1.0)
         self.assertEqual(found.costs(), found.rows[2])
         # one demonstration among many
-        found = self.found(A, row("other", "sapien", 0.33, 0.33, *[0.66] * 6))
+        found = outcome(A, row("other", "sapien", 0.33, 0.33, *[0.66] * 6))
         self.assertIsNone(found.as_dict()["rows"][-1]["share_of_gap"])
         self.assertIsNone(found.costs())
 
 
-class CommandTest(TestCase):
+class CommandTest(InFolder):
+    def test_the_command_writes_what_was_found(self):
+        demos = self.folder / "demos.npz"
+        write_demos(demos, synthesize(["soup"], 1, seed=0))
+        found = outcome(A, row("towards", "arm stiffness", *[0.33] * 8), B)
+        options = (
+            "--robot",
+            "openarm",
+            "--demos",
+            demos,
+            "--towards",
+            "sapien",
+            "--out",
+            self.folder,
+        )
+        options += ("--episodes", 3, "--seed", 4, "--only", "arm stiffness")
+        with patch("xreset.eval.engines.attribution.attribute", return_value=found) as attribute:
+            said = succeeds("engines", "attribute", "zero", *options)
+        spec, a, b, trial = attribute.call_args.args
+        self.assertEqual((spec.name, a.name, b.name, trial.seed), ("zero", "mujoco", "sapien", 4))
+        given = attribute.call_args.kwargs
+        self.assertEqual((given["episodes"], [*given["only"]]), (3, ["arm stiffness"]))
+        content = json.loads((self.folder / "attribution.json").read_text())
+        self.assertEqual(content["costs_most"], "arm stiffness")
+        self.assertEqual((content["robot"], content["demonstrations"]), ("openarm", 1))
+        self.assertIn("demos", content["inputs"])
+        self.assertIn("'arm stiffness' alone brings about 100% of it", " ".join(said.split()))
+
     def test_bad_input(self):
         options = ("--demos", "none.npz", "--robot", "ur7e-sharpa", "--towards")
         for message, policy, other in (

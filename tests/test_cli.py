@@ -6,13 +6,13 @@ import os
 import subprocess
 import sys
 from contextlib import redirect_stderr
+from importlib import import_module
 from unittest import TestCase
 from unittest.mock import patch
 
 from tests.command import refused
 from tests.command import xreset as run
 from xreset.cli import COMMANDS, _terminal
-from xreset.cli.engines import COMMAND as ENGINES
 
 HEAVY = {
     "torch",
@@ -47,7 +47,12 @@ class LightnessTest(TestCase):
         self.assertFalse(modules_after(code) & (HEAVY | {"tyro", "numpy"}))
 
     def test_help_of_every_command_loads_nothing_heavy(self):
-        commands = [[name] for name in COMMANDS] + [["engines", name] for name in ENGINES]
+        commands = []
+        for name in COMMANDS:
+            commands.append([name])
+            group = getattr(import_module(f"xreset.cli.{name}"), "COMMAND", None)
+            if isinstance(group, dict):
+                commands += [[name, *verb.split()] for verb in group]
         code = (
             "from xreset.cli import main\n"
             f"for words in {commands}:\n"
@@ -156,7 +161,7 @@ class UsageTest(TestCase):
         words = r"^xreset train: rsl-rl-lib cannot .* pip install 'xreset\[train\]'"
         self.assertRegex(output_of(code), words)
 
-    def test_a_missing_engine_is_named_with_the_command_that_mends_it(self):
+    def test_a_missing_engine_is_named_with_the_command_that_installs_it(self):
         code = "import sys; sys.modules['pybullet'] = None; from xreset.cli import main; main(['engines', 'list'])"
         self.assertRegex(output_of(code), r"pybullet .* no: .*pip install 'xreset\[pybullet\]'")
 

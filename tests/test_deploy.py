@@ -284,6 +284,23 @@ class ContractTest(InFolder):
         self.assertEqual(episode.answer(json.dumps({"begin": begin})), {"begun": True})
         self.assertIn("joint_pos is missing", episode.answer('{"step": {}}')["error"])
 
+    @skipUnless(find_spec("websockets"), "websockets is not installed")
+    def test_the_command_serves_where_it_is_told_to(self):
+        with (
+            patch("xreset.live.serve.PolicyServer") as server,
+            patch("xreset.pictures.view.server.serve_until_interrupted") as served,
+        ):
+            server.return_value.url = "ws://0.0.0.0:9"
+            options = ("--host", "0.0.0.0", "--port", 9, "--object", "banana")
+            said = succeeds("serve", "nine-objects", *options)
+        contract, network = server.call_args.args
+        self.assertEqual(list(contract["objects"]), ["011_banana"])
+        self.assertEqual(network, load_policy("nine-objects").exported().read_bytes())
+        self.assertEqual(server.call_args.kwargs, {"host": "0.0.0.0", "port": 9})
+        served.assert_called_once_with(server.return_value)
+        self.assertIn("nine-objects for ur7e-sharpa at ws://0.0.0.0:9, 60 steps per second", said)
+        self.assertIn("There is no password", said)
+
     def test_a_baseline_and_cameras_are_refused(self):
         self.assertIn(
             "The baseline 'zero' is not an exported policy",

@@ -1,4 +1,4 @@
-"""The support matrix: what the page says of given results, and the page in docs/."""
+"""The page of the engines: what it says of given results."""
 
 import contextlib
 import copy

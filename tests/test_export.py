@@ -9,6 +9,7 @@ from unittest import skipUnless
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
+from tests.command import succeeds
 from tests.toy_results import InFolder, toy_rollouts
 from xreset.description import load_robot
 from xreset.errors import FileFormatError, RunError, XResetError
@@ -117,6 +118,16 @@ class Arrays(Case):
         self.assertEqual(arrays["engine"].tolist(), ["mujoco", "mujoco", "sapien", "sapien"])
         self.assertEqual(arrays["success"].tolist(), [True, False, True, False])
 
+    def test_the_command_takes_engines_and_words(self):
+        out = self.folder / "out.npz"
+        options = ("--backend", "sapien", "--task", "Lift the {object}.", "--out", out)
+        self.assertIn(
+            "2 episodes of ur7e-sharpa", succeeds("export", "npz", self.evaluate(), *options)
+        )
+        with np.load(out) as file:
+            self.assertEqual(file["engine"].tolist(), ["sapien", "sapien"])
+            self.assertEqual(file["task"][0], "Lift the tomato soup can.")
+
 
 @skipUnless(PARQUET, "pyarrow is not installed")
 class LeRobot(Case):
@@ -130,9 +141,10 @@ class LeRobot(Case):
     def test_meta_agrees_with_the_data(self):
         import pyarrow.parquet as parquet
 
-        recording = read_recorded([self.evaluate()])
+        folder = self.evaluate()
+        recording = read_recorded([folder])
         root = self.folder / "set"
-        write_lerobot(root, recording, video=False)
+        succeeds("export", "lerobot", folder, "--out", root, "--no-video")
         info = json.loads((root / "meta/info.json").read_text())
         self.assertEqual(
             (info["codebase_version"], info["fps"], info["total_frames"]), ("v3.0", 20, 20)

@@ -1,11 +1,12 @@
 """Goal sets: starts at rest, goals of each family within reach, and what is refused."""
 
-from unittest import TestCase, mock
+from unittest import mock
 
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
-from tests.data import InFolder
+from tests.command import succeeds
+from tests.data import InFolder, InOneFolder
 from tests.toy_bank import SOUP, in_this_process
 from tests.toy_goals import toy_goals
 from xreset import GoalConfig, load_object, load_policy, load_robot
@@ -21,9 +22,10 @@ BANANA = "011_banana"
 EXACT = GoalConfig(per_family=1, start_xy=0.0, start_yaw=0.0, goal_xy=0.0, goal_z=0.0, goal_yaw=0.0)
 
 
-class MadeTest(TestCase):
+class MadeTest(InOneFolder):
     @classmethod
     def setUpClass(cls):
+        super().setUpClass()
         cls.enterClassContext(in_this_process())
         cls.robot = load_robot("ur7e-sharpa")
         cls.banana = load_object(BANANA)
@@ -97,6 +99,18 @@ class MadeTest(TestCase):
         assert_allclose(
             np.concatenate((goals.goal_pos[0], goals.goal_quat_wxyz[0])), pose, atol=1e-6
         )
+
+    def test_the_command_draws_what_its_options_say(self):
+        pose = (0.6, 0.25, 0.3, 1, 0, 0, 0)
+        file = self.folder / "goals.npz"
+        options = ("--family", "yaw", "--draw.per-family", 2, "--draw.seed", 3, "--pose", *pose)
+        said = succeeds("goals", "banana", "--robot", "ur7e-sharpa", "--out", file, *options)
+        self.assertIn("3 goals of 1 objects (2 yaw, 1 own)", said)
+        config = GoalConfig(per_family=2, seed=3)
+        expected = make_goals(
+            ["banana"], robot=self.robot, families=["yaw"], poses=[pose], config=config
+        )
+        assert_allclose(read_goals(file).goal_pos, expected.goal_pos)
 
 
 class UsedTest(InFolder):

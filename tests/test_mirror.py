@@ -1,15 +1,16 @@
 """Mirrored demonstrations: the plane of symmetry, and what becomes of object and hand."""
 
 import dataclasses
-import unittest
 
 import numpy as np
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial import cKDTree
 
+from tests.command import succeeds
+from tests.data import InOneFolder
 from tests.test_demos import in_frame
 from tests.toy_retarget import box_object
-from xreset import load_object, synthesize
+from xreset import load_object, merge_demos, read_demos, synthesize, write_demos
 from xreset.demos.mirror import mirrored, symmetry
 from xreset.errors import DemoError
 from xreset.geometry.shapes import turn_of
@@ -20,9 +21,10 @@ def reflect(points):
     return points * [-1.0, 1.0, 1.0] + [2.0 * TableSpec().center[0], 0.0, 0.0]
 
 
-class MirrorTest(unittest.TestCase):
+class MirrorTest(InOneFolder):
     @classmethod
     def setUpClass(cls):
+        super().setUpClass()
         cls.demos = synthesize(["mustard"], 1, 0, side="left")
         cls.object = load_object("mustard")
         cls.symmetries = {cls.object.name: symmetry(cls.object)}
@@ -62,3 +64,12 @@ class MirrorTest(unittest.TestCase):
         crooked = dataclasses.replace(self.symmetries[self.object.name], deviation=0.02)
         with self.assertRaisesRegex(DemoError, r"mustard_bottle 20\.0 mm"):
             mirrored(self.demos, {self.object.name: crooked}, tolerance=0.004)
+
+    def test_the_command_mirrors_the_left_hands_of_an_archive(self):
+        files = [self.folder / name for name in ("demos.npz", "mirrored.npz")]
+        write_demos(files[0], merge_demos([self.demos, synthesize(["soup"], 1, 0)]))
+        said = succeeds("demos", "mirror", files[0], "--out", files[1])
+        self.assertRegex(said, r"mustard_bottle: \d\.\d mm from its reflection, mirrored")
+        found = read_demos(files[1])
+        self.assertEqual(found.object_name.tolist(), ["006_mustard_bottle"])
+        assert_array_equal(found.hand_keypoints, self.found.hand_keypoints)

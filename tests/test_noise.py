@@ -1,18 +1,19 @@
 """Errors of a worse hand tracker: one offset for a demonstration, wandering fingers, bones and objects as they were."""
 
-import unittest
-
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
-from xreset import synthesize
+from tests.command import succeeds
+from tests.data import InOneFolder
+from xreset import read_demos, synthesize, write_demos
 from xreset.demos.hand import bone_lengths
 from xreset.demos.noise import MEMORY, TIERS, with_noise
 
 
-class NoiseTest(unittest.TestCase):
+class NoiseTest(InOneFolder):
     @classmethod
     def setUpClass(cls):
+        super().setUpClass()
         cls.demos = synthesize(["soup", "mustard"], 3, seed=0)
         cls.seen = cls.demos.hand_valid
 
@@ -47,3 +48,10 @@ class NoiseTest(unittest.TestCase):
         assert_array_equal(noisy.object_pos, self.demos.object_pos)
         assert_array_equal(noisy.hand_keypoints, again.hand_keypoints)
         self.assertGreater(np.nanmax(np.abs(noisy.hand_keypoints - other.hand_keypoints)), 1e-3)
+
+    def test_the_command_adds_the_errors_of_a_tier(self):
+        files = [self.folder / name for name in ("demos.npz", "noisy.npz")]
+        write_demos(files[0], self.demos)
+        succeeds("demos", "noise", files[0], "--out", files[1], "--tier", "high", "--seed", 5)
+        expected = with_noise(self.demos, **TIERS["high"], seed=5)
+        assert_array_equal(read_demos(files[1]).hand_keypoints, expected.hand_keypoints)

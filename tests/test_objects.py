@@ -82,6 +82,11 @@ class Names(TestCase):
 
 
 class StandIns(TestCase):
+    def test_the_command_lists_them(self):
+        said = succeeds("objects", "list")
+        self.assertRegex(said, r"003_cracker_box\W+cheez-its\W+0\.411\W+\d+x\d+x\d+\W+1 box")
+        self.assertEqual([name for name in object_names() if name not in said], [])
+
     def test_physical(self):
         for obj in load_objects(object_names()):
             with self.subTest(obj.name):
@@ -469,6 +474,11 @@ class RandomShapes(InFolder):
             assert_allclose(mesh.bounds.mean(axis=0), 0.0, atol=1e-9)
             self.assertIn("mass", path.with_suffix(".toml").read_text())
         self.assertNotEqual(nine[0].read_bytes(), nine[8].read_bytes())
+        out = self.folder / "two"
+        succeeds("objects", "make", "--out", out, "--count", 2, "--seed", 3)
+        made = sorted(path.name for path in out.glob("*.obj"))
+        self.assertEqual(made, sorted(path.name for path in nine[:2]))
+        self.assertEqual((out / nine[1].name).read_bytes(), nine[1].read_bytes())
 
     def test_a_folder_is_never_overwritten(self):
         for words, folder, count in (

@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from functools import partial
 from unittest import TestCase, mock
 
 import numpy as np
@@ -12,12 +13,12 @@ from torch import tensor
 from torch.testing import assert_close
 
 from tests import toy_grasp, toy_results
-from tests.command import printed, refused
+from tests.command import printed, refused, succeeds
 from tests.data import InFolder
 from tests.engine_checks import JOINT, with_drive
 from tests.toy_bank import SOUP, SPAM
 from tests.toy_grasp import recording
-from xreset import robots
+from xreset import load_object, robots
 from xreset.errors import DemoError, FileFormatError, XResetError
 from xreset.eval.engines.actions import (
     Actions,
@@ -329,6 +330,22 @@ class EvaluationTest(toy_results.InFolder):
         self.assertRaisesRegex(DemoError, f"has no mug; it has {SOUP}, {SPAM}", load, 0, "mug")
         with self.assertRaisesRegex(FileFormatError, "states without the actions"):
             load(0, joint_target=None)
+
+    def test_the_command_writes_what_it_compares(self):
+        robot = robots.load("openarm")
+        rollouts = toy_results.toy_rollouts(robot.home)
+        self.write_results("", rollouts, ("mujoco",), robot.joint_names, robot="openarm")
+        out = self.folder / "trace"
+        options = ("--object", SPAM, "--backend", "mujoco", "--backend", "sapien", "--out", out)
+        with mock.patch("xreset.eval.rollout.engine", partial(engine, workers=0)):
+            said = succeeds("engines", "trace", self.folder / "eval/mujoco.trace.npz", *options)
+        data = json.loads((out / "trace.json").read_text())
+        self.assertEqual([e["name"] for e in data["engines"]], ["mujoco", "sapien"])
+        self.assertRegex(said, "sapien (stays with mujoco|diverges first)")
+        found = read_actions(out / "actions.npz", robot, load_object)
+        self.assertEqual(found.label, "zero in mujoco, demonstration 1")
+        with np.load(out / "actions.npz") as file:
+            self.assertEqual(file["engine"].tolist(), ["mujoco", "sapien"])
 
 
 class CommandTest(InFolder):

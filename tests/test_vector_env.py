@@ -41,7 +41,7 @@ class VectorEnvTest(WithEnv):
             seen, reward, terminated, truncated, _ = env.step(env.action_space.sample())
             self.assertTrue(env.observation_space.contains(seen))
             self.assertFalse(terminated.any())
-            self.assertEqual(truncated.all(), step in (length, 2 * length + 1))
+            self.assertEqual(truncated.tolist(), [step in (length, 2 * length + 1)] * N)
             if step == length + 1:
                 assert_array_equal(reward, 0.0)
                 assert_array_equal(env.env.episode_length_buf, 0)

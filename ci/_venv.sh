@@ -1,4 +1,4 @@
-# Sourced by the scripts beside it: makes .venv with everything the project needs, once, and puts it on the PATH.
+# Sourced by the other scripts of this folder: makes .venv with everything the project needs, once, and puts it on the PATH.
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 cd "$root"
 
@@ -17,7 +17,7 @@ for candidate in "${candidates[@]}"; do
   fi
 done
 if [ -z "$python" ]; then
-  echo "xreset needs Python 3.11, 3.12 or 3.13; none of these is one: ${candidates[*]}. Set PYTHON=/path/to/python." >&2
+  echo "xreset needs Python 3.11, 3.12 or 3.13; not found among: ${candidates[*]}. Set PYTHON=/path/to/python." >&2
   exit 1
 fi
 
@@ -27,7 +27,7 @@ if [ ! -e "$stamp" ]; then
   echo "== setting up .venv with $("$python" --version) (once)"
   version=$("$python" -c 'import sys; print(sys.version_info[:2])')
   if [ -x .venv/bin/python ] && [ "$(.venv/bin/python -c 'import sys; print(sys.version_info[:2])')" != "$version" ]; then
-    rm -rf .venv  # it is of another version of Python
+    rm -rf .venv  # made with another version of Python
   fi
   [ -x .venv/bin/python ] || "$python" -m venv .venv
   install() { .venv/bin/python -m pip install --quiet --disable-pip-version-check --only-binary :all: "$@"; }

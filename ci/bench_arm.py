@@ -1,4 +1,4 @@
-"""arm: seconds that the arm's inverse kinematics takes, and how many of the wrist poses within its reach it solves on the way."""
+"""arm: time of the arm's inverse kinematics, and the share of wrist poses within reach that it solves along the path."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ def add_arguments(group: _ArgumentGroup) -> None:
 
 def run(options: Options, console: Console) -> None:
     robot = robots.load(options.robot)
-    given, folder = options.extra["arm_demos"], options.extra["arm_objects"]
+    given = options.extra["arm_demos"]
+    folder = options.extra["arm_objects"]
     demos = read_demos(given) if isinstance(given, Path) else synthesize(per_object=1, seed=0)
     objects = list(demo_objects(demos, folder if isinstance(folder, Path) else None).values())
     paths: list[ArmTargets] = []
@@ -58,14 +59,11 @@ def run(options: Options, console: Console) -> None:
         ]
     )
     chosen = torch.as_tensor(np.random.default_rng(0).permutation(len(free))[:_SAMPLE])
-    alone = ArmTargets(
-        **{
-            name: torch.cat([getattr(p, name)[mask] for p, mask in zip(paths, above, strict=True)])[
-                chosen
-            ][:, None]
-            for name in vars(paths[0])
-        }
-    )
+    fields = {}
+    for name in vars(paths[0]):
+        parts = [getattr(path, name)[mask] for path, mask in zip(paths, above, strict=True)]
+        fields[name] = torch.cat(parts)[chosen][:, None]
+    alone = ArmTargets(**fields)
     config = replace(ArmConfig(), restarts=16, reseeds=0, collision_weight=0.0)
     within = _follows(
         track(model, alone, replace(SOLVED, table_depth=1e9, self_depth=1e9), config)[1], 1e9

@@ -1,8 +1,9 @@
-"""depth: how deep the hand of retargeted states lies in the object, between collision shapes, exactly (coal)."""
+"""depth: how deep the hand of retargeted states is in the object, between collision shapes, exactly (coal)."""
 
 from __future__ import annotations
 
 from argparse import _ArgumentGroup
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -32,11 +33,13 @@ def add_arguments(group: _ArgumentGroup) -> None:
 
 
 def run(options: Options, console: Console) -> None:
-    path, folder = options.extra["depth_file"], options.extra["depth_objects"]
+    path = options.extra["depth_file"]
+    folder = options.extra["depth_objects"]
     if not isinstance(path, Path):
         console.print("depth: left out. Give --depth-file and --depth-objects.")
         return
-    robot, states = robots.load(options.robot), read_retargeted(path)
+    robot = robots.load(options.robot)
+    states = read_retargeted(path)
     specs = load_objects(
         sorted(set(states.object_name.tolist())), folder if isinstance(folder, Path) else None
     )
@@ -69,7 +72,8 @@ def depths(
     """Links with shapes; object [M] and depth [M, links] in it [m] of every valid frame, 0 where they are apart."""
     import coal
 
-    request, result = coal.DistanceRequest(), coal.DistanceResult()
+    request = coal.DistanceRequest()
+    result = coal.DistanceResult()
     request.enable_signed_distance = True
     kinematics = Kinematics(robot)
     links = [
@@ -79,17 +83,10 @@ def depths(
     ]
     T_links = kinematics.link_poses(torch.as_tensor(states.joint_pos), links).numpy()
     T_objects = np.tile(np.eye(4), (len(states.valid), 1, 1))
-    T_objects[:, :3, :3], T_objects[:, :3, 3] = (
-        quat_to_matrix(torch.as_tensor(states.object_quat_wxyz)).numpy(),
-        states.object_pos,
-    )
-    hand = [
-        [_prepared(coal, shape) for shape in kinematics.tree.link(link).collisions]
-        for link in links
-    ]
-    pieces = {
-        name: [_prepared(coal, shape) for shape in spec.pieces] for name, spec in objects.items()
-    }
+    T_objects[:, :3, :3] = quat_to_matrix(torch.as_tensor(states.object_quat_wxyz)).numpy()
+    T_objects[:, :3, 3] = states.object_pos
+    hand = [_prepared(coal, kinematics.tree.link(link).collisions) for link in links]
+    pieces = {name: _prepared(coal, spec.pieces) for name, spec in objects.items()}
     names = states.object_name[states.sequence_of_frame]
     frames = np.flatnonzero(states.valid)
     depth = np.zeros((len(frames), len(links)))
@@ -97,7 +94,8 @@ def depths(
         for k, shapes in enumerate(hand):
             for T_shape, shape, center, radius in shapes:
                 for T_piece, piece, middle, reach in pieces[names[frame]]:
-                    a, b = T_links[frame, k], T_objects[frame]
+                    a = T_links[frame, k]
+                    b = T_objects[frame]
                     if np.linalg.norm(a @ center - b @ middle) < radius + reach:
                         poses = [
                             coal.Transform3s(T[:3, :3].copy(), T[:3, 3].copy())
@@ -109,9 +107,13 @@ def depths(
     return links, names[frames], depth
 
 
-def _prepared(coal, shape: Shape) -> tuple[np.ndarray, object, np.ndarray, float]:
-    """Pose, coal's geometry, and centre (homogeneous) and radius of a ball about it."""
-    points, radius = support_points(shape)
-    center = (points.max(axis=0) + points.min(axis=0)) / 2
-    reach = radius + float(np.linalg.norm(points - center, axis=1).max())
-    return shape.T_body_shape, coal_geometry(coal, shape.geometry), np.array([*center, 1.0]), reach
+def _prepared(coal, shapes: Iterable[Shape]) -> list[tuple[np.ndarray, object, np.ndarray, float]]:
+    """Pose of each shape, coal's geometry, and centre (homogeneous) and radius of a ball about it."""
+    prepared = []
+    for shape in shapes:
+        points, radius = support_points(shape)
+        center = (points.max(axis=0) + points.min(axis=0)) / 2
+        reach = radius + float(np.linalg.norm(points - center, axis=1).max())
+        geometry = coal_geometry(coal, shape.geometry)
+        prepared.append((shape.T_body_shape, geometry, np.array([*center, 1.0]), reach))
+    return prepared

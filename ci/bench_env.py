@@ -1,7 +1,7 @@
 """env: control steps per second of an engine and of the environment on it, all worlds together.
 
 backend   Backend.step with all worlds, readings included; a CPU engine runs on all cores
-env       ManipulationEnv.step with actions at zero: actions, physics, observations, reward, resets; beside it the share of backend
+env       ManipulationEnv.step with actions at zero: actions, physics, observations, reward, resets; next to it the share of backend
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from xreset.task.config import TaskConfig
 
 
 def run(options: Options, console: Console) -> None:
-    robot, task = robots.load(options.robot), TaskConfig()
+    robot = robots.load(options.robot)
+    task = TaskConfig()
     scene = make_scene(robot, tuple(load_objects([OBJECT], None)), task)
     columns = ["engine", "device", "backend", "env (of backend)"]
     table = Table(

@@ -1,4 +1,4 @@
-"""learning: whether a small training learns as it did, as JSON beside the stored band (ci/learning.json); exit status 1 if it does not.
+"""learning: whether a small training learns as it did, as JSON with the stored band (ci/learning.json); exit status 1 if it does not.
 
 A gripper takes a brick between its jaws and lifts it (tests/toy_learning.py), in the task of the recipe minutes, or with --task small in the one
 of the tests (60 Hz, one cloud). --device cpu: MuJoCo, 60 iterations, 40 seconds. --device cuda: mujoco-warp, the paper's networks in bfloat16, as
@@ -21,7 +21,8 @@ from xreset.learning.config import ModelConfig
 from xreset.plugins import make_backend
 
 BAND = Path(__file__).with_name("learning.json")
-_GPU_WORLDS, _GPU_ITERATIONS = 2048, 200
+_GPU_WORLDS = 2048
+_GPU_ITERATIONS = 200
 
 
 def add_arguments(group: argparse._ArgumentGroup) -> None:
@@ -33,7 +34,8 @@ def run(options: Options, console: Console) -> None:
     sys.path.append(str(BAND.parents[1]))  # for tests/, behind an installed xreset
     from tests.toy_learning import CONFIG, RECIPE, WORLDS, scene, trained
 
-    seed, gpu = int(str(options.extra["seed"])), options.device.startswith("cuda")
+    seed = int(str(options.extra["seed"]))
+    gpu = options.device.startswith("cuda")
     task = str(options.extra["task"])
     config = CONFIG if task == "small" else RECIPE
     if gpu:

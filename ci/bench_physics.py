@@ -12,7 +12,7 @@ PhysX does not tell friction, so both work it out.
 Raw and bare are control steps per second of CPU time, the processes per second of wall time. "of raw" is the CPU time of the raw loop
 through that of all processes of the backend, this one included; in brackets the same by the wall clock, per process. Contenders take turns
 in slices of some hundredths of a second, every other time in reverse, each slice after a control step that is not counted; ratios are of
-slices of one turn, and figures are medians over turns. So the CPU's share bears other programs on the machine; the wall clock does not.
+slices of one turn, and figures are medians over turns. So other programs on the machine change the wall clock, and not the CPU's share.
 
 By default there are 64 worlds, as many as `xreset eval`, `attribute` and `resets` run at a time. To wake a process costs the same whatever
 it then has to do, as much as half a world of MuJoCo, so what the pool loses shows more, the fewer worlds there are: see --num-envs 8.
@@ -50,13 +50,14 @@ Readings = Literal["state", "all"]
 _SLICE = 0.04
 """Seconds that a slice of the raw loop takes."""
 _HOLD = 120
-"""Control steps, about, after which the grasp starts anew: in minutes any object creeps out of a hand."""
+"""Control steps, about, after which the grasp starts again: in minutes any object creeps out of a hand."""
 _SETTLE = 20
 """Control steps before the clock runs: the hand closes."""
 
 
 def run(options: Options, console: Console) -> None:
-    robot, task = robots.load(options.robot), TaskConfig()
+    robot = robots.load(options.robot)
+    task = TaskConfig()
     scene = make_scene(robot, tuple(load_objects([OBJECT], None)), task)
     grasp = held_grasp(robot, scene.objects)
     grasp = State(
@@ -66,7 +67,9 @@ def run(options: Options, console: Console) -> None:
         }
     )
     pools = sorted({1, min(2, usable_cores()), min(usable_cores(), options.num_envs)})
-    processes = [column for n in pools for column in (f"{n} process{'es' * (n > 1)}", "of raw")]
+    processes = []
+    for n in pools:
+        processes += [f"{n} process{'es' * (n > 1)}", "of raw"]
     columns = ["engine", "device", "readings", "bare", "raw", *processes, "held"]
     table = Table(
         *columns,
@@ -134,10 +137,9 @@ def _pooled(
         backends += [make_backend(name, scene, n, workers=workers) for workers in pools]  # pyright: ignore[reportArgumentType]
         loop = _LOOPS.get(name, _world_loop)
         targets = grasp.joint_target.double().numpy()
-        raw = {
-            kind: [loop(world, targets[i], scene, kind) for i, world in enumerate(worlds)]
-            for kind in kinds
-        }
+        raw = {}
+        for kind in kinds:
+            raw[kind] = [loop(world, targets[i], scene, kind) for i, world in enumerate(worlds)]
 
         def start() -> None:
             for i, world in enumerate(worlds):
@@ -231,7 +233,8 @@ def _cpu_time(processes: Sequence[int]) -> float:
 def _spent(step: Callable[[], object], steps: int, processes: Sequence[int]) -> _Spent:
     """What a control step takes on average of some, after one that is not counted."""
     step()
-    cpu, wall = _cpu_time(processes), time.perf_counter()
+    cpu = _cpu_time(processes)
+    wall = time.perf_counter()
     for _ in range(steps):
         step()
     return _Spent((time.perf_counter() - wall) / steps, (_cpu_time(processes) - cpu) / steps)
@@ -239,13 +242,16 @@ def _spent(step: Callable[[], object], steps: int, processes: Sequence[int]) -> 
 
 def _within(function: tuple[object, str], step: Callable[[], object], steps: int) -> _Spent:
     """What of that passes within the function ``(owner, name)``."""
-    inner, wall, cpu = getattr(*function), 0.0, 0.0
+    inner = getattr(*function)
+    wall = 0.0
+    cpu = 0.0
 
     def timed(*arguments, **keywords) -> None:
         nonlocal wall, cpu
         start = time.perf_counter(), time.process_time()
         inner(*arguments, **keywords)
-        wall, cpu = wall + time.perf_counter() - start[0], cpu + time.process_time() - start[1]
+        wall = wall + time.perf_counter() - start[0]
+        cpu = cpu + time.process_time() - start[1]
 
     with mock.patch.object(*function, timed):
         for _ in range(steps):
@@ -261,7 +267,9 @@ def _mujoco_loop(
 ) -> Callable[[], object]:
     import mujoco
 
-    model, data, bodies = world._model, world._data, world._at.link_body
+    model = world._model
+    data = world._data
+    bodies = world._at.link_body
 
     def loop() -> object:
         data.ctrl[:] = targets
@@ -279,8 +287,12 @@ def _pybullet_loop(
 ) -> Callable[[], object]:
     from xreset.backends.pybullet import INTERNAL_STEPS
 
-    p, drives, tracked = world._p, world._drives, world._frames.bodies
-    robot, thing, joints = world._robot, world._object, drives._links
+    p = world._p
+    drives = world._drives
+    tracked = world._frames.bodies
+    robot = world._robot
+    thing = world._object
+    joints = drives._links
     weight = [0.0, 0.0, -GRAVITY * scene.objects[0].mass]
 
     def loop() -> object:
@@ -291,7 +303,8 @@ def _pybullet_loop(
             p.applyExternalForce(thing, -1, weight, com, p.WORLD_FRAME)
             p.stepSimulation()
         states = p.getJointStates(robot, joints)
-        joint_pos, joint_vel = np.array([s[0] for s in states]), np.array([s[1] for s in states])
+        joint_pos = np.array([s[0] for s in states])
+        joint_vel = np.array([s[1] for s in states])
         pose = p.getBasePositionAndOrientation(thing)
         state = joint_pos, joint_vel, pose, p.getBaseVelocity(thing)
         if kind == "state":
@@ -306,13 +319,14 @@ def _pybullet_loop(
 def _sapien_loop(
     world: Any, targets: np.ndarray, scene: SceneSpec, kind: Readings
 ) -> Callable[[], object]:
-    thing, joints, tracked = world._object, world._joints, world._tracked
-    articulation, drives, brakes = (
-        joints._articulation,
-        joints._drives,
-        joints._moving.has_dry_friction,
-    )
-    weight, nothing = np.array([0.0, 0.0, -GRAVITY * scene.objects[0].mass]), np.zeros(3)
+    thing = world._object
+    joints = world._joints
+    tracked = world._tracked
+    articulation = joints._articulation
+    drives = joints._drives
+    brakes = joints._moving.has_dry_friction
+    weight = np.array([0.0, 0.0, -GRAVITY * scene.objects[0].mass])
+    nothing = np.zeros(3)
 
     def motion(body: Any) -> tuple[np.ndarray, ...]:
         pose = body.entity_pose

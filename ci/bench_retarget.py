@@ -1,4 +1,4 @@
-"""retarget: hand retargeting on one real sequence per object beside PyRoki's contact-aware example, and seconds for a whole archive."""
+"""retarget: hand retargeting on one real sequence per object, next to PyRoki's contact-aware example, and seconds for a whole archive."""
 
 from __future__ import annotations
 
@@ -70,7 +70,8 @@ def add_arguments(group: _ArgumentGroup) -> None:
 
 
 def run(options: Options, console: Console) -> None:
-    path, folder = options.extra["retarget_demos"], options.extra["retarget_objects"]
+    path = options.extra["retarget_demos"]
+    folder = options.extra["retarget_objects"]
     if not isinstance(path, Path) or not isinstance(folder, Path):
         console.print("retarget: left out. Give --retarget-demos and --retarget-objects.")
         return
@@ -131,7 +132,8 @@ def errors(
     """Retarget the hand and measure."""
     robot = robots.load(options.robot)
     hand = HandModel(robot)
-    keypoint, tip = hand.keypoint_indices, hand.is_tip.numpy()
+    keypoint = hand.keypoint_indices
+    tip = hand.is_tip.numpy()
     specs = list(objects.values())
     on_table = rest_on_table(demos, specs)
     points, touching = vertex_contacts(on_table, objects)
@@ -153,10 +155,8 @@ def errors(
             seen = on_table.hand_valid[rows]
             robot_points = followed[slot, : len(seen)]
             human = on_table.hand_keypoints[rows][:, keypoint]
-            contact_points, contact = (
-                points[rows][:, keypoint],
-                touching[rows][:, keypoint] & seen[:, None],
-            )
+            contact_points = points[rows][:, keypoint]
+            contact = touching[rows][:, keypoint] & seen[:, None]
             off = np.linalg.norm(robot_points - human, axis=-1)[seen]
             jumps = np.abs(np.diff(motion.joints[slot, : len(seen)].numpy(), axis=0))[
                 seen[1:] & seen[:-1]
@@ -184,10 +184,8 @@ def vertex_contacts(
     """Nearest mesh vertex [F, 21, 3] of every keypoint, edges of the mesh being at most 5 mm, and whether it is nearer than 20 mm."""
     import trimesh
 
-    points, touching = (
-        np.zeros((demos.num_frames, 21, 3)),
-        np.zeros((demos.num_frames, 21), dtype=bool),
-    )
+    points = np.zeros((demos.num_frames, 21, 3))
+    touching = np.zeros((demos.num_frames, 21), dtype=bool)
     vertices = {
         name: trimesh.remesh.subdivide_to_size(spec.vertices, spec.faces, _EDGE)[0]
         for name, spec in objects.items()

@@ -1,4 +1,4 @@
-"""threads: retargeting a synthetic demonstration beside other work, as it is and told to take one thread: the ratios must be about 1."""
+"""threads: retargeting a synthetic demonstration while other processes run, by default and with one thread: the ratios must be about 1."""
 
 from __future__ import annotations
 

@@ -1,12 +1,12 @@
 """training: environment steps per second of a training on mujoco-warp, and where its time goes.
 
 raw       the captured graph of the engine's own step, as many times as a control step has physics steps, timed inside the steps of env: how
-          long a step takes depends on what the worlds are doing, so it is timed in the same worlds at the same moments; beside it the
+          long a step takes depends on what the worlds are doing, so it is timed in the same worlds at the same moments; next to it the
           rate that the same graph reaches in worlds left to themselves, their targets constant
-env       ManipulationEnv.step with random actions, resets from home and bank included; beside it the share of raw
+env       ManipulationEnv.step with random actions, resets from home and bank included; next to it the share of raw
 rollout   env and the policy, the value and the storage
 update    the rest of a PPO iteration: all epochs over the rollout
-train     whole iterations; beside it how many seconds of physics they simulate in a second
+train     whole iterations; next to it how many seconds of physics they simulate in a second
 The worlds start from a bank of retargeted synthetic demonstrations, or from --resets. --recipe and --precision as in training.
 """
 
@@ -69,7 +69,8 @@ def run(options: Options, console: Console) -> None:
 
 
 def _measure(env: ManipulationEnv, config: TrainConfig, options: Options, folder: Path) -> Table:
-    n, device = env.num_envs, options.device
+    n = env.num_envs
+    device = options.device
     env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=env.max_episode_length)
 
     def act() -> torch.Tensor:
@@ -88,7 +89,8 @@ def _measure(env: ManipulationEnv, config: TrainConfig, options: Options, folder
     env.reset()
     runner = TrainingRunner(env, config, folder / "run")
     runner.learn(2)
-    alg, horizon = runner.alg, config.ppo.horizon
+    alg = runner.alg
+    horizon = config.ppo.horizon
     obs = env.get_observations()
 
     def roll_out() -> None:
@@ -100,11 +102,13 @@ def _measure(env: ManipulationEnv, config: TrainConfig, options: Options, folder
                 alg.process_env_step(obs, reward, done, extras)
             alg.compute_returns(obs)
 
-    collect, learn = [], []
+    collect = []
+    learn = []
     for _ in range(options.extra["iterations"]):
         collect.append(seconds_of(roll_out, device))
         learn.append(seconds_of(alg.update, device))
-    runner.elapsed, before = 0.0, runner.env_steps
+    runner.elapsed = 0.0
+    before = runner.env_steps
     runner.learn(runner.iteration + options.extra["iterations"])
     trained = (runner.env_steps - before) / runner.elapsed
     rolled, updated = (horizon / sorted(times)[len(times) // 2] for times in (collect, learn))
@@ -133,7 +137,9 @@ def _physics_and_env(
     env: ManipulationEnv, act: Callable[[], torch.Tensor], options: Options
 ) -> tuple[float, float]:
     """Control steps per second of the engine's own steps, and of the environment's steps that they are part of."""
-    backend, run, marks = env.backend, env.backend._run, []
+    backend = env.backend
+    run = env.backend._run
+    marks = []
 
     def mark() -> None:
         if env.device.type == "cuda":

@@ -1,4 +1,4 @@
-"""What the sections of the benchmark share: timing, tables of engines, and a grasp that is held."""
+"""Shared by the sections of the benchmark: timing, engines, and a grasp that is held."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _PRESS = 8.0
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """What all sections are told; their own options are in ``extra``."""
+    """Options of all sections; those of single sections are in ``extra``."""
 
     robot: str
     backends: tuple[str, ...]
@@ -33,13 +33,13 @@ class Options:
     device: str
     """``cpu``, or ``cuda`` for the engines that can."""
     seconds: float
-    """How long to measure each thing."""
+    """Time of one measurement [s]."""
     extra: Mapping[str, object]
     """Options that sections have added, by name."""
 
 
 def engines(options: Options, console: Console) -> Iterator[tuple[str, str]]:
-    """Name and device of the engines asked for that work here; says why others are left out."""
+    """Yield name and device of the chosen engines that work here; print why others are left out."""
     for name in options.backends or tuple(backend_names()):
         status = backend_status(name)
         if status.reason is None:
@@ -64,7 +64,8 @@ def rate(step: Callable[[], object], seconds: float, device: str) -> float:
         return seconds_of(lambda: [step() for _ in range(5)], device)
 
     burst(), burst()
-    end, bursts = time.perf_counter() + seconds, []
+    end = time.perf_counter() + seconds
+    bursts = []
     while not bursts or time.perf_counter() < end:
         bursts.append(burst())
     return 5 / float(np.median(bursts))
@@ -76,10 +77,9 @@ def run_time(command: Sequence[str]) -> float:
 
 
 def held_grasp(robot: RobotSpec, objects: Sequence[ObjectSpec]) -> State:
-    """One world ([1, ...]) in which the robot has closed its fingers around the first object in the air, and presses.
+    """Return one world ([1, ...]) in which the robot presses with its fingers on the first object in the air.
 
-    A retargeted synthetic demonstration gives the hand's shape; the drives' targets lie where each fingertip presses towards the object's
-    centre.
+    A retargeted synthetic demonstration gives the hand's shape. With the drives' targets each fingertip presses towards the object's centre.
     """
     from xreset.demos.synth import synthesize
     from xreset.geometry.kinematics import Kinematics

@@ -1,8 +1,7 @@
-"""Speed on the machine at hand. Compare figures of one run only, and believe them only if nothing else ran meanwhile.
+"""Measures speed on this machine. Compare only figures of one run during which nothing else ran.
 
-A section is a module ci/bench_NAME.py: its docstring says what it measures, run(options, console) prints it; add_arguments(group), if there
-is one, adds options, and NUM_ENVS, if there is one, is how many worlds it has where --num-envs is not given. ci/benchlib.py holds what
-sections share.
+A section is a module ci/bench_NAME.py. Its docstring says what it measures; run(options, console) prints the result. Optional:
+add_arguments(group) adds options, and NUM_ENVS is the number of worlds without --num-envs. ci/benchlib.py has what sections share.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from rich.console import Console
 from xreset.backends.workers import usable_cores
 
 _NUM_ENVS = 8
-"""Worlds of a section that does not say otherwise."""
+"""Worlds of a section without NUM_ENVS."""
 
 
 def sections() -> dict[str, ModuleType]:
@@ -62,7 +61,7 @@ def main() -> None:
     chosen = arguments.pop("sections") or list(known)
     if unknown := set(chosen) - set(known):
         parser.error(
-            f"there is no section {', '.join(sorted(unknown))}; there are {', '.join(known)}"
+            f"Unknown section {', '.join(sorted(unknown))}. Choose from: {', '.join(known)}."
         )
 
     num_envs = arguments.pop("num_envs")

@@ -1,6 +1,4 @@
-"""Fuzzes every reader and command for some minutes.
-
-tests/fuzzing.py and tests/fuzzing_commands.py say what is done and what must hold."""
+"""Fuzzes every reader and command for some minutes, as tests/fuzzing.py and tests/fuzzing_commands.py describe."""
 
 from __future__ import annotations
 
@@ -23,7 +21,7 @@ from tests.fuzzing import Reader, damages, outcome, readers
 from tests.fuzzing_commands import commands, draw, outcome_of_command
 
 GIGABYTES = 6
-"""Of address space that the whole process may take beyond what it has at the start."""
+"""Address space that the process may take in addition to that at its start."""
 
 COMMAND_LINES = "command lines"
 """The name of the commands among the readers."""
@@ -107,7 +105,8 @@ def main() -> int:
         resource.setrlimit(
             resource.RLIMIT_AS, (virtual + (GIGABYTES << 30), resource.RLIM_INFINITY)
         )
-        end, rounds = time.monotonic() + 60 * options.minutes, 0
+        end = time.monotonic() + 60 * options.minutes
+        rounds = 0
         while time.monotonic() < end:
             rounds += 1
             for name, reader in chosen.items():

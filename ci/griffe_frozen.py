@@ -1,4 +1,4 @@
-"""The reference's signatures of classes that are ``@xreset.checks.frozen``: to griffe they are data classes."""
+"""Shows classes that are ``@xreset.checks.frozen`` as data classes in the reference, for their signatures."""
 
 import griffe
 

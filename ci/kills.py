@@ -1,6 +1,6 @@
-"""SIGKILL at random moments: every command is killed some times, then given again until it ends; nothing may be lost but the time.
+"""Kills each command some times at random moments, then repeats it until it ends. Only time may be lost.
 
-A file under its final name must always be whole, and at the end no leftover may lie beside it or in shared memory.
+A file under its final name must always be whole. At the end no temporary file may be left.
 """
 
 from __future__ import annotations
@@ -172,7 +172,7 @@ def main() -> int:
             print(rows[-1], flush=True)
     orphans = set(SHARED_MEMORY.glob("xreset-*")) - shared
     print(
-        "| command | kills | then went on to its end | left behind |\n|---|---|---|---|",
+        "| command | kills | finished when repeated | left behind |\n|---|---|---|---|",
         *rows,
         sep="\n",
     )

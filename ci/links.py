@@ -1,4 +1,4 @@
-"""Links of the pages outside of docs/: each must lead to a file or heading of the project. mkdocs checks those within docs/."""
+"""Checks the links of pages outside of docs/: each must lead to a file or heading of the project. mkdocs checks docs/."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _LINK = re.compile(r"\]\(([^)\s#]*)(?:#([^)\s]*))?\)")
 
 
 def anchors(page: Path) -> set[str]:
-    """What headings are called in links, as GitHub and mkdocs do."""
+    """Return the names of a page's headings in links, as GitHub and mkdocs make them."""
     headings = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)
     return {
         re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings
@@ -19,7 +19,7 @@ def anchors(page: Path) -> set[str]:
 
 
 def broken(page: Path) -> list[str]:
-    """The links of a page that lead nowhere."""
+    """Return the links of a page that lead nowhere."""
     found = []
     for target, anchor in _LINK.findall(page.read_text()):
         if "://" in target or target.startswith("mailto:"):
@@ -35,12 +35,10 @@ def main() -> None:
     pages = subprocess.run(
         ["git", "ls-files", "*.md"], capture_output=True, text=True, check=True
     ).stdout.split()
-    problems = [
-        problem
-        for page in pages
-        if not page.startswith("docs/") and Path(page).exists()
-        for problem in broken(Path(page))
-    ]
+    problems = []
+    for page in pages:
+        if not page.startswith("docs/") and Path(page).exists():
+            problems += broken(Path(page))
     print("\n".join(problems), file=sys.stderr, end="\n" if problems else "")
     raise SystemExit(bool(problems))
 

@@ -1,6 +1,6 @@
 """Runs the unittest suite, one process per core, and ends with one line: ``N passed, N failed, N skipped``.
 
-usage: run_tests.py [--quick] [NAME ...]      (default: every tests/test_*.py; --quick: those that take seconds, no physics)
+usage: run_tests.py [--quick] [NAME ...]      (default: every tests/test_*.py; --quick: the modules in QUICK)
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ QUICK = (
     "accounts", "docs", "engines_page", "eval", "files", "kinematics", "mirror", "render", "robots",
     "schedule", "task",
 )  # fmt: skip
-"""Modules of tests that a change of code is first tried with."""
+"""Test modules of `--quick`: without physics, done in seconds."""
 
 MOST_PROCESSES = 4
-"""A process of tests takes up to 2 GB."""
+"""Most test processes at a time: each takes up to 2 GB."""
 
 
 @dataclass
 class Outcome:
-    """What the tests of one module did."""
+    """Outcome of the tests of one module."""
 
     name: str
     seconds: float
     passed: int
     failed: int
     skipped: list[str]
-    text: str  # what unittest prints, with tracebacks
+    text: str  # output of unittest, with tracebacks
 
 
 class Result(unittest.TextTestResult):
@@ -57,7 +57,7 @@ class Result(unittest.TextTestResult):
 
 
 def restore_interrupts() -> None:
-    # What a script starts in the background ignores Ctrl-C, and so would every process that a test starts and interrupts.
+    # A process in the background of a script ignores Ctrl-C, and so do its children, which some tests interrupt.
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
@@ -93,7 +93,7 @@ def run_all(names: list[str], processes: int):
                     0,
                     1,
                     [],
-                    "A test process died here, or in a module that ran beside it.\n",
+                    "A test process died, of this module or of one that ran at the same time.\n",
                 )
 
 

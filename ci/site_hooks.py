@@ -1,4 +1,4 @@
-"""What mkdocs does not do by itself."""
+"""Hooks of mkdocs that change the site's pages."""
 
 import re
 from pathlib import Path
@@ -21,7 +21,7 @@ def on_page_content(html: str, **_: Any) -> str:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """The reference names `xreset.NAME`; its docstring is in the module that `import xreset` takes it from."""
+    """Replace `xreset.NAME` in the reference by the module that `import xreset` takes the name from."""
 
     def place(match: re.Match[str]) -> str:
         name = match[1]

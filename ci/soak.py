@@ -1,4 +1,4 @@
-"""Steps worlds of each engine in turn, begins them anew and breaks them now and then, and watches the memory of its processes."""
+"""Steps worlds of each engine in turn, resets them often and breaks some on purpose, and watches the memory of its processes."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def main() -> int:
         name for name in backend_names() if backend_status(name).reason is None
     ]
     print(
-        "| engine | minutes | control steps of a world | new starts | broken on purpose | memory at first, at the end | |\n"
+        "| engine | minutes | control steps of a world | resets | broken on purpose | memory at first, at the end | |\n"
         + "|---" * 7
         + "|"
     )
@@ -58,10 +58,14 @@ def main() -> int:
 
 
 def soak(name: str, seconds: float) -> int:
-    robot, task = robots.load("ur7e-sharpa"), TaskConfig()
+    robot = robots.load("ur7e-sharpa")
+    task = TaskConfig()
     scene = make_scene(robot, tuple(load_objects([OBJECT], None)), task)
     chance = torch.Generator().manual_seed(0)
-    used, steps, starts, broken = [], 0, 0, 0
+    used = []
+    steps = 0
+    starts = 0
+    broken = 0
     with (
         tempfile.TemporaryDirectory() as folder,
         make_backend(name, scene, WORLDS, device="cpu") as backend,

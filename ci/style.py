@@ -1,6 +1,6 @@
 """Checks two habits that ruff has no rule for: packed assignments and nested comprehensions.
 
-usage: style.py [FOLDER ...]      (default: the packages that docs/style.md applies to)
+usage: style.py [FOLDER ...]      (default: all code but the examples, which must be short)
 
 A packed assignment is ``a, b = x, y`` where a plain pair of statements would do; swapping two names is allowed.
 A nested comprehension has two ``for`` or holds another comprehension. ``# noqa: XR001`` or ``XR002`` on the line allows one.
@@ -13,7 +13,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-FOLDERS = ("xreset", "backends", "robots", "eval", "ci", "tests", "examples")
+FOLDERS = ("xreset", "backends", "robots", "eval", "ci", "tests")
 COMPREHENSIONS = (ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
 
 
@@ -40,7 +40,7 @@ def is_nested(node: ast.AST) -> bool:
 
 
 def problems(path: Path) -> Iterator[str]:
-    """One line for each finding in a file."""
+    """Yield one line for each finding in a file."""
     text = path.read_text()
     lines = text.splitlines()
     for node in ast.walk(ast.parse(text)):
@@ -53,7 +53,7 @@ def problems(path: Path) -> Iterator[str]:
 
 
 def python_files(folder: Path) -> Iterator[Path]:
-    """Python files of a folder; links are left out, because what they point to is checked where it lies."""
+    """Yield the Python files of a folder without its links, whose files are checked where they are."""
     for path in sorted(folder.rglob("*.py")):
         if not any(part.is_symlink() for part in (path, *path.parents)):
             yield path

@@ -10,7 +10,7 @@ from xreset.demos.keypoints import Convention, read_keypoints
 
 
 def record(file: Path) -> None:
-    """Stands for your tracker: 21 hand keypoints and the object's pose in each frame, millimetres, quaternions (x, y, z, w)."""
+    """Write what your tracker would record: 21 hand keypoints and the object's pose in each frame, millimetres, quaternions (x, y, z, w)."""
     hand = xreset.synthesize(["005_tomato_soup_can"], 1, seed=0)
     seen = hand.hand_valid
     np.savez(
@@ -26,7 +26,7 @@ def record(file: Path) -> None:
 def main(out: Path) -> None:
     """Write ``recorded.npz`` and ``bank.npz``."""
     record(out / "recorded.npz")
-    # what the numbers mean is said, never guessed
+    # what the numbers mean is stated, never guessed
     convention = Convention(
         order="mediapipe",
         units="mm",
@@ -37,7 +37,8 @@ def main(out: Path) -> None:
     )
     demos = read_keypoints(out / "recorded.npz", convention)
 
-    robot, can = xreset.load_robot("openarm"), xreset.load_object("soup")
+    robot = xreset.load_robot("openarm")
+    can = xreset.load_object("soup")
     motion = xreset.retarget_demos(demos, robot, [can])
     bank = xreset.make_bank(motion, robot, [can], num_envs=8)
     xreset.write_bank(out / "bank.npz", bank, config={}, inputs={})

@@ -10,7 +10,8 @@ import xreset
 
 def main(bank: Path, engine: str = "mujoco", steps: int = 60) -> None:
     """Act at random; ``bank``: a file of ``xreset resets``, or of example 02."""
-    robot, states = xreset.load_robot("openarm"), xreset.read_bank(bank)
+    robot = xreset.load_robot("openarm")
+    states = xreset.read_bank(bank)
     objects = [xreset.load_object(name) for name in states.object_names]
     with xreset.make_env(robot, objects, states, engine=engine, num_envs=4) as env:
         print(

@@ -27,7 +27,8 @@ def upright(x: RewardInput) -> Tensor:
 
 def main(bank: Path) -> None:
     """Act at random, and show what the term pays."""
-    robot, states = xreset.load_robot("openarm"), xreset.read_bank(bank)
+    robot = xreset.load_robot("openarm")
+    states = xreset.read_bank(bank)
     objects = [xreset.load_object(name) for name in states.object_names]
     term = f"{Path(__file__).stem}:upright"  # module:function
     task = TaskConfig(reward=RewardConfig(own={term: 0.5}))

@@ -3,7 +3,7 @@
 `xreset robots import --arm ARM --hand HAND --out FOLDER` writes such a folder from what makers publish. A package makes it known by name:
 
     [project.entry-points."xreset.robots"]
-    my-robot = "my_package.my_robot"          # the module beside robot.toml
+    my-robot = "my_package.my_robot"          # the module next to robot.toml
 """
 
 import shutil

@@ -10,10 +10,11 @@ from xreset.geometry.rotations import matrix_to_quat
 
 
 class KinematicWorld(World):
-    """A robot that follows its targets at once, beside an object that nothing moves."""
+    """A robot that follows its targets at once, next to an object that nothing moves."""
 
     def __init__(self, scene, object_index):
-        self._robot, self._kinematics = scene.robot, Kinematics(scene.robot)
+        self._robot = scene.robot
+        self._kinematics = Kinematics(scene.robot)
 
     def set_state(self, state):
         self._state = {name: np.array(value) for name, value in state.items()}
@@ -31,17 +32,15 @@ class KinematicWorld(World):
         }
 
     def links(self):
-        q, velocity, links = (
-            torch.as_tensor(self._state["joint_pos"]),
-            self._state["joint_vel"],
-            self._robot.tracked_links,
-        )
-        T, J = self._kinematics.link_poses(q, links), self._kinematics.jacobian(q, links)
+        q = torch.as_tensor(self._state["joint_pos"])
+        links = self._robot.tracked_links
+        T = self._kinematics.link_poses(q, links)
+        J = self._kinematics.jacobian(q, links)
         return (
             T[:, :3, 3].numpy(),
             matrix_to_quat(T[:, :3, :3]).numpy(),
-            J.linear.numpy() @ velocity,
-            J.angular.numpy() @ velocity,
+            J.linear.numpy() @ self._state["joint_vel"],
+            J.angular.numpy() @ self._state["joint_vel"],
         )
 
     def contacts(self):
@@ -52,12 +51,14 @@ class KinematicWorld(World):
 
 
 class KinematicBackend(PoolBackend):
-    name, capabilities, world_class = "kinematic", frozenset(), KinematicWorld
+    name = "kinematic"
+    capabilities = frozenset()
+    world_class = KinematicWorld
     engine_version = classmethod(lambda cls: "1")
 
 
 def main() -> None:
-    """What `xreset engines check` does. The first two checks pass; nothing falls in this engine, and the third says so."""
+    """Do what `xreset engines check` does. The first two checks pass; the third fails, because nothing falls in this engine."""
     make = lambda *scene, **options: KinematicBackend(*scene, workers=0, **options)  # noqa: E731 (in this process)
     checks = ("state_round_trip", "links_after_set", "free_fall")
     for result in conformance.run(make, only=checks):

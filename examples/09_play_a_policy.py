@@ -1,4 +1,4 @@
-"""A policy plays without the training stack: onnxruntime and numpy read the file, which says itself what goes in and comes out.
+"""A policy plays without the training stack: onnxruntime and numpy read the file, which states its inputs and outputs.
 
 Only the worlds come from xreset here; on a robot, your own code fills the same arrays.
 """

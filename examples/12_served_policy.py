@@ -14,7 +14,7 @@ from websockets.sync.client import connect
 
 
 def main(url: str = "ws://127.0.0.1:8765", steps: int = 300) -> None:
-    """Ask for targets of a robot that stands at home, and print how long the answers take."""
+    """Ask for targets of a robot that rests at home, and print how long the answers take."""
     try:
         connection = connect(url, max_size=None, compression=None)
     except (OSError, WebSocketException) as error:

@@ -58,7 +58,7 @@ class Reader:
     file: Path
     """A valid one."""
     read: Callable[[Path], Any]
-    """Reads a file of that name; the others beside it are valid."""
+    """Reads a file of that name; the other files of its folder are valid."""
     kind: str
     """``npz``, ``json``, ``yaml``, ``checkpoint``, ``text`` or ``bytes``: what damage understands of it."""
     may_hold: tuple[str, ...] = ()

@@ -120,9 +120,10 @@ def outcome_of_command(line):
             for flag, value in pairwise(line)
             if flag.lstrip("-") in _WRITTEN
         ]
-        stray = sorted(
-            path for path in written if not any(path.is_relative_to(out) for out in outputs)
-        )
+        stray = []
+        for path in sorted(written):
+            if not any(path.is_relative_to(out) for out in outputs):
+                stray.append(path)
         is_device = (work / "null.npz").is_char_device()
     assert is_device, "it replaced a device"
     assert code in (0, 1, 2), f"exit status {code!r}"

@@ -1,6 +1,7 @@
 """Accounts of what is kept and lost."""
 
 import unittest
+from itertools import product
 
 import numpy as np
 
@@ -15,11 +16,8 @@ class AccountsTest(unittest.TestCase):
         reason = rng.choice(["", "jump", "limit", "not annotated"], 200, p=[0.5, 0.3, 0.1, 0.1])
         rows = accounts(names, post, reason)
         phases = ("pre-contact", "post-contact")
-        expected = [(name, phase) for name in ("box", "can") for phase in phases]
-        self.assertEqual(
-            [(r.object_name, r.phase) for r in rows],
-            [*expected, *(("all", p) for p in (*phases, "both"))],
-        )
+        expected = [*product(("box", "can", "all"), phases), ("all", "both")]
+        self.assertEqual([(row.object_name, row.phase) for row in rows], expected)
         for row in rows:
             mine = (names == row.object_name) | (row.object_name == "all")
             mine &= (post == (row.phase == "post-contact")) | (row.phase == "both")

@@ -1,5 +1,4 @@
-"""Base placement: wrist poses that are within reach by construction are found so, and a robot that stands wrong is
-moved."""
+"""Base placement: wrist poses within reach are found to be, and a robot in a wrong place is moved."""
 
 import shutil
 from dataclasses import replace
@@ -64,7 +63,7 @@ class PlaceTest(InFolder):
         self.assertGreater(self.reached[1], 0.1)
         self.assertEqual(placing.reach(self.lost, self.wrists), (0.0, 0.0))
 
-    def test_a_robot_that_stands_wrong_is_moved_to_where_it_reaches(self):
+    def test_a_robot_in_a_wrong_place_is_moved_to_where_it_reaches(self):
         seen = []
         avoid = self.wrists.root_pos[:, 0].numpy()
         told = lambda *at: seen.append(at)  # noqa: E731
@@ -250,13 +249,14 @@ class WritePlacementTest(InFolder):
     def test_the_description_reads_back(self):
         for _ in range(2):  # the second one replaces the first
             self.write(self.best, 'xreset robots place openarm --demos "my demos.npz"')
-            after, best = load(self.folder), self.best.robot
+            after = load(self.folder)
+            best = self.best.robot
             self.assertEqual((after.base_pos, after.base_quat), (best.base_pos, best.base_quat))
             assert_allclose(after.home, best.home, atol=1e-3)
         line = '# Placement: reaches 91.2 % and follows 87.6 % of 321 frames: xreset robots place openarm --demos "my demos.npz"'
         self.assertEqual(self.lines(True), [line])
-        drives = ([joint.drive for joint in robot.joints] for robot in (after, self.robot))
-        self.assertEqual(*drives)
+        for joint, before in zip(after.joints, self.robot.joints, strict=True):
+            self.assertEqual(joint.drive, before.drive)
 
     def test_where_the_own_placement_is_best_only_its_figure_is_written(self):
         lines = self.lines(False)

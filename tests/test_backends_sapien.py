@@ -85,7 +85,7 @@ class CollisionBitsTest(TestCase):
             for a, b in itertools.combinations(robot.self_collision_links, 2)
             if bits[a][0] & bits[b][1] or bits[a][1] & bits[b][0]
         }
-        # base and column are neighbours, wrist and jaw_a too; between wrist and pad_b lies jaw_b.
+        # base and column are neighbours, wrist and jaw_a too; jaw_b is between wrist and pad_b.
         expected = {("base", "wrist"), ("base", "pad_b"), ("column", "wrist"), ("column", "jaw_a"), ("column", "pad_b"),
                     ("wrist", "pad_b"), ("jaw_a", "pad_b")}  # fmt: skip
         self.assertEqual(hits, {frozenset(pair) for pair in expected})

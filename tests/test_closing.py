@@ -29,7 +29,8 @@ from xreset.retarget.file import object_sources, write_retargeted
 from xreset.task.config import ResetConfig
 
 ROBOT = toy_grasp.robot()
-JAW, LIFT = ROBOT.joint_names.index("jaw_a_slide"), ROBOT.joint_names.index("lift")
+JAW = ROBOT.joint_names.index("jaw_a_slide")
+LIFT = ROBOT.joint_names.index("lift")
 WIDE = toy_grasp.OPEN + 0.03
 """A jaw position 30.1 mm from the brick."""
 
@@ -119,7 +120,8 @@ class ClosingTest(TestCase):
 
     def test_only_until_thumb_and_finger_touch_or_the_object_is_moved(self):
         self.gap[1:, 1] = 0.001  # a finger alone
-        self.gap[2, 0], self.gap[8, 0] = 0.001, 0.001
+        self.gap[2, 0] = 0.001
+        self.gap[8, 0] = 0.001
         self.assertEqual(self.bridged(), [0, 1, 5, 6, 7], "also where the thumb lets go again")
         pos = self.data.object_pos.copy()
         pos[6, 0] += 0.011
@@ -187,7 +189,8 @@ class FingersTest(TestCase):
         pressing = torch.ones(2, 5, dtype=torch.bool)
         pressing[1, 1:] = False
         factor = _balance(toy_fingers(2, 5, inward=inward, lever=lever), pressing)
-        thumb, others = float(factor[0, 0]), factor[0, 1:]
+        thumb = float(factor[0, 0])
+        others = factor[0, 1:]
         self.assertAlmostEqual(float(factor[0].mean()), 1.0)
         self.assertAlmostEqual(thumb, float(others.sum()), delta=0.1)
         assert_allclose(others, others.mean().expand(4), atol=1e-6)

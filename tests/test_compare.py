@@ -299,9 +299,11 @@ class ScoreTest(Compared):
 
     def test_the_crossed_bootstrap_has_the_variance_of_its_design(self):
         rng = default_rng(1)
-        of_run, of_demo = rng.normal(size=8), 2 * rng.normal(size=30)
+        of_run = rng.normal(size=8)
+        of_demo = 2 * rng.normal(size=30)
         values = (of_run[:, None] + of_demo).ravel()
-        runs, demos = np.repeat(np.arange(8), 30), np.tile(np.arange(30), 8)
+        runs = np.repeat(np.arange(8), 30)
+        demos = np.tile(np.arange(30), 8)
         with mock.patch("xreset.eval.stats.DRAWS", 20000):
             low, high = crossed_bootstrap_ci95(values, runs, demos)
         expected = 2 * 1.96 * np.sqrt(of_run.var() / 8 + of_demo.var() / 30)
@@ -326,8 +328,9 @@ class ScoreTest(Compared):
         one = np.zeros(40, int)
         low, high = difference_ci95([hard, one, one], [hard + rng.normal(size=40), one, one])
         self.assertGreater(high - low, 0.3, "episodes of one demonstration are drawn")
-        one, two = ([x[:n] for x in (both[0], runs, demos)] for n in (3, 41))
-        self.assertRaisesRegex(ValueError, "every training needs", difference_ci95, one, two)
+        few = [x[:3] for x in (both[0], runs, demos)]
+        more = [x[:41] for x in (both[0], runs, demos)]
+        self.assertRaisesRegex(ValueError, "every training needs", difference_ci95, few, more)
 
 
 class FairnessTest(Compared):

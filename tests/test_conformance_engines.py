@@ -35,7 +35,7 @@ def explain(result):
 
 @cache
 def panda():
-    """The Franka Panda of the package ``pybullet_data``, standing beside the table, with critically damped drives."""
+    """The Franka Panda of the package ``pybullet_data``, next to the table, with critically damped drives."""
     import pybullet_data
 
     urdf = Path(pybullet_data.getDataPath()) / "franka_panda" / "panda.urdf"

@@ -167,10 +167,10 @@ class Archive(InFolder):
             self.assertRaisesRegex(DemoError, message, self.demos.select, **options)
 
     def test_split_by_share_spread_and_chance(self):
-        parts = [
-            replace(self.demos, sequence_name=np.array([f"{i}{j}" for j in range(4)]))
-            for i in range(6)
-        ]
+        parts = []
+        for i in range(6):
+            names = np.array([f"{i}{j}" for j in range(4)])
+            parts.append(replace(self.demos, sequence_name=names))
         demos = merge_demos(parts)  # 12 sequences of each object
         alone = demos.select(objects=["soup"])
         for options, soup in (

@@ -80,7 +80,8 @@ class RuntimeTest(InFolder):
                 frames.append({"action": action.numpy(), **vars(reading)})
                 env.advance(action)
         names = ("action", "joint_pos", "joint_vel", "object_pos", "object_quat", "tip_force")
-        recording |= {name: np.stack([frame[name][0] for frame in frames]) for name in names}
+        for name in names:
+            recording[name] = np.stack([frame[name][0] for frame in frames])
         np.savez(f"{self.folder}/recording.npz", object=SOUP, **recording)
         command = [
             sys.executable,

@@ -118,10 +118,10 @@ class DistillTest(WithBank):
             after = read_checkpoint(latest_checkpoint(out))
         self.assertLess(np.mean(errors[-3:]), 0.5 * np.mean(errors[:3]))
         self.assertEqual((before.iteration, after.iteration), (15, 20))
-        steps = [
-            max(int(s["step"]) for s in c.optimizer_state_dict["state"].values())
-            for c in (before, after)
-        ]
+        steps = []
+        for checkpoint in (before, after):
+            states = checkpoint.optimizer_state_dict["state"].values()
+            steps.append(max(int(state["step"]) for state in states))
         self.assertEqual(20 * steps[0], 15 * steps[1], "the optimizer went on")
 
     def test_the_lift_clock_starts_when_the_student_acts_alone(self):

@@ -79,7 +79,7 @@ def unknown_names(program):
     unknown = [name for name, value in known.items() if value is None]
 
     def value_of(node):
-        """What a name, or an attribute of a module, stands for; None: something else."""
+        """Return the value of a name or of a module's attribute; None: unknown."""
         if isinstance(node, ast.Name):
             return known.get(node.id)
         if isinstance(node, ast.Attribute):
@@ -146,10 +146,10 @@ class PageTest(TestCase):
 
     def test_classes_and_files_exist(self):
         folders = ("xreset", "backends", "robots", "eval", "examples", "tests", "ci")
-        sources = [file for folder in folders for file in (ROOT / folder).rglob("*.py")]
         defined = {"DataFrame"}  # of pandas
-        for file in sources:
-            defined.update(re.findall(r"(?m)(?:class |import |^)(\w+)", file.read_text()))
+        for folder in folders:
+            for file in (ROOT / folder).rglob("*.py"):
+                defined.update(re.findall(r"(?m)(?:class |import |^)(\w+)", file.read_text()))
         files = 0
         for page in PAGES:
             text = re.sub(r"(?ms)^```.*?^```|^    .*?$", "", page.read_text())

@@ -1,7 +1,7 @@
 """The environment and the rollouts on the MuJoCo C engine: episodes begin and end as they should, world by world."""
 
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, product
 from types import SimpleNamespace
 from unittest import SkipTest, TestCase
 from unittest.mock import patch
@@ -64,7 +64,7 @@ QUIET = replace(
 
 
 class BreakableBackend(MujocoBackend):
-    """An engine some of whose worlds are not finite, or drop contacts, until they are set again."""
+    """An engine with worlds that are not finite, or drop contacts, until they are set again."""
 
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
@@ -91,7 +91,7 @@ class BreakableBackend(MujocoBackend):
 
 
 class Waiting(TorchDispatchMode):
-    """Takes note of operations whose result decides what the host does next: a number read, a number of rows that depends on values."""
+    """Records operations for which the host waits: reading a number, or a number of rows that depends on values."""
 
     NAMES = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "is_nonzero")
 
@@ -147,7 +147,9 @@ class WithEnv(TestCase):
 
 class RefusalTest(WithEnv):
     def test_what_does_not_belong_together_is_refused(self):
-        robot, objects, bank = self.robot, self.objects, self.bank
+        robot = self.robot
+        objects = self.objects
+        bank = self.bank
         names = tuple(f"other_{name}" for name in robot.joint_names)
         meshes = [replace(obj, source="0" * 64) for obj in objects]
         for words, *parts in (
@@ -232,7 +234,8 @@ class StepTest(WithEnv):
         env = self.make()
         before = env.joint_target.clone()
         action = torch.zeros(N, 7)
-        action[1, 1], action[2, 3] = 1.0, 2.0
+        action[1, 1] = 1.0
+        action[2, 3] = 2.0
         env.step(action)
         target = env.backend.state().joint_target
         assert_close(target, env.joint_target)
@@ -244,7 +247,8 @@ class StepTest(WithEnv):
         env = self.make(replace(QUIET, action=ActionConfig(arm_step=0.3, arm_lead=1.0)))
         env.advance(torch.ones(N, 7))
         env.reset()
-        readings, reach = [env.reading()], []
+        readings = [env.reading()]
+        reach = []
         for action in [1.0, -1.0, 1.0, -1.0]:
             for _ in range(5):
                 reading, reward = env.advance(torch.full((N, 7), action))
@@ -274,8 +278,9 @@ class StepTest(WithEnv):
 
 
 class ResetTest(WithEnv):
-    def test_only_the_finished_world_begins_anew(self):
-        env, other = self.make(QUIET), self.make(QUIET)
+    def test_only_the_finished_world_is_reset(self):
+        env = self.make(QUIET)
+        other = self.make(QUIET)
         began = env.backend.state().object_quat.clone()
         for each in (env, other):
             self.play(each, 8)
@@ -295,7 +300,7 @@ class ResetTest(WithEnv):
         self.assert_same(observations, expected, [0, 2])
         cloud = observations["perception"]
         assert_close(cloud[[0, 2], :-1], last_cloud[[0, 2], 1:])
-        # the new episode's history is its first frame, without previous action and reward
+        # the new episode's history is its first frame; it has no previous action and reward
         assert_close(cloud[1], cloud[1, :1].expand_as(cloud[1]))
         self.assertEqual(observations["policy"][1, 15:].abs().max(), 0.0)
         self.assertEqual(observations["privileged"][1, -1], 0.0)
@@ -374,7 +379,8 @@ class RobustnessTest(WithEnv):
     def observed(self, tracker):
         """Errors of the observed positions [steps, N, 3], and errors of the cloud's middle that follow from them."""
         env = self.make(self.task(tracker=tracker))
-        errors, cloud_errors = [], []
+        errors = []
+        cloud_errors = []
         for action in self.actions(12):
             observations, *_ = env.step(action)
             state = env.backend.state()
@@ -384,7 +390,7 @@ class RobustnessTest(WithEnv):
             cloud_errors.append((seen - cloud).mean(dim=1))
         return torch.stack(errors), torch.stack(cloud_errors)
 
-    def test_a_tracker_errs_by_the_same_in_an_episode_and_anew_in_every_pose(self):
+    def test_a_tracker_has_one_bias_in_an_episode_and_new_noise_in_every_pose(self):
         bias, cloud_bias = self.observed(TrackerConfig(position_bias=0.01))
         self.assertTrue(((bias.abs() <= 0.01001) & (bias.abs() > 0)).all())
         assert_close(bias, bias[:1].expand_as(bias))
@@ -444,13 +450,16 @@ class RobustnessTest(WithEnv):
 
     def test_pushes_change_velocities_by_what_they_say(self):
         push = PushConfig(probability=(1.0, 1.0), object_velocity=0.5, object_spin=4.0)
-        env, same = self.make(self.task(push=push)), self.make(self.task())
+        env = self.make(self.task(push=push))
+        same = self.make(self.task())
         for each in (env, same):
             state = each.backend.state()
             raised = state.object_pos + tensor([0.0, 0.0, 0.3])
             each.backend.set_state(replace(state, object_pos=raised))
             each.step(torch.zeros(N, 7))
-        pushes, pushed, free = env.variation.pushes, env.backend.state(), same.backend.state()
+        pushes = env.variation.pushes
+        pushed = env.backend.state()
+        free = same.backend.state()
         mass = env.variation.parameters["object_mass"][:, None]
         expected = pushes.force / mass * env.backend.scene.control_dt
         self.assertTrue(((expected.norm(dim=-1) > 0) & (expected.norm(dim=-1) <= 0.5)).all())
@@ -520,7 +529,8 @@ class RobustnessTest(WithEnv):
     def test_a_snapshot_holds_what_is_late_and_scaled(self):
         live = RECIPES["live"].config.task.randomization
         task = replace(QUIET, randomization=replace(live, hand_latency=(0.0, 2.0)))
-        env, other = self.make(task), self.make(task, seed=1)
+        env = self.make(task)
+        other = self.make(task, seed=1)
         self.play(env, 5)
         other.restore(env.snapshot())
         other.generator.set_state(env.generator.get_state())
@@ -541,7 +551,7 @@ class RobustnessTest(WithEnv):
                 self.assertGreater(waiting.operations, 500)
                 self.assertEqual(waiting.found, [])
                 with waiting:
-                    # an engine on the CPU asks which worlds begin anew: that must show
+                    # an engine on the CPU asks which worlds are reset: that must show
                     self.play(env, 1)
                 self.assertEqual(waiting.found, ["aten.nonzero.default"])
 
@@ -666,7 +676,7 @@ class RolloutTest(WithEnv):
         one, found = (self.roll_out(ZeroPolicy(7), n) for n in (1, 6))
         self.assertEqual(
             [(e.sequence, e.repetition) for e in found.episodes],
-            [(s, r) for s in range(3) for r in range(2)],
+            [*product(range(3), range(2))],
         )
         self.assertEqual([e.object for e in found.episodes], [SOUP, SOUP, SPAM, SPAM, SOUP, SOUP])
         self.assertEqual(found.episodes[2].sequence_name, "demo_b")
@@ -726,7 +736,8 @@ class KinematicRetargetingTest(WithEnv):
         env = self.make(task)
         lengths = [7, 5, 6]
         rng = default_rng(0)
-        low, high = env.actions.lower.numpy(), env.actions.upper.numpy()
+        low = env.actions.lower.numpy()
+        high = env.actions.upper.numpy()
         shares = [0.5 + 0.02 * np.cumsum(rng.random((n, 7)), axis=0) for n in lengths]
         paths = [low + (high - low) * share for share in shares]
         for path in paths:

@@ -45,8 +45,10 @@ from xreset.task.reading import Reading
 CORNERS = tensor([[-1.0, -1, -1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]]) * 0.05
 POINTS = MetricPoints(keypoints=CORNERS[None], surface=CORNERS[None])
 IDENTITY = tensor([1.0, 0, 0, 0])
-START, GOAL = tensor([0.5, 0.3, 0.05]), tensor([0.5, 0.3, 0.25])
-PRESS, LIGHT = (1.0, 0.0, 1.0), (0.0, 1.0, 1.0)
+START = tensor([0.5, 0.3, 0.05])
+GOAL = tensor([0.5, 0.3, 0.25])
+PRESS = (1.0, 0.0, 1.0)
+LIGHT = (0.0, 1.0, 1.0)
 
 
 def reading(
@@ -58,7 +60,8 @@ def reading(
     overflow=False,
 ):
     """One world with three fingers (thumb first): the object's pose, fingertip distances [m], contact forces [N]."""
-    zero3, quats = torch.zeros(1, 3), IDENTITY.expand(1, 4, 4)
+    zero3 = torch.zeros(1, 3)
+    quats = IDENTITY.expand(1, 4, 4)
     joints = torch.zeros(1, 2)
     force = tensor(press)[None, :, None] * tensor([0.0, 0.6, 0.8])
     state = State.at_rest(joints, torch.as_tensor(pos)[None], torch.as_tensor(quat)[None])
@@ -272,7 +275,8 @@ class BootstrapTest(TestCase):
     @patch("xreset.eval.stats.DRAWS", 400)
     def covered(self, cluster):
         """Share of 200 experiments whose interval holds the true mean: 15 demonstrations, 5 episodes each, which are nearly alike."""
-        rng, hits = default_rng(3), 0
+        rng = default_rng(3)
+        hits = 0
         for _ in range(200):
             groups = np.repeat(np.arange(15), 5)
             values = rng.normal(0, 1, 15)[groups] + 0.1 * rng.normal(size=75)

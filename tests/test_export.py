@@ -102,12 +102,10 @@ class Arrays(Case):
         with np.load(f"{self.folder}/out.npz") as file:
             arrays = dict(file)
         page = (Path(__file__).parents[1] / "docs/rollouts.md").read_text().split("## npz")[1]
-        documented = {
-            name
-            for line in page.splitlines()
-            if line.startswith("| `")
-            for name in line.split("|")[1].split("`")[1::2]
-        }
+        documented = set()
+        for line in page.splitlines():
+            if line.startswith("| `"):
+                documented.update(line.split("|")[1].split("`")[1::2])
         self.assertEqual(documented, set(arrays))
         self.assertEqual(str(arrays["schema"]), "xreset-rollouts/1")
         self.assertIn(file_hash(f"{self.folder}/eval/sapien.trace.npz"), str(arrays["meta"]))

@@ -55,7 +55,7 @@ class Budget(TestCase):
 
 
 class Environment(WithEnv):
-    def test_a_world_that_drops_contacts_begins_anew_and_is_counted_once(self):
+    def test_a_world_that_drops_contacts_is_reset_and_counted_once(self):
         env = self.make(kind=BreakableBackend)
         env.backend.overflow[1] = True
         for world_ends in (True, False):

@@ -99,7 +99,8 @@ class AtomicWriteTest(InFolder):
         self.addCleanup(os.umask, os.umask(0o022))
         for umask in (0o022, 0o077):
             os.umask(umask)
-            file, folder = self.folder / "a.json", self.folder / f"made-{umask}"
+            file = self.folder / "a.json"
+            folder = self.folder / f"made-{umask}"
             write_json(file, {})
             with atomic_folder(folder):
                 pass

@@ -47,13 +47,13 @@ _PLACES = {
 """The fourth is a right hand's thumb: seen from the back of the hand, fingers up, it is on the left."""
 
 
-def _finger(name, beside=0.0):
-    """A finger along x that bends towards -z; its second joint follows the first. The origins of its joints are beside
-    it along their axes."""
+def _finger(name, sideways=0.0):
+    """A finger along x that bends towards -z; its second joint follows the first. The origins of its joints are moved
+    sideways along their axes."""
     (x, y, z), rpy = _PLACES[name]
-    return f"""<link name="{name}_a">{_BONE.format(mass=0.05, y=-beside)}<link name="{name}_b">{_BONE.format(mass=0.03, y=-beside)}
+    return f"""<link name="{name}_a">{_BONE.format(mass=0.05, y=-sideways)}<link name="{name}_b">{_BONE.format(mass=0.03, y=-sideways)}
 <joint name="{name}_1" type="revolute"><parent link="base"/><child link="{name}_a"/>
-  <origin xyz="{x} {y + beside} {z}" rpy="{rpy}"/>{_LIMIT}</joint>
+  <origin xyz="{x} {y + sideways} {z}" rpy="{rpy}"/>{_LIMIT}</joint>
 <joint name="{name}_2" type="revolute"><parent link="{name}_a"/><child link="{name}_b"/><origin xyz="0.045 0 0"/>{_LIMIT}
   <mimic joint="{name}_1" multiplier="0.8" offset="0.1"/></joint>"""
 

@@ -1,3 +1,5 @@
+"""Kinematics, URDF files and mass matrices: read, written, and compared with MuJoCo."""
+
 import os
 import unittest
 from dataclasses import replace

@@ -37,7 +37,10 @@ from xreset.task.config import (
     TrackerConfig,
 )
 
-N, T, L, A = 3, 8, 4, 5
+N = 3
+T = 8
+L = 4
+A = 5
 GROUPS = ("policy", "proprio", "perception")
 SMALL = CONFIG.model
 
@@ -142,7 +145,7 @@ class ModelTest(TestCase):
 
 
 def places(alg):
-    """Where in memory the tensors lie that an update reads: a captured one reads there for ever."""
+    """Return the addresses of the tensors that an update reads: a captured update always reads these addresses."""
     read = vars(alg.storage) | {"rate": alg._rate, "sums": alg._sums}
     del read["rewards"]  # an update reads the returns of the rewards
     read["observations"] = dict(alg.storage.observations.items())

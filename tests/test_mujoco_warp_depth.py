@@ -1,4 +1,4 @@
-"""Contacts of MuJoCo-Warp against MuJoCo's: as many, and as deep, where shapes lie across an edge."""
+"""Contacts of MuJoCo-Warp are as many and as deep as MuJoCo's where shapes are across an edge."""
 
 import warnings
 from unittest import TestCase
@@ -21,7 +21,7 @@ WORLDS = 200
 
 
 def across_an_edge():
-    """A free capsule, and a can as a mesh of 24 faces around, whose edges it can lie across."""
+    """A free capsule, and a can as a mesh of 24 sides, across whose edges it can be."""
     can = trimesh.creation.cylinder(0.033, 0.1, sections=24)
     spec = mujoco.MjSpec()
     spec.add_mesh(
@@ -38,7 +38,7 @@ def across_an_edge():
 
 
 def poses(rng):
-    """[N, 7] the capsule beside the can, up to 1 mm deep and inclined by some hundredths, as fingertips are."""
+    """[N, 7] the capsule at the can, up to 1 mm deep and inclined by some hundredths, as fingertips are."""
     out = np.zeros((WORLDS, 7), dtype=np.float32)
     azimuth = rng.uniform(0, 2 * np.pi, WORLDS)
     radius = 0.033 + 0.009 - rng.uniform(0.0, 1e-3, WORLDS)

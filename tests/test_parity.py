@@ -1,3 +1,5 @@
+"""Agreement of engines on grasps: the episodes, the grasps that are found, the figures, and the engines themselves."""
+
 import json
 import math
 from dataclasses import replace
@@ -54,7 +56,8 @@ BRISK = mock.patch.multiple(
 """Grasps are tried harder and faster."""
 OFFSETS = ((0.0, 0.0), (0.02, 0.0), (0.0, 0.01), (-0.015, -0.005), (0.03, 0.0))
 """The open hand starts with fingers up to 17 mm inside the can, which every engine resolves in its own way: for MuJoCo against itself."""
-FREE_OFFSETS, FREE_GAP = ((0.03, 0.01), (0.02, 0.02), (0.04, 0.0)), 0.09
+FREE_OFFSETS = ((0.03, 0.01), (0.02, 0.02), (0.04, 0.0))
+FREE_GAP = 0.09
 """With these nothing overlaps at the start."""
 
 
@@ -132,7 +135,8 @@ class Episodes(TestCase):
             kinematics = Kinematics(robots.load(name))
             home = torch.as_tensor(kinematics.robot.home)[None]
             q = moved_fingertips(kinematics, home, distance)
-            before, after = tips(kinematics, home), tips(kinematics, q)
+            before = tips(kinematics, home)
+            after = tips(kinematics, q)
             line = torch.nn.functional.normalize(opening(kinematics, home), dim=-1)
             moved = ((after - before) * line[:, None]).sum(-1)[0]
             expected = torch.full_like(moved, -distance)
@@ -150,7 +154,7 @@ class Episodes(TestCase):
         kp = tensor([joint.drive.kp for joint in self.robot.joints], dtype=torch.float64)
         torque = (kp * (target - held))[0]
         line = torch.nn.functional.normalize(opening(self.kinematics, self.home)[0], dim=0)
-        # four fingers share what the thumb bears
+        # the four fingers share the thumb's force
         force = torch.stack([4.0 * line, *[-1.0 * line] * 4])
         jacobian = self.kinematics.jacobian(
             held, [tip.link for tip in self.robot.fingertips]
@@ -221,7 +225,8 @@ class Finding(TestCase):
 
     def test_a_turned_or_moved_object_is_not_at_rest(self):
         motion = grasps_of(self.robot, self.can, [(0.0, 0.0), (0.0, 0.01), (0.02, 0.0)])
-        pos, joints = motion.object_pos, motion.joint_pos
+        pos = motion.object_pos
+        joints = motion.joint_pos
         for values in (pos, joints):
             values[1::2] = values[::2]
         pos[1, 0] += 0.012
@@ -291,7 +296,8 @@ class Numbers(TestCase):
     def test_object_in_palm(self):
         quarter = quat_from_axis_angle(tensor([0.0, 0.0, math.pi / 2]))
         corners = tensor([[[0.1, 0, 0], [-0.1, 0, 0]]]).expand(2, 2, 3)
-        pos, quat = tensor([0.0, 0.3, 0.0]).expand(3, 2, 3), quarter.expand(3, 2, 4)
+        pos = tensor([0.0, 0.3, 0.0]).expand(3, 2, 3)
+        quat = quarter.expand(3, 2, 4)
         # The same motion of palm and object changes nothing, and an object that turns in the palm is seen.
         moved = recording(object_pos=pos, palm_pos=pos, object_quat=quat, palm_quat=quat)
         for found, expected in ((moved, 0.0), (recording(object_quat=quat), 0.1 * math.sqrt(2))):
@@ -306,7 +312,8 @@ class Comparing(InFolder):
     @BRISK
     def setUpClass(cls):
         reference = engine("mujoco", workers=0)
-        robot, can = robots.load("ur7e-sharpa"), load_object("soup")
+        robot = robots.load("ur7e-sharpa")
+        can = load_object("soup")
         # Engines are told apart even where two have one name.
         named = (("heavy", heavy), (reference.name, weak))
         tested = [toy_grasp.with_scene(reference, *each) for each in named]
@@ -367,7 +374,8 @@ class Engines(TestCase):
 
     @BRISK
     def test_they_agree_with_mujoco(self):
-        robot, can = robots.load("ur7e-sharpa"), load_object("soup")
+        robot = robots.load("ur7e-sharpa")
+        can = load_object("soup")
         tested = [
             engine(name, workers=0)
             for name in ("pybullet", "sapien")

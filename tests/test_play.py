@@ -143,7 +143,7 @@ class Played(InFolder):
             assert_close(value, before[name], atol=0, rtol=0)
         session.step()
 
-    def test_a_broken_simulation_begins_anew(self):
+    def test_a_broken_simulation_is_reset(self):
         session = self.session
         session.step()
         session.env.backend.state().joint_vel.fill_(float("nan"))

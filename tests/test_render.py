@@ -1,3 +1,5 @@
+"""Pictures: everything is where it should be, in its own color."""
+
 from unittest import TestCase, mock
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""Robots: those that ship, descriptions with mistakes, and what `xreset robots check` finds."""
+
 import shutil
 from dataclasses import replace
 from importlib.metadata import EntryPoint

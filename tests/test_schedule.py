@@ -13,7 +13,7 @@ CASES = {
     "uneven objects": ([0] * 13 + [2] * 2 + [5], 6),
     "interleaved": ([i % 3 for i in range(20)], 5),
     "one of each of nine": (list(range(9)), 4),
-    "a rare object beside a common one": ([0] + [1] * 99, 10),
+    "a rare object and a common one": ([0] + [1] * 99, 10),
     "three rare objects": ([0, 1, 2] + [3] * 97, 10),
 }
 

@@ -64,9 +64,9 @@ class SelectTest(InFolder):
             choice.sentence(),
             "200.pt, 75.0 % in its worst engine (b), of 4 checkpoints in 3 engines; the newest, 300.pt, has 60.0 %.",
         )
-        order = {
-            name: "".join(e for other, e, _ in self.played if other == name) for name in SCORES
-        }
+        order = dict.fromkeys(SCORES, "")
+        for name, played_in, _ in self.played:
+            order[name] += played_in
         # where the best is worst comes first; one that cannot win is given up
         self.assertEqual(order, {"300.pt": "abc", "200.pt": "bca", "100.pt": "bc", "050.pt": "b"})
         with patch.dict(SCORES, {"100.pt": SCORES["200.pt"]}):

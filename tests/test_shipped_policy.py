@@ -54,7 +54,7 @@ class ShippedPolicyTest(unittest.TestCase):
                 self.assertNotIn(name, BASELINES)
                 found = card(file)
                 self.assertTrue(found.licence and found.data and found.recipe)
-                engines = {engine for figures in found.results.values() for engine in figures}
+                engines = set().union(*found.results.values())
                 self.assertLessEqual({"mujoco", "mujoco-warp", "pybullet", "sapien"}, engines)
                 trained = set(OnnxPolicy(file).contract.objects)
                 self.assertEqual(set(spec.objects_of(None)), trained & set(object_names()))

@@ -206,7 +206,10 @@ class RewardTest(TestCase):
         ):
             pressed = tensor(forces)[None, :, None] * tensor([0.6, 0.0, -0.8])
             self.assertEqual(contact_gate(pressed, 0.1), expected, forces)
-        down, left, right, none = [0.0, 0, -5], [-5.0, 0, -1], [5.0, 0, -1], [0.0, 0, 0]
+        down = [0.0, 0, -5]
+        left = [-5.0, 0, -1]
+        right = [5.0, 0, -1]
+        none = [0.0, 0, 0]
         for hand, touches, opposes in (
             ((down, down, down), True, False),
             ((left, right, none), True, True),
@@ -221,7 +224,8 @@ class RewardTest(TestCase):
 
 class TerminationTest(TestCase):
     def test_bounds(self):
-        table, c = TableSpec(center=(0.5, 0.3), half_size=(0.7, 0.5, 0.02)), TerminationConfig()
+        table = TableSpec(center=(0.5, 0.3), half_size=(0.7, 0.5, 0.02))
+        c = TerminationConfig()
         middle = tensor([0.5, 0.3, 0.1])
         for axis, limit in ((0, 1.3), (0, -0.3), (1, 0.9), (1, -0.3), (2, 1.0), (2, -0.05)):
             for share, expected in ((0.99, False), (1.01, True)):
@@ -300,7 +304,7 @@ class LatencyTest(TestCase):
         drawn.draw(torch.ones(4, dtype=torch.bool), generator())
         line.fill(torch.ones(4, dtype=torch.bool), torch.zeros(4, 1))
 
-        def heard(value):
+        def delayed(value):
             return line.push(torch.full((4, 1), value))[:, 0].tolist()
 
         for value, expected in (
@@ -308,9 +312,9 @@ class LatencyTest(TestCase):
             (20.0, [20, 10, 5, 0]),
             (30.0, [30, 20, 15, 10]),
         ):
-            self.assertEqual(heard(value), expected)
+            self.assertEqual(delayed(value), expected)
         line.fill(tensor([False, True, False, False]), torch.full((4, 1), 7.0))
-        self.assertEqual(heard(40.0), [40, 7, 25, 20])
+        self.assertEqual(delayed(40.0), [40, 7, 25, 20])
 
 
 class RandomizationTest(TestCase):
@@ -334,7 +338,7 @@ class RandomizationTest(TestCase):
 
 
 class Comparisons(TorchDispatchMode):
-    """Takes note of which numbers are compared."""
+    """Records comparisons of numbers."""
 
     def __init__(self):
         super().__init__()
@@ -473,7 +477,7 @@ class ResetTest(TestCase):
         self.assertAlmostEqual(offset(self.sample(training_xy=0.1)).max(), 0.1, delta=1e-3)
         lying = np.tile(turned(90, (1.0, 0, 0)).numpy(), (3, 1))
         found = self.sample(bank=replace(self.bank, start_quat_wxyz=lying)).object_quat
-        # y of the object stands up
+        # the object's y is vertical
         axis = quat_rotate(found, tensor([0.0, 1, 0]))
         assert_close(axis, tensor([0.0, 0, 1]).expand_as(axis), atol=1e-6, rtol=0)
 
@@ -507,7 +511,9 @@ QUIET = NoiseConfig(joint_pos=0.0, joint_vel=0.0, object_pos=0.0, object_rot=0.0
 
 
 class ObservationTest(TestCase):
-    N, J, E = 5, 7, 2
+    N = 5
+    J = 7
+    E = 2
 
     def setUp(self):
         g = generator()
@@ -619,7 +625,8 @@ class ObservationTest(TestCase):
 
     def test_privileged_group(self):
         found = obs.privileged_group(self.x, ObservationConfig())
-        x, state = self.x, self.x.state
+        x = self.x
+        state = self.x.state
         turn = quat_from_axis_angle(found[:, 9:12])
         axis = tensor([1.0, 0, 0]).expand(self.N, 3)
         corrected = quat_rotate(turn, quat_rotate(state.object_quat, axis))

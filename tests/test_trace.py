@@ -58,7 +58,7 @@ def grasp_actions(steps=60):
 
 
 def wave_actions():
-    """Every joint but the jaws steps at once, far from the object, which lies on the table."""
+    """Every joint but the jaws steps at once, far from the object, which is on the table."""
     actions = grasp_actions(30)
     home = torch.as_tensor(actions.robot.home, dtype=torch.float32)
     step = tensor([0.2 if "jaw" not in name else 0.0 for name in actions.robot.joint_names])
@@ -258,7 +258,8 @@ class ActionsTest(InFolder):
             assert_close(getattr(found.start, name), value, rtol=0, atol=0)
 
     def test_refusals(self):
-        robot, thing = self.actions.robot, self.actions.object
+        robot = self.actions.robot
+        thing = self.actions.object
         with self.assertRaisesRegex(
             FileFormatError, "for another version of 'conformance-gripper'"
         ):

@@ -124,7 +124,7 @@ class TrainingTest(WithBank):
             self.assertEqual((info.robot, info.resets, info.objects), expected)
 
     def test_goals_need_no_demonstrations(self):
-        """Every episode begins at home; fine-tuning goes on with the run's networks and configuration; a bank keeps its
+        """Every episode begins at home; fine-tuning continues with the run's networks and configuration; a bank keeps its
         states and gets the goals in addition."""
         goals = toy_goals(self.robot)
         write_goals(f"{self.folder}/goals.npz", goals)
@@ -440,7 +440,8 @@ class TrainingTest(WithBank):
         out = self.train("onwards", config=still, weights=self.out)
         info = read_run(out)
         self.assertEqual((info.weights, info.weights_hash), (str(given), file_hash(given)))
-        content, before = newest(out), read_checkpoint(given)
+        content = newest(out)
+        before = read_checkpoint(given)
         # counters start at zero
         self.assertEqual((content.iteration, content.env_steps), (1, 8 * 4))
         runner = Mock(config=CONFIG, _load=read_checkpoint)
@@ -570,7 +571,7 @@ class TrainingTest(WithBank):
         self.assertEqual(torch.get_float32_matmul_precision(), "medium")
         self.assertTrue(torch.distributed.is_initialized())
 
-    def test_a_run_without_a_checkpoint_goes_on_or_begins_anew(self):
+    def test_a_run_without_a_checkpoint_starts_again(self):
         """Killed before the first one: whether the same command is given again or --resume, and whatever is left of the first."""
         for is_resumed in (True, False):
             with self.subTest(is_resumed=is_resumed):

@@ -29,7 +29,7 @@ class VectorEnvTest(WithEnv):
         words = r"^env is 'x', expected ManipulationEnv\. Look at help\(xreset\.VectorEnv\.__init__\)\.$"
         self.assertRaisesRegex(XResetError, words, VectorEnv, "x")
 
-    def test_episodes_are_truncated_and_begin_anew_a_step_later(self):
+    def test_truncated_episodes_are_reset_a_step_later(self):
         env = self.vector_env(0.1)
         env.reset(seed=1)
         first, _ = env.reset(seed=0)
@@ -54,7 +54,8 @@ class VectorEnvTest(WithEnv):
             termination=TerminationConfig(episode_seconds=0.1),
         )
         inner = self.make(task, kind=BreakableBackend)
-        env, still = VectorEnv(inner), np.zeros((N, inner.num_actions), np.float32)
+        env = VectorEnv(inner)
+        still = np.zeros((N, inner.num_actions), np.float32)
         before, *_ = env.step(still)
         inner.backend.broken[0] = True
         seen, reward, terminated, truncated, infos = env.step(still)

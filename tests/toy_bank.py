@@ -8,7 +8,8 @@ import numpy as np
 
 from xreset import ResetBank, Retargeted, make_backend
 
-SOUP, SPAM = "005_tomato_soup_can", "010_potted_meat_can"
+SOUP = "005_tomato_soup_can"
+SPAM = "010_potted_meat_can"
 
 
 def in_this_process():

@@ -19,7 +19,8 @@ from xreset.spec import PairFriction, SceneSpec
 from xreset.task.config import ResetConfig, TaskConfig
 
 FRICTION = PairFriction(tip=0.9, link=0.5, table=0.6, torsional=0.002)
-OPEN, CLOSED = 0.0201, 0.0141
+OPEN = 0.0201
+CLOSED = 0.0141
 """Positions and targets [m] of a jaw: each finger then presses with 2.5 N, and 0.9 of that, twice, is 1.8 times the brick's weight."""
 AT_HOME = ResetConfig(
     demo_probability=0.0, home_gravity_std=0.0, spawn_xy=0.0, spawn_yaw=0.0, home_noise=False
@@ -74,7 +75,7 @@ def targets(step):
 
 
 def recording(*, steps=20, worlds=1, joints=5, **changes):
-    """A recording with two fingertips in which everything stands still and touches nothing; ``changes`` replace fields."""
+    """A recording with two fingertips in which nothing moves and nothing touches; ``changes`` replace fields."""
     upright = torch.tensor([1.0, 0, 0, 0])
     still = State.at_rest(
         torch.zeros(worlds, joints), torch.zeros(worlds, 3), upright.expand(worlds, 4)
@@ -129,7 +130,8 @@ class OpenLoop:
     """The policy that gives :func:`targets`."""
 
     def begin(self, env):
-        self._env, self._step = env, 0
+        self._env = env
+        self._step = 0
 
     def act(self, observations):
         wanted = torch.as_tensor(targets(self._step), dtype=torch.float32).expand(

@@ -74,7 +74,8 @@ def shares(mean):
 
 def bank():
     """States in which the brick hangs between the jaws, which are told to close."""
-    robot, (pos, quat) = toy_grasp.robot(), toy_grasp.brick_pose()
+    robot = toy_grasp.robot()
+    pos, quat = toy_grasp.brick_pose()
     closing = robot.home.copy()
     closing[robot.joint_names.index("jaw_a_slide")] = toy_grasp.CLOSED
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Collection, Mapping
 from importlib.metadata import version
+from itertools import product
 from typing import get_args
 
 import numpy as np
@@ -55,13 +56,12 @@ class DrakeWorld(World):
         self, scene: SceneSpec, object_index: int, *, settings: DrakeSettings = _DEFAULTS
     ) -> None:
         """See :class:`World`."""
-        robot, thing = mechanism(scene.robot), scene.objects[object_index]
+        robot = mechanism(scene.robot)
+        thing = scene.objects[object_index]
         self._inertia = object_inertia(thing)
         self._at = at = build_model(scene, robot, thing, self._inertia, settings)
-        self._internal_steps, self._dt = (
-            settings.internal_steps,
-            scene.timestep / settings.internal_steps,
-        )
+        self._internal_steps = settings.internal_steps
+        self._dt = scene.timestep / settings.internal_steps
         self._tips = len(scene.robot.fingertips)
         mimics = scene.robot.mimics
         self._source = np.array(
@@ -90,14 +90,19 @@ class DrakeWorld(World):
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         """See :meth:`World.set_state`. Drake's state is all that its solver remembers: nothing else has to be forgotten."""
-        at, i, j = self._at, self._object_q, self._object_v
+        at = self._at
+        i = self._object_q
+        j = self._object_v
         q, v = (np.zeros(size) for size in self._sizes)
-        q[at.joint_position], v[at.joint_velocity] = state["joint_pos"], state["joint_vel"]
+        q[at.joint_position] = state["joint_pos"]
+        v[at.joint_velocity] = state["joint_vel"]
         q[at.mimic_position] = self._multiplier * state["joint_pos"][self._source] + self._offset
         v[at.mimic_velocity] = self._multiplier * state["joint_vel"][self._source]
         self._quat = state["object_quat"] / np.linalg.norm(state["object_quat"])
-        q[i : i + 4], q[i + 4 : i + 7] = self._quat, state["object_pos"]
-        v[j : j + 3], v[j + 3 : j + 6] = state["object_angvel"], state["object_linvel"]
+        q[i : i + 4] = self._quat
+        q[i + 4 : i + 7] = state["object_pos"]
+        v[j : j + 3] = state["object_angvel"]
+        v[j + 3 : j + 6] = state["object_linvel"]
         values = np.concatenate((q, v))
         self._lost = None if np.isfinite(values).all() else values
         if self._lost is None:
@@ -109,7 +114,9 @@ class DrakeWorld(World):
 
     def get_state(self) -> dict[str, np.ndarray]:
         """See :meth:`World.get_state`."""
-        at, i, j = self._at, self._object_q, self._object_v
+        at = self._at
+        i = self._object_q
+        j = self._object_v
         values = (
             at.plant.GetPositionsAndVelocities(self._context) if self._lost is None else self._lost
         )
@@ -138,7 +145,8 @@ class DrakeWorld(World):
             return
         at = self._at
         load = ExternallyAppliedSpatialForce()
-        load.body_index, load.p_BoBq_B = at.object.index(), self._inertia.com
+        load.body_index = at.object.index()
+        load.p_BoBq_B = self._inertia.com
         load.F_Bq_W = SpatialForce(
             self.torque,
             self.force - np.array([0.0, 0.0, self._inertia.mass * GRAVITY * self.gravity_fraction]),
@@ -180,11 +188,9 @@ class DrakeWorld(World):
 
     def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See :meth:`World.contacts`: of the last internal step, which is what Drake's output ports report."""
-        tip_force, tip_touch, table_force = (
-            np.zeros((self._tips, 3)),
-            np.zeros(self._tips, dtype=bool),
-            np.zeros(3),
-        )
+        tip_force = np.zeros((self._tips, 3))
+        tip_touch = np.zeros(self._tips, dtype=bool)
+        table_force = np.zeros(3)
         if self._steps == 0 or self._lost is not None:
             return tip_force, tip_touch, table_force
         results = self._at.plant.get_contact_results_output_port().Eval(self._context)
@@ -194,9 +200,11 @@ class DrakeWorld(World):
             patch = contact.contact_surface()
             # on the first of the two geometries
             force = contact.F_Ac_W().translational()
-            first, second = self._at.surfaces[patch.id_M()], self._at.surfaces[patch.id_N()]
+            first = self._at.surfaces[patch.id_M()]
+            second = self._at.surfaces[patch.id_N()]
             if second.role == "object":
-                first, second, force = second, first, -force
+                first, second = second, first
+                force = -force
             if first.role != "object":
                 continue
             if second.role == "table":
@@ -288,8 +296,7 @@ _KNOWN_DIFFERENCES = (
             bound=bound,
             reason=_PITCHING,
         )
-        for mu, bound in ((0.5, 0.15), (0.8, 0.3), (1.2, 0.8))
-        for degrees in (0, 45)
+        for (mu, bound), degrees in product(((0.5, 0.15), (0.8, 0.3), (1.2, 0.8)), (0, 45))
     ),
     KnownDifference(
         check="slope", measure="acceleration, mu 1.2, 0 degrees", bound=1.5, reason=_PITCHING
@@ -325,19 +332,18 @@ class _Brake:
 
     def __init__(self, scene: SceneSpec) -> None:
         drives = [joint.drive for joint in scene.robot.joints]
-        self._kp, self._kd, self._effort, self._loss = (
-            np.array([getattr(drive, field) for drive in drives])
-            for field in ("kp", "kd", "effort", "friction_loss")
-        )
+        self._kp = np.array([drive.kp for drive in drives])
+        self._kd = np.array([drive.kd for drive in drives])
+        self._effort = np.array([drive.effort for drive in drives])
+        self._loss = np.array([drive.friction_loss for drive in drives])
         self.needed = bool(self._loss.any())
 
     def apply(self, at: DrakeModel, context: Context, target: np.ndarray, dt: float) -> None:
         """Set the torques of one step."""
-        plant, joints = at.plant, at.joint_velocity
-        position, velocity = (
-            plant.GetPositions(context)[at.joint_position],
-            plant.GetVelocities(context)[joints],
-        )
+        plant = at.plant
+        joints = at.joint_velocity
+        position = plant.GetPositions(context)[at.joint_position]
+        velocity = plant.GetVelocities(context)[joints]
         drive = np.clip(
             self._kp * (target - position) - self._kd * velocity, -self._effort, self._effort
         )

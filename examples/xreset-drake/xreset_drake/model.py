@@ -1,7 +1,7 @@
 """A scene as a Drake model.
 
 Contact is hydroelastic: objects and table are compliant, the robot is rigid, and a contact is the patch in which two shapes overlap.
-Drake's other contact model has one point per pair of shapes, on which no box stands still; it is left for the robot's contacts with itself,
+Drake's other contact model has one point per pair of shapes, on which no box rests; it is left for the robot's contacts with itself,
 where both are rigid.
 """
 
@@ -178,7 +178,8 @@ class _Parts:
     """What has been added to a plant."""
 
     def __init__(self, plant: MultibodyPlant, settings: DrakeSettings) -> None:
-        self.plant, self.settings = plant, settings
+        self.plant = plant
+        self.settings = settings
         self.surfaces: dict[GeometryId, Surface] = {}
         self.properties: dict[GeometryId, ProximityProperties] = {}
         self.links: dict[str, list[GeometryId]] = {}
@@ -216,13 +217,15 @@ class _Parts:
             f"shape{len(self.surfaces)}",
             with_friction,
         )
-        self.surfaces[geometry], self.properties[geometry] = surface, properties
+        self.surfaces[geometry] = surface
+        self.properties[geometry] = properties
         if link:
             self.links.setdefault(link, []).append(geometry)
 
 
 def _add_robot(parts: _Parts, robot: Mechanism, instance: ModelInstanceIndex) -> list[RigidBody]:
-    plant, spec = parts.plant, robot.robot
+    plant = parts.plant
+    spec = robot.robot
     bodies: list[RigidBody] = []
     for item in robot.bodies:
         body = plant.AddRigidBody(
@@ -292,20 +295,17 @@ def _add_object(parts: _Parts, thing: ObjectSpec, inertia: Inertia) -> RigidBody
 def _filter_collisions(scene_graph: SceneGraph, parts: _Parts, robot: Mechanism) -> None:
     """Let only those pairs collide that the scene says: everything is excluded first, then the wanted pairs are allowed."""
     spec = robot.robot
-    of_role = {
-        role: [g for g, surface in parts.surfaces.items() if surface.role == role]
-        for role in ("object", "table")
-    }
-    on_links = [g for geometries in parts.links.values() for g in geometries]
-    above_table = [
-        g
-        for link, geometries in parts.links.items()
-        if link not in spec.table_exclude
-        for g in geometries
-    ]
+    on_object = [g for g, surface in parts.surfaces.items() if surface.role == "object"]
+    on_table = [g for g, surface in parts.surfaces.items() if surface.role == "table"]
+    on_links = []
+    above_table = []
+    for link, geometries in parts.links.items():
+        on_links += geometries
+        if link not in spec.table_exclude:
+            above_table += geometries
     rule = CollisionFilterDeclaration().ExcludeWithin(GeometrySet(list(parts.surfaces)))
-    rule.AllowBetween(GeometrySet(of_role["object"]), GeometrySet(of_role["table"] + on_links))
-    rule.AllowBetween(GeometrySet(of_role["table"]), GeometrySet(above_table))
+    rule.AllowBetween(GeometrySet(on_object), GeometrySet(on_table + on_links))
+    rule.AllowBetween(GeometrySet(on_table), GeometrySet(above_table))
     for a, b in combinations(parts.links, 2):
         if robot.may_collide(a, b):
             rule.AllowBetween(GeometrySet(parts.links[a]), GeometrySet(parts.links[b]))

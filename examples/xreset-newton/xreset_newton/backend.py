@@ -53,15 +53,14 @@ class NewtonWorld(World):
         self, scene: SceneSpec, object_index: int, *, settings: NewtonSettings = _DEFAULTS
     ) -> None:
         """See :class:`World`."""
-        robot, thing = mechanism(scene.robot), scene.objects[object_index]
+        robot = mechanism(scene.robot)
+        thing = scene.objects[object_index]
         self._inertia = object_inertia(thing)
         self._at = at = build_model(scene, robot, thing, self._inertia, settings)
         model = self._model = at.model
         self._tips = len(scene.robot.fingertips)
-        self._joints, self._frames = (
-            MovingJoints(scene.robot, robot.joint_names),
-            TrackedFrames(robot),
-        )
+        self._joints = MovingJoints(scene.robot, robot.joint_names)
+        self._frames = TrackedFrames(robot)
         self._pipeline = newton.CollisionPipeline(
             model,
             broad_phase="explicit",
@@ -82,11 +81,10 @@ class NewtonWorld(World):
             deterministic=wp.DeterministicMode.RUN_TO_RUN,
         )
         self.forces = self._solver.observables({_FORCE}, contacts=self._contacts)
-        self._states, self._control = [model.state(), model.state()], model.control()
-        self._roles = {
-            role: np.array([s.role == role for s in at.surfaces])
-            for role in ("tip", "link", "table", "object")
-        }
+        self._states = [model.state(), model.state()]
+        self._control = model.control()
+        roles = np.array([surface.role for surface in at.surfaces])
+        self._roles = {role: roles == role for role in ("tip", "link", "table", "object")}
         self._tip_of_shape = np.array([surface.tip for surface in at.surfaces])
         self._base = np.array([*scene.robot.base_pos, *np.roll(scene.robot.base_quat, -1)])
         masses = np.array([body.inertia.mass for body in robot.bodies if body.inertia is not None])
@@ -94,17 +92,20 @@ class NewtonWorld(World):
         self._graph = self._captured(
             scene.timestep / settings.internal_steps, settings.internal_steps
         )
-        self._target, self._quat = scene.robot.home, np.array([1.0, 0.0, 0.0, 0.0])
+        self._target = scene.robot.home
+        self._quat = np.array([1.0, 0.0, 0.0, 0.0])
         self._stepped = False
         self.set_friction(np.array([scene.friction.tip, scene.friction.link, scene.friction.table]))
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         """See :meth:`World.set_state`."""
         now = self._states[0]
-        q, v = now.joint_q.numpy(), now.joint_qd.numpy()
+        q = now.joint_q.numpy()
+        v = now.joint_qd.numpy()
         q[:-7], v[:-6] = self._joints.spread(state["joint_pos"], state["joint_vel"])
         self._quat = state["object_quat"] / np.linalg.norm(state["object_quat"])
-        q[-7:-4], q[-4:] = state["object_pos"], np.roll(self._quat, -1)
+        q[-7:-4] = state["object_pos"]
+        q[-4:] = np.roll(self._quat, -1)
         v[-6:-3] = state["object_linvel"] + cross(
             state["object_angvel"], rotate(self._quat, self._inertia.com)
         )
@@ -117,8 +118,10 @@ class NewtonWorld(World):
 
     def get_state(self) -> dict[str, np.ndarray]:
         """See :meth:`World.get_state`."""
-        now, joints = self._states[0], self._joints.driven
-        q, v = now.joint_q.numpy().astype(float), now.joint_qd.numpy().astype(float)
+        now = self._states[0]
+        joints = self._joints.driven
+        q = now.joint_q.numpy().astype(float)
+        v = now.joint_qd.numpy().astype(float)
         self._quat = nearer(np.roll(q[-4:], 1), self._quat)
         return {
             "joint_pos": q[joints],
@@ -140,7 +143,8 @@ class NewtonWorld(World):
         for state in self._states:
             load = state.body_f.numpy()
             load[:-1, 2] = -self._robot_weight
-            load[-1, :3], load[-1, 3:] = self.force, self.torque
+            load[-1, :3] = self.force
+            load[-1, 3:] = self.torque
             load[-1, 2] -= self._inertia.mass * GRAVITY * self.gravity_fraction
         for _ in range(n):
             wp.capture_launch(self._graph)
@@ -151,7 +155,8 @@ class NewtonWorld(World):
 
         def step() -> None:
             for index in range(internal_steps):
-                now, after = self._states[index % 2], self._states[1 - index % 2]
+                now = self._states[index % 2]
+                after = self._states[1 - index % 2]
                 self._pipeline.collide(now, self._contacts)
                 self._solver.step(
                     now, after, self._control, self._contacts, dt, observables=self.forces
@@ -164,7 +169,8 @@ class NewtonWorld(World):
 
     def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """See :meth:`World.links`."""
-        bodies, now = self._frames.bodies, self._states[0]
+        bodies = self._frames.bodies
+        now = self._states[0]
         pose = np.vstack((self._base, now.body_q.numpy()))[bodies]
         motion = np.vstack((np.zeros(6), now.body_qd.numpy()))[bodies]
         return self._frames.locate(
@@ -173,11 +179,9 @@ class NewtonWorld(World):
 
     def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See :meth:`World.contacts`: of the last internal step."""
-        tip_force, tip_touch, table_force = (
-            np.zeros((self._tips, 3)),
-            np.zeros(self._tips, dtype=bool),
-            np.zeros(3),
-        )
+        tip_force = np.zeros((self._tips, 3))
+        tip_touch = np.zeros(self._tips, dtype=bool)
+        table_force = np.zeros(3)
         count = int(self._contacts.rigid_contact_count.numpy()[0]) if self._stepped else 0
         first, second = (
             shape.numpy()[:count]
@@ -215,15 +219,13 @@ class NewtonWorld(World):
 
     def set_object_inertia(self, inertia: Inertia) -> None:
         """See :meth:`World.set_object_inertia`."""
-        self._inertia, model, matrix = inertia, self._model, inertia.matrix
-        model.body_mass.numpy()[-1], model.body_inv_mass.numpy()[-1] = (
-            inertia.mass,
-            1.0 / inertia.mass,
-        )
-        model.body_inertia.numpy()[-1], model.body_inv_inertia.numpy()[-1] = (
-            matrix,
-            np.linalg.inv(matrix),
-        )
+        self._inertia = inertia
+        model = self._model
+        matrix = inertia.matrix
+        model.body_mass.numpy()[-1] = inertia.mass
+        model.body_inv_mass.numpy()[-1] = 1.0 / inertia.mass
+        model.body_inertia.numpy()[-1] = matrix
+        model.body_inv_inertia.numpy()[-1] = np.linalg.inv(matrix)
         model.body_com.numpy()[-1] = inertia.com
         self._solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
 
@@ -235,7 +237,8 @@ class NewtonWorld(World):
 
     def set_drives(self, scale: np.ndarray) -> None:
         """See :meth:`World.set_drives`."""
-        model, joints = self._model, self._joints
+        model = self._model
+        joints = self._joints
         arrays = model.joint_target_ke, model.joint_target_kd, model.joint_effort_limit
         for array, value in zip(arrays, joints.nominal * scale, strict=True):
             array.numpy()[joints.driven] = value

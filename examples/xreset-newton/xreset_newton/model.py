@@ -106,7 +106,8 @@ class _Shapes:
     def add(self, body: int, shape: Shape, surface: Surface, link: str = "") -> None:
         """Add a collision shape to a body; -1 is the world."""
         where = {"body": body, "xform": transform(shape.T_body_shape), "cfg": self._config}
-        kind, size = shape.geometry.kind, shape.geometry.size
+        kind = shape.geometry.kind
+        size = shape.geometry.size
         if kind == "box":
             self._builder.add_shape_box(hx=size[0], hy=size[1], hz=size[2], **where)
         elif kind == "sphere":

@@ -136,6 +136,17 @@ class PlaceTest(InFolder):
         ):
             placing.place(self.robot, [self.wrists], avoid, replace(CONFIG, clear=9.0))
 
+    def test_a_search_that_cannot_be_made_is_refused(self):
+        for changes, words in (
+            ({"elite": 0}, "elite is 0, expected a whole number above 0"),
+            ({"frames": 0}, "frames is 0"),
+            ({"x": (1.0, 0.0)}, "x is .*two finite numbers, the lower one first"),
+            ({"tilt": (0.0, np.nan)}, "tilt is"),
+            ({"seed": -1}, "seed is -1"),
+        ):
+            with self.subTest(words), self.assertRaisesRegex(ValueError, words):
+                PlaceConfig(**changes)
+
     def test_parameters_of_a_placement_come_back(self):
         for parameters in (
             (0.1, -0.2, 0.3, 170.0, 40.0, -100.0),

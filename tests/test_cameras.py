@@ -162,6 +162,10 @@ class TestCameras(TestCase):
         ):
             with self.subTest(changes), self.assertRaises(ValueError):
                 replace(ABOVE, **changes)
+        few = VisionConfig(cameras=(ABOVE,), width=8, height=8, view="points", points=64)
+        self.assertEqual(self.look(self.cameras(few)).shape, (2, 1, 64, 4))
+        with self.assertRaisesRegex(ValueError, "points is 65, expected at most 64"):
+            replace(few, points=65)
 
 
 class TestVisionInTheEnvironment(TestCase):

@@ -266,6 +266,9 @@ class Served(WithFiles):
         page._step(1)
         page.show()
         self.assertEqual(page.row, 5)
+        page._rows = page._rows[:1]
+        page.show()  # a slider of one row has two places
+        self.assertIn("1 of 1", page._text.content)
         page._rows = page._rows[:0]
         page.show()
         self.assertIn("nothing", page._text.content)

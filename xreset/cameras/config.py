@@ -94,6 +94,14 @@ class VisionConfig(Checked):
     goal_image: bool = False
     """Whether the policy also sees the object at its goal: another image for each camera, or as many points."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        pixels = len(self.cameras) * self.width * self.height
+        if self.view == "points" and 0 < pixels < self.points:
+            raise ValueError(
+                f"points is {self.points}, expected at most {pixels}, one for each pixel"
+            )
+
     @property
     def view_shape(self) -> tuple[int, int, int]:
         """Shape of one world's view: images, height, width; or clouds, points, coordinates and 1 (0: no point)."""

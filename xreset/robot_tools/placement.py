@@ -5,37 +5,44 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from math import inf
 from pathlib import Path
+from typing import Annotated
 
-from xreset.checks import frozen
+from xreset.checks import Checked, NonNegativeFloat, NonNegativeInt, PositiveInt, Rule, frozen
 from xreset.errors import RobotError
 from xreset.files import write_whole
 from xreset.spec import RobotSpec
 
+Span = Annotated[
+    tuple[float, float],
+    Rule("two finite numbers, the lower one first", lambda x: -inf < x[0] <= x[1] < inf),
+]
+
 
 @frozen
-class PlaceConfig:
+class PlaceConfig(Checked):
     """What is searched, and how hard."""
 
-    x: tuple[float, float] = (-0.3, 1.4)
+    x: Span = (-0.3, 1.4)
     """Range of the base's position [m]; the defaults are the table and what is next to it."""
-    y: tuple[float, float] = (-0.5, 1.2)
-    z: tuple[float, float] = (0.0, 0.8)
-    tilt: tuple[float, float] | None = None
+    y: Span = (-0.5, 1.2)
+    z: Span = (0.0, 0.8)
+    tilt: Span | None = None
     """Range of the angle between the base's z axis and the vertical [degrees]; None: as the description has it."""
-    clear: float = 0.30
+    clear: NonNegativeFloat = 0.30
     """Least distance [m] from the base's origin to every wrist and object of the demonstrations; what is below an
     upright base keeps the same distance."""
-    frames: int = 100
+    frames: PositiveInt = 100
     """Frames that each candidate is tried on, each on its own."""
-    candidates: int = 40
+    candidates: PositiveInt = 40
     """Candidates of each round."""
-    rounds: int = 5
+    rounds: NonNegativeInt = 5
     """Rounds of candidates; 0 measures only the description's own placement."""
-    elite: int = 5
+    elite: PositiveInt = 5
     """Best candidates: the next round is drawn around them, and in the end they and the description's own placement are
     the finalists."""
-    seed: int = 0
+    seed: NonNegativeInt = 0
 
 
 @frozen

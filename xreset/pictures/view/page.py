@@ -74,7 +74,8 @@ class Page(WebPage):
                 return
             self._scene.show(row)
             first, *others = self.view.text(row)
-            position = f"{self._frame.value + 1} of {len(self._rows)}"
+            number = min(self._frame.value + 1, len(self._rows))
+            position = f"{number} of {len(self._rows)}"
             self._text.content = "\n\n".join((f"**{first}**", *others, position))
 
     def serve(self) -> None:

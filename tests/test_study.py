@@ -3,12 +3,14 @@
 import io
 import json
 import os
+import re
 import signal
 import threading
 import time
 from contextlib import redirect_stdout
 from dataclasses import replace
 from importlib.util import find_spec
+from pathlib import Path
 from unittest import TestCase, skipUnless
 from unittest.mock import Mock, patch
 
@@ -143,6 +145,16 @@ class FileTest(Studied):
         for file in files:
             with self.subTest(file.stem):
                 self.assertTrue(read_study(study_path(file.stem)).tables)
+
+    def test_the_documentation_counts_their_trainings(self):
+        page = (Path(__file__).parents[1] / "docs" / "studies.md").read_text()
+        stated = {name: int(n) for name, n in re.findall(r"(?m)^\| `(\w+)` \|.*\| (\d+) \|$", page)}
+        found = {}
+        for file in SHIPPED.glob("*.toml"):
+            runs = [run for run in read_study(file).runs.values() if run.policy is None]
+            each = [len(run.seeds) * (len(run.objects) if run.alone else 1) for run in runs]
+            found[file.stem] = sum(each)
+        self.assertEqual(stated, found)
 
 
 class PaperTest(TestCase):

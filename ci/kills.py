@@ -77,6 +77,8 @@ def commands(folder: Path) -> list[Command]:
         8,
         "--vision.height",
         8,
+        "--vision.points",
+        16,
     ]
     return [
         Command(

@@ -175,9 +175,13 @@ class DistillTest(WithBank):
                 config=CONFIG,
                 **OPTIONS,
             )
-        words = "No camera shows 005_tomato_soup_can, 010_potted_meat_can"
-        with quickly(), self.assertRaisesRegex(XResetError, words):
-            self.distill("away", away)
+        tiny = replace(IMAGES, view="points", width=8, height=8, points=129)
+        for name, vision, words in (
+            ("away", away, "No camera shows 005_tomato_soup_can, 010_potted_meat_can"),
+            ("tiny", tiny, "vision.points is 129, expected at most 128: the images have"),
+        ):
+            with quickly(), self.assertRaisesRegex(XResetError, words):
+                self.distill(name, vision)
 
     def test_a_student_is_resumed_as_it_was_started(self):
         for options, problem in (

@@ -54,16 +54,9 @@ class Cameras:
             scale: factor on the coordinates of points [1/m].
 
         Raises:
-            XResetError: a camera is inside a body, the images have too few pixels for the points, or the renderer
-                cannot start.
+            XResetError: a camera is inside a body, or the renderer cannot start.
             RobotError: the robot has no such link.
         """
-        pixels = config.width * config.height * len(config.cameras)
-        if config.view == "points" and config.points > pixels:
-            raise XResetError(
-                f"vision.points is {config.points}, expected at most {pixels}: the images have no more pixels. "
-                "Give a larger --vision.width and --vision.height, or fewer points."
-            )
         self.config = config
         self._scale = scale
         device = object_index.device

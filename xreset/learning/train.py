@@ -240,14 +240,20 @@ def distill(
 
     Raises:
         PolicyError: the teacher is unknown, sees itself, or is for another robot.
-        XResetError: a camera is unknown, given twice or inside a body, no camera ever shows some object, or the
-            renderer cannot start.
+        XResetError: a camera is unknown, given twice or inside a body, no camera ever shows some object, the images
+            have fewer pixels than points, or the renderer cannot start.
     """
     if config is None:
         wanted = [cameras] if isinstance(cameras, str | CameraConfig) else cameras
         chosen = tuple(_camera(each) for each in wanted)
         told = OnnxPolicy(policy_file(teacher)).contract.task
-        config = student_config(told, replace(vision or STUDENT_VISION, cameras=chosen))
+        try:
+            seen = replace(vision or STUDENT_VISION, cameras=chosen)
+        except ValueError as error:
+            raise XResetError(
+                f"vision.{error}. Give fewer --vision.points, or a larger --vision.width and --vision.height."
+            ) from None
+        config = student_config(told, seen)
     if not config.task.vision.cameras:
         raise XResetError(
             "A student needs a camera. Give one or two of: " + ", ".join(CAMERAS) + "."

@@ -463,7 +463,7 @@ class TypedTest(TestCase):
             if is_newer:
                 expected += (
                     f"\nIt was written by xreset {version!r}, and this is xreset {__version__}. "
-                    "Update xreset."
+                    "Update xreset, or make it again."
                 )
             self.assertEqual(str(caught.exception), expected)
 

@@ -60,6 +60,10 @@ class OnnxPolicyTest(WithPolicy):
             ("a JSON list, expected an object", {"metadata": "[]"}),
             ("missing: .*schema.* Export the policy again", {"metadata": "{}"}),
             ("missing: robot", {"metadata": partial}),
+            (
+                "unknown: eyes.* by xreset '9.9', .* Update xreset",
+                {"metadata": self.contract | {"eyes": 2}, "version": "9.9"},
+            ),
             (r"task is \[\], expected an object", {"metadata": self.contract | {"task": []}}),
             ("observation_layout.policy.x is -1", {"metadata": self.contract | negative}),
             (r"joint_names\[0\] is 1", {"metadata": self.contract | {"joint_names": [1, 2]}}),

@@ -9,7 +9,16 @@ from xreset.policy import observation_shapes, parsed_contract
 
 
 def write_policy(
-    path, contract, *, lstm=8, actions=None, outputs=3, value=0.5, state="Identity", metadata=None
+    path,
+    contract,
+    *,
+    lstm=8,
+    actions=None,
+    outputs=3,
+    value=0.5,
+    state="Identity",
+    metadata=None,
+    version="",
 ):
     """Write it; without options it is sound.
 
@@ -22,6 +31,7 @@ def write_policy(
         value: of every weight.
         state: ONNX operator that makes the LSTM's new state from the old one.
         metadata: in place of the contract: text, or a dictionary.
+        version: of xreset, which exported it.
     """
     policy, proprio, cloud = observation_shapes(parsed_contract("it", contract), "it").values()
     flat = policy[0] + proprio[0]
@@ -48,9 +58,7 @@ def write_policy(
     ]
     graph = helper.make_graph(nodes, "policy", inputs, given, [weights])
     model = helper.make_model(graph, ir_version=9, opset_imports=[helper.make_opsetid("", 18)])
-    helper.set_model_props(
-        model,
-        {"xreset": metadata if isinstance(metadata, str) else json.dumps(metadata or contract)},
-    )
+    text = metadata if isinstance(metadata, str) else json.dumps(metadata or contract)
+    helper.set_model_props(model, {"xreset": text, "xreset-version": version})
     path.write_bytes(model.SerializeToString())
     return path

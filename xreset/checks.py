@@ -221,12 +221,8 @@ def from_dict(cls: type[T], data: Any, where: str = "configuration", version: An
     Raises:
         FileFormatError: names every entry that is unknown, missing, of the wrong type or out of range.
     """
-    value, problems = parsed(cls, data, where)
+    value, problems = parsed(cls, data, where, version)
     if value is None:
-        if _release(version) > _release(__version__):
-            problems.append(
-                f"It was written by xreset {shown(version)}, and this is xreset {__version__}. Update xreset."
-            )
         raise FileFormatError("\n".join(problems))
     return value
 
@@ -237,13 +233,19 @@ def _release(version: Any) -> list[int]:
     return [int(number) for number in re.findall(r"\d{1,9}", release)]
 
 
-def parsed(cls: type[T], data: Any, where: str) -> tuple[T | None, list[str]]:
-    """Return the dataclass and no problem, or None and a sentence for each problem."""
+def parsed(cls: type[T], data: Any, where: str, version: Any = None) -> tuple[T | None, list[str]]:
+    """Return the dataclass and no problem, or None and a sentence for each problem. See :func:`from_dict`."""
     problems = []
     value = _record(cls, data, where, problems)
-    if problems:
-        return None, _first(problems)
-    return value, []
+    if not problems:
+        return value, []
+    problems = _first(problems)
+    if _release(version) > _release(__version__):
+        problems.append(
+            f"It was written by xreset {shown(version)}, and this is xreset {__version__}. "
+            "Update xreset, or make it again."
+        )
+    return None, problems
 
 
 def _record(cls: type, data: Any, where: str, problems: list[str]) -> Any:

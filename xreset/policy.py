@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 METADATA_KEY = "xreset"
 """Key of the ONNX metadata entry that holds the contract as JSON."""
+VERSION_KEY = "xreset-version"
+"""Key of the ONNX metadata entry that holds the version and commit of xreset."""
 INPUTS = ("flat", "cloud", "h_in", "c_in")
 """Inputs of the ONNX graph: the two flat groups of ``TaskConfig.policy_groups`` in one, the clouds or images, and the
 LSTM's state."""
@@ -119,9 +121,15 @@ def _meaning(contract: Contract) -> dict[str, dict[str, Any]]:
     }
 
 
-def parsed_contract(source: str, contract: Any) -> Contract:
-    """Return a contract with types; ``PolicyError`` if it lacks an entry or holds one of another type."""
-    typed, problems = parsed(Contract, contract, f"The contract of {source}")
+def parsed_contract(source: str, contract: Any, version: str | None = None) -> Contract:
+    """Return a contract with types; ``PolicyError`` if it lacks an entry or holds one of another type.
+
+    Args:
+        source: name of the policy in messages.
+        contract: as read from JSON.
+        version: the version of xreset that exported the policy, if it states it.
+    """
+    typed, problems = parsed(Contract, contract, f"The contract of {source}", version)
     if typed is None:
         raise PolicyError(" ".join([*problems, "Export the policy again."]))
     return typed
@@ -247,7 +255,7 @@ def _read_contract(path: Path, metadata: dict[str, str]) -> Contract:
         raise PolicyError(
             f"{path} holds a contract that is not valid JSON ({error}). Export it again."
         ) from error
-    return parsed_contract(str(path), contract)
+    return parsed_contract(str(path), contract, metadata.get(VERSION_KEY))
 
 
 def _why_unreadable(path: Path, error: Exception) -> str:

@@ -19,13 +19,18 @@ from xreset.files import atomic_write, check_suffix, code_version, file_hash, mu
 from xreset.learning.checkpoint import must_fit, read_checkpoint
 from xreset.learning.model import ExportedPolicy, PointNetLstmModel, make_actor
 from xreset.learning.run import read_run
-from xreset.policy import INPUTS, METADATA_KEY, OUTPUTS, Contract, observation_shapes
+from xreset.policy import (
+    INPUTS,
+    METADATA_KEY,
+    OUTPUTS,
+    VERSION_KEY,
+    Contract,
+    observation_shapes,
+)
 
 if TYPE_CHECKING:
     from onnx import ModelProto
 
-_VERSION_KEY = "xreset-version"
-"""Key of the ONNX metadata entry that holds the version and commit of xreset."""
 _CHECKPOINT_KEY = "xreset-checkpoint"
 """Key of the ONNX metadata entry that holds the SHA-256 of the checkpoint."""
 
@@ -72,7 +77,7 @@ def export_onnx(
     _drop_exporter_notes(model)
     entries = {
         METADATA_KEY: json.dumps(asdict(contract), sort_keys=True),
-        _VERSION_KEY: code_version(),
+        VERSION_KEY: code_version(),
     }
     if checkpoint is not None:
         entries[_CHECKPOINT_KEY] = file_hash(checkpoint)

@@ -134,19 +134,24 @@ class RewardTest(TestCase):
     def test_the_published_reward(self):
         """Numbers from the published paper: -2.5 min(P, 3) - 2.5 min(M, 0.5) + G (3 (1.4 - 3 d) + [d <= 0.02] 15 / (1 + 10 d))."""
         config = RECIPES["published"].config.task.reward
-        for tips, palm, d, gate in (
-            (0.15, 0.1, 0.0, True),
-            (0.15, 0.1, 0.015, True),
-            (0.15, 0.1, 0.1, True),
-            (0.25, 0.1, 0.0, False),
-            (0.15, 0.25, 0.0, False),
-            (2.0, 0.9, 0.0, False),
+        for tips, palm, shift, degrees, gate in (
+            (0.15, 0.1, 0.0, 0.0, True),
+            (0.15, 0.1, 0.015, 0.0, True),
+            (0.15, 0.1, 0.1, 0.0, True),
+            (0.15, 0.1, 0.0, 40.0, True),
+            (0.15, 0.1, 0.0, 60.0, True),
+            (0.25, 0.1, 0.0, 0.0, False),
+            (0.15, 0.25, 0.0, 0.0, False),
+            (2.0, 0.9, 0.0, 0.0, False),
         ):
+            # a turn about z moves two of the four points, which are 5 cm from the axis
+            d = shift + 0.05 * math.sin(math.radians(degrees / 2))
             reward = self.reward(
                 config,
                 tip_distance=[tips] * 3,
                 palm_distance=palm,
-                object_pos=[0.5, 0.3 + d, 0.1],
+                object_pos=[0.5, 0.3 + shift, 0.1],
+                object_quat=turned(degrees),
                 points=[[0.05, 0, 0], [0, 0.05, 0], [0, 0, 0.05], [0, 0, -0.05]],
                 action=[0.5, 0, 0.5, 0],
             )

@@ -92,7 +92,7 @@ class PlaceTest(InFolder):
         self.assertEqual([finalist.robot for finalist in found], [self.lost, self.robot])
         self.assertGreater(found[1].followed, found[0].followed)
 
-    def test_a_candidate_that_cannot_come_in_is_given_up(self):
+    def test_a_candidate_that_cannot_be_among_the_best_is_given_up(self):
         least = placing._rank(self.reached)[0]
         self.assertEqual(placing._rank(placing.reach(self.robot, self.wrists, least))[0], least)
         # What was tried fails, what was not counts as reached.

@@ -63,9 +63,7 @@ class Model(InFolder):
         cls.scene = scene()
         cls.at = compile_scene(cls.scene, 0)
 
-    def test_a_drive_at_its_target_rests_and_off_it_pulls_with_its_stiffness_where_joints_are_coupled_too(
-        self,
-    ):
+    def test_drives_pull_with_their_stiffness_also_where_joints_are_coupled(self):
         at = self.at
         robot = self.scene.robot
         data = mujoco.MjData(at.model)
@@ -115,7 +113,7 @@ class Model(InFolder):
         )
         self.assertEqual(own, {frozenset(("robot/jaw_a/0", "robot/finger_b/0"))})
 
-    def test_neighbours_of_a_base_that_stands_still_never_collide(self):
+    def test_neighbours_of_a_fixed_base_never_collide(self):
         own = self.collisions_of_the_robot(
             self_collision_links=("base", "column", "wrist"), collision_exclude=()
         )

@@ -81,7 +81,7 @@ class UsageTest(TestCase):
 
         self.assertEqual(run("--version"), (0, f"xreset {code_version()}\n", ""))
 
-    def test_what_is_wrong_is_told_before_work_begins(self):
+    def test_errors_are_found_before_work_begins(self):
         for words, arguments in (
             (r"Unknown command 'trian'[\s\S]* train ", "trian"),
             (

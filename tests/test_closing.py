@@ -161,7 +161,7 @@ class FingersTest(TestCase):
         # the jaw's inner side
         assert_allclose(fingers.point[:, 0, 0], -0.005, atol=1e-3)
 
-    def test_a_squeeze_by_weight_is_one_with_that_force(self):
+    def test_a_squeeze_by_weight_equals_one_with_that_force(self):
         fingers, joints = self.fingers(0.0201)
         weight = 9.81 * toy_grasp.brick().mass
         by_force = squeeze_targets(ROBOT, fingers, joints, SqueezeConfig(force=1.0 + 2 * weight))
@@ -196,7 +196,7 @@ class FingersTest(TestCase):
         assert_allclose(others, others.mean().expand(4), atol=1e-6)
         self.assertEqual(factor[1].tolist(), [1, 0, 0, 0, 0])
 
-    def test_a_squeeze_is_as_far_beyond_as_its_force_takes(self):
+    def test_targets_of_a_squeeze_press_with_its_force(self):
         fingers, joints = self.fingers(0.0201, 0.0501)
 
         def squeezed(force, robot=ROBOT):
@@ -299,7 +299,7 @@ class CommandTest(InFolder):
         self.assertEqual(config["closing"], {"spacing": 0.0056, "within": 0.1})
         self.assertEqual(config["squeeze"]["force"], 2.5)
 
-    def test_other_meshes_than_those_of_the_motion_are_told(self):
+    def test_other_meshes_than_those_of_the_motion_are_noted(self):
         for source, told in ((toy_grasp.brick().source, 0), ("another mesh", 1)):
             inputs = {"object brick": source, "object robot": "a toy", "robot": "openarm"}
             write_retargeted(f"{self.folder}/r.npz", grasp_and_lift(), inputs=inputs)

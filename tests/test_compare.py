@@ -222,7 +222,7 @@ class GroupTest(Compared):
         groups, notes = grouped([self.training(name) for name in names])
         return [(label, len(members)) for label, members in groups.items()], " ".join(notes)
 
-    def test_what_differs_in_the_seed_only_is_one(self):
+    def test_trainings_that_differ_only_in_the_seed_are_one_group(self):
         seeds = []
         for i in (1, 2, 10):
             config = TrainConfig(iterations=1000 * i)
@@ -334,7 +334,7 @@ class ScoreTest(Compared):
 
 
 class FairnessTest(Compared):
-    def test_alike(self):
+    def test_results_that_are_alike_have_no_note(self):
         for name, share in (("a", 0.3), ("b", 0.6)):
             self.write_run(name, reset_config(demo_probability=share))
             self.write_results(name, inputs={"demos": "ab", "policy": name})
@@ -343,7 +343,7 @@ class FairnessTest(Compared):
         note = "Of 4 episodes of a in mujoco, 1 stopped being finite and 1 dropped contacts"
         self.assertIn(f"Note:** {note}", text)
 
-    def test_what_makes_results_incomparable_is_said(self):
+    def test_the_page_names_what_makes_results_incomparable(self):
         self.write_results("a", engines=("mujoco", "sapien"))
         base = toy_rollouts()
         renamed = [replace(e, sequence_name=f"other_{e.sequence}") for e in base.episodes]
@@ -445,7 +445,7 @@ class WrittenTest(Compared):
         self.assertIn("![Learning curves and task progress](compare.png)", text)
         self.assertIn("# Comparison: x-s0, x-s1, fixed, ik\n", self.compare(*names, apart=True))
 
-    def test_a_picture_of_the_right_size_with_everything_and_with_less(self):
+    def test_the_picture_is_higher_with_curves(self):
         names = self.write_three()
         heights = []
         every = ("task/success", "task/success_from_home", *SPEED)

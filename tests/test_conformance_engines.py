@@ -63,7 +63,7 @@ class EveryBackend(unittest.TestCase):
                 self.passes(backend)
 
     @PYBULLET  # whose data package has the robot
-    def test_a_robot_from_outside(self):
+    def test_a_robot_of_another_package(self):
         robot_dependent = [
             c.name for c in CHECKS if c.group in ("state", "robot") and not c.own_robot_only
         ]

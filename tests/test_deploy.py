@@ -169,7 +169,7 @@ class ContractTest(InFolder):
             controller.set_goal(goal["goal_pos"], long)
             self.assertFalse(Runner(controller, driver).run(0.05).refused.any())
 
-    def test_another_version_and_damage_are_one_sentence(self):
+    def test_another_version_and_damage_are_refused(self):
         file = self.out / "contract.json"
         original = file.read_text()
         for change, words in (

@@ -41,7 +41,7 @@ class PageTest(InFolder):
             main(["engines", "page", "--from", str(STORED / "conformance.json"), "--out", str(out)])
         self.assertEqual(out.read_text(), (STORED / "page.md").read_text())
 
-    def test_devices_of_an_engine_stand_side_by_side_whatever_the_order_of_the_files(self):
+    def test_devices_of_an_engine_are_neighbouring_columns(self):
         slower = self.changed(engine="mujoco-warp", device="cuda", capabilities=["friction"])
         [fall] = [check for check in slower["runs"][0]["checks"] if check["check"] == "free_fall"]
         for measure in fall["measures"]:

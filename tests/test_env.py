@@ -243,7 +243,7 @@ class StepTest(WithEnv):
         assert_close(target[0, :3], before[0, :3])
         assert_close(target[2, 3], env.actions.upper[3])
 
-    def test_the_reach_reward_rests_on_the_best_of_the_episode(self):
+    def test_the_reach_reward_uses_the_best_distance_of_the_episode(self):
         env = self.make(replace(QUIET, action=ActionConfig(arm_step=0.3, arm_lead=1.0)))
         env.advance(torch.ones(N, 7))
         env.reset()

@@ -37,7 +37,7 @@ class Case(InFolder):
 
 
 class Episodes(Case):
-    def test_states_with_the_action_that_is_in_force_before_the_next(self):
+    def test_the_action_is_the_last_target_before_the_next_frame(self):
         recording = read_recorded([self.evaluate()])
         self.assertEqual(recording.fps, 20.0)
         self.assertEqual(

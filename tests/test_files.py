@@ -187,7 +187,7 @@ class ClaimTest(InFolder):
         self.assertEqual((self.folder / "a").read_bytes(), b"whole")
         self.assertTrue((self.folder / "b" / "c").exists())
 
-    def test_a_claim_outlasts_a_look(self):
+    def test_a_claim_waits_for_a_check_of_the_claim(self):
         """Whoever asks whether a folder is claimed locks it for a moment."""
         looking = claim(self.folder)
         looking.__enter__()

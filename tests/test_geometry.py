@@ -82,13 +82,13 @@ class ShapesTest(TestCase):
                 depth = -signed_distance(Shape(geometry=geometry), centers)
                 self.assertGreaterEqual(depth.min(), radius - 1e-9)
 
-    def test_sharp_points_lie_on_edges(self):
+    def test_sharp_points_are_on_edges(self):
         points = sharp_points(self.BOX, 0.01)
         at_side = np.isclose(np.abs(points), self.BOX.size).sum(axis=1)
         self.assertEqual(np.unique(at_side, return_counts=True)[1][-1], 8)
         self.assertEqual(at_side.min(), 2)
 
-    def test_no_surface_of_a_thick_shape_lies_bare(self):
+    def test_balls_cover_the_surface_of_a_thick_shape(self):
         """Without balls under its surface the OpenArm's gripper was 7 mm deep between its balls, and bananas sank
         in."""
         for shape in (
@@ -104,7 +104,7 @@ class ShapesTest(TestCase):
             self.assertLess(outside[radii < radii.max()].max(), 1e-3)
         self.assertTrue((link_balls([Shape(geometry=self.CAPSULE)])[1] == 0.01).all())
 
-    def test_near_points_of_several_solids_are_those_that_looking_at_all_of_them_finds(self):
+    def test_near_points_of_several_solids_are_found(self):
         sizes = ((0.06, 0.04, 0.02), (0.02, 0.02, 0.1))
         fields = DistanceFields.join([link_field([box((0, 0, 0), size)]) for size in sizes])
         rng = default_rng(0)

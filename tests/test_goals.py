@@ -67,7 +67,7 @@ class MadeTest(InOneFolder):
         assert_allclose(turn.as_rotvec()[:, :2], 0.0, atol=1e-5)
         self.assertTrue(10 < np.degrees(turn.magnitude()).max() <= 55)
 
-    def test_what_cannot_be_is_refused(self):
+    def test_impossible_goals_are_refused(self):
         for error, message, options in (
             (
                 GoalError,

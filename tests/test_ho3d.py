@@ -65,7 +65,7 @@ class Ho3d(InFolder):
         with self.subTest(words), self.assertRaisesRegex(DemoError, words):
             self.read(**options)
 
-    def test_back_as_it_was(self):
+    def test_an_imported_demonstration_is_as_it_was(self):
         self.write()
         found = self.read()
         assert_same_motion(self.demos, found, angle=1e-3)
@@ -166,7 +166,7 @@ class Pickles(InFolder):
         self.assertEqual(self.load(call.encode())["a"].arguments, (str(target),))
         self.assertFalse(target.exists())
 
-    def test_an_array_that_is_none(self):
+    def test_what_is_not_an_array_is_refused(self):
         good = pickle.dumps({"a": np.zeros(3)}, protocol=2)
         for wrong in (
             good.replace(b"K\x03\x85", b"J\xff\xff\xff\x7f\x85"),

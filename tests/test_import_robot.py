@@ -141,7 +141,7 @@ class Toy(Robots):
             [path.name for path in self.sources.iterdir() if path.name.startswith(".")], []
         )
 
-    def test_the_palm_looks_where_the_fingers_bend(self):
+    def test_the_palm_faces_where_the_fingers_bend(self):
         hand, palm = at_home(self.spec, "hand_base", "palm_frame")
         in_hand = np.linalg.inv(hand) @ palm
         assert_allclose(in_hand[:3, :3], np.diag((1, -1, -1)), atol=0.06)
@@ -192,7 +192,7 @@ class Toy(Robots):
         self.assertEqual(len(found), 4, found)
         self.assertIn("'f1_2' goes from 0.1 to 1.3 with 'f1_1', beyond its own limits", found[0])
 
-    def test_origins_beside_a_finger_do_not_turn_its_palm(self):
+    def test_origins_moved_sideways_do_not_turn_the_palm(self):
         fingers = [_finger(f"f{i}", 0.015) for i in (1, 2, 3)]
         folder = self.imported(_hand(*fingers, _finger("thumb")), offset=(0, 0, 0.01))
         spec = load_robot(folder)
@@ -329,7 +329,7 @@ class Toy(Robots):
             with self.subTest(words), self.assertRaisesRegex(RobotError, words):
                 self.read("hand.xml", MJCF.replace(old, new))
 
-    def test_what_hangs_on_the_flange_gives_way(self):
+    def test_what_is_mounted_on_the_flange_is_removed(self):
         gripper = '<link name="{0}"/><joint name="{0}" type="fixed"><parent link="l5"/><child link="{0}"/></joint>'
         claw, thumb = (gripper.format(name) for name in ("claw", "thumb"))
         arm, _ = self.read("armed.urdf", ARM.replace("</robot>", f"{claw}</robot>"))
@@ -341,7 +341,7 @@ class Toy(Robots):
         self.assertRaisesRegex(RobotError, words, self.imported, HAND, two)
         self.assertRaisesRegex(RobotError, "no link 'wrist'", self.imported, HAND, flange="wrist")
 
-    def test_a_hand_whose_root_is_inside_it_stands_before_the_flange(self):
+    def test_a_hand_whose_root_is_inside_it_is_moved_in_front_of_the_flange(self):
         """Its palm is along x, from 0 to 80 mm."""
         made = import_robot(self.arm, self.hand, self.folder / "mine", rpy=(0, np.pi / 2, 0))
         T = load_urdf(made.folder / "robot.urdf").joint("hand_base_fixed").T_parent_joint
@@ -368,7 +368,7 @@ class Toy(Robots):
                 if axis != "z":  # no axis of the flange points out of the arm
                     assert_allclose(fingers, (0, 0, 1), atol=0.06)
 
-    def test_impossible_figures_are_replaced_and_told(self):
+    def test_impossible_figures_are_replaced_with_a_note(self):
         heavy = HAND.replace(
             'ixx="1e-5" iyy="1e-5" izz="1e-5"', 'ixx="0.1" iyy="0.1" izz="0.1"', 1
         ).replace('<mass value="0.4"/>', '<mass value="0"/>')

@@ -121,7 +121,7 @@ class UrdfTest(InFolder):
         with self.assertRaisesRegex(RobotError, "starts with <mujocoinclude>.*Expected <robot>"):
             load_urdf(path)
 
-    def test_what_is_no_tree_of_links_is_refused(self):
+    def test_what_is_not_a_tree_of_links_is_refused(self):
         link = '<link name="end"/>'
         joint = FIXED.format(name="j", child="end")
         revolute = joint.replace("fixed", "revolute").replace("<!---->", '<axis xyz="{}"/>')

@@ -147,7 +147,7 @@ class Rest(TestCase):
         low, high = bounding_box(obj)
         assert_allclose(rest_height(obj, quats), [-low[2], high[0], high[2]], atol=1e-12)
 
-    def test_stable_pose_stands_over_its_base(self):
+    def test_a_stable_pose_is_balanced_over_its_base(self):
         obj = load_object("powerdrill")
         rotation = turn_of(resting_orientation(obj, Z))
         self.assertGreater(rotation.apply(Z)[2], np.cos(np.radians(5)))
@@ -227,7 +227,7 @@ class MeshImport(InFolder):
             self.load(RING)
 
     @CUTS
-    def test_open_meshes_are_closed_and_it_is_said(self):
+    def test_open_meshes_are_closed_with_a_note(self):
         box = CUBE.subdivide().subdivide()
         result = self.load(trimesh.Trimesh(box.vertices, box.faces[:-1]), facts="mass = 1.0")
         self.assertIn("not closed", result.notes[0])
@@ -247,7 +247,7 @@ class MeshImport(InFolder):
             assert_allclose(np.diag(found.inertia), moment, rtol=0.01)
             assert_allclose(found.com, (0.1, 0.2, 0.3), atol=1e-6)
 
-    def test_a_mesh_in_millimetres_with_what_it_is_made_of(self):
+    def test_a_mesh_in_millimetres_with_density_and_friction(self):
         path = self.write(trimesh.creation.box((100, 60, 40)))
         out = self.folder / "objects"
         result = add_mesh(

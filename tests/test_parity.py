@@ -333,7 +333,7 @@ class Comparing(InFolder):
         self.assertEqual(set(outcomes["closing"]), {True, False})
         self.assertEqual(set(outcomes["hold 0.5"] + outcomes["hold 0.8"]), {True, False})
 
-    def test_what_differs_is_seen(self):
+    def test_differences_of_engines_are_found(self):
         for name, missed in (
             ("heavy", ("hold, outcome", "closing, outcome")),
             ("mujoco", ("press, total", "press, fingertip")),

@@ -87,7 +87,7 @@ class OnnxPolicyTest(WithPolicy):
         words = "demos.npz is not an exported policy, expected a run folder, a .onnx file"
         self.assertRaisesRegex(PolicyError, words, OnnxPolicy, other)
 
-    def test_a_training_checkpoint_is_called_one(self):
+    def test_a_training_checkpoint_is_recognised(self):
         run = self.folder / "run"
         checkpoint = run / "checkpoints" / "000100.pt"
         checkpoint.parent.mkdir(parents=True)
@@ -132,7 +132,7 @@ class ShippedTest(WithPolicy):
             write_choice(folder, toy_choice(policy_hash=policy_hash))
             self.assertEqual(load_policy("skilled").selection_seed, seed)
 
-    def test_the_list_is_of_cards(self):
+    def test_the_list_shows_the_cards(self):
         self.assertIn("the card of skilled.onnx", refused("policies", "list"))
         card = policies.FOLDER / "skilled.toml"
         text = (

@@ -179,7 +179,7 @@ class CollectTest(Reported):
             words = f"not comparable: not the same {what} .*: soup in mujoco; .*: soup in sapien"
             self.assertRegex(note, words)
 
-    def test_what_it_bears_and_how_it_was_chosen(self):
+    def test_the_page_has_tolerances_and_the_choice_of_the_checkpoint(self):
         policy = {"policy": "ab12"}
         self.write(inputs=policy)
         (prop,) = chosen(["force-gain=2"])
@@ -257,7 +257,7 @@ class ClipTest(Reported):
         assert_allclose(other.eye, camera.eye, atol=1e-6)
         assert_allclose(other.target, camera.target, atol=1e-6)
 
-    def test_a_clip_stands_still_once_a_state_is_not_finite(self):
+    def test_a_clip_freezes_once_a_state_is_not_finite(self):
         clip = self.draw(is_broken=True)
         self.assertEqual((clip.finite, len(clip.frames)), (False, 3))
         strip = self.draw(strip=True, is_broken=True)

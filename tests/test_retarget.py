@@ -139,7 +139,7 @@ class HandTest(TestCase):
         self.assertLess((found.joints - self.motion.joints)[..., seen].abs().max(), 5e-3)
         self.assertLess(quat_angle(found.root_quat, self.motion.root_quat).max(), 5e-3)
 
-    def test_order_and_company_of_sequences_do_not_matter(self):
+    def test_each_sequence_is_retargeted_independently(self):
         targets = self.targets(object_pos=self.keypoints[:, :, self.tip] + 0.01)
         together = retarget_hand(self.model, targets).joints
         for order in ([2, 0, 1], [1]):
@@ -332,7 +332,7 @@ class PipelineTest(InOneFolder):
         self.assertEqual(np.flatnonzero(self.result.contact[self.first])[0], first)
         self.assertGreater(first, 0)
 
-    def test_a_hand_that_is_elsewhere_while_the_object_moves_is_told(self):
+    def test_a_hand_far_from_a_moving_object_is_warned_of(self):
         assert_array_equal(self.result.untouched, [False, False])
         contact = self.result.contact.copy()
         contact[self.first][self.result.first_contact[0] + 2 :] = False

@@ -54,7 +54,7 @@ class BuiltIn(TestCase):
                     load(name).urdf.read_text(), build_robot.robot_urdf(name.replace("-", "_"))
                 )
 
-    def test_files_of_before_know_them(self):
+    def test_fingerprints_are_those_of_earlier_files(self):
         for name, fingerprint in BUILT_IN.items():
             self.assertEqual(load(name).fingerprint, fingerprint, name)
 

@@ -78,7 +78,7 @@ class SelectTest(InFolder):
         self.assertEqual(len(candidates_in(self.folder, 9)), 4)
         self.assertRaisesRegex(RunError, "no checkpoint", candidates_in, self.folder / "nowhere", 2)
 
-    def test_the_starts_that_decided_are_not_reported(self):
+    def test_the_seed_of_the_selection_is_refused(self):
         choice = self.choose()
         policy = replace(toy_grasp.policy(), selection_seed=choice.seed)
         trial = Mock(seed=SEED)

@@ -24,7 +24,7 @@ class StableBaselinesTest(WithEnv):
         self.addCleanup(env.close)
         return env
 
-    def test_what_is_no_environment_is_named(self):
+    def test_what_is_not_an_environment_is_refused(self):
         words = "^env is None, expected ManipulationEnv"
         self.assertRaisesRegex(XResetError, words, StableBaselinesEnv, None)
 

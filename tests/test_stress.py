@@ -76,7 +76,7 @@ class StressedTest(TestCase):
 
 
 class CurveTest(InFolder):
-    def test_the_limit_lies_between_two_values_that_were_tried(self):
+    def test_the_limit_is_interpolated_between_tried_values(self):
         base = [1.0, 0.6, 0.8, 0.8]
 
         def swept(option, changes):

@@ -60,7 +60,7 @@ class Studied(InFolder):
 
 
 class FileTest(Studied):
-    def test_what_is_wrong_is_said(self):
+    def test_wrong_entries_are_named(self):
         a = "[runs.a]\n"
         none = "states schema None, expected 'xreset-study/1'"
         for text, message in (
@@ -385,7 +385,7 @@ class TablesTest(Studied):
         summary = toy_summary("mujoco", rollouts, robot="openarm", seed=0, **changes)
         write_results(self.out / name / "eval", summary, rollouts, ("a", "b", "c"))
 
-    def test_ours_beside_the_papers(self):
+    def test_our_figures_are_next_to_the_papers(self):
         self.write("ours-seed0", 1.0, 1.0, 0.33, 0.33)
         self.write("ours-seed1", 0.66, 0.66, 0.33, 0.33)
         self.write("ik", 0.33, 0.33, 0.33, 0.33)
@@ -427,7 +427,7 @@ class TablesTest(Studied):
         (soup,) = [line for line in lines if line.startswith("mujoco,tomato soup can,Ours,")]
         self.assertEqual([float(text) for text in soup.split(",")[3:7]], [0.83, 0.66, 1.0, 90.8])
 
-    def test_a_mean_over_some_objects_is_none_over_all(self):
+    def test_a_mean_over_some_objects_is_not_shown_as_one_over_all(self):
         self.write("ours-tomato_soup_can-seed0", 1.0, 0.33)
         text = self.TEXT.replace("[runs.ours]\n", "[runs.ours]\nalone = true\n")
         plan = self.plan(text)

@@ -170,7 +170,7 @@ class RewardTest(TestCase):
         self.assertEqual(from_dict(TaskConfig, json.loads(json.dumps(asdict(task)))), task)
         self.assertEqual(evaluation_task(task).reward, RewardConfig())
 
-    def test_a_term_that_is_none_is_refused(self):
+    def test_what_is_not_a_reward_term_is_refused(self):
         for name, problem in (
             ("no_such_module:f", "No module named"),
             (f"{__name__}:no_such_function", "no attribute"),

@@ -197,7 +197,7 @@ class TraceTest(TestCase):
         self.assertGreater(found["joints"].time, found["object position"].time)
         self.assertIn("slippery diverges first in object position", list(sentences(self.result))[1])
 
-    def test_noise_excuses_only_what_it_does_itself_by_then(self):
+    def test_noise_excuses_only_what_it_causes_by_then(self):
         position = next(
             d for d in self.result.engines[1].divergences if d.quantity == "object position"
         )

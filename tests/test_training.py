@@ -204,7 +204,7 @@ class TrainingTest(WithBank):
                 for value in content.actor_state_dict.values():
                     self.assertTrue(value.isfinite().all())
 
-    def test_the_same_ctrl_c_told_twice_is_one(self):
+    def test_a_ctrl_c_that_arrives_twice_counts_once(self):
         with _stop_on_interrupt(say=True) as stop, patch("os.write") as written:
             self.assertFalse(stop)
             os.kill(os.getpid(), signal.SIGINT)
@@ -595,7 +595,7 @@ class TrainingTest(WithBank):
                     [f.name for f in out.rglob("*") if f.name.endswith((".part", ".old", ".lock"))]
                 )
 
-    def test_too_little_memory_is_said(self):
+    def test_too_little_memory_is_named(self):
         few = "4 worlds on cpu need more memory.*--num-envs"
         for error, wanted, said in (
             (torch.OutOfMemoryError("CUDA out of memory"), RunError, few),

@@ -25,7 +25,7 @@ class VectorEnvTest(WithEnv):
         self.addCleanup(envs.close)
         return envs
 
-    def test_what_is_no_environment_is_named(self):
+    def test_what_is_not_an_environment_is_refused(self):
         words = r"^env is 'x', expected ManipulationEnv\. Look at help\(xreset\.VectorEnv\.__init__\)\.$"
         self.assertRaisesRegex(XResetError, words, VectorEnv, "x")
 

@@ -153,14 +153,14 @@ class TestCameras(TestCase):
             ),
         ):
             self.cameras()
-        for changes in (
-            {"near": 3.0},
-            {"fov": 4.0},
-            {"target": ABOVE.pos},
-            {"pos": (0.5, 0.2)},
-            {"pos": (0.5, 0.2, float("nan"))},
+        for words, changes in (
+            ("near is 3.0, expected less than far, which is 2.0", {"near": 3.0}),
+            ("fov is 4.0, expected an angle between", {"fov": 4.0}),
+            ("target is .*, expected another point than pos", {"target": ABOVE.pos}),
+            ("pos is .*, expected three finite numbers", {"pos": (0.5, 0.2)}),
+            ("pos is .*, expected three finite numbers", {"pos": (0.5, 0.2, float("nan"))}),
         ):
-            with self.subTest(changes), self.assertRaises(ValueError):
+            with self.subTest(changes), self.assertRaisesRegex(ValueError, words):
                 replace(ABOVE, **changes)
         few = VisionConfig(cameras=(ABOVE,), width=8, height=8, view="points", points=64)
         self.assertEqual(self.look(self.cameras(few)).shape, (2, 1, 64, 4))

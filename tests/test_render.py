@@ -109,7 +109,7 @@ class Pictures(TestCase):
             x, y = pixel(self.camera, self.size, T[:3, 3] + 0.08 * T[:3, axis]).astype(int)
             self.assertEqual(picture[y, x].argmax(), axis)
             self.assertGreater(picture[y, x].max() - picture[y, x].min(), 100)
-        with self.assertRaises(RobotError):
+        with self.assertRaisesRegex(RobotError, "no link 'no_such_link'"):
             self.renderer.link_frames(self.home, ["no_such_link"])
 
     def test_a_picture_may_have_its_own_camera(self):

@@ -176,9 +176,9 @@ class Data(WithFiles):
         text.write_text("hello")
         for words, kind, path, options in (
             ("there is no|There is no", FileFormatError, self.folder / "none.npz", {}),
-            ("npz", FileFormatError, text, {}),
+            ("text.npz is not a file of xreset demos", FileFormatError, text, {}),
             ("demonstrations only", XResetError, self.demos, {"demos": self.demos}),
-            ("robot", FileFormatError, self.bank, {"robot": "ur7e-sharpa"}),
+            ("for the robot 'openarm'", FileFormatError, self.bank, {"robot": "ur7e-sharpa"}),
             ("no sequence 2", XResetError, self.retargeted, {}),
         ):
             with self.subTest(words), self.assertRaisesRegex(kind, words):

@@ -113,6 +113,7 @@ class MetricsTest(TestCase):
             ("too low", "a", episode(reading(raised(0.009), **HELD))),
             ("no thumb", "a", episode(reading(raised(0.011), press=LIGHT, **near))),
             ("thumb too light", "a", episode(reading(raised(0.011), press=(0.09, 1, 1), **near))),
+            ("light thumb", "ag", episode(reading(raised(0.011), press=(0.11, 1, 1), **near))),
             (
                 "not at once",
                 "a",

@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import asdict, replace
+from itertools import product
 from unittest import TestCase
 
 import numpy as np
@@ -163,6 +164,15 @@ class RewardTest(TestCase):
                 self.assertEqual((reward.gate, reward.success), (gate, success))
                 self.assertAlmostEqual(reward.total, 0.01 / 30 * expected, delta=5e-7)
 
+    def test_each_term_of_the_points_counts_a_turn(self):
+        points = [[0.05, 0, 0], [0, 0.05, 0], [-0.05, 0, 0], [0, -0.05, 0]]
+        turn = FAR | {"tip_force": self.PRESS, "points": points, "object_quat": turned(20.0)}
+        d = 0.1 * math.sin(math.radians(10))
+        paid = self.reward(RewardConfig(points=4.2), **turn).terms["points"]
+        self.assertAlmostEqual(paid, 4.2 * (1 - d / (1.4 / 3)), delta=5e-6)
+        paid = self.reward(RewardConfig(success_shape="points"), **turn).terms["success"]
+        self.assertAlmostEqual(paid, 10 / (1 + 10 * d), delta=5e-6)
+
     def test_a_term_of_the_users_own_is_added(self):
         config = RewardConfig(own={f"{__name__}:height": 0.5})
         self.assert_terms(self.reward(config, **FAR), **{f"{__name__}:height": 0.05})
@@ -252,9 +262,16 @@ class ActionTest(TestCase):
         # a loaded arm that sags would otherwise sink a little further at every step of zero action
         assert_close(still[:, :3], target[:, :3])
         assert_close(still[:, 3:], tensor([[-0.55, 0.55, 0.8, 0.02]]))
+        half = space.targets(torch.full((1, 7), 0.5), target, target)
+        assert_close(half[:, 3:], tensor([[-0.025, 1.075, 1.2, 0.03]]))
         # actions are limited to [-1, 1]
         full = space.targets(torch.full((1, 7), 5.0), target, target)
         assert_close(full, tensor([[0.15, 0.55, -0.45, 0.5, 1.6, 1.6, 0.04]]))
+        full = space.targets(torch.full((1, 7), -5.0), target, target)
+        assert_close(full, tensor([[0.05, 0.45, -0.55, -1.6, -0.5, 0.0, 0.0]]))
+        for away in (-9.0, 9.0):
+            found = space.action_for(target + away, target)
+            assert_close(found, torch.full((1, 7), away).sign())
 
     def test_arm_targets_stay_near_the_joint_and_within_its_limits(self):
         space = self.space(arm_step=0.05, arm_lead=0.15)
@@ -304,22 +321,22 @@ class ActionTest(TestCase):
 
 class LatencyTest(TestCase):
     def test_values_come_late_and_are_mixed_between_whole_steps(self):
-        drawn = Drawn(4, torch.device("cpu"))
-        line = DelayLine(drawn, "line", 1, 2.0, lambda _: tensor([0.0, 1.0, 1.5, 2.0]))
-        drawn.draw(torch.ones(4, dtype=torch.bool), generator())
-        line.fill(torch.ones(4, dtype=torch.bool), torch.zeros(4, 1))
+        drawn = Drawn(5, torch.device("cpu"))
+        line = DelayLine(drawn, "line", 1, 2.0, lambda _: tensor([0.0, 0.5, 1.0, 1.5, 2.0]))
+        drawn.draw(torch.ones(5, dtype=torch.bool), generator())
+        line.fill(torch.ones(5, dtype=torch.bool), torch.zeros(5, 1))
 
         def delayed(value):
-            return line.push(torch.full((4, 1), value))[:, 0].tolist()
+            return line.push(torch.full((5, 1), value))[:, 0].tolist()
 
         for value, expected in (
-            (10.0, [10, 0, 0, 0]),
-            (20.0, [20, 10, 5, 0]),
-            (30.0, [30, 20, 15, 10]),
+            (10.0, [10, 5, 0, 0, 0]),
+            (20.0, [20, 15, 10, 5, 0]),
+            (30.0, [30, 25, 20, 15, 10]),
         ):
             self.assertEqual(delayed(value), expected)
-        line.fill(tensor([False, True, False, False]), torch.full((4, 1), 7.0))
-        self.assertEqual(delayed(40.0), [40, 7, 25, 20])
+        line.fill(tensor([False, False, True, False, False]), torch.full((5, 1), 7.0))
+        self.assertEqual(delayed(40.0), [40, 35, 7, 25, 20])
 
 
 class RandomizationTest(TestCase):
@@ -388,6 +405,7 @@ class ResetTest(TestCase):
     def test_which_states_are_drawn(self):
         """Every state of the object, and of no other; home where there is none."""
         some = self.bank.with_states(self.bank.object_name == SOUP)
+        one = self.bank.with_states(np.arange(6) == 3)
         empty = self.bank.with_states(np.zeros(6, dtype=bool))
         for objects, index, options, states, sequences in (
             ((SOUP, SPAM), 0, {}, {0, 1, 4, 5}, {0, 2}),
@@ -396,6 +414,7 @@ class ResetTest(TestCase):
             ((SPAM,), 0, {}, {2, 3}, {1}),
             ((SOUP, SPAM), 0, {"pre_contact_only": True}, {0, 4}, {0, 2}),
             ((SOUP, SPAM), 1, {"bank": some}, set(), {1}),
+            ((SOUP, SPAM), 1, {"bank": one}, {3}, {1}),
             ((SOUP, SPAM), 0, {"bank": empty}, set(), {0, 2}),
         ):
             with self.subTest(objects=objects, index=index, options=list(options)):
@@ -411,14 +430,15 @@ class ResetTest(TestCase):
 
     def test_demonstrations_that_fail_are_drawn_more_often(self):
         """The soup can's two demonstrations are 0, which always succeeds, and 2, which never does."""
-        for share, expected in ((0.0, 0.5), (0.5, 0.25 + 0.5 / 1.05), (1.0, 1 / 1.05)):
+        shares = ((0.0, 0.5), (0.5, 0.25 + 0.5 / 1.05), (1.0, 1 / 1.05))
+        for (share, expected), objects in product(shares, ((SOUP, SPAM), (SPAM, SOUP))):
             for p in (0.0, 1.0):
                 config = ResetConfig(demo_probability=p, adaptive_share=share)
-                distribution = ResetDistribution(self.bank, self.robot, (SOUP, SPAM), config)
+                distribution = ResetDistribution(self.bank, self.robot, objects, config)
                 distribution.success_rate[0] = 1.0
-                reset = distribution.sample(self.SOUPS, generator())
+                reset = distribution.sample(self.SOUPS + objects.index(SOUP), generator())
                 of_second = (reset.sequence == 2).float().mean()
-                with self.subTest(share=share, p=p):
+                with self.subTest(share=share, p=p, objects=objects):
                     self.assertAlmostEqual(of_second, expected, delta=0.02)
                     self.assertEqual(set(reset.sequence.tolist()), {0, 2})
                     assert_close(reset.goal_pos, self.of(reset, "goal_pos"))
@@ -627,6 +647,17 @@ class ObservationTest(TestCase):
         ends = self.x.links.pos[:, 1:] + vectors
         gaps = (ends[:, :, None] - cloud[:, None]).norm(dim=-1).amin(dim=-1)
         self.assertLess(gaps.max(), 1e-5)
+
+    def test_the_critic_observes_what_the_published_policy_does_not(self):
+        c = replace(RECIPES["published"].config.task.observation, joint_vel_scale=0.2)
+        shown = obs.proprio_group(self.x, c, generator())
+        angles = torch.cat((self.x.state.joint_pos, self.x.joint_target), dim=-1)
+        assert_close(shown, (angles - 0.5) / 2.5)  # limits -2, 3 become -1, 1
+        found = obs.privileged_group(self.x, c)
+        assert_close(found[:, :15], obs.privileged_group(self.x, ObservationConfig()))
+        assert_close(found[:, 15 : 15 + self.J], 0.2 * self.x.state.joint_vel)
+        forces = (c.contact_force_scale * self.x.tip_force).clamp(-1.0, 1.0)
+        assert_close(found[:, 15 + self.J :], forces.flatten(1))
 
     def test_privileged_group(self):
         found = obs.privileged_group(self.x, ObservationConfig())

@@ -117,6 +117,7 @@ class FaultTest(TestCase):
             ("old joints", after(1, joint_time=0.99), "joint positions are 0.1. s old"),
             ("NaN force", after(1, tip_force=np.full((2, 3), np.nan)), "joint positions are 0.1. s old, or not finite"),
             ("limit", after(1, joint_pos=np.array([0, 9.11])), "Joint finger is at 9.11, beyond its limit 9.00"),
+            ("lower limit", after(1, joint_pos=np.array([-1.11, 0])), "Joint shoulder is at -1.11, beyond its limit -1.00"),
             ("no pose", after(1, object_pos=None), "object_pos is None. Without a new value, give the last one"),
             ("no cable", lambda t, r: refuse() if t > 1 else r, "The driver could not read: the cable is out"),
         ):  # fmt: skip
@@ -128,6 +129,10 @@ class FaultTest(TestCase):
                     continue
                 self.assertRegex(self.stopped(Scripted(fault)) or "", words)
                 self.assertEqual(len(logs.output), 1)
+
+    def test_joints_slightly_beyond_their_limits_are_tolerated(self):
+        driver = Scripted(after(0, joint_pos=np.array([-1.09, 9.09])))
+        self.assertIsNone(Runner(Steady(), driver).run(1).reason)
 
     def test_a_policy_that_fails(self):
         calls = []

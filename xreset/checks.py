@@ -63,14 +63,13 @@ Positive = Annotated[T, Rule("a number above 0 and finite", lambda x: 0 < x < in
 """JSON, and so a run's configuration, has no infinity."""
 NotNegative = Annotated[T, Rule("a number from 0 to 1e15", lambda x: 0 <= x <= 1e15)]
 """No time, number of steps or distance is larger: such a number in a file is damage."""
-Finite = Annotated[T, Rule("a finite number", isfinite)]
 PositiveFloat = Positive[float]
 PositiveInt = Annotated[int, Rule("a whole number above 0", lambda x: _is_whole(x) and x > 0)]
 NonNegativeFloat = NotNegative[float]
 NonNegativeInt = Annotated[
     int, Rule("a whole number from 0 to 1e15", lambda x: _is_whole(x) and 0 <= x <= 1e15)
 ]
-FiniteFloat = Finite[float]
+FiniteFloat = Annotated[float, Rule("a finite number", isfinite)]
 Share = Annotated[float, Rule("a number from 0 to 1", lambda x: 0 <= x <= 1)]
 Range = Annotated[
     tuple[float, float],

@@ -146,7 +146,7 @@ def _against_built(
 
 
 def _built_with(scene: SceneSpec, given: Mapping[str, np.ndarray]) -> SceneSpec:
-    """Return a scene of one object that states the values that a world of another scene is given."""
+    """Return a scene of one object whose specification has the values that a world was given."""
     (obj,) = scene.objects
     mass = float(given.get("object_mass", obj.mass))
     growth = given.get("object_inertia", 1.0) * mass / obj.mass

@@ -22,6 +22,7 @@ from tests.data import InFolder as WithFolder
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_hand_arm
 from xreset import (
+    ResetBank,
     TaskConfig,
     __version__,
     read_bank,
@@ -42,7 +43,7 @@ from xreset.files import (
     read_toml,
     write_json,
 )
-from xreset.records import Field, read_npz, write_npz
+from xreset.records import Field, arrays_of, read_npz, write_npz
 
 SCHEMA = {
     "points": Field(("F", 3), "f"),
@@ -536,6 +537,25 @@ class BankTest(InFolder):
             write_bank(self.file, content)
         self.assertEqual(self.file.read_bytes(), content)
 
+    def test_a_bank_that_could_not_be_read_is_not_written(self):
+        bank = toy_bank(self.robot)
+        for words, changes in (
+            (
+                "'object_pos' holds .*, expected numbers from -100 to 100",
+                {"object_pos": bank.object_pos + 1000},
+            ),
+            ("'object_pos' has shape .* but L = 5", {"joint_pos": bank.joint_pos[:5]}),
+            ("'sequence_index' points beyond", {"sequence_index": bank.sequence_index + 9}),
+            ("'post_contact' has type int", {"post_contact": bank.post_contact.astype(int)}),
+            ("goal_pos is None, expected an array", {"goal_pos": None}),
+            ("goal_pos is .*, expected an array. Nothing", {"goal_pos": [[0.0], [0.0, 1.0]]}),
+        ):
+            with self.subTest(words), self.assertRaisesRegex(XResetError, words):
+                write_bank(self.file, replace(bank, **changes))
+        with self.assertRaisesRegex(XResetError, "config .* PosixPath .* Use numbers, texts"):
+            write_bank(self.file, bank, config={"demos": self.file})
+        self.assertFalse(self.file.exists())
+
     def test_a_bank_prints_shapes(self):
         text = repr(toy_bank(self.robot))
         self.assertIn("joint_pos=array[6, 7], object_pos=array[6, 3]", text)
@@ -591,6 +611,9 @@ class BankTest(InFolder):
             ("'rejected_reason' points beyond 'reason_names'", with_value("rejected_reason", 0, 2)),
             ("but J = 7", {"joint_pos": np.zeros((6, 8), dtype=np.float32)}),
         ):
-            self.write(**changes)
+            arrays = arrays_of(ResetBank, toy_bank(self.robot, **changes))
+            write_npz(self.file, "xreset-resets/1", arrays)
             with self.subTest(words), self.refused("not valid as a reset bank", words):
                 read_bank(self.file, robot=self.robot)
+            with self.assertRaisesRegex(XResetError, f"was not written, .*{words}"):
+                self.write(**changes)

@@ -15,14 +15,16 @@ from tests.toy_retarget import FLOAT, arm_targets, box_object, check_gradient, d
 from tests.toy_robot import toy_motion, toy_robot
 from xreset import read_retargeted, robots, synthesize, write_retargeted
 from xreset.demos.archive import demo_objects, read_demos, write_demos
-from xreset.errors import DemoError, FileFormatError, RobotError
+from xreset.errors import DemoError, FileFormatError, RobotError, XResetError
 from xreset.geometry.collision import table_clearance
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_angle, quat_from_axis_angle, quat_to_matrix
 from xreset.geometry.surface import Surface
+from xreset.records import arrays_of, write_npz
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.arm.model import ArmModel
 from xreset.retarget.arm.solve import track
+from xreset.retarget.file import SCHEMA, Retargeted
 from xreset.retarget.hand import terms
 from xreset.retarget.hand.clearance import Objects, too_near
 from xreset.retarget.hand.config import HandConfig
@@ -389,9 +391,15 @@ class PipelineTest(InOneFolder):
             ({"frame_offsets": self.result.frame_offsets[::-1].copy()}, "frame_offsets"),
             ({"first_contact": np.array([10_000, -1])}, "first_contact"),
         ):
-            path = self.write("d.npz", replace(self.result, **changes))
+            path = self.folder / "d.npz"
+            damaged = replace(self.result, **changes)
+            write_npz(path, SCHEMA, arrays_of(Retargeted, damaged))
             with self.subTest(message), self.assertRaisesRegex(FileFormatError, message):
                 read_retargeted(path)
+            path.unlink()
+            with self.assertRaisesRegex(XResetError, f"was not written, .*{message}"):
+                self.write("d.npz", damaged)
+            self.assertFalse(path.exists())
 
     def test_an_object_that_was_not_given_is_named(self):
         with self.assertRaisesRegex(DemoError, "005_tomato_soup_can"):

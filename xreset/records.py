@@ -82,9 +82,17 @@ def write_npz(
         arrays: name -> array (numbers, bool or text; never objects).
         config: JSON-able configuration that made the content; numbers that are not finite are written as text.
         inputs: name -> SHA-256 of each input.
+
+    Raises:
+        XResetError: the configuration holds what JSON has not, such as a path, or the file cannot be written.
     """
     meta = {"xreset": code_version(), "config": dict(config or {}), "inputs": dict(inputs or {})}
-    as_json = json.loads(json.dumps(meta, sort_keys=True), parse_constant=str)
+    try:
+        as_json = json.loads(json.dumps(meta, sort_keys=True), parse_constant=str)
+    except (TypeError, ValueError) as error:
+        raise XResetError(
+            f"config or inputs cannot be written to {path}: {error}. Use numbers, texts, lists and dictionaries."
+        ) from error
     out = {
         "schema": np.array(schema_name),
         "meta": np.array(json.dumps(as_json)),
@@ -240,7 +248,7 @@ def _wrong_shape(arrays: Arrays, schema: Schema) -> str | None:
     lengths: dict[str, tuple[int, str]] = {}
     for name, array in arrays.items():
         field = schema[name]
-        if array.dtype.kind not in field.kind:
+        if array.dtype.kind.replace("u", "i") not in field.kind:
             wanted = " or ".join(_KINDS[kind] for kind in field.kind)
             return f"array {name!r} has type {array.dtype}, expected {wanted}."
         expected = f"array {name!r} has shape {array.shape}, expected ({', '.join(map(str, field.shape))})."
@@ -335,18 +343,40 @@ def schema_of(cls: type) -> Schema:
 
 
 def write_record(
-    cls: type, path: str | Path, schema_name: str, record: Any, **provenance: Any
+    cls: type,
+    path: str | Path,
+    schema_name: str,
+    record: Any,
+    *,
+    check: Callable[[Arrays], str | None],
+    **provenance: Any,
 ) -> None:
     """Write a dataclass of :func:`schema_of`'s kind; fields that are None are left out. See :func:`write_npz` for
-    ``provenance``. ``XResetError`` if it is of another class."""
-    write_npz(path, schema_name, arrays_of(cls, record), **provenance)
+    ``provenance``.
+
+    Raises:
+        XResetError: it is of another class, or :func:`read_record` with the same ``check`` would refuse the file.
+    """
+    arrays = arrays_of(cls, record)
+    if problem := record_problem(cls, arrays, check):
+        raise XResetError(f"{path} was not written, because it could not be read: {problem}")
+    write_npz(path, schema_name, arrays, **provenance)
+
+
+def record_problem(cls: type, arrays: Arrays, check: Callable[[Arrays], str | None]) -> str | None:
+    """Return what is wrong with the arrays of a dataclass of :func:`schema_of`'s kind, or None."""
+    schema = schema_of(cls)
+    for name, field in schema.items():
+        if field.required and name not in arrays:
+            return f"{name} is None, expected an array."
+    return _wrong_shape(arrays, schema) or wrong_value(arrays, schema) or check(arrays)
 
 
 def arrays_of(cls: type, record: Any) -> Arrays:
     """Return the arrays of a dataclass of :func:`schema_of`'s kind, as they are written.
 
     Raises:
-        XResetError: the record is of another class, so that its file could not be read.
+        XResetError: the record is of another class, or a field is no array, so that its file could not be read.
     """
     if not isinstance(record, cls):
         raise XResetError(f"Found {shown(record)}, expected {cls.__name__}. Nothing was written.")
@@ -355,7 +385,12 @@ def arrays_of(cls: type, record: Any) -> Arrays:
         value = getattr(record, name)
         if value is not None:
             default = np.str_ if field.kind == "U" else None
-            arrays[name] = np.asarray(value, dtype=field.dtype or default)
+            try:
+                arrays[name] = np.asarray(value, dtype=field.dtype or default)
+            except (TypeError, ValueError, RuntimeError) as error:  # such as a tensor of a GPU
+                raise XResetError(
+                    f"{name} is {shown(value)}, expected an array. Nothing was written."
+                ) from error
     return arrays
 
 

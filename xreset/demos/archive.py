@@ -29,9 +29,8 @@ from xreset.records import (
     arrays_of,
     offsets_problem,
     read_record,
-    schema_of,
-    write_record,
-    wrong_value,
+    record_problem,
+    write_npz,
 )
 from xreset.spec import ObjectSpec
 from xreset.text import Brief, shown
@@ -316,7 +315,7 @@ def merge_demos(parts: Sequence[Demos]) -> Demos:
         fps=parts[0].fps,
         **joined,
     )
-    _check(demos)
+    _checked_arrays(demos)
     return demos
 
 
@@ -420,8 +419,7 @@ def write_demos(
     Raises:
         DemoError: the demonstrations hold a value that the archive may not hold.
     """
-    _check(demos)
-    write_record(Demos, path, SCHEMA_NAME, demos, config=config, inputs=inputs)
+    write_npz(path, SCHEMA_NAME, _checked_arrays(demos), config=config, inputs=inputs)
 
 
 def demo_objects(demos: Demos, folder: Path | None = None) -> dict[str, ObjectSpec]:
@@ -457,11 +455,11 @@ def sequences_problem(arrays: Arrays) -> str | None:
     return None
 
 
-def _check(demos: Demos) -> None:
+def _checked_arrays(demos: Demos) -> Arrays:
     arrays = arrays_of(Demos, demos)
-    problem = wrong_value(arrays, schema_of(Demos)) or _problem(arrays)
-    if problem:
+    if problem := record_problem(Demos, arrays, _problem):
         raise DemoError(f"The demonstrations cannot be used: {problem}")
+    return arrays
 
 
 def _problem(arrays: Arrays) -> str | None:

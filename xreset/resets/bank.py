@@ -190,7 +190,7 @@ def write_bank(
     inputs: Mapping[str, str] | None = None,
 ) -> None:
     """Write a bank. The file states the configuration that made it, and name -> SHA-256 of the input files."""
-    write_record(ResetBank, path, SCHEMA, bank, config=config, inputs=inputs)
+    write_record(ResetBank, path, SCHEMA, bank, check=bank_problem, config=config, inputs=inputs)
 
 
 def read_bank(path: str | Path, *, robot: RobotSpec | None = None) -> ResetBank:

@@ -151,7 +151,8 @@ def make_goals(
 
 def write_goals(path: str | Path, goals: GoalSet, config: GoalConfig | None = None) -> None:
     """Write a goal set; see :func:`xreset.records.write_record`."""
-    write_record(GoalSet, path, SCHEMA, goals, config=asdict(config) if config else None)
+    made_with = asdict(config) if config else None
+    write_record(GoalSet, path, SCHEMA, goals, check=bank_problem, config=made_with)
 
 
 def read_goals(path: str | Path) -> GoalSet:

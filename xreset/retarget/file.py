@@ -123,7 +123,7 @@ def write_retargeted(
     inputs: Mapping[str, str] | None = None,
 ) -> None:
     """Write trajectories, the configuration that made them, and the inputs: name -> SHA-256 of a file."""
-    write_record(Retargeted, path, SCHEMA, retargeted, config=config, inputs=inputs)
+    write_record(Retargeted, path, SCHEMA, retargeted, check=_check, config=config, inputs=inputs)
 
 
 def read_retargeted(path: str | Path) -> Retargeted:

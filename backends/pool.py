@@ -26,7 +26,7 @@ from xreset.backends.workers import (
     layout_of,
     usable_cores,
 )
-from xreset.errors import CapabilityError, XResetError
+from xreset.errors import CapabilityError, WrongValueError, XResetError
 from xreset.physics import Backend, Contacts, Health, Links, MassProperties, Parameter, State
 from xreset.plugins import refuse_unknown_options
 from xreset.spec import SceneSpec
@@ -189,7 +189,7 @@ class PoolBackend(Backend):
         if workers is None:
             workers = 0 if num_worlds == 1 else usable_cores()
         if workers < 0:
-            raise ValueError(f"workers is {workers}, expected 0 or more")
+            raise WrongValueError(f"workers is {workers}, expected 0 or more")
         layout = layout_of(scene, self.object_index)
         jobs = []
         for worlds in np.array_split(np.arange(num_worlds), max(min(workers, num_worlds), 1)):
@@ -252,7 +252,7 @@ class PoolBackend(Backend):
             return np.arange(self.num_worlds)
         index = torch.as_tensor(worlds, dtype=torch.long).detach().cpu().numpy()
         if index.ndim != 1 or (index.size and (index.min() < 0 or index.max() >= self.num_worlds)):
-            raise ValueError(
+            raise WrongValueError(
                 f"worlds must be a list of indices in 0..{self.num_worlds - 1}, found {worlds}"
             )
         return index

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
+from xreset.checks import Seed
 from xreset.errors import XResetError
 from xreset.eval.policy_spec import PolicySpec, load_policy
 from xreset.eval.results import (
@@ -28,7 +29,7 @@ def evaluate(
     engines: str | Sequence[str | Engine] = "mujoco",
     *,
     episodes: int = 5,
-    seed: int = 0,
+    seed: Seed = 0,
     robot: str | Path | None = None,
     objects: str | Path | None = None,
     num_envs: int = 64,

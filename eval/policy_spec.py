@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from xreset.checks import frozen
+from xreset.checks import Seed, frozen
 from xreset.description import load_robot
 from xreset.env import ManipulationEnv, make_env
 from xreset.errors import PolicyError
@@ -88,7 +88,7 @@ class PolicySpec(Brief):
         engine: str = "mujoco",
         num_envs: int = 1,
         device: str = "cpu",
-        seed: int = 0,
+        seed: Seed = 0,
     ) -> ManipulationEnv:
         """Make an environment of the policy's own task, as evaluations play it: from home, at full gravity.
 
@@ -150,7 +150,7 @@ class PolicySpec(Brief):
 
 
 def load_policy(
-    policy: str | Path | PolicySpec, *, robot: str | Path | None = None, seed: int = 0
+    policy: str | Path | PolicySpec, *, robot: str | Path | None = None, seed: Seed = 0
 ) -> PolicySpec:
     """Load the policy that a name means. A file or folder comes before a shipped policy of the same name.
 

@@ -14,7 +14,7 @@ from dataclasses import field, replace
 from pathlib import Path
 from typing import Any
 
-from xreset.checks import frozen
+from xreset.checks import Seed, frozen
 from xreset.demos.synth import synthesize
 from xreset.eval.pages import render
 from xreset.eval.plots import COLORS, svg
@@ -71,7 +71,7 @@ def rehearse(
     *,
     faults: str | Sequence[str] = (),
     episodes: int = 1,
-    seed: int = 0,
+    seed: Seed = 0,
     robot: str | Path | None = None,
     objects: str | Path | None = None,
     num_envs: int = 64,

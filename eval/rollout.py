@@ -18,6 +18,7 @@ from torch import Tensor
 
 from xreset.checks import frozen
 from xreset.env import ManipulationEnv, make_scene
+from xreset.errors import XResetError
 from xreset.eval.metrics import EpisodeMetrics, MetricPoints
 from xreset.eval.policy_spec import PolicySpec
 from xreset.eval.results import Episode, Rollouts, Trace
@@ -88,8 +89,10 @@ def engine(name: str, *, device: str = "cpu", **options: Any) -> Engine:
 
 
 def chosen_engines(engines: str | Iterable[str | Engine], device: str) -> list[Engine]:
-    """Return engines, given by name or as such, each once."""
-    names = (engines,) if isinstance(engines, str) else engines
+    """Return engines, given by name or as such, each once; ``XResetError`` if there is none."""
+    names = (engines,) if isinstance(engines, str) else tuple(engines)
+    if not names:
+        raise XResetError("No engine is named. Name one or several of them.")
     return [
         each if isinstance(each, Engine) else engine(each, device=device)
         for each in dict.fromkeys(names)

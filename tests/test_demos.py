@@ -28,7 +28,7 @@ from xreset.demos.dexycb import read_dexycb
 from xreset.demos.grasp import TIPS, Solid
 from xreset.demos.keypoints import ORDERS
 from xreset.demos.plausible import doubts
-from xreset.errors import DemoError, FileFormatError
+from xreset.errors import DemoError, FileFormatError, XResetError
 from xreset.geometry.shapes import turn_of
 from xreset.objects.rest import rest_height
 
@@ -163,8 +163,16 @@ class Archive(InFolder):
                 "Unknown objects 'cup', 'mug'. Choose from: 005_tomato_soup_can",
             ),
             ({"share": 0.0}, "share is 0, expected"),
+            ({"indices": [True, False, False, True]}, r"whole numbers. Of a mask: np.flatnonzero"),
+            ({"indices": [1.5]}, "expected whole numbers"),
         ):
             self.assertRaisesRegex(DemoError, message, self.demos.select, **options)
+        for options, message in (
+            ({"indices": 0}, "^indices is 0, expected Iterable"),
+            ({"names": [0]}, r"^names is \[0\], expected Iterable.str. . None. Look at help.xreset.Demos.select"),
+            ({"max_per_object": 1, "seed": -1}, "^seed is -1, expected a whole number from 0"),
+        ):  # fmt: skip
+            self.assertRaisesRegex(XResetError, message, self.demos.select, **options)
 
     def test_split_by_share_spread_and_chance(self):
         parts = []

@@ -439,10 +439,13 @@ class ResultsTest(InFolder):
             evaluate("zero", "demos.npz", robot="openarm", episodes=0)
 
     def test_two_evaluations_are_not_written_into_one_folder(self):
-        with patch("xreset.eval.evaluate.load_trial"):
+        with (
+            patch("xreset.eval.evaluate.load_trial"),
+            patch("xreset.eval.evaluate.chosen_engines", return_value=[]),
+        ):
             with claim_folder(self.folder), self.assertRaisesRegex(XResetError, "writing"):
-                evaluate(self.policy, "demos.npz", [])
-            self.assertEqual(evaluate(self.policy, "demos.npz", []), [])
+                evaluate(self.policy, "demos.npz")
+            self.assertEqual(evaluate(self.policy, "demos.npz"), [])
 
     def test_episodes_have_the_length_that_is_asked_for(self):
         """The same starts, played for longer: the first states are the same. The result states the length."""

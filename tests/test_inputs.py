@@ -16,6 +16,8 @@ from xreset import (
     load_object,
     make_bank,
     make_env,
+    make_goals,
+    merge_demos,
     rehearse,
     retarget_demos,
     robots,
@@ -102,12 +104,16 @@ class InputsTest(InOneFolder):
         run = {"bank": self.bank_file, "out": self.folder / "run", "engine": "mujoco"}
         scene = {"robot": self.robot, "objects": objects}
         playing = {"policy": "zero", "robot": "ur7e-sharpa", "demos": bank}
+        seeds = "a whole number from 0 to 4294967295"
         for call, given, wrong, expected in (
             (train, run, {"minutes": "1"}, "float"),
             (train, run, {"config": {"iterations": 5}}, "TrainConfig | None"),
-            (train, run, {"seed": "3"}, "int"),
+            (train, run, {"seed": "3"}, seeds),
+            (train, run, {"seed": -1}, seeds),
             (evaluate, playing, {"episodes": "5"}, "int"),
-            (evaluate, playing, {"seed": "4"}, "int"),
+            (evaluate, playing, {"seed": 2**32}, seeds),
+            (make_env, {"bank": bank} | scene, {"seed": np.random.default_rng()}, seeds),
+            (merge_demos, {}, {"parts": ["demos.npz"]}, "Sequence[Demos]"),
             (evaluate, playing, {"engines": 5}, "str | Sequence[str | Engine]"),
             (rehearse, {"policy": "soup-can", "demos": bank}, {"episodes": "5"}, "int"),
             (retarget_demos, {"demos": self.demos} | scene, {"config": {"arm": 1}}, "RetargetConfig | None"),
@@ -120,8 +126,18 @@ class InputsTest(InOneFolder):
                 self.assertRaisesRegex(XResetError, f"^{next(iter(wrong))} {words}"),
             ):
                 call(**given | wrong)
+        self.assertFalse((self.folder / "run").exists())
         with self.assertRaisesRegex(XResetError, "^num_envs is '3', expected int"):
             distill("many-objects", self.bank_file, out=self.folder / "run", num_envs="3")
+
+    def test_an_empty_selection_is_not_everything(self):
+        for call in (
+            lambda: synthesize([]),
+            lambda: make_goals([], robot="openarm"),
+            lambda: evaluate("zero", self.demos, [], robot="ur7e-sharpa"),
+        ):
+            with self.assertRaisesRegex(XResetError, "^No (object|engine) is named. Name one"):
+                call()
 
     def test_functions_of_the_package_can_be_sent_to_other_processes(self):
         for function in (evaluate, make_env, train):

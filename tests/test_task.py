@@ -16,7 +16,7 @@ from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_robot
 from xreset.cameras.config import FRONT, VisionConfig
 from xreset.checks import from_dict
-from xreset.errors import DemoError, PolicyError, RunError
+from xreset.errors import DemoError, PolicyError, RunError, XResetError
 from xreset.geometry.rotations import (
     quat_angle,
     quat_conjugate,
@@ -24,6 +24,7 @@ from xreset.geometry.rotations import (
     quat_multiply,
     quat_rotate,
 )
+from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import RECIPES
 from xreset.physics import Links, State
 from xreset.policy import RandomPolicy, ZeroPolicy, check_contract, parsed_contract, policy_contract
@@ -193,6 +194,16 @@ class RewardTest(TestCase):
         for own in ({"height": 1.0}, {"module:": 1.0}, {"a:b": math.nan}, {math.sin: 1.0}, ["a:b"]):
             with self.subTest(own), self.assertRaisesRegex(ValueError, words):
                 RewardConfig(own=own)
+
+    def test_unknown_words_and_other_objects_are_refused(self):
+        for make, words in (
+            (lambda: TaskConfig(object_frame="centre"), "is 'centre', expected one of 'mesh', 'center'"),
+            (lambda: TaskConfig(reward={"grasp": 2}), "reward is {'grasp': 2}, expected RewardConfig"),
+            (lambda: TrainConfig(task=None), "task is None, expected TaskConfig"),
+            (lambda: TrainConfig(iterations=0), "iterations is 0, expected a whole number above 0"),
+        ):  # fmt: skip
+            with self.subTest(words), self.assertRaisesRegex(XResetError, words):
+                make()
 
     def test_success_needs_two_centimetres_and_fifteen_degrees_and_contact(self):
         for distance, degrees, changes, expected in (

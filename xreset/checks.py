@@ -34,7 +34,7 @@ from typing import (
 import numpy as np
 
 from xreset import __version__
-from xreset.errors import FileFormatError, XResetError
+from xreset.errors import FileFormatError, WrongValueError, XResetError
 from xreset.text import Brief, shown
 
 P = ParamSpec("P")
@@ -75,14 +75,24 @@ Range = Annotated[
     tuple[float, float],
     Rule("two finite numbers, 0 or more, the lower one first", lambda x: 0 <= x[0] <= x[1] < inf),
 ]
+LARGEST_SEED = 2**32 - 1
+"""numpy, torch and the engines take seeds up to this one."""
+Seed = Annotated[
+    int,
+    Rule(
+        f"a whole number from 0 to {LARGEST_SEED}",
+        lambda x: _is_whole(x) and 0 <= x <= LARGEST_SEED,
+    ),
+]
 Text = Annotated[str, Rule("a text", lambda text: bool(text.strip()) and text.isprintable())]
 Number = Annotated[float, Rule("a finite number of at most 1e9", lambda x: abs(x) <= 1e9)]
 """A number of a robot's description: stiffnesses reach 1e5, everything else is far smaller."""
 
 
 class Checked:
-    """Base of dataclasses that obey the rules of their fields: making one that does not raises ``ValueError``, which
-    names every field."""
+    """Base of dataclasses whose fields are checked: making one with a value that breaks its field's rule, with an
+    unknown word, or with something else in place of a dataclass raises ``WrongValueError``, which names every such
+    field."""
 
     def __post_init__(self) -> None:
         wrong = []
@@ -92,8 +102,12 @@ class Checked:
                 f"{name} is {shown(value)}, expected {rule.expected}"
                 for rule in _broken(marks, value)
             ]
+        for name, hint in _choices_of(type(self)).items():
+            value = getattr(self, name)
+            if not _is_of(hint, value):
+                wrong.append(f"{name} is {shown(value)}, expected {_described(hint)}")
         if wrong:
-            raise ValueError("; ".join(wrong))
+            raise WrongValueError("; ".join(wrong))
 
 
 class Options:
@@ -103,11 +117,34 @@ class Options:
 @cache
 def marks_of(cls: type) -> dict[str, list[Any]]:
     """Field name -> what its annotation holds in addition to the type."""
-    marks = {}
-    for name, hint in get_type_hints(cls, include_extras=True).items():
-        parts = get_args(hint) if _is_union(hint) else (hint,)
-        marks[name] = [mark for part in parts for mark in getattr(part, "__metadata__", ())]  # noqa: XR002
+    hints = get_type_hints(cls, include_extras=True)
+    return {name: _marks(hint) for name, hint in hints.items()}
+
+
+def _marks(hint: Any) -> list[Any]:
+    marks = []
+    for part in _parts(hint):
+        marks += getattr(part, "__metadata__", ())
     return marks
+
+
+@cache
+def _choices_of(cls: type) -> dict[str, Any]:
+    """Field name -> type, of the fields that take one of a few words or an object of a dataclass."""
+    choices = {}
+    for name, hint in get_type_hints(cls).items():
+        if any(get_origin(part) is Literal or is_dataclass(part) for part in _parts(hint)):
+            choices[name] = hint
+    return choices
+
+
+def _described(hint: Any) -> str:
+    """Return what messages call a type of :func:`_choices_of`."""
+    if get_origin(hint) is Literal:
+        return f"one of {', '.join(map(repr, get_args(hint)))}"
+    if _is_union(hint):
+        return " or ".join(map(_described, get_args(hint)))
+    return "None" if hint is types.NoneType else hint.__name__
 
 
 def _broken(marks: Iterable[Any], value: Any) -> list[Rule]:
@@ -125,6 +162,11 @@ def _holds(rule: Rule, value: Any) -> bool:
 
 def _is_union(hint: Any) -> bool:
     return get_origin(hint) in (Union, types.UnionType)
+
+
+def _parts(hint: Any) -> tuple[Any, ...]:
+    """Return the members of a union, or the type itself."""
+    return get_args(hint) if _is_union(hint) else (hint,)
 
 
 def is_rigid(T: np.ndarray) -> bool:
@@ -145,11 +187,21 @@ def check_port(port: int) -> None:
 
 
 def names_wrong_arguments(function: Callable[P, T]) -> Callable[P, T]:
-    """Return a function that raises ``XResetError`` in place of Python's own errors if an argument is of another type
-    than its annotation says."""
+    """Return a function that raises ``XResetError`` if an argument breaks a rule of its annotation, or in place of
+    Python's own errors if an argument is of another type than its annotation says."""
 
     @wraps(function)
     def call(*positional: P.args, **named: P.kwargs) -> T:
+        rules = _rules_of(function)
+        if rules:
+            with suppress(TypeError):  # an unknown argument
+                given = signature(function).bind(*positional, **named).arguments
+                for name, value in given.items():
+                    for rule in _broken(rules.get(name, ()), value):
+                        raise WrongValueError(
+                            f"{name} is {shown(value)}, expected {rule.expected}. "
+                            f"Look at help(xreset.{function.__qualname__})."
+                        )
         try:
             return function(*positional, **named)
         except (AttributeError, RuntimeError, TypeError, ValueError) as error:
@@ -166,26 +218,40 @@ def names_wrong_arguments(function: Callable[P, T]) -> Callable[P, T]:
     return call
 
 
-_WIDER = {int: Integral, float: Real, Sequence: Iterable}
+@cache
+def _rules_of(function: Callable[..., Any]) -> dict[str, list[Any]]:
+    """Name of an argument -> what its annotation holds in addition to the type, where that is anything."""
+    marks = {name: _marks(_hint_of(function, name)) for name in function.__annotations__}
+    return {name: found for name, found in marks.items() if found}
+
+
+_WIDER: dict[Any, Any] = {int: Integral, float: Real, Sequence: Iterable}
 
 
 def _hint_of(function: Callable[..., Any], name: str) -> Any:
     """Return the type of an argument; Any if there is none (``self``), or only type checkers know it."""
     with suppress(KeyError, NameError):
         one = SimpleNamespace(__annotations__={name: function.__annotations__[name]})
-        return get_type_hints(one, globalns=getattr(function, "__globals__", None))[name]
+        known = getattr(function, "__globals__", None)
+        return get_type_hints(one, globalns=known, include_extras=True)[name]
     return Any
 
 
 def _is_of(hint: Any, value: Any) -> bool:
-    """Whether a value is of an annotated type; items of lists are not looked at."""
-    if hint is Any:
+    """Whether a value and the items of a sequence are of an annotated type."""
+    if _is_union(hint):
+        return any(_is_of(part, value) for part in get_args(hint))
+    kind = get_origin(hint) or hint
+    if kind is Any:
         return True
-    if get_origin(hint) is Literal:
+    if kind is Literal:
         return value in get_args(hint)
-    parts = get_args(hint) if _is_union(hint) else (hint,)
-    kinds = [get_origin(part) or part for part in parts]
-    return isinstance(value, tuple(_WIDER.get(kind, kind) for kind in kinds))
+    if kind is Annotated:
+        return _is_of(hint.__origin__, value) and not _broken(hint.__metadata__, value)
+    is_one = isinstance(value, _WIDER.get(kind, kind))
+    if is_one and kind in (Sequence, Iterable):
+        return all(_is_of(get_args(hint)[0], item) for item in value)
+    return is_one
 
 
 # Reading from JSON and TOML -------------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from xreset.capture import GraphRunner
+from xreset.checks import Seed
 from xreset.errors import XResetError
 from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
 from xreset.objects.sampling import center, metric_points, surface_points
@@ -72,7 +73,7 @@ def make_env(
     engine: str = "mujoco",
     num_envs: int = 16,
     device: str = "cpu",
-    seed: int = 0,
+    seed: Seed = 0,
 ) -> ManipulationEnv:
     """Make N worlds of the task in an engine. Close the environment, or use it as a context manager.
 

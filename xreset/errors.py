@@ -12,6 +12,10 @@ class XResetError(Exception):
     """Base of every error that a user can fix."""
 
 
+class WrongValueError(XResetError, ValueError):
+    """An argument, or a field of a configuration, has a value that it may not have."""
+
+
 class FileFormatError(XResetError):
     """A file does not fit its reader: wrong schema, missing key, wrong shape or type, damaged, or bad values."""
 

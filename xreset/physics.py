@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from xreset.checks import frozen
-from xreset.errors import BackendUnavailableError, CapabilityError, XResetError
+from xreset.errors import BackendUnavailableError, CapabilityError, WrongValueError, XResetError
 from xreset.spec import RobotSpec, SceneSpec, lowest_point
 from xreset.tensors import Tensors
 
@@ -259,13 +259,13 @@ class Backend(ABC):
             device: ``cpu`` or ``cuda[:i]``.
 
         Raises:
-            ValueError: there is no world or no object, or an index is not one of an object.
+            WrongValueError: there is no world or no object, or an index is not one of an object.
         """
         if num_worlds < 1:
-            raise ValueError(f"num_worlds is {num_worlds}, expected at least 1")
+            raise WrongValueError(f"num_worlds is {num_worlds}, expected at least 1")
         count = len(scene.objects)
         if not count:
-            raise ValueError("the scene has no object; each world holds exactly one")
+            raise WrongValueError("the scene has no object; each world holds exactly one")
         self.scene = scene
         self.num_worlds = num_worlds
         self.device = torch.device(device)
@@ -274,7 +274,7 @@ class Backend(ABC):
         self.object_index = torch.as_tensor(object_index, dtype=torch.long).to(self.device)
         valid = (self.object_index >= 0) & (self.object_index < count)
         if self.object_index.shape != (num_worlds,) or not valid.all():
-            raise ValueError(f"object_index must be [{num_worlds}] indices below {count}")
+            raise WrongValueError(f"object_index must be [{num_worlds}] indices below {count}")
 
     # Availability ----------------------------------------------------------------------------------------------------
 
@@ -438,17 +438,17 @@ class Backend(ABC):
             raise XResetError(f"The backend {self.name!r} is closed. Build a new one.")
 
     def _checked_state(self, state: State, rows: int) -> State:
-        """Return a state on the backend's device; ``ValueError`` if it has another number of rows."""
+        """Return a state on the backend's device; ``WrongValueError`` if it has another number of rows."""
         checked = {}
         for name, present in vars(self._state).items():
             checked[name] = self._checked(name, getattr(state, name), (rows, *present.shape[1:]))
         return State(**checked)
 
     def _checked(self, name: str, value: Tensor, shape: tuple[int, ...]) -> Tensor:
-        """Return values on the backend's device; ``ValueError`` if they have another shape."""
+        """Return values on the backend's device; ``WrongValueError`` if they have another shape."""
         value = torch.as_tensor(value, dtype=torch.float32, device=self.device).detach()
         if value.shape != shape:
-            raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {tuple(shape)}")
+            raise WrongValueError(f"{name} has shape {tuple(value.shape)}, expected {tuple(shape)}")
         return value.contiguous()
 
     def _checked_substeps(self, substeps: int | None) -> int:
@@ -456,7 +456,7 @@ class Backend(ABC):
         if substeps is None:
             return self.scene.substeps
         if substeps < 1:
-            raise ValueError(f"substeps is {substeps}, expected at least 1")
+            raise WrongValueError(f"substeps is {substeps}, expected at least 1")
         return substeps
 
     def _require(self, capability: Capability) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from xreset.checks import Seed
 from xreset.errors import XResetError
 from xreset.eval.play.record import draw_film, last_moments, write_trace
 from xreset.eval.play.session import Session
@@ -62,7 +63,7 @@ def play(
     robot: str | Path | None = None,
     demos: str | Path | None = None,
     objects: str | Path | None = None,
-    seed: int = 0,
+    seed: Seed = 0,
     host: str = "127.0.0.1",
     port: int = 8080,
 ) -> None:

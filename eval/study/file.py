@@ -36,7 +36,7 @@ from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from xreset.checks import Checked, PositiveFloat, PositiveInt, Rule, from_dict, frozen, merged
+from xreset.checks import Checked, PositiveFloat, PositiveInt, Rule, Seed, from_dict, frozen, merged
 from xreset.errors import FileFormatError, RunError
 from xreset.eval.study.paper import paper_tables
 from xreset.eval.table import METRICS
@@ -47,11 +47,6 @@ SHIPPED = Path(__file__).parent.parent / "studies"
 """Folder of the studies that ship with xreset."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
-_LARGEST_SEED = 2**32 - 1
-"""numpy, torch and the engines take seeds up to this one."""
-Seed = Annotated[
-    int, Rule(f"a whole number from 0 to {_LARGEST_SEED}", lambda x: 0 <= x <= _LARGEST_SEED)
-]
 Robot = Annotated[
     str,
     Rule(

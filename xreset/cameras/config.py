@@ -16,7 +16,7 @@ from xreset.checks import (
     Share,
     frozen,
 )
-from xreset.errors import XResetError
+from xreset.errors import WrongValueError, XResetError
 
 Point = Annotated[
     tuple[float, float, float],
@@ -69,9 +69,11 @@ class CameraConfig(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.near < self.far:
-            raise ValueError(f"near is {self.near}, expected less than far, which is {self.far}")
+            raise WrongValueError(
+                f"near is {self.near}, expected less than far, which is {self.far}"
+            )
         if math.dist(self.pos, self.target) < 1e-3:
-            raise ValueError(f"target is {self.target}, expected another point than pos")
+            raise WrongValueError(f"target is {self.target}, expected another point than pos")
 
 
 @frozen
@@ -98,7 +100,7 @@ class VisionConfig(Checked):
         super().__post_init__()
         pixels = len(self.cameras) * self.width * self.height
         if self.view == "points" and 0 < pixels < self.points:
-            raise ValueError(
+            raise WrongValueError(
                 f"points is {self.points}, expected at most {pixels}, one for each pixel"
             )
 

@@ -10,7 +10,7 @@ from inspect import signature
 from pathlib import Path
 from typing import Any
 
-from xreset.checks import LAST_PORT, Options
+from xreset.checks import LARGEST_SEED, LAST_PORT, Options
 from xreset.errors import XResetError
 from xreset.files import check_suffix, claim
 from xreset.plugins import existing_device
@@ -28,8 +28,6 @@ _SUFFIXES = {"png": ".png", "mp4": ".mp4", "picture": ".png"}
 """How the name of a file ends that can be written in one format only."""
 _IN_PLACE = {"policy"}
 """Options that may name the same file as the output."""
-_LARGEST = 2**32 - 1
-"""The largest seed that numpy, torch and all engines accept; also an upper limit for counts."""
 _LONGEST = 1000
 """Largest number of characters of a text or a file name, because messages repeat them."""
 
@@ -63,7 +61,7 @@ def _check(options: dict[str, Any]) -> None:
             continue
         if name in _COUNTS or name in _INDICES:
             low = 1 if name in _COUNTS else 0
-            high = LAST_PORT if name == "port" else _LARGEST
+            high = LAST_PORT if name == "port" else LARGEST_SEED
             if not low <= value <= high:
                 raise XResetError(
                     f"{flag} is {value}, expected a whole number from {low} to {high}."

@@ -42,7 +42,7 @@ def goals(
 
     with Progress() as bar:
         made = goal_sets.make_goals(
-            names, robot=robot, meshes=objects, families=family or None, poses=pose, config=draw,
+            names or None, robot=robot, meshes=objects, families=family or None, poses=pose, config=draw,
             progress=bar.count("goals within reach"),
         )  # fmt: skip
     goal_sets.write_goals(out, made, draw)

@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xreset.checks import frozen, is_rigid
+from xreset.checks import Seed, frozen, is_rigid, names_wrong_arguments
 from xreset.errors import DemoError, ObjectError
 from xreset.geometry.shapes import quat_of, turn_of
 from xreset.objects.catalogue import canonical_names, load_object, object_names, official_name
@@ -140,6 +140,7 @@ class Demos(ObjectMotions):
     def __len__(self) -> int:
         return self.num_sequences
 
+    @names_wrong_arguments
     def select(
         self,
         *,
@@ -151,7 +152,7 @@ class Demos(ObjectMotions):
         max_per_object: int | None = None,
         share: float = 1.0,
         spread: bool = False,
-        seed: int | None = None,
+        seed: Seed | None = None,
     ) -> Demos:
         """Return the sequences that meet every given condition. A single name need not be in a list.
 
@@ -173,7 +174,12 @@ class Demos(ObjectMotions):
         """
         chosen = np.arange(len(self))
         if indices is not None:
-            chosen = np.asarray(list(indices), dtype=np.int64)
+            chosen = np.asarray(list(indices))
+            if chosen.size and chosen.dtype.kind not in "iu":
+                raise DemoError(
+                    f"indices is {shown(indices)}, expected whole numbers. Of a mask: np.flatnonzero(mask)."
+                )
+            chosen = chosen.astype(np.int64)
             if not np.isin(chosen, range(len(self))).all():
                 raise DemoError(
                     f"Unknown sequence index in {chosen.tolist()}: there are {len(self)} sequences."

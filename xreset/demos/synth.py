@@ -17,6 +17,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from xreset.checks import Seed
 from xreset.demos import hand
 from xreset.demos.archive import Demos, merge_demos, one_sequence
 from xreset.demos.grasp import Contacts, Grasp, Solid, fit_hand, handedness, plan_contacts
@@ -63,7 +64,7 @@ _OPENING = np.array([0.0, 0.4, 0.2] * 4 + [-0.15, -0.1, 0.0, 0.3, 0.3])
 def synthesize(
     objects: Iterable[str] | None = None,
     per_object: int = 4,
-    seed: int = 0,
+    seed: Seed = 0,
     *,
     fps: float = 30.0,
     side: Literal["right", "left"] = "right",
@@ -96,7 +97,7 @@ def synthesize(
     if side not in ("right", "left"):
         raise DemoError(f"side is {side!r}, expected 'right' or 'left'.")
     folder = Path(meshes) if meshes else None
-    specs = load_objects(objects or object_names(folder), folder)
+    specs = load_objects(object_names(folder) if objects is None else objects, folder)
     parts = []
     for spec in specs:
         starts = [_start(spec, np.array(up), side) for up in _REST_UP.get(spec.name, (_Z,))]

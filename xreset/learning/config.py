@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 
 from xreset.checks import Checked, NonNegativeFloat, PositiveFloat, PositiveInt, Rule, Share, frozen
+from xreset.errors import WrongValueError
 from xreset.task.config import TaskConfig
 
 Widths = Annotated[
@@ -89,7 +90,7 @@ class PpoConfig(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.horizon % self.sequence_length:
-            raise ValueError(
+            raise WrongValueError(
                 f"sequence_length is {self.sequence_length}, expected a divisor of the horizon, which is {self.horizon}"
             )
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Annotated
 
 from xreset.checks import Checked, NonNegativeInt, PositiveInt, Rule, Share, from_dict, frozen
-from xreset.errors import PolicyError, RunError
+from xreset.errors import PolicyError, RunError, WrongValueError
 from xreset.files import read_json, read_typed, write_json
 from xreset.learning.config import TrainConfig
 from xreset.plugins import robot_names
@@ -201,7 +201,7 @@ class Choice(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.chosen not in [c.name for c in self.candidates]:
-            raise ValueError(f"chosen is {self.chosen!r}, expected one of the candidates")
+            raise WrongValueError(f"chosen is {self.chosen!r}, expected one of the candidates")
 
     @property
     def candidate(self) -> Candidate:

@@ -21,7 +21,7 @@ from xreset.cameras.config import (
     VisionConfig,
     check_each_once,
 )
-from xreset.checks import names_wrong_arguments
+from xreset.checks import Seed, names_wrong_arguments
 from xreset.env import make_env
 from xreset.errors import PolicyError, RunError, XResetError
 from xreset.files import claim_folder, file_hash, write_whole
@@ -68,7 +68,7 @@ def train(
     num_envs: int = 4096,
     iterations: int | None = None,
     minutes: float = math.inf,
-    seed: int = 0,
+    seed: Seed = 0,
     weights: str | Path | None = None,
     teacher: str | Path | None = None,
     wandb: str | None = None,

@@ -127,5 +127,7 @@ def load_object(name: str, folder: str | Path | None = None) -> ObjectSpec:
 
 def load_objects(names: Iterable[str], folder: str | Path | None = None) -> tuple[ObjectSpec, ...]:
     """Load several objects, in that order, or the one of a single name; see :func:`load_object`."""
-    names = (names,) if isinstance(names, str) else names
+    names = (names,) if isinstance(names, str) else tuple(names)
+    if not names:
+        raise ObjectError("No object is named. Name one or several, or give None for all.")
     return tuple(load_object(name, folder) for name in names)

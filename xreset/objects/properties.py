@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from xreset.checks import Checked, Rule, from_dict, frozen
-from xreset.errors import ObjectError
+from xreset.errors import ObjectError, WrongValueError
 from xreset.files import read_toml
 
 
@@ -31,7 +31,7 @@ class Properties(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.mass is not None and self.density is not None:
-            raise ValueError("mass and density are both given; one follows from the other")
+            raise WrongValueError("mass and density are both given; one follows from the other")
 
     def to_toml(self) -> str:
         """Return the text of the file; empty if nothing is known."""

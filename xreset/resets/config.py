@@ -10,6 +10,7 @@ from xreset.checks import (
     PositiveInt,
     frozen,
 )
+from xreset.errors import WrongValueError
 
 
 @frozen
@@ -54,7 +55,7 @@ class SqueezeConfig(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.balanced and not self.presses:
-            raise ValueError(
+            raise WrongValueError(
                 "balanced is True and there is no force to balance. Set force or weight"
             )
 

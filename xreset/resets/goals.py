@@ -117,7 +117,7 @@ def make_goals(
         families = () if poses else FAMILIES
     if unknown := [family for family in families if family not in FAMILIES]:
         raise GoalError(f"Unknown family {unknown[0]!r}. Choose from: {', '.join(FAMILIES)}.")
-    loaded = load_objects(objects or object_names(meshes), meshes)
+    loaded = load_objects(object_names(meshes) if objects is None else objects, meshes)
     robot = load_robot(robot)
     own = [_own_pose(pose) for pose in poses]
     for obj in loaded:

@@ -22,7 +22,7 @@ from xreset.checks import (
     Share,
     frozen,
 )
-from xreset.errors import XResetError
+from xreset.errors import WrongValueError, XResetError
 from xreset.text import shown
 
 LONGEST_EPISODE = 1e6
@@ -251,7 +251,7 @@ class TerminationConfig(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.object_low < self.object_high:
-            raise ValueError(
+            raise WrongValueError(
                 f"object_low is {self.object_low}, expected less than object_high, which is {self.object_high}"
             )
 
@@ -436,7 +436,7 @@ class RandomizationConfig(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.tracker.jitter and not self.observation_latency[1]:
-            raise ValueError(
+            raise WrongValueError(
                 "tracker.jitter changes observation_latency, which is 0. Set observation_latency"
             )
 
@@ -521,7 +521,7 @@ class TaskConfig(Checked):
         seconds = self.termination.episode_seconds
         is_number = isinstance(seconds, Real) and not isinstance(seconds, bool)
         if not is_number or not (1 - 1e-6) * self.control_dt <= seconds <= LONGEST_EPISODE:
-            raise ValueError(
+            raise WrongValueError(
                 f"episode_seconds is {shown(seconds)}, expected a number from {self.control_dt:.3g}, which is one "
                 f"control step, to {LONGEST_EPISODE:,.0f}"
             )
@@ -529,7 +529,7 @@ class TaskConfig(Checked):
         for name in ("action_latency", "hand_latency", "observation_latency", "proprio_latency"):
             longest = self.randomization.longest(name)
             if longest >= steps:
-                raise ValueError(
+                raise WrongValueError(
                     f"{name} goes up to {longest:g} control steps, expected fewer than the {steps:.0f} of an episode"
                 )
 

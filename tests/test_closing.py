@@ -74,6 +74,7 @@ class ClosingTest(TestCase):
         tips = np.arange(10)[:, None, None] * [[0.012, 0, 0], [0, 0.004, 0]]
         turned = quat_of(Rotation.from_rotvec(0.2 * np.arange(10)[:, None] * [0, 0, 1]))
         changes = {"joint_pos": joints, "fingertip_pos": tips, "object_quat_wxyz": turned}
+        changes["object_pos"] = np.tile([0.5, 0.3, 0.1], (10, 1))
         self.data = toy_retargeted(ROBOT, ["brick", "brick"], [0, 5, 10], **changes)
         self.gap = np.full((10, 2), 0.03)
 
@@ -126,6 +127,8 @@ class ClosingTest(TestCase):
         pos = self.data.object_pos.copy()
         pos[6, 0] += 0.011
         self.assertEqual(self.bridged(replace(self.data, object_pos=pos)), [0, 1, 5])
+        self.gap[5] = 0.001  # the second sequence begins with a grasp
+        self.assertEqual(self.bridged(), [0, 1])
 
 
 class FingersTest(TestCase):

@@ -307,7 +307,7 @@ class ScoreTest(Compared):
         with mock.patch("xreset.eval.stats.DRAWS", 20000):
             low, high = crossed_bootstrap_ci95(values, runs, demos)
         expected = 2 * 1.96 * np.sqrt(of_run.var() / 8 + of_demo.var() / 30)
-        self.assertAlmostEqual(high - low, expected, delta=0.05 * expected)
+        self.assertAlmostEqual(high - low, expected, delta=0.03 * expected)
         one_run = crossed_bootstrap_ci95(values, np.zeros(240), demos)
         self.assertEqual(one_run, bootstrap_ci95(values, demos))
         with self.assertRaisesRegex(ValueError, "every demonstration"):

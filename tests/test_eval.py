@@ -268,8 +268,8 @@ class BootstrapTest(TestCase):
         values = default_rng(2).normal(5.0, 2.0, 400)
         low, high = bootstrap_ci95(values)
         half = 1.96 * values.std() / math.sqrt(len(values))
-        self.assertAlmostEqual(low, values.mean() - half, delta=0.1 * half)
-        self.assertAlmostEqual(high, values.mean() + half, delta=0.1 * half)
+        self.assertAlmostEqual(low, values.mean() - half, delta=0.05 * half)
+        self.assertAlmostEqual(high, values.mean() + half, delta=0.05 * half)
         self.assertEqual(bootstrap_ci95(values), (low, high))
         self.assertEqual(bootstrap_ci95(np.array([0.3])), (0.3, 0.3))
 

@@ -41,6 +41,11 @@ class NoiseTest(InOneFolder):
         still = np.corrcoef(path[1:].ravel(), path[:-1].ravel())[0, 1]
         self.assertGreater(still, MEMORY - 0.3)
 
+    def test_tiers_are_those_of_the_published_paper(self):
+        found = {name: (tier["wrist"], tier["cap"]) for name, tier in TIERS.items()}
+        expected = {"low": (0.010, 0.003), "medium": (0.020, 0.006), "high": (0.040, 0.012)}
+        self.assertEqual(found, expected)
+
     def test_objects_stay_and_a_seed_repeats(self):
         noisy = with_noise(self.demos, **TIERS["low"], seed=3)
         again = with_noise(self.demos, **TIERS["low"], seed=3)

@@ -146,6 +146,10 @@ class Rest(TestCase):
         quats = np.array([[1, 0, 0, 0], [0.5**0.5, 0, 0.5**0.5, 0], [0, 1, 0, 0]])
         low, high = bounding_box(obj)
         assert_allclose(rest_height(obj, quats), [-low[2], high[0], high[2]], atol=1e-12)
+        quats = 3 * np.random.default_rng(0).normal(size=(8, 4))
+        lowest = [turn_of(quat).apply(obj.vertices)[:, 2].min() for quat in quats]
+        assert_allclose(rest_height(obj, quats), np.negative(lowest), atol=1e-12)
+        self.assertIsInstance(rest_height(obj, quats[0]), float)
 
     def test_a_stable_pose_is_balanced_over_its_base(self):
         obj = load_object("powerdrill")
@@ -156,9 +160,17 @@ class Rest(TestCase):
         edges = ConvexHull(base).equations
         self.assertLess((edges[:, :2] @ rotation.apply(obj.com)[:2] + edges[:, 2]).max(), 1e-6)
         box = load_object("cheez-its")
-        for up, nearest in (([0.9, 0.1, 0.4], [1, 0, 0]), (-Z, -Z)):
-            rotation = turn_of(resting_orientation(box, np.array(up)))
-            assert_allclose(rotation.apply(nearest), Z, atol=1e-9)
+        shear = np.array([[1.0, 0, 2], [0, 1, 0], [0, 0, 1]])
+        leaning = replace(box, vertices=box.vertices @ shear.T, com=shear @ box.com)
+        for obj, up, nearest in (
+            (box, [0.9, 0.1, 0.4], [1, 0, 0]),
+            (box, Z, Z),
+            (box, -Z, -Z),
+            (leaning, Z, np.array([-1, 0, 2]) / 5**0.5),  # would fall over on its base
+        ):
+            quat = resting_orientation(obj, np.array(up))
+            self.assertAlmostEqual(np.linalg.norm(quat), 1)
+            assert_allclose(turn_of(quat).apply(nearest), Z, atol=1e-9)
 
 
 class MeshImport(InFolder):

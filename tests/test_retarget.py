@@ -270,23 +270,31 @@ class ArmTest(TestCase):
 
 class ValidityTest(TestCase):
     def test_every_reason_can_be_reached_and_the_first_counts(self):
-        good = {"annotated": True, "at_limit": False, "arm_jump": 0.1}
-        good |= dict.fromkeys(("table_clearance", "self_clearance"), 0.01)
-        good |= dict.fromkeys(("hand_error", "wrist_position", "wrist_orientation"), 0.001)
+        good = {
+            "annotated": True,
+            "at_limit": False,
+            "hand_error": 0.0299,
+            "wrist_position": 0.0099,
+            "wrist_orientation": 0.0872,
+            "arm_jump": 0.349,
+            "table_clearance": -0.0029,
+            "self_clearance": -0.0029,
+        }
 
         def reason(changes):
             measures = {name: tensor([value]) for name, value in (good | changes).items()}
             return REASONS[int(classify(Measures(**measures), Thresholds()))]
 
         self.assertEqual(reason({}), "valid")
+        self.assertEqual(reason({"hand_error": 0.0301}), "hand error")
         self.assertEqual(reason({"at_limit": True}), "valid")  # a limit alone does no harm
         everything = {}
         for name, changed, value in (
-            ("self collision", "self_clearance", -0.01),
-            ("table collision", "table_clearance", -0.01),
-            ("arm jump", "arm_jump", 0.5),
-            ("wrist orientation", "wrist_orientation", 0.2),
-            ("wrist position", "wrist_position", 0.02),
+            ("self collision", "self_clearance", -0.0031),
+            ("table collision", "table_clearance", -0.0031),
+            ("arm jump", "arm_jump", 0.351),
+            ("wrist orientation", "wrist_orientation", 0.0874),
+            ("wrist position", "wrist_position", 0.0101),
             ("joint limit", "at_limit", True),
             ("hand error", "hand_error", float("nan")),
             ("not annotated", "annotated", False),

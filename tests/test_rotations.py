@@ -7,7 +7,18 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
 
-from xreset.geometry.rotations import quat_angle, quat_multiply, quat_rotate, quat_to_matrix
+from xreset.geometry.rotations import (
+    matrix_to_quat,
+    quat_angle,
+    quat_from_axis_angle,
+    quat_multiply,
+    quat_normalize,
+    quat_rotate,
+    quat_rotate_inverse,
+    quat_to_axis_angle,
+    quat_to_matrix,
+    relative_pose,
+)
 
 
 class AgainstScipy(unittest.TestCase):
@@ -36,6 +47,32 @@ class AgainstScipy(unittest.TestCase):
         self.assert_near(quat_to_matrix, self.a.as_matrix(), a)
         self.assert_near(quat_rotate, self.a.apply(self.points), a, self.points)
         self.assert_near(quat_angle, (self.a.inv() * self.b).magnitude(), a, b)
+
+    def test_conversions(self):
+        a = self.a.as_quat(scalar_first=True)
+        positive = self.a.as_quat(canonical=True, scalar_first=True)
+        self.assert_near(quat_normalize, positive, 3 * a)
+        self.assert_near(quat_to_axis_angle, self.a.as_rotvec(), a)
+        self.assert_near(quat_from_axis_angle, positive, self.a.as_rotvec())
+        self.assert_near(matrix_to_quat, positive, self.a.as_matrix())
+        half_turns = np.diag([1.0, 1, 1, 1])[1:]
+        self.assert_near(
+            matrix_to_quat,
+            half_turns,
+            Rotation.from_quat(half_turns, scalar_first=True).as_matrix(),
+        )
+        for tiny in (0.0, 1e-10):
+            vector = np.array([[0.0, tiny, 0.0]])
+            self.assert_near(quat_to_axis_angle, vector, [[1.0, 0.0, tiny / 2, 0.0]])
+
+    def test_pose_in_a_frame(self):
+        a, b = (torch.as_tensor(r.as_quat(scalar_first=True)) for r in (self.a, self.b))
+        points = torch.as_tensor(self.points)
+        self.assert_near(quat_rotate_inverse, self.a.inv().apply(self.points), a, points)
+        pos, quat = relative_pose(points, b, points.flip(0), a)
+        expected = self.a.inv().apply(self.points - self.points[::-1])
+        assert_close(pos, torch.as_tensor(expected))
+        self.assertLess(quat_angle(quat_multiply(a, quat), b).max(), 1e-14)
 
     def test_both_arguments_broadcast(self):
         a, b = (torch.as_tensor(r.as_quat(scalar_first=True)[:5]) for r in (self.a, self.b))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from xreset.checks import Seed, frozen
+from xreset.checks import Seed, frozen, names_wrong_arguments
 from xreset.description import load_robot
 from xreset.env import ManipulationEnv, make_env
 from xreset.errors import PolicyError
@@ -80,6 +80,7 @@ class PolicySpec(Brief):
         names = object_names(folder)
         return tuple(name for name in names if name in (self.objects or ())) or names
 
+    @names_wrong_arguments
     def make_env(
         self,
         objects: Sequence[ObjectSpec],
@@ -111,6 +112,7 @@ class PolicySpec(Brief):
             seed=seed,
         )
 
+    @names_wrong_arguments
     def begin(self, env: ManipulationEnv) -> Policy:
         """Return the policy, ready to act in an environment whose episodes have just begun.
 

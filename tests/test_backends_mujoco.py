@@ -28,8 +28,8 @@ from xreset.backends.mujoco_warp import MujocoWarpBackend
 from xreset.backends.mujoco_warp_setup import contact_room, differing_fields
 from xreset.backends.mujoco_warp_step import constraints, finish, forked_step, smooth_dynamics
 from xreset.errors import BackendUnavailableError, ObjectError, RobotError, XResetError
-from xreset.plugins import device_for
-from xreset.spec import FingertipSpec
+from xreset.plugins import device_for, make_backend
+from xreset.spec import FingertipSpec, SceneSpec
 
 
 def colliding_geoms(model):
@@ -227,6 +227,20 @@ class BothBackends(TestCase):
             means.append(torch.stack(forces).mean(dim=0)[[0, 3]])
         assert_close(*means, atol=0.02, rtol=0.0)
         assert_close(self.warp.contacts().tip_touch, self.c.contacts().tip_touch)
+
+    def test_a_scene_is_checked_when_it_is_made(self):
+        good = self.scene
+        one = SceneSpec(robot=good.robot, objects=good.objects[0])
+        self.assertEqual(one.objects, good.objects[:1], "a single object need not be in a list")
+        for changes, words in (
+            ({"robot": "openarm"}, "robot is 'openarm', expected a RobotSpec: xreset.load_robot"),
+            ({"objects": ["soup"]}, "objects has 'soup', expected an ObjectSpec"),
+            ({"timestep": 0}, "timestep is 0, expected a number above 0"),
+        ):
+            with self.subTest(words), self.assertRaisesRegex(XResetError, words):
+                replace(good, **changes)
+        with self.assertRaisesRegex(XResetError, "scene is RobotSpec.*, expected a SceneSpec"):
+            make_backend("mujoco", good.robot, 2)
 
     def test_bad_shapes_are_named(self):
         state = self.bench.start()

@@ -204,6 +204,24 @@ class RefusalTest(WithEnv):
         with self.assertRaisesRegex(XResetError, "a ndarray, expected a tensor"):
             env.step(np.zeros((3, 7)))
 
+    def test_what_is_not_one_value_for_each_world_is_refused(self):
+        env = self.make()
+        still = torch.zeros(N, 7)
+        before = env.snapshot()
+        for call, words in (
+            (lambda: env.step(still, [True] * N), r"^begin is .*, expected Tensor . None"),
+            (lambda: env.step(still, torch.tensor([0])), r"^begin has the shape \(1,\), expected \(3,\)"),
+            (lambda: env.advance(still, torch.zeros(7)), r"^push has the shape \(7,\), expected \(3, 7\)"),
+            (lambda: env.reset(torch.tensor([N])), "^worlds is .*, expected indices from 0 to 2"),
+            (lambda: env.reset(start=env.backend.state()), "^start is State.*, expected Reset"),
+            (lambda: env.restore({}), "^The snapshot has no 'goal_pos'"),
+            (lambda: env.restore({name: value[:2] for name, value in before.items()}),
+             r"^goal_pos of the snapshot has the shape \(2, 3\), expected \(3, 3\)"),
+        ):  # fmt: skip
+            with self.subTest(words), self.assertRaisesRegex(XResetError, words):
+                call()
+        assert_close(env.snapshot(), before, equal_nan=True)
+
     def test_observations_do_not_hold_the_graph_of_an_action(self):
         observations, reward, *_ = self.make().step(torch.zeros(N, 7, requires_grad=True) * 1.0)
         for value in (*observations.values(), reward):

@@ -41,6 +41,17 @@ class WithPolicy(InOneFolder):
 
 
 class OnnxPolicyTest(WithPolicy):
+    def test_what_an_environment_does_not_give_is_refused(self):
+        policy = OnnxPolicy(self.file)
+        seen = torch.zeros(2, 9)
+        for observations, words in (
+            ({}, r"observations\['policy'\] is None, expected a tensor \[N, ...\]"),
+            ({"policy": seen.numpy()}, r"observations\['policy'\] is array"),
+            ({"policy": seen, "proprio": seen[0]}, r"observations\['proprio'\] is tensor"),
+        ):
+            with self.subTest(words), self.assertRaisesRegex(PolicyError, words):
+                policy.act(observations)
+
     def test_what_cannot_act_is_refused_before_work_begins(self):
         """One step with zeros at loading: whatever the graph is like, evaluation meets no surprise."""
         path = self.folder / "tried.onnx"

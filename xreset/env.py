@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from xreset.capture import GraphRunner
-from xreset.checks import Seed
+from xreset.checks import Seed, names_wrong_arguments
 from xreset.errors import XResetError
 from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
 from xreset.objects.sampling import center, metric_points, surface_points
@@ -34,6 +34,7 @@ from xreset.task.rewards import Reward, RewardInput, compute_reward, own_term
 from xreset.task.terminations import out_of_bounds
 from xreset.task.variation import Variation
 from xreset.tensors import where
+from xreset.text import shown
 
 if TYPE_CHECKING:
     from tensordict import TensorDict
@@ -57,6 +58,13 @@ _LASTING = (
     "_cloud",
 )
 """Buffers that carry each world from step to step, in addition to the engine's state."""
+
+
+def _check_shape(name: str, value: Tensor, like: Tensor) -> None:
+    if value.shape != like.shape:
+        raise XResetError(
+            f"{name} has the shape {tuple(value.shape)}, expected {tuple(like.shape)}."
+        )
 
 
 def make_scene(robot: RobotSpec, objects: tuple[ObjectSpec, ...], task: TaskConfig) -> SceneSpec:
@@ -264,6 +272,7 @@ class ManipulationEnv:
         """Observations of the present state, by group."""
         return self._observations.clone()
 
+    @names_wrong_arguments
     def step(
         self, action: Tensor, begin: Tensor | None = None
     ) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
@@ -280,8 +289,10 @@ class ManipulationEnv:
             simulation failed: learn nothing from this step) and ``log``.
 
         Raises:
-            XResetError: the action is not a tensor, or has another shape.
+            XResetError: action or begin is not a tensor, or has another shape.
         """
+        if begin is not None:
+            _check_shape("begin", begin, self._reset_mask)
         self._apply_action(action)
         self._graphs.run(self._compute_rewards)
         reward = self._reward.clone()
@@ -303,6 +314,7 @@ class ManipulationEnv:
 
     # Stepping and resetting
 
+    @names_wrong_arguments
     def advance(self, action: Tensor, push: Tensor | None = None) -> tuple[Reading, Reward]:
         """Take one control step without any reset. Evaluations end episodes themselves.
 
@@ -311,8 +323,10 @@ class ManipulationEnv:
             push: [N, J] offset of the drives' targets [rad, m]: an external torque, divided by the drive's stiffness.
 
         Raises:
-            XResetError: the action is not a tensor, or has another shape.
+            XResetError: action or push is not a tensor, or has another shape.
         """
+        if push is not None:
+            _check_shape("push", push, self._action)
         self._apply_action(action, push)
         reading, reward = self._compute_rewards()
         self._reset_mask.zero_()
@@ -320,17 +334,26 @@ class ManipulationEnv:
         self._compute_observations()
         return reading, reward
 
+    @names_wrong_arguments
     def reset(self, worlds: Tensor | None = None, start: Reset | None = None) -> None:
         """Start new episodes. The other worlds and their observations stay as they are.
 
         Args:
             worlds: [M] long indices of worlds; None: all worlds.
             start: M starts; None: they are drawn from the reset distribution.
+
+        Raises:
+            XResetError: there is no such world.
         """
         if worlds is None:
             worlds = torch.arange(self.num_envs, device=self.device)
         self._reset_mask.zero_()
-        self._reset_mask[worlds] = True
+        try:
+            self._reset_mask[worlds] = True
+        except IndexError as error:
+            raise XResetError(
+                f"worlds is {shown(worlds)}, expected indices from 0 to {self.num_envs - 1}."
+            ) from error
         if start is not None:
             self._new_start[worlds] = start
         lasting = self._lasting
@@ -359,6 +382,7 @@ class ManipulationEnv:
         """[N, 3] goal position of the object's origin in the task (``TaskConfig.object_frame``)."""
         return self._task_origin(self.goal_pos, self.goal_quat)
 
+    @names_wrong_arguments
     def render(self, world: int = 0, size: tuple[int, int] = (640, 480)) -> np.ndarray:
         """Return a picture of one world, [H, W, 3] uint8, with the goal as a translucent object.
 
@@ -384,8 +408,18 @@ class ManipulationEnv:
         values = self._lasting | vars(self.backend.state())
         return {name: value.to("cpu", copy=True) for name, value in values.items()}
 
+    @names_wrong_arguments
     def restore(self, snapshot: dict[str, Tensor]) -> None:
-        """Continue from a snapshot of the same task with as many worlds."""
+        """Continue from a snapshot of the same task with as many worlds.
+
+        Raises:
+            XResetError: the snapshot is of another task, or of another number of worlds.
+        """
+        present = self._lasting | vars(self.backend.state())
+        for name, value in present.items():
+            if name not in snapshot:
+                raise XResetError(f"The snapshot has no {name!r}. Take one of the same task.")
+            _check_shape(f"{name} of the snapshot", snapshot[name], value)
         for name, value in self._lasting.items():
             value.copy_(snapshot[name])
         self._reset_mask.fill_(True)
@@ -411,10 +445,7 @@ class ManipulationEnv:
             raise XResetError(
                 f"The actions are a {type(action).__name__}, expected a tensor: torch.as_tensor(actions)."
             )
-        if action.shape != self._action.shape:
-            raise XResetError(
-                f"The actions have the shape {tuple(action.shape)}, expected {tuple(self._action.shape)}."
-            )
+        _check_shape("action", action, self._action)
         self._action.copy_(action.detach())
         self._graphs.run(self._process_action)
         target = self._sent_target if push is None else self._sent_target + push

@@ -17,6 +17,7 @@ from xreset.checks import frozen
 from xreset.errors import BackendUnavailableError, CapabilityError, WrongValueError, XResetError
 from xreset.spec import RobotSpec, SceneSpec, lowest_point
 from xreset.tensors import Tensors
+from xreset.text import shown
 
 Parameter = Literal[
     "friction",
@@ -259,8 +260,10 @@ class Backend(ABC):
             device: ``cpu`` or ``cuda[:i]``.
 
         Raises:
-            WrongValueError: there is no world or no object, or an index is not one of an object.
+            WrongValueError: there is no world or no object, an index is not one of an object, or ``scene`` is no scene.
         """
+        if not isinstance(scene, SceneSpec):
+            raise WrongValueError(f"scene is {shown(scene)}, expected a SceneSpec")
         if num_worlds < 1:
             raise WrongValueError(f"num_worlds is {num_worlds}, expected at least 1")
         count = len(scene.objects)

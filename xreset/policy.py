@@ -233,7 +233,14 @@ class OnnxPolicy:
 
     def _outputs(self, observations: TensorDict | dict[str, Tensor]) -> list[np.ndarray]:
         """Return the graph's outputs: actions [N, J] without limits, and the LSTM's next state."""
-        *flat_groups, picture = self.contract.task.policy_groups
+        groups = self.contract.task.policy_groups
+        for name in groups:
+            value = observations.get(name, None)
+            if not isinstance(value, Tensor) or value.dim() < 2:
+                raise PolicyError(
+                    f"observations[{name!r}] is {shown(value)}, expected a tensor [N, ...] of env.get_observations()."
+                )
+        *flat_groups, picture = groups
         flat = torch.cat([observations[name] for name in flat_groups], dim=-1)
         shape = (1, len(flat), self._lstm_dim)
         if self._state is None or self._state[0].shape != shape:

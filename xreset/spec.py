@@ -14,7 +14,17 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from xreset.checks import NotNegative, Number, Positive, Rule, Text, frozen
+from xreset.checks import (
+    Checked,
+    NotNegative,
+    Number,
+    Positive,
+    PositiveFloat,
+    PositiveInt,
+    Rule,
+    Text,
+    frozen,
+)
 from xreset.errors import DemoError, FileFormatError, XResetError
 from xreset.text import Brief, shown
 
@@ -264,7 +274,7 @@ class PairFriction:
 
 
 @frozen
-class SceneSpec:
+class SceneSpec(Checked):
     """Everything that a backend may read."""
 
     robot: RobotSpec
@@ -273,10 +283,14 @@ class SceneSpec:
     table: TableSpec = TableSpec()
     friction: PairFriction = PairFriction()
     """Friction until a world's is set."""
-    timestep: float = 1.0 / 240.0
+    timestep: PositiveFloat = 1.0 / 240.0
     """Physics timestep [s]."""
-    substeps: int = 4
+    substeps: PositiveInt = 4
     """Physics steps per control step (60 Hz)."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "objects", checked_objects(self.robot, self.objects))
+        super().__post_init__()
 
     @property
     def control_dt(self) -> float:

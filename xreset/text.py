@@ -14,9 +14,9 @@ _REPR.maxother = 80
 
 
 def shown(value: Any) -> str:
-    """Return a value as Python writes it, shortened: the content of a file may have any size."""
+    """Return a value as Python writes it, in one line and shortened: the content of a file may have any size."""
     try:
-        text = _REPR.repr(value)
+        text = re.sub(r"\n\s*", " ", _REPR.repr(value))
     except ValueError:  # Python refuses to write thousands of digits
         text = "a number of thousands of digits"
     return text if len(text) <= 200 else f"{text[:160]}...{text[-30:]}"

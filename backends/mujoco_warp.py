@@ -420,7 +420,7 @@ class MujocoWarpBackend(Backend):
         """Set the mask of the worlds to change, and return their indices [M]."""
         index = self._every_world
         if worlds is not None:
-            index = torch.as_tensor(worlds, dtype=torch.int64, device=self.device)
+            index = self._indices(worlds)
         self._mask.zero_()
         self._mask[index] = True
         return index

@@ -250,8 +250,8 @@ class PoolBackend(Backend):
     def _selected(self, worlds: Tensor | None) -> np.ndarray:
         if worlds is None:
             return np.arange(self.num_worlds)
-        index = torch.as_tensor(worlds, dtype=torch.long).detach().cpu().numpy()
-        if index.ndim != 1 or (index.size and (index.min() < 0 or index.max() >= self.num_worlds)):
+        index = self._indices(worlds).numpy()
+        if index.size and (index.min() < 0 or index.max() >= self.num_worlds):
             raise WrongValueError(
                 f"worlds must be a list of indices in 0..{self.num_worlds - 1}, found {worlds}"
             )

@@ -124,6 +124,15 @@ class UsageTest(TestCase):
                 self.assertRegex(err + out, words)
                 self.assertNotIn("Traceback", err)
 
+    def test_a_wrong_value_of_a_verb_names_the_option_and_the_help(self):
+        code, out, err = run(
+            "robots", "place", "openarm", "--demos", "d.npz", "--search.elite", "0"
+        )
+        self.assertEqual(code, 2)
+        self.assertRegex(
+            err + out, r"parsing search: elite is 0, expected[\s\S]*xreset robots place --help"
+        )
+
     def test_a_gpu_that_is_not_there(self):
         """It is also not there if only its driver knows it."""
         arguments = "resets none.npz --out x.npz --backend mujoco-warp --device cuda"

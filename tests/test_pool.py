@@ -222,6 +222,13 @@ class PoolTest(TestCase):
                 pool.set_state(random_state(4, 0))
             with self.assertRaisesRegex(ValueError, "indices in 0..4"):
                 pool.set_state(random_state(1, 0), tensor([5]))
+            mask = tensor([True, False, False, True, True])
+            with self.assertRaisesRegex(
+                ValueError, r"type torch.bool and shape \(5,\), expected \[M\] indices"
+            ):
+                pool.set_state(random_state(5, 0), mask)
+            with self.assertRaisesRegex(ValueError, "worlds has type torch.float32"):
+                pool.set_object_mass(torch.ones(2), tensor([0.0, 1.0]))
             with self.assertRaisesRegex(CapabilityError, "'toy' does not support object gravity"):
                 pool.set_object_gravity(torch.ones(5))
         with self.assertRaisesRegex(CapabilityError, "CPU only"):

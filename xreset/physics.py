@@ -440,6 +440,19 @@ class Backend(ABC):
         if self._closed:
             raise XResetError(f"The backend {self.name!r} is closed. Build a new one.")
 
+    def _indices(self, worlds: Tensor) -> Tensor:
+        """Return indices of worlds [M] on the backend's device; ``WrongValueError`` for a mask, or numbers of another
+        type or shape. Their range is not checked: a GPU would have to be waited for."""
+        index = torch.as_tensor(worlds, device=self.device)
+        if index.ndim != 1 or (
+            len(index) and (index.dtype == torch.bool or index.is_floating_point())
+        ):
+            raise WrongValueError(
+                f"worlds has type {index.dtype} and shape {tuple(index.shape)}, expected [M] indices. "
+                "For a mask, call set_where, or give mask.nonzero().squeeze(-1)."
+            )
+        return index.long()
+
     def _checked_state(self, state: State, rows: int) -> State:
         """Return a state on the backend's device; ``WrongValueError`` if it has another number of rows."""
         checked = {}

@@ -110,10 +110,12 @@ def _run(argv: list[str]) -> None:
     if not isinstance(command, dict):
         tyro.cli(checked(command), args=arguments, **how)
         return
+    for words in (2, 1):  # a verb may have two words
+        verb = " ".join(arguments[:words])
+        if verb in command:
+            tyro.cli(checked(command[verb]), args=arguments[words:], prog=f"xreset {name} {verb}")
+            return
     verbs = {verb: checked(function) for verb, function in command.items()}
-    two = " ".join(arguments[:2])
-    if two in verbs:  # a verb may have two words
-        arguments = [two, *arguments[2:]]
     tyro.extras.subcommand_cli_from_dict(verbs, args=arguments, **how)
 
 

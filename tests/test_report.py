@@ -62,20 +62,7 @@ class Reported(InFolder):
         self.write_results("", rollouts, engines, **changes)
 
     def write_soup(self):
-        self.write_run("", TrainConfig(iterations=500), num_envs=4096, seed=7, contract=CONTRACT)
-
-
-CONTRACT = {
-    "schema": "xreset-policy/1",
-    "robot": "openarm",
-    "robot_fingerprint": "aa",
-    "joint_names": ["a"],
-    "fingertip_names": ["thumb"],
-    "objects": [SOUP],
-    "observation_layout": {"policy": {"x": 1}, "proprio": {"y": 1}},
-    "control_dt": 1 / 60,
-    "task": {},
-}
+        self.write_run("", TrainConfig(iterations=500), num_envs=4096, seed=7)
 
 
 def table_of(*episodes, engine="mujoco"):
@@ -137,7 +124,7 @@ class CollectTest(Reported):
 
     def test_a_teacher_that_played_other_episodes_is_not_compared(self):
         self.write(("mujoco",))
-        self.write_run("", contract=CONTRACT, teacher="soup-can")
+        self.write_run("", teacher="soup-can")
         for engine in (None, "sapien", "mujoco"):
             if engine is not None:
                 summary = toy_summary(engine)

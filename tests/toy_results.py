@@ -11,9 +11,23 @@ from xreset import TrainConfig
 from xreset.eval.results import Episode, Rollouts, Trace, summarize, write_results
 from xreset.eval.stress import Stress
 from xreset.learning.run import Candidate, Choice, RunInfo, write_run
+from xreset.task.config import TaskConfig
+from xreset.task.contract import Contract
 
 OBJECTS = (SOUP, SPAM)
 ENGINES = ("mujoco", "mujoco-warp", "pybullet", "sapien")
+
+CONTRACT = Contract(
+    schema="xreset-policy/1",
+    robot="openarm",
+    robot_fingerprint="aa",
+    joint_names=("a",),
+    fingertip_names=("thumb",),
+    objects=(SOUP,),
+    observation_layout={"policy": {"x": 1}, "proprio": {"y": 1}},
+    control_dt=1 / 60,
+    task=TaskConfig(),
+)
 
 
 def toy_episode(sequence, repetition, *reached, thing="", **changes):
@@ -136,7 +150,7 @@ class InFolder(data.InFolder):
             "num_envs": 64,
             "seed": 0,
             "config": config or TrainConfig(),
-            "contract": {"objects": [SOUP]},
+            "contract": CONTRACT,
         }
         write_run(self.folder / name, RunInfo(**(info | changes)))
         return self.folder / name

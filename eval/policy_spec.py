@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from xreset.checks import Seed, frozen, names_wrong_arguments
+from xreset.checks import Checked, Seed, frozen, names_wrong_arguments
 from xreset.description import load_robot
 from xreset.env import ManipulationEnv, make_env
 from xreset.errors import PolicyError
@@ -34,7 +34,7 @@ LEAD_IN = 1.0
 
 
 @frozen
-class PolicySpec(Brief):
+class PolicySpec(Brief, Checked):
     """A policy, the robot and the task that it was trained for, and where its results go."""
 
     name: str
@@ -55,6 +55,10 @@ class PolicySpec(Brief):
     """The exported policy; None: a baseline."""
     selection_seed: int | None = None
     """Seed of the starts that chose this checkpoint (``xreset select``); None: it was not chosen."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "folder", Path(self.folder))
+        super().__post_init__()
 
     @property
     def follows_motion(self) -> bool:

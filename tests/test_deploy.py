@@ -25,7 +25,14 @@ from xreset.eval.rollout import engine, episode_starts, load_trial
 from xreset.live.deploy import deploy_contract, write_deployed
 from xreset.live.engine import EngineDriver
 from xreset.policy import policy_contract
-from xreset.runtime import LiveError, RemoteController, Runner, load_controller, read_contract
+from xreset.runtime import (
+    LiveError,
+    Reading,
+    RemoteController,
+    Runner,
+    load_controller,
+    read_contract,
+)
 
 POLICY = "soup-can"
 STEPS = 30
@@ -141,10 +148,34 @@ class ContractTest(InFolder):
             ("goal_pos", [0.5, 0.3], r"shape \(2,\), expected \(3,\)"),
             ("goal_quat", [1, 0, 0, 1], "expected a unit quaternion"),
             ("goal_quat", [float("nan")] * 4, "expected a unit quaternion"),
-        ):
+            ("target", [90.0] * 5, r"target of .* is 90, expected .* to .*\. Are these degrees"),
+            ("target", [float("nan")] * 5, "target of .* is nan"),
+            ("goal_pos", [500.0, 300.0, 200.0], "expected at most 10 m. Are these millimetres"),
+            ("goal_pos", [float("nan")] * 3, "expected at most 10 m"),
+            ("object_points", 1000 * np.array(brick["points"]), "beyond 10 m. Are these millimetres"),
+        ):  # fmt: skip
             with self.subTest(name), self.assertRaisesRegex(LiveError, words):
                 controller.begin(**good | {name: value})
         controller.begin(**good)
+
+    def test_a_reading_that_does_not_fit_is_refused(self):
+        controller = load_controller(self.out)
+        brick = self.contract["objects"]["brick"]
+        reading = Reading(
+            joint_pos=self.home, joint_vel=[0.0] * 5, joint_time=0.0,
+            object_pos=[0.5, 0.3, 0.1], object_quat=[1, 0, 0, 0], object_time=0.0,
+        )  # fmt: skip
+        self.assertRaisesRegex(LiveError, "No episode has begun", controller.step, reading)
+        goal = ([0.5, 0.3, 0.2], [1, 0, 0, 0])
+        self.assertRaisesRegex(LiveError, "No episode has begun", controller.set_goal, *goal)
+        controller.begin(brick["points"], *goal, self.home, brick["center"])
+        self.assertEqual(controller.step(reading).shape, (1, 5))
+        for changes, words in (
+            ({"joint_pos": self.home[1:]}, r"joint_pos has shape \(1, 4\), expected \(1, 5\)"),
+            ({"object_quat": [1, 0, 0]}, r"object_quat has shape \(1, 3\), expected \(1, 4\)"),
+        ):
+            with self.subTest(words), self.assertRaisesRegex(LiveError, words):
+                controller.step(replace(reading, **changes))
 
     @skipUnless(find_spec("websockets"), "websockets is not installed")
     def test_controller_server_and_runner_judge_quaternions_alike(self):

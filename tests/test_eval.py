@@ -438,6 +438,16 @@ class ResultsTest(InFolder):
         with self.assertRaisesRegex(XResetError, "episodes is 0"):
             evaluate("zero", "demos.npz", robot="openarm", episodes=0)
 
+    def test_a_policy_of_ones_own_is_checked(self):
+        mine = replace(self.policy, folder=str(self.folder))
+        self.assertEqual(mine.folder, self.folder)
+        for changes, words in (
+            ({"robot": "openarm"}, "robot is 'openarm', expected RobotSpec"),
+            ({"task": None}, "task is None, expected TaskConfig"),
+        ):
+            with self.subTest(words), self.assertRaisesRegex(XResetError, words):
+                replace(mine, **changes)
+
     def test_two_evaluations_are_not_written_into_one_folder(self):
         with (
             patch("xreset.eval.evaluate.load_trial"),

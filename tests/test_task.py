@@ -199,6 +199,7 @@ class RewardTest(TestCase):
         for make, words in (
             (lambda: TaskConfig(object_frame="centre"), "is 'centre', expected one of 'mesh', 'center'"),
             (lambda: TaskConfig(reward={"grasp": 2}), "reward is {'grasp': 2}, expected RewardConfig"),
+            (lambda: VisionConfig(cameras="front"), "cameras is 'front', expected several of: CameraConfig"),
             (lambda: TrainConfig(task=None), "task is None, expected TaskConfig"),
             (lambda: TrainConfig(iterations=0), "iterations is 0, expected a whole number above 0"),
         ):  # fmt: skip

@@ -133,8 +133,10 @@ def _choices_of(cls: type) -> dict[str, Any]:
     """Field name -> type, of the fields that take one of a few words or an object of a dataclass."""
     choices = {}
     for name, hint in get_type_hints(cls).items():
-        if any(get_origin(part) is Literal or is_dataclass(part) for part in _parts(hint)):
-            choices[name] = hint
+        for part in _parts(hint):
+            item = get_args(part)[0] if get_origin(part) is tuple else part
+            if get_origin(item) is Literal or is_dataclass(item):
+                choices[name] = hint
     return choices
 
 
@@ -144,6 +146,8 @@ def _described(hint: Any) -> str:
         return f"one of {', '.join(map(repr, get_args(hint)))}"
     if _is_union(hint):
         return " or ".join(map(_described, get_args(hint)))
+    if get_origin(hint) is tuple:
+        return f"several of: {_described(get_args(hint)[0])}"
     return "None" if hint is types.NoneType else hint.__name__
 
 
@@ -221,11 +225,12 @@ def names_wrong_arguments(function: Callable[P, T]) -> Callable[P, T]:
 @cache
 def _rules_of(function: Callable[..., Any]) -> dict[str, list[Any]]:
     """Name of an argument -> what its annotation holds in addition to the type, where that is anything."""
-    marks = {name: _marks(_hint_of(function, name)) for name in function.__annotations__}
+    annotations = getattr(function, "__annotations__", ())
+    marks = {name: _marks(_hint_of(function, name)) for name in annotations}
     return {name: found for name, found in marks.items() if found}
 
 
-_WIDER: dict[Any, Any] = {int: Integral, float: Real, Sequence: Iterable}
+_WIDER: dict[Any, Any] = {int: Integral, float: Real, Sequence: Iterable, tuple: Iterable}
 
 
 def _hint_of(function: Callable[..., Any], name: str) -> Any:
@@ -249,7 +254,7 @@ def _is_of(hint: Any, value: Any) -> bool:
     if kind is Annotated:
         return _is_of(hint.__origin__, value) and not _broken(hint.__metadata__, value)
     is_one = isinstance(value, _WIDER.get(kind, kind))
-    if is_one and kind in (Sequence, Iterable):
+    if is_one and (kind in (Sequence, Iterable) or Ellipsis in get_args(hint)):
         return all(_is_of(get_args(hint)[0], item) for item in value)
     return is_one
 

@@ -15,6 +15,11 @@ from .driver import Array, Links, Reading
 from .kinematics import Kinematics
 from .rotations import is_unit, multiply, rotate
 
+_MARGIN = 0.5
+"""How far a target may be beyond a joint's limit when an episode begins [rad, m]."""
+_REACH = 10.0
+"""Farthest place of a goal, or of a point of an object [m]."""
+
 
 class OnnxActor:
     """The network of an exported policy with its recurrent state. It uses one core, so that its time varies little."""
@@ -112,17 +117,27 @@ class Controller:
                 where the contract's ``object_frame`` is ``center``.
 
         Raises:
-            LiveError: a shape is not the contract's, a quaternion has another length than 1, or ``center`` is missing.
+            LiveError: a shape is not the contract's, a number is not finite or far outside its range, a quaternion has
+                another length than 1, or ``center`` is missing.
         """
         given = np.atleast_2d(np.asarray(target, dtype=np.float32))
         joints = len(self.contract["joints"])
         if given.ndim != 2 or given.shape[1] != joints:
             raise LiveError(f"target has shape {np.shape(target)}, expected ({joints},).")
+        inside = (given >= self.lower - _MARGIN) & (given <= self.upper + _MARGIN)
+        if not inside.all():
+            robot, j = np.argwhere(~inside)[0]
+            raise LiveError(
+                f"target of {self.contract['joints'][j]['name']} is {given[robot, j]:g}, expected {self.lower[j]:g} to "
+                f"{self.upper[j]:g}. Are these degrees?"
+            )
         self.target = given
         expected = self.contract["observation"]["cloud_points"]
         shape = np.shape(object_points)
         if shape[-2:] != (expected, 3):
             raise LiveError(f"The object has points of shape {shape}, expected ({expected}, 3).")
+        if not np.abs(object_points).max() <= _REACH:
+            raise LiveError(f"The object has points beyond {_REACH:g} m. Are these millimetres?")
         self._points = self._of_each(object_points, expected, 3)
         self._center: Array | None = None
         if self.contract["object_frame"] == "center":
@@ -139,11 +154,21 @@ class Controller:
 
     def set_goal(self, pos: Array, quat: Array) -> None:
         """Set the goal pose, also while the policy acts; shapes and errors as for :meth:`begin`."""
+        self._must_have_begun()
         goal_quat = self._of_each(quat, 4)
         if not is_unit(goal_quat).all():
             raise LiveError(f"The goal has {quat}, expected a unit quaternion (w, x, y, z).")
-        self._goal_pos = self._origin(self._of_each(pos, 3), goal_quat)
+        goal_pos = self._of_each(pos, 3)
+        if not np.abs(goal_pos).max() <= _REACH:
+            raise LiveError(
+                f"The goal has {pos}, expected at most {_REACH:g} m. Are these millimetres?"
+            )
+        self._goal_pos = self._origin(goal_pos, goal_quat)
         self._goal_quat = goal_quat
+
+    def _must_have_begun(self) -> None:
+        if not hasattr(self, "target"):
+            raise LiveError("No episode has begun. Call begin first.")
 
     def _of_each(self, values: Array, *shape: int) -> Array:
         """[N, ...] values of every robot in float32, given those [N, ...] or one robot's [...]."""
@@ -174,7 +199,19 @@ class Controller:
         return np.array(objects[name][entry], dtype=np.float32)
 
     def step(self, reading: Reading) -> Array:
-        """[N, J] new joint targets for a reading with the axis N."""
+        """[N, J] new joint targets for a reading.
+
+        Raises:
+            LiveError: no episode has begun, or data of the reading have another shape.
+        """
+        reading = reading.batched()
+        self._must_have_begun()
+        robots, joints = self.target.shape
+        widths = {"joint_pos": joints, "joint_vel": joints, "object_pos": 3, "object_quat": 4}
+        for name, width in widths.items():
+            shape = np.shape(getattr(reading, name))
+            if shape != (robots, width):
+                raise LiveError(f"{name} has shape {shape}, expected ({robots}, {width}).")
         flat, cloud = self.observe(reading)
         self.action = self._actor.act(flat, cloud)
         self.target = self._targets(self.action, reading.joint_pos)

@@ -56,7 +56,7 @@ class Compared(InFolder):
 
     def training(self, name, curves=None):
         """What a folder holds, with curves that need not be written."""
-        read = read_training(name, self.folder / name)
+        read = read_training(self.folder / name, name)
         return replace(read, curves=pd.DataFrame() if curves is None else curves)
 
     def run_and_results(self, name, results=None, **changes):
@@ -107,9 +107,9 @@ class ReadTest(Compared):
             whole = (a / name).read_text()
             (a / name).write_text(whole.replace(old, new))
             with self.subTest(message), self.assertRaisesRegex(FileFormatError, message):
-                read_training("a", a)
+                read_training(a)
             (a / name).write_text(whole)
-        read_training("a", a)
+        self.assertEqual(read_training(str(a)).label, "a")
 
     def test_event_files_that_are_not_whole(self):
         """Cut anywhere: the head is missed, what is left of a tail is read as it was."""

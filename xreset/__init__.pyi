@@ -18,6 +18,8 @@ from xreset.eval.policy_spec import PolicySpec as PolicySpec
 from xreset.eval.policy_spec import load_policy as load_policy
 from xreset.eval.rehearse import Rehearsal as Rehearsal
 from xreset.eval.rehearse import rehearse as rehearse
+from xreset.eval.report.read import Training as Training
+from xreset.eval.report.read import read_training as read_training
 from xreset.eval.results import EvalResult as EvalResult
 from xreset.eval.results import Evaluation as Evaluation
 from xreset.eval.rollout import Engine as Engine

@@ -27,7 +27,6 @@ from xreset.eval.report.read import (
     ReportData,
     Training,
     how_to_evaluate,
-    name_of,
     read_training,
     read_trainings,
     versions,
@@ -85,7 +84,7 @@ def collect(folder: Path, robot: str | None = None, objects: Path | None = None)
         RunError: the folder does not exist or holds no results.
         FileFormatError: a file is damaged or of another version.
     """
-    training = read_training(name_of(folder), folder)
+    training = read_training(folder)
     if not training.results:
         raise RunError(f"{folder} holds no evaluation results. {how_to_evaluate(folder)}")
     run = None

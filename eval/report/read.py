@@ -25,7 +25,7 @@ from xreset.text import short_name
 
 @frozen
 class Training:
-    """A training or a baseline, as comparisons read it."""
+    """Learning curves and evaluations of a training or a baseline."""
 
     label: str
     results_folder: Path
@@ -203,21 +203,25 @@ def read_trainings(runs: Sequence[str]) -> tuple[Training, ...]:
                 f"Name them: {label}-1={folders[label]} {label}-2={folder}"
             )
         folders[label] = folder
-    return tuple(read_training(label, folder) for label, folder in folders.items())
+    return tuple(read_training(folder, label) for label, folder in folders.items())
 
 
-def read_training(label: str, folder: Path, results: Path | None = None) -> Training:
-    """Read one training; configuration, curves or evaluations may be missing, but not all of them.
+def read_training(
+    folder: str | Path, label: str | None = None, results: Path | None = None
+) -> Training:
+    """Read learning curves and evaluations of a training; one of them may be missing.
 
     Args:
-        label: name of the training in tables and pictures.
         folder: run folder, or folder of results.
+        label: name of the training in tables and pictures; default: that of the folder.
         results: folder of its evaluations; default: as ``xreset eval`` chooses it.
 
     Raises:
         RunError: the folder does not exist, or holds neither learning curves nor results.
         FileFormatError: a file is damaged or of another version.
     """
+    folder = Path(folder)
+    label = label or name_of(folder)
     results = results or results_in(folder)
     evaluation = read_evaluation(results, label)
     curves = read_curves(folder)

@@ -144,7 +144,7 @@ def trainings_of(plan: Plan, group: str, evaluation: str) -> list[Training]:
     for run in plan.runs:
         folder = run.folder / evaluation
         if run.group == group and any(folder.glob("*.episodes.json")):
-            found.append(read_training(run.label, run.folder, folder))
+            found.append(read_training(run.folder, run.label, folder))
     return found
 
 

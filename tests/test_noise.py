@@ -1,12 +1,15 @@
 """Errors of a worse hand tracker: one offset for a demonstration, wandering fingers, bones and objects as they were."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial.transform import Rotation
 
 from tests.command import succeeds
 from tests.data import InOneFolder
 from xreset import read_demos, synthesize, write_demos
-from xreset.demos.hand import bone_lengths
+from xreset.demos.hand import PARENTS, bone_lengths
 from xreset.demos.noise import MEMORY, TIERS, with_noise
 
 
@@ -27,6 +30,7 @@ class NoiseTest(InOneFolder):
             shifts.append(shift[0, 0])
         self.assertLessEqual(np.abs(shifts).max(), 0.04)
         self.assertGreater(np.ptp(shifts, axis=0).min(), 0.01)
+        self.assertLess(np.min(shifts), -0.01)
 
     def test_fingers_wander_and_keep_their_bones(self):
         noisy = with_noise(self.demos, wrist=0.0, finger=0.006, cap=0.012)
@@ -40,6 +44,39 @@ class NoiseTest(InOneFolder):
         path = (noisy.hand_keypoints - self.demos.hand_keypoints)[frames][self.seen[frames]][:, 4]
         still = np.corrcoef(path[1:].ravel(), path[:-1].ravel())[0, 1]
         self.assertGreater(still, MEMORY - 0.3)
+
+    def errors(self, **options):
+        """Errors [F, 5, 3] of the keypoints next to the wrist. Across their bones they are as drawn."""
+        noisy = with_noise(self.demos, wrist=0.0, **options)
+        roots = [child for child, parent in enumerate(PARENTS, start=1) if parent == 0]
+        return (noisy.hand_keypoints.astype(float) - self.demos.hand_keypoints)[:, roots]
+
+    def test_errors_have_the_stated_size_and_memory(self):
+        errors = self.errors(finger=0.0005, cap=1.0)
+        squares = (errors[self.seen] ** 2).sum(axis=-1)
+        self.assertAlmostEqual(squares.mean() ** 0.5, 0.0005 * 2**0.5, delta=0.00005)
+        pairs = []
+        for sequence in range(self.demos.num_sequences):
+            path = errors[self.demos.frames(sequence)]
+            pairs.append(np.stack((path[1:], path[:-1])).reshape(2, -1))
+        now, before = np.concatenate(pairs, axis=1)
+        self.assertAlmostEqual(np.corrcoef(now, before)[0, 1], np.exp(-1 / 8), delta=0.03)
+        large = np.linalg.norm(self.errors(finger=1.0, cap=0.003)[self.seen], axis=-1)
+        self.assertLess(large.max(), 0.0031)
+        self.assertGreater(large.mean(), 0.0015)
+
+    def test_errors_turn_with_the_palm(self):
+        turn = Rotation.from_rotvec([0.4, -1.0, 2.0])
+        wrist = turn * Rotation.from_quat(self.demos.wrist_quat_wxyz, scalar_first=True)
+        turned = replace(
+            self.demos,
+            hand_keypoints=self.demos.hand_keypoints @ turn.as_matrix().T,
+            wrist_quat_wxyz=wrist.as_quat(scalar_first=True),
+        )
+        options = {"wrist": 0.0, "finger": 0.006, "cap": 0.012}
+        expected = with_noise(self.demos, **options).hand_keypoints @ turn.as_matrix().T
+        found = with_noise(turned, **options).hand_keypoints
+        assert_allclose(found[self.seen], expected[self.seen], atol=1e-5)
 
     def test_tiers_are_those_of_the_published_paper(self):
         found = {name: (tier["wrist"], tier["cap"]) for name, tier in TIERS.items()}

@@ -5,7 +5,7 @@ import unittest
 import numpy as np
 from numpy.testing import assert_array_equal
 
-from xreset.schedule import schedule
+from xreset.schedule import schedule, shared_worlds
 
 CASES = {
     "one world": ([0, 0, 0], 1),
@@ -42,3 +42,14 @@ class ScheduleTest(unittest.TestCase):
         plan = schedule(np.array([0, 0, 0]), 2)
         assert_array_equal(plan.rounds, [[0, 1], [2, 2]])
         assert_array_equal(plan.fresh, [[True, True], [True, False]])
+
+    def test_objects_get_worlds_by_their_share(self):
+        for names, worlds, share, expected in (
+            ("abc", 10, {"b": 3.0}, [2, 6, 2]),
+            ("abc", 9, {"a": 0.5, "c": 2.0}, [1, 3, 5]),  # of 1.3, 2.6 and 5.1
+            ("ab", 7, {"a": 1.0}, [4, 3]),  # the first of equal remainders
+            ("abcdefghijklmnopqrst", 30, {"a": 1.0}, [2] * 10 + [1] * 10),
+        ):
+            held = shared_worlds(names, worlds, share)
+            assert_array_equal(held, np.repeat(np.arange(len(names)), expected))
+        self.assertIsNone(shared_worlds("abc", 10, {}))

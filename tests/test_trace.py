@@ -114,6 +114,9 @@ class DivergenceTest(TestCase):
         short = no_force()
         short[18:, 0, 0, 2] = 1.0  # two steps: shorter than 50 ms
         self.assertIsNone(compare(recording(tip_force=short), recording())["contacts"].time)
+        short[17, 0, 0, 2] = 1.0
+        d = compare(recording(tip_force=short), recording())["contacts"]
+        self.assertAlmostEqual(d.time, 18 * DT)
 
     def test_forces_are_averaged_and_their_direction_does_not_count(self):
         force = no_force()
@@ -124,6 +127,25 @@ class DivergenceTest(TestCase):
         d = compare(recording(tip_force=force), recording(tip_force=other))["contact force"]
         self.assertIsNone(d.time)
         self.assertAlmostEqual(d.largest, 5 / 3, places=5)
+
+    def test_the_least_difference_of_each_quantity(self):
+        steps = torch.ones(20, 1, 1)
+        joint = 0.02 * tensor([0, 0, 0, 1.0, 0]) * steps
+        still = tensor([1.0, 0, 0, 0]).expand(20, 1, 4)
+        turn = tensor([0.0, 0.0, math.radians(5.0)]) * steps
+        touch = no_force()
+        touch[:, 0, 1, 2] = 0.1
+        for quantity, made in (
+            ("joints", lambda x: {"joint_pos": x * joint}),
+            ("object position", lambda x: {"object_pos": x * tensor([0, 0.003, 0.004]) * steps}),
+            ("object orientation", lambda x: {"object_quat": quat_from_axis_angle(x * turn)}),
+            ("contacts", lambda x: {"tip_force": x * touch}),
+            ("contact force", lambda x: {"tip_force": x * 20 * touch}),
+        ):
+            base = recording(object_quat=still)
+            below, above = (compare(replace(base, **made(x)), base)[quantity] for x in (0.99, 1.01))
+            self.assertEqual((below.time, below.where), (None, ""), quantity)
+            self.assertAlmostEqual(above.time, DT, msg=quantity)
 
     def test_what_is_not_finite_ends_the_comparison(self):
         pos = torch.zeros(20, 1, 3)
@@ -172,6 +194,39 @@ class TraceTest(TestCase):
             self.assertGreater(noise.divergences[0].largest, 0.0)
         self.assertIn("same stays with mujoco", next(sentences(self.result)))
         self.assertAlmostEqual(self.result.reference.lifted, toy_grasp.RAISED, delta=0.01)
+
+    def test_the_reference_also_starts_a_micrometre_away_on_either_side(self):
+        starts = []
+
+        def make(*args):
+            backend = self.mujoco.make(*args)
+            begin = backend.set_state
+            backend.set_state = lambda state: (starts.append(state), begin(state))
+            return backend
+
+        actions = replace(grasp_actions(), joint_target=grasp_actions().joint_target[:1])
+        for seed in (0, 0, 1):
+            trace(actions, replace(self.mujoco, make=make), [], seed=seed)
+        for name, value in vars(starts[0]).items():
+            change = (value - getattr(actions.start, name)).double()
+            self.assertEqual(change[0].abs().max(), 0.0, name)
+            if name in ("joint_pos", "object_pos"):
+                assert_allclose(change[1:].abs(), 1e-6, atol=1e-7)
+                self.assertLess(change[1:].sign().mean().abs(), 0.6, name)
+                self.assertFalse(torch.equal(value, getattr(starts[2], name)))
+            else:
+                self.assertEqual(change.abs().max(), 0.0, name)
+            assert_close(value, getattr(starts[1], name), rtol=0, atol=0)
+
+    def test_noise_is_the_earliest_time_and_the_largest_differences(self):
+        made = self.result.noise[0]
+        first = made.divergences[0]
+        ones = []
+        for time, end, largest in ((None, 3.0, 4.0), (0.5, 1.0, 5.0), (0.2, 2.0, 2.0)):
+            ones.append((replace(first, time=time, end=end, largest=largest, where=f"at {time}"),))
+        noise = tuple(replace(made, divergences=each) for each in ones)
+        (worst,) = replace(self.result, noise=noise).worst_noise
+        self.assertEqual((worst.time, worst.where, worst.end, worst.largest), (0.2, "at 0.2", 3, 5))
 
     def test_half_a_drives_gain_is_found_in_its_joint_at_once(self):
         kp = 0.5 * toy_grasp.robot().joints[JOINT["turn"]].drive.kp

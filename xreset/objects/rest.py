@@ -37,10 +37,9 @@ def resting_orientation(obj: ObjectSpec, up: np.ndarray) -> np.ndarray:
     convex = ConvexHull(obj.vertices)
     corners = obj.vertices[convex.simplices]
     normals = convex.equations[:, :3]
-    # height of the center of mass above each face, negative because it is inside
-    height = normals @ obj.com + convex.equations[:, 3]
-    foot = obj.com - height[:, None] * normals
-    stable = (points_to_barycentric(corners, foot) >= -1e-9).all(axis=1)
+    # of the center of mass's projection into each face
+    coordinates = points_to_barycentric(corners, np.broadcast_to(obj.com, normals.shape))
+    stable = (coordinates >= -1e-9).all(axis=1)
     top = -normals[stable][np.argmin(normals[stable] @ up)]
     axis = np.cross(top, (0.0, 0.0, 1.0))
     sine = np.linalg.norm(axis)

@@ -183,6 +183,13 @@ class DistillTest(WithBank):
         words = "No camera shows 005_tomato_soup_can, 010_potted_meat_can"
         with quickly(), self.assertRaisesRegex(XResetError, words):
             self.distill("away", away)
+        self.assertFalse((self.folder / "away").exists())
+        notes = self.folder / "kept" / "notes.txt"
+        notes.parent.mkdir()
+        notes.touch()
+        with quickly(), self.assertRaisesRegex(XResetError, words):
+            self.distill("kept", away)
+        self.assertEqual(list(notes.parent.iterdir()), [notes])
 
     def test_a_student_is_resumed_as_it_was_started(self):
         for options, problem in (

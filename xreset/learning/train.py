@@ -6,7 +6,7 @@ import math
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -142,7 +142,7 @@ def train(
     teacher_file = None if teacher is None else policy_file(teacher)
     if teacher_file is not None:
         _check_teacher(teacher_file, inputs, config)
-    with _alone(out):
+    with _new_run(out):
         if teacher_file is not None:
             write_whole(out / TEACHER, teacher_file.read_bytes())
         # the training reads its own file, so that it has the same data as a resumed one, and values are checked
@@ -377,6 +377,21 @@ def _alone(out: Path) -> Iterator[None]:
             stack.enter_context(claim_folder(out))
             stack.enter_context(claim_folder(out / "checkpoints"))
         yield
+
+
+@contextmanager
+def _new_run(out: Path) -> Iterator[None]:
+    """Like :func:`_alone`; leave nothing new in the folder if the run does not get its ``run.json``."""
+    written = (out / TEACHER, out / "goals.npz", out / "resets.npz", out / "checkpoints", out)
+    new = [path for path in written if not path.exists()]
+    with _alone(out):
+        try:
+            yield
+        finally:
+            if Processes.of_environment().is_main and not (out / "run.json").exists():
+                for path in new:
+                    with suppress(OSError):  # not written yet, or a folder with other files
+                        path.rmdir() if path.is_dir() else path.unlink()
 
 
 def _train_cleanly(

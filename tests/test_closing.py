@@ -89,6 +89,10 @@ class ClosingTest(TestCase):
         frame, part = self.states(data, **config)
         return sorted(set(frame[part > 0].tolist()))
 
+    def test_a_spacing_without_sense_is_refused(self):
+        with self.assertRaisesRegex(ValueError, "spacing is 1e-300, expected a number from 1e-5"):
+            ClosingConfig(spacing=1e-300)
+
     def test_fingertips_move_by_no_more_than_the_spacing(self):
         frame, part = self.states()
         self.assertEqual(len(frame), 26, "12 mm are three steps of 4 mm")

@@ -109,6 +109,13 @@ class HandTest(TestCase):
         frames = self.in_frames(targets, state)
         return too_near(self.model, *frames, targets.annotated.flatten(), *limits)
 
+    def test_a_length_scale_without_sense_is_refused(self):
+        for scale in (1e-300, 1e300):
+            with self.assertRaisesRegex(
+                ValueError, "length_scale is .*expected a number from 1e-5"
+            ):
+                HandConfig(length_scale=scale)
+
     def test_gradient_is_the_derivative_of_the_cost(self):
         """All terms at once: bones, alignment, contact (beyond and below the knee), object, smoothness, jumps."""
         turn = quat_from_axis_angle(double([0.3, -0.2, 0.5]))

@@ -64,6 +64,8 @@ Positive = Annotated[T, Rule("a number above 0 and finite", lambda x: 0 < x < in
 NotNegative = Annotated[T, Rule("a number from 0 to 1e15", lambda x: 0 <= x <= 1e15)]
 """No time, number of steps or distance is larger: such a number in a file is damage."""
 PositiveFloat = Positive[float]
+Length = Annotated[float, Rule("a number from 1e-5 to 1e5", lambda x: 1e-5 <= x <= 1e5)]
+"""A length [m] that others are divided by: its square is finite, too."""
 PositiveInt = Annotated[int, Rule("a whole number above 0", lambda x: _is_whole(x) and x > 0)]
 NonNegativeFloat = NotNegative[float]
 NonNegativeInt = Annotated[

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from xreset.checks import (
     Checked,
+    Length,
     NonNegativeFloat,
     NonNegativeInt,
     PositiveFloat,
@@ -31,7 +32,7 @@ class FilterConfig(Checked):
 class ClosingConfig(Checked):
     """More states where a hand closes in on an object (:mod:`xreset.resets.closing`)."""
 
-    spacing: PositiveFloat | None = None
+    spacing: Length | None = None
     """Farthest that any fingertip moves from one state to the next [m], such as 0.005. None: no states are added."""
     within: PositiveFloat = 0.10
     """States are added between two frames if a finger is nearer than this to the object in one of them [m]."""

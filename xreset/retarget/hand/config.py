@@ -7,6 +7,7 @@ from typing import Literal
 from xreset.checks import (
     Checked,
     FiniteFloat,
+    Length,
     NonNegativeFloat,
     NonNegativeInt,
     PositiveFloat,
@@ -52,7 +53,7 @@ class HandConfig(Checked):
     paper's)."""
     jump_weight: NonNegativeFloat = 1000.0
     """Weight of a hand joint's change between neighboring frames beyond ``jump_limit``."""
-    length_scale: PositiveFloat = 0.10
+    length_scale: Length = 0.10
     """Length that counts as much as one radian [m]: about a finger's length."""
     iterations: NonNegativeInt = 40
     """Largest number of Levenberg-Marquardt steps with the full weight of the clearance."""

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from xreset.checks import Seed
+from xreset.checks import PositiveInt, Seed
 from xreset.errors import XResetError
 from xreset.eval.policy_spec import PolicySpec, load_policy
 from xreset.eval.results import (
@@ -28,11 +28,11 @@ def evaluate(
     demos: str | Path | Data,
     engines: str | Sequence[str | Engine] = "mujoco",
     *,
-    episodes: int = 5,
+    episodes: PositiveInt = 5,
     seed: Seed = 0,
     robot: str | Path | None = None,
     objects: str | Path | None = None,
-    num_envs: int = 64,
+    num_envs: PositiveInt = 64,
     device: str = "cpu",
     settle: bool = False,
     episode_seconds: float | None = None,

@@ -14,7 +14,7 @@ from dataclasses import field, replace
 from pathlib import Path
 from typing import Any
 
-from xreset.checks import Seed, frozen
+from xreset.checks import PositiveInt, Seed, frozen
 from xreset.demos.synth import synthesize
 from xreset.eval.pages import render
 from xreset.eval.plots import COLORS, svg
@@ -70,11 +70,11 @@ def rehearse(
     engines: str | Sequence[str | Engine] = "mujoco",
     *,
     faults: str | Sequence[str] = (),
-    episodes: int = 1,
+    episodes: PositiveInt = 1,
     seed: Seed = 0,
     robot: str | Path | None = None,
     objects: str | Path | None = None,
-    num_envs: int = 64,
+    num_envs: PositiveInt = 64,
     device: str = "cpu",
     real_time: bool = False,
     out: str | Path | None = None,

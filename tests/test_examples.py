@@ -44,7 +44,7 @@ class FaceTest(TestCase):
 
     def test_every_type_in_the_signature_of_a_function_is_a_public_name(self):
         elsewhere = {"Path", "Callable", "Sequence", "Iterable", "Mapping"}
-        elsewhere |= {"Literal", "None", "Any", "Self", "Data", "Seed"}
+        elsewhere |= {"Literal", "None", "Any", "Self", "Data", "PositiveInt", "Seed"}
         functions = 0
         for name in set(xreset.__all__) - {"VectorEnv"}:  # which needs gymnasium
             value = getattr(xreset, name)
@@ -123,6 +123,8 @@ class FromABankTest(InOneFolder):
             self.assertTrue((first == env.render(0, (64, 48))).all())
             env.goal_pos[1] += 0.1
             self.assertTrue((first != env.render(1, (64, 48))).any())
+            with self.assertRaisesRegex(xreset.XResetError, "world is 2, expected one from 0 to 1"):
+                env.render(2)
 
     def test_a_reward_term_pays(self):
         self.assertRegex(

@@ -105,17 +105,20 @@ class InputsTest(InOneFolder):
         scene = {"robot": self.robot, "objects": objects}
         playing = {"policy": "zero", "robot": "ur7e-sharpa", "demos": bank}
         seeds = "a whole number from 0 to 4294967295"
+        counts = "a whole number above 0"
         for call, given, wrong, expected in (
             (train, run, {"minutes": "1"}, "float"),
             (train, run, {"config": {"iterations": 5}}, "TrainConfig | None"),
             (train, run, {"seed": "3"}, seeds),
             (train, run, {"seed": -1}, seeds),
-            (evaluate, playing, {"episodes": "5"}, "int"),
+            (evaluate, playing, {"episodes": "5"}, counts),
+            (evaluate, playing, {"num_envs": 0}, counts),
+            (make_bank, {"retargeted": motion} | scene, {"num_envs": 0}, counts),
             (evaluate, playing, {"seed": 2**32}, seeds),
             (make_env, {"bank": bank} | scene, {"seed": np.random.default_rng()}, seeds),
             (merge_demos, {}, {"parts": ["demos.npz"]}, "Sequence[Demos]"),
             (evaluate, playing, {"engines": 5}, "str | Sequence[str | Engine]"),
-            (rehearse, {"policy": "soup-can", "demos": bank}, {"episodes": "5"}, "int"),
+            (rehearse, {"policy": "soup-can", "demos": bank}, {"episodes": 0}, counts),
             (retarget_demos, {"demos": self.demos} | scene, {"config": {"arm": 1}}, "RetargetConfig | None"),
             (make_bank, {"retargeted": motion} | scene, {"limits": {"steps": 1}}, "FilterConfig | None"),
             (make_env, {"bank": bank} | scene, {"task": {"timestep": 1}}, "TaskConfig | None"),

@@ -389,7 +389,12 @@ class ManipulationEnv:
         Args:
             world: index of the world.
             size: width and height in pixels.
+
+        Raises:
+            XResetError: there is no such world.
         """
+        if not 0 <= world < self.num_envs:
+            raise XResetError(f"world is {world}, expected one from 0 to {self.num_envs - 1}.")
         # trimesh, which training does not need
         from xreset.pictures.render import Renderer
 

@@ -37,7 +37,7 @@ def resting_orientation(obj: ObjectSpec, up: np.ndarray) -> np.ndarray:
     convex = ConvexHull(obj.vertices)
     corners = obj.vertices[convex.simplices]
     normals = convex.equations[:, :3]
-    # of the center of mass's projection into each face
+    # barycentric coordinates of the point below the center of mass, in each face
     coordinates = points_to_barycentric(corners, np.broadcast_to(obj.com, normals.shape))
     stable = (coordinates >= -1e-9).all(axis=1)
     top = -normals[stable][np.argmin(normals[stable] @ up)]

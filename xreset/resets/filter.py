@@ -13,6 +13,7 @@ from functools import partial
 import numpy as np
 import torch
 
+from xreset.checks import PositiveInt
 from xreset.errors import DemoError
 from xreset.physics import State
 from xreset.progress import Progress, unseen
@@ -38,7 +39,7 @@ def make_bank(
     objects: Sequence[ObjectSpec],
     engine: str | Sequence[str] = "mujoco",
     *,
-    num_envs: int = 64,
+    num_envs: PositiveInt = 64,
     device: str = "cpu",
     limits: FilterConfig | None = None,
     closing: ClosingConfig | None = None,

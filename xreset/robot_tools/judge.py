@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.checks import frozen
+from xreset.checks import PositiveInt, frozen
 from xreset.errors import RobotError
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import (
@@ -122,7 +122,7 @@ def judge(
     *,
     states: int = 8,
     squeeze: SqueezeConfig = SqueezeConfig(force=5.0, reach=0.01),
-    num_envs: int = 32,
+    num_envs: PositiveInt = 32,
     device: str = "cpu",
     progress: Callable[[float, int], None] = unseen,
 ) -> Judgement:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import types
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from difflib import get_close_matches
@@ -199,29 +199,36 @@ def names_wrong_arguments(function: Callable[P, T]) -> Callable[P, T]:
     @wraps(function)
     def call(*positional: P.args, **named: P.kwargs) -> T:
         rules = _rules_of(function)
-        if rules:
-            with suppress(TypeError):  # an unknown argument
-                given = signature(function).bind(*positional, **named).arguments
-                for name, value in given.items():
-                    for rule in _broken(rules.get(name, ()), value):
-                        raise WrongValueError(
-                            f"{name} is {shown(value)}, expected {rule.expected}. "
-                            f"Look at help(xreset.{function.__qualname__})."
-                        )
+        if rules:  # methods without rules, such as step, are called often
+            for name, value in _by_name(function, positional, named).items():
+                for rule in _broken(rules.get(name, ()), value):
+                    raise WrongValueError(_wrong(function, name, value, rule.expected))
         try:
             return function(*positional, **named)
         except (AttributeError, RuntimeError, TypeError, ValueError) as error:
-            with suppress(TypeError):  # an unknown argument
-                given = signature(function).bind(*positional, **named).arguments
-                for name, value in given.items():
+            with suppress(TypeError):  # isinstance does not take every type
+                for name, value in _by_name(function, positional, named).items():
                     if not _is_of(_hint_of(function, name), value):
-                        raise XResetError(
-                            f"{name} is {shown(value)}, expected {function.__annotations__[name]}. "
-                            f"Look at help(xreset.{function.__qualname__})."
-                        ) from error
+                        expected = function.__annotations__[name]
+                        raise XResetError(_wrong(function, name, value, expected)) from error
             raise
 
     return call
+
+
+def _by_name(
+    function: Callable[..., Any], positional: Sequence[Any], named: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return the arguments of a call by name; none if one is unknown or missing."""
+    try:
+        return signature(function).bind(*positional, **named).arguments
+    except TypeError:
+        return {}
+
+
+def _wrong(function: Callable[..., Any], name: str, value: Any, expected: str) -> str:
+    """Return the message about an argument of a public function."""
+    return f"{name} is {shown(value)}, expected {expected}. Look at help(xreset.{function.__qualname__})."
 
 
 @cache

@@ -23,7 +23,7 @@ from xreset.demos.archive import Demos, merge_demos, one_sequence
 from xreset.demos.grasp import Contacts, Grasp, Solid, fit_hand, handedness, plan_contacts
 from xreset.errors import DemoError
 from xreset.geometry.shapes import turn_of
-from xreset.objects.catalogue import load_objects, object_names
+from xreset.objects.catalogue import load_objects
 from xreset.objects.rest import rest_height, resting_orientation
 from xreset.progress import unseen
 from xreset.spec import ObjectSpec
@@ -97,7 +97,7 @@ def synthesize(
     if side not in ("right", "left"):
         raise DemoError(f"side is {side!r}, expected 'right' or 'left'.")
     folder = Path(meshes) if meshes else None
-    specs = load_objects(object_names(folder) if objects is None else objects, folder)
+    specs = load_objects(objects, folder)
     parts = []
     for spec in specs:
         starts = [_start(spec, np.array(up), side) for up in _REST_UP.get(spec.name, (_Z,))]

@@ -125,8 +125,13 @@ def load_object(name: str, folder: str | Path | None = None) -> ObjectSpec:
     return import_mesh(files[full], name if name in STAND_INS else full)
 
 
-def load_objects(names: Iterable[str], folder: str | Path | None = None) -> tuple[ObjectSpec, ...]:
-    """Load several objects, in that order, or the one of a single name; see :func:`load_object`."""
+def load_objects(
+    names: Iterable[str] | None, folder: str | Path | None = None
+) -> tuple[ObjectSpec, ...]:
+    """Load objects in the order of their names, as :func:`load_object` does. A single name gives one object, None gives
+    all of :func:`object_names`."""
+    if names is None:
+        names = object_names(folder)
     names = (names,) if isinstance(names, str) else tuple(names)
     if not names:
         raise ObjectError("No object is named. Name one or several, or give None for all.")

@@ -27,7 +27,7 @@ from xreset.demos.synth import LIFT, WORKSPACE
 from xreset.description import load_robot
 from xreset.errors import FileFormatError, GoalError
 from xreset.geometry.shapes import quat_of, turn_of
-from xreset.objects.catalogue import load_objects, object_names
+from xreset.objects.catalogue import load_objects
 from xreset.objects.rest import rest_height, resting_orientation
 from xreset.progress import unseen
 from xreset.records import Field, read_record, schema_of, write_record
@@ -117,7 +117,7 @@ def make_goals(
         families = () if poses else FAMILIES
     if unknown := [family for family in families if family not in FAMILIES]:
         raise GoalError(f"Unknown family {unknown[0]!r}. Choose from: {', '.join(FAMILIES)}.")
-    loaded = load_objects(object_names(meshes) if objects is None else objects, meshes)
+    loaded = load_objects(objects, meshes)
     robot = load_robot(robot)
     own = [_own_pose(pose) for pose in poses]
     for obj in loaded:

@@ -35,7 +35,8 @@ APPROACH_DISTANCE = 0.05
 LIFT = 0.01
 """Least height of the object above its start in the stage grasp [m]."""
 CONTACT_FORCE = 0.1
-"""Force from which a finger counts as in contact [N]. Not in the paper."""
+"""Force from which a finger counts as in contact [N], whatever the reward's ``contact_threshold`` is. Not in the
+paper."""
 GOAL_DISTANCE = 0.02
 """Largest distance of the object's origin from the goal in the stage reorientation [m]."""
 GOAL_ANGLE = 0.2617993877991494
@@ -83,26 +84,26 @@ class EpisodeMetrics:
         self._goal_quat = goal_quat.clone()
         self._start_height = start.task_state.object_pos[:, 2].clone()
         self._start_keypoint_distance = self._distances(start, points.keypoints).amax(dim=-1)
-        self._least_keypoint_distance = self._start_keypoint_distance.clone()
-        far = torch.full_like(self._least_keypoint_distance, torch.inf)
-        self.least_distance = far.clone()
+        self._least_keypoint_distance = self._start_keypoint_distance
+        infinite = torch.full_like(self._least_keypoint_distance, torch.inf)
+        self.least_distance = infinite
         """[N] least mean distance of the surface points to the goal [m]."""
-        self.final_distance = far.clone()
+        self.final_distance = infinite
         """[N] mean distance of the surface points to the goal in the last reading, or the last before an early end
         [m]."""
-        self.final_position_error = far.clone()
+        self.final_position_error = infinite
         """[N] distance of the object's origin from the goal in the same reading [m]."""
-        self.final_angle = far.clone()
+        self.final_angle = infinite
         """[N] angle between the object and the goal in the same reading [rad]."""
-        no = torch.zeros_like(self._least_keypoint_distance, dtype=torch.bool)
-        self.approach = no.clone()
-        self.grasp = no.clone()
-        self.reorient = no.clone()
-        self.reorient_once = no.clone()
-        self.nonfinite = no.clone()
-        self.overflow = no.clone()
-        self.out_of_bounds = no.clone()
-        self._ended = no.clone()
+        false = torch.zeros_like(self._least_keypoint_distance, dtype=torch.bool)
+        self.approach = false.clone()
+        self.grasp = false.clone()
+        self.reorient = false
+        self.reorient_once = false.clone()
+        self.nonfinite = false.clone()
+        self.overflow = false.clone()
+        self.out_of_bounds = false.clone()
+        self._ended = false.clone()
         self._add(start)
 
     def update(self, reading: Reading, out_of_bounds: Tensor) -> None:
@@ -112,9 +113,10 @@ class EpisodeMetrics:
             reading: the reading; a number that is not finite ends a world.
             out_of_bounds: [N] bool: whether the object has left the scene, which ends a world, too.
         """
-        self.nonfinite |= reading.health.nonfinite & ~self._ended
-        self.overflow |= reading.health.overflow & ~self._ended
-        self.out_of_bounds |= out_of_bounds & ~self._ended & ~self.nonfinite
+        live = ~self._ended
+        self.nonfinite |= reading.health.nonfinite & live
+        self.overflow |= reading.health.overflow & live
+        self.out_of_bounds |= out_of_bounds & live & ~self.nonfinite
         self._ended |= self.nonfinite | self.out_of_bounds
         self._add(reading)
 
@@ -133,12 +135,11 @@ class EpisodeMetrics:
     @property
     def task_progress(self) -> Tensor:
         """[N] score of the highest stage, one of :data:`STAGE_SCORES`."""
-        stage = torch.where(
-            self.reorient, 3, torch.where(self.grasp, 2, torch.where(self.approach, 1, 0))
-        )
+        stage = torch.where(self.reorient, 3, torch.where(self.grasp, 2, self.approach.long()))
         return torch.tensor(STAGE_SCORES, device=stage.device)[stage]
 
     def _add(self, reading: Reading) -> None:
+        """Update the metrics of the worlds that have not ended."""
         state = reading.task_state
         live = ~self._ended
         self.approach |= live & (reading.tip_distance.amin(dim=-1) <= APPROACH_DISTANCE)
@@ -151,10 +152,8 @@ class EpisodeMetrics:
         self.reorient = at_goal
         self.reorient_once |= at_goal
         farthest = self._distances(reading, self._points.keypoints).amax(dim=-1)
-        self._least_keypoint_distance = torch.where(
-            live,
-            torch.minimum(self._least_keypoint_distance, farthest),
-            self._least_keypoint_distance,
+        self._least_keypoint_distance = torch.minimum(
+            self._least_keypoint_distance, torch.where(live, farthest, torch.inf)
         )
         distance = self._distances(reading, self._points.surface).mean(dim=-1)
         self.final_distance = torch.where(live, distance, self.final_distance)

@@ -70,7 +70,7 @@ else:
 
 @frozen
 class Episode:
-    """Result of one episode."""
+    """Result of one episode. :mod:`xreset.eval.metrics` defines the metrics."""
 
     sequence: NonNegativeInt
     """Index of the demonstration."""
@@ -81,6 +81,7 @@ class Episode:
     approach: bool
     grasp: bool
     reorient: bool
+    """Whether the object was at the goal at the end."""
     reorient_once: bool
     """Whether the object was at the goal at any time."""
     reorientation_progress: Share

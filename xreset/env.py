@@ -1,7 +1,10 @@
 """The environment: N worlds of a physics backend, and the task's pure functions around them.
 
-It has rsl-rl's interface of vector environments (``step`` resets finished worlds itself), but only training needs
-rsl-rl. Evaluations use the same class with another configuration.
+A step turns actions into joint targets, advances the physics, computes rewards and ends of episodes, resets the worlds
+whose episode has ended, and computes observations.
+
+The environment has rsl-rl's interface of vector environments (``step`` resets finished worlds itself), but only
+training needs rsl-rl. Evaluations use the same class with another configuration.
 """
 
 from __future__ import annotations
@@ -157,7 +160,7 @@ class ManipulationEnv:
         self.backend = backend
         self.task = task
         self.resets = resets
-        self.cfg = task
+        self.cfg = task  # rsl-rl's name of the configuration
         self.device = backend.device
         scene = backend.scene
         self.num_envs = backend.num_worlds
@@ -199,9 +202,11 @@ class ManipulationEnv:
 
         self.drawn = Drawn(self.num_envs, self.device)
         zeros = self.drawn.zeros
-        never = zeros().bool()
+        no_world = zeros().bool()
+        # Only the shapes of this draw are used. Another generator draws it, so that episodes do not depend on it.
         unused = torch.Generator(device=self.device)
         self._new_start = self.resets.sample(self.backend.object_index, unused).clone()
+        # How each world's present episode began. Resets write into these tensors, which the names below share.
         episode = self._new_start.clone()
         self.goal_pos = episode.goal_pos
         self.goal_quat = episode.goal_quat
@@ -220,12 +225,12 @@ class ManipulationEnv:
         self._best_reach = zeros()
         self._reward = zeros()
         self._cloud = zeros(*self.task.observation.cloud_shape)
-        self._time_out = never.clone()
-        self._bad_action = never.clone()
-        self._faulty = never.clone()
+        self._time_out = no_world.clone()
+        self._bad_action = no_world.clone()
+        self._faulty = no_world.clone()
         # Worlds to reset, and worlds whose episode is over and that wait for a reset.
-        self._reset_mask = never.clone()
-        self._over = never.clone()
+        self._reset_mask = no_world.clone()
+        self._over = no_world.clone()
         task = self.task
         robot = self.backend.scene.robot
         layout = obs.layout(len(robot.joints), len(robot.fingertips), task.observation)
@@ -252,7 +257,7 @@ class ManipulationEnv:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    # rsl-rl's contract
+    # rsl-rl's interface
 
     @property
     def episode_length_buf(self) -> Tensor:
@@ -305,10 +310,11 @@ class ManipulationEnv:
         if begin is not None:
             self._over |= self._reset_mask
             self._reset_mask.copy_(begin)
+        # a GPU would have to be waited for to learn whether there is a world to reset
         if self._graphs.active or self._reset_mask.any():
             self._graphs.run(self._sample_resets)
             self._write_resets()
-        self._look()
+        self._take_images()
         self._graphs.run(self._compute_observations)
         return self.get_observations(), reward, done, extras
 
@@ -330,7 +336,7 @@ class ManipulationEnv:
         self._apply_action(action, push)
         reading, reward = self._compute_rewards()
         self._reset_mask.zero_()
-        self._look()
+        self._take_images()
         self._compute_observations()
         return reading, reward
 
@@ -360,7 +366,7 @@ class ManipulationEnv:
         before = {name: value.clone() for name, value in lasting.items()}
         self._sample_resets(start is None)
         self._write_resets()
-        self._look()
+        self._take_images()
         self._compute_observations()
         others = ~self._reset_mask
         for name, value in before.items():
@@ -472,7 +478,7 @@ class ManipulationEnv:
         self._sent_target.copy_(self.variation.sent_targets(self._target, state, self.generator))
 
     def _compute_rewards(self) -> tuple[Reading, Reward]:
-        """Compute rewards, ends of episodes and the numbers to log."""
+        """Read the worlds after a step, and compute rewards, ends of episodes and the numbers to log."""
         reading = self.reading()
         broken = reading.health.nonfinite
         live = ~self._over
@@ -488,15 +494,20 @@ class ManipulationEnv:
         if self.variation.pushes is not None:
             self.variation.pushes.gate.copy_(reward.gate & ~broken)
         self._previous_action.copy_(self._action)
+        self._end_episodes(lost, live, reward.success)
+        self._log_step(reward, ~broken)
+        return reading, reward
+
+    def _end_episodes(self, lost: Tensor, live: Tensor, success: Tensor) -> None:
+        """Count the step, and mark the ``live`` worlds whose episode ends: out of bounds (``lost``), out of time, or
+        with a failed simulation. All masks are [N] bool; ``success``: the object is at its goal now."""
         self._episode_length += 1
         time_out = (self._episode_length >= self.max_episode_length) | self._faulty
         self._time_out.copy_(time_out & ~lost)
         self._reset_mask.copy_((lost | time_out) & live)
         if self.resets.config.adaptive_share:
             ended = self._reset_mask & ~self.from_bank & ~self._faulty
-            self.resets.record(self.sequence, reward.success, ended)
-        self._log_step(reward, ~broken)
-        return reading, reward
+            self.resets.record(self.sequence, success, ended)
 
     def _mark_faults(self, reading: Reading, live: Tensor) -> None:
         """Mark and count the ``live`` worlds [N] whose simulation failed. They end, and training ignores them."""
@@ -575,7 +586,7 @@ class ManipulationEnv:
             Parameters(**self.variation.parameters, object_gravity=self.gravity_fraction),
         )
 
-    def _look(self) -> None:
+    def _take_images(self) -> None:
         """Let the cameras take their images."""
         if self.vision is not None:
             self._graphs.run(self._aim_cameras)

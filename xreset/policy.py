@@ -34,10 +34,10 @@ METADATA_KEY = "xreset"
 VERSION_KEY = "xreset-version"
 """Key of the ONNX metadata entry that holds the version and commit of xreset."""
 INPUTS = ("flat", "cloud", "h_in", "c_in")
-"""Inputs of the ONNX graph: the two flat groups of ``TaskConfig.policy_groups`` in one, the clouds or images, and the
-LSTM's state."""
+"""Inputs of the ONNX graph: the two flat groups of ``TaskConfig.policy_groups`` in one [N, D], the clouds [N, H, P, K]
+or images, and the LSTM's state, two tensors [1, N, units]."""
 OUTPUTS = ("actions", "h_out", "c_out")
-"""Outputs of the ONNX graph: actions, and the LSTM's next state."""
+"""Outputs of the ONNX graph: mean actions [N, J], not limited yet, and the LSTM's next state."""
 
 
 class Policy(Protocol):

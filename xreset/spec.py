@@ -88,7 +88,7 @@ class JointSpec:
     name: Text
     """Its name in the URDF."""
     group: Literal["arm", "hand"]
-    """Arm joints take a position change per control step, hand joints an absolute target."""
+    """Arm and hand turn actions into targets in different ways: :class:`xreset.task.config.ActionConfig`."""
     drive: DriveSpec
     home: Number
     """Home position [rad or m]."""

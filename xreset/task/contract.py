@@ -16,10 +16,18 @@ class Contract:
 
     schema: Literal["xreset-policy/1"]
     robot: str
+    """Name of the robot."""
     robot_fingerprint: str
+    """:attr:`xreset.spec.RobotSpec.fingerprint`"""
     joint_names: tuple[str, ...]
+    """Order of the joints in observations and actions (length J)."""
     fingertip_names: tuple[str, ...]
+    """Order of the fingertips in observations, thumb first."""
     objects: tuple[str, ...]
+    """Objects of the training; a policy may play with others."""
     observation_layout: dict[str, dict[str, PositiveInt]]
+    """Group -> term -> number of values, in order: :func:`xreset.task.observations.layout`."""
     control_dt: PositiveFloat
+    """Time between two actions [s]."""
     task: TaskConfig
+    """The task of the training; :func:`xreset.policy.check_contract` compares the parts of it that must agree."""

@@ -29,10 +29,15 @@ from xreset.task.config import ObservationConfig
 
 @frozen
 class ObservationInput:
-    """Quantities that observations are made of: world frame, quaternions (w, x, y, z)."""
+    """Quantities that observations are made of: world frame, quaternions (w, x, y, z).
+
+    The object's origin is that of the task (``TaskConfig.object_frame``).
+    """
 
     state: State
+    """[N, ...] true state. The policy observes ``observed_pos`` and ``observed_quat`` instead of its object pose."""
     links: Links
+    """[N, 1 + E, ...] the palm, then the fingertips."""
     joint_target: Tensor
     """[N, J] targets of the drives [rad, m]."""
     joint_lower: Tensor
@@ -40,27 +45,27 @@ class ObservationInput:
     joint_upper: Tensor
     """[J]"""
     points: Tensor
-    """[N, P, 3] surface points of each world's object, object frame."""
+    """[N, P, 3] surface points of each world's object, from its origin along the mesh frame's axes [m]."""
     observed_pos: Tensor
-    """[N, 3] object position as the policy observes it, possibly delayed."""
+    """[N, 3] object position as the tracker reports it [m]: late, wrong, or old (``task.randomization``)."""
     observed_quat: Tensor
     """[N, 4]"""
     goal_pos: Tensor
-    """[N, 3]"""
+    """[N, 3] m"""
     goal_quat: Tensor
     """[N, 4]"""
     start_quat: Tensor
     """[N, 4] object orientation at the start of the episode."""
     gravity_fraction: Tensor
-    """[N]"""
+    """[N] share of the object's weight that acts."""
     previous_action: Tensor
-    """[N, J]"""
+    """[N, J] in [-1, 1]."""
     tip_force: Tensor
     """[N, E, 3] force on the object [N]."""
     tip_distance: Tensor
     """[N, E] distance from each fingertip to the object's surface points [m]."""
     reward: Tensor
-    """[N]"""
+    """[N] of the last step, scaled; 0 when an episode begins."""
 
 
 def layout(
@@ -70,24 +75,29 @@ def layout(
 
     ``perception`` has H * P * K values. With cameras the groups are ``goal``, ``proprio`` and ``view``.
     """
-    turn = "rotation"
+    rotation = "rotation"
     width = 6
     if c.rotation == "quaternion":
-        turn = "quat"
+        rotation = "quat"
         width = 4
     if c.content == "published":
         policy = {"tip_to_object": 3 * num_tips, "palm_distance": 1}
         proprio = {"joint_pos": num_joints, "target_pos": num_joints}
     else:
-        pose = {"object_pos": 3, f"object_{turn}": width, "goal_pos": 3, f"goal_{turn}": width}
+        poses = {
+            "object_pos": 3,
+            f"object_{rotation}": width,
+            "goal_pos": 3,
+            f"goal_{rotation}": width,
+        }
         if c.rotation == "to_goal":
-            pose = {"object_pos": 3, "goal_pos": 3, "rotation_to_goal": 6}
-        policy = pose | {"gravity_fraction": 1, "previous_action": num_joints}
+            poses = {"object_pos": 3, "goal_pos": 3, "rotation_to_goal": 6}
+        policy = poses | {"gravity_fraction": 1, "previous_action": num_joints}
         proprio = {
             "joint_pos": num_joints,
             "joint_vel": num_joints,
             "palm_pos": 3,
-            f"palm_{turn}": width,
+            f"palm_{rotation}": width,
             "palm_linvel": 3,
             "palm_angvel": 3,
             "tip_pos": 3 * num_tips,
@@ -98,9 +108,9 @@ def layout(
     if vision is None or not vision.cameras:
         cloud = "cloud" if c.cloud == "history" else "paired_cloud"
         return {"policy": policy, "proprio": proprio, "perception": {cloud: prod(c.cloud_shape)}}
-    goal = "rotation_from_start" if c.rotation == "to_goal" else f"goal_{turn}"
+    goal_rotation = "rotation_from_start" if c.rotation == "to_goal" else f"goal_{rotation}"
     return {
-        "goal": {"goal_pos": 3, goal: width, "previous_action": num_joints},
+        "goal": {"goal_pos": 3, goal_rotation: width, "previous_action": num_joints},
         "proprio": proprio,
         "view": {vision.view: prod(vision.view_shape)},
     }
@@ -116,8 +126,8 @@ def policy_group(x: ObservationInput, c: ObservationConfig, generator: torch.Gen
     if c.content == "published":
         return _vectors_to_object(x)
     pos = _noisy(x.observed_pos, c.noise.object_pos, generator)
-    turn = quat_from_axis_angle(c.noise.object_rot * _normal(x.observed_pos, generator))
-    quat = quat_multiply(turn, x.observed_quat)
+    error = quat_from_axis_angle(c.noise.object_rot * _normal(x.observed_pos, generator))
+    quat = quat_multiply(error, x.observed_quat)
     if c.rotation == "to_goal":
         to_goal = quat_multiply(x.goal_quat, quat_conjugate(quat))
         poses = (pos, x.goal_pos, _encoded(to_goal, c))
@@ -143,17 +153,18 @@ def goal_group(x: ObservationInput, c: ObservationConfig) -> Tensor:
     With ``rotation="to_goal"``, the goal's orientation is given as the rotation from the start of the episode to the
     goal, because no image shows the axes in which a mesh was drawn.
     """
-    turn = x.goal_quat
+    rotation = x.goal_quat
     if c.rotation == "to_goal":
-        turn = quat_multiply(x.goal_quat, quat_conjugate(x.start_quat))
-    return torch.cat((x.goal_pos, _encoded(turn, c), x.previous_action), dim=-1)
+        rotation = quat_multiply(x.goal_quat, quat_conjugate(x.start_quat))
+    return torch.cat((x.goal_pos, _encoded(rotation, c), x.previous_action), dim=-1)
 
 
 def proprio_group(x: ObservationInput, c: ObservationConfig, generator: torch.Generator) -> Tensor:
-    """[N, 2 J + 13 + 6 E] joints, palm, fingertips and limited contact forces.
+    """[N, 2 J + 13 + 6 E] joints, palm, fingertips and limited contact forces, in the order of :func:`layout`.
 
-    Joint positions are scaled to [-1, 1] between their limits. Without quaternions there are two numbers more, with
-    ``joint_target`` J more. With ``content="published"``, [N, 2 J] positions and drives' targets, both scaled.
+    Palm and fingertips are in the world frame. Joint positions are scaled to [-1, 1] between their limits. Without
+    quaternions there are two numbers more, with ``joint_target`` J more. With ``content="published"``, [N, 2 J]
+    positions and drives' targets, both scaled.
     """
     pos = _noisy(x.state.joint_pos, c.noise.joint_pos, generator)
     if c.content == "published":
@@ -174,7 +185,8 @@ def proprio_group(x: ObservationInput, c: ObservationConfig, generator: torch.Ge
 
 
 def privileged_group(x: ObservationInput, c: ObservationConfig) -> Tensor:
-    """[N, 15] object velocities, pose error, least fingertip distance, gravity fraction and reward (critic).
+    """[N, 15] object velocities, pose error (a vector [m] and a rotation vector [rad]), least fingertip distance [m],
+    gravity fraction and reward; for the critic only.
 
     With ``content="published"``, [N, 15 + J + 3 E]: joint velocities and contact forces follow, because the policy
     does not observe them.
@@ -207,7 +219,7 @@ def cloud_frame(x: ObservationInput, c: ObservationConfig, generator: torch.Gene
 
 
 def _world_points(x: ObservationInput) -> Tensor:
-    """[N, P, 3] the object's points in the world frame, as they are observed."""
+    """[N, P, 3] the object's points in the world frame, at the pose that the tracker reports [m]."""
     return quat_rotate(x.observed_quat[:, None], x.points) + x.observed_pos[:, None]
 
 

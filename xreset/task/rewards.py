@@ -7,6 +7,8 @@ The published paper, with the sum P of the fingertips' distances and the distanc
 distance d of surface points to the goal, and G = 1 where P <= 0.6 and M <= 0.2:
 r = -2.5 min(P, 3) - 2.5 min(M, 0.5) + G 3 (1.4 - 3 d) + G [d <= 0.02] 15 / (1 + 10 d) - 0.005 |a_t|^2
 - 0.05 |arm's a_t - a_{t-1}|^2 - 0.005 |hand's a_t - a_{t-1}|^2 - 500 r_oob
+
+The learner gets ``scale`` r. Weights and widths are fields of :class:`~xreset.task.config.RewardConfig`.
 """
 
 from __future__ import annotations
@@ -28,47 +30,51 @@ from xreset.task.config import RewardConfig
 
 @frozen
 class RewardInput:
-    """What the reward is computed from; N worlds, E fingertips with the thumb first."""
+    """What the reward is computed from; N worlds, J joints, E fingertips with the thumb first.
+
+    Positions are in the world frame [m], and those of the object are of its origin in the task
+    (``TaskConfig.object_frame``).
+    """
 
     tip_distance: Tensor
     """[N, E] distance from each fingertip to the object's surface [m]."""
     best_reach: Tensor
     """[N] smallest mean fingertip distance of the episode, this step included [m]."""
     tip_force: Tensor
-    """[N, E, 3] each finger's contact force on the object [N], world frame."""
+    """[N, E, 3] force of each finger's contact links on the object [N], world frame, in the last physics step."""
     state: State
-    """[N, ...] state of joints and object."""
+    """[N, ...] state of joints and object, without noise."""
     goal_pos: Tensor
     """[N, 3]"""
     goal_quat: Tensor
-    """[N, 4]"""
+    """[N, 4] (w, x, y, z)"""
     start_pos: Tensor
-    """[N, 3] position of the object at the start of the demonstration."""
+    """[N, 3] position of the object at the start of the demonstration, without the episode's own perturbation."""
     start_quat: Tensor
     """[N, 4]"""
     action: Tensor
-    """[N, J] this step's action, limited unless ``raw_actions`` is set."""
+    """[N, J] this step's action, limited to [-1, 1] unless ``raw_actions`` is set."""
     previous_action: Tensor
-    """[N, J]"""
+    """[N, J] 0 in the first step of an episode."""
     out_of_bounds: Tensor
-    """[N] bool"""
+    """[N] bool: the object has left the scene, and the episode ends."""
     palm_distance: Tensor
     """[N] distance from the palm to the object's surface [m]."""
     points: Tensor
     """[N, 64, 3] :func:`xreset.objects.sampling.metric_points` of each world's object, in its frame [m]."""
     is_arm: Tensor
-    """[J] bool"""
+    """[J] bool: the joint is one of the arm's; the others are the hand's."""
     success_position: Tensor
     """[] largest distance to the goal that counts as success [m]: the configuration's, or a schedule's."""
 
     @property
     def object_pos(self) -> Tensor:
-        """[N, 3] of the state."""
+        """[N, 3] present position of the object, of ``state``."""
         return self.state.object_pos
 
     @property
     def object_quat(self) -> Tensor:
-        """[N, 4] of the state."""
+        """[N, 4] present orientation of the object, of ``state``."""
         return self.state.object_quat
 
 
@@ -77,7 +83,7 @@ class Reward:
     """The reward, its terms and their conditions."""
 
     total: Tensor
-    """[N] scaled sum of the terms."""
+    """[N] sum of the terms, times ``scale``: what the learner gets."""
     terms: dict[str, Tensor]
     """Name -> [N] weighted term, before ``scale``."""
     grasped: Tensor

@@ -1,8 +1,8 @@
 """The paper's network (appendix C, Table VIII): PointNet per cloud frame, LSTM with layer norm, MLP.
 
 Observation groups with two dimensions are flat; groups with four, [N, H, P, K], are cloud histories, or images. Shape
-letters: N worlds (or sequences), T steps of a rollout, L steps of a sequence, H history (or the LSTM's width), P
-points, K numbers per point, D flat width.
+letters: N worlds (or sequences), T steps of a rollout, L steps of a sequence, H history, P points, K numbers per point,
+D flat width; ``embedding`` and ``lstm`` are the widths of a frame's embedding and of the LSTM.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ with needs("rsl-rl-lib", "train"):
     from rsl_rl.modules.distribution import GaussianDistribution
 
 LstmState = tuple[Tensor, Tensor]
+"""Hidden and cell state of the LSTM, each [1, N, lstm]."""
 
 
 class PointNet(nn.Module):
@@ -115,10 +116,10 @@ def run_lstm(lstm: nn.LSTM, x: Tensor, keep: Tensor, state: LstmState) -> tuple[
         lstm: the layer.
         x: [L, N, D]; in bfloat16 (on a GPU) all products have such factors, while sums and the state are float32.
         keep: [L, N] False where an episode begins.
-        state: [1, N, H] each.
+        state: [1, N, lstm] each.
 
     Returns:
-        outputs [L, N, H], new state.
+        outputs [L, N, lstm], new state.
     """
     h, c = state
     out = []

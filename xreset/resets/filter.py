@@ -1,4 +1,4 @@
-"""The physics filter: which retargeted states stay put when they are spawned (the paper's appendix D.c).
+"""Make a reset bank: the physics filter keeps the retargeted states that stay put (the paper's appendix D.c).
 
 Each candidate is spawned at rest, the drives hold its joint positions, the object has no weight, and a few control
 steps pass. It is rejected if it leaves the scene or still moves.

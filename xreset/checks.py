@@ -102,7 +102,7 @@ class Checked:
             value = getattr(self, name)
             wrong += [
                 f"{name} is {shown(value)}, expected {rule.expected}"
-                for rule in _broken(marks, value)
+                for rule in _broken_rules(marks, value)
             ]
         for name, hint in _choices_of(type(self)).items():
             value = getattr(self, name)
@@ -153,7 +153,7 @@ def _described(hint: Any) -> str:
     return "None" if hint is types.NoneType else hint.__name__
 
 
-def _broken(marks: Iterable[Any], value: Any) -> list[Rule]:
+def _broken_rules(marks: Iterable[Any], value: Any) -> list[Rule]:
     if value is None:
         return []
     return [mark for mark in marks if isinstance(mark, Rule) and not _holds(mark, value)]
@@ -201,8 +201,8 @@ def names_wrong_arguments(function: Callable[P, T]) -> Callable[P, T]:
         rules = _rules_of(function)
         if rules:  # methods without rules, such as step, are called often
             for name, value in _by_name(function, positional, named).items():
-                for rule in _broken(rules.get(name, ()), value):
-                    raise WrongValueError(_wrong(function, name, value, rule.expected))
+                for rule in _broken_rules(rules.get(name, ()), value):
+                    raise WrongValueError(_message(function, name, value, rule.expected))
         try:
             return function(*positional, **named)
         except (AttributeError, RuntimeError, TypeError, ValueError) as error:
@@ -210,7 +210,7 @@ def names_wrong_arguments(function: Callable[P, T]) -> Callable[P, T]:
                 for name, value in _by_name(function, positional, named).items():
                     if not _is_of(_hint_of(function, name), value):
                         expected = function.__annotations__[name]
-                        raise XResetError(_wrong(function, name, value, expected)) from error
+                        raise XResetError(_message(function, name, value, expected)) from error
             raise
 
     return call
@@ -226,7 +226,7 @@ def _by_name(
         return {}
 
 
-def _wrong(function: Callable[..., Any], name: str, value: Any, expected: str) -> str:
+def _message(function: Callable[..., Any], name: str, value: Any, expected: str) -> str:
     """Return the message about an argument of a public function."""
     return f"{name} is {shown(value)}, expected {expected}. Look at help(xreset.{function.__qualname__})."
 
@@ -261,7 +261,7 @@ def _is_of(hint: Any, value: Any) -> bool:
     if kind is Literal:
         return value in get_args(hint)
     if kind is Annotated:
-        return _is_of(hint.__origin__, value) and not _broken(hint.__metadata__, value)
+        return _is_of(hint.__origin__, value) and not _broken_rules(hint.__metadata__, value)
     is_one = isinstance(value, _WIDER.get(kind, kind))
     if is_one and (kind in (Sequence, Iterable) or Ellipsis in get_args(hint)):
         return all(_is_of(get_args(hint)[0], item) for item in value)
@@ -315,10 +315,10 @@ def _release(version: Any) -> list[int]:
 def parsed(cls: type[T], data: Any, where: str, version: Any = None) -> tuple[T | None, list[str]]:
     """Return the dataclass and no problem, or None and a sentence for each problem. See :func:`from_dict`."""
     problems = []
-    value = _record(cls, data, where, problems)
+    value = _parsed_record(cls, data, where, problems)
     if not problems:
         return value, []
-    problems = _first(problems)
+    problems = _shortened(problems)
     if _release(version) > _release(__version__):
         problems.append(
             f"It was written by xreset {shown(version)}, and this is xreset {__version__}. "
@@ -327,7 +327,7 @@ def parsed(cls: type[T], data: Any, where: str, version: Any = None) -> tuple[T 
     return None, problems
 
 
-def _record(cls: type, data: Any, where: str, problems: list[str]) -> Any:
+def _parsed_record(cls: type, data: Any, where: str, problems: list[str]) -> Any:
     if not isinstance(data, dict):
         problems.append(
             f"{where} is {shown(data)}, expected an object with the entries of {cls.__name__}."
@@ -352,7 +352,7 @@ def _record(cls: type, data: Any, where: str, problems: list[str]) -> Any:
     nearest: list[str] = []
     if unknown:
         keys = []
-        for key in _first([str(key)[:100] for key in unknown]):
+        for key in _shortened([str(key)[:100] for key in unknown]):
             guesses = get_close_matches(key, names, 1, 0.75)
             nearest += guesses
             keys.append(f"{key} ({guesses[0]}?)" if guesses else key)
@@ -365,7 +365,7 @@ def _record(cls: type, data: Any, where: str, problems: list[str]) -> Any:
         problems.append(f"{where} does not fit {cls.__name__} ({'; '.join(found)}).")
     hints = get_type_hints(cls, include_extras=True)
     values = {
-        name: _value(hints[name], data[name], f"{where}.{name}", problems)
+        name: _parsed_value(hints[name], data[name], f"{where}.{name}", problems)
         for name in data
         if name in names
     }
@@ -378,7 +378,7 @@ def _record(cls: type, data: Any, where: str, problems: list[str]) -> Any:
         return None
 
 
-def _first(texts: list[str]) -> list[str]:
+def _shortened(texts: list[str]) -> list[str]:
     """Return the first texts, and the number of the others: a file may have any number of entries."""
     others = len(texts) - _MOST_NAMED
     if others <= 0:
@@ -386,7 +386,7 @@ def _first(texts: list[str]) -> list[str]:
     return [*texts[:_MOST_NAMED], f"and {others} more"]
 
 
-def _value(hint: Any, value: Any, where: str, problems: list[str]) -> Any:
+def _parsed_value(hint: Any, value: Any, where: str, problems: list[str]) -> Any:
     """Convert a value to the type of a field, and append what is wrong with it to the problems."""
 
     def wrong(expected: str) -> None:
@@ -395,21 +395,21 @@ def _value(hint: Any, value: Any, where: str, problems: list[str]) -> Any:
     origin = get_origin(hint)
     arguments = get_args(hint)
     if is_dataclass(hint):
-        return _record(cast(type, hint), value, where, problems)
+        return _parsed_record(cast(type, hint), value, where, problems)
     if hint is Any:
         return value
     if origin is Annotated:
         count = len(problems)
-        converted = _value(arguments[0], value, where, problems)
+        converted = _parsed_value(arguments[0], value, where, problems)
         if len(problems) == count:
-            for rule in _broken(arguments[1:], converted):
+            for rule in _broken_rules(arguments[1:], converted):
                 wrong(rule.expected)
         return converted
     if _is_union(hint):
         if value is None:
             return None
         kind = next(argument for argument in arguments if argument is not types.NoneType)
-        return _value(kind, value, where, problems)
+        return _parsed_value(kind, value, where, problems)
     if origin is tuple:
         if not isinstance(value, list | tuple):
             return wrong("a list")
@@ -420,13 +420,13 @@ def _value(hint: Any, value: Any, where: str, problems: list[str]) -> Any:
             problems.append(f"{where} has {len(value)} entries, expected {len(kinds)}.")
             return None
         return tuple(
-            _value(kind, value[i], f"{where}[{i}]", problems) for i, kind in enumerate(kinds)
+            _parsed_value(kind, value[i], f"{where}[{i}]", problems) for i, kind in enumerate(kinds)
         )
     if origin is dict:
         if not isinstance(value, dict):
             return wrong("an object")
         return {
-            name: _value(arguments[1], item, f"{where}.{name}", problems)
+            name: _parsed_value(arguments[1], item, f"{where}.{name}", problems)
             for name, item in value.items()
         }
     if origin is Literal:

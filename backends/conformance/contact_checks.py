@@ -206,7 +206,7 @@ def sliding_distance(bench: Bench) -> Measured:
     start = bench.initial(scene, object_index)
     start = replace_fields(start, object_linvel=speed[:, None] * direction)
     with bench.other(scene, object_index) as worlds:
-        worlds.set_parameter("friction", _pairs(mu))
+        worlds.set_parameter("friction", _same_for_all_pairs(mu))
         end = worlds.advance(start, round(1.0 / scene.timestep))
     way = ((end.object_pos - start.object_pos) * direction).sum(-1)
     off = (way / _DISTANCE - 1.0).view(len(_CASES), len(shapes))
@@ -225,7 +225,7 @@ def slope(bench: Bench) -> Measured:
     quarter = round(0.25 / scene.timestep)
     half = round(0.5 / scene.timestep)
     with bench.other(scene, object_index) as worlds:
-        worlds.set_parameter("friction", _pairs(mu))
+        worlds.set_parameter("friction", _same_for_all_pairs(mu))
         worlds.advance(bench.initial(scene, object_index), quarter)
         worlds.push(force, torch.zeros(3))
         worlds.step(quarter)
@@ -248,7 +248,7 @@ def torsional_friction(bench: Bench) -> Measured:
 
     I domega/dt = -t m g, with t the torsional friction, a length.
     """
-    friction = _pairs(torch.tensor([0.3, 1.0]))
+    friction = _same_for_all_pairs(torch.tensor([0.3, 1.0]))
     # The time is long, so that the variations of an unsteady contact average out.
     lost = _spin_lost(bench, 2, 0.8, lambda worlds: worlds.set_parameter("friction", friction))
     return {"spin lost": lost - 1.0}
@@ -298,6 +298,6 @@ def _cases(bench: Bench, each: int) -> tuple[Tensor, Tensor]:
     return mu, direction
 
 
-def _pairs(mu: Tensor) -> Tensor:
+def _same_for_all_pairs(mu: Tensor) -> Tensor:
     """[N, 3] the same friction [N] for all pairs; only the table is touched."""
     return mu[:, None].expand(-1, 3)

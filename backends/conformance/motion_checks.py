@@ -112,13 +112,13 @@ def object_wrench(bench: Bench) -> Measured:
     arm = quat_rotate(state.object_quat, com)
     com_velocity = state.object_linvel + torch.linalg.cross(state.object_angvel, arm)
     return {
-        "velocity of the centre of mass": _share(com_velocity, gained),
-        "angular velocity": _share(state.object_angvel, omega),
+        "velocity of the centre of mass": _relative_difference(com_velocity, gained),
+        "angular velocity": _relative_difference(state.object_angvel, omega),
         "push after the state was set": after.object_linvel[:, :2],
     }
 
 
-def _share(found: Tensor, expected: Tensor) -> Tensor:
+def _relative_difference(found: Tensor, expected: Tensor) -> Tensor:
     """[N] largest difference of each row as a share of the expected row's largest number."""
     return (found - expected).abs().amax(dim=1) / expected.abs().amax(dim=1)
 

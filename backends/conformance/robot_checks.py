@@ -64,14 +64,14 @@ def joint_tracking(bench: Bench) -> Measured:
 def effort_limit(bench: Bench) -> Measured:
     """Step every joint with an effort limit of 30 % of what its drive asks for; compare with the reference engine."""
     scene = bench.free_scene
-    _, way = _alone(bench)
+    _, way = _each_joint_alone(bench)
     asked = 0.3 * drive_values(scene.robot, "kp") * way.abs().numpy()
     weak = _with_drives(scene, effort=np.minimum(drive_values(scene.robot, "effort"), asked))
     step = torch.ones(round(_DURATION / scene.control_dt))
     return _against_reference(bench, weak, {"weak step": step})
 
 
-def _alone(bench: Bench) -> tuple[State, Tensor]:
+def _each_joint_alone(bench: Bench) -> tuple[State, Tensor]:
     """[J] worlds: in world i joint i has room for its way on both sides, the others are at home; and each way [J]."""
     slides = torch.tensor(prismatic_joints(bench.scene.robot))
     lower = bench.kinematics.lower
@@ -88,7 +88,7 @@ def _against_reference(bench: Bench, scene: SceneSpec, signals: dict[str, Tensor
 
     A slide's path counts in proportion to its way, as if that were 0.2 rad.
     """
-    start, way = _alone(bench)
+    start, way = _each_joint_alone(bench)
     object_index = [0] * len(way)
 
     def paths(worlds: Worlds) -> list[Tensor]:
@@ -154,7 +154,7 @@ def drive_scale(bench: Bench) -> Measured:
     scene = bench.free_scene
     scales = torch.tensor(_DRIVE_SCALES)
     object_index = [0] * len(scales)
-    _, way = _alone(bench)
+    _, way = _each_joint_alone(bench)
     start = bench.initial(scene, object_index)
     limits = bench.kinematics
     target = (start.joint_pos + way).clamp(limits.lower.float(), limits.upper.float())
@@ -192,7 +192,7 @@ def joint_limits(bench: Bench) -> Measured:
     """Send every joint beyond its limits: it must come to rest there."""
     scene = bench.free_scene
     names = scene.robot.joint_names
-    start, way = _alone(bench)
+    start, way = _each_joint_alone(bench)
     errors = {}
     with bench.other(scene, [0] * len(way)) as worlds:
         for name, side in (("upper", 1.0), ("lower", -1.0)):

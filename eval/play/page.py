@@ -105,7 +105,7 @@ def play(
 class Page(WebPage):
     """A page at :attr:`url` until :meth:`close`.
 
-    The session is used by :meth:`serve` alone. Visitors' wishes wait in a queue until the next control step.
+    The session is used by :meth:`serve` alone. What visitors do waits in a queue until the next control step.
     """
 
     def __init__(self, session: Session, *, host: str = "127.0.0.1", port: int = 8080) -> None:
@@ -121,7 +121,7 @@ class Page(WebPage):
         """
         self.session = session
         super().__init__(host, port, "xreset play")
-        self._wishes: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self._queue: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._paused = False
         self._factor = 1.0
         """How many seconds are played in a second."""
@@ -137,8 +137,8 @@ class Page(WebPage):
         camera = self._server.initial_camera
         camera.position = NEAR * np.subtract(camera.position, LOOK_AT) + LOOK_AT
         camera.look_at = LOOK_AT
-        self._server.on_client_connect(self._welcome)
-        self._server.on_client_disconnect(self._part)
+        self._server.on_client_connect(self._on_connect)
+        self._server.on_client_disconnect(self._on_disconnect)
         self._draw()
 
     def serve(self) -> None:
@@ -147,8 +147,8 @@ class Page(WebPage):
             self.tick()
 
     def tick(self) -> None:
-        """Fulfil wishes, take a control step if one is due, and wait for the next one."""
-        self._fulfil()
+        """Do what visitors have asked for, take a control step if one is due, and wait for the next one."""
+        self._run_queue()
         now = time.monotonic()
         watched = bool(self._server.get_clients())
         if self._paused or not watched:
@@ -169,30 +169,30 @@ class Page(WebPage):
         self._films.shutdown(wait=False, cancel_futures=True)
         super().close()
 
-    def _wish(self, action: Callable[..., Any], *arguments: Any) -> None:
-        self._wishes.put(lambda: action(*arguments))
+    def _enqueue(self, action: Callable[..., Any], *arguments: Any) -> None:
+        self._queue.put(lambda: action(*arguments))
 
-    def _fulfil(self) -> None:
+    def _run_queue(self) -> None:
         while True:
             try:
-                wish = self._wishes.get_nowait()
+                action = self._queue.get_nowait()
             except Empty:
                 return
             try:
-                wish()
+                action()
             except XResetError as error:
-                self._tell("That does not work", str(error))
+                self._notify("That does not work", str(error))
 
     def _step(self) -> None:
         try:
             self.session.step()
         except XResetError as error:
-            self._tell("Restarted", str(error))
+            self._notify("Restarted", str(error))
         if self._retry.value and self.session.dropped:
-            self._tell("Dropped", "The robot tries again from home.")
+            self._notify("Dropped", "The robot tries again from home.")
             self.session.begin(keep_goal=True)
 
-    def _tell(self, title: str, text: str) -> None:
+    def _notify(self, title: str, text: str) -> None:
         for client in self._server.get_clients().values():
             client.add_notification(title, text, auto_close_seconds=8.0)
 
@@ -213,16 +213,16 @@ class Page(WebPage):
 
     # Visitors ---------------------------------------------------------------------------------------------------------
 
-    def _welcome(self, client: Any) -> None:
+    def _on_connect(self, client: Any) -> None:
         if client.camera.aspect < 1.0:  # a phone: its controls cover the lower part
             below = LOOK_AT - (0.0, 0.0, 0.3)
             client.camera.position = below + 1.4 * (self._server.initial_camera.position - LOOK_AT)
             client.camera.look_at = below
 
-    def _part(self, client: Any) -> None:
+    def _on_disconnect(self, client: Any) -> None:
         if self._holder == client.client_id:
             self._turning = False
-            self._wish(self.session.release)
+            self._enqueue(self.session.release)
 
     # The scene --------------------------------------------------------------------------------------------------------
 
@@ -282,24 +282,24 @@ class Page(WebPage):
         async def pull(event: Any) -> None:
             if event.phase == "start":
                 self._holder = event.client_id
-                self._wish(self.session.grab, link, event.start_position)
-            self._wish(self.session.pull, event.end_position)
+                self._enqueue(self.session.grab, link, event.start_position)
+            self._enqueue(self.session.pull, event.end_position)
             if event.phase == "end":
-                self._wish(self.session.release)
+                self._enqueue(self.session.release)
 
         mesh.on_drag("left")(pull)
 
     async def _drag(self, event: Any) -> None:
         if event.phase == "start":
             self._grasped = self._goal.position - np.array(event.start_position)
-        self._wish(
+        self._enqueue(
             self._move_goal, np.array(event.end_position) + self._grasped, self._goal.wxyz.copy()
         )
 
     async def _turn(self, event: Any) -> None:
         self._holder = event.client_id
         self._turning = event.phase != "end"
-        self._wish(self._move_goal, self._goal.position.copy(), event.target.wxyz.copy())
+        self._enqueue(self._move_goal, self._goal.position.copy(), event.target.wxyz.copy())
 
     def _move_goal(self, pos: np.ndarray, quat: np.ndarray) -> None:
         self._hint.visible = False
@@ -337,10 +337,10 @@ class Page(WebPage):
         gui.add_markdown(HELP)
         self._text = gui.add_markdown("")
         self._run = gui.add_button_group("time", ("Pause", "Step", "Restart"))
-        self._run.on_click(lambda _: self._wish(self._control, self._run.value))
+        self._run.on_click(lambda _: self._enqueue(self._press, self._run.value))
         self._speed = gui.add_slider("speed", 0.1, 1.0, 0.1, 1.0)
         self._take = gui.add_button("Take the object away")
-        self._take.on_click(lambda _: self._wish(self._take_or_put))
+        self._take.on_click(lambda _: self._enqueue(self._toggle_object))
         self._retry = gui.add_checkbox(
             "try again", True, hint="Begin again from home once the object was dropped."
         )
@@ -365,12 +365,12 @@ class Page(WebPage):
         with gui.add_folder("save", expand_by_default=False):
             self._seconds = gui.add_slider("seconds", 2, 60, 1, 10)
             film = gui.add_button("Film (mp4)")
-            film.on_click(lambda event: self._wish(self._save_film, event.client))
+            film.on_click(lambda event: self._enqueue(self._save_film, event.client))
             trace = gui.add_button("Numbers (npz)")
-            trace.on_click(lambda event: self._wish(self._save_trace, event.client))
+            trace.on_click(lambda event: self._enqueue(self._save_trace, event.client))
         self._show_choices()
         for control in (self._object, self._engine, self._policy, self._robot_name):
-            control.on_update(lambda _: self._wish(self._choose))
+            control.on_update(lambda _: self._enqueue(self._open_chosen))
 
     def _show_choices(self) -> None:
         """Let the controls say what the session is."""
@@ -385,7 +385,7 @@ class Page(WebPage):
         if self._input.options != inputs:
             self._input.options = inputs
 
-    def _control(self, button: str) -> None:
+    def _press(self, button: str) -> None:
         if button == "Restart":
             self.session.begin()
         else:
@@ -394,13 +394,13 @@ class Page(WebPage):
         if button == "Step":
             self._step()
 
-    def _take_or_put(self) -> None:
+    def _toggle_object(self) -> None:
         if self.session.away or self.session.lost:
             self.session.begin(keep_goal=True)
         else:
             self.session.take_away()
 
-    def _choose(self) -> None:
+    def _open_chosen(self) -> None:
         """Open what the controls say, unless it is open already."""
         session = self.session
         robot = self._robot_name.value

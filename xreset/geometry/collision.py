@@ -150,14 +150,14 @@ class SelfCollision:
                 return [link in links for links in moved]
 
             counted = [(a, b) for a, b in counted if movers(a) != movers(b)]
-        self._count(counted)
+        self._measure_only(counted)
         home = kinematics.link_poses(kinematics.clamp(kinematics.home))
         overlapping = self.near(home[None].numpy(), 0.0)
         self.overlapping_at_home = [pair for pair in counted if (0, *pair) in overlapping]
         """Pairs of links that do not count because they overlap at home."""
-        self._count([pair for pair in counted if pair not in self.overlapping_at_home])
+        self._measure_only([pair for pair in counted if pair not in self.overlapping_at_home])
 
-    def _count(self, link_pairs: list[tuple[str, str]]) -> None:
+    def _measure_only(self, link_pairs: list[tuple[str, str]]) -> None:
         """Measure only these pairs of links from now on."""
         self.link_pairs = link_pairs
         """Pairs of links that count."""

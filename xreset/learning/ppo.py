@@ -121,7 +121,7 @@ class SequencePpo(PPO):
                     self._worlds.copy_(worlds)
                 else:
                     self._worlds = worlds
-                self._graphs.run(self._learn)
+                self._graphs.run(self._learn_from_minibatch)
         observations = storage.observations.flatten(0, 1)
         self.actor.update_normalization(observations)
         self.critic.update_normalization(observations)
@@ -130,7 +130,7 @@ class SequencePpo(PPO):
         self.learning_rate = float(self._rate)
         return dict(zip(("value", "surrogate", "entropy", "bounds"), means, strict=True))
 
-    def _learn(self) -> None:
+    def _learn_from_minibatch(self) -> None:
         """Take one step of the optimizer on the minibatch of ``_worlds``, and add its losses to ``_sums``."""
         storage = self.storage
         worlds = self._worlds
@@ -145,7 +145,7 @@ class SequencePpo(PPO):
         values = self.critic(observations, masks=first, hidden_state=critic_state)
         entropy = self.actor.output_entropy.mean()
         if self.schedule == "adaptive":
-            self._adapt(tuple(p[:, worlds] for p in storage.distribution_params or ()))
+            self._adapt_rate(tuple(p[:, worlds] for p in storage.distribution_params or ()))
             self._use_rate()
         advantages = storage.advantages[:, worlds, 0]
         ratio = torch.exp(log_prob - storage.actions_log_prob[:, worlds, 0])
@@ -178,7 +178,7 @@ class SequencePpo(PPO):
         return torch.max(error.square(), ((near - returns) / unit).square()).mean()
 
     @torch.no_grad()
-    def _adapt(self, old_params: tuple[Tensor, ...]) -> None:
+    def _adapt_rate(self, old_params: tuple[Tensor, ...]) -> None:
         """Divide (multiply) the rate by 1.5 where the policy moved more than twice (less than half) the desired KL."""
         kl = self.actor.get_kl_divergence(old_params, self.actor.output_distribution_params).mean()
         if self.is_multi_gpu:

@@ -129,7 +129,7 @@ def train(
         raise RunError(
             f"The engine {engine!r} does not run on {device!r}. Omit --device, or choose another --backend."
         )
-    data = _data_of(bank, goals)
+    data = _bank_or_goals(bank, goals)
     load = partial(load_inputs, robot=robot, objects=objects, accept=("bank", "goals"))
     inputs = load(data)
     if isinstance(inputs.data, GoalSet):
@@ -174,7 +174,7 @@ def train(
     return out
 
 
-def _data_of(
+def _bank_or_goals(
     bank: str | Path | ResetBank | None, goals: str | Path | GoalSet | None
 ) -> str | Path | ResetBank:
     """Return a bank or a goal set, as they were given, or a bank with the goals of both."""
@@ -358,7 +358,7 @@ def resume(
             f"{info.resets} is not the file that this run was started with. Put it back, or start a new run."
         )
     check_contract(str(out), info.contract, inputs.robot, info.config.task)
-    with _alone(out):
+    with _claimed(out):
         _train_cleanly(out, info, inputs, minutes=minutes, resumed=True, wandb=wandb)
     return out
 
@@ -370,7 +370,7 @@ _NO_MEMORY = re.compile("Failed to allocate|out of memory")
 
 
 @contextmanager
-def _alone(out: Path) -> Iterator[None]:
+def _claimed(out: Path) -> Iterator[None]:
     """Let no other training write the run folder."""
     with ExitStack() as stack:
         if Processes.of_environment().is_main:
@@ -381,10 +381,10 @@ def _alone(out: Path) -> Iterator[None]:
 
 @contextmanager
 def _new_run(out: Path) -> Iterator[None]:
-    """Like :func:`_alone`; leave nothing new in the folder if the run does not get its ``run.json``."""
+    """Like :func:`_claimed`; leave nothing new in the folder if the run does not get its ``run.json``."""
     written = (out / TEACHER, out / "goals.npz", out / "resets.npz", out / "checkpoints", out)
     new = [path for path in written if not path.exists()]
-    with _alone(out):
+    with _claimed(out):
         try:
             yield
         finally:

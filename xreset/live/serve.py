@@ -56,7 +56,7 @@ class PolicyServer:
         self._log = logging.getLogger("xreset")
         try:
             self._server: Server = serve(
-                self._talk,
+                self._answer_client,
                 host,
                 port,
                 origins=[None],  # no page in a browser
@@ -82,7 +82,7 @@ class PolicyServer:
         for client in tuple(self._clients):
             client.close()
 
-    def _talk(self, client: ServerConnection) -> None:
+    def _answer_client(self, client: ServerConnection) -> None:
         """Answer a client until it disconnects."""
         who = "{}:{}".format(*client.remote_address[:2])
         try:

@@ -179,7 +179,7 @@ def judge(
             for name, mine in groups.items():
                 best = mine[verdicts[mine, 1:].sum(axis=1).argmax()]
                 later = table[best, 1 + len(PHASES) :].reshape(len(PHASES), -1)
-                shots[name] = np.vstack((_moment(start[[best]]).numpy(), later))
+                shots[name] = np.vstack((_shot(start[[best]]).numpy(), later))
     without = sorted({*bank.object_names} - set(names))
     return Judgement(robot=robot.name, rows=tuple(rows), without=tuple(without), shots=shots)
 
@@ -237,8 +237,9 @@ def _tightest(fingers: Fingers, bank: ResetBank, count: int, reach: float) -> li
     return sorted(chosen)
 
 
-def _moment(state: State) -> Tensor:
-    """[N, J + 7] joint positions, and position and orientation of the object."""
+def _shot(state: State) -> Tensor:
+    """[N, J + 7] a row of :attr:`Judgement.shots` for each world: joint positions, then position and orientation of the
+    object."""
     return torch.cat((state.joint_pos, state.object_pos, state.object_quat), dim=1)
 
 
@@ -261,7 +262,7 @@ def _play(kinematics: Kinematics, backend: Backend, start: State) -> Tensor:
     still = torch.stack((joints, joints))
     kept = torch.ones_like(able)
     passed = []
-    moments = []
+    shots = []
     for path, error in ((still, torch.zeros_like(up_error)), (up, up_error), (turn, turn_error)):
         _move(backend, start.joint_target, path, kinematics.robot.arm_indices)
         now = backend.state().to("cpu").map(Tensor.double)
@@ -272,10 +273,10 @@ def _play(kinematics: Kinematics, backend: Backend, start: State) -> Tensor:
         near = ((now_pos - pos).norm(dim=-1) < DISTANCE) & (quat_angle(now_quat, quat) < ANGLE)
         kept = kept & near & (error < 1)
         passed.append(kept)
-        moments.append(_moment(now))
+        shots.append(_shot(now))
     health = backend.health()
     sound = ~(health.nonfinite | health.overflow).cpu()
-    return torch.cat((able[:, None], torch.stack(passed, dim=1) & sound[:, None], *moments), dim=1)
+    return torch.cat((able[:, None], torch.stack(passed, dim=1) & sound[:, None], *shots), dim=1)
 
 
 def arm_path(
@@ -340,16 +341,16 @@ def judge_picture(
     with the share of states that pass the phase in each engine."""
     by_name = {spec.name: spec for spec in objects}
     pictures = []
-    for name, moments in judgement.shots.items():
+    for name, shots in judgement.shots.items():
         rows = [row for row in judgement.rows if row.object_name == name]
         renderer = Renderer(
             SceneSpec(robot=robot, objects=(by_name[name],)), size=_TILE, smooth=True
         )
         tiles = []
-        for phase, moment in zip(("start", *PHASES), moments, strict=True):
-            target = moment[-7:-4]
+        for phase, shot in zip(("start", *PHASES), shots, strict=True):
+            target = shot[-7:-4]
             camera = Camera(eye=tuple(target + np.array((0.42, -0.42, 0.22))), target=tuple(target))
-            tile = renderer.draw(moment[:-7], (target, moment[-4:]), camera=camera)
+            tile = renderer.draw(shot[:-7], (target, shot[-4:]), camera=camera)
             caption = [name]
             if phase != "start":
                 caption = [

@@ -18,7 +18,7 @@ def is_unit(quat: Array) -> Array:
     return np.abs(np.linalg.norm(quat, axis=-1) - 1.0) <= UNIT_TOLERANCE
 
 
-def _fused(a: Array, b: Array, c: Array) -> Array:
+def _fused_multiply_add(a: Array, b: Array, c: Array) -> Array:
     """Return a * b + c in float32, rounded once."""
     return (a.astype(np.float64) * b + c).astype(np.float32)
 
@@ -26,7 +26,7 @@ def _fused(a: Array, b: Array, c: Array) -> Array:
 def _cross(a: Array, b: Array) -> Array:
     parts = []
     for i, j in ((1, 2), (2, 0), (0, 1)):
-        parts.append(_fused(a[..., i], b[..., j], -(a[..., j] * b[..., i])))
+        parts.append(_fused_multiply_add(a[..., i], b[..., j], -(a[..., j] * b[..., i])))
     return np.stack(parts, axis=-1)
 
 
@@ -35,7 +35,7 @@ def rotate(quat: Array, vector: Array) -> Array:
     w = quat[..., :1]
     u, v = np.broadcast_arrays(quat[..., 1:], vector)
     t = np.float32(2.0) * _cross(u, v)
-    return _fused(w, t, v) + _cross(u, t)
+    return _fused_multiply_add(w, t, v) + _cross(u, t)
 
 
 def multiply(a: Array, b: Array) -> Array:
@@ -44,4 +44,7 @@ def multiply(a: Array, b: Array) -> Array:
     v = b[:, 1:]
     products = a * b
     w = products[:, :1] - ((products[:, 1] + products[:, 2]) + products[:, 3])[:, None]
-    return np.concatenate((w, _fused(b[:, :1], u, _fused(a[:, :1], v, _cross(u, v)))), axis=1)
+    return np.concatenate(
+        (w, _fused_multiply_add(b[:, :1], u, _fused_multiply_add(a[:, :1], v, _cross(u, v)))),
+        axis=1,
+    )

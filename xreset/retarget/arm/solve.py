@@ -81,13 +81,13 @@ def track(
     joints, worth = best_path(problem, forwards)
     failing = (problem.reasons(joints) > REASONS.index("hand error")).any(dim=1).nonzero()[:, 0]
     if len(failing):
-        joints[failing] = _rescued(
+        joints[failing] = _better_paths(
             problem[failing], forwards[failing], joints[failing], worth[failing]
         )
     return joints, problem.measures(joints)
 
 
-def _rescued(problem: ArmProblem, paths: Paths, joints: Tensor, worth: Tensor) -> Tensor:
+def _better_paths(problem: ArmProblem, paths: Paths, joints: Tensor, worth: Tensor) -> Tensor:
     """[S, T, n] better paths than ``joints`` for sequences with failing frames; ``joints`` where none is found.
 
     Args:
@@ -126,7 +126,7 @@ def follow(problem: ArmProblem, start: Tensor) -> Tensor:
 
 def branches(problem: ArmProblem) -> Paths:
     """Return the paths from distinct solutions of the first frame."""
-    starts = _first_frames(problem)  # [S, K, n]
+    starts = _first_frame_solutions(problem)  # [S, K, n]
     paths = follow(problem.repeated(starts.shape[1]), starts.flatten(0, 1))
     return judged_paths(problem, paths.unflatten(0, starts.shape[:2]))
 
@@ -159,7 +159,7 @@ def repaired(problem: ArmProblem, known: Paths, missed: Tensor) -> Tensor:
     at a limit in these frames, on the wrong side of the arm's null space.
     """
     config = problem.config
-    owner, paths = _reseeded(problem, missed)
+    owner, paths = _paths_from_missed_frames(problem, missed)
     count = torch.bincount(owner, minlength=len(missed))
     column = torch.arange(len(owner)) - (count.cumsum(0) - count)[owner]
     # Sequences with fewer new paths than others repeat a known one.
@@ -181,7 +181,7 @@ def repaired(problem: ArmProblem, known: Paths, missed: Tensor) -> Tensor:
     )
 
 
-def _reseeded(problem: ArmProblem, missed: Tensor) -> tuple[Tensor, Tensor]:
+def _paths_from_missed_frames(problem: ArmProblem, missed: Tensor) -> tuple[Tensor, Tensor]:
     """Follow paths both ways from distinct valid solutions of some missed frames.
 
     Args:
@@ -193,7 +193,7 @@ def _reseeded(problem: ArmProblem, missed: Tensor) -> tuple[Tensor, Tensor]:
     """
     owner, seed = spread_over(missed, problem.config.reseeds)
     alone = problem[owner[:, None], seed[:, None]]  # [C, 1, ...]
-    starts = _first_frames(alone)  # [C, K, n]
+    starts = _first_frame_solutions(alone)  # [C, K, n]
     count = starts.shape[1]
     is_new = torch.ones(starts.shape[:2], dtype=torch.bool)
     # frames with fewer solutions repeat the last one
@@ -218,7 +218,7 @@ def _reseeded(problem: ArmProblem, missed: Tensor) -> tuple[Tensor, Tensor]:
     return owner, paths
 
 
-def _first_frames(problem: ArmProblem) -> Tensor:
+def _first_frame_solutions(problem: ArmProblem) -> Tensor:
     """[S, K, n] distinct solutions of the first frame: the solution from home, then the best others. If there are fewer
     than K, the last one is repeated."""
     config = problem.config
@@ -235,7 +235,7 @@ def _first_frames(problem: ArmProblem) -> Tensor:
     chosen = []
     for solutions, ranking in zip(solved, order, strict=True):
         from_home = solutions[0]
-        chosen.append(_distinct(from_home, solutions[ranking], number))
+        chosen.append(_distinct_solutions(from_home, solutions[ranking], number))
     return torch.stack(chosen) if chosen else home.new_zeros(0, number, len(home))
 
 
@@ -253,7 +253,7 @@ def _random_starts(model: ArmModel, config: ArmConfig) -> Tensor:
     return home + spread * torch.where(spread < 0, home - lower, upper - home)
 
 
-def _distinct(first: Tensor, candidates: Tensor, number: int) -> Tensor:
+def _distinct_solutions(first: Tensor, candidates: Tensor, number: int) -> Tensor:
     """[number, n] the first solution [n], then those of the candidates [..., n] that differ from all before. If there
     are fewer, the last one is repeated."""
     kept = [first]

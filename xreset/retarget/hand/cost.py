@@ -48,7 +48,7 @@ def system(
     sequences, frames, joints = state.joints.shape
     rows = torch.arange(sequences, device=state.joints.device)
     size = max(1, _FRAMES_PER_CHUNK[state.joints.device.type] // frames)
-    chunks = [_frames(model, targets[part], config, state[part]) for part in rows.split(size)]
+    chunks = [_frame_costs(model, targets[part], config, state[part]) for part in rows.split(size)]
     single = Quadratic.cat(chunks).map(lambda x: x.unflatten(0, (sequences, frames)))
 
     turn = quat_to_axis_angle(
@@ -73,7 +73,7 @@ def system(
     )
 
 
-def _frames(
+def _frame_costs(
     model: HandModel, targets: HandTargets, config: HandConfig, state: HandState
 ) -> Quadratic:
     """Compute the cost [B] of single frames and its approximation."""

@@ -1,4 +1,4 @@
-"""Fuzzes every reader and command for some minutes, as tests/fuzzing.py and tests/fuzzing_commands.py describe."""
+"""Fuzzes every reader and command for some minutes, as tests/fuzzing.py, tests/damage.py and tests/fuzzing_commands.py describe."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ sys.path.insert(0, os.getcwd())
 
 from hypothesis import HealthCheck, Phase, given, seed, settings
 
-from tests.fuzzing import Reader, damages, outcome, readers
+from tests.damage import damages
+from tests.fuzzing import Reader, outcome, readers
 from tests.fuzzing_commands import commands, draw, outcome_of_command
 
 GIGABYTES = 6

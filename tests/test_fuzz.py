@@ -9,7 +9,8 @@ if not find_spec("hypothesis"):
 
 from hypothesis import HealthCheck, given, settings
 
-from tests.fuzzing import damages, outcome, readers
+from tests.damage import damages
+from tests.fuzzing import outcome, readers
 from tests.fuzzing_commands import outcome_of_command
 
 EXAMPLES = 40

@@ -152,7 +152,7 @@ class ContractTest(InFolder):
             ("target", [float("nan")] * 5, "target of .* is nan"),
             ("goal_pos", [500.0, 300.0, 200.0], "expected at most 10 m. Are these millimetres"),
             ("goal_pos", [float("nan")] * 3, "expected at most 10 m"),
-            ("object_points", 1000 * np.array(brick["points"]), "beyond 10 m. Are these millimetres"),
+            ("object_points", 1000 * np.array(brick["points"]), "The object .* at most 10 m. Are these millimetres"),
         ):  # fmt: skip
             with self.subTest(name), self.assertRaisesRegex(LiveError, words):
                 controller.begin(**good | {name: value})

@@ -136,9 +136,7 @@ class Controller:
         shape = np.shape(object_points)
         if shape[-2:] != (expected, 3):
             raise LiveError(f"The object has points of shape {shape}, expected ({expected}, 3).")
-        if not np.abs(object_points).max() <= _REACH:
-            raise LiveError(f"The object has points beyond {_REACH:g} m. Are these millimetres?")
-        self._points = self._of_each(object_points, expected, 3)
+        self._points = self._positions("The object", object_points, expected, 3)
         self._center: Array | None = None
         if self.contract["object_frame"] == "center":
             if center is None:
@@ -158,12 +156,7 @@ class Controller:
         goal_quat = self._of_each(quat, 4)
         if not is_unit(goal_quat).all():
             raise LiveError(f"The goal has {quat}, expected a unit quaternion (w, x, y, z).")
-        goal_pos = self._of_each(pos, 3)
-        if not np.abs(goal_pos).max() <= _REACH:
-            raise LiveError(
-                f"The goal has {pos}, expected at most {_REACH:g} m. Are these millimetres?"
-            )
-        self._goal_pos = self._origin(goal_pos, goal_quat)
+        self._goal_pos = self._origin(self._positions("The goal", pos, 3), goal_quat)
         self._goal_quat = goal_quat
 
     def _must_have_begun(self) -> None:
@@ -177,6 +170,16 @@ class Controller:
             return np.broadcast_to(array, (len(self.target), *shape))
         except ValueError:
             raise LiveError(f"Found numbers of shape {array.shape}, expected {shape}.") from None
+
+    def _positions(self, what: str, values: Array, *shape: int) -> Array:
+        """Return positions [m] of every robot, as :meth:`_of_each`; ``LiveError`` if one is far away or not finite."""
+        positions = self._of_each(values, *shape)
+        farthest = np.abs(positions).max()
+        if not farthest <= _REACH:
+            raise LiveError(
+                f"{what} has the coordinate {farthest:g}, expected at most {_REACH:g} m. Are these millimetres?"
+            )
+        return positions
 
     def _origin(self, pos: Array, quat: Array) -> Array:
         """[N, 3] where the policy's origin of the object is, for poses [N, 3], [N, 4] of the object's frame."""

@@ -349,17 +349,19 @@ def write_record(
     record: Any,
     *,
     check: Callable[[Arrays], str | None],
+    error: type[XResetError] = XResetError,
     **provenance: Any,
 ) -> None:
     """Write a dataclass of :func:`schema_of`'s kind; fields that are None are left out. See :func:`write_npz` for
     ``provenance``.
 
     Raises:
-        XResetError: it is of another class, or :func:`read_record` with the same ``check`` would refuse the file.
+        XResetError: it is of another class, or, as an ``error``, :func:`read_record` with the same ``check`` would
+            refuse the file.
     """
     arrays = arrays_of(cls, record)
     if problem := record_problem(cls, arrays, check):
-        raise XResetError(f"{path} was not written, because it could not be read: {problem}")
+        raise error(f"{path} was not written, because it could not be read: {problem}")
     write_npz(path, schema_name, arrays, **provenance)
 
 

@@ -30,7 +30,7 @@ from xreset.records import (
     offsets_problem,
     read_record,
     record_problem,
-    write_npz,
+    write_record,
 )
 from xreset.spec import ObjectSpec
 from xreset.text import Brief, shown
@@ -321,7 +321,8 @@ def merge_demos(parts: Sequence[Demos]) -> Demos:
         fps=parts[0].fps,
         **joined,
     )
-    _checked_arrays(demos)
+    if problem := record_problem(Demos, arrays_of(Demos, demos), _problem):
+        raise DemoError(f"The demonstrations cannot be used: {problem}")
     return demos
 
 
@@ -425,7 +426,16 @@ def write_demos(
     Raises:
         DemoError: the demonstrations hold a value that the archive may not hold.
     """
-    write_npz(path, SCHEMA_NAME, _checked_arrays(demos), config=config, inputs=inputs)
+    write_record(
+        Demos,
+        path,
+        SCHEMA_NAME,
+        demos,
+        check=_problem,
+        error=DemoError,
+        config=config,
+        inputs=inputs,
+    )
 
 
 def demo_objects(demos: Demos, folder: Path | None = None) -> dict[str, ObjectSpec]:
@@ -459,13 +469,6 @@ def sequences_problem(arrays: Arrays) -> str | None:
         if side not in SIDES:
             return f"sequence {name} has hand_side {shown(side)}, expected 'right' or 'left'."
     return None
-
-
-def _checked_arrays(demos: Demos) -> Arrays:
-    arrays = arrays_of(Demos, demos)
-    if problem := record_problem(Demos, arrays, _problem):
-        raise DemoError(f"The demonstrations cannot be used: {problem}")
-    return arrays
 
 
 def _problem(arrays: Arrays) -> str | None:

@@ -44,7 +44,7 @@ from xreset.backends.rigid import (
     sum_contacts,
 )
 from xreset.backends.sapien_robot import OBJECT_BIT, TABLE_BIT, SapienJoints, self_collision_bits
-from xreset.geometry.shapes import transform
+from xreset.geometry.shapes import perpendicular, transform
 from xreset.geometry.urdf import Joint
 from xreset.physics import Capability, KnownDifference, unavailable
 from xreset.spec import GRAVITY, Geometry, SceneSpec, Shape
@@ -390,9 +390,7 @@ def _rotation(quat: np.ndarray) -> np.ndarray:
 
 def _x_to(axis: np.ndarray) -> np.ndarray:
     """[3, 3] a rotation that turns x into a unit vector: joints, capsules and cylinders are along x in PhysX."""
-    other = np.eye(3)[np.abs(axis).argmin()]
-    y = np.cross(axis, other)
-    y /= np.linalg.norm(y)
+    y = perpendicular(axis)
     return np.stack([axis, y, np.cross(axis, y)], axis=1)
 
 

@@ -85,6 +85,11 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         temporary.replace(path)
 
 
+def is_occupied(folder: Path) -> bool:
+    """Return whether there is a file of this name, or a folder that is not empty."""
+    return folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+
+
 @contextmanager
 def _temporary(folder: Path, make: Callable[[Path], None]) -> Iterator[Path]:
     """Make a temporary file or folder, and remove it at the end if it is still there.

@@ -23,7 +23,7 @@ from xreset.errors import XResetError
 from xreset.eval.rollout import Engine
 from xreset.geometry.dynamics import drive_values, mass_matrix
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.shapes import hull, transformed
+from xreset.geometry.shapes import hull, perpendicular, transformed
 from xreset.geometry.urdf import joint_limits, link_meshes
 from xreset.physics import State
 from xreset.spec import GRAVITY, ObjectSpec, SceneSpec, Shape
@@ -323,7 +323,7 @@ def _reachable(scene: SceneSpec, *, tip: bool) -> tuple[np.ndarray, np.ndarray, 
             f"no {what} of {robot.name!r} at home can be reached from outside, so its friction cannot be measured."
         )
     normal = normals[best]
-    along = -_across(normal)
+    along = perpendicular(normal)
     if along[2] < 0:
         along = -along  # away from the table
     return mine[reach[:, best].argmax()], normal, along
@@ -338,15 +338,9 @@ def _directions(count: int) -> np.ndarray:
     return np.stack((r * np.cos(angle), r * np.sin(angle), z), axis=1)
 
 
-def _across(direction: np.ndarray) -> np.ndarray:
-    """[3] unit vector at right angles to a direction [3]."""
-    across = np.cross(np.eye(3)[np.abs(direction).argmin()], direction)
-    return across / np.linalg.norm(across)
-
-
 def _z_to(direction: np.ndarray) -> np.ndarray:
     """[4] rotation that turns z into a unit vector [3]."""
-    x = _across(direction)
+    x = -perpendicular(direction)
     return Rotation.from_matrix(np.stack((x, np.cross(direction, x), direction), axis=1)).as_quat(
         scalar_first=True
     )

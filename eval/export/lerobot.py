@@ -21,7 +21,7 @@ from xreset.errors import XResetError, needs
 from xreset.eval.export.recorded import RecordedEpisodes
 from xreset.eval.report.clips import draw_state, draw_view, encode_mp4, policy_cameras
 from xreset.eval.results import Trace
-from xreset.files import atomic_folder, write_json
+from xreset.files import atomic_folder, is_occupied, write_json
 from xreset.objects.catalogue import load_object
 from xreset.pictures.render import Renderer, Size
 from xreset.spec import RobotSpec, SceneSpec
@@ -73,7 +73,7 @@ def write_lerobot(
             "Films of cameras are wanted and not wanted. Leave out --no-video or --camera."
         )
     videos = (VIDEO, *(_DEPTH + name for name in cameras)) if video else ()
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    if is_occupied(folder):
         raise XResetError(f"{folder} is there already. Nothing was changed; choose another --out.")
     if video and (min(size) < 16 or size[0] % 2 or size[1] % 2):
         raise XResetError(

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from xreset.checks import frozen
 from xreset.demos.archive import Demos, levelled
 from xreset.errors import DemoError
-from xreset.geometry.shapes import turn_of
+from xreset.geometry.shapes import perpendicular, turn_of
 from xreset.spec import ObjectSpec, TableSpec
 
 _SAMPLES = 600
@@ -119,8 +119,7 @@ def _plane(
 ) -> tuple[np.ndarray, float]:
     """Return normal [3] and offset [m] of a plane through the center, across an axis, which is tilted by two angles
     [rad] and moved by a length [0.1 m]."""
-    u = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-    u /= np.linalg.norm(u)
+    u = perpendicular(axis)
     normal = axis + parameters[0] * u + parameters[1] * np.cross(axis, u)
     normal /= np.linalg.norm(normal)
     return normal, float(normal @ center + 0.1 * parameters[2])

@@ -89,6 +89,12 @@ def transformed(points: np.ndarray, T: np.ndarray) -> np.ndarray:
     return points @ T[:3, :3].T + T[:3, 3]
 
 
+def perpendicular(direction: np.ndarray) -> np.ndarray:
+    """[3] unit vector at right angles to a direction [3]."""
+    across = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
+    return across / np.linalg.norm(across)
+
+
 def box(center: ArrayLike, size: Sequence[float]) -> Shape:
     """Make an axis-aligned box of edge lengths ``size``."""
     half = tuple(float(edge) / 2 for edge in size)

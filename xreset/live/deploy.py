@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from xreset.errors import PolicyError
-from xreset.files import atomic_folder, code_version, file_hash, write_json
+from xreset.files import atomic_folder, code_version, file_hash, is_occupied, write_json
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import robot_tree
 from xreset.objects.sampling import center, surface_points
@@ -155,7 +155,7 @@ def write_deployed(policy: Path, contract: dict[str, Any], out: Path) -> None:
     Raises:
         PolicyError: the folder is not empty.
     """
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    if is_occupied(out):
         raise PolicyError(f"{out} exists already. Choose another --out, or remove it.")
     with atomic_folder(out) as folder:
         shutil.copyfile(policy, folder / files.POLICY)

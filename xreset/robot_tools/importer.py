@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from xreset.checks import frozen
 from xreset.description import DESCRIPTION, load_robot
 from xreset.errors import RobotError
-from xreset.files import atomic_folder
+from xreset.files import atomic_folder, is_occupied
 from xreset.geometry.collision import SelfCollision
 from xreset.geometry.dynamics import drive_inertia
 from xreset.geometry.kinematics import Kinematics
@@ -94,7 +94,7 @@ def import_robot(
     Raises:
         RobotError: a file cannot be read, the folder exists, or no fingers are found; the message says what to do.
     """
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    if is_occupied(out):
         raise RobotError(f"{out} is there already; give another folder, or remove it.")
     for option, values, most, unit in (
         ("--offset", offset, 1.0, "metres"),

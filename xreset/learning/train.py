@@ -170,7 +170,8 @@ def train(
             weights_hash=file_hash(start) if start else None,
             teacher=str(teacher) if teacher else None,
         )
-        _train_cleanly(out, info, inputs, minutes=minutes, resumed=False, wandb=wandb)
+        with _cleanly(out, info):
+            _train(out, info, inputs, minutes=minutes, resumed=False, wandb=wandb)
     return out
 
 
@@ -358,8 +359,8 @@ def resume(
             f"{info.resets} is not the file that this run was started with. Put it back, or start a new run."
         )
     check_contract(str(out), info.contract, inputs.robot, info.config.task)
-    with _claimed(out):
-        _train_cleanly(out, info, inputs, minutes=minutes, resumed=True, wandb=wandb)
+    with _claimed(out), _cleanly(out, info):
+        _train(out, info, inputs, minutes=minutes, resumed=True, wandb=wandb)
     return out
 
 
@@ -394,17 +395,9 @@ def _new_run(out: Path) -> Iterator[None]:
                         path.rmdir() if path.is_dir() else path.unlink()
 
 
-def _train_cleanly(
-    out: Path,
-    info: RunInfo,
-    inputs: Inputs,
-    *,
-    minutes: float,
-    resumed: bool,
-    wandb: str | None,
-) -> None:
-    """Train, say what to do if there is too little memory, and leave the process's global state as it was."""
-    processes = Processes.of_environment()
+@contextmanager
+def _cleanly(out: Path, info: RunInfo) -> Iterator[None]:
+    """Say what to do if there is too little memory, and leave the process's global state as it was."""
     if info.device == "cpu" and info.num_envs > _MANY_ON_A_CPU:
         print(
             f"With {info.num_envs:,} worlds on a CPU, an iteration takes minutes. Train on a GPU; to see that a "
@@ -416,7 +409,7 @@ def _train_cleanly(
         if not torch.distributed.is_initialized():
             stack.callback(leave)
         try:
-            _train(processes, out, info, inputs, minutes=minutes, resumed=resumed, wandb=wandb)
+            yield
         except (MemoryError, RuntimeError) as error:
             if isinstance(error, RuntimeError) and not _NO_MEMORY.search(str(error)):
                 raise
@@ -430,7 +423,6 @@ def _train_cleanly(
 
 
 def _train(
-    processes: Processes,
     out: Path,
     info: RunInfo,
     inputs: Inputs,
@@ -440,6 +432,7 @@ def _train(
     wandb: str | None,
 ) -> None:
     """Train from the newest checkpoint, from the networks of ``weights`` or from new ones, and export the policy."""
+    processes = Processes.of_environment()
     device = processes.device(info.device)
     newest = latest_checkpoint(out) if resumed and checkpoints(out) else None
     # a run that continues draws other numbers than it began with

@@ -1,6 +1,7 @@
 """A headless Chromium that tests drive through its DevTools protocol."""
 
 import base64
+import io
 import itertools
 import json
 import shutil
@@ -11,6 +12,9 @@ import urllib.request
 from importlib.util import find_spec
 from pathlib import Path
 from unittest import SkipTest
+
+import numpy as np
+from PIL import Image
 
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 _FLAGS = (
@@ -187,9 +191,10 @@ class Browser:
             mobile=phone,
         )
 
-    def screenshot(self):
-        """The page as PNG."""
-        return base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"])
+    def pixels(self):
+        """The page as a picture, [height, width, 3] integers."""
+        png = base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"])
+        return np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
 
 
 def wait_until(condition, what, seconds=20.0):

@@ -6,7 +6,6 @@ from contextlib import redirect_stdout
 from importlib.util import find_spec
 
 import numpy as np
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from tests.browser import Browser, find_chromium, wait_until
@@ -50,9 +49,7 @@ class InTheBrowser(unittest.TestCase):
 
     def shows_the_object(self):
         """Whether the page has pixels of the object's color."""
-        rgb = np.asarray(Image.open(io.BytesIO(self.browser.screenshot())).convert("RGB")).astype(
-            int
-        )
+        rgb = self.browser.pixels()
         return int(((rgb[150:, 40:640, 0] - rgb[150:, 40:640, 2]) > 60).sum()) > 50
 
     def pixel_of(self, point):

@@ -53,11 +53,7 @@ class InTheBrowser(WithFiles):
 
     def orange_pixels(self):
         """How much of the page has the object's colour."""
-        from PIL import Image
-
-        rgb = np.asarray(Image.open(io.BytesIO(self.browser.screenshot())).convert("RGB")).astype(
-            int
-        )
+        rgb = self.browser.pixels()
         return int(((rgb[..., 0] - rgb[..., 2] > 60) & (rgb[..., 1] > 100)).sum())
 
     def assert_no_problem(self):

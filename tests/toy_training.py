@@ -7,6 +7,7 @@ from unittest.mock import patch
 
 import numpy as np
 
+from tests.command import refused, succeeds
 from tests.data import InOneFolder
 from tests.toy_bank import toy_bank
 from xreset import TaskConfig, make_backend, robots, write_bank
@@ -34,6 +35,13 @@ class WithBank(InOneFolder):
         cls.states = toy_bank(cls.robot, joint_pos=home)
         cls.bank = cls.folder / "bank.npz"
         write_bank(cls.bank, cls.states)
+
+    def assert_resumed(self, command, problem):
+        """A command continues a run or, if there is a problem, prints it and does not."""
+        run = refused if problem else succeeds
+        with patch("xreset.learning.train.resume") as resumed:
+            self.assertRegex(run(*command.split()), problem or "^$")
+        self.assertEqual(resumed.called, not problem)
 
 
 @contextmanager

@@ -107,9 +107,8 @@ def make_env(
     task = task or TaskConfig()
     objects = checked_objects(robot, objects)
     check_states(bank, robot, objects)
-    names = tuple(o.name for o in objects)
     scene = make_scene(robot, objects, task)
-    worlds = shared_worlds(names, num_envs, task.reset.object_share)
+    worlds = shared_worlds([o.name for o in objects], num_envs, task.reset.object_share)
     object_index = None if worlds is None else torch.as_tensor(worlds)
     backend = make_backend(engine, scene, num_envs, object_index=object_index, device=device)
     try:
@@ -232,8 +231,8 @@ class ManipulationEnv:
         self._reset_mask = no_world.clone()
         self._over = no_world.clone()
         task = self.task
-        robot = self.backend.scene.robot
-        layout = obs.layout(len(robot.joints), len(robot.fingertips), task.observation)
+        tips = len(self.backend.scene.robot.fingertips)
+        layout = obs.layout(self.num_actions, tips, task.observation)
         width = sum(layout["proprio"].values())
         self.variation = Variation(
             self.drawn, self.backend, task.randomization, self.actions.is_arm, width
@@ -481,10 +480,10 @@ class ManipulationEnv:
         """Read the worlds after a step, and compute rewards, ends of episodes and the numbers to log."""
         reading = self.reading()
         broken = reading.health.nonfinite
-        live = ~self._over
-        self._mark_faults(reading, live)
-        object_pos = reading.task_state.object_pos
-        lost = out_of_bounds(object_pos, self.backend.scene.table, self.task.termination) & ~broken
+        self._mark_faults(reading)
+        lost = ~broken & out_of_bounds(
+            reading.task_state.object_pos, self.backend.scene.table, self.task.termination
+        )
         reach = reading.tip_distance.mean(dim=-1)
         self._best_reach.copy_(
             torch.where(broken, self._best_reach, torch.minimum(self._best_reach, reach))
@@ -494,25 +493,30 @@ class ManipulationEnv:
         if self.variation.pushes is not None:
             self.variation.pushes.gate.copy_(reward.gate & ~broken)
         self._previous_action.copy_(self._action)
-        self._end_episodes(lost, live, reward.success)
+        self._end_episodes(lost, reward.success)
         self._log_step(reward, ~broken)
         return reading, reward
 
-    def _end_episodes(self, lost: Tensor, live: Tensor, success: Tensor) -> None:
-        """Count the step, and mark the ``live`` worlds whose episode ends: out of bounds (``lost``), out of time, or
-        with a failed simulation. All masks are [N] bool; ``success``: the object is at its goal now."""
+    def _end_episodes(self, lost: Tensor, success: Tensor) -> None:
+        """Count the step, and mark the worlds whose episode ends now: out of bounds, out of time, or with a failed
+        simulation. An episode ends once, also if the world has to wait for its reset.
+
+        Args:
+            lost: [N] bool, worlds that are out of bounds.
+            success: [N] bool, worlds whose object is at its goal.
+        """
         self._episode_length += 1
         time_out = (self._episode_length >= self.max_episode_length) | self._faulty
         self._time_out.copy_(time_out & ~lost)
-        self._reset_mask.copy_((lost | time_out) & live)
+        self._reset_mask.copy_((lost | time_out) & ~self._over)
         if self.resets.config.adaptive_share:
             ended = self._reset_mask & ~self.from_bank & ~self._faulty
             self.resets.record(self.sequence, success, ended)
 
-    def _mark_faults(self, reading: Reading, live: Tensor) -> None:
-        """Mark and count the ``live`` worlds [N] whose simulation failed. They end, and training ignores them."""
+    def _mark_faults(self, reading: Reading) -> None:
+        """Mark and count the worlds whose simulation failed in an episode that is not over. Training ignores them."""
         broken = reading.health.nonfinite
-        self._faulty.copy_((broken | reading.health.overflow) & live)
+        self._faulty.copy_((broken | reading.health.overflow) & ~self._over)
         self.nonfinite_count += (self._faulty & broken).sum()
         self.overflow_count += (self._faulty & ~broken).sum()
 
@@ -601,32 +605,11 @@ class ManipulationEnv:
     def _compute_observations(self) -> None:
         """Refresh the observations. In fresh worlds the present cloud and reach become the whole history."""
         reading = self.reading()
-        state = reading.task_state
         c = self.task.observation
         self._best_reach.copy_(
             torch.where(self._reset_mask, reading.tip_distance.mean(dim=-1), self._best_reach)
         )
-        observed_pos, observed_quat = self.variation.tracker.observe(
-            state.object_pos, state.object_quat, self._reset_mask, self.generator
-        )
-        x = obs.ObservationInput(
-            state=state,
-            links=reading.links,
-            joint_target=self._target,
-            joint_lower=self._joint_lower,
-            joint_upper=self._joint_upper,
-            points=self._cloud_points,
-            observed_pos=observed_pos,
-            observed_quat=observed_quat,
-            goal_pos=self.task_goal_pos,
-            goal_quat=self.goal_quat,
-            start_quat=self.start_quat,
-            gravity_fraction=self.gravity_fraction,
-            previous_action=self._previous_action.clamp(-1.0, 1.0),
-            tip_force=reading.contacts.tip_force * self.variation.force_gain,
-            tip_distance=reading.tip_distance,
-            reward=self._reward,
-        )
+        x = self._observation_input(reading)
         frame = obs.cloud_frame(x, c, self.generator)[:, None]
         history = torch.cat((self._cloud[:, 1:], frame), dim=1)
         self._cloud.copy_(where(self._reset_mask, frame, history))
@@ -645,3 +628,28 @@ class ManipulationEnv:
             if name not in self._observations:
                 self._observations[name] = torch.zeros_like(value)
             self._observations[name].copy_(value)
+
+    def _observation_input(self, reading: Reading) -> obs.ObservationInput:
+        """Return what observations are made of; the tracker observes the object."""
+        state = reading.task_state
+        observed_pos, observed_quat = self.variation.tracker.observe(
+            state.object_pos, state.object_quat, self._reset_mask, self.generator
+        )
+        return obs.ObservationInput(
+            state=state,
+            links=reading.links,
+            joint_target=self._target,
+            joint_lower=self._joint_lower,
+            joint_upper=self._joint_upper,
+            points=self._cloud_points,
+            observed_pos=observed_pos,
+            observed_quat=observed_quat,
+            goal_pos=self.task_goal_pos,
+            goal_quat=self.goal_quat,
+            start_quat=self.start_quat,
+            gravity_fraction=self.gravity_fraction,
+            previous_action=self._previous_action.clamp(-1.0, 1.0),
+            tip_force=reading.contacts.tip_force * self.variation.force_gain,
+            tip_distance=reading.tip_distance,
+            reward=self._reward,
+        )

@@ -1,4 +1,8 @@
-"""The processes that train together, as ``torchrun`` starts them."""
+"""The processes that train together, as ``torchrun`` starts them.
+
+Each has worlds of its own. They average the gradients of every minibatch (rsl-rl's ``reduce_parameters``) and, after
+every rollout, the demonstrations' rates of success. The first one writes the run's files.
+"""
 
 from __future__ import annotations
 

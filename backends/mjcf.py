@@ -203,6 +203,7 @@ def _impratio(timestep: float) -> float:
 
 
 def _solref(scene: SceneSpec) -> tuple[float, float]:
+    """Return time constant [s] and damping ratio of contacts and joint limits."""
     return (_CONTACT_STEPS * scene.timestep, 1.0)
 
 

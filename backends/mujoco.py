@@ -47,6 +47,7 @@ class MujocoWorld(World):
         if mujoco.get_mju_user_warning() is None:
             mujoco.set_mju_user_warning(lambda _: None)
         self._at = at = _compiled(scene, object_index)
+        """Where the scene's parts are in the engine's model."""
         self._model = model = copy(at.model)  # each world has parameters of its own
         self._data = data = mujoco.MjData(model)
         self._option = model.opt

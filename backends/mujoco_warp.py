@@ -171,6 +171,17 @@ class MujocoWarpBackend(Backend):
         with self._on_stream():
             self._run("begin")
 
+    def set_where(self, mask: Tensor, state: State, parameters: Parameters) -> None:
+        self._must_be_open()
+        self._mask.copy_(mask)
+        for name, value in parameters.given().items():
+            present = self._parameters[name]
+            mine = self._mask.view(-1, *[1] * (present.ndim - 1))
+            torch.where(mine, self._checked(name, value, present.shape), present, out=present)
+        self._coming.map(Tensor.copy_, self._checked_state(state, self.num_worlds))
+        with self._on_stream():
+            self._run("begin")
+
     def step(self, substeps: int | None = None) -> None:
         self._must_be_open()
         substeps = self._checked_substeps(substeps)
@@ -184,17 +195,6 @@ class MujocoWarpBackend(Backend):
     def health(self) -> Health:
         self._must_be_open()
         return Health(nonfinite=self._nonfinite, overflow=(self._overflow & _OVERFLOW) != 0)
-
-    def set_where(self, mask: Tensor, state: State, parameters: Parameters) -> None:
-        self._must_be_open()
-        self._mask.copy_(mask)
-        for name, value in parameters.given().items():
-            present = self._parameters[name]
-            mine = self._mask.view(-1, *[1] * (present.ndim - 1))
-            torch.where(mine, self._checked(name, value, present.shape), present, out=present)
-        self._coming.map(Tensor.copy_, self._checked_state(state, self.num_worlds))
-        with self._on_stream():
-            self._run("begin")
 
     def mass_properties(self) -> MassProperties:
         self._must_be_open()

@@ -87,11 +87,11 @@ def write_state(
     length = wp.sqrt(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3])
     unit = wp.quat(quat[0] / length, quat[1] / length, quat[2] / length, quat[3] / length)
     # a free joint's angular velocity is in the body's frame
-    turn = _rotate(_conjugate(unit), object_angvel[world])
+    local_angvel = _rotate(_conjugate(unit), object_angvel[world])
     for k in range(3):
         qpos[world, object_qpos + k] = object_pos[world][k]
         qvel[world, object_dof + k] = object_linvel[world][k]
-        qvel[world, object_dof + 3 + k] = turn[k]
+        qvel[world, object_dof + 3 + k] = local_angvel[k]
     for k in range(4):
         qpos[world, object_qpos + 3 + k] = unit[k]
     for k in range(qacc_warmstart.shape[1]):
@@ -230,12 +230,12 @@ def read_links(
     """Poses and velocities of the tracked links, one thread a link."""
     world, k = wp.tid()
     body = link_body[k]
-    turn = xquat[world, body]
-    point = xpos[world, body] + _rotate(turn, link_pos[k])
+    body_quat = xquat[world, body]
+    point = xpos[world, body] + _rotate(body_quat, link_pos[k])
     velocity = cvel[world, body]  # angular, then linear at the centre of mass of the whole tree
     omega = wp.spatial_top(velocity)
     pos[world, k] = point
-    quat[world, k] = _multiply(turn, link_quat[k])
+    quat[world, k] = _multiply(body_quat, link_quat[k])
     angvel[world, k] = omega
     linvel[world, k] = wp.spatial_bottom(velocity) + wp.cross(
         omega, point - subtree_com[world, body_rootid[body]]

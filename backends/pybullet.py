@@ -135,17 +135,17 @@ class PybulletWorld(World):
         self._drives.reset(state["joint_pos"], state["joint_vel"], state["joint_target"])
         self._quat = np.array(state["object_quat"])
         arm = rotate(self._quat, self._inertia.com)
-        turn = multiply(self._quat, self._inertia.quat)
-        p.resetBasePositionAndOrientation(self._object, state["object_pos"] + arm, _xyzw(turn))
+        principal = multiply(self._quat, self._inertia.quat)
+        p.resetBasePositionAndOrientation(self._object, state["object_pos"] + arm, _xyzw(principal))
         omega = state["object_angvel"]
         p.resetBaseVelocity(self._object, state["object_linvel"] + cross(omega, arm), omega)
         self._fresh = True
 
     def get_state(self) -> StateArrays:
-        com, turn = self._p.getBasePositionAndOrientation(self._object)
+        com, principal = self._p.getBasePositionAndOrientation(self._object)
         linear, angular = self._p.getBaseVelocity(self._object)
         angvel = np.array(angular)
-        self._quat = nearer(multiply(_wxyz(turn), self._from_principal), self._quat)
+        self._quat = nearer(multiply(_wxyz(principal), self._from_principal), self._quat)
         arm = rotate(self._quat, self._inertia.com)
         position, velocity = self._drives.read()
         return {

@@ -344,6 +344,9 @@ def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.array((w, x, y, z)).T
 
 
+_CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
+
+
 def conjugate(q: np.ndarray) -> np.ndarray:
     """[..., 4] inverse of a unit quaternion."""
     return q * _CONJUGATE
@@ -366,9 +369,6 @@ def rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
     u = q[..., 1:]
     t = 2.0 * cross(u, v)
     return v + q[..., :1] * t + cross(u, t)
-
-
-_CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def matrix_to_quat(R: np.ndarray) -> np.ndarray:

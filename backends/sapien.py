@@ -384,8 +384,8 @@ def _rotation(quat: np.ndarray) -> np.ndarray:
     """[3, 3] rotation matrix, in double precision, of a unit quaternion [4], whose products keep its precision."""
     products = np.outer(quat, quat)
     squares = products[1:, 1:].astype(np.float64)
-    turn = cross(products[0, 1:], np.eye(3)).T
-    return np.eye(3) + 2.0 * (turn + squares - np.trace(squares) * np.eye(3))
+    skew = cross(products[0, 1:], np.eye(3)).T
+    return np.eye(3) + 2.0 * (skew + squares - np.trace(squares) * np.eye(3))
 
 
 def _x_to(axis: np.ndarray) -> np.ndarray:

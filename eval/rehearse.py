@@ -117,19 +117,19 @@ def rehearse(
     for prop in properties:
         for value in prop.values:
             _setting(trial, prop, value)
-    opened = chosen_engines(engines, device)
+    played_engines = chosen_engines(engines, device)
     folder = Path(out) if out else spec.folder.parent / "rehearsal"
     found: list[Rehearsal] = []
     stopped: dict[str, Counter[str]] = defaultdict(Counter)
 
-    def play(place: Engine, prop: Property | None, value: float) -> tuple[Episode, ...]:
+    def play(engine: Engine, prop: Property | None, value: float) -> tuple[Episode, ...]:
         changed, fault = _setting(trial, prop, value)
-        return _play(actor, place, changed, fault, episodes, real_time, stopped[place.name])
+        return _play(actor, engine, changed, fault, episodes, real_time, stopped[engine.name])
 
     with claim_folder(folder):
-        for place in opened:
-            card = sweep(Rehearsal, spec, trial, place, properties, play, folder, progress)
-            card = replace(card, stopped=dict(stopped[place.name]))
+        for engine in played_engines:
+            card = sweep(Rehearsal, spec, trial, engine, properties, play, folder, progress)
+            card = replace(card, stopped=dict(stopped[engine.name]))
             write_card(folder, card)
             found.append(card)
             write_whole(folder / "index.html", page(found))

@@ -131,9 +131,9 @@ def _spin(obj: ObjectSpec, quat: np.ndarray, angvel: np.ndarray, t: float) -> np
         w = y[0]
         v = y[1:4]
         omega = y[4:]
-        turn = 0.5 * np.array([-v @ omega, *(w * omega + np.cross(v, omega))])
+        quat_rate = 0.5 * np.array([-v @ omega, *(w * omega + np.cross(v, omega))])
         return np.concatenate(
-            (turn, np.linalg.solve(obj.inertia, -np.cross(omega, obj.inertia @ omega)))
+            (quat_rate, np.linalg.solve(obj.inertia, -np.cross(omega, obj.inertia @ omega)))
         )
 
     start = np.concatenate((quat, body.inv().apply(angvel)))

@@ -447,8 +447,8 @@ class Page(WebPage):
         self._forces.show(times, forces, session.policy.robot.fingertip_names)
         rewards = np.array([moment.reward for moment in moments])
         self._rewards.show(times, rewards, session.terms)
-        place = session.inputs[self._input.value]
-        inputs = np.array([moment.inputs[place] for moment in moments])
+        shown = session.inputs[self._input.value]
+        inputs = np.array([moment.inputs[shown] for moment in moments])
         columns = [f"{self._input.value} {i}" for i in range(inputs.shape[1])]
         self._inputs.show(times, inputs, columns)
 

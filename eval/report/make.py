@@ -95,12 +95,12 @@ def collect(folder: Path, robot: str | None = None, objects: Path | None = None)
         except FileFormatError as error:
             # results are shown even if an older configuration is unreadable
             not_described.append(f"The training is not described here: {error}")
-    place = training.results_folder.parent
-    choice = read_choice(place)
+    policy_folder = training.results_folder.parent
+    choice = read_choice(policy_folder)
     policies = {result.inputs.get("policy") for result in training.results.values()}
     if choice is not None and choice.policy_hash not in policies:
         choice = None
-    stress = read_stress(place / "stress", training.first.inputs.get("policy"))
+    stress = read_stress(policy_folder / "stress", training.first.inputs.get("policy"))
     taught = read_evaluation(folder / "teacher")
     notes = fairness.uneven([training]) + not_described
     missed = ""

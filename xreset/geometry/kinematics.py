@@ -43,8 +43,8 @@ class _Step(NamedTuple):
     offset: Tensor
     """[3] origin of the joint in the parent's frame."""
     rotations: Tensor
-    """[3, 3] R; for a revolute joint [3, 9] (R, R K, R K^2) with K the axis' cross-product matrix (Rodrigues'
-    formula)."""
+    """[3, 3] R; for a revolute joint [3, 9] (R, R K, R K^2) with K the axis' cross-product matrix. At an angle a the
+    rotation is R + sin(a) R K + (1 - cos(a)) R K^2 (Rodrigues' formula)."""
     axis: Tensor
     """[3] joint axis in the parent's frame."""
 
@@ -85,8 +85,8 @@ class Kinematics:
         self.base = torch.eye(4, dtype=dtype, device=self.device)
         """[4, 4] default pose of the root: the robot's base in the world, or the identity below another root."""
         if self.root == tree.root:
-            turn = quat_to_matrix(self._tensor(robot.base_quat))
-            self.base = homogeneous(turn, self._tensor(robot.base_pos))
+            rot = quat_to_matrix(self._tensor(robot.base_quat))
+            self.base = homogeneous(rot, self._tensor(robot.base_pos))
         self.link_names = tuple(tree.below(self.root))
         """Links from the root down, parents before children (length L)."""
         joints = [tree.above[name] for name in self.link_names[1:]]
@@ -104,10 +104,10 @@ class Kinematics:
         """Names of the joints, in the robot's joint order."""
         self.home = self._tensor(robot.home[indices])
         """[J] joint positions at home."""
-        self._couple(moving, mimics)
-        self._chain(joints, moving)
+        self._set_coupling(moving, mimics)
+        self._set_steps(joints, moving)
 
-    def _couple(self, moving: Sequence[Joint], mimics: Mapping[str, MimicSpec]) -> None:
+    def _set_coupling(self, moving: Sequence[Joint], mimics: Mapping[str, MimicSpec]) -> None:
         """Set how the moving joints follow from the actuated ones, and the limits that result."""
         coupling = np.zeros((len(moving), len(self.joint_names)))
         constant = np.zeros(len(moving))
@@ -131,7 +131,7 @@ class Kinematics:
         self.upper = self._tensor(upper)
         """[J] upper position limits, mimic joints' limits included; inf where there is none."""
 
-    def _chain(self, joints: Sequence[Joint], moving: Sequence[Joint]) -> None:
+    def _set_steps(self, joints: Sequence[Joint], moving: Sequence[Joint]) -> None:
         """Set the steps from each link to the next, and which joints move which link."""
         row = {joint.name: i for i, joint in enumerate(moving)}
         self._moving = moving
@@ -276,7 +276,7 @@ class Kinematics:
             )
         values = q.reshape(-1, q.shape[-1]) @ self._coupling.T + self._constant  # [B, M]
         sines = torch.sin(values)
-        cosines = 1.0 - torch.cos(values)
+        versines = 1.0 - torch.cos(values)
         base = (self.base if base is None else base).expand(*q.shape[:-1], 4, 4).reshape(-1, 4, 4)
         rotations = {0: base[:, :3, :3]}
         positions = {0: base[:, :3, 3]}
@@ -297,11 +297,9 @@ class Kinematics:
                 if step.prismatic:
                     origin = origin + axis * values[:, joint, None]
                 else:
-                    still, turn, turn_twice = rotation.split(3, dim=-1)
+                    R, RK, RKK = rotation.split(3, dim=-1)
                     rotation = (
-                        still
-                        + sines[:, joint, None, None] * turn
-                        + cosines[:, joint, None, None] * turn_twice
+                        R + sines[:, joint, None, None] * RK + versines[:, joint, None, None] * RKK
                     )
             rotations[i] = rotation
             positions[i] = origin

@@ -247,14 +247,14 @@ def distill(
     if config is None:
         wanted = [cameras] if isinstance(cameras, str | CameraConfig) else cameras
         chosen = tuple(_camera(each) for each in wanted)
-        told = OnnxPolicy(policy_file(teacher)).contract.task
+        teacher_task = OnnxPolicy(policy_file(teacher)).contract.task
         try:
-            seen = replace(vision or STUDENT_VISION, cameras=chosen)
+            vision = replace(vision or STUDENT_VISION, cameras=chosen)
         except ValueError as error:
             raise XResetError(
                 f"vision.{error}. Give fewer --vision.points, or a larger --vision.width and --vision.height."
             ) from None
-        config = student_config(told, seen)
+        config = student_config(teacher_task, vision)
     if not config.task.vision.cameras:
         raise XResetError(
             "A student needs a camera. Give one or two of: " + ", ".join(CAMERAS) + "."

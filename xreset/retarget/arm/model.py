@@ -146,9 +146,9 @@ class ArmModel:
             hand_poses: [B, G, 4, 4] see :meth:`hand_poses`.
             below: largest height above the table [m].
         """
-        turn = hand_poses[..., :3, :3]
-        shift = hand_poses[..., :3, 3]
-        middle = shift + matvec(turn, self._middles)  # [B, G, 3]
+        hand_rot = hand_poses[..., :3, :3]
+        hand_pos = hand_poses[..., :3, 3]
+        middle = hand_pos + matvec(hand_rot, self._middles)  # [B, G, 3]
         height = pos[:, self._carrier, 2] + (rot[:, self._carrier, 2] * middle).sum(-1)
         frame, link = (height - self._reach < below).nonzero(as_tuple=True)
         count = self._count[link]
@@ -158,7 +158,7 @@ class ArmModel:
         row = frame[position]
         own = link[position]
         carrier = self._carrier[own]
-        local = shift[row, own] + matvec(turn[row, own], self._points[point])
+        local = hand_pos[row, own] + matvec(hand_rot[row, own], self._points[point])
         lever = matvec(rot[row, carrier], local)
         heights = height_above_table(lever + pos[row, carrier], self._radii[point], self.table)
         low = LowPoints(frame=row, carrier=carrier, height=heights, lever=lever)[heights < below]

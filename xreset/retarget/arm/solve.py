@@ -368,10 +368,13 @@ def system(frame: ArmProblem, q: Tensor, previous: Tensor | None = None) -> Quad
     angular = angular[..., model.arm]
     position_scale = config.position_weight**0.5
     orientation_scale = config.orientation_weight**0.5
-    turn = quat_to_axis_angle(
+    rotation_error = quat_to_axis_angle(
         quat_multiply(matrix_to_quat(rot[:, 0]), quat_conjugate(frame.root_quat))
     )
-    residuals = [position_scale * (origins[:, 0] - frame.root_pos), orientation_scale * turn]
+    residuals = [
+        position_scale * (origins[:, 0] - frame.root_pos),
+        orientation_scale * rotation_error,
+    ]
     jacobians = [position_scale * linear[:, 0], orientation_scale * angular[:, 0]]
     if previous is not None:
         scale = config.smoothness_weight**0.5

@@ -51,10 +51,12 @@ def system(
     chunks = [_frame_costs(model, targets[part], config, state[part]) for part in rows.split(size)]
     single = Quadratic.cat(chunks).map(lambda x: x.unflatten(0, (sequences, frames)))
 
-    turn = quat_to_axis_angle(
+    rotation_change = quat_to_axis_angle(
         quat_multiply(state.root_quat[:, 1:], quat_conjugate(state.root_quat[:, :-1]))
     )
-    changes = torch.cat((state.joints.diff(dim=1), state.root_pos.diff(dim=1), turn), dim=-1)
+    changes = torch.cat(
+        (state.joints.diff(dim=1), state.root_pos.diff(dim=1), rotation_change), dim=-1
+    )
     weight = changes.new_full((joints + 6,), config.smoothness_weight)
     weight[joints : joints + 3] /= config.length_scale**2
     limit = torch.full_like(weight, float("inf"))

@@ -180,10 +180,12 @@ class HandModel:
         identity = torch.eye(3, dtype=links.pos.dtype, device=links.pos.device).expand(
             *links.pos.shape[:-1], 3, 3
         )
-        # row i: e_i x r
-        turn = torch.linalg.cross(identity, (links.pos - state.root_pos[:, None])[..., None, :])
+        # row i: velocity e_i x r of a link, r away from the root, as the root rotates about axis i
+        by_rotation = torch.linalg.cross(
+            identity, (links.pos - state.root_pos[:, None])[..., None, :]
+        )
         return links._replace(
-            linear=torch.cat((links.linear, identity, turn.mT), dim=-1),
+            linear=torch.cat((links.linear, identity, by_rotation.mT), dim=-1),
             angular=torch.cat((links.angular, torch.zeros_like(identity), identity), dim=-1),
         )
 

@@ -49,11 +49,11 @@ def retarget_hand(
         The motions, on the targets' device; joints are within their limits.
     """
     config = config or HandConfig()
-    home = targets.keypoints.device
+    device = targets.keypoints.device
     targets = targets.to(model.device)
     human = _gaps_filled(targets)
     if model.is_jaw and config.jaw == "analytic":
-        return jaw_state(model, human).to(home)
+        return jaw_state(model, human).to(device)
     root_pos, root_quat = _align_root(model, human)
     joints = model.kinematics.clamp(model.home).expand(*targets.annotated.shape, -1)
     state = HandState(joints, root_pos, root_quat)
@@ -62,7 +62,7 @@ def retarget_hand(
             weight = share * config.clearance_weight
             stage = replace(config, clearance_weight=weight, iterations=_GROWTH_STEPS)
             state = _minimize(model, targets, stage, state)
-    return _minimize(model, targets, config, state).to(home)
+    return _minimize(model, targets, config, state).to(device)
 
 
 def _minimize(

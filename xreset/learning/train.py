@@ -175,41 +175,52 @@ def train(
     return out
 
 
-def _bank_or_goals(
-    bank: str | Path | ResetBank | None, goals: str | Path | GoalSet | None
-) -> str | Path | ResetBank:
-    """Return a bank or a goal set, as they were given, or a bank with the goals of both."""
-    if bank is not None and goals is not None:
-        bank = bank if isinstance(bank, ResetBank) else read_bank(bank)
-        bank = with_goals(bank, goals if isinstance(goals, GoalSet) else read_goals(goals))
-    given = goals if bank is None else bank
-    if given is None:
-        raise RunError("A training needs a reset bank (--resets), a goal set (--goals), or both.")
-    return given
+def resume(
+    out: str | Path,
+    *,
+    iterations: int | None = None,
+    minutes: float = math.inf,
+    own: Mapping[str, float] | None = None,
+    wandb: str | None = None,
+) -> Path:
+    """Continue a run from its newest checkpoint, and export its policy; see :func:`train`.
 
+    Args:
+        out: the run's folder.
+        iterations: number of iterations in all; default: as the run was started.
+        minutes: most time to train now.
+        own: the user's own reward terms with which the run was started. They name code to import, which a file must not
+            decide.
+        wandb: as for :func:`train`.
 
-def _check_minutes(minutes: float) -> None:
-    if not minutes > 0:
-        raise RunError(f"--minutes is {minutes}, expected more than 0.")
-
-
-def _check_config(config: TrainConfig, inputs: Inputs, *, has_teacher: bool) -> None:
-    """Refuse, with ``RunError``, a schedule without effect, and bank states where there are none."""
-    if config.schedule.teacher and not has_teacher:
+    Raises:
+        RunError: the run has other reward terms of the user's own, the bank is not the run's, the newest checkpoint
+            does not fit, another process is training here, or there is too little memory.
+        PolicyError: the robot has changed, or the policy observed something else in an earlier version of xreset.
+    """
+    _check_minutes(minutes)
+    out = Path(out)
+    info = read_run(out)
+    expected = info.config.task.reward.own
+    if expected != dict(own or {}):
+        fix = f"add {own_terms_flag(expected)}" if expected else "omit --config.task.reward.own"
         raise RunError(
-            "schedule.teacher is for xreset distill, and this training has no teacher. Leave it empty: "
-            "--config.schedule.teacher without a value"
+            f"{out} was trained with {len(expected)} reward terms of your own, but {len(own or {})} were named. "
+            f"A run folder must not decide which code is imported. If you trust this code, {fix}."
         )
-    if config.schedule.faults and not config.task.randomization.has_faults:
+    if iterations is not None:
+        info = replace(info, config=replace(info.config, iterations=iterations))
+    inputs = load_inputs(
+        info.resets, robot=info.robot, objects=info.objects, accept=("bank", "goals")
+    )
+    if inputs.hash != info.resets_hash:
         raise RunError(
-            "schedule.faults scales the faults of a real loop, and task.randomization has none. Set some, "
-            "or omit the schedule."
+            f"{info.resets} is not the file that this run was started with. Put it back, or start a new run."
         )
-    if config.uses_states and not inputs.bank.num_states:
-        raise RunError(
-            f"There is no state to reset to in {inputs.name}: every candidate was rejected. Look at its reasons "
-            "(xreset resets), or train without it: --config.task.reset.demo-probability 0"
-        )
+    check_contract(str(out), info.contract, inputs.robot, info.config.task)
+    with _claimed(out), _cleanly(out, info):
+        _train(out, info, inputs, minutes=minutes, resumed=True, wandb=wandb)
+    return out
 
 
 def distill(
@@ -265,25 +276,41 @@ def distill(
     return public_train(bank, out=out, config=config, teacher=teacher, **options)
 
 
-def _camera(camera: str | CameraConfig) -> CameraConfig:
-    """Return a camera, or the one of a name."""
-    if isinstance(camera, CameraConfig):
-        return camera
-    if camera not in CAMERAS:
-        raise XResetError(f"Unknown camera {shown(camera)}. Choose from: {', '.join(CAMERAS)}.")
-    return CAMERAS[camera]
+def _bank_or_goals(
+    bank: str | Path | ResetBank | None, goals: str | Path | GoalSet | None
+) -> str | Path | ResetBank:
+    """Return a bank or a goal set, as they were given, or a bank with the goals of both."""
+    if bank is not None and goals is not None:
+        bank = bank if isinstance(bank, ResetBank) else read_bank(bank)
+        bank = with_goals(bank, goals if isinstance(goals, GoalSet) else read_goals(goals))
+    given = goals if bank is None else bank
+    if given is None:
+        raise RunError("A training needs a reset bank (--resets), a goal set (--goals), or both.")
+    return given
 
 
-def _check_teacher(teacher: Path, inputs: Inputs, config: TrainConfig) -> None:
-    """Refuse the policy of a teacher that does not fit the robot and the task."""
-    contract = OnnxPolicy(teacher).contract
-    if contract.task.vision.cameras:
-        raise PolicyError(
-            f"{teacher} sees through cameras itself. Give a teacher that is told pose and shape."
+def _check_minutes(minutes: float) -> None:
+    if not minutes > 0:
+        raise RunError(f"--minutes is {minutes}, expected more than 0.")
+
+
+def _check_config(config: TrainConfig, inputs: Inputs, *, has_teacher: bool) -> None:
+    """Refuse, with ``RunError``, a schedule without effect, and bank states where there are none."""
+    if config.schedule.teacher and not has_teacher:
+        raise RunError(
+            "schedule.teacher is for xreset distill, and this training has no teacher. Leave it empty: "
+            "--config.schedule.teacher without a value"
         )
-    check_contract(
-        str(teacher), contract, inputs.robot, replace(config.task, vision=VisionConfig())
-    )
+    if config.schedule.faults and not config.task.randomization.has_faults:
+        raise RunError(
+            "schedule.faults scales the faults of a real loop, and task.randomization has none. Set some, "
+            "or omit the schedule."
+        )
+    if config.uses_states and not inputs.bank.num_states:
+        raise RunError(
+            f"There is no state to reset to in {inputs.name}: every candidate was rejected. Look at its reasons "
+            "(xreset resets), or train without it: --config.task.reset.demo-probability 0"
+        )
 
 
 def _checkpoint_to_start_from(run: Path, inputs: Inputs, config: TrainConfig) -> Path:
@@ -316,58 +343,25 @@ def _checkpoint_to_start_from(run: Path, inputs: Inputs, config: TrainConfig) ->
     return latest_checkpoint(run)
 
 
-def resume(
-    out: str | Path,
-    *,
-    iterations: int | None = None,
-    minutes: float = math.inf,
-    own: Mapping[str, float] | None = None,
-    wandb: str | None = None,
-) -> Path:
-    """Continue a run from its newest checkpoint, and export its policy; see :func:`train`.
-
-    Args:
-        out: the run's folder.
-        iterations: number of iterations in all; default: as the run was started.
-        minutes: most time to train now.
-        own: the user's own reward terms with which the run was started. They name code to import, which a file must not
-            decide.
-        wandb: as for :func:`train`.
-
-    Raises:
-        RunError: the run has other reward terms of the user's own, the bank is not the run's, the newest checkpoint
-            does not fit, another process is training here, or there is too little memory.
-        PolicyError: the robot has changed, or the policy observed something else in an earlier version of xreset.
-    """
-    _check_minutes(minutes)
-    out = Path(out)
-    info = read_run(out)
-    expected = info.config.task.reward.own
-    if expected != dict(own or {}):
-        fix = f"add {own_terms_flag(expected)}" if expected else "omit --config.task.reward.own"
-        raise RunError(
-            f"{out} was trained with {len(expected)} reward terms of your own, but {len(own or {})} were named. "
-            f"A run folder must not decide which code is imported. If you trust this code, {fix}."
+def _check_teacher(teacher: Path, inputs: Inputs, config: TrainConfig) -> None:
+    """Refuse the policy of a teacher that does not fit the robot and the task."""
+    contract = OnnxPolicy(teacher).contract
+    if contract.task.vision.cameras:
+        raise PolicyError(
+            f"{teacher} sees through cameras itself. Give a teacher that is told pose and shape."
         )
-    if iterations is not None:
-        info = replace(info, config=replace(info.config, iterations=iterations))
-    inputs = load_inputs(
-        info.resets, robot=info.robot, objects=info.objects, accept=("bank", "goals")
+    check_contract(
+        str(teacher), contract, inputs.robot, replace(config.task, vision=VisionConfig())
     )
-    if inputs.hash != info.resets_hash:
-        raise RunError(
-            f"{info.resets} is not the file that this run was started with. Put it back, or start a new run."
-        )
-    check_contract(str(out), info.contract, inputs.robot, info.config.task)
-    with _claimed(out), _cleanly(out, info):
-        _train(out, info, inputs, minutes=minutes, resumed=True, wandb=wandb)
-    return out
 
 
-_MANY_ON_A_CPU = 256
-"""More worlds than these keep a CPU busy for minutes in each iteration."""
-_NO_MEMORY = re.compile("Failed to allocate|out of memory")
-"""How Warp reports too little memory, as a ``RuntimeError``."""
+def _camera(camera: str | CameraConfig) -> CameraConfig:
+    """Return a camera, or the one of a name."""
+    if isinstance(camera, CameraConfig):
+        return camera
+    if camera not in CAMERAS:
+        raise XResetError(f"Unknown camera {shown(camera)}. Choose from: {', '.join(CAMERAS)}.")
+    return CAMERAS[camera]
 
 
 @contextmanager
@@ -393,6 +387,12 @@ def _new_run(out: Path) -> Iterator[None]:
                 for path in new:
                     with suppress(OSError):  # not written yet, or a folder with other files
                         path.rmdir() if path.is_dir() else path.unlink()
+
+
+_MANY_ON_A_CPU = 256
+"""More worlds than these keep a CPU busy for minutes in each iteration."""
+_NO_MEMORY = re.compile("Failed to allocate|out of memory")
+"""How Warp reports too little memory, as a ``RuntimeError``."""
 
 
 @contextmanager

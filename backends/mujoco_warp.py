@@ -256,6 +256,7 @@ class MujocoWarpBackend(Backend):
         self._wrench = wp.to_torch(self._data.xfrc_applied)[:, at.object_body]
         self._overflow = wp.to_torch(self._data.overflow)
         self._coming = State.initial(self.scene, self.object_index).to(self.device)
+        """State that the worlds of the mask get when the graph ``begin`` runs."""
         self._state = replace(self._coming.clone(), joint_target=wp.to_torch(self._data.ctrl))
         readings = no_readings(self.scene.robot, self.num_worlds)
         links, contacts, health = (reading.to(self.device) for reading in readings)

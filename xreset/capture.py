@@ -35,8 +35,8 @@ class GraphRunner:
         if name not in self._graphs:
             self._calls[name] = self._calls.get(name, 0) + 1
             if self._calls[name] <= self.WARM_UP:
-                # on the stream that will be captured: there autograd's nodes that outlive a call expect
-                # to be called again
+                # on the stream that will be captured, because autograd's nodes that outlive a call run
+                # on the stream of their first call
                 self._stream.wait_stream(torch.cuda.current_stream())
                 with torch.cuda.stream(self._stream):
                     function()

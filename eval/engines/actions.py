@@ -27,9 +27,8 @@ from xreset.inputs import load_inputs
 from xreset.objects.catalogue import load_object
 from xreset.physics import State
 from xreset.records import JOINT, POSITION, Field, arrays_of, npz_schema, read_record, write_npz
-from xreset.resets.bank import check_robot
 from xreset.retarget.file import JointNames
-from xreset.spec import ObjectSpec, PairFriction, RobotSpec, SceneSpec
+from xreset.spec import ObjectSpec, PairFriction, RobotSpec, SceneSpec, check_robot
 from xreset.task.config import EVALUATION_TIMESTEP, TaskConfig
 
 SCHEMA = "xreset-actions/1"

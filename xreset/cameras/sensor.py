@@ -79,6 +79,7 @@ class Cameras:
         surfaces = [*bodies.values(), table, *objects]
         self.pose = torch.eye(4, device=device).repeat(worlds, count, 1, 1)
         self._tangent = torch.ones(worlds, count, device=device)
+        """[N, C] tangent of half the field of view."""
         self._due = torch.ones(worlds, dtype=torch.bool, device=device)
         views = (self.pose, self._tangent, self._due, size)
         self.rays = RayCaster(surfaces, torch.cat((fixed, held), dim=1), *views)
@@ -101,6 +102,7 @@ class Cameras:
         self.noise_scale = torch.ones(worlds, device=device)
         self.image = torch.zeros(worlds, count, *size, device=device)
         self._believed = torch.zeros(worlds, count, 4, 4, device=device)
+        """[N, C, 4, 4] poses without ``shift`` and ``turn``, which the policy does not know."""
         self.view = torch.zeros(worlds, *config.view_shape, device=device)
 
     def aim(self, state: State, goal_pos: Tensor, goal_quat: Tensor, due: Tensor) -> None:

@@ -254,6 +254,7 @@ def _own_pose(pose: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _check_above_table(name: str, depth: float) -> None:
+    """Refuse, with ``GoalError``, a goal whose lowest point is too deep [m] in the table."""
     if depth > _INSIDE:
         raise GoalError(
             f"{name}: the goal is {100 * depth:.1f} cm inside the table. Raise it by as much."

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from xreset.checks import Checked, NonNegativeFloat, Share, frozen
 from xreset.env import ManipulationEnv
+from xreset.geometry.shapes import turn_of
 from xreset.live.engine import EngineDriver
 from xreset.runtime import Reading
 
@@ -186,8 +187,7 @@ class FaultyDriver(EngineDriver):
         error = self._error[:, k]
         has_error = error.any(axis=1)[:, None]
         pos = (reading.object_pos + error[:, :3]).astype(np.float32)
-        rotation = Rotation.from_quat(reading.object_quat, scalar_first=True)
-        turned = Rotation.from_rotvec(error[:, 3:]) * rotation
+        turned = Rotation.from_rotvec(error[:, 3:]) * turn_of(reading.object_quat)
         quat = turned.as_quat(scalar_first=True).astype(np.float32)
         return {
             "object_pos": np.where(has_error, pos, reading.object_pos),

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
+from xreset.geometry.shapes import quat_of
 from xreset.spec import ObjectSpec
 
 
@@ -45,6 +46,4 @@ def resting_orientation(obj: ObjectSpec, up: np.ndarray) -> np.ndarray:
     sine = np.linalg.norm(axis)
     if sine < 1e-12:  # no turn, or half a turn about any horizontal axis
         return np.array([1.0, 0.0, 0.0, 0.0]) if top[2] > 0 else np.array([0.0, 1.0, 0.0, 0.0])
-    return Rotation.from_rotvec(axis / sine * np.arctan2(sine, top[2])).as_quat(
-        canonical=True, scalar_first=True
-    )
+    return quat_of(Rotation.from_rotvec(axis / sine * np.arctan2(sine, top[2])))

@@ -431,7 +431,7 @@ def _parsed_value(hint: Any, value: Any, where: str, problems: list[str]) -> Any
         }
     if origin is Literal:
         if value not in arguments:
-            return wrong(f"one of {', '.join(map(repr, arguments))}")
+            return wrong(_described(hint))
         return value
     kinds = (int, float) if hint is float else hint
     is_bool = hint is not bool and isinstance(value, bool)

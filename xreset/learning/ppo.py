@@ -99,6 +99,27 @@ class SequencePpo(PPO):
         # a graph needs minibatches of one size
         self._graphs.active &= not self.is_multi_gpu and count % self.num_mini_batches == 0
 
+    def process_env_step(
+        self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]
+    ) -> None:
+        """Record one environment step; ``extras["faulty"]`` [N] bool marks worlds whose step teaches nothing."""
+        self._faulty[self.storage.step] = extras.get("faulty", False)
+        super().process_env_step(obs, rewards, dones, extras)
+
+    def compute_returns(self, obs: TensorDict) -> None:
+        """Compute returns and advantages; at faulty steps neither loss gets a gradient from them.
+
+        A faulty step is the last of its episode. With the value as its reward, its error is zero, whatever the
+        simulation gave.
+        """
+        storage = self.storage
+        faulty = self._faulty[..., None]
+        advantages = storage.advantages
+        storage.rewards = torch.where(faulty, storage.values, storage.rewards)
+        super().compute_returns(obs)
+        # written in place, where the update's graph reads them
+        storage.advantages = advantages.copy_(torch.where(faulty, 0.0, storage.advantages))
+
     def update(self) -> dict[str, float]:
         """Learn from the rollout; return the mean losses of its minibatches.
 
@@ -201,24 +222,3 @@ class SequencePpo(PPO):
                 group |= {"fused": on_gpu, "foreach": False, "capturable": on_gpu}
             for state in self.optimizer.state.values():
                 state["step"] = state["step"].to(self.device)
-
-    def process_env_step(
-        self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]
-    ) -> None:
-        """Record one environment step; ``extras["faulty"]`` [N] bool marks worlds whose step teaches nothing."""
-        self._faulty[self.storage.step] = extras.get("faulty", False)
-        super().process_env_step(obs, rewards, dones, extras)
-
-    def compute_returns(self, obs: TensorDict) -> None:
-        """Compute returns and advantages; at faulty steps neither loss gets a gradient from them.
-
-        A faulty step is the last of its episode. With the value as its reward, its error is zero, whatever the
-        simulation gave.
-        """
-        storage = self.storage
-        faulty = self._faulty[..., None]
-        advantages = storage.advantages
-        storage.rewards = torch.where(faulty, storage.values, storage.rewards)
-        super().compute_returns(obs)
-        # written in place, where the update's graph reads them
-        storage.advantages = advantages.copy_(torch.where(faulty, 0.0, storage.advantages))

@@ -145,6 +145,23 @@ class TrainingRunner:
                     + self._resume_command
                 )
 
+    def _agreed(self, stop: bool) -> bool:
+        """Whether any process is to stop: then all do, after the same iteration."""
+        return bool(self.processes.sum(torch.tensor(int(stop), device=self.device)))
+
+    def _follow_schedule(self, progress: float) -> None:
+        """Give the settings that have a schedule their values at a share of the run."""
+        schedule = self.config.schedule
+        if schedule.demo_probability:
+            share = value_at(schedule.demo_probability, progress)
+            self.env.resets.demo_probability.fill_(share)
+        if schedule.success_position:
+            self.env.success_position.fill_(value_at(schedule.success_position, progress))
+        if schedule.faults:
+            self.env.drawn.fault_scale.fill_(value_at(schedule.faults, progress))
+        if schedule.teacher and isinstance(self.alg, SequenceDistillation):
+            self.alg.teacher_share = value_at(schedule.teacher, progress)
+
     def _iterate(self, obs: TensorDict, log: TrainingLog | None) -> TensorDict:
         """Collect a rollout, learn from it and write the log; return the last observations."""
         steps = self.config.ppo.horizon * self.env.num_envs * self.processes.count
@@ -188,22 +205,40 @@ class TrainingRunner:
         rates.copy_(self.processes.sum(rates) / self.processes.count)
         return obs
 
-    def _follow_schedule(self, progress: float) -> None:
-        """Give the settings that have a schedule their values at a share of the run."""
-        schedule = self.config.schedule
-        if schedule.demo_probability:
-            share = value_at(schedule.demo_probability, progress)
-            self.env.resets.demo_probability.fill_(share)
-        if schedule.success_position:
-            self.env.success_position.fill_(value_at(schedule.success_position, progress))
-        if schedule.faults:
-            self.env.drawn.fault_scale.fill_(value_at(schedule.faults, progress))
-        if schedule.teacher and isinstance(self.alg, SequenceDistillation):
-            self.alg.teacher_share = value_at(schedule.teacher, progress)
+    def _check_finite(self, obs: TensorDict) -> None:
+        """Refuse observations that are not finite, once per iteration: they come from worlds whose health was sound."""
+        if own := ", ".join(self.env.task.reward.own):
+            remedy = (
+                f"The critic observes the reward: do your own terms return finite numbers ({own})?"
+            )
+        else:
+            remedy = f"Continue from the last checkpoint: {self._resume_command}"
+        for group, value in obs.items():
+            if not value.isfinite().all():
+                raise RunError(
+                    f"The observation group {group!r} is not finite at iteration {self.iteration}. {remedy}"
+                )
 
-    def _agreed(self, stop: bool) -> bool:
-        """Whether any process is to stop: then all do, after the same iteration."""
-        return bool(self.processes.sum(torch.tensor(int(stop), device=self.device)))
+    def _check_faults(self, steps: int) -> None:
+        """End the run if too many worlds broke. Every process comes to the same result.
+
+        Args:
+            steps: world-steps of an iteration, of all processes.
+        """
+        counts = torch.stack((self.env.nonfinite_count, self.env.overflow_count))
+        now = self.processes.sum(counts).tolist()
+        before = self._fault_totals[0]
+        nonfinite = now[0] - before[0]
+        overflow = now[1] - before[1]
+        if nonfinite + overflow > MAX_FAULTY_SHARE * FAULT_WINDOW * steps:
+            raise RunError(
+                f"The run ends: {nonfinite} worlds were not finite and {overflow} dropped contacts or constraints in "
+                f"the last {len(self._fault_totals)} iterations, more than {MAX_FAULTY_SHARE:.1%} of the "
+                f"{FAULT_WINDOW * steps} world-steps of {FAULT_WINDOW} iterations. Look for what the robot or an "
+                "object does that the engine cannot simulate. Then continue from the last checkpoint: "
+                f"{self._resume_command}"
+            )
+        self._fault_totals.append(now)
 
     def save_checkpoint(self) -> None:
         """Write ``checkpoints/ITERATION.pt``, in the main process."""
@@ -252,41 +287,6 @@ class TrainingRunner:
             for name, network in self.alg.networks.items():
                 network.load_state_dict(getattr(content, f"{name}_state_dict"))
         return content
-
-    def _check_faults(self, steps: int) -> None:
-        """End the run if too many worlds broke. Every process comes to the same result.
-
-        Args:
-            steps: world-steps of an iteration, of all processes.
-        """
-        counts = torch.stack((self.env.nonfinite_count, self.env.overflow_count))
-        now = self.processes.sum(counts).tolist()
-        before = self._fault_totals[0]
-        nonfinite = now[0] - before[0]
-        overflow = now[1] - before[1]
-        if nonfinite + overflow > MAX_FAULTY_SHARE * FAULT_WINDOW * steps:
-            raise RunError(
-                f"The run ends: {nonfinite} worlds were not finite and {overflow} dropped contacts or constraints in "
-                f"the last {len(self._fault_totals)} iterations, more than {MAX_FAULTY_SHARE:.1%} of the "
-                f"{FAULT_WINDOW * steps} world-steps of {FAULT_WINDOW} iterations. Look for what the robot or an "
-                "object does that the engine cannot simulate. Then continue from the last checkpoint: "
-                f"{self._resume_command}"
-            )
-        self._fault_totals.append(now)
-
-    def _check_finite(self, obs: TensorDict) -> None:
-        """Refuse observations that are not finite, once per iteration: they come from worlds whose health was sound."""
-        if own := ", ".join(self.env.task.reward.own):
-            remedy = (
-                f"The critic observes the reward: do your own terms return finite numbers ({own})?"
-            )
-        else:
-            remedy = f"Continue from the last checkpoint: {self._resume_command}"
-        for group, value in obs.items():
-            if not value.isfinite().all():
-                raise RunError(
-                    f"The observation group {group!r} is not finite at iteration {self.iteration}. {remedy}"
-                )
 
 
 _SAME_REQUEST = 2.0

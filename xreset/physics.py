@@ -139,13 +139,13 @@ class Links(Tensors):
     """Poses and velocities of the tracked links (palm, then fingertips)."""
 
     pos: Tensor
-    """[N, K, 3]"""
+    """[N, K, 3] origin of the link's frame."""
     quat: Tensor
     """[N, K, 4]"""
     linvel: Tensor
-    """[N, K, 3] velocity of the link frame's origin."""
+    """[N, K, 3] velocity of this origin."""
     angvel: Tensor
-    """[N, K, 3]"""
+    """[N, K, 3] world frame, rad/s."""
 
 
 @frozen

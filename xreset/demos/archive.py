@@ -129,12 +129,12 @@ class Demos(ObjectMotions):
 
     @property
     def num_sequences(self) -> int:
-        """S."""
+        """Number of sequences (S)."""
         return len(self.sequence_name)
 
     @property
     def num_frames(self) -> int:
-        """F."""
+        """Number of frames of all sequences (F)."""
         return len(self.object_pos)
 
     def __len__(self) -> int:

@@ -107,7 +107,7 @@ class ResetBank(Brief):
 
     @property
     def num_states(self) -> int:
-        """L"""
+        """Number of stable states (L)."""
         return len(self.joint_pos)
 
     @property

@@ -51,7 +51,7 @@ class Paths(Tensors):
     """K paths of each sequence."""
 
     joints: Tensor
-    """[S, K, T, n]"""
+    """[S, K, T, n] arm joints [rad or m]."""
     sound: Tensor
     """[S, K, T] bool: whether a frame is valid if the joints do not jump there."""
 

@@ -44,7 +44,7 @@ class HandTargets(Tensors):
     held: Tensor
     """[S, T] bool: the human's thumb and another finger touch the object."""
     object_pos: Tensor
-    """[S, T, 3]"""
+    """[S, T, 3] origin of the object's mesh frame [m]."""
     object_quat: Tensor
     """[S, T, 4]"""
     object_index: Tensor
@@ -58,9 +58,9 @@ class HandState(Tensors):
     """The variables: joints and root pose of every frame."""
 
     joints: Tensor
-    """[S, T, J]"""
+    """[S, T, J] rad (m)"""
     root_pos: Tensor
-    """[S, T, 3]"""
+    """[S, T, 3] position of the link that carries the hand [m]."""
     root_quat: Tensor
     """[S, T, 4]"""
 

@@ -205,7 +205,8 @@ class ManipulationEnv:
         # Only the shapes of this draw are used. Another generator draws it, so that episodes do not depend on it.
         unused = torch.Generator(device=self.device)
         self._new_start = self.resets.sample(self.backend.object_index, unused).clone()
-        # How each world's present episode began. Resets write into these tensors, which the names below share.
+        # How each world's episode began, and its present joint targets. Resets write into these tensors, and the names
+        # below share them.
         episode = self._new_start.clone()
         self.goal_pos = episode.goal_pos
         self.goal_quat = episode.goal_quat
@@ -221,15 +222,21 @@ class ManipulationEnv:
         self._action = zeros(self.num_actions)
         self._previous_action = zeros(self.num_actions)
         self._sent_target = zeros(self.num_actions)
+        """[N, J] joint targets that reach the drives: late, lost or pushed (``variation``)."""
         self._best_reach = zeros()
+        """[N] smallest mean distance of the fingertips to the object in the episode [m]."""
         self._reward = zeros()
         self._cloud = zeros(*self.task.observation.cloud_shape)
         self._time_out = no_world.clone()
+        """[N] bool: the episode ends now, and not because the object is out of bounds."""
         self._bad_action = no_world.clone()
+        """[N] bool: an action of the episode was not finite."""
         self._faulty = no_world.clone()
-        # Worlds to reset, and worlds whose episode is over and that wait for a reset.
+        """[N] bool: the simulation failed in this step."""
         self._reset_mask = no_world.clone()
+        """[N] bool: the world is reset now, or its episode has just begun."""
         self._over = no_world.clone()
+        """[N] bool: the episode is over, and the world waits for its reset."""
         task = self.task
         tips = len(self.backend.scene.robot.fingertips)
         layout = obs.layout(self.num_actions, tips, task.observation)
@@ -441,7 +448,7 @@ class ManipulationEnv:
 
     @property
     def _lasting(self) -> dict[str, Any]:
-        """Buffers that carry each world from step to step, in addition to the engine's state."""
+        """Every buffer that carries a world from step to step: :data:`_LASTING`, what is drawn, and observations."""
         own = {name: getattr(self, name) for name in _LASTING}
         return own | self.drawn.lasting | dict(self._observations.items())
 

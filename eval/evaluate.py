@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from xreset.eval.results import (
 from xreset.eval.rollout import Engine, chosen_engines, load_trial, roll_out
 from xreset.files import claim_folder
 from xreset.inputs import Data
-from xreset.progress import NamedProgress, unseen
+from xreset.progress import unseen
 
 
 def evaluate(
@@ -37,7 +37,7 @@ def evaluate(
     settle: bool = False,
     episode_seconds: float | None = None,
     out: str | Path | None = None,
-    progress: NamedProgress = unseen,
+    progress: Callable[[str, float, int], None] = unseen,
 ) -> Evaluation:
     """Play every demonstration in every engine, from the same starts, and write the results.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import field, replace
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,7 @@ from xreset.files import claim_folder, write_whole
 from xreset.inputs import Data
 from xreset.live.engine import make_controller
 from xreset.live.faults import Faults, FaultyDriver
-from xreset.progress import NamedProgress, unseen
+from xreset.progress import unseen
 from xreset.runtime import OnnxActor, Runner
 
 SCHEMA = "xreset-rehearsal/1"
@@ -78,7 +78,7 @@ def rehearse(
     device: str = "cpu",
     real_time: bool = False,
     out: str | Path | None = None,
-    progress: NamedProgress = unseen,
+    progress: Callable[[str, float, int], None] = unseen,
 ) -> list[Rehearsal]:
     """Rehearse a policy for a robot: play the same episodes with each fault in each engine, and write the results.
 

@@ -9,7 +9,7 @@ simulated.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -25,7 +25,7 @@ from xreset.errors import DemoError
 from xreset.geometry.shapes import turn_of
 from xreset.objects.catalogue import load_objects
 from xreset.objects.rest import rest_height, resting_orientation
-from xreset.progress import Progress, unseen
+from xreset.progress import unseen
 from xreset.spec import ObjectSpec
 
 SUBJECT = "synthetic"
@@ -69,7 +69,7 @@ def synthesize(
     fps: float = 30.0,
     side: Literal["right", "left"] = "right",
     meshes: str | Path | None = None,
-    progress: Progress = unseen,
+    progress: Callable[[float, int], None] = unseen,
 ) -> Demos:
     """Make synthetic demonstrations of the built-in stand-ins, or of the objects of a folder of meshes, which stand
     with z up.

@@ -6,7 +6,7 @@ steps pass. It is rejected if it leaves the scene or still moves.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -44,7 +44,7 @@ def make_bank(
     limits: FilterConfig | None = None,
     closing: ClosingConfig | None = None,
     squeeze: SqueezeConfig | None = None,
-    progress: Progress = unseen,
+    progress: Callable[[float, int], None] = unseen,
 ) -> ResetBank:
     """Try every valid frame in every engine and keep those that all engines accept.
 

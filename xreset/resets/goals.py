@@ -13,7 +13,7 @@ those of the published paper, and goals drawn at random:
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
@@ -29,7 +29,7 @@ from xreset.errors import FileFormatError, GoalError
 from xreset.geometry.shapes import quat_of, turn_of
 from xreset.objects.catalogue import load_objects
 from xreset.objects.rest import rest_height, resting_orientation
-from xreset.progress import Progress, unseen
+from xreset.progress import unseen
 from xreset.records import Field, read_record, schema_of, write_record
 from xreset.resets.bank import ResetBank, bank_problem, check_objects, no_states
 from xreset.resets.config import GoalConfig
@@ -90,7 +90,7 @@ def make_goals(
     families: str | Sequence[str] | None = None,
     poses: Sequence[Sequence[float]] = (),
     config: GoalConfig | None = None,
-    progress: Progress = unseen,
+    progress: Callable[[float, int], None] = unseen,
 ) -> GoalSet:
     """Draw starts and goals of objects, without demonstrations.
 

@@ -5,7 +5,7 @@ Shape letters: F frames of all sequences, S sequences of a batch padded to T fra
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import field, replace
 
 import numpy as np
@@ -55,7 +55,7 @@ def retarget_demos(
     objects: Sequence[ObjectSpec],
     config: RetargetConfig | None = None,
     *,
-    progress: Progress = unseen,
+    progress: Callable[[float, int], None] = unseen,
     device: str = "cpu",
 ) -> Retargeted:
     """Retarget demonstrations. Sequences are independent of one another; the same arguments give the same result.

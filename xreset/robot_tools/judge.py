@@ -9,7 +9,7 @@ Shape letters: M states, N worlds, J joints, n arm joints, P phases.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
 from typing import Any
@@ -33,7 +33,7 @@ from xreset.geometry.rotations import (
 )
 from xreset.physics import Backend, State
 from xreset.pictures.render import Camera, Renderer, add_caption
-from xreset.progress import Progress, unseen
+from xreset.progress import unseen
 from xreset.resets.bank import ResetBank, check_states
 from xreset.resets.config import SqueezeConfig
 from xreset.resets.fingers import Fingers, fingers_of, squeeze_targets
@@ -124,7 +124,7 @@ def judge(
     squeeze: SqueezeConfig = SqueezeConfig(force=5.0, reach=0.01),
     num_envs: PositiveInt = 32,
     device: str = "cpu",
-    progress: Progress = unseen,
+    progress: Callable[[float, int], None] = unseen,
 ) -> Judgement:
     """Judge which objects a robot holds, lifts and turns.
 

@@ -228,6 +228,14 @@ class MeshImport(InFolder):
         self.load(BOX)  # the cache knows the version of the cutter
         self.assertEqual(len(list(file.parent.glob("*.npz"))), 3)
 
+    def test_pieces_whose_cutting_was_stopped_are_cached_and_still_say_so(self):
+        stopped = replace(decompose(BOX), finished=False)
+        with patch("xreset.objects.cache.decompose", return_value=stopped) as cut:
+            notes = [self.load(RING).notes for _ in range(2)]
+        self.assertEqual(cut.call_count, 1)
+        self.assertIn("was stopped", notes[0][-1])
+        self.assertEqual(notes[0], notes[1])
+
     def test_without_manifold3d_or_a_writable_cache(self):
         (self.folder / "file").write_text("")
         with patch.dict(os.environ, {"XRESET_CACHE": f"{self.folder}/file"}):

@@ -32,13 +32,14 @@ SCHEMA = {
     "vertices": Field(("V", 3), "f", within=POSITION),
     "offsets": Field(("K+1",), "i"),
     **_NUMBERS,
+    "finished": Field((), "b", required=False),
 }
 _ALGORITHM = 2
 """Raise it when :mod:`xreset.objects.decompose` gives other pieces than before."""
 
 
 def cached_pieces(mesh: trimesh.Trimesh, source: str, settings: Settings) -> Pieces:
-    """Return the pieces of a mesh, from the cache if they are there. An unfinished decomposition is not kept.
+    """Return the pieces of a mesh, from the cache if they are there.
 
     Args:
         source: SHA-256 of the mesh's file.
@@ -53,16 +54,16 @@ def cached_pieces(mesh: trimesh.Trimesh, source: str, settings: Settings) -> Pie
                 hull(part) for part in np.split(arrays["vertices"], arrays["offsets"][1:-1])
             )
             numbers: dict[str, Any] = {name: arrays[name][()] for name in _NUMBERS}
-            return Pieces(shapes=shapes, **numbers)
+            finished = bool(arrays.get("finished", True))  # 0.2 kept no others
+            return Pieces(shapes=shapes, finished=finished, **numbers)
         except (FileFormatError, ObjectError):
             path.unlink(missing_ok=True)  # damaged: make it again
     pieces = decompose(mesh, settings)
     parts = [np.asarray(piece.geometry.vertices) for piece in pieces.shapes]
     arrays = {"vertices": np.concatenate(parts), "offsets": np.cumsum([0, *map(len, parts)])}
-    arrays |= {name: np.asarray(getattr(pieces, name)) for name in _NUMBERS}
-    if pieces.finished:
-        with suppress(XResetError):  # a cache that cannot be written costs time, nothing else
-            write_npz(path, SCHEMA_NAME, arrays, inputs={"mesh": source})
+    arrays |= {name: np.asarray(getattr(pieces, name)) for name in (*_NUMBERS, "finished")}
+    with suppress(XResetError):  # a cache that cannot be written costs time, nothing else
+        write_npz(path, SCHEMA_NAME, arrays, inputs={"mesh": source})
     return pieces
 
 

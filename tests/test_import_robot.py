@@ -141,6 +141,26 @@ class Toy(Robots):
             [path.name for path in self.sources.iterdir() if path.name.startswith(".")], []
         )
 
+    def test_fingers_opposite_a_thumb_in_the_middle_are_those_of_a_right_hand(self):
+        for y in (-0.001, 0.0, 0.001):
+            places = {
+                "f2": ((0.085, -0.03, 0), "0 0 0"),
+                "thumb": ((0.085, y, -0.06), "3.1416 0 0"),
+            }
+            with self.subTest(y=y), mock.patch.dict(_PLACES, places):
+                hand = _hand(*map(_finger, ("f1", "f2", "thumb")))
+                made = import_robot(
+                    self.arm, self.file("hand.urdf", hand), self.folder / f"mine{1e3 * y:g}"
+                )
+                tips = {
+                    tip.name: tip.contact_links[0] for tip in load_robot(made.folder).fingertips
+                }
+                self.assertEqual(tips, {"thumb": "thumb_b", "index": "f1_b", "middle": "f2_b"})
+                self.assertIn(
+                    "fingers are named as in a right hand: index is f1_b; middle is f2_b",
+                    made.guessed,
+                )
+
     def test_the_palm_faces_where_the_fingers_bend(self):
         hand, palm = at_home(self.spec, "hand_base", "palm_frame")
         in_hand = np.linalg.inv(hand) @ palm

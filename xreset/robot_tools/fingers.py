@@ -41,6 +41,8 @@ _WRIST_BEHIND = 0.095
 """[m] The human wrist behind the knuckles."""
 _PALM_BEHIND = 0.04
 """[m] The palm's center behind the knuckles."""
+_SIDE = 0.1
+"""A thumb that is less than this share of the fingers' width beside their middle is opposite it."""
 _BEND = 0.15
 """Share of its range by which a finger's joint is bent at home."""
 
@@ -141,16 +143,14 @@ class Hand:
                 raise RobotError(
                     f"the hand has {len(others)} fingers and a thumb; xreset knows {', '.join(_FINGERS)}."
                 )
+            toward_index, why = _index_side(first, others)
             bases = np.array([chain.points[0] for chain in others])
-            middle = bases.mean(axis=0)
-            across = np.linalg.svd(bases - middle)[2][0]
-            across *= np.sign((first.points[-1] - middle) @ across) or 1.0
-            order = np.argsort(-(bases @ across), kind="stable")
+            order = np.argsort(-(bases @ toward_index), kind="stable")
             others = [
                 replace(others[i], name=name) for i, name in zip(order, _FINGERS, strict=False)
             ]
             listed = "; ".join(f"{finger.name} is {finger.links[-1]}" for finger in others)
-            self._notes.append(f"fingers are named from the thumb's side on: {listed}")
+            self._notes.append(f"fingers are named {why}: {listed}")
         others.sort(key=lambda finger: _FINGERS.index(finger.name))
         return [replace(first, name="thumb"), *others]
 
@@ -345,6 +345,23 @@ class Hand:
             return origin
         axis = self._at[link][:3, :3] @ self.tree.above[link].axis
         return origin + axis * ((bounding_ball(cloud)[0] - origin) @ axis)
+
+
+def _index_side(thumb: Finger, others: list[Finger]) -> tuple[np.ndarray, str]:
+    """Return the direction [3] across the fingers in which the index finger is, and how it was found, in words.
+
+    It is the thumb's side. A thumb opposite the middle of the fingers has none; then it is that of a right hand.
+    """
+    bases = np.array([finger.points[0] for finger in others])
+    ends = np.array([finger.points[-1] for finger in others])
+    middle = bases.mean(axis=0)
+    across = np.linalg.svd(bases - middle)[2][0]
+    to_thumb = thumb.points[-1] - middle
+    side = to_thumb @ across
+    if abs(side) >= _SIDE * np.ptp(bases @ across):
+        return across * (np.sign(side) or 1.0), "from the thumb's side on"
+    right = np.cross((ends - bases).mean(axis=0), to_thumb) @ across
+    return across * (np.sign(right) or 1.0), "as in a right hand"
 
 
 def _stated_finger(names: str) -> str:

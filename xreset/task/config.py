@@ -272,7 +272,7 @@ class ResetConfig(Checked):
     pre_contact_only: bool = False
     """Use only bank states before first contact."""
     random_gravity: bool = True
-    """Bank resets: gravity fraction U(0, 1); False: 1 (the fixed-gravity ablation)."""
+    """Bank resets: gravity fraction U(0, 1); False: 1 (the paper's ablation, and better in docs/lab-book.md)."""
     home_gravity_std: NonNegativeFloat = 1.0
     """Home resets: standard deviation of the object's gravity [m/s^2] around 9.81; 0 is exactly full gravity."""
     home_gravity_clip: NonNegativeFloat = 0.3

@@ -134,6 +134,20 @@ class AtomicFolderTest(InFolder):
         self.assertEqual(list(made.parent.iterdir()), [])
         with self.refused(f"^{made / 'a'} is wrong$"), atomic_folder(made) as part:
             raise FileFormatError(f"{part / 'a'} is wrong")
+        file = self.folder / "file"
+        file.touch()
+        for folder in (file / "made", file / "a" / "made"):
+            with self.assertRaisesRegex(XResetError, f"^cannot write {folder}: "):
+                atomic_folder(folder).__enter__()
+        file.unlink()
+        for error in (OSError(ENOSPC, "full"), OSError(ENOSPC, "full", "PART")):
+            message = f"^cannot write {made}: full. "
+            with self.assertRaisesRegex(XResetError, message), atomic_folder(made) as part:
+                if error.filename:
+                    error.filename = str(part / "a")
+                raise error
+        with self.assertRaises(FileNotFoundError), atomic_folder(made):
+            (self.folder / "missing").read_bytes()
         made.mkdir()  # an empty one makes room
         with atomic_folder(made) as part:
             (part / "a").write_text("1")

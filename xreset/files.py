@@ -75,14 +75,26 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     """Make a temporary folder that becomes ``path`` when the block ends, and is removed if the block raises.
 
     ``path`` must not exist, or be an empty folder. What killed processes have left next to it is removed.
+
+    Raises:
+        XResetError: the folder cannot be made or written.
     """
-    with _temporary(path.parent, Path.mkdir) as temporary:
-        remove_leftovers(path.parent)
-        try:
-            yield temporary
-        except XResetError as error:  # the user knows only the folder's own name
-            raise type(error)(str(error).replace(str(temporary), str(path))) from error
-        temporary.replace(path)
+    try:
+        with _temporary(path.parent, Path.mkdir) as temporary:
+            remove_leftovers(path.parent)
+            try:
+                yield temporary
+            except XResetError as error:  # the user knows only the folder's own name
+                raise type(error)(str(error).replace(str(temporary), str(path))) from error
+            temporary.replace(path)
+    except OSError as error:
+        name = str(error.filename or "")  # a full disk names no file
+        if name and ".xreset-" not in name and Path(name) not in path.parents:
+            raise  # it is about another file
+        raise XResetError(
+            f"cannot write {path}: {error.strerror or error}. Nothing was changed; free some space or choose another"
+            " place."
+        ) from error
 
 
 def is_occupied(folder: Path) -> bool:

@@ -87,6 +87,13 @@ class PluginTest(InFolder, Unavailable):
                 backend,
                 "a class that inherits from xreset.physics.Backend",
             ),
+            (
+                "from xreset.backends.pool import PoolBackend\n"
+                f"class {backend}(PoolBackend):\n    name = 'someones'\n",
+                backend,
+                "^the backend 'someones' is not complete. Add to SomeonesBackend: "
+                "capabilities, engine_version, world_class.$",
+            ),
             (install, backend, "^pip install their-engine$"),
         ):
             with self.subTest(source):

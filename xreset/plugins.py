@@ -123,7 +123,7 @@ def backend_class(name: str) -> type[Backend]:
     """Return the class of a backend.
 
     Raises:
-        BackendUnavailableError: no backend of that name, or its plugin does not load.
+        BackendUnavailableError: no backend of that name, or its plugin does not load or is not complete.
     """
     cls = load_plugin(ENGINES, name)
     from xreset.physics import Backend
@@ -131,6 +131,15 @@ def backend_class(name: str) -> type[Backend]:
     if not (isinstance(cls, type) and issubclass(cls, Backend)):
         raise BackendUnavailableError(
             f"the backend {name!r} is {cls!r}, expected a class that inherits from xreset.physics.Backend."
+        )
+    missing = set(cls.__abstractmethods__)
+    for base in cls.__mro__:
+        for attribute, kind in vars(base).get("__annotations__", {}).items():
+            if "ClassVar" in str(kind) and not hasattr(cls, attribute):
+                missing.add(attribute)
+    if missing:
+        raise BackendUnavailableError(
+            f"the backend {name!r} is not complete. Add to {cls.__name__}: {', '.join(sorted(missing))}."
         )
     return cls
 

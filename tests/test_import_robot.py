@@ -409,6 +409,7 @@ class Toy(Robots):
                 {},
                 "limit on input amplification",
             ),
+            ((self.sources / "mine" / "robot.urdf").read_text(), {}, "holds the arm as well"),
             (HAND, {"thumb": "f9"}, "--thumb 'f9' is in 0 fingers"),
             (HAND, {"offset": (0, 0, 60)}, "--offset is 0.00, 0.00, 60.00, expected metres"),
             (HAND, {"rpy": (0, 0, 90)}, "--rpy is 0.00, 0.00, 90.00, expected radians"),

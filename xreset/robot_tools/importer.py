@@ -22,7 +22,7 @@ from xreset.geometry.collision import SelfCollision
 from xreset.geometry.dynamics import drive_inertia
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import roll_pitch_yaw, surface_of
-from xreset.geometry.urdf import RobotTree
+from xreset.geometry.urdf import Joint, RobotTree
 from xreset.geometry.urdf_writer import axes, pose
 from xreset.robot_tools.draft import description_text, draft_spec
 from xreset.robot_tools.fingers import Hand
@@ -113,7 +113,14 @@ def import_robot(
     ahead = _out_of_flange(arm_tree, flange)
     sign = "-" if ahead.sum() < 0 else ""
     along = f"the flange's {sign}{'xyz'[int(np.abs(ahead).argmax())]} axis"
-    hand_tree = renamed(read_source(hand, notes), arm_tree)
+    hand_tree = read_source(hand, notes)
+    # names alone may be the same in two files; the places of the joints are not
+    arm_joints = {_place(joint) for joint in arm_tree.moved_by.values()}
+    if arm_joints and arm_joints <= {_place(joint) for joint in hand_tree.moved_by.values()}:
+        raise RobotError(
+            f"{hand} holds the arm as well: it has all joints of {arm}. Remove the arm's links and joints from it."
+        )
+    hand_tree = renamed(hand_tree, arm_tree)
     with atomic_folder(out) as work:
         found = Hand(hand_tree, work, thumb, notes)
         if rpy is None:
@@ -162,6 +169,11 @@ def _out_of_flange(arm: RobotTree, flange: str) -> np.ndarray:
     outward = (joint.T_parent_joint @ T)[:3, 3] - before
     sign = np.sign(joint.T_parent_joint[:3, :3] @ joint.axis @ outward) or 1.0
     return sign * axis.round() + 0.0
+
+
+def _place(joint: Joint) -> tuple[str, ...]:
+    """Return the name of a joint, and its place, as text."""
+    return joint.name, joint.parent, joint.child, _vector(joint.T_parent_joint[:3, 3])
 
 
 def _guessed_rpy(

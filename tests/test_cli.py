@@ -124,6 +124,9 @@ class UsageTest(TestCase):
                 self.assertRegex(err + out, words)
                 self.assertNotIn("Traceback", err)
 
+    def test_a_student_has_the_robot_of_the_bank(self):
+        self.assertIn("default: that of the bank", run("distill", "--help")[1])
+
     def test_a_wrong_value_of_a_verb_names_the_option_and_the_help(self):
         code, out, err = run(
             "robots", "place", "openarm", "--demos", "d.npz", "--search.elite", "0"

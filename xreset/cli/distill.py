@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 
 from xreset.cameras.config import STUDENT_VISION, VisionConfig
-from xreset.cli._common import Objects, Policy, Robot, Several, given_flags, refuse_changes
+from xreset.cli._common import Objects, Policy, Several, given_flags, refuse_changes
 from xreset.errors import RunError
 
 
@@ -15,7 +15,7 @@ def distill(
     *,
     out: Path,
     resets: Path | None = None,
-    robot: Robot = None,
+    robot: str | None = None,
     objects: Objects = None,
     camera: Several = (),
     vision: VisionConfig = STUDENT_VISION,
@@ -32,6 +32,7 @@ def distill(
     Args:
         out: Run folder to make, or to continue.
         resets: Reset bank, made by `xreset resets`.
+        robot: Name or folder of the robot; default: that of the bank.
         camera: front, side, or wrist; give it again for two cameras. Default: front.
         vision: Images, their timing, and what the policy gets from them.
         backend: Physics engine to train on.

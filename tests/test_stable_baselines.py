@@ -1,6 +1,7 @@
 """The environment as Stable-Baselines3 knows it."""
 
 import unittest
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -66,6 +67,16 @@ class StableBaselinesTest(WithEnv):
             self.assertTrue(np.isfinite(value).all(), name)
             np.testing.assert_array_equal(infos[0]["terminal_observation"][name], before[name][0])
         self.assertEqual(env.env.episode_length_buf.tolist(), [0] + [2] * (N - 1))
+
+    def test_an_attribute_that_the_environment_lacks_is_refused(self):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # of a missing render_mode
+            env = self.wrapped(1.0)
+        self.assertEqual(env.get_attr("num_actions", 0), [env.env.num_actions])
+        self.assertTrue(env.has_attr("num_actions"))
+        self.assertFalse(env.has_attr("action_masks"))
+        for get in (env.get_attr, env.env_method):
+            self.assertRaisesRegex(AttributeError, "num_action", get, "num_action")
 
     def test_a_learner_takes_steps(self):
         env = self.wrapped(0.2)

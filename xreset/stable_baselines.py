@@ -93,7 +93,8 @@ class StableBaselinesEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Return an attribute of the environment, once for each world: the worlds share one environment."""
-        value = getattr(self.env, attr_name, None)
+        # Stable-Baselines3 asks for render_mode, which the environment does not have
+        value = None if attr_name == "render_mode" else getattr(self.env, attr_name)
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:

@@ -80,7 +80,7 @@ def select(
         for path in candidates_in(folder, most):
             file = Path(scratch) / f"{path.stem}.onnx"
             export_checkpoint(path, file)
-            policy = load_policy(file, robot=setting.robot)
+            policy = load_policy(file, robot=setting.robot or run.robot)
             trial = load_trial(
                 policy, demos, objects=meshes, seed=setting.seed, num_envs=setting.num_envs
             )

@@ -37,6 +37,7 @@ class SelectTest(InFolder):
 
     def choose(self, **options):
         def load_policy(path, robot):
+            self.assertEqual(robot, "my/robot", "the run's, which may be a folder")
             return SimpleNamespace(start=lambda motion: f"{path.stem}.pt")
 
         def load_trial(policy, demos, seed, **_):
@@ -50,7 +51,7 @@ class SelectTest(InFolder):
             file.write_bytes(checkpoint.read_bytes())
 
         engines = [SimpleNamespace(name=name, version="1") for name in "abc"]
-        run = SimpleNamespace(objects=None)
+        run = SimpleNamespace(objects=None, robot="my/robot")
         patches = {"load_policy": load_policy, "load_trial": load_trial, "roll_out": rolled}
         patches |= {"export_checkpoint": export, "read_run": lambda folder: run}
         with patch.multiple("xreset.eval.select", **patches):

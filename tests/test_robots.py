@@ -1,5 +1,6 @@
 """Robots: those that ship, descriptions with mistakes, and what `xreset robots check` finds."""
 
+import pickle
 import shutil
 from dataclasses import replace
 from importlib.metadata import EntryPoint
@@ -57,6 +58,15 @@ class BuiltIn(TestCase):
     def test_fingerprints_are_those_of_earlier_files(self):
         for name, fingerprint in BUILT_IN.items():
             self.assertEqual(load(name).fingerprint, fingerprint, name)
+
+    def test_one_line_says_what_a_robot_is(self):
+        robot = load("ur7e-robotiq")
+        words = (
+            "RobotSpec('ur7e-robotiq', 6 joints of the arm, 1 of the hand, fingertips thumb, index)"
+        )
+        self.assertEqual(repr(robot), words)
+        again = pickle.loads(pickle.dumps(robot))
+        self.assertEqual((again, hash(again)), (robot, hash(robot)))
 
     def test_check_finds_nothing(self):
         for name in BUILT_IN:

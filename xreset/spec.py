@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Sequence
-from dataclasses import field, replace
+from dataclasses import field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -171,6 +171,12 @@ class RobotSpec:
     """Fingerprint of a robot that differs in shapes only: its policies play here. It is no part of this robot's
     fingerprint."""
 
+    def __repr__(self) -> str:
+        arm = len(self.arm_indices)
+        hand = len(self.hand_indices)
+        tips = ", ".join(self.fingertip_names)
+        return f"RobotSpec({self.name!r}, {arm} joints of the arm, {hand} of the hand, fingertips {tips})"
+
     @property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the actuated joints, in joint order."""
@@ -214,7 +220,9 @@ class RobotSpec:
         Files hold it, so the text that is hashed must not change: a new field of a spec gets ``repr=False``, and enters
         the hash only where it differs from its default.
         """
-        description = repr(replace(self, urdf=Path(self.urdf.name)))
+        spec = replace(self, urdf=Path(self.urdf.name))
+        values = [f"{f.name}={getattr(spec, f.name)!r}" for f in fields(spec) if f.repr]
+        description = f"RobotSpec({', '.join(values)})"
         digest = hashlib.sha256(description.encode() + self.urdf.read_bytes())
         for mesh in self.meshes:
             digest.update(mesh.read_bytes())
@@ -334,8 +342,8 @@ def check_robot(path: str | Path, what: str, data: Any, robot: RobotSpec) -> Non
     if data.robot != robot.name or data.joint_names != robot.joint_names:
         raise FileFormatError(
             f"{path} is a {what} for the robot {data.robot!r} with {len(data.joint_names)} joints; "
-            f"{robot.name!r} has {len(robot.joints)}. Make it again with --robot {robot.name}, or use --robot "
-            f"{data.robot}."
+            f"{robot.name!r} has {len(robot.joints)}. Make it again for {robot.name!r}, or use the robot "
+            f"{data.robot!r}."
         )
     if not robot.has_fingerprint(data.robot_fingerprint):
         raise FileFormatError(

@@ -26,7 +26,7 @@ from xreset.progress import unseen
 def evaluate(
     policy: str | Path | PolicySpec,
     demos: str | Path | Data,
-    engines: str | Sequence[str | Engine] = "mujoco",
+    engines: str | Engine | Sequence[str | Engine] = "mujoco",
     *,
     episodes: PositiveInt = 5,
     seed: Seed = 0,
@@ -44,7 +44,7 @@ def evaluate(
     Args:
         policy: the policy or its name, as for :func:`~xreset.eval.policy_spec.load_policy`.
         demos: starts and goals: demonstrations, retargeted motion or a goal set, or a file of one of these.
-        engines: name of a physics engine, or several.
+        engines: a physics engine or its name, or several.
         episodes: episodes of each demonstration, each with another perturbation of robot and object.
         seed: seed of the perturbations.
         robot: name or folder of the robot; default: the policy's own. Baselines need it.

@@ -57,6 +57,8 @@ class PolicySpec(Brief, Checked):
     """Seed of the starts that chose this checkpoint (``xreset select``); None: it was not chosen."""
 
     def __post_init__(self) -> None:
+        if not isinstance(self.folder, str | Path):
+            raise PolicyError(f"folder is {shown(self.folder)}, expected a path.")
         object.__setattr__(self, "folder", Path(self.folder))
         super().__post_init__()
 
@@ -149,9 +151,9 @@ class PolicySpec(Brief, Checked):
         Raises:
             PolicyError: ``xreset select`` used the seed.
         """
-        if seed == self.selection_seed:
+        if self.selection_seed is not None and seed == self.selection_seed:
             raise PolicyError(
-                f"Seed {seed} chose this checkpoint (xreset select). Use another --seed."
+                f"Seed {seed} chose this checkpoint (xreset select). Use another seed."
             )
 
 
@@ -213,7 +215,7 @@ def load_policy(
 
 def _baseline(name: str, robot: str | Path | None, seed: int) -> PolicySpec:
     if robot is None:
-        raise PolicyError(f"The baseline {name!r} needs a robot. Add --robot.")
+        raise PolicyError(f"The baseline {name!r} needs a robot. Name it (robot=... or --robot).")
     spec = load_robot(robot)
 
     joints = len(spec.joints)

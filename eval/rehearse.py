@@ -67,7 +67,7 @@ LEAST = 0.5
 def rehearse(
     policy: str | Path | PolicySpec,
     demos: str | Path | Data | None = None,
-    engines: str | Sequence[str | Engine] = "mujoco",
+    engines: str | Engine | Sequence[str | Engine] = "mujoco",
     *,
     faults: str | Sequence[str] = (),
     episodes: PositiveInt = 1,
@@ -86,7 +86,7 @@ def rehearse(
         policy: the policy or its name, as for :func:`~xreset.eval.policy_spec.load_policy`; not a baseline.
         demos: demonstrations or retargeted motion, or a file of them: starts and goals. None: two synthetic
             demonstrations of each of the policy's objects.
-        engines: name of a physics engine, or several.
+        engines: a physics engine or its name, or several.
         faults: faults to try, as ``NAME`` or ``NAME=VALUE,VALUE...``; default: all that
             :data:`~xreset.eval.sensitivity.REHEARSED` lists.
         episodes: episodes of each demonstration, the same for every fault.

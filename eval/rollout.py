@@ -88,9 +88,9 @@ def engine(name: str, *, device: str = "cpu", **options: Any) -> Engine:
     return Engine(name=name, make=make, version=version, device=used)
 
 
-def chosen_engines(engines: str | Iterable[str | Engine], device: str) -> list[Engine]:
+def chosen_engines(engines: str | Engine | Iterable[str | Engine], device: str) -> list[Engine]:
     """Return engines, given by name or as such, each once; ``XResetError`` if there is none."""
-    names = (engines,) if isinstance(engines, str) else tuple(engines)
+    names = (engines,) if isinstance(engines, str | Engine) else tuple(engines)
     if not names:
         raise XResetError("No engine is named. Name one or several of them.")
     return [

@@ -437,6 +437,10 @@ class ResultsTest(InFolder):
             evaluate("zero", ["soup"], robot="openarm")
         with self.assertRaisesRegex(XResetError, "episodes is 0"):
             evaluate("zero", "demos.npz", robot="openarm", episodes=0)
+        with self.assertRaisesRegex(XResetError, r"needs a robot.* \(robot=... or --robot\)"):
+            evaluate("zero", "demos.npz")
+        policy = load_policy("zero", robot="openarm")
+        policy.check_seed(None)  # no seed chose the policy, and the type is checked later
 
     def test_a_policy_of_ones_own_is_checked(self):
         mine = replace(self.policy, folder=str(self.folder))
@@ -444,6 +448,7 @@ class ResultsTest(InFolder):
         for changes, words in (
             ({"robot": "openarm"}, "robot is 'openarm', expected RobotSpec"),
             ({"task": None}, "task is None, expected TaskConfig"),
+            ({"folder": None}, "folder is None, expected a path"),
         ):
             with self.subTest(words), self.assertRaisesRegex(XResetError, words):
                 replace(mine, **changes)
@@ -466,7 +471,7 @@ class ResultsTest(InFolder):
             (result,) = evaluate(
                 policy,
                 bank,
-                [engine("mujoco", workers=0)],
+                engine("mujoco", workers=0),
                 episodes=1,
                 episode_seconds=seconds,
                 out=self.folder,

@@ -49,7 +49,7 @@ class InputsTest(InOneFolder):
         self.assertEqual((inputs.path, inputs.hash), (self.demos_file, file_hash(self.demos_file)))
         self.assertIsNone(inputs.robot_name)
         with self.assertRaisesRegex(
-            DemoError, "demos.npz holds human demonstrations.* Give --robot"
+            DemoError, r"demos.npz holds human demonstrations.* \(robot=... or --robot\)"
         ):
             inputs.bank  # noqa: B018
 
@@ -117,7 +117,7 @@ class InputsTest(InOneFolder):
             (evaluate, playing, {"seed": 2**32}, seeds),
             (make_env, {"bank": bank} | scene, {"seed": np.random.default_rng()}, seeds),
             (merge_demos, {}, {"parts": ["demos.npz"]}, "Sequence[Demos]"),
-            (evaluate, playing, {"engines": 5}, "str | Sequence[str | Engine]"),
+            (evaluate, playing, {"engines": 5}, "str | Engine | Sequence[str | Engine]"),
             (rehearse, {"policy": "soup-can", "demos": bank}, {"episodes": 0}, counts),
             (retarget_demos, {"demos": self.demos} | scene, {"config": {"arm": 1}}, "RetargetConfig | None"),
             (make_bank, {"retargeted": motion} | scene, {"limits": {"steps": 1}}, "FilterConfig | None"),

@@ -67,7 +67,7 @@ class Inputs:
         """
         if self.loaded_robot is None:
             raise DemoError(
-                f"{self.name} holds human demonstrations, which are for no robot yet. Give --robot."
+                f"{self.name} holds human demonstrations, which are for no robot yet. Give one (robot=... or --robot)."
             )
         return self.loaded_robot
 

@@ -52,7 +52,7 @@ def make_bank(
         retargeted: robot trajectories.
         robot: the robot of the trajectories.
         objects: the objects of the trajectories.
-        engine: one or several engines, tried in this order; a rejection states the first engine's reason.
+        engine: name of an engine, or several names, tried in this order; a rejection states the first engine's reason.
         num_envs: worlds at a time.
         device: where engines run that can use it; the others run on the CPU.
         limits: time and speeds by which states are judged; None: the draft paper's.

@@ -132,7 +132,7 @@ def judge(
         bank: states that physics accepted.
         robot: the bank's robot.
         objects: the bank's objects.
-        backends: engines.
+        backends: names of engines.
         states: number of states of each object: those in the air in which the thumb and another finger are nearest to
             the object, as many from each demonstration as possible.
         squeeze: how hard fingers press, and which.
@@ -213,7 +213,7 @@ def _grasps(
         raise RobotError(
             f"robot {robot.name!r}: in no lifted state are the thumb and another finger within "
             f"{1e3 * squeeze.reach:g} mm of the object. Check the fingertips' frames (xreset robots check --picture), "
-            "or raise --squeeze.reach."
+            "or raise squeeze.reach."
         )
     targets = squeeze_targets(robot, fingers, lifted.joint_pos, squeeze)[chosen]
     tried = lifted.with_states(np.array(chosen))

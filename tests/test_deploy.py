@@ -26,6 +26,7 @@ from xreset.live.deploy import deploy_contract, write_deployed
 from xreset.live.engine import EngineDriver
 from xreset.policy import policy_contract
 from xreset.runtime import (
+    Controller,
     LiveError,
     Reading,
     RemoteController,
@@ -217,8 +218,12 @@ class ContractTest(InFolder):
             file.write_text(json.dumps(self.contract | change))
             with self.subTest(words), self.assertRaisesRegex(LiveError, words):
                 load_controller(self.out)
+        file.write_text("[]")
+        self.assertRaisesRegex(LiveError, "has schema 'None', this", load_controller, self.out)
         file.write_text(original[:100])
         self.assertRaisesRegex(LiveError, "is not an exported policy", load_controller, self.out)
+        self.assertRaisesRegex(LiveError, "None is not an exported policy", load_controller, None)
+        self.assertRaisesRegex(LiveError, "^The contract has schema", Controller, str(self.out))
 
     @skipUnless(find_spec("websockets"), "websockets is not installed")
     def test_served_it_acts_alike_and_a_lost_server_stops_the_robot(self):

@@ -161,6 +161,8 @@ class RefusalTest(WithEnv):
         ):
             with self.subTest(words), self.assertRaisesRegex(XResetError, words):
                 make_env(*parts, num_envs=1)
+        with self.assertRaisesRegex(XResetError, "^backend is None, expected Backend"):
+            ManipulationEnv(None, TASK, None)
         motion = toy_retargeted(robot, [SOUP], [0, 2], joint_names=names)
         with self.assertRaisesRegex(XResetError, "The motion is .* joints are not those of"):
             make_bank(motion, robot, objects)

@@ -143,6 +143,7 @@ class ManipulationEnv:
         vision: the cameras; None: the task has none.
     """
 
+    @names_wrong_arguments
     def __init__(
         self, backend: Backend, task: TaskConfig, resets: ResetDistribution, *, seed: int = 0
     ) -> None:

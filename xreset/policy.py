@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.checks import parsed
+from xreset.checks import names_wrong_arguments, parsed
 from xreset.errors import PolicyError, needs
 from xreset.files import max_bytes, parse_json
 from xreset.spec import RobotSpec
@@ -77,7 +77,7 @@ def check_contract(source: str, contract: Contract, robot: RobotSpec, task: Task
     here = policy_contract(robot, task, ())
     if robot.like and contract.robot_fingerprint == robot.like:
         here = replace(here, robot=contract.robot, robot_fingerprint=robot.like)
-    use_robot = f"Use --robot {contract.robot}."
+    use_robot = f"Use the robot {contract.robot!r}."
     fixes = {
         "robot": use_robot,
         "joint order": use_robot,
@@ -159,6 +159,7 @@ class OnnxPolicy:
         hash: SHA-256 of the file.
     """
 
+    @names_wrong_arguments
     def __init__(self, path: str | Path) -> None:
         """Load the file.
 

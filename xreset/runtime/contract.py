@@ -33,6 +33,8 @@ _KNOWN = {
 
 def check_contract(contract: dict[str, Any], source: str) -> None:
     """Raise ``LiveError`` for a contract of another schema or with options that this package does not support."""
+    if not isinstance(contract, dict):
+        contract = {}
     problem = ""
     for part, known in _KNOWN.items():
         if unknown := sorted(set(contract.get(part, {})) - known):
@@ -51,16 +53,15 @@ def read_contract(folder: str | Path) -> dict[str, Any]:
     Raises:
         LiveError: the folder is incomplete or of another version, or its policy's hash is not the contract's.
     """
-    folder = Path(folder)
-    path = folder / CONTRACT
     try:
-        contract = json.loads(path.read_text())
+        folder = Path(folder)
+        contract = json.loads((folder / CONTRACT).read_text())
         content = (folder / POLICY).read_bytes()
-    except (OSError, ValueError) as error:
+    except (OSError, TypeError, ValueError) as error:
         raise LiveError(
             f"{folder} is not an exported policy ({error}). Make one: xreset export deploy"
         ) from error
-    check_contract(contract, str(path))
+    check_contract(contract, str(folder / CONTRACT))
     found = hashlib.sha256(content).hexdigest()
     if found != contract["policy_sha256"]:
         raise LiveError(

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from .contract import POLICY, LiveError, read_contract
+from .contract import POLICY, LiveError, check_contract, read_contract
 from .driver import Array, Links, Reading
 from .kinematics import Kinematics
 from .rotations import is_unit, multiply, rotate
@@ -78,6 +78,7 @@ class Controller:
             contract: what the policy expects.
             actor: the policy's network; None: a subclass acts itself.
         """
+        check_contract(contract, "The contract")
         self.contract = contract
         self.dt: float = contract["control_dt"]
         self._actor = actor

@@ -33,6 +33,7 @@ from xreset.eval.stats import Interval, bootstrap_ci95
 from xreset.eval.table import table_text
 from xreset.files import read_json, read_typed, write_json
 from xreset.records import POSITION, UNIT_TOLERANCE, Field, read_npz, write_npz
+from xreset.text import Brief
 
 SCHEMA = "xreset-eval/1"
 EPISODES_SCHEMA = "xreset-episodes/1"
@@ -104,11 +105,12 @@ class Episode:
 
 
 @frozen
-class Trace:
+class Trace(Brief):
     """States of one episode, for pictures, and the drives' targets, for replays. Poses are in the world frame, of the
     object's mesh frame; quaternions are w x y z.
 
-    Shape letters: T states, C control steps, J joints.
+    Shape letters: T states, the first one before the first control step, C control steps, J joints in the order of
+    :attr:`xreset.RobotSpec.joint_names`.
     """
 
     sequence: int
@@ -208,7 +210,7 @@ class EpisodeFaults(Checked):
 
 
 @frozen
-class EvalResult(Checked):
+class EvalResult(Brief, Checked):
     """Contents of ``eval/ENGINE.json``: one policy in one engine."""
 
     backend: Annotated[str, Rule("an engine's name", lambda name: bool(name) and "/" not in name)]

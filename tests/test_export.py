@@ -15,6 +15,7 @@ from xreset.description import load_robot
 from xreset.errors import FileFormatError, RunError, XResetError
 from xreset.eval.export.lerobot import write_lerobot
 from xreset.eval.export.recorded import read_recorded, write_arrays
+from xreset.eval.report.read import read_training
 from xreset.files import file_hash
 
 PARQUET = find_spec("pyarrow") is not None
@@ -52,6 +53,20 @@ class Episodes(Case):
         )
         self.assertEqual(list(recording.episodes["repetition"]), [0] * 4)
         self.assertEqual(list(recording.episodes["least_distance"]), [0.01, 0.1] * 2)
+
+    def test_python_reads_the_arrays_of_each_episode(self):
+        folder = self.evaluate()
+        table = read_training(folder).recorded()
+        self.assertEqual(list(table["engine"]), ["mujoco"] * 2 + ["sapien"] * 2)
+        made = toy_rollouts(self.robot.home).traces
+        for read, trace in zip(table["trace"], made * 2, strict=True):
+            assert_allclose(read.object_pos, trace.object_pos)
+            assert_array_equal(read.joint_pos.shape, (5, len(self.robot.joints)))
+            self.assertIn("object_pos=array[5, 3]", repr(read))
+        with self.assertRaisesRegex(FileFormatError, "is a trace of the joints"):
+            read_training(folder).recorded("openarm")
+        with self.assertRaisesRegex(RunError, "no evaluation results. Make them first"):
+            replace(read_training(folder), results={}).recorded()
 
     def test_only_some_engines_of_several_folders(self):
         folders = [self.evaluate("a"), self.evaluate("b")]

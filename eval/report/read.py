@@ -11,6 +11,7 @@ import pandas as pd
 
 from xreset.cameras.config import VisionConfig
 from xreset.checks import frozen
+from xreset.description import load_robot
 from xreset.errors import FileFormatError, RunError, needs
 from xreset.eval.results import EvalResult, Table, read_evaluation, read_traces, recorded
 from xreset.eval.stress import Stress
@@ -20,11 +21,11 @@ from xreset.learning.run import SCHEMA as RUN_SCHEMA
 from xreset.learning.run import Choice, RunInfo
 from xreset.policies import run_folder
 from xreset.spec import RobotSpec
-from xreset.text import short_name
+from xreset.text import Brief, short_name
 
 
 @frozen
-class Training:
+class Training(Brief):
     """Learning curves and evaluations of a training or a baseline."""
 
     label: str
@@ -47,9 +48,24 @@ class Training:
         """The result of the first engine."""
         return next(iter(self.results.values()))
 
-    def recorded(self, robot: RobotSpec) -> Table:
-        """Return the recorded episodes in all engines; see :func:`xreset.eval.results.recorded`."""
-        names = robot.joint_names
+    def recorded(self, robot: str | Path | RobotSpec | None = None) -> Table:
+        """Return the recorded episodes in all engines: the first of each demonstration.
+
+        A row holds the figures of the episode (:func:`xreset.eval.results.episode_table`) and in the column ``trace``
+        its arrays over time, a :class:`xreset.eval.results.Trace`.
+
+        Args:
+            robot: the robot, its name or its folder; default: as the results name it.
+
+        Raises:
+            RunError: there are no results.
+            FileFormatError: a recording is damaged, or is of other joints than the robot's.
+        """
+        if not self.results:
+            raise RunError(
+                f"{self.results_folder} holds no evaluation results. {how_to_evaluate(self.results_folder)}"
+            )
+        names = load_robot(robot or self.first.robot).joint_names
         parts = [
             recorded(self.episodes, engine, read_traces(self.results_folder, engine, names))
             for engine in self.results

@@ -158,7 +158,7 @@ class DistillTest(WithBank):
             (XResetError, "Unknown camera 3", {"cameras": (FRONT, 3)}),
             (
                 XResetError,
-                "^vision.points is 128, expected at most 64, .* Give fewer --vision.points",
+                "^vision.points is 128, expected at most 64, .* Give fewer points, or a larger width",
                 {"vision": replace(STUDENT_VISION, width=8, height=8)},
             ),
             (PolicyError, "Unknown policy 'nobody'", {"teacher": "nobody"}),

@@ -164,7 +164,7 @@ def claim(path: str | Path) -> Iterator[None]:
         ) from error
     if descriptor is None:
         raise XResetError(
-            f"another command is writing {path}. Wait for its end, or choose another --out."
+            f"another command is writing {path}. Wait for its end, or choose another place."
         )
     try:
         remove_leftovers(folder)

@@ -228,7 +228,7 @@ def read_actions(
     if obj.source != made.object_source:
         raise FileFormatError(
             f"{path} was made with another geometry of {obj.name} ({made.object_source}, here {obj.source}). "
-            "Give the same --objects folder."
+            "Give the same folder of meshes."
         )
     tip, link, table = made.friction.tolist()
     scene = SceneSpec(

@@ -449,7 +449,7 @@ def demo_objects(demos: Demos, folder: Path | None = None) -> dict[str, ObjectSp
     try:
         canonical_names(names, object_names(folder))
     except ObjectError as error:
-        hint = "" if folder else " Or give a folder of meshes with --objects."
+        hint = "" if folder else " Or give a folder of meshes (objects=... or --objects)."
         raise DemoError(
             f"The demonstrations need objects that are not there. {error}{hint}"
         ) from None

@@ -120,14 +120,14 @@ def train(
     device = device or device_for(engine, "cuda" if torch.cuda.is_available() else "cpu")
     if checkpoints(out):
         raise RunError(
-            f"{out} holds a run already. Continue it with --resume, or choose another --out."
+            f"{out} holds a run already. Continue it (xreset.resume or --resume), or choose another folder."
         )
     if num_envs < 1:
-        raise RunError(f"--num-envs is {num_envs}, expected at least 1.")
+        raise RunError(f"num_envs is {num_envs}, expected at least 1.")
     _check_minutes(minutes)
     if device_for(engine, device) != device:
         raise RunError(
-            f"The engine {engine!r} does not run on {device!r}. Omit --device, or choose another --backend."
+            f"The engine {engine!r} does not run on {device!r}. Omit the device, or choose another engine."
         )
     data = _bank_or_goals(bank, goals)
     load = partial(load_inputs, robot=robot, objects=objects, accept=("bank", "goals"))
@@ -203,7 +203,7 @@ def resume(
     info = read_run(out)
     expected = info.config.task.reward.own
     if expected != dict(own or {}):
-        fix = f"add {own_terms_flag(expected)}" if expected else "omit --config.task.reward.own"
+        fix = f"add {own_terms_flag(expected)} (or own=...)" if expected else "omit them"
         raise RunError(
             f"{out} was trained with {len(expected)} reward terms of your own, but {len(own or {})} were named. "
             f"A run folder must not decide which code is imported. If you trust this code, {fix}."
@@ -263,7 +263,7 @@ def distill(
             vision = replace(vision or STUDENT_VISION, cameras=chosen)
         except ValueError as error:
             raise XResetError(
-                f"vision.{error}. Give fewer --vision.points, or a larger --vision.width and --vision.height."
+                f"vision.{error}. Give fewer points, or a larger width and height."
             ) from None
         config = student_config(teacher_task, vision)
     if not config.task.vision.cameras:
@@ -291,7 +291,7 @@ def _bank_or_goals(
 
 def _check_minutes(minutes: float) -> None:
     if not minutes > 0:
-        raise RunError(f"--minutes is {minutes}, expected more than 0.")
+        raise RunError(f"minutes is {minutes}, expected more than 0.")
 
 
 def _check_config(config: TrainConfig, inputs: Inputs, *, has_teacher: bool) -> None:
@@ -325,7 +325,7 @@ def _checkpoint_to_start_from(run: Path, inputs: Inputs, config: TrainConfig) ->
             f"{run} is a run of xreset distill and has no critic, so no training can start from it. Give a run of "
             f"xreset train (--weights), or continue the distillation: --out {run} --resume"
         )
-    start = f"Start from its configuration: --like {run}"
+    start = f"Start from its configuration, with recipe=... or --like {run}"
     try:
         check_contract(str(run), other.contract, inputs.robot, config.task)
     except PolicyError as error:

@@ -156,7 +156,7 @@ def write_deployed(policy: Path, contract: dict[str, Any], out: Path) -> None:
         PolicyError: the folder is not empty.
     """
     if is_occupied(out):
-        raise PolicyError(f"{out} exists already. Choose another --out, or remove it.")
+        raise PolicyError(f"{out} exists already. Choose another folder, or remove it.")
     with atomic_folder(out) as folder:
         shutil.copyfile(policy, folder / files.POLICY)
         shutil.copytree(

@@ -230,7 +230,7 @@ def check_objects(path: str | Path, bank: ResetBank, objects: tuple[ObjectSpec, 
         if found == used:
             found = "another mesh"
         raise FileFormatError(
-            f"{path} was made with {used} of {name}, but the given one is {found}. Give the same --objects folder, or "
+            f"{path} was made with {used} of {name}, but the given one is {found}. Give the same folder of meshes, or "
             "make it again."
         )
 

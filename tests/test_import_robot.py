@@ -388,6 +388,42 @@ class Toy(Robots):
                 if axis != "z":  # no axis of the flange points out of the arm
                     assert_allclose(fingers, (0, 0, 1), atol=0.06)
 
+    def test_arm_and_hand_in_one_file_are_the_same_robot(self):
+        mount = load_urdf(self.sources / "mine" / "robot.urdf").joint("hand_base_fixed")
+        assert_allclose(mount.T_parent_joint[:3, 3], (0, 0, 0), atol=1e-9)
+        fixed = f"""<joint name="mount" type="fixed"><parent link="{mount.parent}"/><child link="hand_base"/>
+          <origin rpy="0 -1.5708 0"/></joint>"""
+        fingers = HAND.replace('"base"', '"hand_base"').partition(">")[2]
+        whole = self.file("whole.urdf", ARM.replace("</robot>", fixed + fingers))
+        said = succeeds("robots", "import", "--hand", whole, "--out", self.folder / "mine")
+        spec = load_robot(self.folder / "mine")
+        for field in ("joint_names", "mimics", "fingertips", "keypoints"):
+            self.assertEqual(getattr(spec, field), getattr(self.spec, field), field)
+        assert_allclose(spec.home, self.spec.home, atol=2e-3)
+        tips = [tip.link for tip in spec.fingertips]
+        assert_allclose(at_home(spec, *tips), at_home(self.spec, *tips), atol=2e-3)
+        self.assertNotIn("how the hand is mounted", said)
+        refused = (
+            (HAND, {}, "has no arm: no joint moves all of its fingers"),
+            (HAND, {"flange": "l5"}, "but there is no --arm"),
+        )
+        for hand, options, words in refused:
+            with self.subTest(words), self.assertRaisesRegex(RobotError, words):
+                import_robot(None, self.file("h.urdf", hand), self.folder / "no", **options)
+        self.assertFalse((self.folder / "no").exists())
+
+    def test_a_jaw_that_is_closed_at_0_in_one_file_with_its_arm(self):
+        described = load_robot("openarm")
+        made = import_robot(None, described.urdf, self.folder / "mine")
+        spec = load_robot(made.folder)
+        self.assertEqual(spec.joint_names, described.joint_names)
+        self.assertEqual(len(spec.arm_indices), 7)
+        palms = []
+        for robot in (spec, described):
+            hand, palm = at_home(robot, described.hand_root, robot.palm)
+            palms.append(hand[:3, :3].T @ palm[:3, :3])
+        assert_allclose(*palms, atol=1e-3)
+
     def test_impossible_figures_are_replaced_with_a_note(self):
         heavy = HAND.replace(
             'ixx="1e-5" iyy="1e-5" izz="1e-5"', 'ixx="0.1" iyy="0.1" izz="0.1"', 1

@@ -74,7 +74,7 @@ def check(robot: RobotName, /, *, picture: Path | None = None) -> None:
 
 def import_(
     *,
-    arm: Path,
+    arm: Path | None = None,
     hand: Path,
     out: Path,
     name: str | None = None,
@@ -83,14 +83,14 @@ def import_(
     rpy: tuple[float, float, float] | None = None,
     thumb: str | None = None,
 ) -> None:
-    """Make a robot's folder from the published files of an arm and a hand.
+    """Make a robot's folder from the published files of an arm and a hand, or from one file of both.
 
     Writes robot.urdf, the hulls of the meshes, a commented robot.toml and a picture, and lists what it guessed and what
     only you can decide.
 
     Args:
-        arm: URDF or MJCF of the arm.
-        hand: URDF or MJCF of the hand.
+        arm: URDF or MJCF of the arm; leave it out if the hand's file holds the arm as well.
+        hand: URDF or MJCF of the hand. Joints that move all fingers become joints of the arm.
         out: Folder to make.
         name: Name of the robot; default: the folder's.
         flange: Link of the arm that carries the hand; default: one that makers call so, or the arm's last link.

@@ -116,8 +116,8 @@ class Hand:
             link = moving[0].child
         if wrist:
             self._notes.append(
-                f"{', '.join(wrist)} move the whole hand: they are the last joints of the arm. To keep a wrist still, "
-                "make its joints fixed in the hand's file"
+                f"{', '.join(wrist)} move the whole hand: they are the last joints of the arm. To keep one still, "
+                "make it fixed in the hand's file"
             )
         while not tree.link(link).collisions:
             children = [joint.child for joint in tree.joints if joint.parent == link]
@@ -257,7 +257,10 @@ class Hand:
         z = moved - (moved @ x) * x
         if is_jaw:
             # as in a right hand, whose thumb is against the palm's y
-            z = np.cross(x, ends[1] - ends[0])
+            apart = ends[1] - ends[0]
+            if np.linalg.norm(apart) < 0.01:  # the jaw is closed where its joint is at 0
+                apart = self._opened(fingers)
+            z = np.cross(x, apart)
         if np.linalg.norm(z) < 0.01:
             raise RobotError(
                 "the fingers do not bend to one side when their joints move, so the palm's inner side is unknown."
@@ -266,6 +269,19 @@ class Hand:
         T = axes(x=x, z=z)
         T[:3, 3] = bases.mean(axis=0) - _PALM_BEHIND * x
         return T
+
+    def _opened(self, jaw: list[Finger]) -> np.ndarray:
+        """[3] from the thumb's tip to the other finger's where the jaw's drive is in the middle of its range."""
+        middle = {
+            name: (self.tree.joint(name).lower + self.tree.joint(name).upper) / 2
+            for name in set.union(*map(self._drives_of, jaw))
+        }
+        places = link_places(self._spec, middle)
+        thumb, finger = (
+            transformed(self._in_link(part.links[-1], part.points[-1]), places[part.links[-1]])
+            for part in jaw
+        )
+        return finger - thumb
 
     def _add_frames(self, fingers: list[Finger]) -> None:
         """Add frames for palm, wrist, fingertips and keypoints, and note which link follows which human keypoint."""

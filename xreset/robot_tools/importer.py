@@ -1,5 +1,5 @@
-"""Makes a robot's folder from an arm and a hand as their makers publish them: ``robot.urdf``, its meshes and a
-commented ``robot.toml``.
+"""Makes a robot's folder from an arm and a hand as their makers publish them, in two files or in one: ``robot.urdf``,
+its meshes and a commented ``robot.toml``.
 
 What the files do not say is guessed from the hand's geometry, and every guess is told: which chain of links is which
 finger, where the palm looks, which links follow which human keypoint, drives, home, and which links always touch.
@@ -67,7 +67,7 @@ class Imported:
 
 
 def import_robot(
-    arm: Path,
+    arm: Path | None,
     hand: Path,
     out: Path,
     *,
@@ -80,8 +80,8 @@ def import_robot(
     """Make a robot's folder.
 
     Args:
-        arm: URDF or MJCF of the arm.
-        hand: URDF or MJCF of the hand.
+        arm: URDF or MJCF of the arm; None: the hand's file holds the arm as well.
+        hand: URDF or MJCF of the hand. Joints that move all fingers become joints of the arm.
         out: folder to make; it appears whole or not at all.
         name: name of the robot; default: the folder's.
         flange: link of the arm that carries the hand; default: its last one.
@@ -105,37 +105,48 @@ def import_robot(
                 f"{option} is {_vector(np.array(values))}, expected {unit} from {-most:.3g} to {most:.3g}."
             )
     notes = []
-    arm_tree = read_source(arm, notes)
-    if flange is None:
-        flange = last_link(arm_tree)
-        notes.append(f"the hand is carried by the arm's link {flange!r} (--flange says another)")
-    arm_tree = bare(arm_tree, arm_tree.link(flange).name, notes)
-    ahead = _out_of_flange(arm_tree, flange)
-    sign = "-" if ahead.sum() < 0 else ""
-    along = f"the flange's {sign}{'xyz'[int(np.abs(ahead).argmax())]} axis"
-    hand_tree = read_source(hand, notes)
-    # names alone may be the same in two files; the places of the joints are not
-    arm_joints = {_place(joint) for joint in arm_tree.moved_by.values()}
-    if arm_joints and arm_joints <= {_place(joint) for joint in hand_tree.moved_by.values()}:
+    carrier = None
+    if arm is not None:
+        carrier = read_source(arm, notes)
+        if flange is None:
+            flange = last_link(carrier)
+            notes.append(
+                f"the hand is carried by the arm's link {flange!r} (--flange says another)"
+            )
+        carrier = bare(carrier, carrier.link(flange).name, notes)
+    elif flange is not None or offset is not None or rpy is not None:
         raise RobotError(
-            f"{hand} holds the arm as well: it has all joints of {arm}. Remove the arm's links and joints from it."
+            "--flange, --offset and --rpy say how an arm carries the hand, but there is no --arm. Give the arm, or "
+            "leave them out."
         )
-    hand_tree = renamed(hand_tree, arm_tree)
+    hand_tree = read_source(hand, notes)
+    if carrier is not None:
+        # names alone may be the same in two files; the places of the joints are not
+        arm_joints = {_place(joint) for joint in carrier.moved_by.values()}
+        if arm_joints and arm_joints <= {_place(joint) for joint in hand_tree.moved_by.values()}:
+            raise RobotError(
+                f"{hand} holds the arm as well: it has all joints of {arm}. Leave out --arm, or remove the arm's links "
+                "and joints from the hand's file."
+            )
+        hand_tree = renamed(hand_tree, carrier)
+    to_say = [*_TO_SAY]
     with atomic_folder(out) as work:
         found = Hand(hand_tree, work, thumb, notes)
-        if rpy is None:
-            rpy = _guessed_rpy(found, ahead, along, notes)
-        if offset is None:
-            offset = _guessed_offset(found, rpy, ahead, along, notes)
-        T_flange_hand = pose(offset, rpy=rpy)
-        whole = combined(
-            arm_tree, _with_rotors(found, notes), flange, T_flange_hand, name or out.name
-        )
+        if carrier is None or flange is None:
+            tree = _with_rotors(found, notes)
+        else:
+            tree, mounting = _carried(found, carrier, flange, offset, rpy, notes)
+            to_say.insert(0, mounting)
+        tree = replace(tree, name=name or out.name)
         spec = draft_spec(
-            whole, found.root, work, tips=found.tips, keypoints=found.keypoints, bent=found.bent
+            tree, found.root, work, tips=found.tips, keypoints=found.keypoints, bent=found.bent
         )
+        if not len(spec.arm_indices):
+            raise RobotError(
+                f"{hand} has no arm: no joint moves all of its fingers. Give the arm with --arm."
+            )
         spec = _with_arm_home(spec, found.palm_in_hand, notes)
-        spec = _with_drives(spec, whole, notes)
+        spec = _with_drives(spec, tree, notes)
         pairs = SelfCollision(Kinematics(spec)).overlapping_at_home
         if pairs:
             listed = "; ".join(f"{a} and {b}" for a, b in pairs)
@@ -143,12 +154,32 @@ def import_robot(
         spec = replace(spec, collision_exclude=tuple(pairs))
         (work / DESCRIPTION).write_text(description_text(spec, notes))
         load_robot(work)
-    T_flange_palm = T_flange_hand @ found.palm
+    return Imported(folder=out, guessed=tuple(notes), to_say=tuple(to_say))
+
+
+def _carried(
+    hand: Hand,
+    arm: RobotTree,
+    flange: str,
+    offset: tuple[float, float, float] | None,
+    rpy: tuple[float, float, float] | None,
+    notes: list[str],
+) -> tuple[RobotTree, str]:
+    """Return an arm with the hand on its flange, and what only a person can say about the mounting."""
+    ahead = _out_of_flange(arm, flange)
+    sign = "-" if ahead.sum() < 0 else ""
+    along = f"the flange's {sign}{'xyz'[int(np.abs(ahead).argmax())]} axis"
+    if rpy is None:
+        rpy = _guessed_rpy(hand, ahead, along, notes)
+    if offset is None:
+        offset = _guessed_offset(hand, rpy, ahead, along, notes)
+    T_flange_hand = pose(offset, rpy=rpy)
+    T_flange_palm = T_flange_hand @ hand.palm
     mounting = (
         f"how the hand is mounted (--offset, --rpy): its fingers point along ({_vector(T_flange_palm[:3, 0])}) of "
         f"{flange!r}, its inner side along ({_vector(T_flange_palm[:3, 2])}). The angle about {along} is yours to know"
     )
-    return Imported(folder=out, guessed=tuple(notes), to_say=(mounting, *_TO_SAY))
+    return combined(arm, _with_rotors(hand, notes), flange, T_flange_hand), mounting
 
 
 def _out_of_flange(arm: RobotTree, flange: str) -> np.ndarray:

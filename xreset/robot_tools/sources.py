@@ -130,12 +130,10 @@ def renamed(hand: RobotTree, arm: RobotTree) -> RobotTree:
     return replace(hand, root=link_name(hand.root), links=tuple(links), joints=tuple(joints))
 
 
-def combined(
-    arm: RobotTree, hand: RobotTree, flange: str, T_flange_hand: np.ndarray, name: str
-) -> RobotTree:
+def combined(arm: RobotTree, hand: RobotTree, flange: str, T_flange_hand: np.ndarray) -> RobotTree:
     """Return a bare arm with a renamed hand whose root link has a pose [4, 4] in the frame of the arm's flange."""
     return RobotTree(
-        name=name,
+        name=arm.name,
         root=arm.root,
         links=(*arm.links, *hand.links),
         joints=(*arm.joints, fixed(flange, hand.root, T_flange_hand), *hand.joints),

@@ -367,7 +367,8 @@ class RobustnessTest(WithEnv):
         return replace(QUIET, randomization=RandomizationConfig(**ranges))
 
     def test_pose_joints_and_forces_are_observed_late(self):
-        late = self.task(observation_latency=(2.0, 2.0), proprio_latency=(2.0, 2.0))
+        """Joints and forces by whole steps."""
+        late = self.task(observation_latency=(2.0, 2.0), proprio_latency=(1.6, 1.6))
         found, present = (self.play(self.make(task), 6) for task in (late, self.task()))
         for now, before in zip(found[2:], present, strict=False):
             assert_close(now["policy"][:, :3], before["policy"][:, :3])
@@ -424,8 +425,10 @@ class RobustnessTest(WithEnv):
     def test_poses_may_come_seldom_and_go_missing(self):
         """The error of each pose is another one, so the same error is the same pose."""
         for period, options in (
-            (3, {"interval": (3.0, 3.0)}),
-            (5, {"loss": 1.0, "loss_steps": (4.0, 4.0)}),
+            (3, {"interval": (2.6, 2.6)}),
+            (3, {"interval": (3.4, 3.4)}),
+            (5, {"loss": 1.0, "loss_steps": (3.6, 3.6)}),
+            (5, {"loss": 1.0, "loss_steps": (4.4, 4.4)}),
         ):
             env = self.make(self.task(tracker=TrackerConfig(position_noise=0.01, **options)))
             poses = [seen["policy"][:, :3] for seen in self.play(env, 12)]
@@ -505,6 +508,50 @@ class RobustnessTest(WithEnv):
         pushes.gate.fill_(True)
         env.step(torch.zeros(N, 7))
         self.assertGreater(pushes.force.norm(dim=-1).min(), 0.0)
+        pushes.gate.fill_(True)
+        env.reset(tensor([1]))
+        self.assertEqual(pushes.gate.tolist(), [True, False, True])
+
+    def test_the_same_spin_needs_more_torque_where_the_inertia_is_larger(self):
+        push = PushConfig(probability=(1.0, 1.0), object_spin=4.0)
+        torques = []
+        for scale in (2.0, 3.0):
+            env = self.make(self.task(push=push, object_inertia=(scale, scale)))
+            env.step(torch.zeros(N, 7))
+            torques.append(env.variation.pushes.torque / scale)
+        self.assertTrue(torques[0].any(dim=-1).all())
+        assert_close(*torques)
+
+    def test_forces_are_read_with_the_gain_of_the_episode(self):
+        env = self.make(self.task(force_gain=(2.0, 3.0)))
+        contacts = env.backend.contacts()
+        pressed = replace(contacts, tip_force=torch.full_like(contacts.tip_force, 0.1))
+        with patch.object(env.backend, "contacts", lambda: pressed):
+            env.reset()
+        force = env.get_observations()["proprio"][:, -6:]
+        gain = force / (TASK.observation.contact_force_scale * 0.1)
+        assert_close(gain, gain[:, :1].expand_as(gain))
+        self.assertTrue((gain >= 2.0).all() and (gain <= 3.0).all())
+        self.assertEqual(len(gain[:, 0].unique()), N)
+
+    def test_without_randomization_each_object_has_its_own_mass_and_friction(self):
+        """A pair's friction is the mean of its materials: of the object's own, or of the middle of the range."""
+        self.objects = [
+            replace(obj, mass=mass, friction=friction)
+            for obj, mass, friction in zip(self.objects, (0.2, 0.6), (0.95, None), strict=True)
+        ]
+        slippery = replace(self.objects[1], friction=0.0)
+        materials = {"elastomer": 0.8, "metal": 0.0, "table": 0.5}
+        task = self.task(enabled=False, friction=(0.4, 0.8), **materials)
+        for second, own in ((self.objects[1], 0.6), (slippery, 0.0)):
+            self.objects[1] = second
+            found = self.make(task).variation.parameters
+            assert_close(found["object_mass"], tensor([0.2, 0.6, 0.2]))
+            pairs = [
+                [max((one + other) / 2, 0.05) for other in materials.values()]
+                for one in (0.95, own, 0.95)
+            ]
+            assert_close(found["friction"], tensor(pairs))
 
     def test_parameters_are_drawn_for_the_worlds_that_begin(self):
         wide = (0.5, 2.0)

@@ -4,10 +4,13 @@ import json
 import math
 from dataclasses import asdict, replace
 from itertools import product
+from types import SimpleNamespace
 from unittest import TestCase
 
 import numpy as np
 import torch
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
 from torch import tensor
 from torch.testing import assert_close
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -23,10 +26,12 @@ from xreset.geometry.rotations import (
     quat_from_axis_angle,
     quat_multiply,
     quat_rotate,
+    quat_to_axis_angle,
+    quat_to_matrix,
 )
 from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import RECIPES
-from xreset.physics import Links, State
+from xreset.physics import Contacts, Health, Links, State
 from xreset.policy import RandomPolicy, ZeroPolicy, check_contract, parsed_contract, policy_contract
 from xreset.resets.distribution import ResetDistribution
 from xreset.spec import TableSpec
@@ -36,17 +41,28 @@ from xreset.task.config import (
     ActionConfig,
     NoiseConfig,
     ObservationConfig,
+    PushConfig,
     RandomizationConfig,
     ResetConfig,
     RewardConfig,
     TaskConfig,
     TerminationConfig,
+    TrackerConfig,
     evaluation_task,
 )
 from xreset.task.latency import DelayLine
-from xreset.task.randomization import Drawn, pair_friction, sample_friction
-from xreset.task.rewards import RewardInput, compute_reward, contact_gate
+from xreset.task.pushes import Pushes
+from xreset.task.randomization import (
+    Drawn,
+    pair_friction,
+    sample_drives,
+    sample_friction,
+    sample_offset,
+)
+from xreset.task.reading import Reading, step_log
+from xreset.task.rewards import Reward, RewardInput, compute_reward, contact_gate
 from xreset.task.terminations import out_of_bounds
+from xreset.task.tracker import Tracker
 
 IDENTITY = tensor([1.0, 0, 0, 0])
 FAR = {"best_reach": 1e3}
@@ -155,10 +171,10 @@ class RewardTest(TestCase):
                 object_pos=[0.5, 0.3 + shift, 0.1],
                 object_quat=turned(degrees),
                 points=[[0.05, 0, 0], [0, 0.05, 0], [0, 0, 0.05], [0, 0, -0.05]],
-                action=[0.5, 0, 0.5, 0],
+                action=[0.5, 0, 0.2, 0],
             )
             success = gate and d <= 0.02
-            actions = 0.005 * 0.5 + 0.05 * 0.25 + 0.005 * 0.25
+            actions = 0.005 * 0.29 + 0.05 * 0.25 + 0.005 * 0.04
             expected = -2.5 * min(3 * tips, 3) - 2.5 * min(palm, 0.5) - actions
             expected += gate * 3 * (1.4 - 3 * d) + success * 15 / (1 + 10 * d)
             with self.subTest(tips=tips, palm=palm, d=d):
@@ -173,6 +189,11 @@ class RewardTest(TestCase):
         self.assertAlmostEqual(paid, 4.2 * (1 - d / (1.4 / 3)), delta=5e-6)
         paid = self.reward(RewardConfig(success_shape="points"), **turn).terms["success"]
         self.assertAlmostEqual(paid, 10 / (1 + 10 * d), delta=5e-6)
+        for limit, success in ((0.99 * d, False), (1.01 * d, True)):
+            reward = self.reward(
+                RewardConfig(success_shape="points"), **turn, success_position=limit
+            )
+            self.assertEqual(reward.success, success)
 
     def test_a_term_of_the_users_own_is_added(self):
         config = RewardConfig(own={f"{__name__}:height": 0.5})
@@ -229,6 +250,7 @@ class RewardTest(TestCase):
             ([1, 1, 0], True),
             ([0.09, 1, 1], False),
             ([1, 0.1, 0.1], False),
+            ([0.11, 0.11, 0], True),
             ([0, 0, 0], False),
         ):
             pressed = tensor(forces)[None, :, None] * tensor([0.6, 0.0, -0.8])
@@ -369,6 +391,242 @@ class RandomizationTest(TestCase):
             assert_range(values, 0.5, 1.0, atol=2e-3)
             self.assertAlmostEqual(values.mean(), 0.75, delta=0.005)
         self.assertEqual(len(material.mul(1e5).round().unique()), 250)
+        c = replace(c, friction_buckets=2)
+        material = 2 * sample_friction(100, c, generator())[:, 2] - c.table
+        # the middles of the halves of the range
+        assert_close(material.unique(), tensor([0.625, 0.875]))
+
+    def test_drives_are_scaled_by_their_own_ranges(self):
+        ranges = {
+            "arm_stiffness": (0.5, 0.6),
+            "hand_stiffness": (0.7, 0.8),
+            "arm_damping": (0.9, 1.0),
+            "hand_damping": (1.1, 1.2),
+            "effort": (1.3, 1.4),
+        }
+        is_arm = tensor([True, False])
+        factors = sample_drives(is_arm, 2000, RandomizationConfig(**ranges), generator())
+        for row, name in enumerate(("stiffness", "damping", "effort")):
+            for joint, group in enumerate(("arm_", "hand_")):
+                limits = ranges[name if name == "effort" else group + name]
+                assert_range(factors[:, row, joint], *limits, atol=1e-3)
+
+    def test_offsets_have_any_direction_and_lengths_of_the_range(self):
+        offset = sample_offset(4000, (0.01, 0.03), generator())
+        length = offset.norm(dim=-1)
+        assert_range(length, 0.01, 0.03, atol=1e-4)
+        self.assertAlmostEqual(length.mean(), 0.02, delta=2e-4)
+        direction = offset / length[:, None]
+        self.assertLess(direction.mean(dim=0).abs().max(), 0.03)
+        assert_close(direction.square().mean(dim=0), torch.full((3,), 1 / 3), atol=0.02, rtol=0)
+
+
+class PushTest(TestCase):
+    """Two objects in turn, in 4000 worlds, with masses, orientations and factors on the inertia of their own."""
+
+    N = 4000
+    DT = 0.02
+    IS_ARM = tensor([True, True, False])
+    KP = tensor([50.0, 200.0, 3.0])
+    EFFORT = tensor([10.0, 80.0, 0.9])
+
+    def setUp(self):
+        g = generator(1)
+        turns = torch.nn.functional.normalize(torch.randn(2, 4, generator=g), dim=-1)
+        axes = quat_to_matrix(turns)
+        inertia = axes @ torch.diag_embed(tensor([[1.0, 3, 9], [8, 1, 2]])) @ axes.mT
+        self.own_mass = tensor([0.5, 2.0])
+        objects = [
+            SimpleNamespace(inertia=(1e-4 * i).numpy(), mass=float(mass))
+            for i, mass in zip(inertia, self.own_mass, strict=True)
+        ]
+        self.inertia = 1e-4 * inertia
+        joints = [
+            SimpleNamespace(drive=SimpleNamespace(kp=float(kp), effort=float(effort)))
+            for kp, effort in zip(self.KP, self.EFFORT, strict=True)
+        ]
+        robot = SimpleNamespace(joints=joints)
+        scene = SimpleNamespace(control_dt=self.DT, objects=objects, robot=robot)
+        self.index = torch.arange(self.N) % 2
+        self.backend = SimpleNamespace(scene=scene, device="cpu", object_index=self.index)
+        quat = torch.nn.functional.normalize(torch.randn(self.N, 4, generator=g), dim=-1)
+        self.state = State.at_rest(torch.zeros(self.N, 3), torch.zeros(self.N, 3), quat)
+        self.mass = 0.1 + torch.rand(self.N, generator=g)
+        self.scale = 0.5 + torch.rand(self.N, generator=g)
+
+    def pushed(self, **config):
+        """Pushes after a step, and the offsets of the joints' targets."""
+        drawn = Drawn(self.N, torch.device("cpu"))
+        config = PushConfig(object_velocity=0.5, object_spin=4.0, arm_torque=0.3, **config)
+        pushes = Pushes(drawn, self.backend, config, self.IS_ARM)
+        g = generator()
+        drawn.draw(torch.ones(self.N, dtype=torch.bool), g)
+        return pushes, pushes.act(self.state, self.mass, self.scale, g)
+
+    def test_pushes_are_as_large_as_stated_in_any_direction(self):
+        """Impulses, divided by mass and by inertia in the world's axes; torques, by the drives' stiffness."""
+        pushes, offsets = self.pushed(probability=(1.0, 1.0))
+        velocity = pushes.force * self.DT / self.mass[:, None]
+        axes = quat_to_matrix(self.state.object_quat)
+        of_world = axes @ self.inertia[self.index] @ axes.mT
+        share = self.mass / self.own_mass[self.index] * self.scale
+        spin = torch.linalg.solve(of_world * share[:, None, None], pushes.torque * self.DT)
+        for change, largest in ((velocity, 0.5), (spin, 4.0)):
+            size = change.norm(dim=-1)
+            assert_range(size, 0.0, largest, atol=1e-3 * largest)
+            self.assertAlmostEqual(size.mean(), largest / 2, delta=0.01 * largest)
+            self.assertLess(change.mean(dim=0).abs().max(), 0.02 * largest)
+        torque = offsets * self.KP
+        for joint in (0, 1):
+            limit = float(0.3 * self.EFFORT[joint])
+            assert_range(torque[:, joint], -limit, limit, atol=2e-3 * limit)
+        self.assertFalse(offsets[:, 2].any())
+
+    def test_each_kind_of_push_comes_by_itself(self):
+        pushes, offsets = self.pushed(probability=(0.5, 0.5))
+        happens = [values.any(dim=-1) for values in (pushes.force, pushes.torque, offsets)]
+        for a, b in product(range(3), repeat=2):
+            share = (happens[a] & happens[b]).float().mean()
+            self.assertAlmostEqual(share, 0.5 if a == b else 0.25, delta=0.03)
+
+    def test_probabilities_are_drawn_evenly_in_their_logarithm(self):
+        pushes, _ = self.pushed(probability=(0.001, 0.1))
+        exponent = pushes._probability.log10()
+        assert_range(exponent, -3.0, -1.0, atol=2e-3)
+        self.assertAlmostEqual(exponent.mean(), -2.0, delta=0.03)
+
+
+class TrackerTest(TestCase):
+    N = 4000
+
+    def tracker(self, latency=(0.0, 0.0), scale=1.0, **faults):
+        """A function that observes poses [N, 3], [N, 4]; ``fresh`` [N] are worlds that have just begun."""
+        drawn = Drawn(self.N, torch.device("cpu"))
+        drawn.fault_scale.fill_(scale)
+        config = RandomizationConfig(observation_latency=latency, tracker=TrackerConfig(**faults))
+        tracker = Tracker(drawn, config)
+        g = generator()
+        drawn.draw(torch.ones(self.N, dtype=torch.bool), g)
+
+        def observe(pos, quat=IDENTITY, fresh=False):
+            fresh = torch.as_tensor(fresh).expand(self.N)
+            pos = torch.as_tensor(pos)[..., None].expand(self.N, 3)
+            return tracker.observe(pos, quat.expand(self.N, 4), fresh, g)
+
+        return observe
+
+    def test_errors_are_even_about_each_axis(self):
+        quat = turned(70, (0.6, 0.0, 0.8))
+        for kind, pos_limit, rot_limit in (("bias", 0.02, 0.1), ("noise", 0.05, 0.2)):
+            faults = {f"position_{kind}": pos_limit, f"rotation_{kind}": rot_limit}
+            pos, seen = self.tracker(**faults)(1.0, quat, fresh=True)
+            angle = quat_to_axis_angle(quat_multiply(seen, quat_conjugate(quat).expand(self.N, 4)))
+            for axis in range(3):
+                assert_range(pos[:, axis] - 1.0, -pos_limit, pos_limit, atol=2e-3 * pos_limit)
+                assert_range(angle[:, axis], -rot_limit, rot_limit, atol=2e-3 * rot_limit)
+
+    def test_a_schedule_scales_noise_and_losses(self):
+        observe = self.tracker(scale=0.5, position_noise=0.1)
+        assert_range(observe(1.0, fresh=True)[0] - 1.0, -0.05, 0.05, atol=1e-4)
+        observe = self.tracker(scale=0.5, loss=0.5, loss_steps=(3.0, 3.0))
+        observe(0.0, fresh=True)
+        pos, _ = observe(1.0)
+        self.assertAlmostEqual((pos[:, 0] == 0.0).float().mean(), 0.25, delta=0.03)
+
+    def test_between_two_steps_an_orientation_turns_evenly_and_the_short_way(self):
+        observe = self.tracker(latency=(0.5, 0.5))
+        observe(0.0, turned(10), fresh=True)
+        for now in (turned(50), -turned(50)):
+            pos, quat = observe(2.0, now)
+            sign = quat[:, :1].sign()
+            assert_close(sign * quat, turned(30).expand(self.N, 4))
+            assert_close(pos, torch.ones(self.N, 3))
+            observe(0.0, turned(10), fresh=True)
+
+    def test_a_new_episode_does_not_show_the_pose_of_the_last_one(self):
+        observe = self.tracker(interval=(5.0, 5.0))
+        observe(0.0, fresh=True)
+        begins = torch.arange(self.N) % 2 == 1
+        pos, _ = observe(1.0, fresh=begins)
+        self.assertEqual(pos[:2, 0].tolist(), [0.0, 1.0])
+
+
+class ReadingTest(TestCase):
+    def test_distances_and_the_motion_of_the_center(self):
+        """Distances again in the world frame; velocities from the poses a moment later."""
+        n = 4
+        tips = 3
+        g = generator()
+
+        def rand(*shape):
+            return torch.randn(n, *shape, generator=g)
+
+        quat = torch.nn.functional.normalize(rand(4), dim=-1)
+        still = State.at_rest(rand(2), rand(3), quat)
+        state = replace(still, object_linvel=rand(3), object_angvel=rand(3))
+        zeros = torch.zeros(n, 1 + tips, 3)
+        links = Links(pos=rand(1 + tips, 3), quat=rand(1 + tips, 4), linvel=zeros, angvel=zeros)
+        force = zeros[:, 1:]
+        healthy = torch.zeros(n, dtype=torch.bool)
+        backend = SimpleNamespace(
+            state=lambda: state,
+            links=lambda: links,
+            contacts=lambda: Contacts(
+                tip_force=force, tip_touch=force.any(dim=-1), table_force=zeros[:, 0]
+            ),
+            health=lambda: Health(nonfinite=healthy, overflow=healthy),
+        )
+        points = rand(20, 3)
+        center = rand(3)
+        bad = tensor([False, True, False, False])
+        reading = Reading.of(backend, points, bad, center)
+        self.assertTrue(torch.equal(reading.health.nonfinite, bad))
+        self.assertIs(Reading.of(backend, points, bad, None).task_state, state)
+
+        pos, linvel, angvel = (
+            getattr(state, f"object_{name}").double().numpy()
+            for name in ("pos", "linvel", "angvel")
+        )
+        turn = Rotation.from_quat(quat.double().numpy(), scalar_first=True)
+
+        def place(local, seconds=0.0):
+            turned = Rotation.from_rotvec(seconds * angvel) * turn
+            return turned.apply(local.double().numpy()) + pos + seconds * linvel
+
+        places = np.stack([place(points[:, i]) for i in range(20)], axis=1)
+        gap = np.linalg.norm(links.pos[:, 1:, None].numpy() - places[:, None], axis=-1)
+        assert_allclose(reading.tip_distance, gap.min(axis=-1), rtol=1e-5)
+        assert_allclose(reading.task_state.object_pos, place(center), atol=1e-5)
+        velocity = (place(center, 1e-6) - place(center)) / 1e-6
+        assert_allclose(reading.task_state.object_linvel, velocity, atol=1e-4)
+
+    def test_a_log_has_means_over_the_worlds_that_it_names(self):
+        g = generator()
+        masks = torch.rand(5, 40, generator=g) < tensor([0.2, 0.4, 0.6, 0.7, 0.5])[:, None]
+        grasped, success, done, sound, from_home = masks
+        term = torch.randn(40, generator=g)
+        term[~sound] = math.nan
+        reward = Reward(
+            total=term, terms={"reach": term}, grasped=grasped, gate=~success, success=success
+        )
+        totals = {"health/total": tensor(7)}
+        names, values = step_log(reward, done, sound=sound, from_home=from_home, totals=totals)
+        every = np.ones(40, dtype=bool)
+        expected = {
+            "reward/reach": (term, sound),
+            "task/grasped": (grasped, every),
+            "task/success": (success, every),
+            "task/grasped_from_home": (grasped, from_home),
+            "task/success_from_home": (success, from_home),
+            "episode/ended": (done, every),
+        }
+        means = {
+            name: float(value.numpy()[np.asarray(of)].mean())
+            for name, (value, of) in expected.items()
+        }
+        found = dict(zip(names, values.tolist(), strict=True))
+        self.assertEqual(found.pop("health/total"), 7)
+        assert_close(found, means, rtol=0, atol=1e-6)
 
 
 class Comparisons(TorchDispatchMode):
@@ -440,6 +698,24 @@ class ResetTest(TestCase):
         ):
             self.sample(objects=(SOUP, "011_banana"))
 
+    def test_demonstrations_and_states_are_drawn_evenly_where_all_fail_alike(self):
+        """The soup can has one state of demonstration 0 and two of demonstration 2. A share of the draws chooses the
+        demonstration first."""
+        bank = self.bank.with_states(np.arange(6) != 1)
+        for share in (0.0, 0.5):
+            reset = self.sample(bank=bank, demo_probability=0.5, adaptive_share=share)
+            of_bank = reset[reset.from_bank]
+            first = (1 - share) / 3 + share / 2
+            second = (1 - share) / 3 + share / 4
+            states = ((of_bank.object_pos[:, 0] - 0.6) * 100).round()
+            for state, expected in ((0, first), (4, second), (5, second)):
+                own = states == state
+                with self.subTest(share=share, state=state):
+                    self.assertAlmostEqual(own.float().mean(), expected, delta=0.03)
+                    self.assertAlmostEqual(of_bank.gravity_fraction[own].mean(), 0.5, delta=0.05)
+            of_second = (reset.sequence[~reset.from_bank] == 2).float().mean()
+            self.assertAlmostEqual(of_second, 0.5, delta=0.03)
+
     def test_demonstrations_that_fail_are_drawn_more_often(self):
         """The soup can's two demonstrations are 0, which always succeeds, and 2, which never does."""
         shares = ((0.0, 0.5), (0.5, 0.25 + 0.5 / 1.05), (1.0, 1 / 1.05))
@@ -510,6 +786,11 @@ class ResetTest(TestCase):
         yaw = quat_angle(reset.object_quat, self.of(reset, "start_quat_wxyz")).rad2deg()
         self.assertAlmostEqual(yaw.max(), 25.0, delta=0.1)
         self.assertAlmostEqual(yaw.mean(), 12.5, delta=0.5)
+        start_quat = self.of(reset, "start_quat_wxyz")
+        turn = quat_to_axis_angle(quat_multiply(reset.object_quat, quat_conjugate(start_quat)))
+        assert_range(turn[:, 2].rad2deg(), -25.0, 25.0, atol=0.1)
+        drawn = torch.column_stack((offset(reset)[:, :2], turn[:, 2], reset.gravity_fraction))
+        assert_close(drawn.T.corrcoef(), torch.eye(4), atol=0.05, rtol=0)
         assert_range(offset(self.sample(spawn_xy=0.0, spawn_yaw=0.0)), 0.0, 0.0)
         self.assertAlmostEqual(offset(self.sample(training_xy=0.1)).max(), 0.1, delta=1e-3)
         lying = np.tile(turned(90, (1.0, 0, 0)).numpy(), (3, 1))
@@ -531,6 +812,35 @@ class ResetTest(TestCase):
         self.assertGreaterEqual(height.min(), 0.0)
         task = evaluation_task(TaskConfig(reset=ResetConfig(training_xy=0.1, **options)))
         self.assertEqual(task.reset, evaluation_task(TaskConfig()).reset)
+
+    def test_goals_turn_about_pivots_whose_heights_limit_them(self):
+        """A pivot that is above its place at the start is not lowered beneath it; one that is below is not lowered."""
+        pivots = {SOUP: np.array([0.03, -0.01, 0.02]), SPAM: np.array([-0.02, 0.04, -0.03])}
+        config = ResetConfig(demo_probability=0.0, goal_xy=0.03, goal_z=0.05, goal_yaw=0.5)
+        index = tensor([0, 1] * 2000)
+        pivot = torch.as_tensor(np.stack(list(pivots.values())), dtype=torch.float32)[index]
+        for raised in (0.2, 0.04, -0.1):
+            goals = self.bank.start_pos + np.float32([0, 0, raised])
+            bank = replace(self.bank, goal_pos=goals)
+            resets = ResetDistribution(bank, self.robot, (SOUP, SPAM), config, pivots=pivots)
+            reset = resets.sample(index, generator())
+            start, goal = (
+                pos[reset.sequence] + quat_rotate(quat[reset.sequence], pivot)
+                for pos, quat in (
+                    (torch.as_tensor(bank.start_pos), torch.as_tensor(bank.start_quat_wxyz)),
+                    (torch.as_tensor(bank.goal_pos), torch.as_tensor(bank.goal_quat_wxyz)),
+                )
+            )
+            offset = reset.goal_pos + quat_rotate(reset.goal_quat, pivot) - goal
+            for name, own in ((SOUP, index == 0), (SPAM, index == 1)):
+                lowest = -float((goal - start)[own][0, 2].clamp(0.0, 0.05))
+                with self.subTest(name, raised=raised):
+                    for axis, low, high in ((0, -0.03, 0.03), (1, -0.03, 0.03), (2, lowest, 0.05)):
+                        assert_range(offset[own, axis], low, high, atol=3e-4)
+            quat = self.of(reset, "goal_quat_wxyz")
+            turn = quat_to_axis_angle(quat_multiply(reset.goal_quat, quat_conjugate(quat)))
+            assert_range(turn[:, 2], -0.5, 0.5, atol=2e-3)
+            assert_range(turn[:, :2], 0.0, 0.0, atol=1e-5)
 
     def test_home_joints_spread_as_the_paper_says_and_stay_within_limits(self):
         joints = self.sample().joint_pos
@@ -627,6 +937,13 @@ class ObservationTest(TestCase):
             quat = self.shown[name]
             self.assertTrue((quat[:, 0] >= 0).all(), name)
             assert_close(quat_angle(quat, own), torch.zeros(self.N), atol=1e-3, rtol=0)
+
+    def test_a_rotation_to_the_goal_turns_the_object_there(self):
+        c = replace(self.config, rotation="to_goal")
+        columns = self.terms(self.x, c)["rotation_to_goal"].split(3, dim=-1)
+        for axis, column in zip(torch.eye(3), columns):
+            own = quat_rotate(quat_conjugate(self.x.observed_quat), axis.expand(self.N, 3))
+            assert_close(column, quat_rotate(self.x.goal_quat, own))
 
     def test_with_cameras_a_goal_may_be_a_rotation_from_the_start(self):
         c = replace(self.config, rotation="to_goal")

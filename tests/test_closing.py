@@ -9,7 +9,7 @@ from unittest.mock import patch
 import numpy as np
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 from torch import tensor
 from torch.testing import assert_close
 
@@ -74,7 +74,7 @@ class ClosingTest(TestCase):
         tips = np.arange(10)[:, None, None] * [[0.012, 0, 0], [0, 0.004, 0]]
         turned = quat_of(Rotation.from_rotvec(0.2 * np.arange(10)[:, None] * [0, 0, 1]))
         changes = {"joint_pos": joints, "fingertip_pos": tips, "object_quat_wxyz": turned}
-        changes["object_pos"] = np.tile([0.5, 0.3, 0.1], (10, 1))
+        changes["object_pos"] = np.repeat([[0.5, 0.3, 0.1], [0.6, 0.2, 0.1]], 5, axis=0)
         self.data = toy_retargeted(ROBOT, ["brick", "brick"], [0, 5, 10], **changes)
         self.gap = np.full((10, 2), 0.03)
 
@@ -99,6 +99,8 @@ class ClosingTest(TestCase):
         self.assertEqual(frame[:8].tolist(), [0, 0, 0, 1, 1, 1, 2, 2])
         assert_allclose(part[:5], [0, 1 / 3, 2 / 3, 0, 1 / 3])
         self.assertEqual(frame[part == 0].tolist(), list(range(10)))
+        still = replace(self.data, fingertip_pos=np.zeros((10, 2, 3)))
+        self.assertEqual(self.states(still)[0].tolist(), list(range(10)))
 
     def test_between_two_frames_positions_are_straight_and_rotations_even(self):
         frame, part = self.states()
@@ -110,6 +112,10 @@ class ClosingTest(TestCase):
         quat = rotations_between(self.data.object_quat_wxyz, frame, part)
         assert_allclose(2 * np.arctan2(quat[:, 3], quat[:, 0]), 0.2 * (frame + part), atol=1e-9)
         self.assertEqual(quat[part == 0].tobytes(), self.data.object_quat_wxyz.tobytes())
+        turns = Rotation.random(10, np.random.default_rng(1))
+        between = turn_of(rotations_between(quat_of(turns), frame, part))
+        expected = Slerp(np.arange(10), turns)(frame + part)
+        assert_allclose((between.inv() * expected).magnitude(), 0.0, atol=1e-7)
 
     def test_sequences_are_not_mixed_and_nothing_invalid_is_bridged(self):
         valid = np.ones(10, dtype=bool)
@@ -122,14 +128,20 @@ class ClosingTest(TestCase):
         self.gap[:, :] = np.array([0.3, 0.12, 0.09, 0.2, 0.2] * 2)[:, None]
         self.assertEqual(self.bridged(), [1, 2, 6, 7])
         self.assertEqual(self.bridged(within=0.15), [0, 1, 2, 5, 6, 7])
+        self.gap[:, 0] = 0.3
+        self.assertEqual(self.bridged(), [1, 2, 6, 7], "where any finger is near")
 
     def test_only_until_thumb_and_finger_touch_or_the_object_is_moved(self):
+        self.gap[:] = 0.0021
+        self.assertEqual(self.bridged(), [0, 1, 2, 3, 5, 6, 7, 8], "near is no touch")
         self.gap[1:, 1] = 0.001  # a finger alone
         self.gap[2, 0] = 0.001
         self.gap[8, 0] = 0.001
         self.assertEqual(self.bridged(), [0, 1, 5, 6, 7], "also where the thumb lets go again")
         pos = self.data.object_pos.copy()
-        pos[6, 0] += 0.011
+        pos[6, 0] += 0.0099
+        self.assertEqual(self.bridged(replace(self.data, object_pos=pos)), [0, 1, 5, 6, 7])
+        pos[6, 0] += 0.0002
         self.assertEqual(self.bridged(replace(self.data, object_pos=pos)), [0, 1, 5])
         self.gap[5] = 0.001  # the second sequence begins with a grasp
         self.assertEqual(self.bridged(), [0, 1])

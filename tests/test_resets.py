@@ -1,6 +1,7 @@
 """The physics filter on the MuJoCo C engine: what stays put is kept, what moves is rejected, with its reason."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from unittest import SkipTest, TestCase, mock
 
 import numpy as np
@@ -8,11 +9,14 @@ import torch
 from numpy.testing import assert_allclose
 
 from tests.toy_bank import SOUP, SPAM, in_this_process, toy_retargeted
-from xreset import FilterConfig, robots
+from xreset import FilterConfig, SqueezeConfig, robots
 from xreset.errors import DemoError
 from xreset.objects.catalogue import load_objects
 from xreset.objects.rest import rest_height
+from xreset.physics import Health, State
 from xreset.resets.filter import REASONS, make_bank
+from xreset.resets.probe import rejection
+from xreset.spec import TableSpec
 
 try:
     from xreset.backends.mujoco import MujocoBackend
@@ -34,6 +38,39 @@ def made_of(classes):
 def reasons(bank):
     """Why the candidates of a bank were rejected."""
     return [REASONS[reason] for reason in bank.rejected_reason]
+
+
+class RejectionTest(TestCase):
+    def test_each_limit_rejects_for_its_own_reason_and_the_last_one_counts(self):
+        limits = FilterConfig(linear_velocity=0.1, angular_velocity=1.5, joint_velocity=2.0)
+        linear, angular, joint, nonfinite, overflow = range(1, 6)
+        worlds = [
+            # linear velocity, angular velocity, joint velocities, not finite, overflow, reason
+            ([0.0, 0.06, -0.07], [1.0, 1.0, 0.4], [1.9, -1.9], False, False, -1),
+            ([0.0, 0.08, -0.07], [0.0, 0.0, 0.0], [0.0, 0.0], False, False, linear),
+            ([0.0, 0.0, 0.0], [1.0, -1.0, 0.6], [0.0, 0.0], False, False, angular),
+            ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 2.1], False, False, joint),
+            ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [-2.1, 0.0], False, False, joint),
+            ([9.0, 0.0, 0.0], [9.0, 0.0, 0.0], [0.0, 0.0], False, False, angular),
+            ([9.0, 0.0, 0.0], [0.0, 0.0, 0.0], [9.0, 0.0], True, False, nonfinite),
+            ([9.0, 0.0, 0.0], [0.0, 0.0, 0.0], [9.0, 0.0], True, True, overflow),
+        ]
+        linvel, angvel, joint_vel, *broken, expected = (
+            torch.tensor(column) for column in zip(*worlds, strict=True)
+        )
+        n = len(worlds)
+        table = TableSpec()
+        above = torch.tensor([*table.center, 0.3]).expand(n, 3)
+        still = State.at_rest(torch.zeros(n, 2), above, torch.tensor([1.0, 0, 0, 0]).expand(n, 4))
+        state = replace(still, joint_vel=joint_vel, object_linvel=linvel, object_angvel=angvel)
+        backend = SimpleNamespace(
+            state=lambda: state,
+            health=lambda: Health(nonfinite=broken[0], overflow=broken[1]),
+            scene=SimpleNamespace(table=table),
+            num_worlds=n,
+            device="cpu",
+        )
+        self.assertEqual(rejection(backend, still, limits).tolist(), expected.tolist())
 
 
 class FilterTest(TestCase):
@@ -140,12 +177,48 @@ class FilterTest(TestCase):
             made_of({"moves": Moves}),
             mock.patch("xreset.resets.probe.device_for", lambda name, device: device),
         ):
-            bank = self.bank(["mujoco", "moves"], num_envs=2)
+            calls = []
+            bank = self.bank(
+                ["mujoco", "moves"], num_envs=2, progress=lambda *now: calls.append(now)
+            )
         self.assertEqual(bank.backends, ("mujoco", "moves"))
         self.assertEqual(bank.sequence_index.tolist(), [0, 0, 1])
         self.assertEqual(bank.frame_index.tolist(), [0, 2, 2])
         self.assertEqual(bank.rejected_frame_index.tolist(), [1, 1])
         self.assertEqual(reasons(bank), ["object linear velocity", "joint velocity"])
+        self.assertEqual(calls, sorted(calls))
+        self.assertEqual(calls[-1], (10, 10))
+
+    def test_targets_that_press_are_tried_with_the_same_objects_for_the_stated_steps(self):
+        tried = []
+
+        def accepted(_, scene, object_name, states, judge, **options):
+            tried.append((object_name.tolist(), states, options["steps"]))
+            return np.full(len(object_name), -1)
+
+        def pressed(robot, fingers, joint_pos, config):
+            return joint_pos + 0.25
+
+        motion = self.retargeted(first_contact=np.array([2, 1]))
+        with (
+            mock.patch("xreset.resets.filter.probe", accepted),
+            mock.patch("xreset.resets.filter.fingers_of"),
+            mock.patch("xreset.resets.filter.squeeze_targets", pressed),
+        ):
+            make_bank(
+                motion,
+                self.robot,
+                self.objects,
+                limits=FilterConfig(steps=3),
+                squeeze=SqueezeConfig(force=1.0),
+            )
+        (names, plain, steps), (pressing_names, pressing, pressing_steps) = tried
+        self.assertEqual(names, [SOUP] * 3 + [SPAM] * 2)
+        self.assertEqual(pressing_names, [SOUP, SPAM, SPAM])
+        self.assertEqual((steps, pressing_steps), (3, 3))
+        # the states after contact
+        assert_allclose(pressing.object_pos, plain.object_pos[[2, 3, 4]])
+        assert_allclose(pressing.joint_target, pressing.joint_pos + 0.25, rtol=1e-6)
 
     def test_loose_limits_accept_all_and_nothing_valid_is_an_error(self):
         loose = FilterConfig(linear_velocity=1e3, angular_velocity=1e3, joint_velocity=1e3)

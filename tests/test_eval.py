@@ -34,7 +34,7 @@ from xreset.eval.results import (
     write_results,
 )
 from xreset.eval.rollout import engine, load_trial, roll_out
-from xreset.eval.stats import bootstrap_ci95
+from xreset.eval.stats import bootstrap_ci95, mean_of_known
 from xreset.eval.table import result_rows
 from xreset.files import claim_folder
 from xreset.geometry.rotations import quat_from_axis_angle
@@ -73,6 +73,18 @@ def reading(
         health=Health(nonfinite=tensor([nonfinite]), overflow=tensor([overflow])),
         tip_distance=tensor(tips)[None],
     )  # fmt: skip
+
+
+def joined(places, quat=IDENTITY):
+    """One reading of several worlds, in which the hand holds the object."""
+    each = [reading(pos, quat, **HELD) for pos in places]
+    parts = {
+        name: type(value).cat([getattr(one, name) for one in each])
+        for name, value in vars(each[0]).items()
+        if name not in ("tip_distance", "task_state")
+    }
+    distances = torch.cat([one.tip_distance for one in each])
+    return Reading(**parts, task_state=parts["state"], tip_distance=distances)
 
 
 def raised(height):
@@ -159,6 +171,10 @@ class MetricsTest(TestCase):
             (1.0, episode(reading(GOAL))),
             (0.0, episode(reading(), reading(raised(0.05)), reading(GOAL), lost_at=1)),
             (
+                1 - 0.12 * math.sqrt(2) / 0.2,
+                episode(reading(GOAL + tensor([0.02, 0.02, 0.0]), turned(180))),
+            ),
+            (
                 1 - 0.1 / (0.2 * math.sqrt(2)),
                 episode(reading(raised(0.1)), start=reading(AWAY, turned(180))),
             ),
@@ -193,7 +209,7 @@ class MetricsTest(TestCase):
             ),
             (
                 "left the scene",
-                episode(reading(raised(0.1)), reading(GOAL), lost_at=1),
+                episode(reading(raised(0.1)), reading(GOAL, turned(20)), lost_at=1),
                 False,
                 0.1,
                 (0.1, 0.1, 0.0),
@@ -204,6 +220,40 @@ class MetricsTest(TestCase):
                 self.assertAlmostEqual(m.least_distance, least, delta=5e-7)
                 found = torch.cat((m.final_distance, m.final_position_error, m.final_angle))
                 assert_allclose(found, last, atol=1e-3)
+
+    def test_each_world_has_its_own_start_goal_and_end(self):
+        """The second lifts its object, not as high as the first one's start, and loses it. Also if what was given is
+        overwritten later."""
+        high = START + tensor([0.1, 0.0, 0.1])
+        goal = high + tensor([0.05, 0.0, 0.15])
+        worlds = (
+            (high, goal, turned(40), (high, goal, goal), None),
+            (START, GOAL, IDENTITY, (raised(0.05), raised(0.09), GOAL), 2),
+            (START, high, IDENTITY, (START, START, START), None),
+        )
+        alone = []
+        for start, goal, quat, places, lost_at in worlds:
+            m = EpisodeMetrics(reading(start, **HELD), goal[None], quat[None], POINTS)
+            for step, pos in enumerate(places):
+                m.update(reading(pos, turned(5), **HELD), tensor([step == lost_at]))
+            alone.append(m)
+        starts, goals, quats, paths, losses = zip(*worlds, strict=True)
+        given = (joined(starts), torch.stack(goals), torch.stack(quats))
+        together = EpisodeMetrics(*given, MetricPoints.cat([POINTS] * 3))
+        given[0].state.object_pos.zero_()
+        given[1].zero_()
+        given[2].zero_()
+        for step, places in enumerate(zip(*paths, strict=True)):
+            lost = tensor([step == lost_at for lost_at in losses])
+            together.update(joined(places, turned(5)), lost)
+        self.assertEqual(together.grasp.tolist(), [True, True, False])
+        for name in (
+            "approach", "grasp", "reorient", "reorient_once", "out_of_bounds", "published_success",
+            "least_distance", "final_distance", "final_position_error", "final_angle",
+            "reorientation_progress", "task_progress",
+        ):  # fmt: skip
+            found = getattr(together, name)
+            torch.testing.assert_close(found, torch.cat([getattr(m, name) for m in alone]))
 
     def test_a_world_that_is_not_finite_is_counted_and_no_longer_looked_at(self):
         nan = torch.full((3,), math.nan)
@@ -292,8 +342,16 @@ class BootstrapTest(TestCase):
     def test_groups_may_differ_in_size(self):
         low, high = bootstrap_ci95(np.array([1.0, 1, 1, 1, 0]), np.array([7, 7, 7, 7, 2]))
         self.assertEqual((low, high), (0.0, 1.0))
+        # 20 demonstrations of nine episodes that succeed, and 20 of one that fails
+        groups = np.concatenate((np.repeat(np.arange(20), 9), 20 + np.arange(20)))
+        low, high = bootstrap_ci95((groups < 20).astype(float), groups)
+        self.assertTrue(0.75 < low < 0.9 < high < 1.0, (low, high))
         alone = bootstrap_ci95(np.array([1.0, 0, 1, 0]), np.zeros(4))
         self.assertTrue(0 <= alone[0] < 0.5 < alone[1] <= 1)
+
+    def test_a_mean_of_what_was_not_always_measured_is_unknown(self):
+        self.assertEqual(mean_of_known([1.0, 4.0]), 2.5)
+        self.assertIsNone(mean_of_known([1.0, None]))
 
 
 JOINTS = ("a", "b", "c")

@@ -30,7 +30,7 @@ def evaluate(
             retarget) or a goal set (xreset goals).
         episodes: Episodes of each demonstration, each with another perturbation of robot and object.
         settle: Let objects come to rest before episodes begin. Default: the recorded poses, as in the paper, from which
-            one object in eight tips or rolls.
+            one object in eleven turns by more than 10 degrees.
         episode_seconds: Length of an episode [s], such as 12, as in the published paper. Default: as in the policy's
             training.
         setting: Robot, meshes, seed, device and worlds.

@@ -41,7 +41,7 @@ def resets(
         closing: Extra states between frames in which the hand closes in on the object.
         squeeze: How hard fingers press in states after contact, and which fingers.
         settle: Let objects come to rest (in the first engine) before episodes begin at home. Default: the recorded
-            poses, as in the paper, from which one object in eight tips or rolls.
+            poses, as in the paper, from which one object in eleven turns by more than 10 degrees.
     """
     from xreset.description import load_robot
     from xreset.objects.catalogue import load_objects

@@ -675,7 +675,7 @@ class ObjectFrameTest(WithEnv, InFolder):
             live,
             distance_points=64,
             randomization=RandomizationConfig(),
-            reset=replace(live.reset, training_xy=0.05),
+            reset=replace(live.reset, training_xy=0.05, random_gravity=True),
         )
         corners = default_rng(2).normal(size=(14, 3)) * (0.02, 0.03, 0.05)
         mesh = trimesh.convex.convex_hull(corners + np.array([0.0, 0.01, 0.05]))

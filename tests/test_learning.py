@@ -1,5 +1,6 @@
 """The model, the sequence storage, the export and the run folder; no physics."""
 
+import copy
 import json
 import math
 from dataclasses import asdict, replace
@@ -9,6 +10,7 @@ from unittest.mock import Mock, patch
 
 import numpy as np
 import torch
+from numpy.testing import assert_allclose
 from tensordict import TensorDict
 from torch.testing import assert_close
 from torch.utils._pytree import tree_flatten_with_path
@@ -234,6 +236,193 @@ class StorageTest(TestCase):
         self.assertGreater(self.losses["bounds"], 1.0)
         _, _, held = self.bandit(iterations=5, bias=3.0, target=3.0, bounds_loss=1.0)
         self.assertLess(held.mean(), float(free.mean()) - 0.1)
+
+
+class UpdateTest(TestCase):
+    """One rollout of four worlds and its update, against the formulas written out."""
+
+    WORLDS = 4
+    FIRST = ((2, 1), (3, 0), (6, 0), (6, 2))
+    """Steps and worlds that begin an episode. The step before (2, 1) ends at its time limit; that before (3, 0) fails."""
+
+    def algorithm(self, normalize_returns=False, **ppo):
+        torch.manual_seed(0)
+        model = replace(SMALL, initial_std=0.5, normalize_returns=normalize_returns)
+        options = {"horizon": T, "sequence_length": L, "minibatch_size": 10**6, "mini_epochs": 1}
+        config = TrainConfig(model=model, ppo=PpoConfig(**(options | {"schedule": "fixed"} | ppo)))
+        alg = SequencePpo(observations(self.WORLDS), A, config, "cpu", Processes())
+        # some means lie beyond the bounds, on both sides
+        alg.actor.mlp[-1].bias.data += torch.linspace(-2.0, 2.0, A)
+        return alg
+
+    def roll_out(self, alg, seed=0):
+        """Fill the storage; return rewards and ends of episodes [T, 4], and the critic's last values [4, 1]."""
+        first = torch.zeros(T + 1, self.WORLDS, dtype=torch.bool)
+        first[tuple(zip(*self.FIRST, strict=True))] = True
+        first[T, 3] = True
+        obs = with_real_history(observations(T + 1, self.WORLDS, seed=seed), first)
+        rewards = torch.randn(T, self.WORLDS, generator=torch.Generator().manual_seed(seed))
+        time_outs, faulty = torch.zeros(2, T, self.WORLDS)
+        time_outs[1, 1] = 1.0
+        faulty[2, 0] = 1.0
+        with torch.no_grad():
+            for model in (alg.actor, alg.critic):
+                model.reset()
+            for t in range(T):
+                alg.act(obs[t])
+                extras = {"time_outs": time_outs[t], "faulty": faulty[t].bool()}
+                alg.process_env_step(obs[t + 1], rewards[t], first[t + 1], extras)
+            alg.compute_returns(obs[T])
+            last = alg.critic(obs[T])
+        return rewards, first[1:], last
+
+    def test_returns_and_advantages(self):
+        """Sums of discounted errors until the episode's end; the value of a time limit's state is bootstrapped."""
+        discount = 0.9
+        decay = 0.7
+        alg = self.algorithm(discount=discount, gae_lambda=decay)
+        rewards, ends, last = self.roll_out(alg)
+        values = torch.cat((alg.storage.values[..., 0], last.T)).double().numpy()
+        rewards = rewards.double().numpy()
+        rewards[1, 1] += discount * values[1, 1]
+        advantages = np.zeros((T, self.WORLDS))
+        for world in range(self.WORLDS):
+            for start in range(T):
+                weight = 1.0
+                for t in range(start, T):
+                    following = 0.0 if ends[t, world] else discount * values[t + 1, world]
+                    error = rewards[t, world] + following - values[t, world]
+                    # a faulty step teaches nothing
+                    advantages[start, world] += weight * error * ((t, world) != (2, 0))
+                    weight *= discount * decay
+                    if ends[t, world]:
+                        break
+        assert_allclose(alg.storage.returns[..., 0], advantages + values[:T], atol=1e-5)
+        normalized = (advantages - advantages.mean()) / advantages.std(ddof=1)
+        normalized[2, 0] = 0.0
+        assert_allclose(alg.storage.advantages[..., 0], normalized, atol=1e-5)
+
+    def test_an_update_begins_with_the_values_and_probabilities_of_the_rollout(self):
+        alg = self.algorithm()
+        self.roll_out(alg)
+        advantages = alg.storage.advantages.mean()
+        with patch.object(alg, "_value_loss", wraps=alg._value_loss) as loss:
+            losses = alg.update()
+        values, old_values, _ = loss.call_args.args
+        assert_close(values.detach(), old_values)
+        self.assertAlmostEqual(losses["surrogate"], -float(advantages), places=5)
+
+    def perturbed(self, alg, seed):
+        """A rollout of another policy and critic, and copies of the networks."""
+        self.roll_out(alg, seed)
+        storage = alg.storage
+        g = torch.Generator().manual_seed(10 + seed)
+        storage.actions_log_prob += 0.4 * torch.randn(storage.actions_log_prob.shape, generator=g)
+        storage.values += torch.randn(storage.values.shape, generator=g)
+        return copy.deepcopy((alg.actor, alg.critic))
+
+    def step_by_step(self, model, storage):
+        """[T, 4, ...] outputs of a model along the rollout; gradients end with each sequence."""
+        outputs = []
+        zeros = torch.zeros(1, self.WORLDS, SMALL.lstm)
+        model.reset(hidden_state=(zeros, zeros))
+        for t in range(T):
+            if t % L == 0:
+                model.reset(hidden_state=tuple(part.detach() for part in model.state))
+            outputs.append(model(storage.observations[t]))
+            model.reset(storage.dones[t, :, 0])
+        return torch.stack(outputs)
+
+    def expected(self, models, storage, clip, unit):
+        """The losses by name."""
+        actor, critic = models
+        mean = self.step_by_step(actor, storage)
+        values = self.step_by_step(critic, storage)
+        log_std = actor.distribution.log_std_param
+        distance = (storage.actions - mean) / log_std.exp()
+        log_prob = -(distance.square() / 2 + log_std + math.log(2 * math.pi) / 2).sum(dim=-1)
+        ratio = (log_prob - storage.actions_log_prob[..., 0]).exp()
+        advantage = storage.advantages[..., 0]
+        gain = torch.minimum(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage)
+        change = (values - storage.values).clamp(-clip * unit, clip * unit)
+        errors = [(v - storage.returns) / unit for v in (values, storage.values + change)]
+        beyond = torch.where(mean > 1.1, mean - 1.1, torch.where(mean < -1.1, mean + 1.1, 0.0))
+        return {
+            "value": torch.maximum(errors[0].square(), errors[1].square()).mean(),
+            "surrogate": -gain.mean(),
+            "entropy": (log_std + math.log(2 * math.pi * math.e) / 2).sum(),
+            "bounds": beyond.square().sum(dim=-1).mean(),
+        }
+
+    def test_gradients_are_those_of_the_weighted_losses(self):
+        for limit in (1e3, 0.01):
+            weights = {"value_loss": 0.7, "entropy": 0.02, "bounds_loss": 0.3}
+            alg = self.algorithm(clip=0.15, grad_norm=limit, learning_rate=1e-3, **weights)
+            models = self.perturbed(alg, 0)
+            losses = self.expected(models, alg.storage, 0.15, 1.0)
+            signs = {"value": 0.7, "surrogate": 1.0, "entropy": -0.02, "bounds": 0.3}
+            sum(weight * losses[name] for name, weight in signs.items()).backward()
+            flat = alg.storage.observations.flatten(0, 1)
+            alg.update()
+            for model, own in zip((alg.actor, alg.critic), models, strict=True):
+                gradients = [p.grad for p in own.parameters()]
+                norm = float(torch.cat([grad.flatten() for grad in gradients]).norm())
+                self.assertGreater(norm, 0.02)
+                share = min(1.0, limit / norm)
+                for found, grad in zip(model.parameters(), gradients, strict=True):
+                    assert_close(found.grad, share * grad, rtol=1e-3, atol=1e-5 * share)
+                for name, found in model.named_parameters():
+                    moved = found - own.get_parameter(name)
+                    # the first step of Adam
+                    self.assertAlmostEqual(moved.abs().max(), 1e-3, delta=1e-5)
+                seen = torch.cat([flat[group] for group in model.obs_groups], dim=-1)
+                assert_close(model.trunk.normalizer.mean, seen.mean(dim=0))
+
+    def test_losses_are_means_over_epochs_and_minibatches(self):
+        """Also of later updates, and in units of the returns' deviation."""
+        for normalize in (False, True):
+            options = {"mini_epochs": 2, "minibatch_size": 16, "clip": 0.15}
+            alg = self.algorithm(normalize, learning_rate=1e-9, **options)
+            self.assertEqual(alg.num_mini_batches, 2)
+            seen = []
+            for seed in (0, 1):
+                models = self.perturbed(alg, seed)
+                seen.append(alg.storage.returns.clone())
+                unit = torch.cat(seen).std(unbiased=False) if normalize else 1.0
+                with torch.no_grad():
+                    expected = self.expected(models, alg.storage, 0.15, unit)
+                found = alg.update()
+                expected = {name: float(value) for name, value in expected.items()}
+                assert_close(found, expected, rtol=1e-4, atol=1e-5)
+
+    def test_an_adaptive_rate_follows_the_policy_s_change(self):
+        """By how much the means move makes the divergence of two Gaussians: the change's square / (2 std^2), summed."""
+        desired = 0.02
+        for share, rate, expected in (
+            (0.0, 1e-3, 1e-3),
+            (0.45, 1e-3, 1.5e-3),
+            (0.55, 1e-3, 1e-3),
+            (1.95, 1e-3, 1e-3),
+            (2.05, 1e-3, 1e-3 / 1.5),
+            (2.05, 1.2e-5, 1e-5),
+            (0.45, 9e-3, 1e-2),
+        ):
+            alg = self.algorithm(schedule="adaptive", desired_kl=desired)
+            alg.learning_rate = rate
+            self.roll_out(alg)
+            mean, std = alg.storage.distribution_params
+            mean += std * math.sqrt(2 * share * desired / A)
+            alg.update()
+            with self.subTest(share=share, rate=rate):
+                self.assertAlmostEqual(alg.learning_rate, expected, delta=1e-9)
+                self.assertEqual(alg.optimizer.param_groups[0]["lr"], alg.learning_rate)
+
+    def test_a_fixed_rate_is_the_one_that_was_set_last(self):
+        alg = self.algorithm()
+        alg.learning_rate = 7e-4
+        self.roll_out(alg)
+        alg.update()
+        self.assertEqual((alg.learning_rate, alg.optimizer.param_groups[0]["lr"]), (7e-4, 7e-4))
 
 
 class ReturnCriticTest(TestCase):

@@ -28,18 +28,22 @@ from xreset.tensors import Tensors, where
 
 @frozen
 class Reset(Tensors):
-    """Start of M episodes."""
+    """Start of M episodes; poses of the mesh frame in the world frame, quaternions (w, x, y, z)."""
 
     joint_pos: Tensor
-    """[M, J]"""
+    """[M, J] rad or m"""
     joint_target: Tensor
     """[M, J] drive targets."""
     object_pos: Tensor
+    """[M, 3] m"""
     object_quat: Tensor
+    """[M, 4]"""
     goal_pos: Tensor
+    """[M, 3] m"""
     goal_quat: Tensor
+    """[M, 4]"""
     gravity_fraction: Tensor
-    """[M]"""
+    """[M] share of the object's weight that acts."""
     state: Tensor
     """[M] which of the distribution's bank states, -1 for home."""
     sequence: Tensor

@@ -523,16 +523,17 @@ class RobustnessTest(WithEnv):
         assert_close(*torques)
 
     def test_forces_are_read_with_the_gain_of_the_episode(self):
-        env = self.make(self.task(force_gain=(2.0, 3.0)))
-        contacts = env.backend.contacts()
-        pressed = replace(contacts, tip_force=torch.full_like(contacts.tip_force, 0.1))
-        with patch.object(env.backend, "contacts", lambda: pressed):
-            env.reset()
-        force = env.get_observations()["proprio"][:, -6:]
-        gain = force / (TASK.observation.contact_force_scale * 0.1)
-        assert_close(gain, gain[:, :1].expand_as(gain))
-        self.assertTrue((gain >= 2.0).all() and (gain <= 3.0).all())
-        self.assertEqual(len(gain[:, 0].unique()), N)
+        for (low, high), distinct in (((2.0, 3.0), N), ((1.0, 1.0), 1)):
+            env = self.make(self.task(force_gain=(low, high)))
+            contacts = env.backend.contacts()
+            pressed = replace(contacts, tip_force=torch.full_like(contacts.tip_force, 0.1))
+            with patch.object(env.backend, "contacts", lambda pressed=pressed: pressed):
+                env.reset()
+            force = env.get_observations()["proprio"][:, -6:]
+            gain = force / (TASK.observation.contact_force_scale * 0.1)
+            assert_close(gain, gain[:, :1].expand_as(gain))
+            self.assertTrue((gain > low - 1e-5).all() and (gain < high + 1e-5).all())
+            self.assertEqual(len(gain[:, 0].unique()), distinct)
 
     def test_without_randomization_each_object_has_its_own_mass_and_friction(self):
         """A pair's friction is the mean of its materials: of the object's own, or of the middle of the range."""

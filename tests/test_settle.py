@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from unittest import TestCase
-from unittest.mock import patch
+from unittest.mock import Mock, patch
 
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
@@ -40,8 +40,10 @@ class SettleTest(TestCase):
         quat = quat_of(tilted([[0], [0], [6]]))
         names = np.array([SOUP, SOUP, SPAM])
         bank = toy_bank(self.robot, start_pos=pos, start_quat_wxyz=quat, sequence_object=names)
+        progress = Mock()
         with patch("xreset.resets.settle.probe", wraps=probe) as tried:
-            settled, at_rest = settle_starts(bank, self.robot, self.objects)
+            settled, at_rest = settle_starts(bank, self.robot, self.objects, progress=progress)
+        self.assertEqual(progress.call_args.args, (3, 3))
         held = tried.call_args.args[3].joint_pos
         assert_allclose(held, np.tile(self.robot.home, (3, 1)), rtol=1e-6)
         self.assertEqual(at_rest.tolist(), [True, False, True])

@@ -534,14 +534,30 @@ class TrackerTest(TestCase):
         self.assertAlmostEqual((pos[:, 0] == 0.0).float().mean(), 0.25, delta=0.03)
 
     def test_between_two_steps_an_orientation_turns_evenly_and_the_short_way(self):
+        """About another axis in each world; a quaternion's sign changes from step to step in some of them."""
+        g = generator(1)
+        axes = torch.nn.functional.normalize(torch.randn(self.N, 3, generator=g), dim=-1)
+
+        def turn(degrees):
+            return quat_from_axis_angle(math.radians(degrees) * axes)
+
         observe = self.tracker(latency=(0.5, 0.5))
-        observe(0.0, turned(10), fresh=True)
-        for now in (turned(50), -turned(50)):
-            pos, quat = observe(2.0, now)
-            sign = quat[:, :1].sign()
-            assert_close(sign * quat, turned(30).expand(self.N, 4))
-            assert_close(pos, torch.ones(self.N, 3))
-            observe(0.0, turned(10), fresh=True)
+        observe(0.0, turn(10), fresh=True)
+        for step in range(1, 5):
+            sign = torch.randn(self.N, 1, generator=g).sign()
+            pos, quat = observe(2.0 * step, sign * turn(10 + 100 * step))
+            assert_close(pos, torch.full((self.N, 3), 2.0 * step - 1.0))
+            between = turn(100 * step - 40)
+            between = between * (quat * between).sum(dim=-1, keepdim=True).sign()
+            assert_close(quat, between, atol=1e-5, rtol=0)
+
+    def test_a_delay_jitters_evenly_up_to_the_longest_one(self):
+        observe = self.tracker(latency=(2.0, 2.0), jitter=1.0)
+        for step in range(4):
+            pos, _ = observe(float(step), fresh=step == 0)
+        delay = 3.0 - pos[:, 0]
+        assert_range(delay, 1.0, 2.0, atol=2e-3)
+        self.assertAlmostEqual(delay.mean(), 1.75, delta=0.02)
 
     def test_a_new_episode_does_not_show_the_pose_of_the_last_one(self):
         observe = self.tracker(interval=(5.0, 5.0))
@@ -604,6 +620,8 @@ class ReadingTest(TestCase):
         g = generator()
         masks = torch.rand(5, 40, generator=g) < tensor([0.2, 0.4, 0.6, 0.7, 0.5])[:, None]
         grasped, success, done, sound, from_home = masks
+        from_home[:] = False
+        from_home[7] = success[7] = True
         term = torch.randn(40, generator=g)
         term[~sound] = math.nan
         reward = Reward(
@@ -627,6 +645,9 @@ class ReadingTest(TestCase):
         found = dict(zip(names, values.tolist(), strict=True))
         self.assertEqual(found.pop("health/total"), 7)
         assert_close(found, means, rtol=0, atol=1e-6)
+        _, values = step_log(reward, done, sound=sound, from_home=from_home & False, totals=totals)
+        found = dict(zip(names, values.tolist(), strict=True))
+        self.assertEqual(found["task/success_from_home"], 0.0)
 
 
 class Comparisons(TorchDispatchMode):

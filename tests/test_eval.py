@@ -78,11 +78,10 @@ def reading(
 def joined(places, quat=IDENTITY):
     """One reading of several worlds, in which the hand holds the object."""
     each = [reading(pos, quat, **HELD) for pos in places]
-    parts = {
-        name: type(value).cat([getattr(one, name) for one in each])
-        for name, value in vars(each[0]).items()
-        if name not in ("tip_distance", "task_state")
-    }
+    parts = {}
+    for name, value in vars(each[0]).items():
+        if name not in ("tip_distance", "task_state"):
+            parts[name] = type(value).cat([getattr(one, name) for one in each])
     distances = torch.cat([one.tip_distance for one in each])
     return Reading(**parts, task_state=parts["state"], tip_distance=distances)
 

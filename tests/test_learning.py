@@ -408,14 +408,22 @@ class UpdateTest(TestCase):
             (0.45, 9e-3, 1e-2),
         ):
             alg = self.algorithm(schedule="adaptive", desired_kl=desired)
-            alg.learning_rate = rate
-            self.roll_out(alg)
-            mean, std = alg.storage.distribution_params
-            mean += std * math.sqrt(2 * share * desired / A)
-            alg.update()
-            with self.subTest(share=share, rate=rate):
-                self.assertAlmostEqual(alg.learning_rate, expected, delta=1e-9)
-                self.assertEqual(alg.optimizer.param_groups[0]["lr"], alg.learning_rate)
+            for processes in (1, 2):
+                alg.learning_rate = rate
+                alg.is_multi_gpu = processes > 1
+                alg.gpu_world_size = processes
+                self.roll_out(alg)
+                mean, std = alg.storage.distribution_params
+                mean += std * math.sqrt(2 * share * desired / A)
+                with (
+                    self.subTest(share=share, rate=rate, processes=processes),
+                    # processes that are all alike
+                    patch("torch.distributed.all_reduce", lambda total: total.mul_(2)),
+                    patch.object(alg, "reduce_parameters"),
+                ):
+                    alg.update()
+                    self.assertAlmostEqual(alg.learning_rate, expected, delta=1e-9)
+                    self.assertEqual(alg.optimizer.param_groups[0]["lr"], alg.learning_rate)
 
     def test_a_fixed_rate_is_the_one_that_was_set_last(self):
         alg = self.algorithm()

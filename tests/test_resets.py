@@ -189,36 +189,47 @@ class FilterTest(TestCase):
         self.assertEqual(calls, sorted(calls))
         self.assertEqual(calls[-1], (10, 10))
 
-    def test_targets_that_press_are_tried_with_the_same_objects_for_the_stated_steps(self):
-        tried = []
+    def tried(self, verdicts, **options):
+        """The bank, and the objects, states and steps of each try; ``verdicts`` are the reasons that each try gives."""
+        tries = []
 
-        def accepted(_, scene, object_name, states, judge, **options):
-            tried.append((object_name.tolist(), states, options["steps"]))
-            return np.full(len(object_name), -1)
+        def probe(engine, scene, object_name, states, judge, **limits):
+            tries.append((object_name.tolist(), states, limits["steps"]))
+            return np.array(verdicts[len(tries) - 1])
 
         def pressed(robot, fingers, joint_pos, config):
             return joint_pos + 0.25
 
         motion = self.retargeted(first_contact=np.array([2, 1]))
         with (
-            mock.patch("xreset.resets.filter.probe", accepted),
+            mock.patch("xreset.resets.filter.probe", probe),
             mock.patch("xreset.resets.filter.fingers_of"),
             mock.patch("xreset.resets.filter.squeeze_targets", pressed),
         ):
-            make_bank(
-                motion,
-                self.robot,
-                self.objects,
-                limits=FilterConfig(steps=3),
-                squeeze=SqueezeConfig(force=1.0),
-            )
-        (names, plain, steps), (pressing_names, pressing, pressing_steps) = tried
+            return make_bank(motion, self.robot, self.objects, **options), tries
+
+    def test_targets_that_press_are_tried_with_the_same_objects_for_the_stated_steps(self):
+        """Three states come after contact; the last is out of bounds with targets that press."""
+        bank, tries = self.tried(
+            [[-1] * 5, [-1, -1, 0]], limits=FilterConfig(steps=3), squeeze=SqueezeConfig(force=1.0)
+        )
+        (names, plain, steps), (pressing_names, pressing, pressing_steps) = tries
         self.assertEqual(names, [SOUP] * 3 + [SPAM] * 2)
         self.assertEqual(pressing_names, [SOUP, SPAM, SPAM])
         self.assertEqual((steps, pressing_steps), (3, 3))
-        # the states after contact
-        assert_allclose(pressing.object_pos, plain.object_pos[[2, 3, 4]])
+        assert_allclose(pressing.object_pos, plain.object_pos[2:])
         assert_allclose(pressing.joint_target, pressing.joint_pos + 0.25, rtol=1e-6)
+        pressed = np.array([0.0, 0.0, 0.25, 0.25, 0.0])[:, None]
+        assert_allclose(bank.targets, bank.joint_pos + pressed, rtol=1e-6)
+
+    def test_an_engine_tries_what_the_one_before_accepts(self):
+        bank, tries = self.tried([[0, -1, 1, -1, -1], [-1, -1, 3]], engine=("a", "b"))
+        self.assertEqual(
+            [names for names, *_ in tries], [[SOUP] * 3 + [SPAM] * 2, [SOUP, SPAM, SPAM]]
+        )
+        assert_allclose(tries[1][1].object_pos, tries[0][1].object_pos[[1, 3, 4]])
+        self.assertEqual(bank.rejected_reason.tolist(), [0, 1, 3])
+        assert_allclose(bank.object_pos, tries[0][1].object_pos[[1, 3]])
 
     def test_loose_limits_accept_all_and_nothing_valid_is_an_error(self):
         loose = FilterConfig(linear_velocity=1e3, angular_velocity=1e3, joint_velocity=1e3)

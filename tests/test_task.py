@@ -687,6 +687,7 @@ class ResetTest(TestCase):
         reset = self.sample(tensor([0, 1] * 500), demo_probability=1.0)
         # the toy bank numbers its states
         state = ((reset.object_pos[:, 0] - 0.6) * 100).round().long()
+        self.assertEqual(reset.state.tolist(), state.tolist())
         assert_close(reset.joint_pos, torch.as_tensor(self.bank.joint_pos)[state])
         assert_close(reset.object_quat, torch.as_tensor(self.bank.object_quat_wxyz)[state])
         self.assertEqual(reset.sequence.tolist(), self.bank.sequence_index[state].tolist())
@@ -802,6 +803,7 @@ class ResetTest(TestCase):
             return reset.object_pos - self.of(reset, "start_pos")
 
         reset = self.sample()
+        self.assertEqual(reset.state.unique().tolist(), [-1])
         for axis, limit in enumerate((0.02, 0.02, 0.0)):
             assert_range(offset(reset)[:, axis], -limit, limit, atol=2e-4)
         yaw = quat_angle(reset.object_quat, self.of(reset, "start_quat_wxyz")).rad2deg()

@@ -486,6 +486,9 @@ class ConfigTest(TestCase):
     def test_table_viii(self):
         ppo = TrainConfig().ppo
         self.assertEqual((ppo.minibatches(4096), ppo.horizon, ppo.sequence_length), (2, 16, 4))
+        # no minibatch has less than two worlds
+        small = replace(ppo, minibatch_size=1)
+        self.assertEqual([small.minibatches(worlds) for worlds in (1, 3, 8)], [1, 1, 4])
 
     def test_numbers_that_make_no_sense_are_refused(self):
         for make, options, problem in (
@@ -561,6 +564,7 @@ class ChangingSettings(TestCase):
             ((0.0, 0.9), (0.0, 0.1)),
             ((0.0, 1.2),),
             ((-0.1, 0.5),),
+            ((0.0, 0.5), (1.1, 0.5)),
             ((0.0, math.nan),),
             ((math.nan, 0.5), (1.0, 0.5)),
             (0.0, 0.5, 1.0, 0.2),  # as on the command line

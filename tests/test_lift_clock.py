@@ -30,6 +30,8 @@ class LiftTest(InFolder):
     def test_a_resumed_run_forgets_what_came_after_its_checkpoint(self):
         again = self.after(Lift(), [0.0, 0.02, 0.0, 0.3]).up_to(3)
         self.assertEqual([(p.share, p.iteration) for p in again.passed], [(0.01, 2)])
+        at_checkpoint = self.after(Lift(), [0.0, 0.02]).up_to(2)
+        self.assertEqual([(p.share, p.iteration) for p in at_checkpoint.passed], [(0.01, 2)])
         again = self.after(again, [0.0, 0.4], begin=3)
         self.assertEqual([(p.share, p.iteration) for p in again.passed], [(0.01, 2), (0.1, 5)])
 

@@ -292,6 +292,7 @@ class ActionTest(TestCase):
     def test_hand_is_absolute_and_arm_relative(self):
         space = self.space(arm_step=0.05)
         target = tensor([[0.1, 0.5, -0.5, 0.0, 0.0, 0.3, 0.01]])
+        assert_close(space.step, tensor([0.05] * 3 + [0.0] * 4))
         still = space.targets(torch.zeros(1, 7), target, target - 0.02)
         # a loaded arm that sags would otherwise sink a little further at every step of zero action
         assert_close(still[:, :3], target[:, :3])
@@ -835,6 +836,24 @@ class ResetTest(TestCase):
         self.assertGreaterEqual(height.min(), 0.0)
         task = evaluation_task(TaskConfig(reset=ResetConfig(training_xy=0.1, **options)))
         self.assertEqual(task.reset, evaluation_task(TaskConfig()).reset)
+
+    def test_starts_turn_about_the_origin_that_the_task_names(self):
+        """Of boxes the center is the middle of their corners."""
+        middles = tensor([[0.03, -0.01, 0.02], [-0.02, 0.04, -0.03]])
+        corners = np.array([*product((-0.02, 0.02), (-0.01, 0.01), (-0.03, 0.03))])
+        objects = [
+            SimpleNamespace(name=name, vertices=corners + middle.numpy())
+            for name, middle in zip((SOUP, SPAM), middles, strict=True)
+        ]
+        index = tensor([0, 1] * 10)
+        config = ResetConfig(demo_probability=0.0, spawn_xy=0.0, spawn_yaw=1.0)
+        for frame, origins in (("mesh", torch.zeros(2, 3)), ("center", middles)):
+            task = TaskConfig(object_frame=frame, reset=config)
+            resets = ResetDistribution.of(self.bank, self.robot, objects, task)
+            reset = resets.sample(index, generator())
+            origin = origins[index]
+            place = reset.object_pos + quat_rotate(reset.object_quat, origin)
+            assert_close(place, self.of(reset, "start_pos") + origin)
 
     def test_goals_turn_about_pivots_whose_heights_limit_them(self):
         """A pivot that is above its place at the start is not lowered beneath it; one that is below is not lowered."""

@@ -373,6 +373,13 @@ class RobustnessTest(WithEnv):
         for now, before in zip(found[2:], present, strict=False):
             assert_close(now["policy"][:, :3], before["policy"][:, :3])
             assert_close(now["proprio"], before["proprio"])
+        env = self.make(late)
+        self.play(env, 4)
+        env.reset(tensor([1]))
+        scaled = env.actions.absolute_action(env.backend.state().joint_pos)
+        joints = env.get_observations()["proprio"][:, 3:7]
+        assert_close(joints[1], scaled[1, 3:])  # the new episode's, from its first step
+        self.assertGreater((joints - scaled[:, 3:])[[0, 2]].abs().amax(), 1e-3)
 
     def test_arm_and_hand_may_be_late_apart(self):
         env = self.make(self.task(action_latency=(0.0, 0.0), hand_latency=(1.0, 1.0)))

@@ -363,6 +363,8 @@ class UpdateTest(TestCase):
             signs = {"value": 0.7, "surrogate": 1.0, "entropy": -0.02, "bounds": 0.3}
             sum(weight * losses[name] for name, weight in signs.items()).backward()
             flat = alg.storage.observations.flatten(0, 1)
+            # left over from another minibatch
+            alg.actor.mlp[-1].bias.grad = torch.ones(A)
             alg.update()
             for model, own in zip((alg.actor, alg.critic), models, strict=True):
                 gradients = [p.grad for p in own.parameters()]

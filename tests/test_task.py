@@ -500,11 +500,13 @@ class PushTest(TestCase):
 class TrackerTest(TestCase):
     N = 4000
 
-    def tracker(self, latency=(0.0, 0.0), scale=1.0, **faults):
+    def tracker(self, latency=(0.0, 0.0), scale=1.0, enabled=True, **faults):
         """A function that observes poses [N, 3], [N, 4]; ``fresh`` [N] are worlds that have just begun."""
         drawn = Drawn(self.N, torch.device("cpu"))
         drawn.fault_scale.fill_(scale)
-        config = RandomizationConfig(observation_latency=latency, tracker=TrackerConfig(**faults))
+        config = RandomizationConfig(
+            enabled=enabled, observation_latency=latency, tracker=TrackerConfig(**faults)
+        )
         tracker = Tracker(drawn, config)
         g = generator()
         drawn.draw(torch.ones(self.N, dtype=torch.bool), g)
@@ -561,11 +563,20 @@ class TrackerTest(TestCase):
         self.assertAlmostEqual(delay.mean(), 1.75, delta=0.02)
 
     def test_a_new_episode_does_not_show_the_pose_of_the_last_one(self):
-        observe = self.tracker(interval=(5.0, 5.0))
-        observe(0.0, fresh=True)
         begins = torch.arange(self.N) % 2 == 1
-        pos, _ = observe(1.0, fresh=begins)
-        self.assertEqual(pos[:2, 0].tolist(), [0.0, 1.0])
+        for observe in (self.tracker(interval=(5.0, 5.0)), self.tracker(latency=(2.0, 2.0))):
+            observe(1.0, fresh=True)
+            observe(2.0)
+            pos, _ = observe(3.0, fresh=begins)
+            self.assertEqual(pos[:2, 0].tolist(), [1.0, 3.0])
+
+    def test_without_randomization_it_sees_what_is_there(self):
+        faults = {"position_bias": 0.1, "rotation_noise": 0.1, "loss": 1.0, "interval": (3.0, 3.0)}
+        observe = self.tracker(latency=(2.0, 2.0), enabled=False, **faults)
+        observe(0.0, fresh=True)
+        pos, quat = observe(1.0, turned(30))
+        assert_close(pos, torch.ones(self.N, 3))
+        assert_close(quat, turned(30).expand(self.N, 4))
 
 
 class ReadingTest(TestCase):

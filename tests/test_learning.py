@@ -431,6 +431,8 @@ class UpdateTest(TestCase):
         alg = self.algorithm()
         alg.learning_rate = 7e-4
         self.roll_out(alg)
+        mean, _ = alg.storage.distribution_params
+        mean += 1.0
         alg.update()
         self.assertEqual((alg.learning_rate, alg.optimizer.param_groups[0]["lr"]), (7e-4, 7e-4))
 

@@ -95,10 +95,11 @@ class EpisodeMetrics:
         """[N] distance of the object's origin from the goal in the same reading [m]."""
         self.final_angle = infinite
         """[N] angle between the object and the goal in the same reading [rad]."""
+        # flags are updated in place, so each has a tensor of its own; the distances above are replaced
         false = torch.zeros_like(self._least_keypoint_distance, dtype=torch.bool)
         self.approach = false.clone()
         self.grasp = false.clone()
-        self.reorient = false
+        self.reorient = false.clone()
         self.reorient_once = false.clone()
         self.nonfinite = false.clone()
         self.overflow = false.clone()

@@ -58,10 +58,7 @@ def atomic_write(path: str | Path) -> Iterator[IO[bytes]]:
             os.fsync(file.fileno())
             temporary.replace(path)
     except OSError as error:
-        reason = error.strerror or str(error)
-        raise XResetError(
-            f"cannot write {path}: {reason}. Nothing was changed; free some space or choose another place."
-        ) from error
+        raise _cannot_write(path, error) from error
 
 
 def write_whole(path: str | Path, content: bytes | memoryview | str) -> None:
@@ -91,10 +88,15 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         name = str(error.filename or "")  # a full disk names no file
         if name and ".xreset-" not in name and Path(name) not in path.parents:
             raise  # it is about another file
-        raise XResetError(
-            f"cannot write {path}: {error.strerror or error}. Nothing was changed; free some space or choose another"
-            " place."
-        ) from error
+        raise _cannot_write(path, error) from error
+
+
+def _cannot_write(path: Path, error: OSError) -> XResetError:
+    """Return the error about a file or folder that is as it was before."""
+    reason = error.strerror or str(error)
+    return XResetError(
+        f"cannot write {path}: {reason}. Nothing was changed; free some space or choose another place."
+    )
 
 
 def is_occupied(folder: Path) -> bool:

@@ -104,38 +104,28 @@ def import_robot(
             raise RobotError(
                 f"{option} is {_vector(np.array(values))}, expected {unit} from {-most:.3g} to {most:.3g}."
             )
-    notes = []
-    carrier = None
-    if arm is not None:
-        carrier = read_source(arm, notes)
-        if flange is None:
-            flange = last_link(carrier)
-            notes.append(
-                f"the hand is carried by the arm's link {flange!r} (--flange says another)"
-            )
-        carrier = bare(carrier, carrier.link(flange).name, notes)
-    elif flange is not None or offset is not None or rpy is not None:
+    if arm is None and any(value is not None for value in (flange, offset, rpy)):
         raise RobotError(
             "--flange, --offset and --rpy say how an arm carries the hand, but there is no --arm. Give the arm, or "
             "leave them out."
         )
+    notes = []
+    carrier = None if arm is None else _read_arm(arm, flange, notes)
     hand_tree = read_source(hand, notes)
     if carrier is not None:
-        # names alone may be the same in two files; the places of the joints are not
-        arm_joints = {_place(joint) for joint in carrier.moved_by.values()}
-        if arm_joints and arm_joints <= {_place(joint) for joint in hand_tree.moved_by.values()}:
+        if _holds_arm(hand_tree, carrier.tree):
             raise RobotError(
                 f"{hand} holds the arm as well: it has all joints of {arm}. Leave out --arm, or remove the arm's links "
                 "and joints from the hand's file."
             )
-        hand_tree = renamed(hand_tree, carrier)
+        hand_tree = renamed(hand_tree, carrier.tree)
     to_say = [*_TO_SAY]
     with atomic_folder(out) as work:
         found = Hand(hand_tree, work, thumb, notes)
-        if carrier is None or flange is None:
+        if carrier is None:
             tree = _with_rotors(found, notes)
         else:
-            tree, mounting = _carried(found, carrier, flange, offset, rpy, notes)
+            tree, mounting = _carried(found, carrier, offset, rpy, notes)
             to_say.insert(0, mounting)
         tree = replace(tree, name=name or out.name)
         spec = draft_spec(
@@ -157,16 +147,44 @@ def import_robot(
     return Imported(folder=out, guessed=tuple(notes), to_say=tuple(to_say))
 
 
+@frozen
+class _Arm:
+    """An arm without what it carries."""
+
+    tree: RobotTree
+    flange: str
+    """Link that carries the hand."""
+
+
+def _read_arm(path: Path, flange: str | None, notes: list[str]) -> _Arm:
+    """Read an arm, and find its flange where that is None."""
+    tree = read_source(path, notes)
+    if flange is None:
+        flange = last_link(tree)
+        notes.append(f"the hand is carried by the arm's link {flange!r} (--flange says another)")
+    return _Arm(tree=bare(tree, tree.link(flange).name, notes), flange=flange)
+
+
+def _holds_arm(hand: RobotTree, arm: RobotTree) -> bool:
+    """Return whether a hand has all moving joints of an arm: names may be the same in two files, places are not."""
+    arm_joints = {_place(joint) for joint in arm.moved_by.values()}
+    return bool(arm_joints) and arm_joints <= {_place(joint) for joint in hand.moved_by.values()}
+
+
+def _place(joint: Joint) -> tuple[str, ...]:
+    """Return the name of a joint, and its place, as text."""
+    return joint.name, joint.parent, joint.child, _vector(joint.T_parent_joint[:3, 3])
+
+
 def _carried(
     hand: Hand,
-    arm: RobotTree,
-    flange: str,
+    arm: _Arm,
     offset: tuple[float, float, float] | None,
     rpy: tuple[float, float, float] | None,
     notes: list[str],
 ) -> tuple[RobotTree, str]:
     """Return an arm with the hand on its flange, and what only a person can say about the mounting."""
-    ahead = _out_of_flange(arm, flange)
+    ahead = _out_of_flange(arm.tree, arm.flange)
     sign = "-" if ahead.sum() < 0 else ""
     along = f"the flange's {sign}{'xyz'[int(np.abs(ahead).argmax())]} axis"
     if rpy is None:
@@ -177,9 +195,11 @@ def _carried(
     T_flange_palm = T_flange_hand @ hand.palm
     mounting = (
         f"how the hand is mounted (--offset, --rpy): its fingers point along ({_vector(T_flange_palm[:3, 0])}) of "
-        f"{flange!r}, its inner side along ({_vector(T_flange_palm[:3, 2])}). The angle about {along} is yours to know"
+        f"{arm.flange!r}, its inner side along ({_vector(T_flange_palm[:3, 2])}). The angle about {along} is yours to "
+        "know"
     )
-    return combined(arm, _with_rotors(hand, notes), flange, T_flange_hand), mounting
+    tree = combined(arm.tree, _with_rotors(hand, notes), arm.flange, T_flange_hand)
+    return tree, mounting
 
 
 def _out_of_flange(arm: RobotTree, flange: str) -> np.ndarray:
@@ -200,11 +220,6 @@ def _out_of_flange(arm: RobotTree, flange: str) -> np.ndarray:
     outward = (joint.T_parent_joint @ T)[:3, 3] - before
     sign = np.sign(joint.T_parent_joint[:3, :3] @ joint.axis @ outward) or 1.0
     return sign * axis.round() + 0.0
-
-
-def _place(joint: Joint) -> tuple[str, ...]:
-    """Return the name of a joint, and its place, as text."""
-    return joint.name, joint.parent, joint.child, _vector(joint.T_parent_joint[:3, 3])
 
 
 def _guessed_rpy(

@@ -403,6 +403,9 @@ class Toy(Robots):
         tips = [tip.link for tip in spec.fingertips]
         assert_allclose(at_home(spec, *tips), at_home(self.spec, *tips), atol=2e-3)
         self.assertNotIn("how the hand is mounted", said)
+        self.assertIn(
+            "the last joints of the arm, and the hand begins with 'l5'", " ".join(said.split())
+        )
         refused = (
             (HAND, {}, "has no arm: no joint moves all of its fingers"),
             (HAND, {"flange": "l5"}, "but there is no --arm"),
@@ -411,6 +414,29 @@ class Toy(Robots):
             with self.subTest(words), self.assertRaisesRegex(RobotError, words):
                 import_robot(None, self.file("h.urdf", hand), self.folder / "no", **options)
         self.assertFalse((self.folder / "no").exists())
+
+    def test_what_is_no_robot_of_an_arm_and_a_hand_is_named(self):
+        bone = _BONE.format(mass=0.03, y=0)
+        centered = bone.replace('<collision><origin xyz="0.02 0 0"/>', "<collision>")
+        part = f"""<link name="cam">{centered}<joint name="pan" type="revolute"><parent link="base"/>
+          <child link="cam"/>{_LIMIT}</joint></robot>"""
+        hand = HAND.replace("</robot>", part)
+        words = "tip of 'cam' is at the finger's first joint 'pan'.*If it is no finger, make 'pan' fixed"
+        self.assertRaisesRegex(RobotError, words, self.imported, hand)
+        twice = HAND.replace('name="f2_2"', 'name="f1_2"')
+        words = "the joint name 'f1_2' occurs twice"
+        self.assertRaisesRegex(RobotError, words, self.imported, twice)
+        still = HAND.replace('name="f1_1" type="revolute"', 'name="f1_1" type="fixed"')
+        words = "'f1_2' mimics 'f1_1', which is not a moving joint.*Make 'f1_2' fixed"
+        self.assertRaisesRegex(RobotError, words, self.imported, still)
+
+    def test_frames_whose_fixed_joints_have_one_name_stay(self):
+        frames = [
+            f'<link name="{x}"/><joint name="mark" type="fixed"><parent link="base"/><child link="{x}"/></joint>'
+            for x in ("a", "b")
+        ]
+        folder = self.imported(HAND.replace("</robot>", f"{''.join(frames)}</robot>"))
+        self.assertLess({"a", "b"}, {*load_urdf(folder / "robot.urdf").link_names})
 
     def test_a_jaw_that_is_closed_at_0_in_one_file_with_its_arm(self):
         described = load_robot("openarm")

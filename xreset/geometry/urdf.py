@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import math
 import os
+from collections import Counter
 from dataclasses import field
 from functools import cached_property, lru_cache
 from itertools import chain
@@ -326,6 +327,12 @@ def _ordered(name: str, links: list[Link], joints: list[Joint]) -> RobotTree:
         raise RobotError("a link name occurs twice.")
     if len(joint_above) < len(joints):
         raise RobotError("a link is the child of two joints, expected one.")
+    names = Counter(joint.name for joint in joints)
+    for joint in joints:
+        if names[joint.name] > 1 and joint.type != "fixed":
+            raise RobotError(
+                f"the joint name {joint.name!r} occurs twice. Rename one of the joints."
+            )
     for joint in joints:
         for end in (joint.parent, joint.child):
             if end not in link_by_name:

@@ -43,6 +43,8 @@ _PALM_BEHIND = 0.04
 """[m] The palm's center behind the knuckles."""
 _SIDE = 0.1
 """A thumb that is less than this share of the fingers' width beside their middle is opposite it."""
+_SHORTEST = 1e-6
+"""[m] Length of a finger from which its direction is known."""
 _BEND = 0.15
 """Share of its range by which a finger's joint is bent at home."""
 
@@ -116,8 +118,9 @@ class Hand:
             link = moving[0].child
         if wrist:
             self._notes.append(
-                f"{', '.join(wrist)} move the whole hand: they are the last joints of the arm. To keep one still, "
-                "make it fixed in the hand's file"
+                f"{', '.join(wrist)} move the whole hand: they are the last joints of the arm, and the hand begins "
+                f"with {link!r}. In the hand's file, make a joint fixed to keep it still, or if it moves no finger "
+                "but another part, such as a camera"
             )
         while not tree.link(link).collisions:
             children = [joint.child for joint in tree.joints if joint.parent == link]
@@ -135,6 +138,12 @@ class Hand:
                 "one finger."
             )
         chains = [replace(chain, points=self._points(chain)) for chain in chains]
+        for chain in chains:
+            if np.linalg.norm(chain.points[-1] - chain.points[0]) < _SHORTEST:
+                raise RobotError(
+                    f"the tip of {chain.links[-1]!r} is at the finger's first joint {chain.joints[0]!r}, so where it "
+                    f"points is unknown. If it is no finger, make {chain.joints[0]!r} fixed."
+                )
         first = self._find_thumb(chains, thumb)
         others = [chain for chain in chains if chain is not first]
         names = {chain.name for chain in others}

@@ -143,7 +143,7 @@ def combined(arm: RobotTree, hand: RobotTree, flange: str, T_flange_hand: np.nda
 def _with_limits(tree: RobotTree, path: Path, notes: list[str]) -> RobotTree:
     """Return the tree with finite limits, and with mimic joints that follow a joint that follows nothing; a mimic joint
     has the limits that its source gives it."""
-    joints = {}
+    joints = []
     for joint in tree.joints:
         if joint.type != "fixed" and not np.isfinite((joint.lower, joint.upper)).all():
             notes.append(
@@ -152,15 +152,19 @@ def _with_limits(tree: RobotTree, path: Path, notes: list[str]) -> RobotTree:
             joint = replace(joint, lower=-_TURNS, upper=_TURNS)
         if joint.type != "fixed" and not 0 < joint.velocity < math.inf:
             joint = replace(joint, velocity=math.pi)
-        joints[joint.name] = joint
-    for name, joint in joints.items():
+        if joint.type == "fixed":
+            joint = replace(joint, mimic=None)
+        joints.append(joint)
+    moving = {joint.name: joint for joint in joints if joint.type != "fixed"}
+    for i, joint in enumerate(joints):
+        name = joint.name
         mimic = joint.mimic
         if mimic is None:
             continue
         passed = [name]
-        while mimic.source not in passed and mimic.source in joints and joints[mimic.source].mimic:
+        while mimic.source not in passed and mimic.source in moving and moving[mimic.source].mimic:
             passed.append(mimic.source)
-            above = joints[mimic.source].mimic
+            above = moving[mimic.source].mimic
             offset = mimic.multiplier * above.offset + mimic.offset
             mimic = replace(
                 mimic,
@@ -172,11 +176,12 @@ def _with_limits(tree: RobotTree, path: Path, notes: list[str]) -> RobotTree:
             raise RobotError(
                 f"{path}: joints follow one another in a circle: {', '.join(passed)}. Let one of them follow nothing."
             )
-        if mimic.source not in joints:
+        if mimic.source not in moving:
             raise RobotError(
-                f"{path}: {name!r} mimics {mimic.source!r}, which is not a joint of the same file."
+                f"{path}: {name!r} mimics {mimic.source!r}, which is not a moving joint of the same file. Make "
+                f"{name!r} fixed, or let it follow another joint."
             )
-        driver = joints[mimic.source]
+        driver = moving[mimic.source]
         ends = mimic.multiplier * np.array((driver.lower, driver.upper)) + mimic.offset
         low, high = sorted(ends.tolist())
         if low < joint.lower or high > joint.upper:
@@ -187,8 +192,8 @@ def _with_limits(tree: RobotTree, path: Path, notes: list[str]) -> RobotTree:
                     f"{name!r} has the limits {limits} that {mimic.source!r} gives it, in place of {stated}"
                 )
             joint = replace(joint, lower=low, upper=high)
-        joints[name] = replace(joint, mimic=mimic)
-    return replace(tree, joints=tuple(joints.values()))
+        joints[i] = replace(joint, mimic=mimic)
+    return replace(tree, joints=tuple(joints))
 
 
 def _with_masses(tree: RobotTree, notes: list[str]) -> RobotTree:

@@ -448,18 +448,20 @@ def read_episodes(folder: Path, backend: str) -> tuple[Episode, ...]:
     )
 
 
-def read_traces(folder: Path, backend: str, joint_names: tuple[str, ...]) -> tuple[Trace, ...]:
+def read_traces(
+    folder: Path, backend: str, joint_names: tuple[str, ...] | None
+) -> tuple[Trace, ...]:
     """Read the traces of one engine.
 
     Raises:
-        FileFormatError: the file is damaged, or its joints are not ``joint_names`` in that order.
+        FileFormatError: the file is damaged, or its joints are not ``joint_names`` in that order, unless that is None.
     """
     path = folder / f"{backend}.trace.npz"
     arrays = read_npz(
         path, TRACE_SCHEMA, _TRACE_FIELDS, what="an evaluation trace", check=_trace_problem
     )
     found = tuple(arrays["joint_names"].tolist())
-    if found != joint_names:
+    if joint_names is not None and found != joint_names:
         raise FileFormatError(
             f"{path} is a trace of the joints {', '.join(found)}; the robot has {', '.join(joint_names)}. "
             "Evaluate again."

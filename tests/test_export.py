@@ -1,6 +1,7 @@
 """Episodes for others: a LeRobot data set, which that package reads back, and plain arrays."""
 
 import json
+from contextlib import chdir
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,7 +16,7 @@ from xreset.description import load_robot
 from xreset.errors import FileFormatError, RunError, XResetError
 from xreset.eval.export.lerobot import write_lerobot
 from xreset.eval.export.recorded import read_recorded, write_arrays
-from xreset.eval.report.read import read_training
+from xreset.eval.report.read import read_training, without_results
 from xreset.files import file_hash
 
 PARQUET = find_spec("pyarrow") is not None
@@ -65,8 +66,32 @@ class Episodes(Case):
             self.assertIn("object_pos=array[5, 3]", repr(read))
         with self.assertRaisesRegex(FileFormatError, "is a trace of the joints"):
             read_training(folder).recorded("openarm")
+        with self.assertRaisesRegex(XResetError, "robot is 3, expected"):
+            read_training(folder).recorded(3)
         with self.assertRaisesRegex(RunError, "no evaluation results. Make them first"):
             replace(read_training(folder), results={}).recorded()
+
+    def test_recorded_arrays_need_no_description_of_the_robot(self):
+        folder = self.evaluate()
+        training = read_training(folder)
+        results = {name: replace(result, robot="mine") for name, result in training.results.items()}
+        table = replace(training, results=results).recorded()
+        assert_array_equal(table["trace"][0].joint_pos.shape, (5, len(self.robot.joints)))
+
+    def test_a_training_is_found_by_what_names_it(self):
+        results = self.evaluate("runs/soup-can")
+        self.assertEqual(len(read_training(self.folder, results=str(results / "eval")).results), 2)
+        with chdir(self.folder):  # as xreset eval soup-can writes them
+            self.assertEqual(len(read_training("soup-can").results), 2)
+        file = self.folder / "a.txt"
+        file.write_text("")
+        with self.assertRaisesRegex(RunError, "a.txt is not a folder. Give a run folder"):
+            read_training(file)
+        empty = self.folder / "run"
+        (empty / "eval").mkdir(parents=True)
+        (empty / "run.json").write_text("{}")
+        with self.assertRaisesRegex(RunError, f"Make them first: xreset eval {empty} --demos"):
+            raise without_results(empty / "eval")
 
     def test_only_some_engines_of_several_folders(self):
         folders = [self.evaluate("a"), self.evaluate("b")]

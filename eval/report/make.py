@@ -26,10 +26,10 @@ from xreset.eval.report.groups import by_engine, grouped, scores, singles
 from xreset.eval.report.read import (
     ReportData,
     Training,
-    how_to_evaluate,
     read_training,
     read_trainings,
     versions,
+    without_results,
 )
 from xreset.eval.results import Table, read_evaluation
 from xreset.eval.stress import by_property, read_stress
@@ -86,7 +86,7 @@ def collect(folder: Path, robot: str | None = None, objects: Path | None = None)
     """
     training = read_training(folder)
     if not training.results:
-        raise RunError(f"{folder} holds no evaluation results. {how_to_evaluate(folder)}")
+        raise without_results(folder)
     run = None
     not_described = []
     if training.facts:

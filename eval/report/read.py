@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 
 from xreset.cameras.config import VisionConfig
-from xreset.checks import frozen
+from xreset.checks import frozen, names_wrong_arguments
 from xreset.description import load_robot
 from xreset.errors import FileFormatError, RunError, needs
 from xreset.eval.results import EvalResult, Table, read_evaluation, read_traces, recorded
@@ -48,6 +48,7 @@ class Training(Brief):
         """The result of the first engine."""
         return next(iter(self.results.values()))
 
+    @names_wrong_arguments
     def recorded(self, robot: str | Path | RobotSpec | None = None) -> Table:
         """Return the recorded episodes in all engines: the first of each demonstration.
 
@@ -55,17 +56,15 @@ class Training(Brief):
         its arrays over time, a :class:`xreset.eval.results.Trace`.
 
         Args:
-            robot: the robot, its name or its folder; default: as the results name it.
+            robot: the robot, its name or its folder; default: whatever robot was recorded.
 
         Raises:
             RunError: there are no results.
             FileFormatError: a recording is damaged, or is of other joints than the robot's.
         """
         if not self.results:
-            raise RunError(
-                f"{self.results_folder} holds no evaluation results. {how_to_evaluate(self.results_folder)}"
-            )
-        names = load_robot(robot or self.first.robot).joint_names
+            raise without_results(self.results_folder)
+        names = None if robot is None else load_robot(robot).joint_names
         parts = [
             recorded(self.episodes, engine, read_traces(self.results_folder, engine, names))
             for engine in self.results
@@ -114,8 +113,13 @@ def results_in(folder: Path) -> Path:
         RunError: the folder does not exist.
     """
     if not folder.is_dir():
+        problem = (
+            f"{folder} is not a folder"
+            if folder.exists()
+            else f"The folder {folder} does not exist"
+        )
         raise RunError(
-            f"The folder {folder} does not exist. Give a run folder, or a folder that xreset eval wrote results into. "
+            f"{problem}. Give a run folder, or a folder that xreset eval wrote results into. "
             "For a policy that ships with xreset, make results first: xreset eval NAME --demos DEMOS"
         )
     if (folder / "eval").is_dir() or (folder / "run.json").is_file():
@@ -223,12 +227,12 @@ def read_trainings(runs: Sequence[str]) -> tuple[Training, ...]:
 
 
 def read_training(
-    folder: str | Path, label: str | None = None, results: Path | None = None
+    folder: str | Path, label: str | None = None, results: str | Path | None = None
 ) -> Training:
     """Read learning curves and evaluations of a training; one of them may be missing.
 
     Args:
-        folder: run folder, or folder of results.
+        folder: run folder, or folder of results, or the name of a shipped policy.
         label: name of the training in tables and pictures; default: that of the folder.
         results: folder of its evaluations; default: as ``xreset eval`` chooses it.
 
@@ -236,9 +240,9 @@ def read_training(
         RunError: the folder does not exist, or holds neither learning curves nor results.
         FileFormatError: a file is damaged or of another version.
     """
-    folder = Path(folder)
+    folder = run_folder(folder)
     label = label or name_of(folder)
-    results = results or results_in(folder)
+    results = Path(results) if results else results_in(folder)
     evaluation = read_evaluation(results, label)
     curves = read_curves(folder)
     lift = read_lift(folder)
@@ -262,10 +266,16 @@ def read_training(
     )
 
 
+def without_results(folder: Path) -> RunError:
+    """Return the error about a run folder, or a folder of results, without results."""
+    return RunError(f"{folder} holds no evaluation results. {how_to_evaluate(folder)}")
+
+
 def how_to_evaluate(folder: Path) -> str:
     """Return a sentence that says how to make the missing results."""
-    if (folder / "run.json").is_file():
-        return f"Make them first: xreset eval {folder} --demos DEMOS"
+    run = folder.parent if folder.name == "eval" else folder
+    if (run / "run.json").is_file():
+        return f"Make them first: xreset eval {run} --demos DEMOS"
     return f"Make them first: xreset eval POLICY --demos DEMOS --out {folder}"
 
 

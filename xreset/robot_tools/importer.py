@@ -127,7 +127,7 @@ def import_robot(
         else:
             tree, mounting = _carried(found, carrier, offset, rpy, notes)
             to_say.insert(0, mounting)
-        tree = replace(tree, name=name or out.name)
+        tree = replace(tree, name=name or out.resolve().name)
         spec = draft_spec(
             tree, found.root, work, tips=found.tips, keypoints=found.keypoints, bent=found.bent
         )

@@ -158,6 +158,16 @@ class ContractTest(InFolder):
             with self.subTest(name), self.assertRaisesRegex(LiveError, words):
                 controller.begin(**good | {name: value})
         controller.begin(**good)
+        reading = Reading(
+            joint_pos=self.home, joint_vel=[0.0] * 5, joint_time=0.0,
+            object_pos=[0.5, 0.3, 0.1], object_quat=[1, 0, 0, 0], object_time=0.0,
+        )  # fmt: skip
+        controller.step(reading)
+        for name, value in (("goal_pos", [500.0] * 3), ("target", [90.0] * 5)):
+            controller.begin(**good)
+            with self.subTest(f"no episode after a wrong {name}"):
+                self.assertRaises(LiveError, controller.begin, **good | {name: value})
+                self.assertRaisesRegex(LiveError, "No episode has begun", controller.step, reading)
 
     def test_a_reading_that_does_not_fit_is_refused(self):
         controller = load_controller(self.out)
@@ -174,6 +184,7 @@ class ContractTest(InFolder):
         for changes, words in (
             ({"joint_pos": self.home[1:]}, r"joint_pos has shape \(1, 4\), expected \(1, 5\)"),
             ({"object_quat": [1, 0, 0]}, r"object_quat has shape \(1, 3\), expected \(1, 4\)"),
+            ({"tip_force": [0, 0, 0]}, r"tip_force has shape \(1, 3\), expected \(1, 2, 3\)"),
         ):
             with self.subTest(words), self.assertRaisesRegex(LiveError, words):
                 controller.step(replace(reading, **changes))
@@ -214,10 +225,14 @@ class ContractTest(InFolder):
                 {"observation": {"smell": 1}},
                 "observation options that this runtime does not know: smell",
             ),
+            ({"observation": None}, "contract.json lacks observation, or has another type"),
+            ({"policy_sha256": None}, "contract.json lacks policy_sha256"),
+            ({"joints": {}}, "contract.json lacks joints"),
         ):
             file.write_text(json.dumps(self.contract | change))
             with self.subTest(words), self.assertRaisesRegex(LiveError, words):
                 load_controller(self.out)
+            self.assertRaisesRegex(LiveError, words, read_contract, self.out)
         file.write_text("[]")
         self.assertRaisesRegex(LiveError, "has schema 'None', this", load_controller, self.out)
         file.write_text(original[:100])
@@ -247,7 +262,7 @@ class ContractTest(InFolder):
         targets = []
         for controller in (local, remote):
             controller.begin(*start)
-            targets.append([controller.step(driver.read().batched()).copy() for _ in range(3)])
+            targets.append([controller.step(driver.read()).copy() for _ in range(3)])
         np.testing.assert_array_equal(*targets)
         self.assertIn("brick: 5 joint targets", run("12_served_policy", server.url, 3))
         remote.set_goal([0.5, 0.3, 0.3], [0, 1, 0, 0])

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from .contract import POLICY, LiveError, check_contract, read_contract
+from .contract import CONTRACT, LiveError, check_contract, check_hash, read_exported
 from .driver import Array, Links, Reading
 from .kinematics import Kinematics
 from .rotations import is_unit, multiply, rotate
@@ -71,17 +71,28 @@ class Controller:
         kinematics: palm and fingertips from joint positions.
     """
 
-    def __init__(self, contract: dict[str, Any], actor: OnnxActor | Any = None) -> None:
+    def __init__(
+        self,
+        contract: dict[str, Any],
+        actor: OnnxActor | Any = None,
+        *,
+        source: str = "The contract",
+    ) -> None:
         """Prepare.
 
         Args:
             contract: what the policy expects.
             actor: the policy's network; None: a subclass acts itself.
+            source: what messages call the contract.
+
+        Raises:
+            LiveError: the contract is of another version, or not complete.
         """
-        check_contract(contract, "The contract")
+        check_contract(contract, source)
         self.contract = contract
         self.dt: float = contract["control_dt"]
         self._actor = actor
+        self._has_begun = False
         self.kinematics = Kinematics(contract["kinematics"])
         joints = contract["joints"]
 
@@ -119,8 +130,9 @@ class Controller:
 
         Raises:
             LiveError: a shape is not the contract's, a number is not finite or far outside its range, a quaternion has
-                another length than 1, or ``center`` is missing.
+                another length than 1, or ``center`` is missing. No episode goes on then.
         """
+        self._has_begun = False
         given = np.atleast_2d(np.asarray(target, dtype=np.float32))
         joints = len(self.contract["joints"])
         if given.ndim != 2 or given.shape[1] != joints:
@@ -146,14 +158,18 @@ class Controller:
                 )
             self._center = self._of_each(center, 3)
             self._points = self._points - self._center[:, None]
-        self.set_goal(goal_pos, goal_quat)
+        self._set_goal(goal_pos, goal_quat)
         self.action = np.zeros_like(self.target)
         self._cloud: Array | None = None
         self._actor.begin(len(self.target))
+        self._has_begun = True
 
     def set_goal(self, pos: Array, quat: Array) -> None:
         """Set the goal pose, also while the policy acts; shapes and errors as for :meth:`begin`."""
         self._must_have_begun()
+        self._set_goal(pos, quat)
+
+    def _set_goal(self, pos: Array, quat: Array) -> None:
         goal_quat = self._of_each(quat, 4)
         if not is_unit(goal_quat).all():
             raise LiveError(f"The goal has {quat}, expected a unit quaternion (w, x, y, z).")
@@ -161,7 +177,7 @@ class Controller:
         self._goal_quat = goal_quat
 
     def _must_have_begun(self) -> None:
-        if not hasattr(self, "target"):
+        if not self._has_begun:
             raise LiveError("No episode has begun. Call begin first.")
 
     def _of_each(self, values: Array, *shape: int) -> Array:
@@ -207,15 +223,23 @@ class Controller:
 
         Raises:
             LiveError: no episode has begun, or data of the reading have another shape.
+            ValueError: data that no robot may leave out are None.
         """
         reading = reading.batched()
         self._must_have_begun()
         robots, joints = self.target.shape
-        widths = {"joint_pos": joints, "joint_vel": joints, "object_pos": 3, "object_quat": 4}
-        for name, width in widths.items():
+        shapes = {
+            "joint_pos": (robots, joints),
+            "joint_vel": (robots, joints),
+            "object_pos": (robots, 3),
+            "object_quat": (robots, 4),
+        }
+        if reading.tip_force is not None:
+            shapes["tip_force"] = (robots, len(self.contract["fingertips"]), 3)
+        for name, expected in shapes.items():
             shape = np.shape(getattr(reading, name))
-            if shape != (robots, width):
-                raise LiveError(f"{name} has shape {shape}, expected ({robots}, {width}).")
+            if shape != expected:
+                raise LiveError(f"{name} has shape {shape}, expected {expected}.")
         flat, cloud = self.observe(reading)
         self.action = self._actor.act(flat, cloud)
         self.target = self._targets(self.action, reading.joint_pos)
@@ -319,5 +343,7 @@ class Controller:
 
 def load_controller(folder: str | Path) -> Controller:
     """Return the controller of a folder that ``xreset export deploy`` wrote; ``LiveError`` if it cannot be used."""
-    contract = read_contract(folder)
-    return Controller(contract, OnnxActor((Path(folder) / POLICY).read_bytes()))
+    contract, content = read_exported(folder)
+    controller = Controller(contract, OnnxActor(content), source=f"{Path(folder) / CONTRACT}")
+    check_hash(folder, contract, content)
+    return controller

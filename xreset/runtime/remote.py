@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .contract import LiveError, check_contract
+from .contract import LiveError
 from .controller import Controller
 from .driver import Array, Reading
 
@@ -43,8 +43,7 @@ class RemoteController(Controller):
                 f"{url} has schema {str(hello.get('schema'))[:60]!r}, this runtime reads {LIVE_SCHEMA!r}. "
                 "Use the same version of xreset on both computers."
             )
-        check_contract(hello["contract"], url)
-        super().__init__(hello["contract"])
+        super().__init__(hello.get("contract"), source=url)
 
     def begin(
         self,
@@ -70,7 +69,8 @@ class RemoteController(Controller):
         self._ask({"goal": _lists({"goal_pos": pos, "goal_quat": quat})})
 
     def step(self, reading: Reading) -> Array:
-        """[1, J] new joint targets for a reading with the axis N."""
+        """[1, J] new joint targets for a reading of one robot."""
+        reading = reading.batched()
         values = {}
         for name in ("joint_pos", "joint_vel", "object_pos", "object_quat", "tip_force"):
             rows = getattr(reading, name)

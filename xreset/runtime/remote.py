@@ -43,7 +43,7 @@ class RemoteController(Controller):
                 f"{url} has schema {str(hello.get('schema'))[:60]!r}, this runtime reads {LIVE_SCHEMA!r}. "
                 "Use the same version of xreset on both computers."
             )
-        super().__init__(hello.get("contract"), source=url)
+        super().__init__(hello.get("contract", {}), source=url)
 
     def begin(
         self,

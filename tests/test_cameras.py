@@ -6,6 +6,7 @@ from unittest import SkipTest, TestCase, mock
 
 import numpy as np
 import torch
+import trimesh
 from torch import tensor
 from torch.testing import assert_close
 
@@ -20,6 +21,7 @@ from xreset.plugins import make_backend
 from xreset.task.config import ObservationConfig, RandomizationConfig, TaskConfig, evaluation_task
 
 try:
+    from xreset.cameras.rays import RayCaster
     from xreset.cameras.sensor import Cameras
 except XResetError as error:
     raise SkipTest(str(error)) from error
@@ -68,6 +70,18 @@ class TestCameras(TestCase):
             (body == can).sum(), np.pi * (radius * pixels_per_metre) ** 2, delta=12
         )
         assert_close(view[0, 0], ((2.0 - depth) / 1.9).where(depth > 0, 0.0))
+
+    def test_robots_of_more_than_127_bodies(self):
+        meshes = [trimesh.creation.box((0.01, 0.01, 0.01))]
+        camera = tensor(np.eye(4), dtype=torch.float32).expand(1, 1, 4, 4).contiguous()
+        due = torch.ones(1, dtype=torch.bool)
+        rays = RayCaster(
+            meshes, torch.zeros(1, 300, dtype=torch.long), camera, torch.ones(1, 1), due, (3, 3)
+        )
+        rays.pose[:, :-1, 2, 3] = -1.0  # behind the camera
+        rays.pose[:, -1, 2, 3] = 1.0
+        rays.cast()
+        self.assertEqual(int(rays.body[0, 0, 1, 1]), 299)
 
     def test_errors_of_depth(self):
         def image(scale=1.0, **noise):

@@ -16,7 +16,7 @@ def cast(
     height: int,
     width: int,
     depth: wp.array3d[float],
-    body: wp.array3d[wp.int8],
+    body: wp.array3d[wp.int16],
 ):
     """Cast the ray of one pixel; :class:`xreset.cameras.rays.RayCaster` explains the arrays."""
     world, view, pixel = wp.tid()
@@ -48,4 +48,4 @@ def cast(
                     nearest = query.t
                     hit = i
     depth[world, view, pixel] = wp.where(hit < 0, 0.0, nearest / length)
-    body[world, view, pixel] = wp.int8(hit)
+    body[world, view, pixel] = wp.int16(hit)

@@ -30,7 +30,7 @@ class RayCaster:
     Attributes:
         pose: [N, B, 4, 4] poses of the bodies.
         depth: [N, C, H, W] distance along the view axis [m]; 0 where a ray hits nothing.
-        body: [N, C, H, W] int8, index of the body that a ray hits, or -1.
+        body: [N, C, H, W] int16, index of the body that a ray hits, or -1.
     """
 
     def __init__(
@@ -59,7 +59,7 @@ class RayCaster:
         device = bodies.device
         self.pose = torch.eye(4, device=device).repeat(*bodies.shape, 1, 1)
         self.depth = torch.zeros(*shape, *size, device=device)
-        self.body = torch.zeros(*shape, *size, dtype=torch.int8, device=device)
+        self.body = torch.zeros(*shape, *size, dtype=torch.int16, device=device)
         balls = [bounding_ball(mesh.vertices) for mesh in meshes]
         spheres = torch.tensor([(*center, radius) for center, radius in balls], dtype=torch.float32)
         self._sphere = spheres[bodies.cpu()].to(device)

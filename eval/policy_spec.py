@@ -164,7 +164,7 @@ def load_policy(
 
     Args:
         policy: run folder, exported policy (.onnx), name of a policy that ships with xreset, or one of
-            :data:`BASELINES`. A loaded policy is returned as it is.
+            :data:`BASELINES`. A loaded policy is returned as it is; ``robot`` must be its own then.
         robot: name or folder of the robot; default: the policy's own. Baselines need it.
         seed: seed of the baseline ``random``.
 
@@ -173,6 +173,11 @@ def load_policy(
         FileFormatError: ``run.json`` or ``choice.json`` next to it is damaged.
     """
     if isinstance(policy, PolicySpec):
+        if robot is not None and load_robot(robot).fingerprint != policy.robot.fingerprint:
+            raise PolicyError(
+                f"The policy {policy.name!r} is loaded for the robot {policy.robot.name!r} already. Leave out the "
+                "robot, or give the policy by its name."
+            )
         return policy
     if not isinstance(policy, str | Path):
         raise PolicyError(

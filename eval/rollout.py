@@ -6,6 +6,7 @@ Shape letters: N worlds, J joints.
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import field, fields, replace
@@ -89,14 +90,23 @@ def engine(name: str, *, device: str = "cpu", **options: Any) -> Engine:
 
 
 def chosen_engines(engines: str | Engine | Iterable[str | Engine], device: str) -> list[Engine]:
-    """Return engines, given by name or as such, each once; ``XResetError`` if there is none."""
+    """Return engines, given by name or as such, each once; ``XResetError`` if there is none, or if two would write the
+    same file."""
     names = (engines,) if isinstance(engines, str | Engine) else tuple(engines)
     if not names:
         raise XResetError("No engine is named. Name one or several of them.")
-    return [
+    chosen = [
         each if isinstance(each, Engine) else engine(each, device=device)
         for each in dict.fromkeys(names)
     ]
+    counts = Counter(each.name for each in chosen)
+    for name, count in counts.items():
+        if count > 1:
+            raise XResetError(
+                f"{count} engines are called {name!r}, and their results would have the same file. Play them one after "
+                "another, with another folder (out) each."
+            )
+    return chosen
 
 
 @frozen

@@ -33,7 +33,7 @@ from xreset.eval.results import (
     read_traces,
     write_results,
 )
-from xreset.eval.rollout import engine, load_trial, roll_out
+from xreset.eval.rollout import chosen_engines, engine, load_trial, roll_out
 from xreset.eval.stats import bootstrap_ci95, mean_of_known
 from xreset.eval.table import result_rows
 from xreset.files import claim_folder
@@ -518,6 +518,16 @@ class ResultsTest(InFolder):
             with claim_folder(self.folder), self.assertRaisesRegex(XResetError, "writing"):
                 evaluate(self.policy, "demos.npz")
             self.assertEqual(evaluate(self.policy, "demos.npz"), [])
+
+    def test_engines_of_one_name_and_another_robot_are_refused(self):
+        alike = [engine("mujoco", workers=0), "mujoco"]
+        words = "2 engines are called 'mujoco'.* same file"
+        self.assertRaisesRegex(XResetError, words, chosen_engines, alike, "cpu")
+        policy = load_policy("zero", robot="ur7e-sharpa")
+        words = "'zero' is loaded for the robot 'ur7e-sharpa' already"
+        with self.assertRaisesRegex(PolicyError, words):
+            evaluate(policy, toy_bank(policy.robot), robot="openarm")
+        self.assertIs(load_policy(policy, robot="ur7e-sharpa"), policy)
 
     def test_episodes_have_the_length_that_is_asked_for(self):
         """The same starts, played for longer: the first states are the same. The result states the length."""

@@ -465,6 +465,7 @@ class Toy(Robots):
             entities += f'<!ENTITY e{number} "{10 * f"&e{number - 1};"}">'
         for hand, options, words in (
             (_hand(_finger("f1")), {}, "expected a thumb and at least one finger"),
+            (_hand(), {}, "has no joint that moves"),
             ("nothing", {}, "cannot be read as XML"),
             (
                 f"<!DOCTYPE robot [{entities}]><robot>&e7;</robot>",

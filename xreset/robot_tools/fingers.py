@@ -79,6 +79,8 @@ class Hand:
         self.tree = tree
         """Its links, with frames for palm, wrist, fingertips and keypoints."""
         self._notes = notes
+        if not tree.moved_by:
+            raise RobotError("the hand has no joint that moves. Are its joints fixed in the file?")
         self.root = self._palm_link()
         """Link after which the fingers part."""
         self._spec = draft_spec(tree, self.root, folder)

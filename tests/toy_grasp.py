@@ -47,10 +47,11 @@ def scene():
     return SceneSpec(robot=robot(), objects=(brick(),), friction=FRICTION)
 
 
-def brick_pose():
-    """Where the brick is, between the pads of the robot at home: position [3], quaternion [4]."""
+def brick_pose(joints=None):
+    """Where the brick is, between the pads of the robot with these joints (None: at home): position [3], quaternion [4]."""
     spec = robot()
-    T = Kinematics(spec).link_poses(torch.as_tensor(spec.home), ["wrist"])[0].numpy()
+    joints = spec.home if joints is None else joints
+    T = Kinematics(spec).link_poses(torch.as_tensor(joints), ["wrist"])[0].numpy()
     T_wrist_box = np.eye(4)
     T_wrist_box[2, 3] = 0.075
     T = T @ T_wrist_box @ np.linalg.inv(brick().pieces[0].T_body_shape)

@@ -39,11 +39,13 @@ from xreset.resets.config import ClosingConfig as ClosingConfig
 from xreset.resets.config import FilterConfig as FilterConfig
 from xreset.resets.config import GoalConfig as GoalConfig
 from xreset.resets.config import SqueezeConfig as SqueezeConfig
+from xreset.resets.config import TransferConfig as TransferConfig
 from xreset.resets.filter import make_bank as make_bank
 from xreset.resets.goals import GoalSet as GoalSet
 from xreset.resets.goals import make_goals as make_goals
 from xreset.resets.goals import read_goals as read_goals
 from xreset.resets.goals import write_goals as write_goals
+from xreset.resets.transfer import add_transfers as add_transfers
 from xreset.retarget.file import Retargeted as Retargeted
 from xreset.retarget.file import read_retargeted as read_retargeted
 from xreset.retarget.file import write_retargeted as write_retargeted

@@ -6,12 +6,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 from tyro.conf import arg
 
 from xreset.cli._common import Device, Objects, Several, Source, show_accounts
 from xreset.cli._terminal import Progress, console, show_notes
+from xreset.errors import XResetError
 from xreset.files import file_hash
-from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
+from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig, TransferConfig
 
 
 def resets(
@@ -26,6 +28,7 @@ def resets(
     limits: Annotated[FilterConfig, arg(name="filter")] = FilterConfig(),
     closing: ClosingConfig = ClosingConfig(),
     squeeze: SqueezeConfig = SqueezeConfig(),
+    transfer: TransferConfig = TransferConfig(),
     settle: bool = False,
 ) -> None:
     """Test retargeted states in physics and keep the stable ones.
@@ -40,14 +43,21 @@ def resets(
         limits: Duration of the test, and the largest speeds of a stable state.
         closing: Extra states between frames in which the hand closes in on the object.
         squeeze: How hard fingers press in states after contact, and which fingers.
+        transfer: Extra states at poses of each demonstration, in grasps of other demonstrations of the same object
+            that hold its full weight in every engine.
         settle: Let objects come to rest (in the first engine) before episodes begin at home. Default: the recorded
             poses, as in the paper, from which one object in eleven turns by more than 10 degrees.
     """
+    if transfer.per_pose and not squeeze.presses:
+        raise XResetError(
+            "--transfer.per-pose transfers grasps that press, but no state presses. Add --squeeze.force 5."
+        )
     from xreset.description import load_robot
     from xreset.objects.catalogue import load_objects
     from xreset.resets.bank import write_bank
     from xreset.resets.filter import make_bank
     from xreset.resets.settle import settle_starts
+    from xreset.resets.transfer import add_transfers
     from xreset.retarget.file import check_retargeted, object_sources, read_retargeted
 
     backends = list(dict.fromkeys(backend)) or ["mujoco"]
@@ -74,6 +84,9 @@ def resets(
             progress=bar.count(title),
             **where,
         )
+        if transfer.per_pose:
+            count = bar.count("grasps of other demonstrations")
+            bank = add_transfers(bank, motion, *scene, transfer, progress=count, **where)
         if settle:
             count = bar.count("start poses come to rest")
             bank, at_rest = settle_starts(bank, *scene, backends[0], progress=count, **where)
@@ -87,6 +100,8 @@ def resets(
         "squeeze": asdict(squeeze),
         "settle": settle,
     }
+    if transfer.per_pose:
+        config["transfer"] = asdict(transfer)
     write_bank(out, bank, config=config, inputs=made_from)
     accounts = bank.accounts()
     show_accounts(accounts, f"{bank.robot}: {title}")
@@ -96,10 +111,16 @@ def resets(
             force += f" and {squeeze.weight:g} times the object's weight"
         pressing = f"{bank.num_pressing} of {bank.post_contact.sum()} states after contact"
         console.print(f"{pressing} press with {force}")
-    tried = bank.num_states + len(bank.rejected_reason)
     share = accounts[-1].kept / max(motion.annotated.sum(), 1)
     console.print(f"{share:.0%} of the annotated frames are kept")
-    console.print(f"{bank.num_states} states of {tried} kept in {out}")
+    own = int(bank.own_grasp.sum())
+    console.print(f"{own} states of {own + len(bank.rejected_reason)} kept in {out}")
+    if transfer.per_pose:
+        where_added = np.unique(bank.sequence_index[~bank.own_grasp])
+        console.print(
+            f"{bank.num_states - own} states in grasps of other demonstrations added, to {len(where_added)} of "
+            f"{len(bank.sequence_name)} demonstrations"
+        )
 
 
 COMMAND = resets

@@ -56,7 +56,8 @@ class ResetBank(Brief):
     [C].
 
     A state is ``joint_pos`` [L, J], ``object_pos`` [L, 3] and ``object_quat_wxyz`` [L, 4], in the world frame. It was
-    made from the frame ``frame_index`` [L] of the demonstration ``sequence_index`` [L].
+    made from the frame ``frame_index`` [L] of the demonstration ``sequence_index`` [L]; ``transferred`` states [L] have
+    the object's pose of that frame only.
     """
 
     robot: OneText
@@ -104,6 +105,9 @@ class ResetBank(Brief):
     frame_part: Annotated[np.ndarray, Field(("L",), "f", within=(0.0, 1.0))] | None = None
     """[L] how far a state is on the way from its frame to the next, in [0, 1); None: every state is a frame."""
     rejected_frame_part: Annotated[np.ndarray, Field(("C",), "f", within=(0.0, 1.0))] | None = None
+    transferred: Annotated[np.ndarray, Field(("L",), "b")] | None = None
+    """[L] bool: whether the hand has a grasp of another demonstration, which holds the object at full weight in all
+    ``backends`` (:func:`xreset.resets.transfer.add_transfers`); None: no state has (:attr:`own_grasp`)."""
 
     @property
     def num_states(self) -> int:
@@ -120,9 +124,16 @@ class ResetBank(Brief):
         """Number of states whose drive targets differ from the joints' positions."""
         return int((self.targets != self.joint_pos).any(axis=1).sum())
 
+    @property
+    def own_grasp(self) -> np.ndarray:
+        """[L] bool: whether a state follows its own demonstration, in place of a grasp of another one."""
+        if self.transferred is None:
+            return np.ones(self.num_states, dtype=bool)
+        return ~self.transferred
+
     def accounts(self) -> list[Account]:
-        """Count the demonstrated frames that were kept and lost, by object and phase; states between frames do not
-        count."""
+        """Count the demonstrated frames that were kept and lost, by object and phase. States between frames, and
+        states in grasps of other demonstrations, do not count."""
         object_name = np.concatenate(
             (self.object_name, self.sequence_object[self.rejected_sequence_index])
         )
@@ -132,6 +143,7 @@ class ResetBank(Brief):
         is_frame = np.ones(len(reason), dtype=bool)
         if self.frame_part is not None and self.rejected_frame_part is not None:
             is_frame = np.concatenate((self.frame_part, self.rejected_frame_part)) == 0
+        is_frame[: self.num_states] &= self.own_grasp
         return accounts(object_name[is_frame], post_contact[is_frame], reason[is_frame])
 
     def with_states(self, rows: np.ndarray) -> ResetBank:

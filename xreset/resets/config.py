@@ -67,6 +67,21 @@ class SqueezeConfig(Checked):
 
 
 @frozen
+class TransferConfig(Checked):
+    """More states, in grasps of other demonstrations of the same object (:mod:`xreset.resets.transfer`)."""
+
+    per_pose: NonNegativeInt = 0
+    """Most states at each pose, such as 8. 0: no states are added."""
+    poses: PositiveInt = 4
+    """Most poses of each demonstration: evenly from the first frame in which the object is raised by 3 cm to the last,
+    which is the goal. 1: the first only."""
+    candidates: PositiveInt = 40
+    """Most grasps that are tried at each pose."""
+    seed: NonNegativeInt = 0
+    """The same seed draws the same grasps."""
+
+
+@frozen
 class GoalConfig(Checked):
     """How a goal set is drawn (:mod:`xreset.resets.goals`). Offsets are those of the published paper's evaluation of
     objects without demonstrations (its table A3); the height of a lift is not in the paper."""

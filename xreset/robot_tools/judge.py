@@ -134,7 +134,8 @@ def judge(
         objects: the bank's objects.
         backends: names of engines.
         states: number of states of each object: those in the air in which the thumb and another finger are nearest to
-            the object, as many from each demonstration as possible.
+            the object, as many from each demonstration as possible. States in grasps of other demonstrations are left
+            out: they were chosen because they hold.
         squeeze: how hard fingers press, and which.
         num_envs: worlds at a time.
         device: where engines run that can use it; the others run on the CPU.
@@ -193,7 +194,7 @@ def _grasps(
 ) -> tuple[ResetBank, State]:
     """Return the states to try, and how they start: at rest, with targets that press on the object."""
     height = bank.object_pos[:, 2] - bank.start_pos[bank.sequence_index, 2]
-    lifted = bank.with_states(np.flatnonzero(bank.post_contact & (height > LIFT)))
+    lifted = bank.with_states(np.flatnonzero(bank.own_grasp & bank.post_contact & (height > LIFT)))
     if not lifted.num_states:
         raise RobotError(
             f"robot {robot.name!r}: the bank has no state in which an object is in the air. Look at the reasons of "

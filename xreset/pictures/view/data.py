@@ -65,6 +65,8 @@ class View:
     """[N] mean distance of the robot's fingertips from the human's [m]."""
     wrist_error: np.ndarray | None = None
     """[N] distance of the hand from its target [m]."""
+    own_grasp: np.ndarray | None = None
+    """[N] bool: False where the robot has a grasp of another demonstration."""
     human_keypoints: np.ndarray | None = None
     """[N, 21, 3] of the demonstrating hand; NaN where not annotated."""
     human_touching: np.ndarray | None = None
@@ -110,6 +112,8 @@ class View:
         ]
         if self.kind != "starts":
             lines += [f"frame {int(self.frame[row])}", PHASES[int(self.post_contact[row])]]
+        if self.own_grasp is not None and not self.own_grasp[row]:
+            lines.append("grasp of another demonstration")
         if (
             self.hand_error is not None
             and self.wrist_error is not None

@@ -135,6 +135,7 @@ def _bank_view(bank: ResetBank, inputs: Inputs) -> View:
         post_contact=bank.post_contact,
         reason=("",) * bank.num_states,
         joint_pos=bank.joint_pos,
+        own_grasp=bank.own_grasp,
     )
 
 

@@ -47,7 +47,8 @@ class ArmTargets(Tensors):
 
     @staticmethod
     def of_poses(root_pos: Tensor, root_quat: Tensor, hand_joints: Tensor) -> ArmTargets:
-        """Return a path of one frame for each pose [S, 3], [S, 4] of the hand root; the hand has joints [J_hand]."""
+        """Return a path of one frame for each pose [S, 3], [S, 4] of the hand root; the hand has joints [J_hand], or
+        [S, 1, J_hand]."""
         count = len(root_pos)
         zero = root_pos.new_zeros(count, 1)
         return ArmTargets(

@@ -1,0 +1,403 @@
+"""Grasps of other demonstrations: which poses and grasps are tried, what the arm reaches, what engines hold, and where the states show."""
+
+import json
+from dataclasses import replace
+from importlib.util import find_spec
+from unittest import TestCase, skipUnless
+from unittest.mock import Mock, patch
+
+import numpy as np
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial.transform import Rotation
+
+from tests import toy_grasp
+from tests.command import refused, succeeds
+from tests.data import InFolder
+from tests.test_closing import ROBOT
+from tests.toy_bank import in_this_process, toy_retargeted
+from xreset import (
+    SqueezeConfig,
+    TransferConfig,
+    add_transfers,
+    make_bank,
+    read_bank,
+    write_bank,
+    write_retargeted,
+)
+from xreset.backends.conformance.scene import objects
+from xreset.errors import DemoError, FileFormatError, XResetError
+from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.shapes import quat_of, turn_of
+from xreset.physics import Health, State
+from xreset.pictures.view.load import load_view
+from xreset.resets.bank import starts_and_goals
+from xreset.resets.distribution import ResetDistribution
+from xreset.resets.transfer import _is_held
+from xreset.retarget.file import read_retargeted
+from xreset.robot_tools.judge import judge
+from xreset.task.config import ResetConfig
+
+OBJECTS = objects()[:2]
+BRICK, CAN = (spec.name for spec in OBJECTS)
+LIFT, SWING, TURN, JAW = map(ROBOT.joint_names.index, ("lift", "swing", "turn", "jaw_a_slide"))
+UPRIGHT = torch.tensor([1.0, 0, 0, 0])
+MUJOCO = skipUnless(find_spec("mujoco"), "MuJoCo is not installed")
+
+
+def joints(lift, swing=0.0, turn=0.0):
+    """The robot at home with its jaws around the brick, except for the arm, which has moved by these amounts."""
+    moved = ROBOT.home.copy()
+    moved[[LIFT, SWING, TURN]] += lift, swing, turn
+    return moved
+
+
+OTHER = [joints(*at) for at in ((0, -0.3), (0.05, -0.3, 0.1), (0.07, -0.3, 0.1), (0.09, -0.4, 0.2))]
+"""Where the robot would hold the brick in the second demonstration, of which no frame is valid."""
+
+
+def motion(*, first=(0.0, 0.04, 0.08)):
+    """Three demonstrations: the robot lifts the brick; the robot does not follow the brick's second motion, nor the can.
+
+    ``first`` is how far the brick is lifted in each frame of the first.
+    """
+    held = [joints(lift) for lift in first] + OTHER
+    pos, quat = map(np.array, zip(*map(toy_grasp.brick_pose, held), strict=True))
+    ends = np.cumsum([0, len(first), len(OTHER), 2])
+    reason = np.ones(ends[-1], dtype=int)
+    reason[: len(first)] = 0
+    return toy_retargeted(
+        ROBOT,
+        [BRICK, BRICK, CAN],
+        ends.tolist(),
+        joint_pos=np.array([*held[: len(first)], *[ROBOT.home] * (len(OTHER) + 2)]),
+        object_pos=np.vstack((pos, [[0.5, 0.3, 0.06], [0.5, 0.3, 0.26]])),
+        object_quat_wxyz=np.vstack((quat, np.tile([1.0, 0, 0, 0], (2, 1)))),
+        valid=reason == 0,
+        reason=reason,
+        first_contact=np.array([0, 0, 0]),
+    )
+
+
+def bank(data, jaw=(0.0, 0.0, 0.0), backends=("mujoco",)):
+    """A bank of the frames of the first demonstration, whose jaws are told to go further in by ``jaw`` [m] in each."""
+    count = len(jaw)
+    targets = data.joint_pos[:count].copy()
+    targets[:, JAW] -= jaw
+    as_float = {
+        "joint_pos": data.joint_pos[:count],
+        "joint_target": targets,
+        "object_pos": data.object_pos[:count],
+        "object_quat_wxyz": data.object_quat_wxyz[:count],
+    }
+    return replace(
+        starts_and_goals(data, ROBOT, OBJECTS),
+        backends=backends,
+        object_name=np.full(count, BRICK),
+        sequence_index=np.zeros(count, dtype=np.int32),
+        frame_index=np.arange(count, dtype=np.int32),
+        post_contact=np.ones(count, dtype=bool),
+        **{name: values.astype(np.float32) for name, values in as_float.items()},
+    )
+
+
+PRESSING = toy_grasp.OPEN - toy_grasp.CLOSED
+"""Jaw targets this far in [m] press hard enough to hold the brick."""
+FIRMLY = (PRESSING,) * 3
+
+
+def brick_in_wrist(joint_pos, pos, quat):
+    """Where the brick is in the wrist's frame: positions [M, 3] and M rotations."""
+    T = Kinematics(ROBOT).link_poses(torch.as_tensor(joint_pos).double(), ["wrist"])[:, 0].numpy()
+    to_wrist = Rotation.from_matrix(T[:, :3, :3]).inv()
+    return to_wrist.apply(pos - T[:, :3, 3]), to_wrist * turn_of(quat)
+
+
+def tried(base, data, *, verdicts=None, **config):
+    """The new bank and every call of ``probe``; engines hold everything, or what ``verdicts`` tell, engine by engine."""
+    calls = []
+
+    def probe(engine, scene, object_name, states, judge, **options):
+        calls.append((engine, scene, object_name, states, options))
+        if verdicts is None:
+            return np.ones(len(object_name), dtype=bool)
+        return np.array(verdicts[len(calls) - 1])
+
+    config = TransferConfig(**({"per_pose": 8} | config))
+    with patch("xreset.resets.transfer.probe", probe):
+        return add_transfers(base, data, ROBOT, OBJECTS, config), calls
+
+
+class TransferTest(TestCase):
+    def setUp(self):
+        self.data = motion()
+        self.bank = bank(self.data, FIRMLY)
+
+    def test_the_arm_carries_hand_and_object_to_poses_of_the_other_demonstration(self):
+        found, _ = tried(self.bank, self.data)
+        own = found.num_states - 6
+        self.assertEqual(own, 3)
+        for name in ("joint_pos", "joint_target", "object_pos", "frame_index", "sequence_index"):
+            assert_array_equal(getattr(found, name)[:own], getattr(self.bank, name), name)
+        self.assertEqual(found.transferred.tolist(), [False] * 3 + [True] * 6)
+        new = found.with_states(~found.own_grasp)
+        # two grasps in the air, at three poses; the first frame of the demonstration is not raised
+        self.assertEqual(new.frame_index.tolist(), [1, 1, 2, 2, 3, 3])
+        self.assertEqual(set(new.sequence_index.tolist()), {1})
+        self.assertTrue(new.post_contact.all())
+        self.assertEqual(set(new.object_name.tolist()), {BRICK})
+        frames = 3 + new.frame_index
+        assert_allclose(new.object_pos, self.data.object_pos[frames], atol=1e-6)
+        assert_allclose(new.object_quat_wxyz, self.data.object_quat_wxyz[frames], atol=1e-6)
+        assert_allclose(new.joint_pos, np.array(OTHER)[new.frame_index], atol=0.01)
+        place, turn = brick_in_wrist(new.joint_pos, new.object_pos, new.object_quat_wxyz)
+        at_first = brick_in_wrist(
+            self.bank.joint_pos[:1], self.bank.object_pos[:1], self.bank.object_quat_wxyz[:1]
+        )
+        assert_allclose(place, at_first[0].repeat(6, axis=0), atol=0.005)
+        self.assertLess((turn * at_first[1].inv()).magnitude().max(), np.radians(3))
+
+    def test_targets_are_those_of_the_grasp_in_the_hand_and_joints_in_the_arm(self):
+        base = bank(self.data, (0.001, 0.002, 0.003))
+        base.targets[:, LIFT] += 0.1  # presses on nothing
+        found, _ = tried(base, self.data)
+        new = found.with_states(~found.own_grasp)
+        arm = ROBOT.arm_indices
+        assert_array_equal(new.targets[:, arm], new.joint_pos[:, arm])
+        grasps = {base.targets[row, JAW] for row in (1, 2)}  # row 0 is not raised
+        self.assertEqual(set(new.targets[:, JAW].tolist()), {float(jaw) for jaw in grasps})
+
+    def test_poses_and_grasps_are_drawn_by_number_and_seed(self):
+        self.assertEqual(tried(self.bank, self.data, poses=1)[0].frame_index[3:].tolist(), [1, 1])
+        two, _ = tried(self.bank, self.data, poses=2, per_pose=1)
+        self.assertEqual(two.frame_index[3:].tolist(), [1, 3])
+        self.assertEqual(tried(self.bank, self.data, poses=10**15)[0].num_states, 9)
+        base = bank(self.data, (0.0, 0.002, 0.003))
+        jaws = set()
+        for seed in range(8):
+            once, again = (tried(base, self.data, candidates=1, seed=seed)[0] for _ in range(2))
+            self.assertEqual(once.num_states, 6)
+            assert_array_equal(once.joint_target, again.joint_target)
+            jaws.add(tuple(once.targets[3:, JAW].tolist()))
+        self.assertGreater(len(jaws), 1)
+
+    def test_each_demonstration_gets_grasps_of_the_others_only(self):
+        """The second demonstration has grasps, too."""
+        both = replace(self.bank, sequence_index=np.array([0, 1, 0], dtype=np.int32))
+        found, _ = tried(both, self.data)
+        new = found.with_states(~found.own_grasp)
+        self.assertEqual(new.sequence_index.tolist(), [0, 0, 1, 1, 1])
+        self.assertEqual(new.frame_index.tolist(), [1, 2, 1, 2, 3])
+
+    def test_every_engine_of_the_bank_must_hold_it(self):
+        base = replace(self.bank, backends=("one", "other"))
+        first = [True, False, True, True, True, True]
+        second = [False, True, False, True, True]
+        found, calls = tried(base, self.data, verdicts=[first, second], per_pose=1)
+        self.assertEqual([engine for engine, *_ in calls], ["one", "other"])
+        states = calls[0][3]
+        # the engines agree on the candidates 2, 4 and 5; 4 and 5 have one pose
+        assert_array_equal(found.joint_pos[3:], states.joint_pos[[2, 4]])
+        assert_array_equal(calls[1][3].joint_pos, states.joint_pos[first])
+        self.assertEqual(found.frame_index[3:].tolist(), [2, 3])
+        for _, scene, *_, options in calls:
+            self.assertEqual([spec.name for spec in scene.objects], [BRICK])
+            self.assertEqual((options["gravity"], options["steps"]), (1.0, 30))
+        none, calls = tried(base, self.data, verdicts=[[False] * 6])
+        self.assertEqual((none.num_states, len(calls)), (3, 1))
+        self.assertFalse(none.transferred.any())
+
+    def test_what_the_arm_does_not_reach_is_not_tried(self):
+        pos = self.data.object_pos.copy()
+        pos[5] += [0, 1, 0]
+        found, calls = tried(self.bank, replace(self.data, object_pos=pos))
+        self.assertEqual(len(calls[0][2]), 4)
+        self.assertEqual(found.frame_index[3:].tolist(), [1, 1, 3, 3])
+        pos[3:, 1] += 1
+        found, calls = tried(self.bank, replace(self.data, object_pos=pos))
+        self.assertEqual((found.num_states, calls), (3, []))
+
+    def test_one_demonstration_of_each_object_gets_no_state(self):
+        owners = np.array([BRICK, "bracket", CAN])
+        data = replace(self.data, object_name=owners)
+        found, calls = tried(replace(self.bank, sequence_object=owners), data)
+        self.assertEqual((found.num_states, calls), (3, []))
+        self.assertEqual(found.transferred.tolist(), [False] * 3)
+
+    def test_wrong_input_is_refused(self):
+        other = replace(self.data, sequence_name=np.array(["a", "b", "c"]))
+        with self.assertRaisesRegex(DemoError, "3 demonstrations, and they are not the 3 of the"):
+            add_transfers(self.bank, other, ROBOT, OBJECTS)
+        plain = bank(self.data)
+        with self.assertRaisesRegex(DemoError, "0 of 3 states press. Make the bank with --squeeze"):
+            add_transfers(plain, self.data, ROBOT, OBJECTS)
+        low = motion(first=(0.0, 0.019, 0.01))
+        with self.assertRaisesRegex(DemoError, "raised by more than 2 cm.* 3 of 3 states press"):
+            add_transfers(bank(low, FIRMLY), low, ROBOT, OBJECTS)
+        found, _ = tried(self.bank, self.data)
+        with self.assertRaisesRegex(DemoError, "already has 6 states in grasps of other"):
+            add_transfers(found, self.data, ROBOT, OBJECTS)
+        with self.assertRaisesRegex(DemoError, "not given: brick. Given: can"):
+            add_transfers(self.bank, self.data, ROBOT, OBJECTS[1:])
+        with self.assertRaisesRegex(XResetError, "bank is .*, expected a ResetBank"):
+            add_transfers(self.data, self.bank, ROBOT, OBJECTS)
+        with self.assertRaisesRegex(FileFormatError, "whose joints are not those"):
+            add_transfers(replace(self.bank, joint_names=tuple("abcde")), self.data, ROBOT, OBJECTS)
+        with self.assertRaisesRegex(ValueError, "poses is 0, expected a whole number above 0"):
+            TransferConfig(poses=0)
+
+    def test_none_are_added_by_default(self):
+        self.assertIs(
+            add_transfers(self.bank, self.data, ROBOT, OBJECTS, TransferConfig()), self.bank
+        )
+
+    @MUJOCO
+    def test_a_grasp_that_does_not_hold_the_weight_is_left_out(self):
+        """The grasp of frame 1 presses with a twentieth of the force of that of frame 2."""
+        base = bank(self.data, (PRESSING, PRESSING / 20, PRESSING))
+        progress = Mock()
+        with in_this_process():
+            found = add_transfers(base, self.data, ROBOT, OBJECTS, progress=progress)
+        new = found.with_states(~found.own_grasp)
+        self.assertEqual(new.frame_index.tolist(), [1, 2, 3])
+        assert_array_equal(new.targets[:, JAW], base.targets[[2, 2, 2], JAW])
+        done, work = zip(*(call.args for call in progress.call_args_list), strict=True)
+        self.assertEqual(list(done), sorted(done))
+        self.assertEqual((done[-1], set(work)), (12, {12}))
+
+
+class HeldTest(TestCase):
+    def test_an_object_is_held_where_it_was(self):
+        turned = quat_of(
+            Rotation.from_rotvec(np.radians([0, 0, 14, 16, 0, 0, 0])[:, None] * [1, 0, 0])
+        )
+        moved = [0.019, 0.021, 0.0, 0.0, 0.0, 0.0, np.nan]
+        pos = torch.zeros(7, 3)
+        pos[:, 2] = torch.tensor(moved)
+        start = State.at_rest(torch.zeros(7, 1), torch.zeros(7, 3), UPRIGHT.expand(7, 4))
+        state = replace(start, object_pos=pos, object_quat=torch.as_tensor(turned).float())
+        world = torch.arange(7)
+        backend = Mock()
+        backend.state.return_value = state
+        backend.health.return_value = Health(nonfinite=world == 4, overflow=world == 5)
+        self.assertEqual(
+            _is_held(backend, start).tolist(), [True, False, True, False, False, False, False]
+        )
+
+
+class BankTest(InFolder):
+    """A bank with transferred states, in a file and wherever its states are used."""
+
+    def setUp(self):
+        super().setUp()
+        self.data = motion()
+        self.bank = bank(self.data, FIRMLY)
+        self.found, _ = tried(self.bank, self.data)
+
+    def test_files(self):
+        path = self.folder / "b.npz"
+        write_bank(path, self.found)
+        found = read_bank(path, robot=ROBOT)
+        assert_array_equal(found.transferred, self.found.transferred)
+        assert_array_equal(found.targets, self.found.targets)
+        self.assertEqual(found.own_grasp.tolist(), [True] * 3 + [False] * 6)
+        write_bank(path, self.bank)
+        with np.load(path) as file:
+            self.assertNotIn("transferred", file.files)
+        old = read_bank(path)
+        self.assertIsNone(old.transferred)
+        self.assertTrue(old.own_grasp.all())
+        read, _ = tried(old, self.data)
+        assert_array_equal(read.targets, self.found.targets)
+
+    def test_states_between_frames_stay_marked(self):
+        part = np.float32([0, 0.5, 0])
+        found, _ = tried(replace(self.bank, frame_part=part), self.data)
+        assert_array_equal(found.frame_part, [*part, *[0] * 6])
+        self.assertEqual(found.frame_part.dtype, np.float32)
+        self.assertIsNone(self.found.frame_part)
+
+    def test_they_count_as_no_frames(self):
+        self.assertEqual(self.found.accounts(), self.bank.accounts())
+        self.assertEqual(self.found.accounts()[-1].kept, 3)
+
+    def test_adaptive_resets_draw_them_for_the_demonstration_whose_pose_they_have(self):
+        config = ResetConfig(demo_probability=1.0, adaptive_share=1.0)
+        resets = ResetDistribution(self.found, ROBOT, (BRICK, CAN), config)
+        drawn = resets.sample(torch.zeros(200, dtype=torch.long), torch.Generator().manual_seed(0))
+        is_new = drawn.state >= 3
+        self.assertEqual(set(drawn.sequence[is_new].tolist()), {1})
+        self.assertEqual(set(drawn.sequence[~is_new].tolist()), {0})
+        assert_allclose(drawn.goal_pos, self.bank.goal_pos[drawn.sequence], atol=1e-6)
+
+    def test_a_robot_is_not_judged_by_them(self):
+        with in_this_process():
+            found, plain = (
+                judge(each, ROBOT, OBJECTS, squeeze=SqueezeConfig(force=4.0, reach=0.01))
+                for each in (self.found, self.bank)
+            )
+        self.assertEqual([row.tried for row in found.rows], [row.tried for row in plain.rows])
+
+    def test_the_viewer_names_them(self):
+        write_bank(self.folder / "b.npz", self.found)
+        with (
+            patch("xreset.inputs.load_robot", return_value=ROBOT),
+            patch("xreset.inputs.load_objects", return_value=OBJECTS),
+        ):
+            view = load_view(self.folder / "b.npz")
+        self.assertNotIn("grasp of another demonstration", view.text(2))
+        self.assertIn("grasp of another demonstration", view.text(3))
+
+
+@MUJOCO
+class CommandTest(InFolder):
+    def setUp(self):
+        super().setUp()
+        self.enterContext(patch("xreset.description.load_robot", lambda _: ROBOT))
+        self.enterContext(in_this_process())
+        self.enterContext(patch("xreset.objects.catalogue.load_objects", lambda *_: OBJECTS))
+        self.motion = self.folder / "r.npz"
+        write_retargeted(self.motion, motion())
+
+    def resets(self, *options):
+        path = self.folder / "b.npz"
+        out = succeeds("resets", self.motion, "--out", path, *options)
+        with np.load(path) as file:
+            config = json.loads(str(file["meta"]))["config"]
+        return read_bank(path), config, out
+
+    def test_everything_at_once(self):
+        press = ("--squeeze.force", "2.5")
+        plain, config, out = self.resets(*press)
+        self.assertNotIn("transfer", config)
+        self.assertNotIn("grasps of other", out)
+        bank, config, out = self.resets(*press, "--transfer.per-pose", "1", "--transfer.poses", "2")
+        self.assertEqual(
+            config["transfer"], {"per_pose": 1, "poses": 2, "candidates": 40, "seed": 0}
+        )
+        for words in (
+            "3 states of 3 kept",
+            "2 states in grasps of other demonstrations added, to 1 of 3 demonstrations",
+        ):
+            self.assertIn(words, " ".join(out.split()))
+        self.assertEqual(bank.frame_index[bank.transferred].tolist(), [1, 3])
+        own = bank.with_states(bank.own_grasp)
+        for name, values in vars(plain).items():
+            if name != "transferred":
+                assert_array_equal(getattr(own, name), values, name)
+        data = read_retargeted(self.motion)
+        again = add_transfers(
+            make_bank(data, ROBOT, OBJECTS, squeeze=SqueezeConfig(force=2.5)),
+            data,
+            ROBOT,
+            OBJECTS,
+            TransferConfig(per_pose=1, poses=2),
+        )
+        assert_array_equal(again.joint_pos, bank.joint_pos)
+
+    def test_without_states_that_press_it_is_refused_before_any_work(self):
+        out = refused(
+            "resets", self.motion, "--out", self.folder / "b.npz", "--transfer.per-pose", "8"
+        )
+        self.assertIn("Add --squeeze.force 5", " ".join(out.split()))
+        self.assertFalse((self.folder / "b.npz").exists())

@@ -1,0 +1,293 @@
+"""More states at poses of a demonstration, in grasps of other demonstrations of the same object.
+
+Where the retargeting of a demonstration fails, often at its goal, the bank has no state. Grasps of other demonstrations
+may hold the object there. Such a grasp, hand and object together, is moved to the pose, and the arm's inverse
+kinematics finds the arm's joints. The state is kept if the hand then holds the object at its full weight in every
+engine of the bank.
+
+Shape letters: L states of the bank, J joints, W poses of demonstrations, M candidates (each a grasp at a pose).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from xreset.checks import PositiveInt, frozen
+from xreset.errors import DemoError
+from xreset.geometry.rotations import matrix_to_quat, quat_angle
+from xreset.geometry.shapes import turn_of
+from xreset.physics import Backend, State
+from xreset.progress import Progress, unseen
+from xreset.resets.bank import ResetBank, check_states
+from xreset.resets.config import TransferConfig
+from xreset.resets.probe import probe
+from xreset.retarget.arm.config import QUICK
+from xreset.retarget.arm.model import ArmModel, ArmTargets
+from xreset.retarget.arm.solve import track
+from xreset.retarget.file import Retargeted
+from xreset.retarget.validity import Thresholds, classify
+from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, checked_objects, objects_named
+from xreset.tensors import one_thread
+
+# These limits were measured together (docs/lab-book.md, "Grasps of other demonstrations"), and none was varied.
+_CARRIED = 0.02
+"""Grasps are those of states in which the object is raised by more than this [m]."""
+_RAISED = 0.03
+"""Poses are those of frames in which the object is raised by more than this [m]."""
+_THRESHOLDS = Thresholds(wrist_position=0.005, wrist_orientation=float(np.radians(3.0)))
+"""How exactly the arm must carry the hand: a grasp holds as long as the hand keeps its place at the object."""
+_STEPS = 30
+"""Control steps of 1/60 s for which the hand must hold the object: 99 % of the states that hold for so long hold for
+5 s."""
+_MOVED = 0.02
+"""Farthest that a held object may move in this time [m]."""
+_TURNED = float(np.radians(15.0))
+"""Farthest that a held object may turn in this time [rad]."""
+_BATCH = 512
+"""Candidates whose inverse kinematics is solved at a time; limits the memory that this takes."""
+
+
+@frozen
+class _Poses:
+    """Object poses of demonstrations, in the world frame."""
+
+    sequence: np.ndarray
+    """[W] index of the demonstration."""
+    frame: np.ndarray
+    """[W] frame within the demonstration."""
+    pos: np.ndarray
+    """[W, 3] m"""
+    quat: np.ndarray
+    """[W, 4]"""
+
+
+def add_transfers(
+    bank: ResetBank,
+    retargeted: Retargeted,
+    robot: RobotSpec,
+    objects: Sequence[ObjectSpec],
+    config: TransferConfig = TransferConfig(per_pose=8),
+    *,
+    num_envs: PositiveInt = 64,
+    device: str = "cpu",
+    progress: Progress = unseen,
+) -> ResetBank:
+    """Return a bank with more states: grasps of other demonstrations of the same object, at poses of each
+    demonstration. The arguments determine the result.
+
+    The new states come after those of the bank, and :attr:`ResetBank.transferred` marks them. The hand keeps the joints
+    and the drive targets of the grasp, and its place at the object. An object of which the bank has a single
+    demonstration gets no state.
+
+    Args:
+        bank: its states after contact must press (:class:`xreset.resets.config.SqueezeConfig`). The hand must hold the
+            object in every engine of the bank.
+        retargeted: the motion that the bank was made from.
+        robot: the robot of both.
+        objects: the objects of both.
+        config: how many states.
+        num_envs: worlds at a time.
+        device: where engines run that can use it; the others run on the CPU.
+        progress: called with what is done and what is to be done in all.
+
+    Raises:
+        DemoError: no state of the bank presses on an object in the air, the bank has transferred states already, the
+            motion has other demonstrations than the bank, or an object is not among ``objects``.
+        FileFormatError: the bank's states are for a robot with other joints, or for other meshes.
+    """
+    objects = checked_objects(robot, objects)
+    check_states(bank, robot, tuple(objects))
+    if not config.per_pose:
+        return bank
+    grasps = _grasps(bank, retargeted, robot)
+    poses = _raised_poses(retargeted, config.poses)
+    pose, grasp = _candidates(bank, grasps, poses, config)
+    if not len(pose):
+        return replace(bank, transferred=np.zeros(bank.num_states, dtype=bool))
+    used = objects_named(objects, bank.object_name[grasp])
+    scene = SceneSpec(robot=robot, objects=tuple(used.values()))
+    count = len(pose)
+    work = count * (1 + len(bank.backends))
+    states, is_reached = _carried(
+        bank, grasp, poses, pose, robot, lambda done: progress(done, work)
+    )
+    held = np.flatnonzero(is_reached)
+    for number, engine in enumerate(bank.backends, start=1):
+        if not len(held):
+            break
+        before = number * count
+        share = count / len(held)
+        holds = probe(
+            engine,
+            scene,
+            bank.object_name[grasp[held]],
+            states[torch.as_tensor(held)],
+            _is_held,
+            gravity=1.0,
+            steps=_STEPS,
+            num_envs=num_envs,
+            device=device,
+            progress=lambda done, before=before, share=share: progress(before + share * done, work),
+        )
+        held = held[holds]
+    progress(work, work)
+    kept = _first_of_each(held, pose, config.per_pose)
+    return _joined(bank, states[torch.as_tensor(kept)], poses, pose[kept])
+
+
+def _grasps(bank: ResetBank, retargeted: Retargeted, robot: RobotSpec) -> np.ndarray:
+    """Return the states of the bank, ascending, whose hands press on an object in the air; errors as in
+    :func:`add_transfers`."""
+    if not np.array_equal(bank.sequence_name, retargeted.sequence_name):
+        raise DemoError(
+            f"The bank has {len(bank.sequence_name)} demonstrations, and they are not the "
+            f"{len(retargeted.sequence_name)} of the motion. Give the motion that the bank was made from."
+        )
+    if not bank.own_grasp.all():
+        raise DemoError(
+            f"The bank already has {(~bank.own_grasp).sum()} states in grasps of other demonstrations. Give the bank "
+            "that xreset.make_bank returned."
+        )
+    hand = robot.hand_indices
+    presses = (bank.targets[:, hand] != bank.joint_pos[:, hand]).any(axis=1)
+    start_pos, _ = retargeted.start_pose
+    raised = bank.object_pos[:, 2] - start_pos[bank.sequence_index, 2]
+    grasps = np.flatnonzero(presses & (raised > _CARRIED))
+    if not len(grasps):
+        raise DemoError(
+            f"No state of the bank presses on an object that is raised by more than {100 * _CARRIED:g} cm, so there "
+            f"is no grasp for other demonstrations: {presses.sum()} of {bank.num_states} states press. Make the bank "
+            "with --squeeze.force 5, from demonstrations that lift their objects."
+        )
+    return grasps
+
+
+def _raised_poses(retargeted: Retargeted, count: int) -> _Poses:
+    """Return at most ``count`` poses of every demonstration, evenly spread over the frames in which the object is
+    raised. With two or more, the last one is the goal if the object is raised there."""
+    sequence = []
+    frame = []
+    start_pos, _ = retargeted.start_pose
+    for number, start in enumerate(start_pos):
+        height = retargeted.object_pos[retargeted.frames(number), 2] - start[2]
+        raised = np.flatnonzero(height > _RAISED)
+        spread = np.linspace(0, len(raised) - 1, min(count, len(raised)))
+        chosen = raised[spread.astype(int)]
+        sequence += [number] * len(chosen)
+        frame += chosen.tolist()
+    own = np.array(sequence, dtype=int)
+    rows = retargeted.frame_offsets[own] + np.array(frame, dtype=int)
+    return _Poses(
+        sequence=own,
+        frame=np.array(frame, dtype=int),
+        pos=retargeted.object_pos[rows],
+        quat=retargeted.object_quat_wxyz[rows],
+    )
+
+
+def _candidates(
+    bank: ResetBank, grasps: np.ndarray, poses: _Poses, config: TransferConfig
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw grasps of other demonstrations for each pose: pose [M], ascending, and state of the bank [M]."""
+    random = np.random.default_rng(config.seed)
+    pose = []
+    grasp = []
+    for number, sequence in enumerate(poses.sequence):
+        same_object = bank.object_name[grasps] == bank.sequence_object[sequence]
+        others = grasps[same_object & (bank.sequence_index[grasps] != sequence)]
+        drawn = random.permutation(others)[: config.candidates]
+        pose += [number] * len(drawn)
+        grasp += drawn.tolist()
+    return np.array(pose, dtype=int), np.array(grasp, dtype=int)
+
+
+@one_thread()
+def _carried(
+    bank: ResetBank,
+    grasp: np.ndarray,
+    poses: _Poses,
+    pose: np.ndarray,
+    robot: RobotSpec,
+    progress: Callable[[int], None],
+) -> tuple[State, np.ndarray]:
+    """Move grasps, hand and object together, to poses.
+
+    Args:
+        bank: the bank that has the grasps.
+        grasp: [M] state of the bank.
+        poses: the poses.
+        pose: [M] index of the pose.
+        robot: the robot.
+        progress: called with the number of candidates done.
+
+    Returns:
+        States [M] at rest, and whether the arm reaches each of them [M].
+    """
+    model = ArmModel(robot)
+    joint_pos = bank.joint_pos[grasp].astype(float)
+    root = model.kinematics.link_poses(torch.as_tensor(joint_pos), [robot.hand_root])[:, 0].numpy()
+    turn = turn_of(poses.quat[pose]) * turn_of(bank.object_quat_wxyz[grasp]).inv()
+    root_pos = poses.pos[pose] + turn.apply(root[:, :3, 3] - bank.object_pos[grasp])
+    root_turn = turn * Rotation.from_matrix(root[:, :3, :3])
+    root_quat = matrix_to_quat(torch.as_tensor(root_turn.as_matrix()))
+    hand_joints = torch.as_tensor(joint_pos[:, model.hand.joint_indices])
+    is_reached = np.zeros(len(grasp), dtype=bool)
+    for first in range(0, len(grasp), _BATCH):
+        rows = slice(first, first + _BATCH)
+        targets = ArmTargets.of_poses(
+            torch.as_tensor(root_pos[rows]), root_quat[rows], hand_joints[rows, None]
+        )
+        arm, measures = track(model, targets, _THRESHOLDS, QUICK)
+        joint_pos[rows, robot.arm_indices] = arm[:, 0].numpy()
+        is_reached[rows] = (classify(measures, _THRESHOLDS) == 0)[:, 0].numpy()
+        progress(min(first + _BATCH, len(grasp)))
+    joint_target = joint_pos.copy()
+    joint_target[:, robot.hand_indices] = bank.targets[grasp][:, robot.hand_indices]
+    arrays = (joint_pos, poses.pos[pose], poses.quat[pose], joint_target)
+    return State.at_rest(*map(torch.as_tensor, arrays)), is_reached
+
+
+def _is_held(backend: Backend, start: State) -> Tensor:
+    """[N] bool: whether the object of each world is where it was at the start."""
+    state = backend.state()
+    health = backend.health()
+    moved = (state.object_pos - start.object_pos).norm(dim=-1)
+    turned = quat_angle(state.object_quat, start.object_quat)
+    return (moved < _MOVED) & (turned < _TURNED) & ~health.nonfinite & ~health.overflow
+
+
+def _first_of_each(rows: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
+    """Return the first ``count`` rows of each group; ``rows`` and ``group[rows]`` ascend."""
+    groups = group[rows]
+    place = np.arange(len(rows)) - np.searchsorted(groups, groups)
+    return rows[place < count]
+
+
+def _joined(bank: ResetBank, states: State, poses: _Poses, pose: np.ndarray) -> ResetBank:
+    """Return the bank with states [M] at poses [M] after its own."""
+    count = len(pose)
+    sequence = poses.sequence[pose]
+    added = {
+        "joint_pos": states.joint_pos.numpy(),
+        "joint_target": states.joint_target.numpy(),
+        "object_pos": states.object_pos.numpy(),
+        "object_quat_wxyz": states.object_quat.numpy(),
+        "object_name": bank.sequence_object[sequence],
+        "sequence_index": sequence.astype(bank.sequence_index.dtype),
+        "frame_index": poses.frame[pose].astype(bank.frame_index.dtype),
+        "post_contact": np.ones(count, dtype=bool),
+        "transferred": np.ones(count, dtype=bool),
+    }
+    own = {name: getattr(bank, name) for name in added}
+    own["transferred"] = np.zeros(bank.num_states, dtype=bool)
+    if bank.frame_part is not None:
+        own["frame_part"] = bank.frame_part
+        added["frame_part"] = np.zeros(count, dtype=np.float32)
+    joined = {name: np.concatenate((own[name], values)) for name, values in added.items()}
+    return replace(bank, **joined)

@@ -74,7 +74,7 @@ class TransferConfig(Checked):
     """Most states at each pose, such as 8. 0: no states are added."""
     poses: PositiveInt = 4
     """Most poses of each demonstration: evenly from the first frame in which the object is raised by 3 cm to the last,
-    which is the goal. 1: the first only."""
+    usually the goal. 1: the first only."""
     candidates: PositiveInt = 40
     """Most grasps that are tried at each pose."""
     seed: NonNegativeInt = 0

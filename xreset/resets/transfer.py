@@ -100,6 +100,7 @@ def add_transfers(
         DemoError: no state of the bank presses on an object in the air, the bank has transferred states already, the
             motion has other demonstrations than the bank, or an object is not among ``objects``.
         FileFormatError: the bank's states are for a robot with other joints, or for other meshes.
+        XResetError: coal, which retargeting needs too, is not installed.
     """
     objects = checked_objects(robot, objects)
     check_states(bank, robot, tuple(objects))
@@ -108,8 +109,6 @@ def add_transfers(
     grasps = _grasps(bank, retargeted, robot)
     poses = _raised_poses(retargeted, config.poses)
     pose, grasp = _candidates(bank, grasps, poses, config)
-    if not len(pose):
-        return replace(bank, transferred=np.zeros(bank.num_states, dtype=bool))
     used = objects_named(objects, bank.object_name[grasp])
     scene = SceneSpec(robot=robot, objects=tuple(used.values()))
     count = len(pose)

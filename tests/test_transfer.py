@@ -189,6 +189,12 @@ class TransferTest(TestCase):
         self.assertEqual(new.sequence_index.tolist(), [0, 0, 1, 1, 1])
         self.assertEqual(new.frame_index.tolist(), [1, 2, 1, 2, 3])
 
+    def test_starts_that_were_settled_change_nothing(self):
+        settled = replace(self.bank, start_pos=self.bank.start_pos + np.float32([0, 0, 0.1]))
+        found, plain = (tried(each, self.data)[0] for each in (settled, self.bank))
+        assert_array_equal(found.joint_pos, plain.joint_pos)
+        assert_array_equal(found.start_pos, settled.start_pos)
+
     def test_every_engine_of_the_bank_must_hold_it(self):
         base = replace(self.bank, backends=("one", "other"))
         first = [True, False, True, True, True, True]

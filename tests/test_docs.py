@@ -130,6 +130,29 @@ class DocumentedTest(TestCase):
         self.assertGreater(seen, 6)
 
 
+class HelpTest(TestCase):
+    def test_help_explains_the_fields_of_a_data_class(self):
+        from xreset.task.rewards import RewardInput
+
+        for cls, field, means in (
+            (RewardInput, "tip_force", "force of each finger's contact links on the object"),
+            (xreset.TrainConfig, "save_interval", "Iterations between checkpoints"),
+            (xreset.runtime.Reading, "object_time", "when the image was taken"),
+            (xreset.runtime.Limits, "late", "How late a control step may end"),
+        ):
+            with self.subTest(cls.__name__):
+                text = inspect.getdoc(cls) or ""
+                self.assertRegex(text, rf"(?i)\n    {field}: .*{means}")
+
+    def test_a_data_class_of_an_interactive_session_keeps_its_own_words(self):
+        cells = {"__name__": "__main__"}
+        exec(
+            'from xreset.checks import frozen\n@frozen\nclass A:\n    """Words."""\n    x: int\n    """One."""\n',
+            cells,
+        )
+        self.assertEqual(inspect.getdoc(cells["A"]), "Words.")
+
+
 class PageTest(TestCase):
     def test_code_blocks_fit_on_the_page(self):
         for page in PAGES:

@@ -6,14 +6,17 @@ when a configuration is made, instead of turning into NaN some minutes later.
 
 from __future__ import annotations
 
+import ast
 import re
+import sys
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from difflib import get_close_matches
 from functools import cache, wraps
-from inspect import signature
+from inspect import cleandoc, getsource, signature
+from itertools import pairwise
 from math import inf, isfinite
 from numbers import Integral, Real
 from types import SimpleNamespace
@@ -43,8 +46,42 @@ T = TypeVar("T")
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 def frozen(cls: type[T]) -> type[T]:
-    """Make a data class whose objects do not change, and whose fields are named where one is made."""
-    return dataclass(frozen=True, kw_only=True, repr=not issubclass(cls, Brief))(cls)
+    """Make a data class whose objects do not change, and whose fields are named where one is made; ``help`` explains
+    them."""
+    made = dataclass(frozen=True, kw_only=True, repr=not issubclass(cls, Brief))(cls)
+    type.__setattr__(made, "__doc__", _WithFields(made.__doc__ or ""))
+    return made
+
+
+class _WithFields:
+    """In place of a data class's docstring: the same, and those below its fields, which Python does not keep."""
+
+    def __init__(self, summary: str) -> None:
+        self._summary = cleandoc(summary)
+
+    def __get__(self, instance: Any, cls: type) -> str:
+        return _with_fields(self._summary, cls)
+
+
+@cache
+def _classes_of(module: str) -> dict[str, ast.ClassDef]:
+    """Name -> class of a module; none if it has no source, as an interactive session."""
+    try:
+        nodes = ast.parse(getsource(sys.modules[module])).body
+    except (OSError, TypeError):
+        return {}
+    return {node.name: node for node in nodes if isinstance(node, ast.ClassDef)}
+
+
+@cache
+def _with_fields(summary: str, cls: type) -> str:
+    known = _classes_of(cls.__module__).get(cls.__name__)
+    texts = []
+    for field, below in pairwise(known.body if known else ()):
+        match field, below:
+            case ast.AnnAssign(target=ast.Name(name)), ast.Expr(ast.Constant(str() as text)):
+                texts.append(f"\n    {name}: " + cleandoc(text).replace("\n", "\n        "))
+    return f"{summary}\n\nAttributes:{''.join(texts)}" if texts else summary
 
 
 @dataclass(frozen=True)

@@ -34,24 +34,28 @@ class Links:
 
 @dataclass(frozen=True, kw_only=True)
 class Reading:
-    """The newest data of a robot and of an object tracker. A driver of one robot leaves out the axis N."""
+    """The newest data of a robot and of an object tracker. A driver of one robot leaves out the axis N.
+
+    Attributes:
+        joint_pos: [N, J] in the order of the contract's joints.
+        joint_vel: [N, J]
+        joint_time: [N] when the joints were measured, on the driver's clock [s].
+        object_pos: [N, 3] origin of the object's mesh frame.
+        object_quat: [N, 4] (w, x, y, z)
+        object_time: [N] when the image was taken, not when the pose arrived, on the driver's clock [s].
+        tip_force: [N, E, 3] force of each fingertip on the object, world frame [N]; None: the robot does not measure
+            it.
+        links: measured links, which only engines have; None: they are computed from the joints.
+    """
 
     joint_pos: Array
-    """[N, J] in the order of the contract's joints."""
     joint_vel: Array
-    """[N, J]"""
     joint_time: float | Array
-    """[N] when the joints were measured, on the driver's clock [s]."""
     object_pos: Array
-    """[N, 3] origin of the object's mesh frame."""
     object_quat: Array
-    """[N, 4]"""
     object_time: float | Array
-    """[N] when the image was taken, not when the pose arrived, on the driver's clock [s]."""
     tip_force: Array | None = None
-    """[N, E, 3] force of each fingertip on the object, world frame [N]; None: the robot does not measure it."""
     links: Links | None = None
-    """Measured links, which only engines have; None: they are computed from the joints."""
 
     def batched(self) -> Reading:
         """Return the reading with the axis N, in float32 (times: float64).

@@ -15,32 +15,38 @@ from .rotations import is_unit
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """When a runner stops a robot. None of these numbers was tried on hardware."""
+    """When a runner stops a robot. None of these numbers was tried on hardware.
+
+    Attributes:
+        pose_age: oldest pose of the object that the policy may act on [s].
+        joint_age: oldest joint positions that the policy may act on [s].
+        joint_margin: how far a joint may be beyond its limit [rad, m].
+        late: how late a control step may end, and how long the clock may stand still [s].
+        slow_down: time in which targets come to rest [s].
+    """
 
     pose_age: float = 1.0
-    """Oldest pose of the object that the policy may act on [s]."""
     joint_age: float = 0.1
-    """Oldest joint positions that the policy may act on [s]."""
     joint_margin: float = 0.1
-    """How far a joint may be beyond its limit [rad, m]."""
     late: float = 0.5
-    """How late a control step may end, and how long the clock may stand still [s]."""
     slow_down: float = 0.25
-    """Time in which targets come to rest [s]."""
 
 
 @dataclass(kw_only=True)
 class Outcome:
-    """What became of a run."""
+    """What became of a run.
+
+    Attributes:
+        reasons: [N] why each robot was stopped; None: the time was over.
+        steps: control steps that the policy took.
+        missed: control steps that were skipped because the step before took too long.
+        refused: [N] poses that were not used: not finite, or with a time stamp that ran backwards.
+    """
 
     reasons: list[str | None]
-    """[N] why each robot was stopped; None: the time was over."""
     steps: int = 0
-    """Control steps that the policy took."""
     missed: int = 0
-    """Control steps that were skipped because the step before took too long."""
     refused: Array = field(default_factory=lambda: np.zeros(0, dtype=int))
-    """[N] poses that were not used: not finite, or with a time stamp that ran backwards."""
 
     @property
     def reason(self) -> str | None:

@@ -233,6 +233,19 @@ class ContractTest(InFolder):
             with self.subTest(words), self.assertRaisesRegex(LiveError, words):
                 load_controller(self.out)
             self.assertRaisesRegex(LiveError, words, read_contract, self.out)
+        observation = self.contract["observation"]
+        for change in (
+            {"joints": [{}] * 5},
+            {"observation": {}},
+            {"observation": observation | {"cloud_history": 3}},
+            {"observation": observation | {"cloud_scale": "x"}},
+            {"kinematics": {}},
+            {"objects": {"brick": {}}},
+        ):
+            file.write_text(json.dumps(self.contract | change))
+            words = "contract.json is damaged, or does not fit its policy"
+            with self.subTest(change), self.assertRaisesRegex(LiveError, words):
+                load_controller(self.out)
         file.write_text("[]")
         self.assertRaisesRegex(LiveError, "has schema 'None', this", load_controller, self.out)
         file.write_text(original[:100])

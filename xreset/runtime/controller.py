@@ -344,6 +344,41 @@ class Controller:
 def load_controller(folder: str | Path) -> Controller:
     """Return the controller of a folder that ``xreset export deploy`` wrote; ``LiveError`` if it cannot be used."""
     contract, content = read_exported(folder)
-    controller = Controller(contract, OnnxActor(content), source=f"{Path(folder) / CONTRACT}")
-    check_hash(folder, contract, content)
+    source = str(Path(folder) / CONTRACT)
+    try:
+        controller = Controller(contract, OnnxActor(content), source=source)
+        check_hash(folder, contract, content)
+        _try_step(controller)
+    except LiveError:
+        raise
+    except Exception as error:  # whatever a damaged contract leads to
+        raise LiveError(
+            f"{source} is damaged, or does not fit its policy ({type(error).__name__}: {error}). Export the policy "
+            "again."
+        ) from error
     return controller
+
+
+def _try_step(controller: Controller) -> None:
+    """Take a step from home, so that a policy that cannot act is refused before a robot moves."""
+    contract = controller.contract
+    for name in contract["objects"]:
+        controller.points(name)
+        controller.center(name)
+    joints = np.array([joint["home"] for joint in contract["joints"]], np.float32)
+    origin = np.zeros(3, np.float32)
+    upright = np.array([1, 0, 0, 0], np.float32)
+    points = np.zeros((contract["observation"]["cloud_points"], 3), np.float32)
+    controller.begin(points, origin, upright, joints, origin)
+    reading = Reading(
+        joint_pos=joints,
+        joint_vel=np.zeros_like(joints),
+        joint_time=0.0,
+        object_pos=origin,
+        object_quat=upright,
+        object_time=0.0,
+    )
+    target = controller.step(reading)
+    if target.shape != (1, len(joints)) or not np.isfinite(target).all():
+        raise ValueError(f"the targets at home are {target}")
+    controller._has_begun = False

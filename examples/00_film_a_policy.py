@@ -13,8 +13,8 @@ def main(meshes: str, name: str, out: str) -> None:
 
     # robot states that follow the human hand
     motion = xreset.retarget_demos(demos, policy.robot, [thing])
-    # those that the engine finds stable
-    bank = xreset.make_bank(motion, policy.robot, [thing], engine="pybullet")
+    # those that MuJoCo finds stable
+    bank = xreset.make_bank(motion, policy.robot, [thing])
     with policy.make_env(
         [thing], bank, engine="pybullet"
     ) as env:  # the task that the policy was trained for

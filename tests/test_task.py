@@ -6,6 +6,7 @@ from dataclasses import asdict, replace
 from itertools import product
 from types import SimpleNamespace
 from unittest import TestCase
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -201,6 +202,12 @@ class RewardTest(TestCase):
         task = TaskConfig(reward=config)
         self.assertEqual(from_dict(TaskConfig, json.loads(json.dumps(asdict(task)))), task)
         self.assertEqual(evaluation_task(task).reward, RewardConfig())
+
+    def test_a_term_that_was_defined_again_is_the_new_one(self):
+        name = f"{__name__}:height"
+        with patch(f"{__name__}.height", lambda x: 2 * x.object_pos[:, 2]):
+            self.assert_terms(self.reward(RewardConfig(own={name: 0.5}), **FAR), **{name: 0.1})
+        self.assert_terms(self.reward(RewardConfig(own={name: 0.5}), **FAR), **{name: 0.05})
 
     def test_what_is_not_a_reward_term_is_refused(self):
         for name, problem in (

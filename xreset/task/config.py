@@ -31,6 +31,11 @@ LONGEST_EPISODE = 1e6
 PositiveRange = Annotated[Range, Rule("factors above 0", lambda x: x[0] > 0)]
 
 
+_OWN_TERMS = (
+    "module:function and a finite number (a function of a notebook is named __main__:function)"
+)
+
+
 def _are_own_terms(own: dict[str, float]) -> bool:
     if not isinstance(own, dict):
         return False
@@ -227,9 +232,7 @@ class RewardConfig(Checked):
     """Whether ``action`` and ``action_rate`` penalise actions before they are limited to [-1, 1]. Beyond the limits
     exploration noise has no effect, and only a penalty of the raw action pulls the mean back (as in Isaac Lab's action
     terms)."""
-    own: Annotated[
-        dict[str, float], Rule("module:function and a finite number", _are_own_terms)
-    ] = field(default_factory=dict)
+    own: Annotated[dict[str, float], Rule(_OWN_TERMS, _are_own_terms)] = field(default_factory=dict)
     """Reward terms of the user: ``module:function`` -> weight (docs/own-reward.md)."""
     scale: PositiveFloat = 0.01
     """Factor on the total (Table VIII)."""

@@ -14,7 +14,6 @@ The learner gets ``scale`` r. Weights and widths are fields of :class:`~xreset.t
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 from importlib import import_module
 from typing import Any, cast
 
@@ -99,9 +98,9 @@ OwnTerm = Callable[[RewardInput], Tensor]
 ask for the value of a tensor (``if``, ``item``, ``nonzero``)."""
 
 
-@cache
 def own_term(name: str) -> OwnTerm:
-    """Return the function that ``task.reward.own`` names as ``module:function``.
+    """Return the function that ``task.reward.own`` names as ``module:function``, as it is now: a notebook may have
+    defined it again.
 
     Raises:
         RunError: the module cannot be imported, or has no such function.

@@ -53,7 +53,8 @@ def evaluate(
         device: where GPU engines run: cpu or cuda.
         settle: whether objects come to rest before episodes begin, instead of starting as recorded.
         episode_seconds: length of an episode [s]; default: as in the policy's training.
-        out: folder for the results; default: the folder of the policy.
+        out: folder for the results; default: ``eval`` in the run folder, or ``runs/NAME/eval`` here for a policy that
+            ships with xreset.
         progress: called with (engine, control steps done, control steps in all).
 
     Returns:

@@ -28,9 +28,9 @@ from xreset.checks import (
     from_dict,
     frozen,
 )
-from xreset.errors import FileFormatError
-from xreset.eval.stats import Interval, bootstrap_ci95
-from xreset.eval.table import table_text
+from xreset.errors import FileFormatError, RunError
+from xreset.eval.stats import Interval, bootstrap_ci95, difference_ci95
+from xreset.eval.table import METRICS, table_text
 from xreset.files import read_json, read_typed, write_json
 from xreset.records import POSITION, UNIT_TOLERANCE, Field, read_npz, write_npz
 from xreset.text import Brief
@@ -269,6 +269,43 @@ class Evaluation(list[EvalResult]):
         """Return the table of episodes; see :func:`episode_table`."""
         return self._episodes
 
+    def minus(self, other: Evaluation) -> Table:
+        """Return how much better this policy is than another one that played the same episodes.
+
+        Columns: engine, object (or ``all``), metric (a column of :func:`episode_table`), and mean, low and high: the
+        difference, and its 95 % interval. The interval is a bootstrap that draws the same demonstrations for both.
+
+        Raises:
+            RunError: no engine is in both, or the starts, their seed, the meshes or the length of episodes differ.
+        """
+        starts = ["sequence", "sequence_name", "object", "repetition"]
+        theirs = {result.backend: result for result in other}
+        rows = []
+        for result in self:
+            engine = result.backend
+            if engine not in theirs:
+                continue
+            tables = []
+            played = []
+            for whole, own in ((other, theirs[engine]), (self, result)):
+                table = whole.to_frame()
+                tables.append(table[table["engine"] == engine])
+                episodes = tables[-1][starts].to_numpy().tolist()
+                played.append((episodes, own.seed, own.objects_folder, own.episode_seconds))
+            if played[0] != played[1]:
+                raise RunError(
+                    f"{result.policy} and {theirs[engine].policy} did not play the same episodes in {engine}. "
+                    "Evaluate both with the same demonstrations, episodes, seed, objects and episode_seconds."
+                )
+            for name in ("all", *tables[0]["object"].unique()):
+                one, two = (t if name == "all" else t[t["object"] == name] for t in tables)
+                rows += [
+                    (engine, name, metric, *difference(one, two, metric)) for metric in METRICS
+                ]
+        if not rows:
+            raise RunError("the two evaluations have no engine in common.")
+        return pd.DataFrame(rows, columns=["engine", "object", "metric", "mean", "low", "high"])
+
     def __repr__(self) -> str:
         return table_text(self)
 
@@ -305,6 +342,19 @@ def _table(episodes: Sequence[Episode], about: dict[str, Any]) -> Table:
 def mean(episodes: Table, metric: str) -> float:
     """Return the mean of one metric over episodes, rounded to six digits; NaN if it was not measured in all of them."""
     return round(float(episodes[metric].to_numpy(float).mean()), 6)
+
+
+def difference(one: Table, other: Table, metric: str) -> tuple[float, float, float]:
+    """Return the mean of a metric in ``other`` minus that in ``one``, and the lower and upper end of its 95 % interval
+    (:func:`xreset.eval.stats.difference_ci95`). Both have episodes on the same demonstrations."""
+    interval = difference_ci95(crossed(one, metric), crossed(other, metric))
+    return mean(other, metric) - mean(one, metric), *interval
+
+
+def crossed(episodes: Table, metric: str) -> list[np.ndarray]:
+    """Return the metric, the index of the training and the demonstration of each episode, [E] each."""
+    runs = pd.factorize(episodes["run"])[0]
+    return [episodes[metric].to_numpy(float), runs, episodes["sequence"].to_numpy()]
 
 
 def measured(episodes: Table, metric: str) -> float | None:

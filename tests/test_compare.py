@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from torch.utils.tensorboard import SummaryWriter
 
 from tests.command import refused, succeeds
+from tests.toy_bank import SOUP, SPAM
 from tests.toy_results import ENGINES, InFolder, rollouts_with, toy_rollouts
 from xreset import TrainConfig
 from xreset.errors import FileFormatError, RunError, XResetError
@@ -21,6 +22,7 @@ from xreset.eval.report.figures import draw_lines, draw_scores
 from xreset.eval.report.groups import grouped, scores
 from xreset.eval.report.make import compare
 from xreset.eval.report.read import read_curves, read_training, read_trainings
+from xreset.eval.results import read_evaluation
 from xreset.eval.stats import bootstrap_ci95, crossed_bootstrap_ci95, difference_ci95
 from xreset.learning.clock import Lift, Passing, write_lift
 from xreset.task.config import ResetConfig, TaskConfig, TerminationConfig
@@ -331,6 +333,42 @@ class ScoreTest(Compared):
         few = [x[:3] for x in (both[0], runs, demos)]
         more = [x[:41] for x in (both[0], runs, demos)]
         self.assertRaisesRegex(ValueError, "every training needs", difference_ci95, few, more)
+
+    def test_the_difference_of_two_evaluations(self):
+        base = toy_rollouts()
+        worse = [replace(e, task_progress=0.5 * e.task_progress) for e in base.episodes]
+        for name, episodes, changes in (
+            ("good", base.episodes, {}),
+            ("bad", tuple(worse), {}),
+            ("seed", base.episodes, {"seed": 4}),
+            ("fewer", base.episodes[::2], {}),
+            ("sapien", base.episodes, {"engines": ("sapien",)}),
+        ):
+            self.write_results(name, replace(base, episodes=episodes), **changes)
+        good, bad, *others = (
+            read_evaluation(self.folder / name / "eval")
+            for name in ("good", "bad", "seed", "fewer")
+        )
+        table = good.minus(bad).query("metric == 'task_progress'").set_index(["engine", "object"])
+        self.assertEqual([*table.loc["mujoco"].index], ["all", SOUP, SPAM])
+        half = [0.5 * mean for mean in (0.4975, 0.665, 0.33)]
+        assert_allclose(table["mean"], half, atol=1e-5)
+        row = table.loc["mujoco", "all"]
+        self.assertTrue(row["low"] <= row["mean"] <= row["high"])
+        self.assertTrue((bad.minus(bad).select_dtypes(float) == 0).all(axis=None))
+        for other in others:
+            self.assertRaisesRegex(RunError, "same episodes in mujoco", good.minus, other)
+        elsewhere = read_evaluation(self.folder / "sapien" / "eval")
+        self.assertRaisesRegex(RunError, "no engine in common", good.minus, elsewhere)
+
+    def test_differences_are_in_the_table_of_figures(self):
+        for name, share in (("a", 0.3), ("b", 0.6)):
+            self.write_run(name, reset_config(demo_probability=share))
+            self.write_results(name, inputs={"demos": "ab", "policy": name})
+        self.compare("a", "b")
+        figures = pd.read_csv(self.folder / "out" / "compare.csv")
+        found = figures[figures["metric"] == "published_success minus a"]
+        self.assertEqual(found[["group", "mean", "low", "high"]].values.tolist(), [["b", 0, 0, 0]])
 
 
 class FairnessTest(Compared):

@@ -8,13 +8,12 @@ from math import nan
 from os.path import commonprefix
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from xreset.eval.report.fairness import uneven
 from xreset.eval.report.read import Training
-from xreset.eval.results import Table, mean
-from xreset.eval.stats import crossed_bootstrap_ci95, difference_ci95
+from xreset.eval.results import Table, crossed, difference, mean
+from xreset.eval.stats import crossed_bootstrap_ci95
 from xreset.eval.table import METRICS
 
 Groups = dict[str, Sequence[Training]]
@@ -74,6 +73,9 @@ def _label(members: Sequence[Training]) -> str:
     return re.sub(r"[-_. ]+(seed|s)?[-_. ]*$", "", common) or _whole_label(members)
 
 
+COLUMNS = ("group", "engine", "metric", "mean", "low", "high")
+
+
 def scores(groups: Groups) -> Table:
     """Return a row for each group, engine and metric of :data:`~xreset.eval.table.METRICS`.
 
@@ -85,7 +87,7 @@ def scores(groups: Groups) -> Table:
         for engine, own in by_engine(members):
             for metric in METRICS:
                 rows.append((label, engine, metric, *estimate(own, metric)))
-    return pd.DataFrame(rows, columns=["group", "engine", "metric", "mean", "low", "high"])
+    return pd.DataFrame(rows, columns=COLUMNS)
 
 
 def by_engine(members: Iterable[Training]) -> Sequence[tuple[Any, Table]]:
@@ -112,18 +114,21 @@ def estimate(episodes: Table, metric: str) -> tuple[float, float, float]:
     """
     if episodes.empty:
         return nan, nan, nan
-    return mean(episodes, metric), *crossed_bootstrap_ci95(*_crossed(episodes, metric))
+    return mean(episodes, metric), *crossed_bootstrap_ci95(*crossed(episodes, metric))
 
 
-def difference(one: Table, other: Table) -> str:
-    """Return task progress of ``other`` minus that of ``one`` as text: percentage points, with the 95 % interval
-    (:func:`xreset.eval.stats.difference_ci95`). Both have episodes on the same demonstrations."""
-    low, high = difference_ci95(_crossed(one, "task_progress"), _crossed(other, "task_progress"))
-    value = mean(other, "task_progress") - mean(one, "task_progress")
-    return f"{100 * value:+.1f} ({100 * low:+.1f} to {100 * high:+.1f})"
-
-
-def _crossed(episodes: Table, metric: str) -> list[np.ndarray]:
-    """Return the metric, the index of the training and the demonstration of each episode, [E] each."""
-    runs = pd.factorize(episodes["run"])[0]
-    return [episodes[metric].to_numpy(float), runs, episodes["sequence"].to_numpy()]
+def differences(groups: Groups) -> Table:
+    """Return a row for each group after the first, engine and metric, where both were evaluated alike: by how much the
+    group's mean is above the first group's. Columns as of :func:`scores`; the metric is named ``METRIC minus FIRST``.
+    """
+    rows = []
+    first, *others = groups
+    reference = dict(by_engine(groups[first]))
+    for label in others:
+        if uneven([*groups[first], *groups[label]]):
+            continue
+        for engine, own in by_engine(groups[label]):
+            for metric in METRICS if engine in reference else ():
+                values = difference(reference[engine], own, metric)
+                rows.append((label, engine, f"{metric} minus {first}", *values))
+    return pd.DataFrame(rows, columns=COLUMNS)

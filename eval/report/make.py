@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from xreset.errors import FileFormatError, RunError, XResetError
 from xreset.eval.pages import percent, render
@@ -22,7 +23,7 @@ from xreset.eval.report import fairness, tables
 from xreset.eval.report.clips import Clip, draw_report, encode_mp4
 from xreset.eval.report.curves import AXES, X
 from xreset.eval.report.figures import draw_training, write_picture
-from xreset.eval.report.groups import by_engine, grouped, scores, singles
+from xreset.eval.report.groups import by_engine, differences, grouped, scores, singles
 from xreset.eval.report.read import (
     ReportData,
     Training,
@@ -212,6 +213,7 @@ def compare(
     groups, reasons = (singles(trainings), []) if apart else grouped(trainings)
     tags = choose_curves(trainings, curves)
     found = scores(groups)
+    above = differences(groups)
     notes = [*reasons, *fairness.uneven(trainings), *fairness.begun(trainings)]
     notes = list(dict.fromkeys(notes))  # each sentence once
     policies = []
@@ -227,13 +229,13 @@ def compare(
         versions=caption(policies),
         engines=sorted(found["engine"].unique()),
         engine_versions=partial(versions, trainings),
-        results=tables.results(groups, found),
+        results=tables.results(groups, found, above),
         x=AXES[x][0],
         lifted=tables.lifted(clocks, x),
         different=tables.different(groups),
     )
     write_picture(out / "compare.png", groups, tags, found, x)
-    write_whole(out / "compare.csv", found.to_csv(index=False))
+    write_whole(out / "compare.csv", pd.concat([found, above]).to_csv(index=False))
     write_whole(out / "compare.md", content)
     return out / "compare.md"
 

@@ -9,38 +9,36 @@ from scipy.stats import binomtest
 
 from xreset.errors import RunError
 from xreset.eval.report.curves import AXES, X, amounts
-from xreset.eval.report.fairness import uneven
-from xreset.eval.report.groups import COUNTED, Groups, by_engine, counted, difference
+from xreset.eval.report.groups import COUNTED, Groups, by_engine, counted
 from xreset.eval.report.read import Training
 from xreset.eval.results import Table
 from xreset.eval.table import METRICS, Rows, estimate_text
 from xreset.learning.clock import SHARES, Lift
 
 
-def results(groups: Groups, found: Table) -> dict[str, dict[str, dict[str, str]]]:
+def results(groups: Groups, found: Table, above: Table) -> dict[str, dict[str, dict[str, str]]]:
     """Return group -> name of a row -> engine -> text. The rows are the numbers of episodes, every metric, and the
     difference to the first group where both were evaluated alike.
 
     Args:
         groups: the groups.
         found: :func:`xreset.eval.report.groups.scores`.
+        above: :func:`xreset.eval.report.groups.differences`.
     """
-    first, *_ = groups
-    reference = dict(by_engine(groups[first]))
+    progress = f"task_progress minus {next(iter(groups))}"
     texts = {}
     for label, members in groups.items():
         own = defaultdict(dict)
         texts[label] = own
-        alike = label != first and not uneven([*groups[first], *members])
         for engine, episodes in by_engine(members):
             own[COUNTED][engine] = counted(episodes)
             scored = found[(found["group"] == label) & (found["engine"] == engine)]
             for _, _, metric, *values in scored.itertuples(index=False):
                 own[METRICS[metric]][engine] = estimate_text(metric, *values)
-            if alike and engine in reference:
-                own[f"task progress minus {first}"][engine] = difference(
-                    reference[engine], episodes
-                )
+        for _, engine, metric, *values in above[above["group"] == label].itertuples(index=False):
+            if metric == progress:
+                value, low, high = (f"{100 * share:+.1f}" for share in values)
+                own[metric.replace("_", " ", 1)][engine] = f"{value} ({low} to {high})"
     return texts
 
 

@@ -6,12 +6,14 @@ import sys
 import threading
 from dataclasses import asdict, replace
 from importlib.util import find_spec
+from queue import Queue
 from unittest import skipUnless
 from unittest.mock import patch
 
 import numpy as np
 import torch
 
+import xreset
 from tests import toy_grasp
 from tests.command import refused, succeeds
 from tests.data import InFolder
@@ -365,6 +367,19 @@ class ContractTest(InFolder):
         served.assert_called_once_with(server.return_value)
         self.assertIn("nine-objects for ur7e-sharpa at ws://0.0.0.0:9, 60 steps per second", said)
         self.assertIn("There is no password", said)
+
+    @skipUnless(find_spec("websockets"), "websockets is not installed")
+    def test_a_policy_is_served_from_a_thread_of_a_notebook(self):
+        said: Queue[str] = Queue()
+        with patch("builtins.print", said.put):
+            arguments = {"port": 0, "only": ["banana"]}
+            threading.Thread(
+                target=xreset.serve, args=["nine-objects"], kwargs=arguments, daemon=True
+            ).start()
+            url = said.get(timeout=60).split()[4].rstrip(",")
+        controller = RemoteController(url)
+        self.assertEqual(list(controller.contract["objects"]), ["011_banana"])
+        controller.close()
 
     def test_a_baseline_and_cameras_are_refused(self):
         self.assertIn(

@@ -10,6 +10,7 @@ from unittest import skipUnless
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
+import xreset
 from tests.command import succeeds
 from tests.toy_results import InFolder, toy_rollouts
 from xreset.description import load_robot
@@ -165,6 +166,9 @@ class Arrays(Case):
         with np.load(out) as file:
             self.assertEqual(file["engine"].tolist(), ["sapien", "sapien"])
             self.assertEqual(file["task"][0], "Lift the tomato soup can.")
+        again = self.folder / "again.npz"
+        xreset.export_npz(str(self.folder), again, engines=["sapien"], task="Lift the {object}.")
+        self.assertEqual(again.read_bytes(), out.read_bytes())
 
 
 @skipUnless(PARQUET, "pyarrow is not installed")
@@ -183,6 +187,12 @@ class LeRobot(Case):
         recording = read_recorded([folder])
         root = self.folder / "set"
         succeeds("export", "lerobot", folder, "--out", root, "--no-video")
+        done = []
+        again = self.folder / "again"
+        xreset.export_lerobot(folder, again, video=False, progress=lambda *n: done.append(n))
+        self.assertEqual(done, [(1, 4), (2, 4), (3, 4), (4, 4)])
+        for file in ("data/chunk-000/file-000.parquet", "meta/info.json", "meta/stats.json"):
+            self.assertEqual((again / file).read_bytes(), (root / file).read_bytes(), file)
         info = json.loads((root / "meta/info.json").read_text())
         self.assertEqual(
             (info["codebase_version"], info["fps"], info["total_frames"]), ("v3.0", 20, 20)

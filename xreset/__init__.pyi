@@ -12,6 +12,9 @@ from xreset.env import make_env as make_env
 from xreset.errors import XResetError as XResetError
 from xreset.eval.evaluate import evaluate as evaluate
 from xreset.eval.export.deploy import export_deploy as export_deploy
+from xreset.eval.export.deploy import serve as serve
+from xreset.eval.export.lerobot import export_lerobot as export_lerobot
+from xreset.eval.export.recorded import export_npz as export_npz
 from xreset.eval.film import film as film
 from xreset.eval.play.page import play as play
 from xreset.eval.policy_spec import PolicySpec as PolicySpec

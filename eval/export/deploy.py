@@ -54,3 +54,40 @@ def served(
     folder = spec.meshes(objects)
     listed = load_objects(only or spec.objects_of(folder), folder)
     return spec, deploy_contract(spec.robot, spec.task, listed, file)
+
+
+def serve(
+    policy: str | Path | PolicySpec,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8765,
+    robot: str | Path | None = None,
+    objects: str | Path | None = None,
+    only: Sequence[str] = (),
+) -> None:
+    """Serve a policy to a robot's computer over a WebSocket until Ctrl-C (``docs/live.md`` has the messages). It may
+    run in a thread, such as that of a notebook.
+
+    Args:
+        policy: the policy or its name, as for :func:`~xreset.eval.policy_spec.load_policy`; no baseline.
+        host: address to listen at. Any other than 127.0.0.1 lets other computers use the policy; there is no password.
+        port: port to listen at.
+        robot: name or folder of the robot; default: the policy's own.
+        objects: folder of object meshes; default: the folder of the policy's training, else the stand-ins.
+        only: names of the objects that clients may name; default: the objects of the training.
+
+    Raises:
+        PolicyError: the policy is a baseline or looks through cameras.
+        XResetError: the port is taken or impossible, the address is not this machine's, or websockets is missing.
+    """
+    from xreset.live import serve as server  # which needs websockets
+    from xreset.pictures.view import server as pages
+
+    spec, contract = served(policy, robot=robot, objects=objects, only=only)
+    listening = server.PolicyServer(contract, spec.exported().read_bytes(), host=host, port=port)
+    print(
+        f"{spec.name} for {spec.robot.name} at {listening.url}, {contract['rate']:g} steps per second. Ctrl-C ends."
+    )
+    if host not in ("127.0.0.1", "localhost", "::1"):
+        print("Every computer that reaches this address can use the policy. There is no password.")
+    pages.serve_until_interrupted(listening)

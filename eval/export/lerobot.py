@@ -18,12 +18,13 @@ import pandas as pd
 
 from xreset.cameras.config import CAMERAS, VisionConfig, check_each_once
 from xreset.errors import XResetError, needs
-from xreset.eval.export.recorded import RecordedEpisodes
+from xreset.eval.export.recorded import RecordedEpisodes, read_recorded
 from xreset.eval.report.clips import draw_state, draw_view, encode_mp4, policy_cameras
 from xreset.eval.results import Trace
 from xreset.files import atomic_folder, is_occupied, write_json
 from xreset.objects.catalogue import load_object
 from xreset.pictures.render import Renderer, Size
+from xreset.progress import unseen
 from xreset.spec import RobotSpec, SceneSpec
 
 SCHEMA = "xreset-lerobot/1"
@@ -41,6 +42,41 @@ random."""
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
 
+def export_lerobot(
+    folders: str | Path | Sequence[str | Path],
+    out: str | Path,
+    *,
+    engines: Sequence[str] = (),
+    robot: str | Path | None = None,
+    objects: str | Path | None = None,
+    task: str | None = None,
+    video: bool = True,
+    size: tuple[int, int] = (320, 240),
+    cameras: Sequence[str] = (),
+    progress: Callable[[float, int], None] = unseen,
+) -> None:
+    """Write recorded evaluation episodes as a LeRobot data set (v3.0); ``docs/rollouts.md`` has its features.
+
+    Args:
+        folders: run folders, or folders of evaluations; the first episode of each demonstration and engine is recorded.
+        out: folder to write; must not exist, or be empty.
+        engines: only these engines; empty: all.
+        robot: name or folder of the robot; default: as the results name it.
+        objects: folder of meshes; default: as the results name it.
+        task: the task in words; ``{object}`` is replaced by the object's name.
+        video: whether a film of each episode is drawn.
+        size: width and height of the films [pixels], even.
+        cameras: depth cameras of which films are drawn, too: ``front``, ``side`` or ``wrist``.
+        progress: called with (episodes written, episodes in all).
+
+    Raises:
+        RunError: a folder does not exist, none holds episodes of the engines, or robots or rates differ.
+        XResetError: pyarrow or the encoder of films is missing, or the folder is not empty.
+    """
+    recording = read_recorded(folders, backends=engines, robot=robot, objects=objects, task=task)
+    write_lerobot(Path(out), recording, video=video, size=size, cameras=cameras, progress=progress)
+
+
 def write_lerobot(
     folder: Path,
     recording: RecordedEpisodes,
@@ -48,6 +84,7 @@ def write_lerobot(
     video: bool = True,
     size: Size = (320, 240),
     cameras: Sequence[str] = (),
+    progress: Callable[[float, int], None] = unseen,
 ) -> None:
     """Write a data set; ``docs/rollouts.md`` has its features.
 
@@ -56,6 +93,7 @@ def write_lerobot(
         video: whether films are drawn: from one camera for all episodes, the goal as a translucent object.
         size: width and height of the films [pixels], even.
         cameras: names of depth cameras (:data:`xreset.cameras.config.CAMERAS`), each of which gives a film.
+        progress: called with (episodes written, episodes in all).
 
     Raises:
         XResetError: a camera is unknown or given twice, pyarrow or the encoder of films is missing, the folder is not
@@ -81,14 +119,20 @@ def write_lerobot(
         )
     try:
         with atomic_folder(folder) as part:
-            _write(part, recording, videos, size)
+            _write(part, recording, videos, size, progress)
     except OSError as error:
         raise XResetError(
             f"cannot write {folder}: {error.strerror or error}. Nothing was changed; choose another place."
         ) from error
 
 
-def _write(root: Path, recording: RecordedEpisodes, videos: tuple[str, ...], size: Size) -> None:
+def _write(
+    root: Path,
+    recording: RecordedEpisodes,
+    videos: tuple[str, ...],
+    size: Size,
+    progress: Callable[[float, int], None],
+) -> None:
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -139,6 +183,7 @@ def _write(root: Path, recording: RecordedEpisodes, videos: tuple[str, ...], siz
             samples.setdefault(key, []).append(values)
             row |= {f"stats/{key}/{name}": value for name, value in _stats(key, values).items()}
         rows.append(row)
+        progress(i + 1, len(offsets) - 1)
 
     columns = {}
     whole = {key: np.concatenate(parts) for key, parts in samples.items()}

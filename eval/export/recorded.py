@@ -60,12 +60,35 @@ class RecordedEpisodes:
         return np.cumsum([0, *map(len, self.episodes["action"])])
 
 
+def export_npz(
+    folders: str | Path | Sequence[str | Path],
+    out: str | Path,
+    *,
+    engines: Sequence[str] = (),
+    robot: str | Path | None = None,
+    task: str | None = None,
+) -> None:
+    """Write recorded evaluation episodes as plain arrays in one npz file; ``docs/rollouts.md`` has the schema.
+
+    Args:
+        folders: run folders, or folders of evaluations; the first episode of each demonstration and engine is recorded.
+        out: file to write.
+        engines: only these engines; empty: all.
+        robot: name or folder of the robot; default: as the results name it.
+        task: the task in words; ``{object}`` is replaced by the object's name.
+
+    Raises:
+        RunError: a folder does not exist, none holds episodes of the engines, or robots or rates differ.
+    """
+    write_arrays(out, read_recorded(folders, backends=engines, robot=robot, task=task))
+
+
 def read_recorded(
-    folders: Sequence[Path],
+    folders: str | Path | Sequence[str | Path],
     *,
     backends: Sequence[str] = (),
-    robot: str | None = None,
-    objects: Path | None = None,
+    robot: str | Path | None = None,
+    objects: str | Path | None = None,
     task: str | None = None,
 ) -> RecordedEpisodes:
     """Read the recorded episodes of evaluations: the first of each demonstration and engine.
@@ -92,14 +115,14 @@ def read_recorded(
     robots: dict[str, RobotSpec] = {}
     intervals: dict[float, Path] = {}
     inputs: dict[str, str] = {}
-    for folder in folders:
-        results = results_in(folder)
+    for folder in [folders] if isinstance(folders, str | Path) else folders:
+        results = results_in(Path(folder))
         evaluation = read_evaluation(results)
         for result in evaluation:
             engine = result.backend
             if backends and engine not in backends:
                 continue
-            name = robot or result.robot
+            name = str(robot or result.robot)
             spec = robots[name] = robots.get(name) or load_robot(name)
             traces = read_traces(results, engine, spec.joint_names)
             file = results / f"{engine}.trace.npz"

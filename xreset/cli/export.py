@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from xreset import runtime
 from xreset.cli._common import Policy, Robot, Several, Sources, TrainedObjects
-from xreset.cli._terminal import console
+from xreset.cli._terminal import Progress, console
 
 if TYPE_CHECKING:
     from xreset.eval.export import recorded
@@ -44,8 +44,11 @@ def lerobot(
     recording = recorded.read_recorded(
         folders, backends=backend, robot=robot, objects=objects, task=task
     )
-    with console.status("writing episodes"):
-        dataset.write_lerobot(out, recording, video=video, size=size, cameras=camera)
+    with Progress() as bar:
+        moved = bar.count("episodes")
+        dataset.write_lerobot(
+            out, recording, video=video, size=size, cameras=camera, progress=moved
+        )
     _say(recording, out)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 
 from xreset.cli._common import Policy, Robot, Several, TrainedObjects
-from xreset.live import serve as server
 
 
 def serve(
@@ -25,17 +24,9 @@ def serve(
         object: Object that clients may name; give it again for more. Default: the objects of the training.
     """
     from xreset.eval.export import deploy
-    from xreset.pictures.view import server as pages
 
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
-    spec, contract = deploy.served(policy, robot=robot, objects=objects, only=object)
-    listening = server.PolicyServer(contract, spec.exported().read_bytes(), host=host, port=port)
-    print(
-        f"{spec.name} for {spec.robot.name} at {listening.url}, {contract['rate']:g} steps per second. Ctrl-C ends."
-    )
-    if host not in ("127.0.0.1", "localhost", "::1"):
-        print("Every computer that reaches this address can use the policy. There is no password.")
-    pages.serve_until_interrupted(listening)
+    deploy.serve(policy, host=host, port=port, robot=robot, objects=objects, only=object)
 
 
 COMMAND = serve

@@ -440,15 +440,19 @@ class Toy(Robots):
 
     def test_a_jaw_that_is_closed_at_0_in_one_file_with_its_arm(self):
         described = load_robot("openarm")
-        made = import_robot(None, described.urdf, self.folder / "mine")
-        spec = load_robot(made.folder)
-        self.assertEqual(spec.joint_names, described.joint_names)
-        self.assertEqual(len(spec.arm_indices), 7)
-        palms = []
-        for robot in (spec, described):
-            hand, palm = at_home(robot, described.hand_root, robot.palm)
-            palms.append(hand[:3, :3].T @ palm[:3, :3])
-        assert_allclose(*palms, atol=1e-3)
+        text = described.urdf.read_text()
+        for name, urdf in (("one-drive", text), ("two-drives", re.sub("<mimic[^>]*>", "", text))):
+            made = import_robot(None, self.file(f"{name}.urdf", urdf), self.folder / name)
+            spec = load_robot(made.folder)
+            self.assertEqual(len(spec.arm_indices), 7)
+            palms = []
+            for robot in (spec, described):
+                hand, palm = at_home(robot, described.hand_root, robot.palm)
+                palms.append(hand[:3, :3].T @ palm[:3, :3])
+            with self.subTest(name):
+                assert_allclose(*palms, atol=1e-3)
+            if name == "one-drive":
+                self.assertEqual(spec.joint_names, described.joint_names)
 
     def test_impossible_figures_are_replaced_with_a_note(self):
         heavy = HAND.replace(

@@ -245,7 +245,7 @@ class Hand:
 
     def _find_palm(self, fingers: list[Finger]) -> np.ndarray:
         """Return the palm's frame [4, 4] in the hand root's, and note how far each joint is bent at home."""
-        is_jaw = len(fingers) == 2 and len(set.union(*map(self._drives_of, fingers))) == 1
+        is_jaw = len(fingers) == 2 and self._is_jaw(fingers)
         along = fingers if is_jaw else fingers[1:]
         bases = np.array([finger.points[0] for finger in along])
         ends = np.array([finger.points[-1] for finger in along])
@@ -280,6 +280,12 @@ class Hand:
         T = axes(x=x, z=z)
         T[:3, 3] = bases.mean(axis=0) - _PALM_BEHIND * x
         return T
+
+    def _is_jaw(self, fingers: list[Finger]) -> bool:
+        """Return whether one drive moves two fingers, or both only slide."""
+        names = [*fingers[0].joints, *fingers[1].joints]
+        slide = all(self.tree.joint(name).type == "prismatic" for name in names)
+        return slide or len(set.union(*map(self._drives_of, fingers))) == 1
 
     def _opened(self, jaw: list[Finger]) -> np.ndarray:
         """[3] from the thumb's tip to the other finger's where the jaw's drive is in the middle of its range."""

@@ -169,6 +169,9 @@ class Arrays(Case):
         again = self.folder / "again.npz"
         xreset.export_npz(str(self.folder), again, engines=["sapien"], task="Lift the {object}.")
         self.assertEqual(again.read_bytes(), out.read_bytes())
+        words = f"^{self.folder}: there are no recorded episodes"
+        with self.assertRaisesRegex(RunError, words):
+            xreset.export_npz(str(self.folder), again, engines=["drake"])
 
 
 @skipUnless(PARQUET, "pyarrow is not installed")

@@ -115,7 +115,8 @@ def read_recorded(
     robots: dict[str, RobotSpec] = {}
     intervals: dict[float, Path] = {}
     inputs: dict[str, str] = {}
-    for folder in [folders] if isinstance(folders, str | Path) else folders:
+    every = [folders] if isinstance(folders, str | Path) else folders
+    for folder in every:
         results = results_in(Path(folder))
         evaluation = read_evaluation(results)
         for result in evaluation:
@@ -142,12 +143,12 @@ def read_recorded(
                     continue
                 episode["task"] = (task or TASK).replace("{object}", short_name(trace.object))
                 episode["action"] = action
-                episode["meshes"] = result.meshes(objects)
+                episode["meshes"] = result.meshes(Path(objects) if objects else None)
                 rows.append(episode)
     if not rows:
         of = f" of {', '.join(backends)}" if backends else ""
         raise RunError(
-            f"{', '.join(map(str, folders))}: there are no recorded episodes{of}. Make them first: xreset eval"
+            f"{', '.join(map(str, every))}: there are no recorded episodes{of}. Make them first: xreset eval"
         )
     if len(robots) > 1:
         raise RunError(

@@ -23,7 +23,7 @@ from xreset.errors import DemoError
 from xreset.geometry.rotations import matrix_to_quat, quat_angle
 from xreset.geometry.shapes import turn_of
 from xreset.physics import Backend, State
-from xreset.progress import Progress, unseen
+from xreset.progress import unseen
 from xreset.resets.bank import ResetBank, check_states
 from xreset.resets.config import TransferConfig
 from xreset.resets.probe import probe
@@ -76,7 +76,7 @@ def add_transfers(
     *,
     num_envs: PositiveInt = 64,
     device: str = "cpu",
-    progress: Progress = unseen,
+    progress: Callable[[float, int], None] = unseen,
 ) -> ResetBank:
     """Return a bank with more states: grasps of other demonstrations of the same object, at poses of each
     demonstration. The arguments determine the result.

@@ -173,6 +173,9 @@ class Archive(InFolder):
             ({"max_per_object": 1, "seed": -1}, "^seed is -1, expected a whole number from 0"),
         ):  # fmt: skip
             self.assertRaisesRegex(XResetError, message, self.demos.select, **options)
+        with self.assertRaises(TypeError) as refusal:
+            self.demos.select(per_object=1)
+        self.assertIn("subjects, max_per_object, share", "".join(refusal.exception.__notes__))
 
     def test_split_by_share_spread_and_chance(self):
         parts = []

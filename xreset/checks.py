@@ -243,8 +243,12 @@ def names_wrong_arguments(function: Callable[P, T]) -> Callable[P, T]:
         try:
             return function(*positional, **named)
         except (AttributeError, RuntimeError, TypeError, ValueError) as error:
+            known = _by_name(function, positional, named)
+            if isinstance(error, TypeError) and named and not known:
+                given = ", ".join(name for name in signature(function).parameters if name != "self")
+                error.add_note(f"Its arguments are: {given}.")
             with suppress(TypeError):  # isinstance does not take every type
-                for name, value in _by_name(function, positional, named).items():
+                for name, value in known.items():
                     if not _is_of(_hint_of(function, name), value):
                         expected = function.__annotations__[name]
                         raise XResetError(_message(function, name, value, expected)) from error

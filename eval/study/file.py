@@ -85,6 +85,7 @@ class Data(Checked):
             "--closing.",
             "--filter.",
             "--squeeze.",
+            "--transfer.",
             "--settle",
             "--backend",
             "--device",

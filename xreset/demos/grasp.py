@@ -94,19 +94,18 @@ class Solid:
         leave = []
         normal_in = []
         normal_out = []
-        directions = np.broadcast_to(direction, origins.shape)
-        for plane in self.planes:
-            slope = directions @ plane[:, :3].T
-            height = plane_heights(origins, plane)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                hit = -height / slope
-            outside = ((np.abs(slope) < 1e-12) & (height > 0)).any(axis=-1)
-            into = np.where(slope < -1e-12, hit, -np.inf)
-            out = np.where(slope > 1e-12, hit, np.inf)
+        for planes in self.planes:
+            along, against = np.array([direction, -direction]) @ planes[:, :3].T
+            entries = against > 1e-12
+            exits = along > 1e-12
+            height = plane_heights(origins, planes)
+            outside = (height[..., ~entries & ~exits] > 0).any(axis=-1)
+            into = height[..., entries] / against[entries]
+            out = -height[..., exits] / along[exits]
             enter.append(np.where(outside, np.inf, into.max(axis=-1)))
             leave.append(np.where(outside, -np.inf, out.min(axis=-1)))
-            normal_in.append(plane[into.argmax(axis=-1), :3])
-            normal_out.append(plane[out.argmin(axis=-1), :3])
+            normal_in.append(planes[entries, :3][into.argmax(axis=-1)])
+            normal_out.append(planes[exits, :3][out.argmin(axis=-1)])
         return np.array(enter), np.array(leave), np.array(normal_in), np.array(normal_out)
 
 
@@ -203,13 +202,14 @@ def _part_around(solid: Solid, origins: np.ndarray, direction: np.ndarray) -> np
         room before the start and after the end [m]; the cosines of the angles between line and surface normal there.
     """
     enter, leave, normal_in, normal_out = solid.crossings(origins, direction)
-    holds = (enter <= 0) & (leave >= 0)
-    start = np.where(holds, enter, np.inf).min(axis=0)
-    end = np.where(holds, leave, -np.inf).max(axis=0)
-    for _ in range(len(solid.planes)):
-        touches = (enter <= end + _TOUCH) & (leave >= start - _TOUCH) & (enter <= leave)
-        start = np.minimum(start, np.where(touches, enter, np.inf).min(axis=0))
-        end = np.maximum(end, np.where(touches, leave, -np.inf).max(axis=0))
+    touches = (enter <= 0) & (leave >= 0)
+    while True:
+        start = np.where(touches, enter, np.inf).min(axis=0)
+        end = np.where(touches, leave, -np.inf).max(axis=0)
+        grown = (enter <= end + _TOUCH) & (leave >= start - _TOUCH) & (enter <= leave)
+        if (grown == touches).all():
+            break
+        touches = grown
     other = (enter <= leave) & ((leave < start - _TOUCH) | (enter > end + _TOUCH))
     room_before = start - np.where(other & (leave < start), leave, -np.inf).max(axis=0)
     room_after = np.where(other & (enter > end), enter, np.inf).min(axis=0) - end
@@ -258,25 +258,32 @@ def _contacts_at(
     good = thumb[:, 0] & finger[:, 1:3].all(axis=1)
     good &= (width > MIN_WIDTH) & (width < MAX_OPENING) & (depth > _DEPTH[0]) & (depth < _DEPTH[1])
 
+    rows = np.flatnonzero(good)
+    touching = finger[rows]
+    place = np.where(touching, start[rows] - SKIN, np.nan)
+    place[:, 0] = end[rows, 0] + SKIN
+    points = origins[rows] + place[..., None] * closing
+    fingers = touching[:, 1:].sum(axis=1)
+    middle = (points[:, 0] + np.nansum(points[:, 1:], axis=1) / fingers[:, None]) / 2
+    from_com = middle - solid.com
+    # of the object's weight about the grasp
+    lever = np.cross(from_com, approach)
+    facing = facing_fingers[rows, 1:3].mean(axis=1)
     found = []
-    for i in np.flatnonzero(good):
-        fingers = np.flatnonzero(finger[i, 1:]) + 1
-        points = np.full((5, 3), np.nan)
-        points[0] = origins[i, 0] + (end[i, 0] + SKIN) * closing
-        points[fingers] = origins[i, fingers] + (start[i, fingers] - SKIN)[:, None] * closing
-        middle = (points[0] + points[fingers].mean(axis=0)) / 2
-        # lever of the object's weight about the grasp; each term is divided by what makes a plan worse by 1
-        lever = np.linalg.norm(np.cross(middle - solid.com, approach))
+    for i, row in enumerate(rows):
+        # each term is divided by what makes a plan worse by 1
         cost = (
             effort
-            + lever / 0.03
-            + np.linalg.norm(middle - solid.com) / 0.06
-            + 0.5 * (4 - len(fingers))
-            + 3.0 * (2 - facing_thumb[i, 0] - facing_fingers[i, 1:3].mean())
-            + abs(min(depth[i], 0.03) - 0.03) / 0.02
-            + max(0.0, width[i] - 0.07) / 0.01
+            + np.linalg.norm(lever[i]) / 0.03
+            + np.linalg.norm(from_com[i]) / 0.06
+            + 0.5 * (4 - fingers[i])
+            + 3.0 * (2 - facing_thumb[row, 0] - facing[i])
+            + abs(min(depth[row], 0.03) - 0.03) / 0.02
+            + max(0.0, width[row] - 0.07) / 0.01
         )
-        found.append(Contacts(points=points, approach=approach, closing=closing, cost=float(cost)))
+        found.append(
+            Contacts(points=points[i], approach=approach, closing=closing, cost=float(cost))
+        )
     return found
 
 

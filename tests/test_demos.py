@@ -30,6 +30,7 @@ from xreset.demos.keypoints import ORDERS
 from xreset.demos.plausible import doubts
 from xreset.errors import DemoError, FileFormatError, XResetError
 from xreset.geometry.shapes import turn_of
+from xreset.objects.catalogue import load_object
 from xreset.objects.rest import rest_height
 
 ARCHIVES = (("dexycb_right_9x20.npz", "right"), ("dexycb_left_9x10.npz", "left"))
@@ -459,6 +460,21 @@ class Synthetic(InFolder):
         inside = radius < 0.0365
         self.assertTrue(((radius < 0.040) == inside).all(), radius)  # none is in the wall
         self.assertEqual([inside[0] != inside[1], inside[1] == inside[2]], [True, True])
+
+    def test_a_line_enters_and_leaves_a_box_or_misses_it(self):
+        box = load_object("003_cracker_box")
+        low = box.vertices.min(axis=0)
+        high = box.vertices.max(axis=0)
+        solid = Solid.of(box, np.zeros(3), Rotation.identity())
+        middle = (low + high) / 2
+        beside = high + np.array([0.01, 0.0, 0.0])
+        up = np.array([0.0, 0.0, 1.0])
+        enter, leave, normal_in, normal_out = solid.crossings(np.stack((middle, beside)), up)
+        half = (high - low)[2] / 2
+        assert_allclose(enter, [[-half, np.inf]], atol=1e-8)
+        assert_allclose(leave, [[half, -np.inf]], atol=1e-8)
+        assert_allclose(normal_in[0, 0], -up, atol=1e-8)
+        assert_allclose(normal_out[0, 0], up, atol=1e-8)
 
     def test_the_object_is_lifted_and_the_hand_reaches_opposes_and_holds(self):
         for index, name in enumerate(self.demos.sequence_name.tolist()):

@@ -33,8 +33,8 @@ _PER_VERTEX_BYTE = 8
 _GLTF_NUMBERS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 CYLINDER_SECTIONS = 48
 """Sides of the prism that stands for a cylinder in a surface mesh."""
-_PAIRS = 2_000_000
-"""Pairs of a point and a triangle that are handled at once: bounds memory."""
+_PAIRS = 16_000
+"""Pairs of a point and a triangle that are handled at once: as many as fit a processor's cache."""
 
 
 def transform(R: ArrayLike, position: ArrayLike) -> np.ndarray:
@@ -346,14 +346,13 @@ def winding_number(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) 
     The sum of the triangles' solid angles over 4 pi (Jacobson et al. 2013), each by the formula of Van Oosterom and
     Strackee (1983). Holes in the mesh change it smoothly, so 0.5 still separates in from out.
     """
-    corners = vertices[faces]
+    corners = np.moveaxis(vertices[faces], 0, 2)[:, :, None]  # [3, 3, 1, F]
     block = max(1, _PAIRS // len(faces))
     numbers = [np.empty(0)]
     for begin in range(0, len(points), block):
-        away = corners[None] - points[begin : begin + block, None, None]
-        a, b, c = np.moveaxis(away, 2, 0)
+        a, b, c = corners - points[begin : begin + block].T[..., None]  # [3, n, F] each
         la, lb, lc = (np.sqrt(_dot(v, v)) for v in (a, b, c))
-        volume = _dot(a, np.cross(b, c))
+        volume = _dot(a, np.cross(b, c, axis=0))
         angle = np.arctan2(
             volume, la * lb * lc + _dot(a, b) * lc + _dot(b, c) * la + _dot(c, a) * lb
         )
@@ -362,4 +361,5 @@ def winding_number(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) 
 
 
 def _dot(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    return np.einsum("ijk,ijk->ij", u, v)
+    """[...] scalar products of vectors [3, ...]."""
+    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]

@@ -33,7 +33,13 @@ from xreset.objects.catalogue import (
     mesh_files,
     object_names,
 )
-from xreset.objects.decompose import Settings, as_solid, decompose, limited_hull
+from xreset.objects.decompose import (
+    Settings,
+    as_solid,
+    convex_hulls,
+    decompose,
+    limited_hull,
+)
 from xreset.objects.meshes import (
     DEFAULT_DENSITY,
     add_mesh,
@@ -377,8 +383,8 @@ class MeshImport(InFolder):
             (obj.replace("v ", "v nan ", 1), "finite|cannot be read"),
             (square, "flat"),
             (CUBE.copy().apply_scale(1000).export(file_type="obj"), "millimetres"),
-            (_specks(1e-4), "smaller than a cube of 0.2 mm"),
-            (_specks(1.9e-4), "smaller than a cube of 0.2 mm"),
+            (_specks(1e-4), "bad.obj: .*smaller than a cube of 0.2 mm"),
+            (_specks(1.9e-4), "bad.obj: .*smaller than a cube of 0.2 mm"),
         ):
             path = self.folder / "bad.obj"
             path.write_text(text)
@@ -444,6 +450,16 @@ class ThinWalls(TestCase):
         # a finger of 16 mm through the handle
         self.assertGreater(distance_to_pieces([0.051, 0, 0.045], pieces.shapes), 0.008)
         self.assertAlmostEqual(pieces.volume, mug.volume, delta=1e-9)
+
+    def test_slivers_whose_hull_is_flat_are_left_out(self):
+        from manifold3d import Manifold
+
+        cube = Manifold.cube((0.1, 0.1, 0.1))
+        sliver = Manifold.cube((0.138, 6e-9, 0.047))
+        self.assertGreater(sliver.volume(), 3e-11)
+        hulls = convex_hulls([sliver, cube])
+        self.assertEqual([one.num_tri() for one in hulls], [12])
+        self.assertAlmostEqual(hulls[0].volume(), 1e-3)
 
     def test_a_small_bridge_on_a_large_piece_is_seen(self):
         """The middle of what covers a hollow is 4 mm from its walls; a few hundred points of the plate miss it."""

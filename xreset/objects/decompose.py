@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import heapq
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -347,7 +347,7 @@ class _Cutter:
         cut = self._cut_worst(
             self._parts, self._quick_excess, self._best_cut, tolerance, int(2 * _FEW * most)
         )
-        pieces = [part.hull() for *_, part in cut]
+        pieces = convex_hulls(part for *_, part in cut)
         tolerance = max(tolerance, *(-excess for excess, *_ in cut))
         pieces = self._joined(pieces, tolerance)
         while len(pieces) > _FEW * most and self.effort > 0:
@@ -406,7 +406,7 @@ class _Cutter:
         return self.surface.excess(limited, quick=False)
 
     def _cut_piece(self, piece: Manifold) -> list[Manifold]:
-        return [part.hull() for part in self._best_cut(piece ^ self._solid.solid)]
+        return convex_hulls(self._best_cut(piece ^ self._solid.solid))
 
     def _best_cut(self, part: Manifold) -> list[Manifold]:
         """Cut a part by the planes that remove most of the hulls' volume for each further part.
@@ -495,6 +495,12 @@ def _planes(vertices: np.ndarray, faces: np.ndarray) -> list[list[tuple[np.ndarr
     for pair in _CROSSES:
         sets.append([(directions[i], offsets[_CUTS // 2, i]) for i in pair])
     return sets
+
+
+def convex_hulls(parts: Iterable[Manifold]) -> list[Manifold]:
+    """Return the convex hulls of parts. The hull of a sliver can be flat; such hulls are left out."""
+    hulls = [part.hull() for part in parts]
+    return [one for one in hulls if one.volume() > _SPECK]
 
 
 def _arrays(solid: Manifold) -> tuple[np.ndarray, np.ndarray]:

@@ -106,6 +106,8 @@ def import_with_notes(path: str | Path, name: str) -> Import:
         if own.tolerance is not None:
             settings = Settings(hull_depth=0.0, tolerance=own.tolerance)
         pieces = cached_pieces(mesh, source, settings)
+    except ObjectError as error:
+        raise ObjectError(f"{path}: {error}") from error
     except QhullError as error:
         raise ObjectError(
             f"{path} spans no volume: it is flat, or damaged. A solid object is needed."

@@ -451,6 +451,30 @@ class ThinWalls(TestCase):
         self.assertGreater(distance_to_pieces([0.051, 0, 0.045], pieces.shapes), 0.008)
         self.assertAlmostEqual(pieces.volume, mug.volume, delta=1e-9)
 
+    def test_overlapping_parts_count_once(self):
+        box = trimesh.creation.box
+        bar = box((0.1, 0.04, 0.04))
+        cross = box((0.04, 0.1, 0.04)).apply_translation((0.0501, 0.0101, 0.0001))
+        longer = box((0.06, 0.04, 0.04)).apply_translation((0.02, 0.0, 0.0001))
+        space = box((0.08, 0.03, 0.03))
+        cavity = space.copy()
+        cavity.invert()
+        hollow = trimesh.boolean.difference([bar, space])
+        for name, parts, solids in (
+            ("two bars", [bar, cross], [bar, cross]),
+            ("one piece", [bar, longer], [bar, longer]),
+            ("a hollow bar", [bar, cavity, cross], [hollow, cross]),
+            ("a part inside", [bar, space], [bar]),
+            ("apart", [bar, box((0.02, 0.02, 0.02)).apply_translation((0.3, 0.0, 0.0))], None),
+        ):
+            expected = trimesh.boolean.union(solids or parts)
+            found = decompose(trimesh.util.concatenate(parts))
+            with self.subTest(name):
+                self.assertAlmostEqual(found.volume, expected.volume, delta=1e-10)
+                assert_allclose(found.com, expected.center_mass, atol=1e-6)
+                inertia = expected.moment_inertia / expected.volume
+                assert_allclose(found.inertia, inertia, atol=1e-8)
+
     def test_slivers_whose_hull_is_flat_are_left_out(self):
         from manifold3d import Manifold
 

@@ -34,8 +34,8 @@ SCHEMA = {
     **_NUMBERS,
     "finished": Field((), "b", required=False),
 }
-_ALGORITHM = 2
-"""Raise it when :mod:`xreset.objects.decompose` gives other pieces than before."""
+_ALGORITHM = 3
+"""Raise it when :mod:`xreset.objects.decompose` gives other pieces or mass properties than before."""
 
 
 def cached_pieces(mesh: trimesh.Trimesh, source: str, settings: Settings) -> Pieces:

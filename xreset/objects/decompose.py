@@ -46,6 +46,8 @@ _MAX_VERTICES = 64
 """Most vertices of a piece."""
 _SPECK = 1e-11
 """Smaller parts are dropped: a cube of 0.2 mm [m^3]."""
+_OVERLAP = 1e-6
+"""Share of the volume up to which parts of a solid do not overlap."""
 _SMALL_HOLE = 0.03
 """Largest share of the mesh's area that a hole may have to be closed; larger ones are openings."""
 _FACES = 3000
@@ -124,14 +126,21 @@ def decompose(mesh: trimesh.Trimesh, settings: Settings = Settings()) -> Pieces:
         deviation = surface.deviation(piece.vertices, piece.faces)
         solid = mesh if mesh.is_volume else around
         volume = solid.volume
-        com, inertia = mass_properties(*mesh_arrays(solid), 1.0)
+        filled = mesh_arrays(solid)
+        if mesh.is_volume and mesh.body_count > 1:
+            merged = _merged(as_solid(mesh))
+            volume = merged.volume()
+            filled = _arrays(merged)
     else:
-        cutter = _Cutter(as_solid(mesh), settings)
+        whole = as_solid(mesh)
+        cutter = _Cutter(whole, settings)
         shapes, deviation = cutter.shapes()
         finished = cutter.effort > 0
         surface = cutter.surface
-        volume = surface.solid.volume()
-        com, inertia = mass_properties(surface.vertices, surface.faces, 1.0)
+        merged = _merged(whole)
+        volume = merged.volume()
+        filled = _arrays(merged)
+    com, inertia = mass_properties(*filled, 1.0)
     return Pieces(
         shapes=tuple(shapes),
         deviation=max(deviation, surface.uncovered(shapes)),
@@ -199,6 +208,26 @@ def as_solid(mesh: trimesh.Trimesh) -> Manifold:
             "The mesh encloses no solid, even with its holes closed. Repair it, for example in MeshLab."
         )
     return m3.Manifold.batch_boolean(outer, m3.OpType.Add)
+
+
+def _merged(solid: Manifold) -> Manifold:
+    """Make overlapping parts of a solid one: where two overlap, the volume would count twice. A solid without such
+    parts is returned as it is."""
+    m3 = _manifold3d()
+    parts = solid.decompose()
+    bodies = [part for part in parts if part.volume() > 0]
+    cavities = [part for part in parts if part.volume() <= 0]  # their surfaces face inwards
+    volume = sum(body.volume() for body in bodies)
+    if m3.Manifold.batch_boolean(bodies, m3.OpType.Add).volume() > (1 - _OVERLAP) * volume:
+        return solid
+    for cavity in cavities:
+        vertices, faces = _arrays(cavity)
+        turned = np.array(faces[:, ::-1], dtype=np.uint64, order="C")
+        inner = m3.Manifold(m3.Mesh64(np.array(vertices, order="C"), turned))
+        hosts = [i for i, body in enumerate(bodies) if (inner - body).volume() < _SPECK]
+        if hosts:
+            bodies[min(hosts, key=lambda i: bodies[i].volume())] -= inner
+    return m3.Manifold.batch_boolean(bodies, m3.OpType.Add)
 
 
 def _thinned(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

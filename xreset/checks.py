@@ -75,6 +75,7 @@ def _classes_of(module: str) -> dict[str, ast.ClassDef]:
 
 @cache
 def _with_fields(summary: str, cls: type) -> str:
+    """Return a class's docstring, and after it each field with the string that stands below it in the source."""
     known = _classes_of(cls.__module__).get(cls.__name__)
     texts = []
     for field, below in pairwise(known.body if known else ()):

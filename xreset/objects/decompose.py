@@ -124,23 +124,19 @@ def decompose(mesh: trimesh.Trimesh, settings: Settings = Settings()) -> Pieces:
         shapes = [limited_hull(mesh.vertices)]
         piece = shape_mesh(shapes[0])
         deviation = surface.deviation(piece.vertices, piece.faces)
-        solid = mesh if mesh.is_volume else around
-        volume = solid.volume
-        filled = mesh_arrays(solid)
         if mesh.is_volume and mesh.body_count > 1:
-            merged = _merged(as_solid(mesh))
-            volume = merged.volume()
-            filled = _arrays(merged)
+            volume, com, inertia = _mass_of(as_solid(mesh))
+        else:
+            solid = mesh if mesh.is_volume else around
+            volume = solid.volume
+            com, inertia = mass_properties(*mesh_arrays(solid), 1.0)
     else:
         whole = as_solid(mesh)
         cutter = _Cutter(whole, settings)
         shapes, deviation = cutter.shapes()
         finished = cutter.effort > 0
         surface = cutter.surface
-        merged = _merged(whole)
-        volume = merged.volume()
-        filled = _arrays(merged)
-    com, inertia = mass_properties(*filled, 1.0)
+        volume, com, inertia = _mass_of(whole)
     return Pieces(
         shapes=tuple(shapes),
         deviation=max(deviation, surface.uncovered(shapes)),
@@ -210,6 +206,13 @@ def as_solid(mesh: trimesh.Trimesh) -> Manifold:
     return m3.Manifold.batch_boolean(outer, m3.OpType.Add)
 
 
+def _mass_of(solid: Manifold) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return volume [m^3], center of mass [3] and the inertia [3, 3] of 1 kg about it. Where parts overlap, the volume
+    counts once."""
+    merged = _merged(solid)
+    return merged.volume(), *mass_properties(*_arrays(merged), 1.0)
+
+
 def _merged(solid: Manifold) -> Manifold:
     """Make overlapping parts of a solid one: where two overlap, the volume would count twice. A solid without such
     parts is returned as it is."""
@@ -217,9 +220,11 @@ def _merged(solid: Manifold) -> Manifold:
     parts = solid.decompose()
     bodies = [part for part in parts if part.volume() > 0]
     cavities = [part for part in parts if part.volume() <= 0]  # their surfaces face inwards
-    volume = sum(body.volume() for body in bodies)
-    if m3.Manifold.batch_boolean(bodies, m3.OpType.Add).volume() > (1 - _OVERLAP) * volume:
+    merged = m3.Manifold.batch_boolean(bodies, m3.OpType.Add)
+    if merged.volume() > (1 - _OVERLAP) * sum(body.volume() for body in bodies):
         return solid
+    if not cavities:
+        return merged
     for cavity in cavities:
         vertices, faces = _arrays(cavity)
         turned = np.array(faces[:, ::-1], dtype=np.uint64, order="C")

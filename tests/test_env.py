@@ -215,6 +215,7 @@ class RefusalTest(WithEnv):
             (lambda: env.step(still, torch.tensor([0])), r"^begin has the shape \(1,\), expected \(3,\)"),
             (lambda: env.advance(still, torch.zeros(7)), r"^push has the shape \(7,\), expected \(3, 7\)"),
             (lambda: env.reset(torch.tensor([N])), "^worlds is .*, expected indices from 0 to 2"),
+            (lambda: env.reset([0, -1]), r"^worlds is \[0, -1\], expected indices from 0 to 2"),
             (lambda: env.reset(start=env.backend.state()), "^start is State.*, expected Reset"),
             (lambda: env.restore({}), "^The snapshot has no 'goal_pos'"),
             (lambda: env.restore({name: value[:2] for name, value in before.items()}),

@@ -362,6 +362,8 @@ class ManipulationEnv:
             worlds = torch.arange(self.num_envs, device=self.device)
         self._reset_mask.zero_()
         try:
+            if (torch.as_tensor(worlds) < 0).any():
+                raise IndexError("torch counts negative indices from the end")
             self._reset_mask[worlds] = True
         except IndexError as error:
             raise XResetError(

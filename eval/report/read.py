@@ -12,7 +12,7 @@ import pandas as pd
 from xreset.cameras.config import VisionConfig
 from xreset.checks import frozen, names_wrong_arguments
 from xreset.description import load_robot
-from xreset.errors import FileFormatError, RunError, needs
+from xreset.errors import FileFormatError, RunError, WrongValueError, needs
 from xreset.eval.results import EvalResult, Table, read_evaluation, read_traces, recorded
 from xreset.eval.stress import Stress
 from xreset.files import read_json
@@ -21,7 +21,7 @@ from xreset.learning.run import SCHEMA as RUN_SCHEMA
 from xreset.learning.run import Choice, RunInfo
 from xreset.policies import run_folder
 from xreset.spec import RobotSpec
-from xreset.text import Brief, short_name
+from xreset.text import Brief, short_name, shown
 
 
 @frozen
@@ -237,9 +237,12 @@ def read_training(
         results: folder of its evaluations; default: as ``xreset eval`` chooses it.
 
     Raises:
+        WrongValueError: the label is not a text.
         RunError: the folder does not exist, or holds neither learning curves nor results.
         FileFormatError: a file is damaged or of another version.
     """
+    if not isinstance(label, str | None):
+        raise WrongValueError(f"label is {shown(label)}, expected a text.")
     folder = run_folder(folder)
     label = label or name_of(folder)
     results = Path(results) if results else results_in(folder)

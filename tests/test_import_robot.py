@@ -463,6 +463,17 @@ class Toy(Robots):
         self.assertRegex(notes, words)  # its box of water
         self.assertLess(np.linalg.eigvalsh(tree.link("f1_a").inertia).max(), 1e-4)
 
+    def test_where_shapes_of_a_link_without_mass_overlap_the_volume_counts_once(self):
+        first = '<collision><geometry><box size="0.1 0.04 0.04"/></geometry></collision>'
+        second = first.replace("<geometry>", '<origin xyz="0.05 0 0"/><geometry>')
+        text = f'<robot name="bar"><link name="bar">{first}{second}</link></robot>'
+        link = self.read("bar.urdf", text)[0].link("bar")
+        self.assertAlmostEqual(link.mass, 1000 * 0.15 * 0.04 * 0.04)
+        assert_allclose(link.com, (0.025, 0, 0), atol=1e-9)
+        across = link.mass * (0.15**2 + 0.04**2) / 12
+        along = link.mass * (0.04**2 + 0.04**2) / 12
+        assert_allclose(link.inertia, np.diag((along, across, across)), atol=1e-12)
+
     def test_errors_leave_nothing(self):
         entities = f'<!ENTITY e0 "{80 * "a"}">'
         for number in range(1, 8):

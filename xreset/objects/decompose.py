@@ -206,6 +206,17 @@ def as_solid(mesh: trimesh.Trimesh) -> Manifold:
     return m3.Manifold.batch_boolean(outer, m3.OpType.Add)
 
 
+def mass_of_shapes(shapes: Sequence[Shape]) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return volume, center of mass and inertia of convex shapes of one body; see :func:`_mass_of`. Only several shapes
+    need manifold3d."""
+    if len(shapes) == 1:
+        mesh = shape_mesh(shapes[0])
+        return float(mesh.volume), *mass_properties(*mesh_arrays(mesh), 1.0)
+    solid = _manifold3d().Manifold
+    hulls = [solid.hull_points(shape_mesh(shape).vertices) for shape in shapes]
+    return _mass_of(solid.compose(hulls))
+
+
 def _mass_of(solid: Manifold) -> tuple[float, np.ndarray, np.ndarray]:
     """Return volume [m^3], center of mass [3] and the inertia [3, 3] of 1 kg about it. Where parts overlap, the volume
     counts once."""
@@ -544,7 +555,7 @@ def _arrays(solid: Manifold) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _manifold3d() -> Any:
-    with needs("manifold3d, which cuts concave meshes,", "objects", ObjectError):
+    with needs("manifold3d, which cuts and joins meshes,", "objects", ObjectError):
         import manifold3d
     return manifold3d
 

@@ -8,12 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
 from xreset.errors import RobotError, needs
-from xreset.geometry.shapes import mass_properties, surface_of
+from xreset.geometry.shapes import surface_of
 from xreset.geometry.urdf import Link, RobotTree, load_urdf, parse_xml
 from xreset.geometry.urdf_writer import FRAME_INERTIA, FRAME_MASS, fixed
+from xreset.objects.decompose import mass_of_shapes
 
 _DENSITY = 1000.0
 """[kg/m^3] Density of links whose mass is not stated."""
@@ -220,11 +220,9 @@ def _with_masses(tree: RobotTree, notes: list[str]) -> RobotTree:
 
 
 def _with_mass_of_shapes(link: Link) -> Link:
-    vertices, faces = surface_of(link.collisions)
-    mass = link.mass
-    if mass <= 0:
-        mass = _DENSITY * float(trimesh.Trimesh(vertices, faces, process=False).volume)
-    com, inertia = mass_properties(vertices, faces, mass)
+    volume, com, inertia = mass_of_shapes(link.collisions)
+    mass = link.mass if link.mass > 0 else _DENSITY * volume
+    inertia = inertia * mass
     if not (np.isfinite(com).all() and np.isfinite(inertia).all()):
         raise RobotError(
             f"the shapes of link {link.name!r} have no volume. State the mass and inertia of the link."

@@ -420,7 +420,7 @@ class MeshImport(InFolder):
 
 
 @CUTS
-class ThinWalls(TestCase):
+class ThinWalls(InFolder):
     """Pieces keep to the surface."""
 
     def test_a_finger_fits_into_a_mug_and_its_handle(self):
@@ -474,6 +474,19 @@ class ThinWalls(TestCase):
                 assert_allclose(found.com, expected.center_mass, atol=1e-6)
                 inertia = expected.moment_inertia / expected.volume
                 assert_allclose(found.inertia, inertia, atol=1e-8)
+
+    def test_parts_that_touch_are_closed(self):
+        for shift in ((0.1, 0.1, 0.0), (0.1, 0.1, 0.1)):
+            touching = trimesh.util.concatenate([CUBE, CUBE.copy().apply_translation(shift)])
+            path = self.folder / "touching.obj"
+            touching.export(path)
+            mesh = read_mesh(path)
+            with self.subTest(shift):
+                self.assertTrue(mesh.is_volume)
+                pieces = decompose(mesh)
+                self.assertEqual(len(pieces.shapes), 2)
+                self.assertAlmostEqual(pieces.volume, 2e-3, delta=1e-12)
+                assert_allclose(pieces.com, np.array(shift) / 2, atol=1e-12)
 
     def test_slivers_whose_hull_is_flat_are_left_out(self):
         from manifold3d import Manifold

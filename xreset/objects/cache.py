@@ -34,7 +34,7 @@ SCHEMA = {
     **_NUMBERS,
     "finished": Field((), "b", required=False),
 }
-_ALGORITHM = 3
+_ALGORITHM = 4
 """Raise it when :mod:`xreset.objects.decompose` gives other pieces or mass properties than before."""
 
 

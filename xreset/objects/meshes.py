@@ -252,7 +252,7 @@ def read_mesh(path: Path, *, scale: float = 1.0) -> trimesh.Trimesh:
 
 
 def _checked(mesh: trimesh.Trimesh, path: Path) -> trimesh.Trimesh:
-    """Return the mesh, joined where triangles touch; see :func:`read_mesh` for errors."""
+    """Return the mesh, joined where triangles of a part touch; see :func:`read_mesh` for errors."""
     if not np.isfinite(mesh.vertices).all():
         raise ObjectError(f"{path} has a vertex that is not finite; it is damaged.")
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
@@ -270,7 +270,22 @@ def _checked(mesh: trimesh.Trimesh, path: Path) -> trimesh.Trimesh:
         mesh.invert()  # inside out
     if not len(mesh.faces) or mesh.extents.min() < _FLAT:
         raise ObjectError(f"{path} is flat: {_size(mesh)}; a solid object is needed.")
-    return mesh
+    return _parted(mesh)
+
+
+def _parted(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return a mesh whose solid parts share no vertices, if that closes it: an edge in which two parts touch has four
+    triangles, and would count as open."""
+    import trimesh
+
+    if mesh.is_watertight:
+        return mesh
+    part = trimesh.graph.connected_component_labels(mesh.face_adjacency, len(mesh.faces))
+    corners = np.column_stack((part.repeat(3), mesh.faces.ravel()))
+    own, faces = np.unique(corners, axis=0, return_inverse=True)
+    parted = trimesh.Trimesh(mesh.vertices[own[:, 1]], faces.reshape(-1, 3), process=False)
+    volumes = np.bincount(part, np.linalg.det(parted.triangles))
+    return parted if volumes.min() > 0 and parted.is_volume else mesh
 
 
 def _size(mesh: trimesh.Trimesh) -> str:

@@ -18,6 +18,7 @@ from xreset.geometry.urdf import RobotTree
 from xreset.geometry.urdf_writer import axes, fixed, frame
 from xreset.robot_tools.draft import draft_spec, link_places
 from xreset.robot_tools.opposition import closing_range, opposition
+from xreset.robot_tools.sources import with_fixed
 from xreset.spec import FingertipSpec, KeypointSpec
 
 _FINGERS = ("index", "middle", "ring", "little")
@@ -86,6 +87,23 @@ class Hand:
         self._spec = draft_spec(tree, self.root, folder)
         self._at = link_places(self._spec, {})
         """Link -> pose [4, 4] in the frame of the hand's root, with straight fingers."""
+        still = self._joints_of_other_parts()
+        if still:
+            notes.append(f"joints that move no finger are fixed at 0: {', '.join(still)}")
+            tree = with_fixed(tree, still)
+            self.tree = tree
+            self.root = self._palm_link()
+            self._spec = draft_spec(tree, self.root, folder)
+            self._at = link_places(self._spec, {})
+        wrist = [
+            joint.name for link, joint in tree.moved_by.items() if self.root in tree.below(link)
+        ]
+        if wrist:
+            notes.append(
+                f"{', '.join(wrist)} move the whole hand: they are the last joints of the arm, and the hand begins "
+                f"with {self.root!r}. In the hand's file, make a joint fixed to keep it still, or if it moves no "
+                "finger but another part, such as a camera"
+            )
         fingers = self._find_fingers(thumb)
         self.bent: dict[str, float] = {}
         """Joint -> angle by which it is bent at home [rad]."""
@@ -107,7 +125,6 @@ class Hand:
         has shapes, or more than one child."""
         tree = self.tree
         link = tree.root
-        wrist = []
         while True:
             moving = [
                 joint
@@ -116,20 +133,55 @@ class Hand:
             ]
             if len(moving) != 1:
                 break
-            wrist.append(moving[0].name)
             link = moving[0].child
-        if wrist:
-            self._notes.append(
-                f"{', '.join(wrist)} move the whole hand: they are the last joints of the arm, and the hand begins "
-                f"with {link!r}. In the hand's file, make a joint fixed to keep it still, or if it moves no finger "
-                "but another part, such as a camera"
-            )
         while not tree.link(link).collisions:
             children = [joint.child for joint in tree.joints if joint.parent == link]
             if len(children) != 1:
                 break
             link = children[0]
         return link
+
+    def _joints_of_other_parts(self) -> list[str]:
+        """Return the joints that move no finger, such as that of a camera on the arm.
+
+        The hand is below one child of the root if only there chains can meet one another. A chain elsewhere is none of
+        its fingers, unless its names state one, or it has a drive of the hand.
+        """
+        chains = self._chains()
+        hands = []
+        for joint in self.tree.joints:
+            if joint.parent == self.root:
+                inside = self.tree.below(joint.child)
+                own = [chain for chain in chains if chain.links[-1] in inside]
+                if len(own) > 1 and self._can_meet(own):
+                    hands.append(own)
+        if len(hands) != 1:
+            return []
+        drives = set.union(*map(self._drives_of, hands[0]))
+        still = []
+        for chain in chains:
+            if chain in hands[0]:
+                continue
+            if chain.name or drives & self._drives_of(chain):
+                return []
+            still += [joint for joint in chain.joints if joint not in still]
+        return still
+
+    def _can_meet(self, chains: list[Finger]) -> bool:
+        """Return whether the tips of any two chains can meet when the joints after which they part move."""
+        chains = [replace(chain, points=self._points(chain)) for chain in chains]
+        shared = [self.root]
+        for link in chains[0].links:
+            if all(link in chain.links for chain in chains):
+                shared.append(link)
+        return bool(self._meetings(chains, shared[-1]).any())
+
+    def _meetings(self, chains: list[Finger], root: str) -> np.ndarray:
+        """Return how much the tips of chains oppose each other, see :func:`opposition`; only joints below the root
+        move."""
+        ends = [chain.links[-1] for chain in chains]
+        tips = np.array([self._in_link(chain.links[-1], chain.points[-1]) for chain in chains])
+        return opposition(replace(self._spec, hand_root=root), ends, tips)
 
     def _find_fingers(self, thumb: str | None) -> list[Finger]:
         """Return the hand's fingers, thumb first, then from the thumb's side on."""
@@ -184,9 +236,7 @@ class Hand:
                 )
         if len(marked) == 1:
             return marked[0]
-        ends = [chain.links[-1] for chain in chains]
-        tips = np.array([self._in_link(chain.links[-1], chain.points[-1]) for chain in chains])
-        scores = np.sqrt(opposition(self._spec, ends, tips)).sum(axis=1)
+        scores = np.sqrt(self._meetings(chains, self.root)).sum(axis=1)
         first = scores.argmax()
         if scores[first] == 0 and len(chains) > 2:
             raise RobotError(
@@ -363,7 +413,8 @@ class Hand:
         cloud = self._surface((last, *finger.fixed_links))
         if not len(cloud):
             raise RobotError(
-                f"the last link of a finger, {last!r}, has no collision shape, so it can touch nothing."
+                f"the last link of a finger, {last!r}, has no collision shape, so it can touch nothing. If it is no "
+                f"finger, make {finger.joints[-1]!r} fixed."
             )
         middle = bounding_ball(cloud)[0]
         away = middle - self._on_axis(last, cloud)

@@ -4,6 +4,7 @@ together."""
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -90,21 +91,28 @@ def bare(arm: RobotTree, flange: str, notes: list[str]) -> RobotTree:
         notes.append(
             f"left out, because it hangs on the flange where the hand goes: {', '.join(sorted(removed))}"
         )
-    joints = []
     stiff = []
-    for joint in arm.joints:
-        if joint.child in removed:
-            continue
-        if joint.type != "fixed" and flange not in arm.below(joint.child):
+    for link, joint in arm.moved_by.items():
+        if link not in removed and flange not in arm.below(link):
             stiff.append(joint.name)
-            joint = replace(joint, type="fixed", mimic=None)
-        joints.append(joint)
     if stiff:
         notes.append(
             f"joints of the arm that do not move the hand are fixed at 0: {', '.join(stiff)}"
         )
+    arm = with_fixed(arm, stiff)
+    joints = tuple(joint for joint in arm.joints if joint.child not in removed)
     links = tuple(link for link in arm.links if link.name not in removed)
-    return replace(arm, links=links, joints=tuple(joints))
+    return replace(arm, links=links, joints=joints)
+
+
+def with_fixed(tree: RobotTree, names: Sequence[str]) -> RobotTree:
+    """Return a tree in which some joints are fixed at 0."""
+    joints = []
+    for joint in tree.joints:
+        if joint.name in names:
+            joint = replace(joint, type="fixed", mimic=None)
+        joints.append(joint)
+    return replace(tree, joints=tuple(joints))
 
 
 def renamed(hand: RobotTree, arm: RobotTree) -> RobotTree:

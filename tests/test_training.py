@@ -16,7 +16,9 @@ from unittest import SkipTest
 from unittest.mock import Mock, patch
 
 import numpy as np
+import onnx
 import torch
+from onnx import numpy_helper
 from torch.testing import assert_close
 
 from tests.toy_bank import SOUP, SPAM, toy_bank
@@ -451,6 +453,41 @@ class TrainingTest(WithBank):
         self.assertEqual(
             content.actor_state_dict[count], int(before.actor_state_dict[count]) + 8 * 4
         )
+
+    def test_the_policy_has_the_running_mean_of_the_weights(self):
+        self.assertFalse(newest(self.out).average_state_dict, "no mean was asked for")
+        config = replace(CONFIG, iterations=3, ppo=replace(CONFIG.ppo, average=0.5))
+        out = self.train("average", config=config)
+        self.resume(out, iterations=4)
+        contents = [read_checkpoint(path) for path in checkpoints(out)]
+        assert_close(contents[1].actor_state_dict, newest(self.out).actor_state_dict)
+        expected = {}
+        for t, content in enumerate(contents, start=1):
+            weight = 1 / (1 + 0.5 * (t - 1))
+            for name, value in content.actor_state_dict.items():
+                earlier = expected.get(name, value)
+                expected[name] = earlier + weight * (value - earlier)
+                if name.endswith("normalizer.count"):
+                    expected[name] = value
+            assert_close(content.average_state_dict, expected)
+        last = contents[-1].actor_state_dict
+        self.assertTrue(any(not torch.equal(last[name], expected[name]) for name in last))
+        policy = self.folder / "average.onnx"
+        export_checkpoint(latest_checkpoint(out), policy)
+        weights = [numpy_helper.to_array(each) for each in onnx.load(policy).graph.initializer]
+        bias = expected["mlp.0.bias"].numpy()
+        self.assertTrue(any(np.array_equal(each, bias) for each in weights))
+
+    def test_a_run_without_a_mean_can_go_on_with_one(self):
+        out = self.train("later")
+        config = replace(CONFIG, iterations=3, ppo=replace(CONFIG.ppo, average=0.5))
+        self.changed_run(out, config=asdict(config))
+        before = newest(out).actor_state_dict
+        self.resume(out)
+        after = newest(out)
+        name = "mlp.0.weight"
+        middle = (before[name] + after.actor_state_dict[name]) / 2  # 1 / (1 + 0.5 * 2)
+        assert_close(after.average_state_dict[name], middle)
 
     def test_the_policy_is_that_of_the_chosen_or_newest_checkpoint(self):
         out = self.folder / "exported"

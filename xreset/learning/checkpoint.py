@@ -51,8 +51,15 @@ class Checkpoint:
     elapsed: NonNegativeFloat
     """Time of all iterations [s]."""
     learning_rate: NonNegativeFloat
+    average_state_dict: _Networks = field(default_factory=dict)
+    """Running mean of the actor's state; empty: the training takes none (``ppo.average``)."""
     resets_state_dict: _Networks = field(default_factory=dict)
     """``success_rate`` of the reset distribution; empty: an earlier version did not write it."""
+
+    @property
+    def policy_state_dict(self) -> dict[str, Any]:
+        """State of the policy that is exported."""
+        return self.average_state_dict or self.actor_state_dict
 
 
 def write_checkpoint(path: Path, content: Checkpoint) -> None:

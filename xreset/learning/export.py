@@ -141,7 +141,7 @@ def export_checkpoint(checkpoint: str | Path, policy: str | Path) -> None:
     )
     actor = make_actor(example, len(run.contract.joint_names), run.config)
     with must_fit(checkpoint):
-        actor.load_state_dict(read_checkpoint(checkpoint).actor_state_dict)
+        actor.load_state_dict(read_checkpoint(checkpoint).policy_state_dict)
     export_onnx(actor, policy, run.contract, checkpoint=checkpoint)
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict
+from torch import Tensor
 
 from xreset.env import ManipulationEnv
 from xreset.errors import RunError
@@ -85,6 +86,9 @@ class TrainingRunner:
         self.iteration = 0
         self.env_steps = 0
         self.elapsed = 0.0
+        self._average = {}
+        if config.ppo.average > 0:
+            self._average = {name: value.clone() for name, value in self._actor_state().items()}
         self._fault_totals = deque([[0, 0]], maxlen=FAULT_WINDOW)
         self._resume_command = resume_command(folder, config.task.reward.own)
 
@@ -176,6 +180,7 @@ class TrainingRunner:
         self.iteration += 1
         self.env_steps += steps
         self.elapsed += learned - start
+        self._take_average()
         if log is None:
             return obs
         scalars = {f"loss/{name}": value for name, value in losses.items()}
@@ -190,6 +195,19 @@ class TrainingRunner:
             scalars["policy/teacher_share"] = self.alg.teacher_share
         log.write(self.iteration, self.env_steps, self.elapsed, scalars)
         return obs
+
+    def _actor_state(self) -> dict[str, Tensor]:
+        return self.alg.networks["actor"].state_dict()
+
+    def _take_average(self) -> None:
+        """Take the actor's state into its running mean, if there is one."""
+        weight = 1.0 / (1.0 + self.config.ppo.average * (self.iteration - 1))
+        now = self._actor_state()
+        for name, mean in self._average.items():
+            if mean.is_floating_point():
+                mean.lerp_(now[name], weight)
+            else:  # the normalization's count of observations
+                mean.copy_(now[name])
 
     @torch.no_grad()
     def _roll_out(self, obs: TensorDict, log: TrainingLog | None) -> TensorDict:
@@ -254,6 +272,7 @@ class TrainingRunner:
             env_steps=self.env_steps,
             elapsed=self.elapsed,
             learning_rate=self.alg.learning_rate,
+            average_state_dict=self._average,
             resets_state_dict={"success_rate": self.env.resets.success_rate},
         )
         write_checkpoint(self.folder / "checkpoints" / f"{self.iteration:06d}.pt", content)
@@ -265,6 +284,8 @@ class TrainingRunner:
             load_moments(self.alg.optimizer, content.optimizer_state_dict["state"])
             if content.resets_state_dict:
                 self.env.resets.success_rate.copy_(content.resets_state_dict["success_rate"])
+            for name, mean in self._average.items():
+                mean.copy_(content.policy_state_dict[name])
         self.alg.learning_rate = content.learning_rate
         self.iteration = content.iteration
         self.env_steps = content.env_steps

@@ -28,7 +28,7 @@ from xreset.files import claim_folder, file_hash, write_whole
 from xreset.inputs import Inputs, load_inputs
 from xreset.learning.config import TrainConfig
 from xreset.learning.distributed import Processes, leave
-from xreset.learning.export import export_onnx
+from xreset.learning.export import export_checkpoint
 from xreset.learning.recipes import (
     default_config,
     from_home,
@@ -463,8 +463,7 @@ def _train(
         runner.learn(info.config.iterations, seconds=60 * minutes)
     if processes.is_main:
         policy = out / "policy.onnx"
-        networks = runner.alg.networks
-        export_onnx(networks["actor"], policy, info.contract, checkpoint=latest_checkpoint(out))
+        export_checkpoint(latest_checkpoint(out), policy)
         print(f"policy after {runner.iteration} iterations in {policy}", flush=True)
 
 

@@ -46,7 +46,7 @@ def export_lerobot(
     folders: str | Path | Sequence[str | Path],
     out: str | Path,
     *,
-    engines: Sequence[str] = (),
+    engines: str | Sequence[str] = (),
     robot: str | Path | None = None,
     objects: str | Path | None = None,
     task: str | None = None,
@@ -60,7 +60,7 @@ def export_lerobot(
     Args:
         folders: run folders, or folders of evaluations; the first episode of each demonstration and engine is recorded.
         out: folder to write; must not exist, or be empty.
-        engines: only these engines; empty: all.
+        engines: only this engine, or these; empty: all.
         robot: name or folder of the robot; default: as the results name it.
         objects: folder of meshes; default: as the results name it.
         task: the task in words; ``{object}`` is replaced by the object's name.

@@ -64,7 +64,7 @@ def export_npz(
     folders: str | Path | Sequence[str | Path],
     out: str | Path,
     *,
-    engines: Sequence[str] = (),
+    engines: str | Sequence[str] = (),
     robot: str | Path | None = None,
     task: str | None = None,
 ) -> None:
@@ -73,7 +73,7 @@ def export_npz(
     Args:
         folders: run folders, or folders of evaluations; the first episode of each demonstration and engine is recorded.
         out: file to write.
-        engines: only these engines; empty: all.
+        engines: only this engine, or these; empty: all.
         robot: name or folder of the robot; default: as the results name it.
         task: the task in words; ``{object}`` is replaced by the object's name.
 
@@ -86,7 +86,7 @@ def export_npz(
 def read_recorded(
     folders: str | Path | Sequence[str | Path],
     *,
-    backends: Sequence[str] = (),
+    backends: str | Sequence[str] = (),
     robot: str | Path | None = None,
     objects: str | Path | None = None,
     task: str | None = None,
@@ -97,7 +97,7 @@ def read_recorded(
 
     Args:
         folders: run folders, or folders that ``xreset eval`` wrote into.
-        backends: only these engines; empty: all.
+        backends: only this engine, or these; empty: all.
         robot: name or folder of the robot; None: as the results name it.
         objects: folder of meshes; None: as the results name it.
         task: the task in words, in which ``{object}`` stands for the object's name; default: :data:`TASK`.
@@ -116,12 +116,13 @@ def read_recorded(
     intervals: dict[float, Path] = {}
     inputs: dict[str, str] = {}
     every = [folders] if isinstance(folders, str | Path) else folders
+    wanted = [backends] if isinstance(backends, str) else backends
     for folder in every:
         results = results_in(Path(folder))
         evaluation = read_evaluation(results)
         for result in evaluation:
             engine = result.backend
-            if backends and engine not in backends:
+            if wanted and engine not in wanted:
                 continue
             name = str(robot or result.robot)
             spec = robots[name] = robots.get(name) or load_robot(name)
@@ -146,7 +147,7 @@ def read_recorded(
                 episode["meshes"] = result.meshes(Path(objects) if objects else None)
                 rows.append(episode)
     if not rows:
-        of = f" of {', '.join(backends)}" if backends else ""
+        of = f" of {', '.join(wanted)}" if wanted else ""
         raise RunError(
             f"{', '.join(map(str, every))}: there are no recorded episodes{of}. Make them first: xreset eval"
         )

@@ -192,11 +192,12 @@ class PoolBackend(Backend):
             raise WrongValueError(f"workers is {workers}, expected 0 or more")
         layout = layout_of(scene, self.object_index)
         jobs = []
-        for worlds in np.array_split(np.arange(num_worlds), max(min(workers, num_worlds), 1)):
+        count = max(min(workers, num_worlds), 1)
+        for first in range(count):
+            # neighbours often hold the same object, and some objects take more time
+            worlds = range(first, num_worlds, count)
             held = tuple(self.object_index[worlds].tolist())
-            jobs.append(
-                Job(self.name, self.world_class, world_options, scene, int(worlds[0]), held)
-            )
+            jobs.append(Job(self.name, self.world_class, world_options, scene, worlds, held))
         if workers == 0:
             self._arrays = arrays_in(bytearray(layout.itemsize), layout)
             self._team: LocalWorlds | WorkerTeam = LocalWorlds(jobs[0], self._arrays)

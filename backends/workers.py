@@ -81,19 +81,16 @@ def usable_cores() -> int:
 
 @dataclass(frozen=True)
 class Job:
-    """Which worlds a process runs: ``first``, ``first + 1``, ..., one for each object index."""
+    """Which worlds a process runs."""
 
     backend: str
     world_class: type[World]
     options: Mapping[str, Any]
     scene: SceneSpec
-    first: int
+    worlds: range
+    """Numbers of its worlds."""
     object_index: tuple[int, ...]
-
-    @property
-    def stop(self) -> int:
-        """The number after that of its last world."""
-        return self.first + len(self.object_index)
+    """Object of each of its worlds."""
 
 
 _MOVING = ("build", "set_state", "step")
@@ -111,7 +108,8 @@ class LocalWorlds:
 
     def __init__(self, job: Job, arrays: Mapping[str, np.ndarray]) -> None:
         self._job = job
-        self._arrays = {name: array[job.first : job.stop] for name, array in arrays.items()}
+        own = slice(job.worlds.start, None, job.worlds.step)
+        self._arrays = {name: array[own] for name, array in arrays.items()}
         self._given: dict[str, np.ndarray] = {}
         self._worlds: list[World] = []
         self._inertia_changes: list[dict[str, Any]] = [{} for _ in job.object_index]
@@ -125,11 +123,8 @@ class LocalWorlds:
         Returns:
             What to raise because a world raised. It crosses process boundaries, so it holds the trace as text.
         """
-        rows = (
-            range(len(self._job.object_index))
-            if worlds is None
-            else (worlds - self._job.first).tolist()
-        )
+        own = self._job.worlds
+        rows = range(len(own)) if worlds is None else [own.index(i) for i in worlds.tolist()]
         self._given = {
             name: self._arrays[name].astype(np.float64) for name in _GIVEN.get(method, ())
         }
@@ -142,7 +137,7 @@ class LocalWorlds:
                 for row in rows:
                     self._publish(row)
         except Exception as error:
-            world = f"world {self._job.first + row}"
+            world = f"world {own[row]}"
             if isinstance(error, XResetError):  # one that the user can fix
                 return type(error)(f"{world}: {error}")
             return RuntimeError(
@@ -249,7 +244,7 @@ class WorkerTeam:
         for worker in self._workers:
             mine = worlds
             if worlds is not None:
-                mine = worlds[(worlds >= worker.job.first) & (worlds < worker.job.stop)]
+                mine = worlds[np.isin(worlds, worker.job.worlds)]
                 if not mine.size:
                     continue
             worker.send((method, mine, argument))
@@ -317,10 +312,11 @@ class _Worker:
             if code < 0
             else f"ended with exit code {code}"
         )
+        worlds = ", ".join(map(str, job.worlds))
         return (
-            f"A worker process of the backend {job.backend!r} {how} during {command!r}; it ran worlds "
-            f"{job.first} to {job.stop - 1}. Its messages are on standard error. After SIGKILL, it may have run out "
-            "of memory: use fewer worlds or workers. workers=0 runs the worlds in this process, for a debugger."
+            f"A worker process of the backend {job.backend!r} {how} during {command!r}; it ran the worlds {worlds}. "
+            "Its messages are on standard error. After SIGKILL, it may have run out of memory: use fewer worlds or "
+            "workers. workers=0 runs the worlds in this process, for a debugger."
         )
 
 

@@ -28,6 +28,7 @@ from xreset.backends.rigid import object_inertia
 from xreset.errors import XResetError
 from xreset.physics import Contacts, Links, Parameter, Parameters, State, no_readings
 from xreset.spec import SceneSpec
+from xreset.text import shown
 
 if TYPE_CHECKING:
     from xreset.backends.pool import World
@@ -312,11 +313,10 @@ class _Worker:
             if code < 0
             else f"ended with exit code {code}"
         )
-        worlds = ", ".join(map(str, job.worlds))
         return (
-            f"A worker process of the backend {job.backend!r} {how} during {command!r}; it ran the worlds {worlds}. "
-            "Its messages are on standard error. After SIGKILL, it may have run out of memory: use fewer worlds or "
-            "workers. workers=0 runs the worlds in this process, for a debugger."
+            f"A worker process of the backend {job.backend!r} {how} during {command!r}; it ran the worlds "
+            f"{shown(list(job.worlds))}. Its messages are on standard error. After SIGKILL, it may have run out of "
+            "memory: use fewer worlds or workers. workers=0 runs the worlds in this process, for a debugger."
         )
 
 

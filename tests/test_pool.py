@@ -272,7 +272,7 @@ class DeathTest(TestCase):
         targets[2, 0] = 666.0
         pool.set_joint_targets(targets)
         with self.assertRaisesRegex(
-            XResetError, "SIGKILL during 'step'; it ran the worlds 0, 2\\."
+            XResetError, r"SIGKILL during 'step'; it ran the worlds \[0, 2\]\."
         ):
             pool.step(1)
         self.assertRaisesRegex(XResetError, "is closed", pool.step, 1)

@@ -84,10 +84,10 @@ class PpoConfig(Checked):
     """Weight of the value loss. Not in the paper."""
     grad_norm: PositiveFloat = 1.0
     average: Share = 0.0
-    """Share of the iterations so far over which the policy's weights are averaged; 0: the policy has the last weights.
-    Iteration t has the weight 1 / (1 + average (t - 1)) in the running mean (polynomial-decay averaging, Shamir and
-    Zhang 2013, Stochastic gradient descent for non-smooth optimization). The training itself goes on with the last
-    weights. Not in the paper."""
+    """The policy that is exported has the mean of the weights over about this share of the iterations, the latest ones;
+    0: it has the last weights. Iteration t has the weight 1 / (1 + average (t - 1)) in the running mean
+    (polynomial-decay averaging, Shamir and Zhang 2013, Stochastic gradient descent for non-smooth optimization). The
+    training itself goes on with the last weights. Not in the paper."""
     precision: Literal["float32", "tf32", "bfloat16"] = "tf32"
     """Arithmetic of matrix products on a GPU. ``bfloat16``: factors of point-cloud encoder and LSTM in bfloat16 (sums
     in float32), the rest in TF32. The CPU and the exported policy use float32. Not in the paper."""

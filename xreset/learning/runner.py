@@ -180,7 +180,8 @@ class TrainingRunner:
         self.iteration += 1
         self.env_steps += steps
         self.elapsed += learned - start
-        self._take_average()
+        if self._average:
+            self._take_average()
         if log is None:
             return obs
         scalars = {f"loss/{name}": value for name, value in losses.items()}
@@ -200,7 +201,7 @@ class TrainingRunner:
         return self.alg.networks["actor"].state_dict()
 
     def _take_average(self) -> None:
-        """Take the actor's state into its running mean, if there is one."""
+        """Take the actor's state into its running mean."""
         weight = 1.0 / (1.0 + self.config.ppo.average * (self.iteration - 1))
         now = self._actor_state()
         for name, mean in self._average.items():

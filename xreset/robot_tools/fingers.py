@@ -77,24 +77,15 @@ class Hand:
             thumb: a link or joint of the thumb.
             notes: what is guessed is appended.
         """
-        self.tree = tree
-        """Its links, with frames for palm, wrist, fingertips and keypoints."""
         self._notes = notes
         if not tree.moved_by:
             raise RobotError("the hand has no joint that moves. Are its joints fixed in the file?")
-        self.root = self._palm_link()
-        """Link after which the fingers part."""
-        self._spec = draft_spec(tree, self.root, folder)
-        self._at = link_places(self._spec, {})
-        """Link -> pose [4, 4] in the frame of the hand's root, with straight fingers."""
+        self._take(tree, folder)
         still = self._joints_of_other_parts()
         if still:
             notes.append(f"joints that move no finger are fixed at 0: {', '.join(still)}")
             tree = with_fixed(tree, still)
-            self.tree = tree
-            self.root = self._palm_link()
-            self._spec = draft_spec(tree, self.root, folder)
-            self._at = link_places(self._spec, {})
+            self._take(tree, folder)
         wrist = [
             joint.name for link, joint in tree.moved_by.items() if self.root in tree.below(link)
         ]
@@ -120,6 +111,16 @@ class Hand:
         self.body = transformed(self._surface(body), T_root_hand)
         """[V, 3] vertices of the shapes that are fixed to the tree's root, in its frame."""
 
+    def _take(self, tree: RobotTree, folder: Path) -> None:
+        """Take a tree as the hand, with straight fingers."""
+        self.tree = tree
+        """Its links, with frames for palm, wrist, fingertips and keypoints."""
+        self.root = self._palm_link()
+        """Link after which the fingers part."""
+        self._spec = draft_spec(tree, self.root, folder)
+        self._at = link_places(self._spec, {})
+        """Link -> pose [4, 4] in the frame of the hand's root, with straight fingers."""
+
     def _palm_link(self) -> str:
         """Return the link after which the fingers part, behind the joints of a wrist: the first one of its body that
         has shapes, or more than one child."""
@@ -144,8 +145,9 @@ class Hand:
     def _joints_of_other_parts(self) -> list[str]:
         """Return the joints that move no finger, such as that of a camera on the arm.
 
-        The hand is below one child of the root if only there chains can meet one another. A chain elsewhere is none of
-        its fingers, unless its names state one, or it has a drive of the hand.
+        If chains can meet below one child of the root only, they are the hand, and other chains move no finger. But if
+        the names of another chain state a finger, or a drive of the hand moves it, nothing is certain: no joint is
+        returned.
         """
         chains = self._chains()
         hands = []
@@ -168,16 +170,16 @@ class Hand:
         return still
 
     def _can_meet(self, chains: list[Finger]) -> bool:
-        """Return whether the tips of any two chains can meet when the joints after which they part move."""
+        """Return whether the tips of any two chains can meet. Only joints below the last link of all chains move."""
         chains = [replace(chain, points=self._points(chain)) for chain in chains]
-        shared = [self.root]
+        common = self.root
         for link in chains[0].links:
             if all(link in chain.links for chain in chains):
-                shared.append(link)
-        return bool(self._meetings(chains, shared[-1]).any())
+                common = link
+        return bool(self._meetings(chains, common).any())
 
     def _meetings(self, chains: list[Finger], root: str) -> np.ndarray:
-        """Return how much the tips of chains oppose each other, see :func:`opposition`; only joints below the root
+        """Return how much the tips of chains oppose each other, see :func:`opposition`. Only joints below the root
         move."""
         ends = [chain.links[-1] for chain in chains]
         tips = np.array([self._in_link(chain.links[-1], chain.points[-1]) for chain in chains])

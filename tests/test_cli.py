@@ -5,13 +5,16 @@ import json
 import os
 import subprocess
 import sys
+import zipfile
 from contextlib import redirect_stderr
 from importlib import import_module
+from pathlib import Path
 from unittest import TestCase
 from unittest.mock import patch
 
 from tests.command import refused
 from tests.command import xreset as run
+from tests.data import InFolder
 from xreset.cli import COMMANDS, _terminal
 
 HEAVY = {
@@ -188,3 +191,29 @@ class UsageTest(TestCase):
             with patch("xreset.eval.evaluate.evaluate", side_effect=KeyboardInterrupt) as evaluate:
                 self.assertEqual(run(*argv)[0], 130)
             self.assertEqual(list(evaluate.call_args.args[2]), expected)
+
+
+class InstallationTest(InFolder):
+    def test_an_editable_installation_works_in_the_parent_folder_of_a_clone(self):
+        """Python takes a folder "xreset" of the current folder for a package unless the path has one as well."""
+        clone = self.folder / "xreset"
+        clone.mkdir()
+        repository = Path(__file__).parents[1]
+        for name in ("pyproject.toml", "README.md", "LICENSE", "xreset"):
+            (clone / name).symlink_to(repository / name)
+        build = "from setuptools.build_meta import build_editable; build_editable('..')"
+        subprocess.run([sys.executable, "-c", build], cwd=clone, check=True, capture_output=True)
+        (wheel,) = self.folder.glob("*.whl")
+        site = self.folder / "site-packages"
+        zipfile.ZipFile(wheel).extractall(site)
+        use = (
+            f"import site; site.addsitedir('{site}')\n"
+            "import runpy, sys, xreset; xreset.load_robot('openarm'); sys.argv = ['xreset', '--version']\n"
+            "runpy.run_module('xreset', run_name='__main__')"
+        )
+        command = [sys.executable, "-c", use]
+        environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        done = subprocess.run(
+            command, cwd=self.folder, env=environment, capture_output=True, text=True
+        )
+        self.assertRegex(done.stdout + done.stderr, r"^xreset \d")

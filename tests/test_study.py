@@ -5,6 +5,7 @@ import json
 import os
 import re
 import signal
+import subprocess
 import threading
 import time
 from contextlib import redirect_stdout
@@ -30,7 +31,7 @@ from xreset.eval.study.launch import launch
 from xreset.eval.study.paper import paper_tables
 from xreset.eval.study.plan import Plan, make_plan
 from xreset.eval.study.report import write_page
-from xreset.eval.study.steps import Step, flags
+from xreset.eval.study.steps import XRESET, Step, flags
 from xreset.eval.study.tables import fill
 from xreset.files import claim
 from xreset.learning.clock import read_lift, write_lift
@@ -208,7 +209,7 @@ class PlanTest(Studied):
         self.assertEqual(planned.config.task.reset, changed)
         (command,) = train.todo()[1]
         with patch("xreset.learning.train.train") as start:
-            main(command[3:])
+            main(command[len(XRESET) :])
         given = start.call_args.kwargs
         self.assertEqual(replace(given["config"], iterations=given["iterations"]), planned.config)
         self.assertEqual(list(flags({"config": {"a": {"b_c": True}}})), ["--config.a.b-c"])
@@ -229,7 +230,9 @@ class PlanTest(Studied):
         file = str(folder / "openarm" / "goals.npz")
         (make,) = plan.steps["data goals-tomato_soup_can openarm"].todo()[1]
         expected = ["goals", SOUP, "--robot", "openarm", "--out", file]
-        self.assertEqual(make[3:], [*expected, "--family", "lift", "--draw.per-family", "3"])
+        self.assertEqual(
+            make[len(XRESET) :], [*expected, "--family", "lift", "--draw.per-family", "3"]
+        )
         step = plan.steps["train tuned-seed0"]
         self.assertEqual(step.needs, ["data goals-tomato_soup_can openarm", "train a-seed0"])
         (train,) = step.todo()[1]
@@ -314,6 +317,14 @@ class LaunchTest(Studied):
         )
         self.assertRegex("\n".join(sorted(problems)), "\n".join(expected))
         self.assertEqual(len(problems), 4)
+
+    def test_a_step_imports_nothing_from_the_current_folder(self):
+        for name in ("tyro", "xreset", "queue"):
+            (self.folder / f"{name}.py").write_text("open('imported', 'w')")
+        step = self.plan(BASE + "[runs.a]\n").steps["train a-seed0"]
+        (command,) = step.todo()[1]
+        subprocess.run([*command, "--help"], cwd=self.folder, check=True, capture_output=True)
+        self.assertFalse((self.folder / "imported").exists())
 
     def test_each_step_sees_its_own_gpu_and_a_waiting_one_is_not_asked_again_and_again(self):
         say = "echo $CUDA_VISIBLE_DEVICES > gpus; sleep 0.3; touch done"
@@ -541,7 +552,7 @@ class WholeTest(InOneFolder):
         self.assertTrue(step.left())
         (command,) = step.todo()[1]
         self.assertEqual(
-            command[3:],
+            command[len(XRESET) :],
             ["train", "--out", f"{self.out}/x-reset-seed0", "--iterations", "4", "--resume"],
         )
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 from http.client import HTTPConnection
 from importlib.util import find_spec
 from unittest import mock, skipUnless
+from xml.etree import ElementTree
 
 import numpy as np
 import torch
@@ -272,6 +273,21 @@ class Served(WithFiles):
         page._rows = page._rows[:0]
         page.show()
         self.assertIn("nothing", page._text.content)
+
+    def test_text_of_a_file_is_shown_as_text(self):
+        """A browser shows that none of it runs: tests/test_view_browser.py."""
+        name = "<iframe srcdoc='<script>1</script>'></iframe> **b** ![c](d) &amp;"
+        moved = toy_retargeted(self.robot)
+        names = np.array([name, "other"])
+        reasons = (*moved.reason_names[:1], name, *moved.reason_names[2:])
+        moved = replace(moved, sequence_name=names, reason_names=reasons)
+        page = self.page(self.write(moved, "hostile"), frame=1)
+        self.assertEqual(type(page._text).__name__, "GuiHtmlHandle")
+        root = ElementTree.fromstring(page._text.content)
+        self.assertEqual({element.tag for element in root.iter()}, {"div", "p", "b"})
+        texts = list(root.itertext())
+        self.assertEqual(texts[0], f"not valid: {name}")
+        self.assertIn(f"sequence 0: {name}", texts)
 
     def test_the_command_serves_until_interrupted(self):
         command = [sys.executable, "-u", "-m", "xreset", "view", str(self.bank), "--port", "8960"]

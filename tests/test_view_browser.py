@@ -3,12 +3,14 @@
 import io
 import unittest
 from contextlib import redirect_stdout
+from dataclasses import replace
 from importlib.util import find_spec
 
 import numpy as np
 
 from tests.browser import INPUT, Browser, find_chromium, wait_until
-from tests.test_view import WithFiles
+from tests.test_view import WithFiles, toy_demos
+from xreset import write_demos
 from xreset.pictures.view.load import load_view
 
 SLIDER = INPUT + ".querySelector('[role=slider]')"
@@ -55,6 +57,18 @@ class InTheBrowser(WithFiles):
         """How much of the page has the object's colour."""
         rgb = self.browser.pixels()
         return int(((rgb[..., 0] - rgb[..., 2] > 60) & (rgb[..., 1] > 100)).sum())
+
+    def test_text_of_a_file_is_shown_and_not_run(self):
+        script = "parent.document.body.dataset.ran = 1"
+        name = f"a <b>b</b> <iframe srcdoc='<script>{script}</script>'></iframe> *c* ![d](e) &lt;"
+        path = self.folder / "hostile.npz"
+        write_demos(path, replace(toy_demos(), sequence_name=np.array([name, "other"])))
+        self.open(path)
+        self.until(lambda: f"sequence 0: {name}" in self.browser.text(), "the name as it is")
+        elements = "document.querySelectorAll('iframe, p img, p b b').length"
+        self.assertEqual(
+            self.browser.evaluate(f"[{elements}, document.body.dataset.ran ?? 0]"), [0, 0]
+        )
 
     def assert_no_problem(self):
         self.browser.evaluate("1")  # takes in what is still under way

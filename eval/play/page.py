@@ -23,7 +23,7 @@ from xreset.eval.plots import COLORS
 from xreset.eval.policy_spec import PolicySpec
 from xreset.pictures.meshes import GOAL_COLOR, OBJECT_COLOR, rgb
 from xreset.pictures.view.colors import TOUCH_COLOR
-from xreset.pictures.view.server import RobotMeshes, WebPage, serve_until_interrupted
+from xreset.pictures.view.server import RobotMeshes, WebPage, as_html, serve_until_interrupted
 from xreset.plugins import backend_names, robot_names
 from xreset.policies import shipped
 from xreset.tensors import one_thread
@@ -335,7 +335,7 @@ class Page(WebPage):
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=rgb(GOAL_COLOR))
         gui.add_html(PHONE_STYLE)
         gui.add_markdown(HELP)
-        self._text = gui.add_markdown("")
+        self._text = gui.add_html("")
         self._run = gui.add_button_group("time", ("Pause", "Step", "Restart"))
         self._run.on_click(lambda _: self._enqueue(self._press, self._run.value))
         self._speed = gui.add_slider("speed", 0.1, 1.0, 0.1, 1.0)
@@ -438,7 +438,7 @@ class Page(WebPage):
         self._written = now
         if not session.history:
             return
-        self._text.content = self._status()
+        self._text.content = as_html(*self._status())
         begin = session.history[-1].time - CURVE_SECONDS
         moments = [moment for moment in session.history if moment.time > begin]
         moments = moments[:: max(1, len(moments) // CURVE_POINTS)]
@@ -452,23 +452,26 @@ class Page(WebPage):
         columns = [f"{self._input.value} {i}" for i in range(inputs.shape[1])]
         self._inputs.show(times, inputs, columns)
 
-    def _status(self) -> str:
+    def _status(self) -> tuple[str, str]:
+        """Return where the object is, and how fast the session plays."""
         session = self.session
         last = session.history[-1]
         if session.away:
-            where = "The object is **away**."
+            where = "The object is away."
         elif session.lost:
-            where = "The object has **left the table**. Put it back."
+            where = "The object has left the table. Put it back."
         elif last.success:
-            where = f"**At the goal**: {100 * last.distance:.1f} cm, {degrees(last.angle):.0f} degrees off."
+            where = (
+                f"At the goal: {100 * last.distance:.1f} cm, {degrees(last.angle):.0f} degrees off."
+            )
         else:
             where = (
                 f"{100 * last.distance:.1f} cm and {degrees(last.angle):.0f} degrees from the goal."
             )
         if self._paused:
-            return f"{where}\n\n{session.engine}, paused"
+            return where, f"{session.engine}, paused"
         reason = ", slowed by this machine" if self._factor < 0.9 * self._speed.value else ""
-        return f"{where}\n\n{session.engine}: {self._factor:.2f} x real time{reason}"
+        return where, f"{session.engine}: {self._factor:.2f} x real time{reason}"
 
     # Saving -----------------------------------------------------------------------------------------------------------
 

@@ -10,13 +10,12 @@ import os
 import shlex
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from xreset.eval.study.plan import Plan
-from xreset.eval.study.steps import Step
+from xreset.eval.study.steps import XRESET, Step
 
 _POLL = 0.5
 """Time between two looks at the processes [s]."""
@@ -175,4 +174,4 @@ def _start(command: Sequence[str], gpu: str, log: Path) -> subprocess.Popen:
 
 def shown_command(command: Sequence[str]) -> str:
     """Return a command as a user would type it."""
-    return shlex.join(command).replace(f"{shlex.quote(sys.executable)} -m xreset", "xreset")
+    return shlex.join(command).replace(shlex.join(XRESET), "xreset")

@@ -34,6 +34,8 @@ from xreset.learning.run import checkpoints, read_run
 from xreset.text import shown
 
 SUBSET_SCHEMA = "xreset-subset/1"
+XRESET = (sys.executable, "-P", "-m", "xreset")
+"""Command line of ``xreset``. ``-P``: Python files in the current folder, which may be a download, are not imported."""
 _ENOUGH = 0.97
 """Share of the minutes from which a training counts as done, because a new start would take longer than the rest."""
 
@@ -307,7 +309,7 @@ def eval_todo(run: Run, folder: Path, spec: Evaluation, subset: Subset, engines:
 
 def _xreset(verb: str, *words: object, **options: Any) -> list[str]:
     """Return a command of ``xreset``; see :func:`flags`."""
-    return [sys.executable, "-m", "xreset", verb, *map(str, words), *flags(options)]
+    return [*XRESET, verb, *map(str, words), *flags(options)]
 
 
 def flags(values: dict[str, Any]) -> Iterator[str]:

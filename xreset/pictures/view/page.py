@@ -13,7 +13,7 @@ from xreset.errors import XResetError
 from xreset.pictures.meshes import GOAL_COLOR, OBJECT_COLOR, Color, rgb
 from xreset.pictures.view.colors import HUMAN_COLOR, REACHED_COLOR, TOUCH_COLOR, reason_color
 from xreset.pictures.view.data import BONES, GOOD, View
-from xreset.pictures.view.server import RobotMeshes, WebPage
+from xreset.pictures.view.server import RobotMeshes, WebPage, as_html
 
 _ALL = "all"
 _IDLE = 0.1
@@ -70,13 +70,12 @@ class Page(WebPage):
         with self._lock, self._server.atomic():
             row = self.row
             if row is None:
-                self._text.content = "nothing meets this choice"
+                self._text.content = as_html("nothing meets this choice")
                 return
             self._scene.show(row)
-            first, *others = self.view.text(row)
             number = min(self._frame.value + 1, len(self._rows))
             position = f"{number} of {len(self._rows)}"
-            self._text.content = "\n\n".join((f"**{first}**", *others, position))
+            self._text.content = as_html(*self.view.text(row), position)
 
     def serve(self) -> None:
         """Play while the play button is on, until interrupted."""
@@ -103,7 +102,7 @@ class Page(WebPage):
         gui.add_button("next").on_click(lambda _: self._step(1))
         self._play = gui.add_checkbox("play", False)
         self._speed = gui.add_slider("speed", 0.1, 2.0, 0.1, 1.0)
-        self._text = gui.add_markdown("")
+        self._text = gui.add_html("")
         for control in (self._sequence, self._reason):
             control.on_update(lambda _: self._choose())
         self._frame.on_update(lambda _: self.show())

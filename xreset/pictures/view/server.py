@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from html import escape
 from ipaddress import ip_address
 from socket import getfqdn, gethostname
 from typing import Any
@@ -74,6 +75,17 @@ class WebPage:
     def close(self) -> None:
         """Stop the server."""
         self._server.stop()
+
+
+def as_html(first: str, *others: str) -> str:
+    """Return paragraphs for ``gui.add_html`` that show the texts, which may be from a file, as they are.
+
+    viser's Markdown would run the scripts in them. The first paragraph is bold.
+    """
+    paragraphs = [f"<b>{escape(first)}</b>", *map(escape, others)]
+    lines = [f'<p style="margin: 0 0 0.6em">{paragraph}</p>' for paragraph in paragraphs]
+    style = "padding: 0 0.75em; font-size: 0.875em; overflow-wrap: anywhere"
+    return f'<div style="{style}">{"".join(lines)}</div>'
 
 
 def serve_until_interrupted(server: Any) -> None:

@@ -16,6 +16,8 @@ from tests.command import refused
 from tests.command import xreset as run
 from tests.data import InFolder
 from xreset.cli import COMMANDS, _terminal
+from xreset.cli._options import checked
+from xreset.files import claim_folder
 
 HEAVY = {
     "torch",
@@ -191,6 +193,16 @@ class UsageTest(TestCase):
             with patch("xreset.eval.evaluate.evaluate", side_effect=KeyboardInterrupt) as evaluate:
                 self.assertEqual(run(*argv)[0], 130)
             self.assertEqual(list(evaluate.call_args.args[2]), expected)
+
+
+class OutputTest(InFolder):
+    def test_a_folder_whose_name_has_a_dot_is_written_again(self):
+        def write(*, out: Path) -> None:
+            with claim_folder(out):
+                (out / "result").touch()
+
+        for _ in range(2):
+            checked(write)(out=self.folder / "lr0.001")
 
 
 class InstallationTest(InFolder):

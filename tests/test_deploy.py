@@ -299,6 +299,39 @@ class ContractTest(InFolder):
         with self.assertRaisesRegex(SystemExit, words):
             run("12_served_policy", server.url)
 
+    @skipUnless(find_spec("websockets"), "websockets is not installed")
+    def test_an_answer_that_comes_late_is_not_used(self):
+        hello = {"schema": "xreset-live/1", "contract": self.contract}
+        begin = {"begun": True}
+        target = {"target": self.home}
+        start = (np.zeros((64, 3)), [0.5, 0.3, 0.2], [1, 0, 0, 0], self.home)
+        for answers, words in (
+            ((hello, begin, TimeoutError, target), "has not answered for 0.5 s"),
+            ((hello, begin, KeyboardInterrupt, target), ""),
+            ((hello, begin, [], target), "is a list, expected an object"),
+            ((hello, begin, ConnectionError, target), "has gone"),
+        ):
+            with self.subTest(words), patch("websockets.sync.client.connect") as connect:
+                socket = connect.return_value
+                socket.recv.side_effect = [
+                    answer if isinstance(answer, type) else json.dumps(answer) for answer in answers
+                ]
+                remote = RemoteController("ws://127.0.0.1:9")
+                remote.begin(*start)
+                with self.assertRaisesRegex(BaseException, words):
+                    remote.step(Robot(self.home).read())
+                again = "Make a new RemoteController"
+                self.assertRaisesRegex(LiveError, again, remote.begin, *start)
+                self.assertRaisesRegex(LiveError, again, remote.step, Robot(self.home).read())
+                self.assertEqual(socket.recv.call_count, 3)
+        for answer in (begin, {"target": [0.0]}, {"target": ["x"]}):
+            with self.subTest(answer), patch("websockets.sync.client.connect") as connect:
+                connect.return_value.recv.side_effect = map(json.dumps, (hello, begin, answer))
+                remote = RemoteController("ws://127.0.0.1:9")
+                remote.begin(*start)
+                with self.assertRaisesRegex(LiveError, "the server's (answer holds no )?target"):
+                    remote.step(Robot(self.home).read())
+
     def test_the_example_of_a_driver(self):
         rows = 11
         brick = self.contract["objects"]["brick"]

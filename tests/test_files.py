@@ -241,6 +241,8 @@ class JsonTest(InFolder):
             ("[1]", "a JSON list"),
             ("\xff\xfe", "not valid JSON"),
             ('{"a": ' + "[" * 100_000, "nested too deeply"),
+            ('{"a": ' + "[" * 101 + "]" * 101 + "}", "nested too deeply"),
+            ('{"a": ' * 1200 + "1" + "}" * 1200, "nested too deeply"),
             ('{"a": ' + "1" * 5000 + "}", "not valid JSON"),
             ('{"a": NaN}', "NaN is not a number"),
             (r'{"a": ["\ud800"]}', "control a terminal"),
@@ -337,6 +339,7 @@ class NpzTest(InFolder):
             (b"\xff", "not valid TOML"),
             (b"mass = " + b"9" * 5000, "not valid TOML"),
             (b"a = " + b"[" * 5000, "not valid TOML"),
+            (b"[" + b".".join([b"a"] * 200) + b"]", "nested too deeply"),
             (b"schema = 'other/1'", "states schema 'other/1', expected 'test/1'"),
         ):
             with self.subTest(content[:12]):

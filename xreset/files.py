@@ -29,6 +29,10 @@ T = TypeVar("T")
 RAISE_LIMIT = "If it is what you expect, raise the limit: set XRESET_MAX_FILE_MB (default 1024)."
 """Advice for a file that is too large."""
 
+_MOST_LEVELS = 100
+"""Most levels of nested JSON or TOML; some versions of Python read far more than other functions can walk through."""
+_TOO_DEEP = "it is nested too deeply"
+
 
 def max_bytes() -> int:
     """Most memory that the arrays of a file may take: 1 GiB, or ``XRESET_MAX_FILE_MB``. Small files can unpack to any
@@ -335,6 +339,7 @@ def read_toml(
     """
     try:
         data = tomllib.loads(path.read_bytes().decode())
+        _check_content(data)
     except OSError as problem:
         raise error(f"{path} cannot be read ({problem.strerror}).{hint}") from problem
     # of TOML, of decoding, of numbers of thousands of digits
@@ -355,12 +360,12 @@ def parse_json(text: str | bytes) -> dict[str, Any]:
         text = text.decode() if isinstance(text, bytes) else text
         data = json.loads(text, parse_constant=_no_constant)
     except RecursionError:
-        raise ValueError("it is nested too deeply") from None
+        raise ValueError(_TOO_DEEP) from None
     except UnicodeDecodeError:
         raise ValueError("it is not UTF-8") from None
     if not isinstance(data, dict):
         raise ValueError(f"it holds a JSON {type(data).__name__}, expected an object")
-    _check_texts(data)
+    _check_content(data)
     return data
 
 
@@ -368,16 +373,23 @@ def _no_constant(name: str) -> None:
     raise ValueError(f"{name} is not a number of JSON")
 
 
-def _check_texts(data: Any) -> None:
-    if isinstance(data, dict):
-        data = [*data.keys(), *data.values()]
-    if isinstance(data, list):
-        for value in data:
-            _check_texts(value)
-    elif isinstance(data, str) and not is_plain(data):
-        raise ValueError(
-            f"the text {shown(data)} holds characters that control a terminal, or are none"
-        )
+def _check_content(data: Any) -> None:
+    """Raise ``ValueError`` for data that are nested deeper than functions may be, or texts that cannot be printed."""
+    level = [data]
+    for _ in range(_MOST_LEVELS):
+        below = []
+        for value in level:
+            if isinstance(value, dict):
+                below += [*value.keys(), *value.values()]
+            elif isinstance(value, list):
+                below += value
+            elif isinstance(value, str) and not is_plain(value):
+                raise ValueError(
+                    f"the text {shown(value)} holds characters that control a terminal, or are none"
+                )
+        level = below
+    if level:
+        raise ValueError(_TOO_DEEP)
 
 
 def file_hash(path: str | Path) -> str:

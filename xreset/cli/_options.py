@@ -46,8 +46,10 @@ def checked(command: Callable[..., None]) -> Callable[..., None]:
         with ExitStack() as claims:
             for name in _WRITTEN:
                 path = options.get(name)
-                # the function that writes into a folder claims it
-                if isinstance(path, Path) and path.suffix and path.parent.is_dir():
+                # the function that writes into a folder claims it; its name may have a dot as well
+                if not isinstance(path, Path) or not path.suffix or path.is_dir():
+                    continue
+                if path.parent.is_dir():
                     claims.enter_context(claim(path))
             command(*positional, **named)
 

@@ -31,6 +31,7 @@ class RemoteController(Controller):
         from websockets.sync.client import connect
 
         self._timeout = timeout
+        self._has_failed = False
         try:
             self._socket = connect(url, open_timeout=5, max_size=None, compression=None)
         except Exception as error:
@@ -76,19 +77,36 @@ class RemoteController(Controller):
             rows = getattr(reading, name)
             values[name] = None if rows is None else rows[0]
         answer = self._ask({"step": _lists(values)})
-        self.target = np.array([answer["target"]], dtype=np.float32)
-        return self.target
+        try:
+            target = np.array([answer["target"]], dtype=np.float32)
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            raise LiveError("the server's answer holds no target") from error
+        if target.shape != self.target.shape:
+            raise LiveError(f"the server's target has shape {target.shape[1:]}")
+        self.target = target
+        return target
 
     def close(self) -> None:
         """End the connection."""
         self._socket.close()
 
     def _ask(self, message: dict[str, Any]) -> dict[str, Any]:
+        """Return the answer to a message.
+
+        The first failure ends the connection, because an answer that comes late would be taken for the next one.
+        """
+        if self._has_failed:
+            raise LiveError("the connection has failed before. Make a new RemoteController")
+        self._has_failed = True
         try:
             self._socket.send(json.dumps(message))
         except Exception as error:
             raise LiveError("the server has gone") from error
-        return self._receive()
+        answer = self._receive()
+        self._has_failed = False
+        if "error" in answer:
+            raise LiveError(answer["error"])
+        return answer
 
     def _receive(self) -> dict[str, Any]:
         try:
@@ -97,8 +115,8 @@ class RemoteController(Controller):
             raise LiveError(f"the server has not answered for {self._timeout:g} s") from error
         except Exception as error:
             raise LiveError("the server has gone") from error
-        if "error" in answer:
-            raise LiveError(answer["error"])
+        if not isinstance(answer, dict):
+            raise LiveError(f"the server's answer is a {type(answer).__name__}, expected an object")
         return answer
 
 

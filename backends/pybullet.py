@@ -53,7 +53,7 @@ from xreset.backends.rigid import (
     rotate,
     sum_contacts,
 )
-from xreset.errors import XResetError
+from xreset.errors import BackendUnavailableError, XResetError
 from xreset.physics import Capability, unavailable
 from xreset.spec import GRAVITY, SceneSpec, Shape
 
@@ -63,6 +63,8 @@ fast."""
 _SOLVER_ITERATIONS = 50
 _GEOM_INITIALIZE_SAT_FEATURES = 4
 """Bullet's flag of a collision shape, which PyBullet does not name: contacts between polyhedra are found on faces."""
+_NEWEST_PYTHON = (3, 11)
+"""Newest Python for which PyBullet publishes wheels."""
 _FAR = 100.0
 """A height [m] where nothing touches the object."""
 
@@ -438,6 +440,12 @@ def _engine() -> Any:
             os.dup2(nowhere.fileno(), 2)
         import pybullet
     except ImportError as error:
+        if sys.version_info[:2] > _NEWEST_PYTHON:
+            here = ".".join(map(str, sys.version_info[:2]))
+            newest = ".".join(map(str, _NEWEST_PYTHON))
+            raise BackendUnavailableError(
+                f"PyBullet has no wheel for Python {here}. Use Python {newest}, or another engine."
+            ) from error
         raise unavailable("pybullet", "'xreset[pybullet]'", error) from error
     finally:
         os.dup2(kept, 2)

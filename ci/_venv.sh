@@ -24,18 +24,25 @@ fi
 lock=ci/locks/py$("$python" -c 'import sys; print("%d%d" % sys.version_info[:2])').txt
 stamp=.venv/.xreset-$(cat pyproject.toml "$lock" | sha256sum | cut -c 1-16)
 if [ ! -e "$stamp" ]; then
-  echo "== setting up .venv with $("$python" --version) (once)"
+  echo "== setting up .venv with $("$python" --version) (once; 3 GB, or 7 GB with torch's CUDA build)"
   version=$("$python" -c 'import sys; print(sys.version_info[:2])')
   if [ -x .venv/bin/python ] && [ "$(.venv/bin/python -c 'import sys; print(sys.version_info[:2])')" != "$version" ]; then
     rm -rf .venv  # made with another version of Python
   fi
   [ -x .venv/bin/python ] || "$python" -m venv .venv
-  install() { .venv/bin/python -m pip install --quiet --disable-pip-version-check --only-binary :all: "$@"; }
-  install torch==2.13.0  # first: what depends on torch then takes this build
+  install() { .venv/bin/python -m pip install --disable-pip-version-check --only-binary :all: "$@"; }
+  # torch first: what depends on it then takes this build
+  if nvidia-smi -L > /dev/null 2>&1; then
+    install torch==2.13.0
+  elif ! install torch==2.13.0+cpu 2> /dev/null; then
+    echo "pip's index has no CPU build of torch, so its CUDA build is installed. PyTorch has an index of CPU builds (pytorch.org):"
+    echo "to use it, stop, and set PIP_EXTRA_INDEX_URL."
+    install torch==2.13.0
+  fi
   if [ "$(uname -m)" = x86_64 ]; then
     install --no-deps --require-hashes -r "$lock"  # the versions with which the tests have passed
   fi
-  install -e '.[all,dev]'
+  install --quiet -e '.[all,dev]'
   rm -f .venv/.xreset-*
   touch "$stamp"
 fi

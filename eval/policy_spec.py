@@ -51,8 +51,8 @@ class PolicySpec(Brief, Checked):
     """Names of the objects of the training; None: a baseline, which was not trained."""
     hash: str | None = None
     """SHA-256 of the policy's file; None: a baseline."""
-    file: Path | None = None
-    """The exported policy; None: a baseline."""
+    content: bytes | None = None
+    """Content of the exported policy's file; None: a baseline."""
     selection_seed: int | None = None
     """Seed of the starts that chose this checkpoint (``xreset select``); None: it was not chosen."""
 
@@ -133,17 +133,17 @@ class PolicySpec(Brief, Checked):
         policy.begin(env)
         return policy
 
-    def exported(self) -> Path:
-        """Return the exported policy.
+    def exported(self) -> bytes:
+        """Return the content of the exported policy's file.
 
         Raises:
             PolicyError: a baseline has none.
         """
-        if self.file is None:
+        if self.content is None:
             raise PolicyError(
                 f"The baseline {self.name!r} is not an exported policy. Give a run folder or a .onnx file."
             )
-        return self.file
+        return self.content
 
     def check_seed(self, seed: int) -> None:
         """Refuse the seed whose starts chose this checkpoint, because a result on them is biased.
@@ -206,14 +206,14 @@ def load_policy(
     is_chosen = choice is not None and choice.policy_hash == loaded.hash
     return PolicySpec(
         name=name,
-        start=lambda motion: OnnxPolicy(file),
+        start=lambda motion: loaded.another(),
         robot=spec,
         task=contract.task,
         folder=folder / "eval",
         objects_folder=Path(run.objects) if run and run.objects else None,
         objects=contract.objects,
         hash=loaded.hash,
-        file=file,
+        content=loaded.content,
         selection_seed=choice.seed if is_chosen else None,
     )
 

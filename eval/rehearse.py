@@ -109,7 +109,7 @@ def rehearse(
     properties = chosen(faults, REHEARSED)
     spec = load_policy(policy, robot=robot, seed=seed)
     spec.check_seed(seed)
-    actor = OnnxActor(spec.exported().read_bytes())
+    actor = OnnxActor(spec.exported())
     if demos is None:
         meshes = spec.meshes(objects)
         demos = synthesize(spec.objects_of(meshes), 2, meshes=meshes)

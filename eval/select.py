@@ -26,9 +26,6 @@ from xreset.learning.run import (
     write_choice,
 )
 
-SEED = 1_000_003
-"""Seed of the starts that decide; evaluations use 0 by default."""
-
 
 def candidates_in(folder: Path, most: int) -> list[Path]:
     """Return checkpoints of a run folder, the newest first.

@@ -15,9 +15,8 @@ def main(meshes: str, name: str, out: str) -> None:
     motion = xreset.retarget_demos(demos, policy.robot, [thing])
     # those that MuJoCo finds stable
     bank = xreset.make_bank(motion, policy.robot, [thing])
-    with policy.make_env(
-        [thing], bank, engine="pybullet"
-    ) as env:  # the task that the policy was trained for
+    # the task that the policy was trained for
+    with policy.make_env([thing], bank, engine="sapien") as env:
         xreset.film(policy, env, out)
 
 

@@ -179,8 +179,20 @@ class UsageTest(TestCase):
         self.assertRegex(output_of(code), words)
 
     def test_a_missing_engine_is_named_with_the_command_that_installs_it(self):
-        code = "import sys; sys.modules['pybullet'] = None; from xreset.cli import main; main(['engines', 'list'])"
-        self.assertRegex(output_of(code), r"pybullet .* no: .*pip install 'xreset\[pybullet\]'")
+        code = (
+            "import sys; sys.modules['pybullet'] = None; from xreset.backends import pybullet as ours\n"
+            "from xreset.cli import main; ours._NEWEST_PYTHON = {newest}; main(['engines', 'list'])"
+        )
+        here = ".".join(map(str, sys.version_info[:2]))
+        without_wheel = (
+            rf"no: PyBullet has no wheel for Python {here}\. Use Python 3\.9, or another"
+        )
+        for newest, words in (
+            ((3, 99), r"no: .*pip install 'xreset\[pybullet\]'"),
+            ((3, 9), without_wheel),
+        ):
+            with self.subTest(newest):
+                self.assertRegex(output_of(code.format(newest=newest)), f"pybullet .* {words}")
 
     def test_naming_engines_replaces_the_default(self):
         for given, expected in (

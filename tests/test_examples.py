@@ -78,7 +78,7 @@ class ShelfTest(InFolder):
         self.assertEqual([line.split()[0] for line in lines], ["passed", "passed", "failed"], lines)
 
     @skipUnless(
-        has("coal", "pybullet", "onnxruntime", "imageio_ffmpeg"),
+        has("coal", "sapien", "onnxruntime", "imageio_ffmpeg"),
         "an engine or a codec is not installed",
     )
     def test_a_shipped_policy_is_filmed_with_an_unseen_object(self):

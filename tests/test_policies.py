@@ -5,6 +5,7 @@ import json
 import os
 import tempfile
 from dataclasses import asdict
+from hashlib import sha256
 from importlib.util import find_spec
 from pathlib import Path
 from unittest import mock, skipUnless
@@ -20,7 +21,7 @@ from tests.toy_results import toy_choice
 from xreset import load_policy, policies, robots, synthesize, write_demos
 from xreset.errors import PolicyError, XResetError
 from xreset.learning.run import write_choice
-from xreset.policy import OnnxPolicy, policy_contract
+from xreset.policy import OnnxPolicy, observation_shapes, policy_contract
 from xreset.task.config import ObservationConfig, TaskConfig, TerminationConfig
 
 TASK = TaskConfig(
@@ -98,6 +99,18 @@ class OnnxPolicyTest(WithPolicy):
         (other := self.folder / "demos.npz").write_bytes(b"hello")
         words = "demos.npz is not an exported policy, expected a run folder, a .onnx file"
         self.assertRaisesRegex(PolicyError, words, OnnxPolicy, other)
+
+    def test_the_policy_that_was_loaded_plays_even_if_its_file_is_replaced(self):
+        path = write_policy(self.folder / "replaced.onnx", self.contract)
+        loaded = load_policy(path)
+        shapes = observation_shapes(OnnxPolicy(path).contract, "it")
+        observed = {name: torch.full((2, *shape), 0.01) for name, shape in shapes.items()}
+        expected = OnnxPolicy(path).act(observed)
+        write_policy(path, self.contract, value=-0.5)
+        self.assertTrue((OnnxPolicy(path).act(observed) != expected).all())
+        for _ in range(2):
+            self.assertTrue((loaded.start(None).act(observed) == expected).all())
+        self.assertEqual(sha256(loaded.exported()).hexdigest(), loaded.hash)
 
     def test_a_training_checkpoint_is_recognised(self):
         run = self.folder / "run"

@@ -6,17 +6,18 @@ from types import SimpleNamespace
 from unittest.mock import Mock, patch
 
 from tests import toy_grasp
-from tests.command import refused
+from tests.command import refused, xreset
 from tests.data import InFolder
 from tests.toy_results import episodes
 from xreset import evaluate
 from xreset.errors import FileFormatError, PolicyError, RunError
 from xreset.eval.engines.attribution import attribute
-from xreset.eval.select import SEED, candidates_in, select
+from xreset.eval.select import candidates_in, select
 from xreset.eval.setting import Setting
 from xreset.eval.stress import stress
 from xreset.learning.run import read_choice
 
+SEED = 1_000_003
 SCORES = {
     "300.pt": {"a": 0.90, "b": 0.60, "c": 0.80},
     "200.pt": {"a": 0.80, "b": 0.75, "c": 0.75},
@@ -101,6 +102,14 @@ class SelectTest(InFolder):
         self.assertEqual(policy.read_bytes(), b"of the newest")
         self.choose()
         self.assertEqual(policy.read_bytes(), b"200.pt")
+
+    def test_the_command_takes_the_seed_of_the_starts(self):
+        for words, seed in (((), SEED), (("--seed", 5), 5)):
+            with patch("xreset.eval.select.select", side_effect=KeyboardInterrupt) as chosen:
+                xreset("select", self.folder, "--demos", self.demos, "--backend", "mujoco", *words)
+            self.assertEqual(chosen.call_args.args[3].seed, seed)
+        told = refused("select", self.folder, "--demos", self.demos, "--seed", -1)
+        self.assertIn("--seed is -1, expected a whole number from 0", told)
 
     def test_a_damaged_choice_is_refused(self):
         self.choose()

@@ -6,6 +6,7 @@ rate. Running a policy needs neither warp nor rsl-rl.
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import asdict, replace
 from hashlib import sha256
 from pathlib import Path
@@ -156,7 +157,8 @@ class OnnxPolicy:
     Attributes:
         name: name of the file, or of its folder if the file is called ``policy.onnx``.
         contract: see :func:`policy_contract`.
-        hash: SHA-256 of the file.
+        content: content of the file.
+        hash: SHA-256 of the content.
     """
 
     @names_wrong_arguments
@@ -180,10 +182,10 @@ class OnnxPolicy:
         # Otherwise onnxruntime's threads spin between the steps, which costs as much as the physics.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         try:
-            content = path.read_bytes()
-            self.hash = sha256(content).hexdigest()
+            self.content = path.read_bytes()
+            self.hash = sha256(self.content).hexdigest()
             self._session = onnxruntime.InferenceSession(
-                content,
+                self.content,
                 options,
                 providers=["CPUExecutionProvider"],
                 enable_fallback=0,  # no other provider, which onnxruntime would announce
@@ -220,6 +222,12 @@ class OnnxPolicy:
             raise PolicyError(
                 f"{path} gives numbers that are not finite: its training broke down, or the file is damaged."
             )
+
+    def another(self) -> OnnxPolicy:
+        """Return the same policy, whatever has become of its file, with a recurrent state of its own."""
+        policy = copy(self)
+        policy._state = None
+        return policy
 
     def begin(self, env: ManipulationEnv) -> None:
         """Zero the recurrent state."""

@@ -50,10 +50,9 @@ def served(
 ) -> tuple[PolicySpec, dict[str, Any]]:
     """Return a policy and its contract, for :class:`xreset.live.serve.PolicyServer`; see :func:`export_deploy`."""
     spec = load_policy(policy, robot=robot)
-    file = spec.exported()
     folder = spec.meshes(objects)
     listed = load_objects(only or spec.objects_of(folder), folder)
-    return spec, deploy_contract(spec.robot, spec.task, listed, file)
+    return spec, deploy_contract(spec.robot, spec.task, listed, spec.exported())
 
 
 def serve(
@@ -84,7 +83,7 @@ def serve(
     from xreset.pictures.view import server as pages
 
     spec, contract = served(policy, robot=robot, objects=objects, only=only)
-    listening = server.PolicyServer(contract, spec.exported().read_bytes(), host=host, port=port)
+    listening = server.PolicyServer(contract, spec.exported(), host=host, port=port)
     print(
         f"{spec.name} for {spec.robot.name} at {listening.url}, {contract['rate']:g} steps per second. Ctrl-C ends."
     )

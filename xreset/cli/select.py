@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
-from xreset.cli._common import Flat, Several, Source
+from xreset.cli._common import Flat, Several, Source, quick_engines
 from xreset.cli._terminal import console, show_table
 from xreset.eval.setting import Setting
 
@@ -17,8 +16,7 @@ def select(
     backend: Several = (),
     most: int = 8,
     episodes: int = 2,
-    setting: Flat[Setting] = Setting(),
-    starts: int | None = None,
+    setting: Flat[Setting] = Setting(seed=1_000_003),
 ) -> None:
     """Choose the checkpoint of a training that is best in its worst engine.
 
@@ -28,21 +26,20 @@ def select(
     Args:
         folder: Run folder.
         demos: Demonstrations whose starts and goals are played.
-        backend: Physics engine; give it again for more engines. Default: mujoco, pybullet and sapien.
+        backend: Physics engine; give it again for more engines. Default: all that can be used here, but not
+            MuJoCo-Warp on a CPU, where it is slow.
         most: Largest number of checkpoints to play, spread over the training; the newest is included.
         episodes: Episodes of each demonstration.
-        setting: Robot, meshes, device and worlds; --seed is not used, see --starts.
-        starts: Seed of the starts; default: one that evaluations do not use.
+        setting: Robot, meshes, seed of the starts, device and worlds; the default seed is one that evaluations do
+            not use.
     """
-    from xreset.eval import rollout
     from xreset.eval import select as selection
 
-    engines = rollout.chosen_engines(backend or ("mujoco", "pybullet", "sapien"), setting.device)
+    engines = quick_engines(backend, setting.device)
 
     def say(name: str, engine: str, score: float) -> None:
         console.print(f"{name} in {engine}: {100 * score:.1f} %")
 
-    setting = replace(setting, seed=selection.SEED if starts is None else starts)
     choice = selection.select(
         folder, engines, demos, setting, most=most, episodes=episodes, progress=say
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import shutil
 from collections.abc import Sequence
@@ -13,7 +14,7 @@ import numpy as np
 import torch
 
 from xreset.errors import PolicyError
-from xreset.files import atomic_folder, code_version, file_hash, is_occupied, write_json
+from xreset.files import atomic_folder, code_version, is_occupied, write_json
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import robot_tree
 from xreset.objects.sampling import center, surface_points
@@ -41,7 +42,7 @@ UNITS = {
 
 
 def deploy_contract(
-    robot: RobotSpec, task: TaskConfig, objects: Sequence[ObjectSpec], policy: Path | None = None
+    robot: RobotSpec, task: TaskConfig, objects: Sequence[ObjectSpec], policy: bytes | None = None
 ) -> dict[str, Any]:
     """Return everything that :mod:`xreset.runtime` needs to know about a policy, as JSON.
 
@@ -49,7 +50,8 @@ def deploy_contract(
         robot: robot of the policy.
         task: task of the policy's training.
         objects: objects whose points the contract lists.
-        policy: exported policy, whose hash the contract states; None: the contract stays in this process.
+        policy: content of the exported policy, whose hash the contract states; None: the contract stays in this
+            process.
 
     Raises:
         PolicyError: the policy has cameras.
@@ -73,7 +75,7 @@ def deploy_contract(
     contract = {
         "schema": files.SCHEMA,
         "xreset": code_version(),
-        "policy_sha256": file_hash(policy) if policy else "",
+        "policy_sha256": hashlib.sha256(policy).hexdigest() if policy else "",
         "robot": robot.name,
         "robot_fingerprint": robot.fingerprint,
         "control_dt": trained.control_dt,
@@ -144,11 +146,11 @@ def _chain(robot: RobotSpec) -> dict[str, Any]:
     return {"base": base, "palm": tracked[0], "tips": tracked[1:], "steps": steps}
 
 
-def write_deployed(policy: Path, contract: dict[str, Any], out: Path) -> None:
+def write_deployed(policy: bytes, contract: dict[str, Any], out: Path) -> None:
     """Write ``policy.onnx``, ``contract.json`` and the package ``runtime`` into a new folder.
 
     Args:
-        policy: exported policy (.onnx).
+        policy: content of the exported policy (.onnx).
         contract: what :func:`deploy_contract` returns for it.
         out: folder to write; must not exist, or be empty.
 
@@ -158,7 +160,7 @@ def write_deployed(policy: Path, contract: dict[str, Any], out: Path) -> None:
     if is_occupied(out):
         raise PolicyError(f"{out} exists already. Choose another folder, or remove it.")
     with atomic_folder(out) as folder:
-        shutil.copyfile(policy, folder / files.POLICY)
+        (folder / files.POLICY).write_bytes(policy)
         shutil.copytree(
             Path(files.__file__).parent,
             folder / "runtime",

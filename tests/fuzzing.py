@@ -25,6 +25,7 @@ from tests.test_import_robot import HAND, MJCF
 from tests.test_keypoints import PLAIN, write_csv
 from tests.test_view import toy_demos, toy_retargeted
 from tests.toy_bank import SOUP, toy_bank
+from tests.toy_goals import toy_goals
 from tests.toy_policy import write_policy
 from tests.toy_results import toy_rollouts, toy_summary
 from tests.toy_robot import toy_hand_arm
@@ -35,10 +36,12 @@ from xreset import (
     merge_demos,
     read_bank,
     read_demos,
+    read_goals,
     read_retargeted,
     synthesize,
     write_bank,
     write_demos,
+    write_goals,
     write_retargeted,
 )
 from xreset.backends.conformance import SCHEMA as CONFORMANCE
@@ -57,12 +60,16 @@ from xreset.eval.results import (
     read_traces,
     write_results,
 )
+from xreset.eval.sensitivity import SWEEPS
+from xreset.eval.stress import Stress, curve, read_stress, write_card
 from xreset.eval.study.file import SHIPPED, read_study
 from xreset.files import read_json, write_json
 from xreset.geometry import urdf
 from xreset.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from xreset.learning.clock import Lift, read_lift, write_lift
 from xreset.learning.run import RunInfo, read_run, write_run
+from xreset.live.deploy import deploy_contract, write_deployed
+from xreset.live.serve import _Episode
 from xreset.objects.meshes import read_mesh
 from xreset.objects.properties import properties_of
 from xreset.physics import State
@@ -70,6 +77,7 @@ from xreset.pictures.view.load import load_view
 from xreset.policy import OnnxPolicy, policy_contract
 from xreset.records import Field
 from xreset.robot_tools.sources import read_source
+from xreset.runtime import Controller, load_controller
 from xreset.spec import SceneSpec
 from xreset.task.config import ObservationConfig, TaskConfig
 
@@ -114,6 +122,7 @@ def readers():
             add_curves,
             add_texts_of_engines,
             add_networks,
+            add_deployed,
             add_robots,
             add_dexycb,
             add_keypoints,
@@ -157,6 +166,7 @@ def add_records(every):
     write_retargeted(path, toy_retargeted(every.openarm))
     path = every.add("reset bank", "bank.npz", lambda p: read_bank(p, robot=every.toy), "npz")
     write_bank(path, toy_bank(every.toy), config={"steps": 8}, inputs={"retargeted": "ab"})
+    write_goals(every.add("goal set", "goals.npz", read_goals, "npz"), toy_goals(every.toy))
 
 
 def add_actions(every):
@@ -185,6 +195,16 @@ def write_evaluation(folder):
 def add_evaluation(every):
     write_evaluation(every.folder)
     every.add("result", "mujoco.json", read_result, "json")
+    path = every.add("stress", "stress/mujoco.json", lambda p: read_stress(p.parent), "json")
+    path.parent.mkdir()
+    nominal = toy_rollouts().episodes
+    mass = next(prop for prop in SWEEPS if prop.option == "object-mass")
+    swept = curve(mass, nominal, {2.0: nominal})
+    card = Stress(
+        backend="mujoco", backend_version="4", episodes=len(nominal), task_progress=0.5, ci95=(0.4, 0.6),
+        curves=(swept,), left_out=("arm-stiffness",),
+    )  # fmt: skip
+    write_card(path.parent, card)
 
     def episodes(path):
         return read_episodes(path.parent, "mujoco")
@@ -254,6 +274,42 @@ def add_networks(every):
     )
     path = every.add("checkpoint", "000001.pt", lambda p: vars(read_checkpoint(p)), "checkpoint")
     write_checkpoint(path, checkpoint)
+
+
+def add_deployed(every):
+    soup = load_object("soup")
+    content = write_policy(every.folder / "deployed.onnx", asdict(every.contract)).read_bytes()
+    contract = deploy_contract(every.toy, every.contract.task, [soup], content)
+    write_deployed(content, contract, every.folder / "deployed")
+    every.add(
+        "contract", "deployed/contract.json", lambda p: load_controller(p.parent).contract, "json"
+    )
+    del contract["contract_sha256"]  # a contract of an earlier version
+
+    def of_server(path):
+        return Controller(read_json(path), source=str(path)).contract
+
+    write_json(every.add("contract without a hash", "contract.json", of_server, "json"), contract)
+    home = [joint["home"] for joint in contract["joints"]]
+    goal = {"goal_pos": [0.5, 0.3, 0.2], "goal_quat": [1.0, 0.0, 0.0, 0.0]}
+    begin = json.dumps({"begin": goal | {"object": soup.name, "target": home}})
+    step = {
+        "joint_pos": home, "joint_vel": [0.0] * len(home), "object_pos": [0.5, 0.3, 0.1],
+        "object_quat": [1.0, 0.0, 0.0, 0.0],
+    }  # fmt: skip
+    controller = load_controller(every.folder / "deployed")
+
+    def answer(path):
+        episode = _Episode(controller)
+        episode.answer(begin)
+        reply = episode.answer(path.read_bytes())
+        if "error" in reply:
+            raise XResetError(reply["error"])
+        return reply
+
+    for name, message in (("begin", json.loads(begin)), ("step", {"step": step})):
+        path = every.add(f"message {name}", f"{name}.json", answer, "json")
+        path.write_text(json.dumps(message))
 
 
 def add_robots(every):

@@ -36,6 +36,7 @@ from xreset.runtime import (
     load_controller,
     read_contract,
 )
+from xreset.runtime.contract import digest
 
 POLICY = "soup-can"
 STEPS = 30
@@ -191,6 +192,56 @@ class ContractTest(InFolder):
             with self.subTest(words), self.assertRaisesRegex(LiveError, words):
                 controller.step(replace(reading, **changes))
 
+    def changed(self, place, value):
+        """The contract with another value at a place, of a version that stated no hash."""
+        contract = json.loads(json.dumps(self.contract))
+        del contract["contract_sha256"]
+        entry = contract
+        for name in place[:-1]:
+            entry = entry[name]
+        entry[place[-1]] = value
+        return contract
+
+    def test_a_contract_that_no_robot_may_follow_is_refused(self):
+        load = {"source": "It"}
+        Controller(self.changed(("rate",), 60), **load)
+        joint = ("joints", 1)
+        step = ("kinematics", "steps", 1)
+        mirrored = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
+        for place, values in (
+            (("control_dt",), (1e-30, -0.016, True, 50.0, None)),
+            (("joints",), ([], [{}] * 5, [3])),
+            ((*joint, "step"), (50.0, -0.01, None, "x", float("nan"))),
+            ((*joint, "lead"), (50.0, -1.0)),
+            ((*joint, "above"), (float("nan"), -1.0)),
+            ((*joint, "home"), ("0",)),
+            ((*joint, "lower"), (None, 1e9, float("-inf"))),
+            ((*joint, "upper"), (None, -50.0)),
+            ((*joint, "group"), ("leg",)),
+            (("observation", "rotation"), ("euler", None)),
+            (("observation", "joint_target"), (1,)),
+            (("observation", "cloud_points"), (0, 64.0, 10**400)),
+            (("observation", "cloud_scale"), ("x", -1.0)),
+            (("observation",), ({},)),
+            (("action", "hand"), ("quick",)),
+            (("object_frame",), ("table",)),
+            (("kinematics",), ({},)),
+            (("kinematics", "base"), (mirrored, np.eye(3).tolist())),
+            (("kinematics", "palm"), (-1, 99, 1.0)),
+            (("kinematics", "tips"), ([0], [-1, 0], 0)),
+            ((*step, "parent"), (-1, 2)),
+            ((*step, "joint"), (-1, 5, None)),
+            ((*step, "axis"), ([5, 0, 0], [0, 0, 0], [1, 0])),
+            ((*step, "origin"), (mirrored, (1000 * np.eye(4)).tolist())),
+            ((*step, "multiplier"), (float("inf"),)),
+            (("objects", "brick"), ({}, 3)),
+            (("objects", "brick", "points"), ([[0, 0, float("nan")]] * 64, [])),
+        ):
+            *_, last = (part for part in place if isinstance(part, str))
+            for value in values:
+                with self.subTest(place, value=value), self.assertRaisesRegex(LiveError, last):
+                    Controller(self.changed(place, value), **load)
+
     @skipUnless(find_spec("websockets"), "websockets is not installed")
     def test_controller_server_and_runner_judge_quaternions_alike(self):
         from xreset.live.serve import _Episode
@@ -230,24 +281,18 @@ class ContractTest(InFolder):
             ({"observation": None}, "contract.json lacks observation, or has another type"),
             ({"policy_sha256": None}, "contract.json lacks policy_sha256"),
             ({"joints": {}}, "contract.json lacks joints"),
+            ({"rate": 30.0}, "contract.json was changed after its export"),
         ):
             file.write_text(json.dumps(self.contract | change))
             with self.subTest(words), self.assertRaisesRegex(LiveError, words):
                 load_controller(self.out)
             self.assertRaisesRegex(LiveError, words, read_contract, self.out)
-        observation = self.contract["observation"]
-        for change in (
-            {"joints": [{}] * 5},
-            {"observation": {}},
-            {"observation": observation | {"cloud_history": 3}},
-            {"observation": observation | {"cloud_scale": "x"}},
-            {"kinematics": {}},
-            {"objects": {"brick": {}}},
-        ):
-            file.write_text(json.dumps(self.contract | change))
-            words = "contract.json is damaged, or does not fit its policy"
-            with self.subTest(change), self.assertRaisesRegex(LiveError, words):
-                load_controller(self.out)
+        file.write_text('{"a": ' * 200_000)
+        self.assertRaisesRegex(LiveError, "is not an exported policy", load_controller, self.out)
+        other = self.changed(("observation", "cloud_history"), 3)
+        file.write_text(json.dumps(other | {"contract_sha256": digest(other)}))
+        words = "contract.json is damaged, or does not fit its policy"
+        self.assertRaisesRegex(LiveError, words, load_controller, self.out)
         file.write_text("[]")
         self.assertRaisesRegex(LiveError, "has schema 'None', this", load_controller, self.out)
         file.write_text(original[:100])
@@ -383,6 +428,24 @@ class ContractTest(InFolder):
                 self.assertRegex(episode.answer(text)["error"], words)
         self.assertEqual(episode.answer(json.dumps({"begin": begin})), {"begun": True})
         self.assertIn("joint_pos is missing", episode.answer('{"step": {}}')["error"])
+        told = episode.answer(json.dumps({"begin": begin | {"object": "x" * 500_000}}))
+        self.assertLess(len(told["error"]), 500)
+        self.assertEqual(episode.answer(json.dumps({"begin": begin})), {"begun": True})
+        reading = {
+            "joint_pos": self.home, "joint_vel": [0] * 5, "object_pos": [0.5, 0.3, 0.1],
+            "object_quat": [1, 0, 0, 0], "tip_force": [[0, 0, 0]] * 2,
+        }  # fmt: skip
+        self.assertIn("target", episode.answer(json.dumps({"step": reading})))
+        for name, value, words in (
+            ("joint_pos", [1e30] * 5, "joint_pos of .* is 1e.30, expected .*degrees"),
+            ("joint_pos", [90.0] * 5, "degrees"),
+            ("joint_vel", [3e38] * 5, r"joint_vel holds 3e\+38, expected at most 100 rad/s"),
+            ("object_pos", [500.0, 0, 0], "The object has the coordinate 500.*millimetres"),
+            ("tip_force", [[1e6, 0, 0]] * 2, "tip_force holds 1e.06"),
+        ):
+            answer = episode.answer(json.dumps({"step": reading | {name: value}}))
+            with self.subTest(name):
+                self.assertRegex(answer.get("error", ""), words)
 
     @skipUnless(find_spec("websockets"), "websockets is not installed")
     def test_the_command_serves_where_it_is_told_to(self):

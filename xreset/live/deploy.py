@@ -92,7 +92,7 @@ def deploy_contract(
         "objects": listed,
     }
     check_contract(contract, f"The task of {robot.name}")
-    return contract
+    return contract | {files.DIGEST: files.digest(contract)}
 
 
 def _joints(robot: RobotSpec, task: TaskConfig) -> list[dict[str, Any]]:

@@ -164,7 +164,8 @@ class _Episode:
             object_time=0.0,
             tip_force=force,
         )
-        return {"target": self._controller.step(reading.batched())[0].tolist()}
+        self._controller.check_reading(reading)
+        return {"target": self._controller.step(reading)[0].tolist()}
 
 
 def _numbers(given: Message, name: str, *shape: int) -> np.ndarray:

@@ -18,7 +18,11 @@ from .rotations import is_unit, multiply, rotate
 _MARGIN = 0.5
 """How far a target may be beyond a joint's limit when an episode begins [rad, m]."""
 _REACH = 10.0
-"""Farthest place of a goal, or of a point of an object [m]."""
+"""Farthest place of an object, of a point of it, or of a goal [m]."""
+_FASTEST = 100.0
+"""Largest velocity of a joint in a reading [rad/s, m/s]."""
+_STRONGEST = 1e4
+"""Largest force of a fingertip in a reading [N]."""
 
 
 class OnnxActor:
@@ -137,13 +141,7 @@ class Controller:
         joints = len(self.contract["joints"])
         if given.ndim != 2 or given.shape[1] != joints:
             raise LiveError(f"target has shape {np.shape(target)}, expected ({joints},).")
-        inside = (given >= self.lower - _MARGIN) & (given <= self.upper + _MARGIN)
-        if not inside.all():
-            robot, j = np.argwhere(~inside)[0]
-            raise LiveError(
-                f"target of {self.contract['joints'][j]['name']} is {given[robot, j]:g}, expected {self.lower[j]:g} to "
-                f"{self.upper[j]:g}. Are these degrees?"
-            )
+        self._check_joints("target", given)
         self.target = given
         expected = self.contract["observation"]["cloud_points"]
         shape = np.shape(object_points)
@@ -198,6 +196,33 @@ class Controller:
             )
         return positions
 
+    def _check_joints(self, what: str, values: Array) -> None:
+        """Raise ``LiveError`` if a value [N, J] is far beyond the limits of its joint, or not finite."""
+        inside = (values >= self.lower - _MARGIN) & (values <= self.upper + _MARGIN)
+        if not inside.all():
+            robot, j = np.argwhere(~inside)[0]
+            name = self.contract["joints"][j]["name"]
+            raise LiveError(
+                f"{what} of {name[:60]} is {values[robot, j]:g}, expected {self.lower[j]:g} to {self.upper[j]:g}. Are "
+                "these degrees?"
+            )
+
+    def check_reading(self, reading: Reading) -> None:
+        """Raise ``LiveError`` for numbers that no robot has, such as degrees or millimetres.
+
+        A :class:`~xreset.runtime.Runner` judges readings itself; loops without one call this method before
+        :meth:`step`.
+        """
+        self._must_have_begun()
+        reading = reading.batched()
+        self._check_joints("joint_pos", reading.joint_pos)
+        self._positions("The object", reading.object_pos, 3)
+        for name, unit, most in (("joint_vel", "rad/s", _FASTEST), ("tip_force", "N", _STRONGEST)):
+            values = getattr(reading, name)
+            largest = 0.0 if values is None else np.abs(values).max(initial=0.0)
+            if not largest <= most:
+                raise LiveError(f"{name} holds {largest:g}, expected at most {most:g} {unit}.")
+
     def _origin(self, pos: Array, quat: Array) -> Array:
         """[N, 3] where the policy's origin of the object is, for poses [N, 3], [N, 4] of the object's frame."""
         return pos if self._center is None else pos + rotate(quat, self._center)
@@ -214,7 +239,7 @@ class Controller:
         objects = self.contract["objects"]
         if name not in objects:
             raise LiveError(
-                f"The contract has no object {name!r}. Choose from: {', '.join(objects)}."
+                f"The contract has no object {str(name)[:60]!r}. Choose from: {', '.join(objects)}."
             )
         return np.array(objects[name][entry], dtype=np.float32)
 

@@ -6,14 +6,15 @@ They are written here from the fused bodies, so every mass and inertia is the sa
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from xreset.backends.rigid import OTHER_LINK, Inertia, Mechanism
+from xreset.backends.rigid import OTHER_LINK, Inertia, Mechanism, vertices
 from xreset.checks import frozen
-from xreset.geometry.shapes import roll_pitch_yaw, transform, transformed
+from xreset.geometry.shapes import roll_pitch_yaw, transform
 from xreset.geometry.urdf import Joint
 from xreset.spec import Shape
 
@@ -29,6 +30,8 @@ class Part:
     shapes: tuple[Shape, ...]
     owner: int
     """Index of the fingertip that the part belongs to, or ``OTHER_LINK``."""
+    bare: bool = False
+    """Whether it is a copy of friction 1, which touches links of the robot only."""
 
 
 def is_hull(shapes: Sequence[Shape]) -> bool:
@@ -48,9 +51,13 @@ def link_groups(shapes: Sequence[Shape]) -> list[tuple[Shape, ...]]:
 
 
 def robot_parts(robot: Mechanism) -> list[Part]:
-    """Return the base and the moving bodies, then the fixed pieces, so that Bullet's link i is body i."""
+    """Return the base and the moving bodies, then the fixed pieces, so that Bullet's link i is body i.
+
+    Links that touch one another have bare copies: a pair's friction is that of the rougher part.
+    """
     moving = []
     fixed = []
+    bare = []
     for i, body in enumerate(robot.bodies):
         for link in dict.fromkeys((body.name, *(item.link for item in body.shapes))):
             groups = link_groups([item.shape for item in body.shapes if item.link == link])
@@ -58,10 +65,12 @@ def robot_parts(robot: Mechanism) -> list[Part]:
                 Part(body=i, link=link, shapes=group, owner=robot.tip_of.get(link, OTHER_LINK))
                 for group in groups
             ]
+            if link in robot.robot.self_collision_links:
+                bare += [replace(part, bare=True) for part in parts if part.shapes]
             if link == body.name:
                 moving.append(parts.pop(0))
             fixed += parts
-    return moving + fixed
+    return moving + fixed + bare
 
 
 WEIGHTLESS = Inertia(
@@ -127,7 +136,7 @@ def _geometry(shape: Shape, mesh: Path) -> str:
     kind = shape.geometry.kind
     size = shape.geometry.size
     if shape.geometry.faces is not None:
-        lines = [f"v {_numbers(vertex)}" for vertex in moved_vertices(shape)]
+        lines = [f"v {_numbers(vertex)}" for vertex in vertices(shape)]
         lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in shape.geometry.faces]
         mesh.write_text("\n".join(lines) + "\n")
         return f'<mesh filename="{mesh.name}"/>'
@@ -136,11 +145,6 @@ def _geometry(shape: Shape, mesh: Path) -> str:
     if kind == "sphere":
         return f'<sphere radius="{size[0]!r}"/>'
     return f'<{kind} radius="{size[0]!r}" length="{2.0 * size[1]!r}"/>'
-
-
-def moved_vertices(shape: Shape) -> np.ndarray:
-    """[V, 3] vertices of a hull in the frame of its body."""
-    return transformed(np.asarray(shape.geometry.vertices), shape.T_body_shape)
 
 
 def _origin(T: np.ndarray) -> str:

@@ -76,14 +76,32 @@ _PATTERS = (
     "the convex contact model lifts what slides, by mu times speed times the contact's time constant, so it patters; "
     "an error of the drag counts twenty times here, and on average the drag is right"
 )
-KNOWN_DIFFERENCES = tuple(
+KNOWN_DIFFERENCES = (
     KnownDifference(
-        check="slope",
-        measure=f"acceleration, mu {mu}, {degrees} degrees",
-        bound=1.5,
-        reason=_PATTERS,
-    )
-    for mu, degrees in product((0.5, 0.8, 1.2), (0, 45))
+        check="long_spin",
+        measure="centre of mass",
+        bound=3e-3,
+        reason="MuJoCo moves the origin of the object's mesh by this point's velocity, so the centre of mass of a "
+        "spinning object drifts, in proportion to the timestep and to the distance between the two",
+    ),
+    KnownDifference(
+        check="sliding_height", measure="above the table", bound=0.012, reason=_PATTERS
+    ),
+    KnownDifference(
+        check="joint_friction",
+        measure="way within friction",
+        bound=0.4,
+        reason="dry friction is a soft constraint, so a joint that it holds creeps, by 2 mm/s at three quarters of it",
+    ),
+    *(
+        KnownDifference(
+            check="slope",
+            measure=f"acceleration, mu {mu}, {degrees} degrees",
+            bound=1.5,
+            reason=_PATTERS,
+        )
+        for mu, degrees in product((0.5, 0.8, 1.2), (0, 45))
+    ),
 )
 """Checks that both MuJoCo backends miss: at mu = 1.2 and 0.5 m/s, a 40 mm high box was seen to hop by 3.6 mm."""
 
@@ -296,11 +314,16 @@ def _limit_self_collision(
     """Keep the collisions between bodies that :meth:`Mechanism.may_collide` allows.
 
     MuJoCo excludes whole bodies. Where only some links of two bodies may collide, the bodies are excluded and the geoms
-    of those links are paired.
+    of those links are paired. In MuJoCo-Warp such a pair keeps the scene's friction.
     """
-    contact = _contact(scene.friction.link, scene)
-    slide, spin, roll = contact["friction"]
-    contact["friction"] = (slide, slide, spin, roll, roll)
+
+    def contact(*links: str) -> dict:
+        friction = scene.friction
+        rougher = max(friction.tip if link in robot.tip_of else friction.link for link in links)
+        attributes = _contact(rougher, scene)
+        slide, spin, roll = attributes["friction"]
+        return attributes | {"friction": (slide, slide, spin, roll, roll)}
+
     for i, j in combinations(range(len(geoms)), 2):
         pairs = list(product(geoms[i], geoms[j]))
         allowed = [(a, b) for a, b in pairs if robot.may_collide(geoms[i][a], geoms[j][b])]
@@ -308,7 +331,7 @@ def _limit_self_collision(
             continue
         spec.add_exclude(bodyname1=body_name(robot.bodies[i]), bodyname2=body_name(robot.bodies[j]))
         for a, b in allowed:
-            spec.add_pair(geomname1=a, geomname2=b, **contact)
+            spec.add_pair(geomname1=a, geomname2=b, **contact(geoms[i][a], geoms[j][b]))
 
 
 def _add_drives(

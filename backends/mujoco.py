@@ -177,8 +177,12 @@ class MujocoWorld(World):
         self._ahead = False
 
     def set_friction(self, friction: np.ndarray) -> None:
-        pairs = np.maximum((*friction, 0.0), MIN_FRICTION)
-        self._model.geom_friction[:, 0] = pairs[self._at.friction_column]
+        model = self._model
+        of_roles = np.maximum((*friction, 0.0), MIN_FRICTION)
+        of_geoms = of_roles[self._at.friction_column]
+        model.geom_friction[:, 0] = of_geoms
+        rougher = np.maximum(of_geoms[model.pair_geom1], of_geoms[model.pair_geom2])
+        model.pair_friction[:, :2] = rougher[:, None]
         self._ahead = False
 
     def set_torsional_friction(self, torsional: float) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import weakref
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import fields
 from typing import Any, ClassVar, TypeVar
 
@@ -39,14 +40,15 @@ class World(ABC):
     """One world of a scene in one process. Arrays are numpy float64; conventions are those of :class:`Backend`.
 
     The state is undefined until :meth:`set_state`, which the pool calls first. After each :meth:`set_state` and
-    :meth:`step`, the pool calls :meth:`get_state`, :meth:`health`, :meth:`contacts` and :meth:`links` once, in this
-    order. A world that reports a non-finite state is not stepped again before its state is set.
+    :meth:`step`, the pool calls :meth:`get_state`, :meth:`health` and :meth:`links` once, in this order;
+    :meth:`contacts`, between the latter two, only after a step. A world that reports a non-finite state is not stepped
+    again before its state is set. The first readings of a world are checked: names, shapes and types.
     """
 
-    gravity_fraction = 1.0
-    """Gravity fraction of the object."""
     force = torque = np.zeros(3)
-    """External wrench on the object until the next step: see :meth:`set_object_wrench`."""
+    """Wrench on the object until the next step: see :meth:`set_object_wrench`."""
+    gravity_fraction = 0.0
+    """Zero, for worlds written for xreset 0.3, which add this share of the weight: :attr:`force` has it now."""
 
     @abstractmethod
     def __init__(self, scene: SceneSpec, object_index: int) -> None:
@@ -71,18 +73,22 @@ class World(ABC):
     def step(self, n: int) -> None:
         """Advance by n physics steps."""
 
-    @abstractmethod
-    def links(self) -> LinkArrays:
+    def links(self) -> LinkArrays | None:
         """Return position [K, 3], orientation [K, 4], velocity of the origin [K, 3], angular velocity [K, 3] of links.
 
-        The arrays may be views of the engine's memory, which the next call that changes the world overwrites.
+        None, as here: the pool computes them from the state, with mimic joints where their sources put them. Override
+        it where mimic joints can lag, with the engine's own frames or :class:`~xreset.backends.rigid.TrackedLinks`. The
+        arrays may be views of the engine's memory, which the next call that changes the world overwrites.
         """
+        return None
 
     @abstractmethod
-    def contacts(self) -> ContactArrays:
-        """Return tip force [E, 3], tip touch [E] bool and table force [3] on the object in the last physics step.
+    def contacts(self) -> Iterable[tuple[int, np.ndarray]] | ContactArrays:
+        """Return the contacts of the object in the last physics step.
 
-        All are zero right after :meth:`set_state`.
+        Either a list with a pair for each contact: what touches the object (an index of a fingertip, or ``TABLE`` or
+        ``OTHER_LINK`` of :mod:`~xreset.backends.rigid`), and its force on the object [3]. Or a tuple of their sums: tip
+        force [E, 3], tip touch [E] bool and table force [3].
         """
 
     def health(self, state: StateArrays) -> tuple[bool, bool]:
@@ -111,11 +117,16 @@ class World(ABC):
         """Set the friction of the pairs object-tip, object-other link, object-table [3]."""
 
     def set_object_gravity(self, fraction: float) -> None:
-        """Set the object's gravity fraction."""
+        """Set the object's gravity fraction.
+
+        Override it only where the engine's own gravity pulls the object. Else the pool does not call it, and adds the
+        weight to the force.
+        """
         self.gravity_fraction = fraction
 
     def set_object_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
-        """Set the force [3] at the object's centre of mass and the torque [3]; called before every :meth:`step`."""
+        """Set the force [3] at the object's centre of mass, its weight included, and the torque [3]; called before
+        every :meth:`step`."""
         self.force = force
         self.torque = torque
 
@@ -197,7 +208,16 @@ class PoolBackend(Backend):
             # neighbours often hold the same object, and some objects take more time
             worlds = range(first, num_worlds, count)
             held = tuple(self.object_index[worlds].tolist())
-            jobs.append(Job(self.name, self.world_class, world_options, scene, worlds, held))
+            job = Job(
+                backend=self.name,
+                world_class=self.world_class,
+                adds_weight=self.world_class.set_object_gravity is World.set_object_gravity,
+                options=world_options,
+                scene=scene,
+                worlds=worlds,
+                object_index=held,
+            )
+            jobs.append(job)
         if workers == 0:
             self._arrays = arrays_in(bytearray(layout.itemsize), layout)
             self._team: LocalWorlds | WorkerTeam = LocalWorlds(jobs[0], self._arrays)

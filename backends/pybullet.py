@@ -2,11 +2,12 @@
 
 What differs from PyBullet's defaults, and why:
 
-- Gravity is off, and every step applies the object's weight as a force at its centre of mass: the robot is then
-  compensated exactly and gravity fractions cost nothing. A robot without compensation gets its weight from the engine.
+- Gravity is off: the robot is then compensated exactly. A robot without compensation gets its weight from the engine,
+  and the object, whose weight is part of its force, a force against this gravity.
 - Drives are torques computed in ``bullet_drives``. PyBullet's own position control holds objects with a wrong force.
 - Friction of a pair is the *product* of its bodies' coefficients, and its torsional friction is s_a mu_b + s_b mu_a.
-  With mu = 1 and s = 0 on the object, the other body's coefficients are the pair's.
+  With mu = 1 and s = 0 on the object, the other body's coefficients are the pair's. Robots touch tables of their own
+  and bare copies of their links, whose coefficients are solved for those pairs.
 - Poses and linear velocities of bodies refer to the centre of mass and the principal axes; they are converted here.
 """
 
@@ -28,10 +29,10 @@ from scipy.spatial.transform import Rotation
 from xreset.backends.bullet_drives import BulletDrives
 from xreset.backends.bullet_models import (
     WEIGHTLESS,
+    Part,
     inertial_frame,
     is_hull,
     link_groups,
-    moved_vertices,
     robot_parts,
     robot_urdf,
 )
@@ -39,7 +40,6 @@ from xreset.backends.pool import PoolBackend, World, is_finite
 from xreset.backends.rigid import (
     OTHER_LINK,
     TABLE,
-    ContactArrays,
     Inertia,
     LinkArrays,
     StateArrays,
@@ -51,7 +51,7 @@ from xreset.backends.rigid import (
     nearer,
     object_inertia,
     rotate,
-    sum_contacts,
+    vertices,
 )
 from xreset.errors import BackendUnavailableError, XResetError
 from xreset.physics import Capability, unavailable
@@ -65,6 +65,8 @@ _GEOM_INITIALIZE_SAT_FEATURES = 4
 """Bullet's flag of a collision shape, which PyBullet does not name: contacts between polyhedra are found on faces."""
 _NEWEST_PYTHON = (3, 11)
 """Newest Python for which PyBullet publishes wheels."""
+_LEAST_FRICTION = 1e-4
+"""Coefficient of a robot's link at least: 0 times any other would be 0."""
 _FAR = 100.0
 """A height [m] where nothing touches the object."""
 
@@ -106,17 +108,13 @@ class PybulletWorld(World):
         """Bullet's link numbers of the object."""
         self._robot = self._load_robot()
         self._object = self._load_object(groups)
-        table = p.createCollisionShape(
-            p.GEOM_BOX, halfExtents=scene.table.half_size, flags=_GEOM_INITIALIZE_SAT_FEATURES
-        )
-        self._table = p.createMultiBody(
-            0.0, table, basePosition=(*scene.table.center, -scene.table.half_size[2])
-        )
+        self._table = self._add_table()
+        self._table_of_tips = self._add_table()
+        self._table_of_links = self._add_table()
         for link, part in enumerate(self._parts):
             self._remove_defaults(self._robot, link, part.shapes)
         for link, group in zip(self._pieces_of_object, groups, strict=True):
             self._remove_defaults(self._object, link, group)
-        self._remove_defaults(self._table, -1, ())
         self._set_collision_pairs()
 
         self._drives = BulletDrives(p, self._robot, self._mechanism, dt)
@@ -124,7 +122,6 @@ class PybulletWorld(World):
         self._frames = TrackedFrames(self._mechanism)
         self._from_principal = conjugate(self._inertia.quat)
         self.set_friction(self._friction)
-        self._fresh = True
         self._quat = np.array([1.0, 0.0, 0.0, 0.0])
         self._clean = p.saveState()
 
@@ -141,7 +138,6 @@ class PybulletWorld(World):
         p.resetBasePositionAndOrientation(self._object, state["object_pos"] + arm, _xyzw(principal))
         omega = state["object_angvel"]
         p.resetBaseVelocity(self._object, state["object_linvel"] + cross(omega, arm), omega)
-        self._fresh = True
 
     def get_state(self) -> StateArrays:
         com, principal = self._p.getBasePositionAndOrientation(self._object)
@@ -166,7 +162,7 @@ class PybulletWorld(World):
     def step(self, n: int) -> None:
         p = self._p
         force = np.array(self.force)
-        force[2] += self._inertia.mass * (-GRAVITY * self.gravity_fraction - self._world_gravity)
+        force[2] -= self._inertia.mass * self._world_gravity
         turned = bool(self.torque.any())
         for _ in range(n * INTERNAL_STEPS):
             self._drives.apply()
@@ -175,7 +171,6 @@ class PybulletWorld(World):
             if turned:
                 p.applyExternalTorque(self._object, -1, self.torque, p.WORLD_FRAME)
             p.stepSimulation()
-        self._fresh = False
 
     def links(self) -> LinkArrays:
         states = self._p.getLinkStates(
@@ -184,11 +179,11 @@ class PybulletWorld(World):
         rows = np.array([state[4] + state[5] + state[6] + state[7] for state in states])
         return self._frames.locate(rows[:, :3], rows[:, [6, 3, 4, 5]], rows[:, 7:10], rows[:, 10:])
 
-    def contacts(self) -> ContactArrays:
-        """See :meth:`World.contacts`. The forces are those of the last internal step."""
+    def contacts(self) -> list[tuple[int, np.ndarray]]:
+        """See :meth:`World.contacts`. The forces are those of the last of Bullet's steps."""
         found = []
         # All contacts: when asked for a body, PyBullet swaps the two bodies and the normal, but not the friction.
-        for contact in () if self._fresh else self._p.getContactPoints():
+        for contact in self._p.getContactPoints():
             _, first, second, first_link, second_link, _, _, normal, _, press, *friction = contact
             if self._object not in (first, second):
                 continue
@@ -206,7 +201,7 @@ class PybulletWorld(World):
                 found.append((TABLE, force))
             elif press > 0:
                 found.append((self._parts[link].owner, force))
-        return sum_contacts(len(self._scene.robot.fingertips), found)
+        return found
 
     def mass_properties(self) -> list[Inertia]:
         """See :meth:`World.mass_properties`. The object is loaded in the frame of its inertia."""
@@ -241,15 +236,30 @@ class PybulletWorld(World):
         )
 
     def set_friction(self, friction: np.ndarray) -> None:
+        tips_were_rougher = self._tips_are_rougher
         self._friction = friction
+        if self._tips_are_rougher != tips_were_rougher:  # other copies of links touch
+            state = self.get_state()
+            self._rebuild()
+            self.set_state(state)
+            return
         tip, link, table = friction.tolist()
         for piece in self._pieces_of_object:
             self._set_surface(self._object, piece, 1.0, 0.0)
         self._set_surface(self._table, -1, table, self._torsional)
+        for own, mu in ((self._table_of_tips, tip), (self._table_of_links, link)):
+            self._set_surface(own, -1, max(mu, table) / max(mu, _LEAST_FRICTION), 0.0)
         for i, part in enumerate(self._parts):
-            self._set_surface(
-                self._robot, i, link if part.owner == OTHER_LINK else tip, self._torsional
-            )
+            if part.bare:
+                self._set_surface(self._robot, i, 1.0, 0.0)
+            else:
+                mu = link if part.owner == OTHER_LINK else tip
+                self._set_surface(self._robot, i, max(mu, _LEAST_FRICTION), self._torsional)
+
+    @property
+    def _tips_are_rougher(self) -> bool:
+        tip, link, _ = self._friction
+        return bool(tip >= link)
 
     def _set_surface(self, body: int, link: int, friction: float, torsional: float) -> None:
         self._p.changeDynamics(body, link, lateralFriction=friction, spinningFriction=torsional)
@@ -328,9 +338,9 @@ class PybulletWorld(World):
         """
         p = self._p
         if is_hull(shapes):
-            vertices = moved_vertices(shapes[0]).tolist()
+            corners = vertices(shapes[0]).tolist()
             index = p.createCollisionShape(
-                p.GEOM_MESH, vertices=vertices, flags=_GEOM_INITIALIZE_SAT_FEATURES
+                p.GEOM_MESH, vertices=corners, flags=_GEOM_INITIALIZE_SAT_FEATURES
             )
             alone = p.createMultiBody(0.0, index)
             p.changeDynamics(alone, -1, collisionMargin=0.0)
@@ -368,6 +378,18 @@ class PybulletWorld(World):
         if is_hull(shapes):
             p.changeDynamics(body, link, collisionMargin=0.0)
 
+    def _add_table(self) -> int:
+        """Add the table. The object, fingertips and other links touch one each, so that each pair has its friction."""
+        p = self._p
+        table = self._scene.table
+        shape = p.createCollisionShape(
+            p.GEOM_BOX, halfExtents=table.half_size, flags=_GEOM_INITIALIZE_SAT_FEATURES
+        )
+        place = (*table.center, -table.half_size[2])
+        body = p.createMultiBody(0.0, shape, basePosition=place)
+        self._remove_defaults(body, -1, ())
+        return body
+
     def _set_collision_pairs(self) -> None:
         def allow(body: int, link: int, other: int, other_link: int, yes: bool) -> None:
             self._p.setCollisionFilterPair(body, other, link, other_link, int(yes))
@@ -375,13 +397,30 @@ class PybulletWorld(World):
         excluded = self._scene.robot.table_exclude
         for piece in self._pieces_of_object:
             allow(self._object, piece, self._table, -1, True)
+            allow(self._object, piece, self._table_of_tips, -1, False)
+            allow(self._object, piece, self._table_of_links, -1, False)
         for link, part in enumerate(self._parts):
-            allow(self._robot, link, self._table, -1, part.link not in excluded)
+            on_table = part.link not in excluded and not part.bare
+            is_tip = part.owner != OTHER_LINK
+            allow(self._robot, link, self._table, -1, False)
+            allow(self._robot, link, self._table_of_tips, -1, on_table and is_tip)
+            allow(self._robot, link, self._table_of_links, -1, on_table and not is_tip)
             for piece in self._pieces_of_object:
-                allow(self._robot, link, self._object, piece, True)
+                allow(self._robot, link, self._object, piece, not part.bare)
             for other, other_part in enumerate(self._parts[:link]):
-                may_collide = self._mechanism.may_collide(part.link, other_part.link)
-                allow(self._robot, link, self._robot, other, may_collide)
+                allow(self._robot, link, self._robot, other, self._may_touch(part, other_part))
+
+    def _may_touch(self, part: Part, other: Part) -> bool:
+        """Return whether two parts of the robot touch: of two links, the rougher one and the bare copy of the other."""
+        if part.bare == other.bare or not self._mechanism.may_collide(part.link, other.link):
+            return False
+        rough = other if part.bare else part
+        bare = part if part.bare else other
+        rough_is_tip = rough.owner != OTHER_LINK
+        bare_is_tip = bare.owner != OTHER_LINK
+        if rough_is_tip != bare_is_tip:
+            return rough_is_tip == self._tips_are_rougher
+        return rough.link < bare.link
 
 
 class PybulletBackend(PoolBackend):

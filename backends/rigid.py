@@ -10,13 +10,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xreset.checks import frozen
-from xreset.errors import ObjectError, RobotError, XResetError
+from xreset.errors import ObjectError, RobotError, WrongValueError, XResetError
 from xreset.geometry.dynamics import drive_shares, drive_values
+from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.shapes import pose_matrix, shape_mesh, transformed
 from xreset.geometry.urdf import Joint, Link, robot_tree
 from xreset.spec import ObjectSpec, RobotSpec, Shape
 
@@ -121,6 +124,19 @@ class Mechanism:
             tips |= dict.fromkeys(tip.contact_links, i)
         return tips
 
+    @cached_property
+    def limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper limits [J] of the actuated joints, within which the joints that follow them keep theirs too;
+        infinite where there is none."""
+        kinematics = Kinematics(self.robot)
+        return kinematics.lower.numpy(), kinematics.upper.numpy()
+
+    @cached_property
+    def colliding_links(self) -> tuple[tuple[str, str], ...]:
+        """The pairs of links that collide with each other in physics: see :meth:`may_collide`."""
+        pairs = combinations(self.robot.self_collision_links, 2)
+        return tuple(pair for pair in pairs if self.may_collide(*pair))
+
     def may_collide(self, a: str, b: str) -> bool:
         """Return whether two links of the robot collide with each other in physics.
 
@@ -135,6 +151,15 @@ class Mechanism:
         i = self.frames[a][0]
         j = self.frames[b][0]
         return i != j and self.bodies[i].parent != j and self.bodies[j].parent != i
+
+
+def vertices(shape: Shape) -> np.ndarray:
+    """Return the corners [V, 3] of any convex shape in its body's frame; a round shape is a polyhedron of many."""
+    geometry = shape.geometry
+    corners = shape_mesh(shape).vertices if geometry.vertices is None else None
+    if corners is None:
+        corners = transformed(np.asarray(geometry.vertices), shape.T_body_shape)
+    return np.asarray(corners, dtype=float)
 
 
 def mechanism(robot: RobotSpec) -> Mechanism:
@@ -211,6 +236,60 @@ class TrackedFrames:
         """
         velocity = com_velocity + cross(angvel, rotate(quat, self._lever))
         return pos + rotate(quat, self.pos), multiply(quat, self.quat), velocity, angvel
+
+
+class TrackedLinks:
+    """The tracked links of a robot, computed from the positions and velocities of its moving joints."""
+
+    def __init__(self, robot: Mechanism) -> None:
+        moving = robot.bodies[1:]
+        joints = [body.joint for body in moving]
+        self._frames = TrackedFrames(robot)
+        base = pose_matrix(robot.robot.base_pos, robot.robot.base_quat)
+        self._base = base @ robot.bodies[0].T_parent_body
+        self._parents = [body.parent for body in moving]
+        T = np.array([body.T_parent_body for body in moving])
+        self._offset = T[:, :3, 3]
+        self._axis = np.array([joint.axis for joint in joints])
+        self._slides = np.array([joint.type == "prismatic" for joint in joints])
+        R = T[:, :3, :3]
+        K = np.cross(np.eye(3), self._axis[:, None, :])  # K v = axis x v
+        self._R = R
+        self._RK = R @ K
+        self._RKK = R @ K @ K
+        moved = np.eye(len(robot.bodies), dtype=bool)
+        """[B + 1, B + 1] whether the second body is the first, or carries it."""
+        for i, body in enumerate(moving, start=1):
+            moved[i] |= moved[body.parent]
+        self._moved = moved[self._frames.bodies, 1:].astype(float)
+
+    def locate(self, position: np.ndarray, velocity: np.ndarray) -> LinkArrays:
+        """Return position, orientation, velocity and angular velocity of the tracked links.
+
+        Args:
+            position: [D] of all moving joints, in the order of the bodies.
+            velocity: [D]
+        """
+        angle = np.where(self._slides, 0.0, position)[:, None, None]
+        turns = self._R + np.sin(angle) * self._RK + (1.0 - np.cos(angle)) * self._RKK
+        way = np.where(self._slides, position, 0.0)[:, None, None]
+        shifts = self._offset + (self._R @ (way * self._axis[..., None]))[..., 0]
+        rotations = [self._base[:3, :3]]
+        origins = [self._base[:3, 3]]
+        for parent, turn, shift in zip(self._parents, turns, shifts, strict=True):
+            origins.append(origins[parent] + rotations[parent] @ shift)
+            rotations.append(rotations[parent] @ turn)
+        R = np.array(rotations)
+        o = np.array(origins)
+        bodies = self._frames.bodies
+        quat = Rotation.from_matrix(R[bodies]).as_quat(scalar_first=True)
+        pos = o[bodies] + (R[bodies] @ self._frames.pos[..., None])[..., 0]
+        # A joint moves what it carries along its axis a, or turns it about a: v = w x (p - o).
+        along = velocity[:, None] * (R[1:] @ self._axis[..., None])[..., 0]
+        spin = np.where(self._slides[:, None], 0.0, along)
+        angvel = self._moved @ spin
+        linvel = self._moved @ (along - spin - cross(spin, o[1:])) + cross(angvel, pos)
+        return pos, multiply(quat, self._frames.quat), linvel, angvel
 
 
 class MovingJoints:
@@ -323,9 +402,14 @@ def sum_contacts(tips: int, contacts: Iterable[tuple[int, np.ndarray]]) -> Conta
     for owner, force in contacts:
         if owner == TABLE:
             table_force += force
-        elif owner >= 0:
+        elif 0 <= owner < tips:
             tip_force[owner] += force
             tip_touch[owner] = True
+        elif owner != OTHER_LINK:
+            raise WrongValueError(
+                f"a contact has the owner {owner}, expected TABLE ({TABLE}), OTHER_LINK ({OTHER_LINK}) or the index of "
+                f"a fingertip, below {tips}"
+            )
     return tip_force, tip_touch, table_force
 
 

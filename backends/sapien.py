@@ -5,13 +5,14 @@ What differs from SAPIEN's defaults, and why:
 - The TGS solver, a contact offset of 1 mm (the default of 10 mm loses grasps), no sleeping, no damping, no joint
   friction (the default of 0.05 is no torque, and brakes).
 - Friction of a pair is the *average* of its materials. With 0 on the object, the other material has twice the pair's
-  coefficient. Torsional friction is mu times ``min_patch_radius``, so that radius is torsional / mu. PhysX omits it
-  where a patch has two points and lets half of the sliding friction act at each (``docs/sim-to-sim.md``).
-- The robot feels no gravity (if it is compensated). The object's weight is applied as a force, which gives gravity
-  fractions.
+  coefficient. Robots touch tables of their own and copies of their links, whose materials make up the difference.
+  Torsional friction is mu times ``min_patch_radius``, so that radius is torsional / mu. PhysX omits it where a patch
+  has two points and lets half of the sliding friction act at each (``docs/sim-to-sim.md``).
+- The robot feels no gravity (if it is compensated), nor does the object, whose weight is part of its force.
 - PhysX reports the normal forces of contacts only; friction is computed from the object's momentum
   (:func:`~xreset.backends.rigid.friction_forces`).
-- Linear velocities refer to the centre of mass; they are converted here. PhysX computes in single precision.
+- Linear velocities refer to the centre of mass; they are converted here. Those of links belong to the poses before the
+  last step, so links are computed from the joints. PhysX computes in single precision.
 """
 
 from __future__ import annotations
@@ -29,11 +30,10 @@ from xreset.backends.pool import PoolBackend, World
 from xreset.backends.rigid import (
     OTHER_LINK,
     TABLE,
-    ContactArrays,
     Inertia,
     LinkArrays,
     StateArrays,
-    TrackedFrames,
+    TrackedLinks,
     cross,
     friction_forces,
     matrix_to_quat,
@@ -41,9 +41,14 @@ from xreset.backends.rigid import (
     nearer,
     object_inertia,
     rotate,
-    sum_contacts,
 )
-from xreset.backends.sapien_robot import OBJECT_BIT, TABLE_BIT, SapienJoints, self_collision_bits
+from xreset.backends.sapien_robot import (
+    OBJECT_BIT,
+    TABLE_OF_LINKS_BIT,
+    TABLE_OF_TIPS_BIT,
+    SapienJoints,
+    self_collision_bits,
+)
 from xreset.geometry.shapes import perpendicular, transform
 from xreset.geometry.urdf import Joint
 from xreset.physics import Capability, KnownDifference, unavailable
@@ -65,7 +70,7 @@ class SapienWorld(World):
         self._mechanism = robot = mechanism(scene.robot)
         self._inertia = object_inertia(scene.objects[object_index])
         self._torsional = scene.friction.torsional
-        names = ("tip", "link", "table", "object")
+        names = ("tip", "link", "table", "bare", "table of tips", "table of links", "link of tips")
         self._materials = {name: sapien.physx.PhysxMaterial(0.0, 0.0, 0.0) for name in names}
         self._owners: dict[Any, int] = {}
         """Collision shape -> what it belongs to."""
@@ -78,13 +83,12 @@ class SapienWorld(World):
             self._object = self._add_object(scene.objects[object_index].pieces)
         self._renew_scene()
         self._joints = SapienJoints(self._bodies, robot, scene.timestep)
-        self._frames = TrackedFrames(robot)
-        self._tracked = [self._bodies[i] for i in self._frames.bodies]
+        self._tracked = TrackedLinks(robot)
         self.set_friction(np.array([scene.friction.tip, scene.friction.link, scene.friction.table]))
         self._quat = np.array([1.0, 0.0, 0.0, 0.0])
-        self._last_step: tuple[np.ndarray, ...] | None = None
+        self._last_step: tuple[np.ndarray, ...] = ()
         """The object's velocity, angular velocity and orientation before the last physics step, and the force and
-        torque that were given; None right after a state is set."""
+        torque that were given."""
 
     def set_state(self, state: StateArrays) -> None:
         self._renew_scene()
@@ -96,7 +100,6 @@ class SapienWorld(World):
             omega, rotate(self._quat, self._inertia.com)
         )
         self._object.angular_velocity = omega
-        self._last_step = None
 
     def get_state(self) -> StateArrays:
         pose = self._object.entity_pose
@@ -119,28 +122,18 @@ class SapienWorld(World):
 
     def step(self, n: int) -> None:
         body = self._object
-        force = np.array(self.force)
-        force[2] -= self._inertia.mass * GRAVITY * self.gravity_fraction
         for remaining in reversed(range(n)):
             self._joints.brake()
-            body.add_force_torque(force, self.torque)
+            body.add_force_torque(self.force, self.torque)
             if not remaining:
                 motion = (body.linear_velocity, body.angular_velocity, body.entity_pose.q)
-                self._last_step = (*motion, force, self.torque)
+                self._last_step = (*motion, self.force, self.torque)
             self._system.step()
 
     def links(self) -> LinkArrays:
-        parts = []
-        for body in self._tracked:
-            pose = body.entity_pose
-            parts += (pose.p, pose.q, body.linear_velocity, body.angular_velocity)
-        rows = np.concatenate(parts, dtype=np.float64).reshape(-1, 13)
-        return self._frames.locate(rows[:, :3], rows[:, 3:7], rows[:, 7:10], rows[:, 10:])
+        return self._tracked.locate(*self._joints.read_all())
 
-    def contacts(self) -> ContactArrays:
-        tips = len(self._mechanism.robot.fingertips)
-        if self._last_step is None:
-            return sum_contacts(tips, ())
+    def contacts(self) -> list[tuple[int, np.ndarray]]:
         owners, points, forces = self._contact_points()
         if owners:
             pose = self._object.entity_pose
@@ -148,7 +141,7 @@ class SapienWorld(World):
             coefficients = np.array([self._friction[_material(owner)] for owner in owners])
             missing = self._missing_wrench(self._last_step, arms, forces)
             forces = forces + friction_forces(arms, forces, coefficients, *missing)
-        return sum_contacts(tips, zip(owners, forces, strict=True))
+        return list(zip(owners, forces, strict=True))
 
     def mass_properties(self) -> list[Inertia]:
         found = []
@@ -171,7 +164,13 @@ class SapienWorld(World):
         self._friction: dict[str, float] = dict(
             zip(("tip", "link", "table"), friction.tolist(), strict=True)
         )
-        for name, mu in self._friction.items():
+        tip, link, table = friction.tolist()
+        coefficients = self._friction | {
+            "table of tips": max(tip, table) - tip,
+            "table of links": max(link, table) - link,
+            "link of tips": max(tip, link) - tip,
+        }
+        for name, mu in coefficients.items():
             self._materials[name].static_friction = 2.0 * mu
             self._materials[name].dynamic_friction = 2.0 * mu
         self.set_torsional_friction(self._torsional)
@@ -190,7 +189,9 @@ class SapienWorld(World):
     def _add_table(self, scene: SceneSpec) -> None:
         body = self._sapien.physx.PhysxRigidStaticComponent()
         shape = Shape(geometry=Geometry(kind="box", size=scene.table.half_size))
-        self._attach(body, shape, TABLE, (TABLE_BIT, OBJECT_BIT))
+        self._attach(body, shape, TABLE, (0, OBJECT_BIT))
+        self._attach(body, shape, None, (TABLE_OF_TIPS_BIT, 0), "table of tips")
+        self._attach(body, shape, None, (TABLE_OF_LINKS_BIT, 0), "table of links")
         self._add(
             body, "table", self._sapien.Pose([*scene.table.center, -scene.table.half_size[2]])
         )
@@ -198,7 +199,7 @@ class SapienWorld(World):
     def _add_object(self, pieces: Sequence[Shape]) -> Any:
         body = self._sapien.physx.PhysxRigidDynamicComponent()
         for piece in pieces:
-            self._attach(body, piece, None, (OBJECT_BIT, 0))
+            self._attach(body, piece, None, (OBJECT_BIT, 0), "bare")
         self._set_inertia(body, self._inertia)
         body.disable_gravity = True
         self._add(body, "object", self._sapien.Pose())
@@ -212,10 +213,15 @@ class SapienWorld(World):
             parent = links[body.parent] if body.parent >= 0 else None
             link = self._sapien.physx.PhysxArticulationLinkComponent(parent)
             for part in body.shapes:
-                bits, partner_bits = self_bits.get(part.link, (0, 0))
-                table_bit = 0 if part.link in robot.table_exclude else TABLE_BIT
                 owner = self._mechanism.tip_of.get(part.link, OTHER_LINK)
-                self._attach(link, part.shape, owner, (bits, partner_bits | OBJECT_BIT | table_bit))
+                table_bit = TABLE_OF_LINKS_BIT if owner == OTHER_LINK else TABLE_OF_TIPS_BIT
+                if part.link in robot.table_exclude:
+                    table_bit = 0
+                bit, of_same_kind, of_tips = self_bits.get(part.link, (0, 0, 0))
+                self._attach(link, part.shape, owner, (bit, OBJECT_BIT | table_bit))
+                for partners, material in ((of_same_kind, "bare"), (of_tips, "link of tips")):
+                    if partners:
+                        self._attach(link, part.shape, None, (0, partners), material)
             if body.inertia is not None:
                 self._set_inertia(link, body.inertia)
             link.disable_gravity = robot.gravity_compensated
@@ -239,12 +245,27 @@ class SapienWorld(World):
         limited = np.isfinite(joint.lower) and np.isfinite(joint.upper)
         made.limit = [[joint.lower, joint.upper] if limited else [-np.inf, np.inf]]
 
-    def _attach(self, body: Any, shape: Shape, owner: int | None, groups: tuple[int, int]) -> None:
-        """Add a collision shape of the object (no owner), the table, a link or a fingertip."""
+    def _attach(
+        self,
+        body: Any,
+        shape: Shape,
+        owner: int | None,
+        groups: tuple[int, int],
+        material_name: str = "",
+    ) -> None:
+        """Add a collision shape.
+
+        Args:
+            body: what it is part of.
+            shape: the shape.
+            owner: what touches the object with it: the table, a fingertip or another link. None: nothing.
+            groups: which others it touches: see ``sapien_robot``.
+            material_name: its material; default: that of its owner.
+        """
         physx = self._sapien.physx
         geometry = shape.geometry
         size = geometry.size
-        material = self._materials["object" if owner is None else _material(owner)]
+        material = self._materials[material_name if owner is None else _material(owner)]
         T = shape.T_body_shape
         if geometry.kind == "box":
             made = physx.PhysxCollisionShapeBox(half_size=size, material=material)
@@ -346,11 +367,29 @@ _CREEPS = (
     "PhysX's patch friction gives way a little in every step, the more the nearer the load is to the cone; twice the "
     "position iterations would bring it to 0.4 mm/s, at twice the time"
 )
-KNOWN_DIFFERENCES = tuple(
+KNOWN_DIFFERENCES = (
+    *(
+        KnownDifference(
+            check="drive_equation",
+            measure=f"step of {step} m, stiffer and weaker",
+            bound=0.06,
+            reason="a drive that leaves its effort limit lags, in proportion to the timestep",
+        )
+        for step in ("+0.08", "-0.08")
+    ),
     KnownDifference(
-        check="slope", measure=f"creep, mu {mu}, {degrees} degrees", bound=1e-3, reason=_CREEPS
-    )
-    for mu, degrees in product((0.8, 1.2), (0, 45))
+        check="joint_friction",
+        measure="way within friction",
+        bound=0.4,
+        reason="PhysX applies a torque at the beginning of a step and the drive during it, so a joint that dry "
+        "friction holds creeps, by 2.5 mm/s, until the drive alone balances the friction",
+    ),
+    *(
+        KnownDifference(
+            check="slope", measure=f"creep, mu {mu}, {degrees} degrees", bound=1e-3, reason=_CREEPS
+        )
+        for mu, degrees in product((0.8, 1.2), (0, 45))
+    ),
 )
 """Checks that PhysX misses with these settings."""
 

@@ -23,6 +23,7 @@ class SapienJoints:
         joints = {joint.name: joint for joint in articulation.active_joints}
         self._moving = moving = MovingJoints(spec, list(joints))
         self._driven = moving.driven
+        self._by_body = [list(joints).index(name) for name in robot.joint_names]
         for joint in articulation.active_joints:
             joint.set_friction(0.0)
         for described in spec.joints:
@@ -57,6 +58,12 @@ class SapienJoints:
         """Return positions and velocities [J] of the actuated joints."""
         position = self._articulation.qpos[self._driven]
         velocity = self._articulation.qvel[self._driven]
+        return position.astype(np.float64), velocity.astype(np.float64)
+
+    def read_all(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions and velocities [D] of all moving joints, in the order of the bodies."""
+        position = self._articulation.qpos[self._by_body]
+        velocity = self._articulation.qvel[self._by_body]
         return position.astype(np.float64), velocity.astype(np.float64)
 
     def set_drives(self, scale: np.ndarray) -> None:
@@ -138,14 +145,20 @@ def _couple(articulation: Any, joints: Mapping[str, Any], mimic: MimicSpec) -> N
 # Two shapes collide if a bit of the first group of one is in the second group of the other.
 
 OBJECT_BIT = 1
-TABLE_BIT = 2
-_SELF_BITS = range(2, 32)
+TABLE_OF_TIPS_BIT = 2
+TABLE_OF_LINKS_BIT = 4
+_SELF_BITS = range(3, 32)
 
 
-def self_collision_bits(robot: Mechanism) -> dict[str, tuple[int, int]]:
-    """Return link -> first and second group, such that exactly the links that may collide with each other do.
+def self_collision_bits(robot: Mechanism) -> dict[str, tuple[int, int, int]]:
+    """Return the bits such that exactly the links that may collide with each other do, each pair once.
 
-    Each link has a bit of its own in the first group, and those of its partners in the second group.
+    Of a pair, the shapes of one link touch copies of the other's shapes, whose friction is solved for that pair. A
+    fingertip's own shapes touch the copies of another link.
+
+    Returns:
+        Link -> its own bit; those of its partners of the same kind that its copies touch; those of the fingertips that
+        its copies touch.
 
     Raises:
         XResetError: the robot has more links than there are bits.
@@ -156,11 +169,14 @@ def self_collision_bits(robot: Mechanism) -> dict[str, tuple[int, int]]:
             f"Robot {robot.robot.name!r}: {len(links)} links may collide with one another, and PhysX has bits for "
             f"{len(_SELF_BITS)}. Shorten self_collision_links."
         )
-    groups = {}
-    for link, bit in zip(links, _SELF_BITS, strict=False):
-        partners = 0
-        for other, other_bit in zip(links, _SELF_BITS, strict=False):
-            if robot.may_collide(link, other):
-                partners |= 1 << other_bit
-        groups[link] = (1 << bit, partners)
-    return groups
+    bits = {link: 1 << bit for link, bit in zip(links, _SELF_BITS, strict=False)}
+    of_same_kind = dict.fromkeys(links, 0)
+    of_tips = dict.fromkeys(links, 0)
+    for link, other in robot.colliding_links:
+        if (link in robot.tip_of) == (other in robot.tip_of):
+            of_same_kind[other] |= bits[link]
+        elif link in robot.tip_of:
+            of_tips[other] |= bits[link]
+        else:
+            of_tips[link] |= bits[other]
+    return {link: (bits[link], of_same_kind[link], of_tips[link]) for link in links}

@@ -17,6 +17,7 @@ import sys
 import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
@@ -24,10 +25,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from torch import Tensor
 
-from xreset.backends.rigid import object_inertia
-from xreset.errors import XResetError
+from xreset.backends.rigid import (
+    Inertia,
+    MovingJoints,
+    TrackedLinks,
+    mechanism,
+    object_inertia,
+    sum_contacts,
+)
+from xreset.errors import WrongValueError, XResetError
 from xreset.physics import Contacts, Links, Parameter, Parameters, State, no_readings
-from xreset.spec import SceneSpec
+from xreset.spec import GRAVITY, SceneSpec
 from xreset.text import shown
 
 if TYPE_CHECKING:
@@ -86,6 +94,8 @@ class Job:
 
     backend: str
     world_class: type[World]
+    adds_weight: bool
+    """Whether the object's weight is part of the force that its world is given."""
     options: Mapping[str, Any]
     scene: SceneSpec
     worlds: range
@@ -113,7 +123,16 @@ class LocalWorlds:
         self._arrays = {name: array[own] for name, array in arrays.items()}
         self._given: dict[str, np.ndarray] = {}
         self._worlds: list[World] = []
-        self._inertia_changes: list[dict[str, Any]] = [{} for _ in job.object_index]
+        count = len(job.object_index)
+        self._inertia_changes: list[dict[str, Any]] = [{} for _ in range(count)]
+        objects = [job.scene.objects[i] for i in job.object_index]
+        self._masses = [float(obj.mass) for obj in objects]
+        self._gravity = [1.0] * count
+        """Gravity fraction of each world's object."""
+        self._unread = [{"get_state", "health", "contacts", "links"} for _ in range(count)]
+        """Readings of each world that have not been checked yet."""
+        robot = job.scene.robot
+        self._tips = len(robot.fingertips)
 
     def command(self, method: str, worlds: np.ndarray | None, argument: Any) -> Exception | None:
         """Run one of the methods below for the given worlds (all if None), then publish what they report.
@@ -136,7 +155,7 @@ class LocalWorlds:
                 action(row, argument)
             if method in _MOVING:
                 for row in rows:
-                    self._publish(row)
+                    self._publish(row, stepped=method == "step")
         except Exception as error:
             world = f"world {own[row]}"
             if isinstance(error, XResetError):  # one that the user can fix
@@ -167,12 +186,27 @@ class LocalWorlds:
             return
         world = self._worlds[i]
         wrench = self._given["wrench"][i]
+        if self._job.adds_weight:
+            wrench[2] += self._masses[i] * (-GRAVITY * self._gravity[i])
         world.set_joint_targets(self._given["joint_target"][i])
         world.set_object_wrench(wrench[:3], wrench[3:])
         world.step(n)
 
+    @cached_property
+    def _tracked(self) -> tuple[MovingJoints, TrackedLinks]:
+        robot = mechanism(self._job.scene.robot)
+        return MovingJoints(robot.robot, robot.joint_names), TrackedLinks(robot)
+
     def _mass_properties(self, i: int, _) -> None:
-        for k, body in enumerate(self._worlds[i].mass_properties()):
+        world = self._worlds[i]
+        bodies = world.mass_properties()
+        count = self._arrays["body_mass"].shape[1]
+        if len(bodies) != count or not all(isinstance(body, Inertia) for body in bodies):
+            raise WrongValueError(
+                f"{type(world).__qualname__}.mass_properties() returns {shown(bodies)}, expected {count} Inertia: of "
+                "each moving body of the robot, then of the object"
+            )
+        for k, body in enumerate(bodies):
             self._arrays["body_mass"][i, k] = body.mass
             self._arrays["body_com"][i, k] = body.com
             self._arrays["body_inertia"][i, k] = body.matrix
@@ -181,29 +215,89 @@ class LocalWorlds:
         value = self._arrays[name][i].astype(np.float64)
         if not value.ndim:
             value = float(value)
+        world = self._worlds[i]
+        if name == "object_gravity":
+            self._gravity[i] = value
+            if self._job.adds_weight:
+                return
         if name not in _INERTIA_ARGUMENT:
-            getattr(self._worlds[i], f"set_{name}")(value)
+            getattr(world, f"set_{name}")(value)
             return
         changes = self._inertia_changes[i]
         changes[_INERTIA_ARGUMENT[name]] = value
         nominal = object_inertia(self._job.scene.objects[self._job.object_index[i]])
-        self._worlds[i].set_object_inertia(nominal.changed(**changes))
+        inertia = nominal.changed(**changes)
+        self._masses[i] = inertia.mass
+        world.set_object_inertia(inertia)
 
-    def _publish(self, i: int) -> None:
+    def _publish(self, i: int, stepped: bool) -> None:
         """Copy what a world reports to the shared arrays."""
         arrays = self._arrays
         if arrays["nonfinite"][i]:  # nothing has moved since that was published
             return
         world = self._worlds[i]
         state = world.get_state()
-        for name, value in state.items():
-            arrays[name][i] = value
-        nonfinite, overflow = world.health(state)
-        arrays["nonfinite"][i] |= nonfinite
-        arrays["overflow"][i] |= overflow
-        readings = (*world.contacts(), *world.links())
-        for name, value in zip((*CONTACT_FIELDS, *LINK_FIELDS), readings, strict=True):
-            arrays[name][i] = value
+        self._take(i, "get_state", STATE_FIELDS, state)
+        health = world.health(state)
+        self._check(i, "health", ("nonfinite", "overflow"), health)
+        for name, value in zip(("nonfinite", "overflow"), health, strict=True):
+            arrays[name][i] |= value
+        if stepped:
+            contacts = world.contacts()
+            if not isinstance(contacts, tuple):
+                contacts = sum_contacts(self._tips, contacts)
+            self._take(i, "contacts", CONTACT_FIELDS, contacts)
+        else:
+            for name in CONTACT_FIELDS:
+                arrays[name][i] = 0
+        links = world.links()
+        if links is None:
+            joints, tracked = self._tracked
+            links = tracked.locate(*joints.spread(state["joint_pos"], state["joint_vel"]))
+        self._take(i, "links", LINK_FIELDS, links)
+
+    def _take(self, i: int, reading: str, names: Sequence[str], found: Any) -> None:
+        """Copy a reading of a world to the shared arrays."""
+        self._check(i, reading, names, found)
+        values = found.items() if isinstance(found, Mapping) else zip(names, found, strict=True)
+        for name, value in values:
+            self._arrays[name][i] = value
+
+    def _check(self, i: int, reading: str, names: Sequence[str], found: Any) -> None:
+        """Refuse the first reading of a world whose names, shapes or types are not those of the contract."""
+        if reading not in self._unread[i]:
+            return
+        wanted = {name: self._arrays[name][i] for name in names}
+        check_reading(f"{type(self._worlds[i]).__qualname__}.{reading}()", wanted, found)
+        self._unread[i].remove(reading)
+
+
+def check_reading(what: str, wanted: Mapping[str, np.ndarray], found: Any) -> None:
+    """Refuse a reading of a world that is not what the contract says; ``WrongValueError`` names the field.
+
+    Args:
+        what: the method that returned it.
+        wanted: arrays with the shapes and kinds of numbers that it should have, by name.
+        found: arrays by name, or in a sequence in this order.
+    """
+    if isinstance(found, tuple | list) and len(found) == len(wanted):
+        found = dict(zip(wanted, found, strict=True))
+    if not isinstance(found, Mapping):
+        raise WrongValueError(f"{what} returns {shown(found)}, expected {', '.join(wanted)}")
+    if missing := wanted.keys() - found.keys():
+        raise WrongValueError(f"{what} lacks {', '.join(sorted(missing))}: add it")
+    if unknown := found.keys() - wanted.keys():
+        raise WrongValueError(
+            f"{what} has the unknown field {', '.join(sorted(map(str, unknown)))}, expected {', '.join(wanted)}"
+        )
+    for name, value in found.items():
+        array = np.asarray(value)
+        like = wanted[name]
+        kind = "bool" if like.dtype == bool else "float"
+        if array.shape != like.shape or array.dtype.kind != kind[0]:
+            raise WrongValueError(
+                f"{what}: {name} has shape {array.shape} and type {array.dtype}, expected {like.shape} and {kind}"
+            )
 
 
 # Worker processes -----------------------------------------------------------------------------------------------------

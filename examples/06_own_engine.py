@@ -1,20 +1,16 @@
 """An engine of your own: one world in numpy, of which a pool makes N. `examples/xreset-drake` is a real one, with forces."""
 
 import numpy as np
-import torch
 
 from xreset.backends import conformance
 from xreset.backends.pool import PoolBackend, World
-from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.rotations import matrix_to_quat
 
 
 class KinematicWorld(World):
     """A robot that follows its targets at once, next to an object that nothing moves."""
 
     def __init__(self, scene, object_index):
-        self._robot = scene.robot
-        self._kinematics = Kinematics(scene.robot)
+        self._joints = len(scene.robot.joints)
 
     def set_state(self, state):
         self._state = {name: np.array(value) for name, value in state.items()}
@@ -28,24 +24,11 @@ class KinematicWorld(World):
     def step(self, n):
         self._state |= {
             "joint_pos": self._state["joint_target"],
-            "joint_vel": np.zeros(len(self._robot.joints)),
+            "joint_vel": np.zeros(self._joints),
         }
 
-    def links(self):
-        q = torch.as_tensor(self._state["joint_pos"])
-        links = self._robot.tracked_links
-        T = self._kinematics.link_poses(q, links)
-        J = self._kinematics.jacobian(q, links)
-        return (
-            T[:, :3, 3].numpy(),
-            matrix_to_quat(T[:, :3, :3]).numpy(),
-            J.linear.numpy() @ self._state["joint_vel"],
-            J.angular.numpy() @ self._state["joint_vel"],
-        )
-
     def contacts(self):
-        fingers = len(self._robot.fingertips)
-        return np.zeros((fingers, 3)), np.zeros(fingers, dtype=bool), np.zeros(3)
+        return []
 
     set_object_inertia = set_friction = lambda self, *_: None  # they move nothing here
 

@@ -15,7 +15,6 @@ from xreset.backends.conformance.harness import Bench
 from xreset.backends.conformance.scene import gripper, objects, scene
 from xreset.backends.pool import PoolBackend
 from xreset.errors import BackendUnavailableError
-from xreset.geometry.dynamics import mass_matrix
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_rotate
 from xreset.spec import GRAVITY
@@ -63,40 +62,6 @@ class EngineChecks:
 
     # Joints -----------------------------------------------------------------------------------------------------------
 
-    def test_dry_friction_stops_and_holds(self):
-        robot = with_drive(gripper(), "finger_b_bend", kp=0.0, kd=0.0, friction_loss=0.005)
-        for joint in ("lift", "swing", "turn"):
-            robot = with_drive(robot, joint, kp=5000.0, kd=500.0)
-        backend = self.make(scene(robot))
-        bend = JOINT["finger_b_bend"]
-        state = backend.state().clone()
-        state.joint_vel[0, bend] = 2.0
-        backend.set_state(state)
-        inertia = 1.0 / np.linalg.inv(mass_matrix(robot, robot.home))[bend, bend]
-        n = int(0.5 * 2.0 * inertia / 0.005 * 240)  # half of the steps until it stops
-        self.assertGreater(n, 5)
-        backend.step(n)
-        self.assertAlmostEqual(
-            backend.state().joint_vel[0, bend], 2.0 - 0.005 / inertia * n / 240, delta=0.2
-        )
-        backend.step(n + 12)
-        rest = float(backend.state().joint_pos[0, bend])
-        backend.step(24)
-        self.assertAlmostEqual(backend.state().joint_pos[0, bend], rest, delta=2e-4)
-
-    def test_dry_friction_holds_against_a_weak_drive_only(self):
-        backend = self.make(
-            scene(with_drive(gripper(), "finger_b_bend", kp=1.0, kd=0.05, friction_loss=0.05))
-        )
-        bend = JOINT["finger_b_bend"]
-        start = backend.state().clone()
-        for offset, moves in ((0.04, False), (0.2, True)):
-            state = start.clone()
-            state.joint_target[0, bend] = offset
-            backend.set_state(state)
-            backend.step(240)
-            self.assertEqual(float(backend.state().joint_pos[0, bend]) > 0.02, moves, offset)
-
     def test_a_mimic_joint_shares_its_sources_force(self):
         backend, _ = self.grasp()
         backend.set_object_gravity(torch.zeros(1))
@@ -142,41 +107,3 @@ class EngineChecks:
             presses.append(float(forces[0].norm()))
         self.assertGreater(max(presses), 3.0)
         self.assertLess(max(errors), 0.01 * max(presses))
-
-    def test_only_the_links_named_collide_with_one_another(self):
-        jaw = JOINT["jaw_a_slide"]
-        for links, blocked in ((("jaw_a", "pad_b"), True), ((), False)):
-            backend = self.make(scene(replace(gripper(), self_collision_links=links)), 2)
-            state = backend.state().clone()
-            state.object_pos[:] = tensor([0.9, 0.5, 0.05])
-            state.joint_pos[:, jaw] = 0.05
-            state.joint_target[:, jaw] = 0.005
-            # to the other jaw, and away
-            state.joint_target[:, JOINT["finger_b_bend"]] = tensor([0.6, -0.6])
-            backend.set_state(state)
-            backend.step(240)
-            free, other = backend.state().joint_pos[:, jaw].sort().values.tolist()
-            self.assertAlmostEqual(free, 0.005, delta=1e-3)
-            if blocked:
-                self.assertGreater(other, 0.008)
-            else:
-                self.assertAlmostEqual(other, 0.005, delta=1e-3)
-
-    def test_links_collide_with_the_table_unless_excluded(self):
-        lowest = []
-        for excluded in (("base",), ("base", "jaw_a", "pad_b", "wrist", "column")):
-            backend = self.make(
-                scene(replace(gripper(), table_exclude=excluded, base_pos=(0.57, 0.05, -0.05)))
-            )
-            state = backend.state().clone()
-            state.object_pos[0] = tensor([0.9, 0.6, 0.05])
-            heights = []
-            for lift in (0.19, -0.19):  # one of them is down
-                state.joint_target[0, JOINT["lift"]] = lift
-                backend.set_state(state)
-                backend.step(480)
-                heights.append(float(backend.links().pos[0, 1:, 2].min()))
-            lowest.append(min(heights))
-        blocked, free = lowest
-        self.assertGreater(blocked, -0.01)
-        self.assertLess(free, blocked - 0.02)

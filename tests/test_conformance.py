@@ -17,7 +17,7 @@ from tests.data import InFolder
 from xreset.backends.conformance import CHECKS, CheckResult, Measure, run
 from xreset.backends.mjcf_model import OBJECT
 from xreset.backends.mujoco import MujocoBackend, MujocoWorld
-from xreset.backends.rigid import conjugate, rotate
+from xreset.backends.rigid import OTHER_LINK, TABLE, conjugate, rotate
 from xreset.errors import BackendUnavailableError, XResetError
 from xreset.physics import KnownDifference
 
@@ -113,6 +113,13 @@ class StaleKinematics(_Stepping):
 class LinksOfTheStepBefore(_Stepping):
     def links(self):
         return self._links_before if self._stepped else super().links()
+
+
+@breaks("links_after_steps")
+class LinkVelocitiesHalvedAfterAStep(_Stepping):
+    def links(self):
+        pos, quat, linvel, angvel = super().links()
+        return (pos, quat, linvel / 2, angvel / 2) if self._stepped else (pos, quat, linvel, angvel)
 
 
 @breaks("mimic_joints")
@@ -227,6 +234,31 @@ def drive_without_effort_limit(model, at):
     model.actuator_forcelimited[:] = 0
 
 
+@breaks("drive_equation")
+class DrivesThatLeaveTheirEffortLimitLate(MujocoWorld):
+    """By four steps."""
+
+    def __init__(self, scene, object_index):
+        super().__init__(scene, object_index)
+        self._pull = np.zeros((4, len(scene.robot.joints)))
+
+    def step(self, n):
+        target = self._ctrl.copy()
+        limit = self._model.actuator_forcerange[:, 1]
+        for _ in range(n):
+            force = self._data.actuator_force
+            saturated = np.where(np.abs(force) >= limit, np.sign(force), 0.0)
+            self._pull = np.vstack((self._pull[1:], saturated))
+            self._ctrl[:] = target + self._pull.sum(axis=0)
+            super().step(1)
+        self._ctrl[:] = target
+
+
+@remodelled("joint_friction")
+def joints_without_dry_friction(model, at):
+    model.dof_frictionloss[:] = 0.0
+
+
 @remodelled("joint_limits")
 def joints_without_limits(model, at):
     model.jnt_limited[:] = 0
@@ -285,6 +317,19 @@ class LinearVelocityOfTheCentreOfMass(MujocoWorld):
     def get_state(self):
         state = super().get_state()
         return {**state, "object_linvel": state["object_linvel"] + self._shift(state)}
+
+
+@breaks("long_spin")
+class SpinWithoutGyroscopicTorque(MujocoWorld):
+    """The angular velocity stays, and with it the momentum only of a body that turns about a principal axis."""
+
+    def step(self, n):
+        for _ in range(n):
+            spin = self.get_state()["object_angvel"].copy()
+            super().step(1)
+            quat = self.get_state()["object_quat"]
+            inverse = conjugate(quat)
+            self._object_spin[:] = rotate(inverse, spin)
 
 
 @breaks("object_wrench")
@@ -354,6 +399,45 @@ class FingersMixedUp(MujocoWorld):
         return tip_force[::-1], touch[::-1], table_force
 
 
+@breaks("pressing")
+class FingersThatTouchTogether(MujocoWorld):
+    def contacts(self):
+        tip_force, touch, table_force = super().contacts()
+        return tip_force, np.full_like(touch, touch.any()), table_force
+
+
+@breaks("pressing")
+class ForceOfOtherLinksBookedAsTheTables(MujocoWorld):
+    def contacts(self):
+        tip_force, touch, table_force = super().contacts()
+        force = np.zeros(6)
+        for i, contact in enumerate(self._data.contact):
+            first, second = self._at.geom_role[contact.geom]
+            if {first, second} == {OBJECT, OTHER_LINK}:
+                mujoco.mj_contactForce(self._model, self._data, i, force)
+                sign = 1.0 if second == OBJECT else -1.0  # a force acts on the second geom
+                table_force = table_force + sign * contact.frame.reshape(3, 3).T @ force[:3]
+        return tip_force, touch, table_force
+
+
+@remodelled("robot_collisions")
+def robot_that_collides_with_the_object_only(model, at):
+    of_robot = (at.geom_role >= 0) | (at.geom_role == OTHER_LINK)
+    model.geom_contype[of_robot] = 0
+    model.geom_conaffinity[of_robot] = 1
+
+
+@breaks("robot_friction")
+class OtherLinksWithTheFingertipsFriction(MujocoWorld):
+    def set_friction(self, friction):
+        super().set_friction(friction[[0, 0, 2]])
+
+
+@remodelled("robot_friction")
+def robot_on_the_table_with_the_objects_friction(model, at):
+    model.geom_priority[at.geom_role == TABLE] = 1
+
+
 @remodelled("rest_and_bounce")
 def collision_margin(model, at):
     model.geom_margin[:] = 5e-4
@@ -378,6 +462,13 @@ class FrictionSquared(MujocoWorld):
 
     def set_friction(self, friction):
         super().set_friction(np.square(friction))
+
+
+@breaks("sliding_height")
+class SlidingObjectsThrownUp(MujocoWorld):
+    def set_state(self, state):
+        super().set_state(state)
+        self._object_linvel[2] += 0.6 * np.linalg.norm(state["object_linvel"][:2])
 
 
 @remodelled("slope")

@@ -18,8 +18,10 @@ from torch import tensor
 from torch.testing import assert_close
 
 from xreset.backends.pool import PoolBackend, World, is_finite
+from xreset.backends.rigid import OTHER_LINK, TABLE
 from xreset.backends.workers import STATE_FIELDS, arrays_in, layout_of
-from xreset.errors import CapabilityError, RobotError, XResetError
+from xreset.errors import CapabilityError, RobotError, WrongValueError, XResetError
+from xreset.geometry.kinematics import Kinematics
 from xreset.physics import State
 from xreset.spec import PairFriction, SceneSpec
 
@@ -104,6 +106,81 @@ def random_state(n, seed):
     return State(
         **{f.name: torch.rand(n, width.get(f.name, 2), generator=rng) for f in fields(State)}
     )
+
+
+class Readings(TestCase):
+    """What the pool makes of a world's readings."""
+
+    def world(self, scene=None, **methods):
+        backend = type(
+            "Broken",
+            (ToyBackend,),
+            {"world_class": type("BrokenWorld", (ToyWorld,), methods)},
+        )(scene or toy_scene(), 1, workers=0)
+        self.addCleanup(backend.close)
+        return backend
+
+    def test_the_first_readings_of_a_world_are_checked(self):
+        def changed(**fields):
+            return lambda world: world.state | fields
+
+        def without_quat(world):
+            return {name: world.state[name] for name in STATE_FIELDS if name != "object_quat"}
+
+        def contacts(*values):
+            return lambda world: values
+
+        force = np.zeros((2, 3))
+        touch = np.zeros(2, dtype=bool)
+        for method, reading, message in (
+            ("get_state", without_quat, r"get_state\(\) lacks object_quat"),
+            ("get_state", changed(speed=0.0), "has the unknown field speed"),
+            ("get_state", changed(joint_pos=np.zeros(3)), r"joint_pos has shape \(3,\) and type float64, expected \(2,\)"),
+            ("get_state", lambda world: None, r"get_state\(\) returns None, expected joint_pos, "),
+            ("links", lambda world: (np.zeros((1, 3)), *ToyWorld.links(world)[1:]), r"links\(\): pos has shape \(1, 3\)"),
+            ("links", lambda world: ToyWorld.links(world)[:3], "expected pos, quat, linvel, angvel"),
+            ("contacts", contacts(force, touch.astype(float), force[0]), "tip_touch has .* float64, expected .* bool"),
+            ("contacts", contacts(force[0], touch, force[0]), "tip_force has shape"),
+            ("contacts", lambda world: [(7, np.zeros(3))], "a contact has the owner 7, expected TABLE"),
+            ("health", lambda world, state: (0.0, False), "nonfinite has .* float64, expected .* bool"),
+        ):  # fmt: skip
+            with (
+                self.subTest(message),
+                self.assertRaisesRegex(WrongValueError, f"world 0: .*{message}"),
+            ):
+                self.world(**{method: reading}).step(1)
+
+    def test_misspelt_capabilities_are_refused(self):
+        with self.assertRaisesRegex(XResetError, "Broken.capabilities has unknown names: frictoin"):
+            type("Broken", (ToyBackend,), {"capabilities": frozenset({"frictoin", "friction"})})
+
+    def test_the_pool_adds_weight_sums_contacts_and_computes_links(self):
+        methods = {
+            "contacts": lambda world: [(TABLE, world.force), (1, world.force), (OTHER_LINK, world.force)],
+            "links": World.links,
+            "set_object_gravity": World.set_object_gravity,
+        }  # fmt: skip
+        from xreset.backends.conformance.scene import scene
+
+        pool = self.world(scene(), **methods)
+        with mock.patch.object(
+            ToyBackend, "capabilities", ToyBackend.capabilities | {"object_gravity"}
+        ):
+            pool.set_object_gravity(tensor([0.25]))
+        pool.set_object_mass(tensor([3.0]))
+        pool.set_object_wrench(tensor([[1.0, 0.0, 0.0]]), torch.zeros(1, 3))
+        pool.step(1)
+        force = tensor([1.0, 0.0, -0.25 * 3.0 * 9.81])
+        contacts = pool.contacts()
+        assert_close(contacts.table_force[0], force)
+        assert_close(contacts.tip_force[0], torch.stack((torch.zeros(3), force)))
+        self.assertEqual(contacts.tip_touch[0].tolist(), [False, True])
+        pool.set_state(pool.state().clone())
+        self.assertFalse(contacts.tip_touch.any() or contacts.table_force.any())
+        kinematics = Kinematics(pool.scene.robot)
+        state = pool.state()
+        poses = kinematics.link_poses(state.joint_pos.double(), pool.scene.robot.tracked_links)
+        assert_close(pool.links().pos, poses[..., :3, 3].float())
 
 
 class PoolTest(TestCase):

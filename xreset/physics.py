@@ -8,7 +8,7 @@ of ``scene.robot.joints``.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import ClassVar, Literal, Self, get_args
+from typing import Any, ClassVar, Literal, Self, get_args
 
 import torch
 from torch import Tensor
@@ -241,6 +241,15 @@ class Backend(ABC):
     known_differences: ClassVar[tuple[KnownDifference, ...]] = ()
     """Checks for which this engine has a wider tolerance."""
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        unknown = set(getattr(cls, "capabilities", ())).difference(get_args(Capability))
+        if unknown:
+            raise XResetError(
+                f"{cls.__name__}.capabilities has unknown names: {', '.join(sorted(map(str, unknown)))}. "
+                f"Choose from: {', '.join(sorted(get_args(Capability)))}."
+            )
+
     def __init__(
         self,
         scene: SceneSpec,
@@ -350,7 +359,10 @@ class Backend(ABC):
         self._set("object_mass", mass, worlds)
 
     def set_friction(self, friction: Tensor, worlds: Tensor | None = None) -> None:
-        """Set the friction of the pairs object-fingertip, object-other link, object-table: [M, 3]."""
+        """Set the friction of the pairs object-fingertip, object-other link, object-table: [M, 3].
+
+        Pairs without the object follow: see :class:`~xreset.spec.PairFriction`.
+        """
         self._set("friction", friction, worlds)
 
     def set_torsional_friction(self, torsional: Tensor, worlds: Tensor | None = None) -> None:

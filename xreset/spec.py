@@ -269,7 +269,11 @@ class TableSpec:
 
 @frozen
 class PairFriction:
-    """Coulomb friction of the *pairs* that touch the object; each engine solves for its own per-body coefficients."""
+    """Coulomb friction of the *pairs* that touch the object; each engine solves for its own per-body coefficients.
+
+    Parts that touch without the object, the robot and the table or two links of the robot, have the larger one of their
+    two frictions against the object: a fingertip on the table ``max(tip, table)``, two other links ``link``.
+    """
 
     tip: float = 0.8
     """Object against fingertip links."""
@@ -278,7 +282,7 @@ class PairFriction:
     table: float = 0.6
     """Object against the table."""
     torsional: float = 0.002
-    """Torsional friction of every pair, as a length [m]: torque <= torsional * normal force."""
+    """Torsional friction of the object's pairs, as a length [m]: torque <= torsional * normal force."""
 
 
 @frozen

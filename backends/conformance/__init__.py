@@ -22,6 +22,7 @@ from xreset.backends.conformance import (
     contact_checks,
     grasp_checks,
     motion_checks,
+    press_checks,
     robot_checks,
     state_checks,
     world_checks,
@@ -53,7 +54,15 @@ __all__ = [
     "scene",
 ]
 
-_MODULES = (state_checks, world_checks, robot_checks, motion_checks, contact_checks, grasp_checks)
+_MODULES = (
+    state_checks,
+    world_checks,
+    robot_checks,
+    motion_checks,
+    contact_checks,
+    press_checks,
+    grasp_checks,
+)
 _TABLE = tomllib.loads(Path(__file__).with_name("checks.toml").read_text())
 _FUNCTIONS: Mapping[str, Any] = ChainMap(*map(vars, _MODULES))
 CHECKS = tuple(

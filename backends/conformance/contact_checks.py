@@ -16,7 +16,7 @@ from xreset.backends.conformance.results import Differences, Measured
 from xreset.backends.conformance.scene import ball, flat_objects
 from xreset.geometry.rotations import quat_angle
 from xreset.physics import Parameter, State
-from xreset.spec import GRAVITY, SceneSpec, lowest_point
+from xreset.spec import GRAVITY, ObjectSpec, SceneSpec, lowest_point
 
 _FACTORS = torch.tensor([2.0, 0.5, 4.0, 0.25])
 
@@ -199,19 +199,43 @@ _DISTANCE = 0.2  # m that every object slides
 def sliding_distance(bench: Bench) -> Measured:
     """Push boxes off at the speed v with which Coulomb friction stops them after v^2 / (2 mu g) = 0.2 m."""
     shapes = flat_objects()[:3]
-    scene = replace(bench.scene, objects=shapes)
-    object_index = [*range(len(shapes))] * len(_CASES)
     mu, direction = _cases(bench, len(shapes))
     speed = (2.0 * mu * GRAVITY * _DISTANCE).sqrt()
-    start = bench.initial(scene, object_index)
-    start = replace_fields(start, object_linvel=speed[:, None] * direction)
-    with bench.other(scene, object_index) as worlds:
-        worlds.set_parameter("friction", _same_for_all_pairs(mu))
-        end = worlds.advance(start, round(1.0 / scene.timestep))
-    way = ((end.object_pos - start.object_pos) * direction).sum(-1)
+    start, path = _sliding(bench, shapes, mu, speed[:, None] * direction)
+    way = ((path[-1] - start) * direction).sum(-1)
     off = (way / _DISTANCE - 1.0).view(len(_CASES), len(shapes))
     names = [shape.name for shape in shapes]
     return {case: zip(names, row) for case, row in zip(_CASE_NAMES, off, strict=True)}
+
+
+def sliding_height(bench: Bench) -> Measured:
+    """Push boxes off at 1 m/s on a table of friction 0.6, and look at the whole path: they stay on the table."""
+    shapes = flat_objects()[:3]
+    mu, direction = _cases(bench, len(shapes), ((0.6, 0), (0.6, 45)))
+    start, path = _sliding(bench, shapes * 2, mu, direction)
+    height = (path - start)[..., 2]
+    names = [shape.name for shape in shapes] * 2
+    return {
+        "above the table": zip(names, height.amax(dim=0).clamp_min(0.0)),
+        "in the table": zip(names, height.amin(dim=0).clamp_max(0.0)),
+    }
+
+
+def _sliding(
+    bench: Bench, shapes: Sequence[ObjectSpec], mu: Tensor, velocity: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return places [N, 3] at the start, and at every step of a second [T, N, 3], of objects that slide."""
+    scene = replace(bench.scene, objects=tuple(shapes))
+    object_index = [i % len(shapes) for i in range(len(mu))]
+    start = replace_fields(bench.initial(scene, object_index), object_linvel=velocity)
+    path = []
+    with bench.other(scene, object_index) as worlds:
+        worlds.set_parameter("friction", _same_for_all_pairs(mu))
+        worlds.set(start)
+        for _ in range(round(1.0 / scene.timestep)):
+            worlds.step(1)
+            path.append(worlds.state().object_pos)
+    return start.object_pos, torch.stack(path)
 
 
 def slope(bench: Bench) -> Measured:
@@ -288,9 +312,11 @@ def _spin_lost(
     return lost / (braking * steps * scene.timestep)
 
 
-def _cases(bench: Bench, each: int) -> tuple[Tensor, Tensor]:
+def _cases(
+    bench: Bench, each: int, cases: Sequence[tuple[float, int]] = _CASES
+) -> tuple[Tensor, Tensor]:
     """Coefficient [N] and direction [N, 3], towards the table's middle, of the worlds, ``each`` of them a case."""
-    mu, degrees = torch.tensor(_CASES).repeat_interleave(each, dim=0).T
+    mu, degrees = torch.tensor(cases).repeat_interleave(each, dim=0).T
     angle = degrees.deg2rad()
     towards = torch.tensor(bench.scene.table.center) - torch.tensor(bench.place)
     direction = torch.zeros(len(mu), 3)

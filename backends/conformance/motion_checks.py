@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from scipy.integrate import solve_ivp
@@ -9,8 +11,9 @@ from torch import Tensor
 
 from xreset.backends.conformance.harness import Bench, replace_fields
 from xreset.backends.conformance.results import Measured
-from xreset.geometry.rotations import quat_rotate
+from xreset.geometry.rotations import matvec, quat_rotate, quat_to_matrix
 from xreset.geometry.shapes import turn_of
+from xreset.physics import State
 from xreset.spec import GRAVITY, ObjectSpec
 
 _STEPS = 24
@@ -74,6 +77,37 @@ def free_spin(bench: Bench) -> Measured:
         "linvel": end.object_linvel - torch.tensor(velocity),
         "orientation": (orientation * turn.inv()).magnitude(),
         "angvel": end.object_angvel - torch.tensor(omega),
+    }
+
+
+def long_spin(bench: Bench) -> Measured:
+    """Spin weightless objects for a second: angular momentum stays, and so does the centre of mass."""
+    worlds = bench.worlds()
+    worlds.set_parameter("object_gravity", torch.zeros(bench.NUM_WORLDS))
+    start = bench.in_the_air().map(Tensor.double)
+    com = torch.tensor(np.array([obj.com for obj in bench.objects]))
+    inertia = torch.tensor(np.array([obj.inertia for obj in bench.objects]))
+    spin = torch.tensor([5.0, -3.0, 5.5], dtype=torch.float64).expand_as(com)
+    start = replace(start, object_angvel=spin, object_linvel=-torch.linalg.cross(spin, com))
+    steps = round(1.0 / bench.scene.timestep)
+    end = worlds.advance(start.map(Tensor.float), steps).map(Tensor.double)
+
+    def momentum(state: State) -> Tensor:
+        """[N, 3] angular momentum about the centre of mass."""
+        R = quat_to_matrix(state.object_quat)
+        return matvec(R @ inertia @ R.mT, state.object_angvel)
+
+    def center(state: State) -> Tensor:
+        """[N, 3] centre of mass."""
+        return state.object_pos + quat_rotate(state.object_quat, com)
+
+    names = [obj.name for obj in bench.objects]
+    before = momentum(start)
+    return {
+        "angular momentum": zip(
+            names, (momentum(end) - before).norm(dim=1) / before.norm(dim=1), strict=True
+        ),
+        "centre of mass": zip(names, center(end) - center(start), strict=True),
     }
 
 

@@ -19,7 +19,7 @@ from xreset.backends.rigid import mechanism, object_inertia
 from xreset.geometry.dynamics import com_jacobian, drive_values
 from xreset.geometry.urdf import prismatic_joints, robot_tree
 from xreset.physics import State
-from xreset.spec import GRAVITY, SceneSpec
+from xreset.spec import GRAVITY, DriveSpec, RobotSpec, SceneSpec
 
 _WAY = 0.2  # rad, of a joint's step and of the amplitude of its sine
 _SLIDE_WAY = 0.02  # m, the same of a prismatic joint
@@ -118,32 +118,46 @@ def drive_equation(bench: Bench) -> Measured:
     """Step the target of the vertical slide and compare with the drive's differential equation.
 
     (m + armature) x'' = clip(kp (target - x) - kd x', effort). The robot's weight is compensated, so it is absent.
+    Two of the steps begin at the effort limit. So do those of a drive that is stiffer and weaker, and leaves it fast.
     """
-    robot = bench.scene.robot
-    index = robot.joint_names.index("lift")
-    drive = robot.joints[index].drive
+    scene = bench.scene
+    index = scene.robot.joint_names.index("lift")
+    stiffer = {}
+    for name, factor in (("kp", 3.0), ("kd", 2.0), ("effort", 0.3)):
+        stiffer[name] = factor * drive_values(scene.robot, name)
+    steps = torch.tensor([0.01, -0.01, 0.08, -0.08])
+    errors = {}
+    for what, with_drives in (
+        ("", scene),
+        (", stiffer and weaker", _with_drives(scene, **stiffer)),
+    ):
+        start = bench.start()
+        target = start.joint_pos.clone()
+        target[:, index] += steps
+        with bench.other(with_drives, bench.object_index) as worlds:
+            found = worlds.path(start, [target] * 24, 4)[..., index]
+        joint = with_drives.robot.joints[index]
+        times = 4 * scene.timestep * np.arange(1, 25)
+        for i, step in enumerate(steps.tolist()):
+            way = found[:, i].double().numpy() - joint.home
+            exact = _drive_path(with_drives.robot, joint.drive, step, times)
+            errors[f"step of {step:+.2f} m{what}"] = (way - exact) / step
+    return errors
+
+
+def _drive_path(robot: RobotSpec, drive: DriveSpec, step: float, times: np.ndarray) -> np.ndarray:
+    """Return the way of the gripper's lift at some times after a step of its target."""
     tree = robot_tree(robot)
     carried = sum(
         tree.link(name).mass for name in ("carriage", "wrist", "palm", "jaw_a", "jaw_b", "finger_b")
     )
-    steps = torch.tensor([0.01, -0.01, 0.08, -0.08])  # the last two run into the effort limit
-    start = bench.start()
-    target = start.joint_pos.clone()
-    target[:, index] += steps
-    found = bench.worlds().path(start, [target] * 12, 4)[..., index]
-    path = found.double().numpy() - robot.joints[index].home
-    times = 4 * bench.scene.timestep * np.arange(1, 13)
 
-    def motion(_, y: np.ndarray, goal: float) -> list[float]:
-        effort = np.clip(drive.kp * (goal - y[0]) - drive.kd * y[1], -drive.effort, drive.effort)
+    def motion(_, y: np.ndarray) -> list[float]:
+        effort = np.clip(drive.kp * (step - y[0]) - drive.kd * y[1], -drive.effort, drive.effort)
         return [y[1], effort / (carried + drive.armature)]
 
-    errors = {}
     options = {"t_eval": times, "rtol": 1e-6, "atol": 1e-9, "max_step": 1e-3}
-    for i, step in enumerate(steps.tolist()):
-        exact = solve_ivp(motion, (0.0, times[-1]), [0.0, 0.0], args=(step,), **options).y[0]
-        errors[f"step of {step:+.2f} m"] = (path[:, i] - exact) / step
-    return errors
+    return solve_ivp(motion, (0.0, times[-1]), [0.0, 0.0], **options).y[0]
 
 
 def drive_scale(bench: Bench) -> Measured:

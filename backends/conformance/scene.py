@@ -25,6 +25,19 @@ def gripper() -> RobotSpec:
     return read_description(Path(__file__).with_name("gripper.toml"))
 
 
+def presser(**contact_links: tuple[str, ...]) -> RobotSpec:
+    """Return a foot that slides along x and presses down, next to a shelf on its base.
+
+    Args:
+        contact_links: finger, ``thumb`` or ``index`` -> which links are its own, of ``foot`` and ``shelf``.
+    """
+    robot = read_description(Path(__file__).with_name("presser.toml"))
+    tips = []
+    for tip in robot.fingertips:
+        tips.append(replace(tip, contact_links=contact_links.get(tip.name, tip.contact_links)))
+    return replace(robot, fingertips=tuple(tips))
+
+
 @cache
 def objects() -> tuple[ObjectSpec, ...]:
     """Return a brick (a box), a can (a cylinder) and a bracket (two hulls); no centre of mass is at the mesh origin."""

@@ -71,7 +71,7 @@ def links_after_set(bench: Bench) -> Measured:
 
 
 def links_after_steps(bench: Bench) -> Measured:
-    """Move every joint and compare the tracked links with the kinematics of the joint positions on the way."""
+    """Move every joint and compare the tracked links with the kinematics of the joints on the way: J(q) v."""
     return _errors_on_the_way(bench, ~_moved_by_mimics(bench.scene))
 
 
@@ -80,7 +80,8 @@ def mimic_joints(bench: Bench) -> Measured:
     moved = _moved_by_mimics(bench.scene)
     if not moved.any():
         raise Skipped("no tracked link of this robot is moved by a mimic joint")
-    return _errors_on_the_way(bench, moved)
+    errors = _errors_on_the_way(bench, moved)
+    return {what: errors[what] for what in ("pos", "angle")}
 
 
 def joint_order(bench: Bench) -> Measured:
@@ -162,12 +163,12 @@ def _moved_by_mimics(scene: SceneSpec) -> Tensor:
 
 
 def _errors_on_the_way(bench: Bench, chosen: Tensor) -> Measured:
-    """Return the errors of some tracked links' poses, [T, N, ...], while every joint moves."""
+    """Return the errors of some tracked links' poses and velocities, [T, N, ...], while every joint moves."""
     worlds = bench.worlds()
     worlds.set_targets(bench.start().joint_pos + small_motion(bench.kinematics))
     errors = []
     for _ in range(6):
         worlds.step(4)
         now = _link_errors(bench.kinematics, worlds.state(), worlds.links())
-        errors.append({what: now[what][:, chosen] for what in ("pos", "angle")})
+        errors.append({what: error[:, chosen] for what, error in now.items()})
     return stacked(errors)

@@ -2,8 +2,7 @@
 
 What differs from Drake's defaults, and why:
 
-- Gravity is off for the object, whose weight is applied as a force: so it can have a gravity fraction. It is off for the robot if that is
-  compensated.
+- Gravity is off for the object, whose weight is part of the force that the pool gives. It is off for the robot if that is compensated.
 - Friction of a pair is the *harmonic mean* of its two coefficients; the object's own is fixed, and the others are solved for.
 - The drives are Drake's own PD controllers, which its solver treats implicitly, effort limits included. Armature is the rotor's inertia.
 - Drake ends the process, or raises, where a number is not finite. Such a state never reaches it: see :attr:`DrakeWorld._lost`.
@@ -22,10 +21,18 @@ from typing import get_args
 import numpy as np
 
 from xreset.backends.pool import PoolBackend, World
-from xreset.backends.rigid import Inertia, mechanism, nearer, object_inertia, principal
+from xreset.backends.rigid import (
+    OTHER_LINK,
+    TABLE,
+    Inertia,
+    mechanism,
+    nearer,
+    object_inertia,
+    principal,
+)
 from xreset.errors import XResetError
 from xreset.physics import Capability, KnownDifference, unavailable
-from xreset.spec import GRAVITY, SceneSpec
+from xreset.spec import SceneSpec
 
 try:
     from pydrake.common.value import Value
@@ -62,7 +69,6 @@ class DrakeWorld(World):
         self._at = at = build_model(scene, robot, thing, self._inertia, settings)
         self._internal_steps = settings.internal_steps
         self._dt = scene.timestep / settings.internal_steps
-        self._tips = len(scene.robot.fingertips)
         mimics = scene.robot.mimics
         self._source = np.array(
             [scene.robot.joint_names.index(mimic.source) for mimic in mimics], dtype=int
@@ -147,10 +153,7 @@ class DrakeWorld(World):
         load = ExternallyAppliedSpatialForce()
         load.body_index = at.object.index()
         load.p_BoBq_B = self._inertia.com
-        load.F_Bq_W = SpatialForce(
-            self.torque,
-            self.force - np.array([0.0, 0.0, self._inertia.mass * GRAVITY * self.gravity_fraction]),
-        )
+        load.F_Bq_W = SpatialForce(self.torque, self.force)
         at.plant.get_applied_spatial_force_input_port().FixValue(
             self._context, Value[list[ExternallyAppliedSpatialForce]]([load])
         )
@@ -186,13 +189,11 @@ class DrakeWorld(World):
             np.array([motion.rotational() for motion in motions]),
         )
 
-    def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """See :meth:`World.contacts`: of the last internal step, which is what Drake's output ports report."""
-        tip_force = np.zeros((self._tips, 3))
-        tip_touch = np.zeros(self._tips, dtype=bool)
-        table_force = np.zeros(3)
-        if self._steps == 0 or self._lost is not None:
-            return tip_force, tip_touch, table_force
+    def contacts(self) -> list[tuple[int, np.ndarray]]:
+        """See :meth:`World.contacts`: of the last of Drake's steps, which is what its output ports report."""
+        if self._lost is not None:
+            return []
+        found = []
         results = self._at.plant.get_contact_results_output_port().Eval(self._context)
         for contact in map(
             results.hydroelastic_contact_info, range(results.num_hydroelastic_contacts())
@@ -205,14 +206,11 @@ class DrakeWorld(World):
             if second.role == "object":
                 first, second = second, first
                 force = -force
-            if first.role != "object":
+            if first.role != "object" or not force.any():
                 continue
-            if second.role == "table":
-                table_force += force
-            elif second.tip is not None:
-                tip_force[second.tip] += force
-                tip_touch[second.tip] |= bool(force.any())
-        return tip_force, tip_touch, table_force
+            owner = OTHER_LINK if second.tip is None else second.tip
+            found.append((TABLE if second.role == "table" else owner, force))
+        return found
 
     def mass_properties(self) -> list[Inertia]:
         """See :meth:`World.mass_properties`."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from typing import Any, Literal
 
 import numpy as np
@@ -306,8 +305,8 @@ def _filter_collisions(scene_graph: SceneGraph, parts: _Parts, robot: Mechanism)
     rule = CollisionFilterDeclaration().ExcludeWithin(GeometrySet(list(parts.surfaces)))
     rule.AllowBetween(GeometrySet(on_object), GeometrySet(on_table + on_links))
     rule.AllowBetween(GeometrySet(on_table), GeometrySet(above_table))
-    for a, b in combinations(parts.links, 2):
-        if robot.may_collide(a, b):
+    for a, b in robot.colliding_links:
+        if a in parts.links and b in parts.links:
             rule.AllowBetween(GeometrySet(parts.links[a]), GeometrySet(parts.links[b]))
     scene_graph.collision_filter_manager().Apply(rule)
 

@@ -145,7 +145,6 @@ class NewtonWorld(World):
             load[:-1, 2] = -self._robot_weight
             load[-1, :3] = self.force
             load[-1, 3:] = self.torque
-            load[-1, 2] -= self._inertia.mass * GRAVITY * self.gravity_fraction
         for _ in range(n):
             wp.capture_launch(self._graph)
         self._stepped = True

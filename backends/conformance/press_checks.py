@@ -1,0 +1,194 @@
+"""Checks of a foot that presses on an object, on the table and on its own robot, and of dry friction: closed forms."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import torch
+from scipy.integrate import solve_ivp
+from torch import Tensor
+
+from xreset.backends.conformance.harness import SETTLE, Bench, Worlds
+from xreset.backends.conformance.results import Measured, Skipped
+from xreset.backends.conformance.scene import flat_objects, presser
+from xreset.errors import CapabilityError
+from xreset.physics import State
+from xreset.spec import GRAVITY, RobotSpec, SceneSpec
+
+_PLACES = {"object": (0.15, 0.04), "table": (0.0, 0.0), "shelf": (-0.15, 0.05)}
+"""What the foot presses on -> position of the slide there, and height of the surface [m]."""
+_FOOT = 0.02  # m from the frame of the foot down to its sole
+_DEPTH = 0.01  # m that the target is below the surface: 10 N
+_FRICTIONS = ((0.4, 0.7, 0.9), (0.6, 0.3, 0.5))  # each of the three is once the largest of a pair
+_DRAG = 0.01  # m/s
+
+
+def pressing(bench: Bench) -> Measured:
+    """Press on an object on the table with a thumb, an index finger and another link; only that one must be reported.
+
+    The drive presses with kp (q - target), and the table carries that and the object's weight.
+    """
+    errors = {}
+    for role in ("thumb", "index", "other link"):
+        scene = _scene(bench, presser(**{role: ("foot",)} if role != "other link" else {}))
+        start = _on(scene, ["object"])
+        with bench.other(scene) as worlds:
+            end = worlds.advance(start, SETTLE)
+            contacts = worlds.contacts()
+        press = _press(scene, end)
+        tips = list(scene.robot.fingertip_names)
+        pressing = torch.tensor([tip == role for tip in tips])
+        force = contacts.tip_force[0]
+        expected = torch.zeros_like(force)
+        expected[pressing, :2] = force[pressing, :2]  # a foot may rest against its own slide
+        expected[pressing, 2] = -press
+        carried = press + GRAVITY * scene.objects[0].mass
+        errors[f"{role}: force of the fingers"] = zip(tips, (force - expected) / press)
+        errors[f"{role}: force of the table"] = contacts.table_force[0, 2] / carried - 1.0
+        wrong = (contacts.tip_touch[0] != pressing).float()
+        errors[f"{role}: fingers wrong about a touch"] = zip(tips, wrong)
+    return errors
+
+
+def robot_collisions(bench: Bench) -> Measured:
+    """Press on the table and on the robot's own shelf: both hold the foot, unless the description excludes them."""
+    errors = {}
+    free = replace(presser(), self_collision_links=(), table_exclude=("shelf", "foot"))
+    places = ["table", "shelf"]
+    for robot, what in ((presser(), "sinking into the"), (free, "held up by the excluded")):
+        scene = _scene(bench, robot)
+        start = _on(scene, places)
+        with bench.other(scene, [0, 0]) as worlds:
+            end = worlds.advance(start, SETTLE)
+        press = scene.robot.joint_names.index("press")
+        goal = start if robot is not free else replace(start, joint_pos=start.joint_target)
+        off = (end.joint_pos - goal.joint_pos)[:, press]
+        for place, error in zip(places, off, strict=True):
+            errors[f"{what} {place}"] = error
+    return errors
+
+
+def robot_friction(bench: Bench) -> Measured:
+    """Press on the object, the table and the robot's own shelf, and drag slowly: friction is that of the pair.
+
+    The drive of the slide pulls with mu times the force with which the other drive presses.
+    """
+    errors: dict[str, list[tuple[str, Tensor]]] = {place: [] for place in _PLACES}
+    cases = list(product(_PLACES, _FRICTIONS))
+    friction = torch.tensor([values for _, values in cases])
+    for foot, shelf in (("tip", "link"), ("link", "link"), ("tip", "tip")):
+        fingers = {"thumb": ("foot",) if foot == "tip" else ()}
+        fingers["index"] = ("shelf",) if shelf == "tip" else ()
+        scene = _scene(bench, presser(**{name: links for name, links in fingers.items() if links}))
+        start = _on(scene, [place for place, _ in cases])
+        with bench.other(scene, [0] * len(cases)) as worlds:
+            worlds.set_parameter("friction", friction)
+            found = _dragged(worlds, scene, start)
+        for (place, (tip, link, table)), mu in zip(cases, found, strict=True):
+            own = {"tip": tip, "link": link}
+            expected = {
+                "object": own[foot],
+                "table": max(own[foot], table),
+                "shelf": max(own[foot], own[shelf]),
+            }[place]
+            errors[place].append(
+                (
+                    f"{foot} on {shelf if place == 'shelf' else place}, mu {expected}",
+                    mu / expected - 1.0,
+                )
+            )
+    return {f"on the {place}": found for place, found in errors.items()}
+
+
+def joint_friction(bench: Bench) -> Measured:
+    """Step the target of a slide with dry friction, by more and by less than what the friction holds.
+
+    m x'' = kp (target - x) - kd x' - loss while it moves; the damping is strong, so it stops once.
+    """
+    loss = 4.0
+    robot = presser()
+    index = robot.joint_names.index("slide")
+    joint = robot.joints[index]
+    joints = list(robot.joints)
+    joints[index] = replace(joint, drive=replace(joint.drive, friction_loss=loss))
+    scene = _scene(bench, replace(robot, joints=tuple(joints)))
+    steps = torch.tensor([0.02, -0.02, 0.003, -0.003])
+    object_index = [0] * len(steps)
+    start = _on(scene, ["table"] * len(steps), depth=-0.02)
+    target = start.joint_target.clone()
+    target[:, index] += steps
+    try:
+        with bench.other(scene, object_index) as worlds:
+            path = worlds.path(start, [target] * 40, 4)[..., index].double().numpy()
+    except CapabilityError as error:
+        raise Skipped(str(error)) from error
+    kp = joint.drive.kp
+    kd = joint.drive.kd
+    mass = 2.0  # kg, of slider and foot
+    times = 4 * scene.timestep * np.arange(1, 41)
+
+    def motion(_, y: np.ndarray) -> list[float]:
+        force = kp * (0.02 - y[0]) - kd * y[1] - loss
+        return [y[1], force / mass if y[1] > 0 or force > 0 else 0.0]
+
+    way = solve_ivp(motion, (0.0, times[-1]), [0.0, 0.0], t_eval=times, max_step=1e-3).y[0]
+    signed = path * np.sign(steps.numpy())
+    return {
+        "way against friction": (signed[:, :2] - way[:, None]) / 0.02,
+        "way within friction": signed[:, 2:] / 0.003,
+    }
+
+
+def _scene(bench: Bench, robot: RobotSpec) -> SceneSpec:
+    return replace(bench.scene, robot=robot, objects=flat_objects()[:1])
+
+
+def _on(scene: SceneSpec, places: Sequence[str], depth: float = _DEPTH) -> State:
+    """Return states with the foot on some surfaces, about to press; the object is under it or out of its way."""
+    start = State.initial(scene, torch.zeros(len(places), dtype=torch.long))
+    names = scene.robot.joint_names
+    x, y, z = scene.robot.base_pos
+    for i, place in enumerate(places):
+        slide, height = _PLACES[place]
+        start.joint_pos[i, names.index("slide")] = slide
+        start.joint_pos[i, names.index("press")] = height + _FOOT - z
+        away = 0.0 if place == "object" else 0.3
+        start.object_pos[i, :2] = torch.tensor([x + _PLACES["object"][0], y + away])
+    target = start.joint_pos.clone()
+    target[:, names.index("press")] -= depth
+    return replace(start, joint_target=target)
+
+
+def _press(scene: SceneSpec, state: State) -> Tensor:
+    """[N] force of the drive that presses, at rest."""
+    index = scene.robot.joint_names.index("press")
+    drive = scene.robot.joints[index].drive
+    return drive.kp * (state.joint_pos - state.joint_target)[:, index]
+
+
+def _dragged(worlds: Worlds, scene: SceneSpec, start: State) -> Tensor:
+    """[N] friction of a foot that is dragged slowly: force of the slide's drive over that of the other."""
+    index = scene.robot.joint_names.index("slide")
+    drive = scene.robot.joints[index].drive
+    worlds.advance(start, SETTLE)
+    target = start.joint_target.clone()
+    drags = []
+    presses = []
+    before = worlds.state().joint_pos[:, index]
+    for step in range(480):
+        target[:, index] += _DRAG * scene.timestep
+        worlds.set_targets(target)
+        worlds.step(1)
+        state = worlds.state()
+        now = state.joint_pos[:, index]
+        if step >= 360:
+            drags.append(
+                drive.kp * (target[:, index] - (now + before) / 2)
+                - drive.kd * (now - before) / scene.timestep
+            )
+            presses.append(_press(scene, state))
+        before = now
+    return torch.stack(drags).mean(0) / torch.stack(presses).mean(0)

@@ -37,7 +37,7 @@ def correct_engine() -> None:
         return
     warnings.warn(
         f"MuJoCo-Warp {mjw.__version__} finds contacts in another way than {_TESTED}, whose depths are corrected here. "
-        f"Grasps may slip. Install mujoco-warp=={_TESTED}, or test with: xreset engines check --backend mujoco-warp",
+        f"Grasps may slip. Install mujoco-warp=={_TESTED}, or test with: xreset engines check --engine mujoco-warp",
         stacklevel=3,
     )
 

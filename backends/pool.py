@@ -191,8 +191,8 @@ class PoolBackend(Backend):
         """
         if torch.device(device).type != "cpu":
             raise CapabilityError(
-                f"The backend {self.name!r} runs on the CPU only, found device {device!r}. "
-                "Use device 'cpu', or the backend 'mujoco-warp'."
+                f"The engine {self.name!r} runs on the CPU only, found device {device!r}. "
+                "Use device 'cpu', or the engine 'mujoco-warp'."
             )
         own = ("object_index", "device", "workers")
         refuse_unknown_options(self.name, world_options, self.world_class, own)
@@ -292,5 +292,5 @@ class PoolBackend(Backend):
     def _must_be_open(self) -> None:
         if not self._close.alive:
             raise XResetError(
-                f"The backend {self.name!r} is closed (by close(), Ctrl-C or the death of a worker). Build a new one."
+                f"The engine {self.name!r} is closed (by close(), Ctrl-C or the death of a worker). Build a new one."
             )

@@ -137,7 +137,7 @@ def _couple(articulation: Any, joints: Mapping[str, Any], mimic: MimicSpec) -> N
             return
     raise RobotError(
         f"The joint {mimic.joint!r} mimics {mimic.source!r}, but neither is below the other's parent link: "
-        "the backend 'sapien' cannot couple them. Use another backend."
+        "the engine 'sapien' cannot couple them. Use another engine."
     )
 
 

@@ -408,7 +408,7 @@ class _Worker:
             else f"ended with exit code {code}"
         )
         return (
-            f"A worker process of the backend {job.backend!r} {how} during {command!r}; it ran the worlds "
+            f"A worker process of the engine {job.backend!r} {how} during {command!r}; it ran the worlds "
             f"{shown(list(job.worlds))}. Its messages are on standard error. After SIGKILL, it may have run out of "
             "memory: use fewer worlds or workers. workers=0 runs the worlds in this process, for a debugger."
         )

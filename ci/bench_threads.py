@@ -36,7 +36,7 @@ def run(options: Options, console: Console) -> None:
                     *xreset,
                     "demos",
                     "synth",
-                    "--objects",
+                    "--meshes",
                     OBJECT,
                     "--per-object",
                     "1",

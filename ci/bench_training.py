@@ -40,7 +40,7 @@ def add_arguments(group: argparse._ArgumentGroup) -> None:
         type=Path,
         help="reset bank (default: one of a synthetic soup-can demonstration)",
     )
-    group.add_argument("--objects", type=Path, help="folder of real meshes")
+    group.add_argument("--meshes", type=Path, help="folder of real meshes")
     group.add_argument("--recipe", default="paper", help="as in training")
     group.add_argument("--precision", default="bfloat16", choices=["float32", "tf32", "bfloat16"])
     group.add_argument("--iterations", type=int, default=5, help="PPO iterations to time")
@@ -53,7 +53,7 @@ def run(options: Options, console: Console) -> None:
         return
     with tempfile.TemporaryDirectory() as folder:
         resets = options.extra["resets"] or _synthetic_bank(options.robot, Path(folder))
-        inputs = load_inputs(resets, robot=options.robot, objects=options.extra["objects"])
+        inputs = load_inputs(resets, robot=options.robot, meshes=options.extra["meshes"])
         config = starting_config(options.extra["recipe"])
         config = replace(config, ppo=replace(config.ppo, precision=options.extra["precision"]))
         with make_env(
@@ -178,7 +178,7 @@ def _synthetic_bank(robot: str, folder: Path) -> Path:
     for command in (
         ["demos", "synth", "--objects", OBJECT, "--per-object", "1", "--out", demos],
         ["retarget", demos, "--robot", robot, "--out", moved],
-        ["resets", moved, "--backend", "mujoco", "--out", bank],
+        ["resets", moved, "--engine", "mujoco", "--out", bank],
     ):
         run_time([sys.executable, "-m", "xreset", *map(str, command)])
     return bank

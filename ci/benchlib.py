@@ -27,7 +27,7 @@ class Options:
     """Options of all sections; those of single sections are in ``extra``."""
 
     robot: str
-    backends: tuple[str, ...]
+    engines: tuple[str, ...]
     """Engines to measure, all if empty."""
     num_envs: int
     device: str
@@ -40,7 +40,7 @@ class Options:
 
 def engines(options: Options, console: Console) -> Iterator[tuple[str, str]]:
     """Yield name and device of the chosen engines that work here; print why others are left out."""
-    for name in options.backends or tuple(backend_names()):
+    for name in options.engines or tuple(backend_names()):
         status = backend_status(name)
         if status.reason is None:
             yield name, options.device if "cuda" in status.device else "cpu"

@@ -46,7 +46,7 @@ def main() -> None:
     )
     parser.add_argument("--robot", default="ur7e-sharpa")
     parser.add_argument(
-        "--backend", action="append", default=[], help="engine; again for more (default: all)"
+        "--engine", action="append", default=[], help="engine; again for more (default: all)"
     )
     own = ", ".join(
         f"{name} {module.NUM_ENVS}" for name, module in known.items() if hasattr(module, "NUM_ENVS")
@@ -67,7 +67,7 @@ def main() -> None:
     num_envs = arguments.pop("num_envs")
     common = {name: arguments.pop(name) for name in ("robot", "device", "seconds")}
     options = Options(
-        **common, num_envs=_NUM_ENVS, backends=tuple(arguments.pop("backend")), extra=arguments
+        **common, num_envs=_NUM_ENVS, engines=tuple(arguments.pop("engine")), extra=arguments
     )
     console = Console(width=160)
     gpu = f", {torch.cuda.get_device_name()}" if options.device.startswith("cuda") else ""

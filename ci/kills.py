@@ -64,7 +64,7 @@ def commands(folder: Path) -> list[Command]:
     run = folder / "run"
     eyes = folder / "eyes"
     studies = folder / "studies"
-    where = ["--backend", "mujoco", "--device", "cpu", "--num-envs", 4]
+    where = ["--engine", "mujoco", "--device", "cpu", "--num-envs", 4]
     resume = ["train", "--out", run, "--resume"]
     watch = [
         "--out",
@@ -118,12 +118,12 @@ def commands(folder: Path) -> list[Command]:
         ),
         Command(
             "stress",
-            ["stress", run, "--demos", demos, "--backend", "mujoco", "--property", "object-mass"],
+            ["stress", run, "--demos", demos, "--engine", "mujoco", "--property", "object-mass"],
             run / "stress" / "mujoco.json",
         ),
         Command(
             "rehearse",
-            ["rehearse", run, "--demos", demos, "--backend", "mujoco", "--fault", "pose-delay"],
+            ["rehearse", run, "--demos", demos, "--engine", "mujoco", "--fault", "pose-delay"],
             run / "rehearsal" / "mujoco.json",
         ),
         Command(

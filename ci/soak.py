@@ -32,7 +32,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=60.0, help="for all engines together")
     parser.add_argument(
-        "--backend",
+        "--engine",
         action="append",
         default=[],
         help="engine; again for more (default: all that work here)",
@@ -41,7 +41,7 @@ def main() -> int:
     options = parser.parse_args()
     if options.one:
         return soak(options.one, 60 * options.minutes)
-    names = options.backend or [
+    names = options.engine or [
         name for name in backend_names() if backend_status(name).reason is None
     ]
     print(

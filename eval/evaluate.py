@@ -31,7 +31,7 @@ def evaluate(
     episodes: PositiveInt = 5,
     seed: Seed = 0,
     robot: str | Path | None = None,
-    objects: str | Path | None = None,
+    meshes: str | Path | None = None,
     num_envs: PositiveInt = 64,
     device: str = "cpu",
     settle: bool = False,
@@ -48,7 +48,7 @@ def evaluate(
         episodes: episodes of each demonstration, each with another perturbation of robot and object.
         seed: seed of the perturbations.
         robot: name or folder of the robot; default: the policy's own. Baselines need it.
-        objects: folder of object meshes; default: the folder of the policy's training.
+        meshes: folder of object meshes; default: the folder of the policy's training.
         num_envs: worlds that run at the same time.
         device: where GPU engines run: cpu or cuda.
         settle: whether objects come to rest before episodes begin, instead of starting as recorded.
@@ -73,7 +73,7 @@ def evaluate(
     trial = load_trial(
         policy,
         demos,
-        objects=objects,
+        meshes=meshes,
         seed=seed,
         num_envs=num_envs,
         settle=settle,
@@ -89,17 +89,17 @@ def evaluate(
         for engine in chosen:
             player = policy.start(trial.motion)
             rollouts = roll_out(
-                player, engine, trial, repetitions=episodes, progress=partial(progress, engine.name)
+                player, engine, trial, episodes=episodes, progress=partial(progress, engine.name)
             )
             result = summarize(
                 rollouts,
-                backend=engine.name,
-                backend_version=engine.version,
+                engine=engine.name,
+                engine_version=engine.version,
                 robot=trial.robot.name,
                 policy=policy.name,
                 seed=seed,
                 inputs=trial.inputs,
-                objects_folder=str(trial.objects_folder) if trial.objects_folder else None,
+                meshes=str(trial.meshes) if trial.meshes else None,
                 unseen=policy.unseen(trial.names),
                 vision=trial.task.vision if trial.task.vision.cameras else None,
                 episode_seconds=length,

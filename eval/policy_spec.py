@@ -45,7 +45,7 @@ class PolicySpec(Brief, Checked):
     """The task of the training."""
     folder: Path
     """Default folder of evaluations; other measurements of the policy go next to it."""
-    objects_folder: Path | None = None
+    meshes: Path | None = None
     """Folder of object meshes of the training; None: the stand-ins."""
     objects: tuple[str, ...] | None = None
     """Names of the objects of the training; None: a baseline, which was not trained."""
@@ -71,9 +71,9 @@ class PolicySpec(Brief, Checked):
         """Return the names of objects that the training did not have, sorted; none for a baseline."""
         return () if self.objects is None else tuple(sorted(set(names) - set(self.objects)))
 
-    def meshes(self, objects: str | Path | None) -> Path | None:
+    def meshes_folder(self, given: str | Path | None) -> Path | None:
         """Return the stated folder of meshes, or else that of the training; None: the stand-ins."""
-        return Path(objects) if objects else self.objects_folder
+        return Path(given) if given else self.meshes
 
     def objects_of(self, folder: Path | None) -> tuple[str, ...]:
         """Return the default objects: those of the training that the folder has, or else all objects of the folder.
@@ -210,7 +210,7 @@ def load_policy(
         robot=spec,
         task=contract.task,
         folder=folder / "eval",
-        objects_folder=Path(run.objects) if run and run.objects else None,
+        meshes=Path(run.meshes) if run and run.meshes else None,
         objects=contract.objects,
         hash=loaded.hash,
         content=loaded.content,

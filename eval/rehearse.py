@@ -45,7 +45,7 @@ SCHEMA = "xreset-rehearsal/1"
 
 @frozen
 class Rehearsal(Stress):
-    """Contents of ``rehearsal/BACKEND.json``."""
+    """Contents of ``rehearsal/ENGINE.json``."""
 
     schema: str = SCHEMA
     stopped: dict[str, int] = field(default_factory=dict)
@@ -73,7 +73,7 @@ def rehearse(
     episodes: PositiveInt = 1,
     seed: Seed = 0,
     robot: str | Path | None = None,
-    objects: str | Path | None = None,
+    meshes: str | Path | None = None,
     num_envs: PositiveInt = 64,
     device: str = "cpu",
     real_time: bool = False,
@@ -92,7 +92,7 @@ def rehearse(
         episodes: episodes of each demonstration, the same for every fault.
         seed: seed of starts and faults.
         robot: name or folder of the robot; default: the policy's own.
-        objects: folder of object meshes; default: the folder of the policy's training.
+        meshes: folder of object meshes; default: the folder of the policy's training.
         num_envs: worlds that run at the same time.
         device: where GPU engines run: cpu or cuda.
         real_time: whether the simulation waits for the wall clock.
@@ -111,9 +111,9 @@ def rehearse(
     spec.check_seed(seed)
     actor = OnnxActor(spec.exported())
     if demos is None:
-        meshes = spec.meshes(objects)
-        demos = synthesize(spec.objects_of(meshes), 2, meshes=meshes)
-    trial = load_trial(spec, demos, objects=objects, seed=seed, num_envs=num_envs)
+        folder = spec.meshes_folder(meshes)
+        demos = synthesize(spec.objects_of(folder), 2, meshes=folder)
+    trial = load_trial(spec, demos, meshes=meshes, seed=seed, num_envs=num_envs)
     for prop in properties:
         for value in prop.values:
             _setting(trial, prop, value)
@@ -166,7 +166,7 @@ def _play(
     engine: Engine,
     trial: Trial,
     fault: Faults,
-    repetitions: int,
+    episodes: int,
     real_time: bool,
     stopped: Counter[str],
 ) -> tuple[Episode, ...]:
@@ -188,7 +188,7 @@ def _play(
             if reason is not None:
                 stopped[re.sub(r"-?\d+\.\d+", "...", reason)] += 1
 
-    return play_rounds(engine, trial, repetitions, play)
+    return play_rounds(engine, trial, episodes, play)
 
 
 def judge(found: Sequence[Rehearsal]) -> tuple[str, list[str]]:
@@ -202,7 +202,7 @@ def judge(found: Sequence[Rehearsal]) -> tuple[str, list[str]]:
     for card in found:
         if card.task_progress < LEAST:
             against.append(
-                f"{card.backend}: only {100 * card.task_progress:.0f} % without any fault."
+                f"{card.engine}: only {100 * card.task_progress:.0f} % without any fault."
             )
         for curve, point, most in _deciding_points(card):
             tried += 1
@@ -210,7 +210,7 @@ def judge(found: Sequence[Rehearsal]) -> tuple[str, list[str]]:
                 continue
             low, high = (-100 * bound for bound in reversed(point.difference_ci95))
             text = (
-                f"{card.backend}: {curve.property.replace('-', ' ')} {amount(curve.unit, point.value)} costs "
+                f"{card.engine}: {curve.property.replace('-', ' ')} {amount(curve.unit, point.value)} costs "
                 f"{-100 * point.difference:.1f} points (95 %: {round(low)} to {round(high)}). "
                 f"At most {100 * most:.0f} are wanted."
             )

@@ -10,7 +10,7 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 import pandas as pd
@@ -213,12 +213,17 @@ class EpisodeFaults(Checked):
 class EvalResult(Brief, Checked):
     """Contents of ``eval/ENGINE.json``: one policy in one engine."""
 
-    backend: Annotated[str, Rule("an engine's name", lambda name: bool(name) and "/" not in name)]
-    backend_version: str
+    RENAMED: ClassVar = {
+        "backend": "engine",
+        "backend_version": "engine_version",
+        "objects_folder": "meshes",
+    }
+    engine: Annotated[str, Rule("an engine's name", lambda name: bool(name) and "/" not in name)]
+    engine_version: str
     robot: str
     objects: Annotated[tuple[str, ...], Rule("one object or more", bool)]
     """Object names, sorted."""
-    objects_folder: str | None
+    meshes: str | None
     """Folder of meshes; None: the stand-ins."""
     policy: str
     episodes: PositiveInt
@@ -250,11 +255,11 @@ class EvalResult(Brief, Checked):
     episode_seconds: PositiveFloat | None = None
     """Length of an episode [s]. None: an earlier version did not state it; it was that of the policy's training."""
 
-    def meshes(self, given: Path | None) -> Path | None:
+    def meshes_folder(self, given: Path | None) -> Path | None:
         """Return the given folder of meshes, or else that of the evaluation; None: the stand-ins."""
-        if given is not None or self.objects_folder is None:
+        if given is not None or self.meshes is None:
             return given
-        return Path(self.objects_folder)
+        return Path(self.meshes)
 
 
 class Evaluation(list[EvalResult]):
@@ -279,10 +284,10 @@ class Evaluation(list[EvalResult]):
             RunError: no engine is in both, or the starts, their seed, the meshes or the length of episodes differ.
         """
         starts = ["sequence", "sequence_name", "object", "repetition"]
-        theirs = {result.backend: result for result in other}
+        theirs = {result.engine: result for result in other}
         rows = []
         for result in self:
-            engine = result.backend
+            engine = result.engine
             if engine not in theirs:
                 continue
             tables = []
@@ -291,7 +296,7 @@ class Evaluation(list[EvalResult]):
                 table = whole.to_frame()
                 tables.append(table[table["engine"] == engine])
                 episodes = tables[-1][starts].to_numpy().tolist()
-                played.append((episodes, own.seed, own.objects_folder, own.episode_seconds))
+                played.append((episodes, own.seed, own.meshes, own.episode_seconds))
             if played[0] != played[1]:
                 raise RunError(
                     f"{result.policy} and {theirs[engine].policy} did not play the same episodes in {engine}. "
@@ -325,7 +330,7 @@ def episode_table(result: EvalResult, episodes: Sequence[Episode], run: str = ""
     about = {
         "run": run or result.policy,
         "policy": result.policy,
-        "engine": result.backend,
+        "engine": result.engine,
         "robot": result.robot,
         "seed": result.seed,
     }
@@ -367,7 +372,7 @@ def summarize(rollouts: Rollouts, **about: Any) -> EvalResult:
     """Return the means, intervals and faults of the episodes of one engine.
 
     Args:
-        about: the fields of the result that do not follow from the episodes, such as ``backend`` and ``seed``.
+        about: the fields of the result that do not follow from the episodes, such as ``engine`` and ``seed``.
     """
     episodes = _table(rollouts.episodes, {})
     rates = _rates(episodes)
@@ -424,7 +429,7 @@ def write_results(
     folder: Path, summary: EvalResult, rollouts: Rollouts, joint_names: tuple[str, ...]
 ) -> None:
     """Write ``ENGINE.json``, ``ENGINE.episodes.json`` and ``ENGINE.trace.npz``."""
-    name = summary.backend
+    name = summary.engine
     episodes = [asdict(e) for e in rollouts.episodes]
     write_json(folder / f"{name}.episodes.json", {"schema": EPISODES_SCHEMA, "episodes": episodes})
     write_traces(folder / f"{name}.trace.npz", rollouts.traces, joint_names)
@@ -464,10 +469,10 @@ def read_evaluation(folder: Path, run: str = "") -> Evaluation:
         files = [f for f in folder.glob("*.json") if not f.name.endswith(".episodes.json")]
         results = [read_result(file) for file in sorted(files, key=lambda f: f.stem)]
     for result in results:
-        episodes = read_episodes(folder, result.backend)
+        episodes = read_episodes(folder, result.engine)
         if len(episodes) != result.episodes:
             raise FileFormatError(
-                f"{folder / result.backend}.json states {result.episodes} episodes, {result.backend}.episodes.json "
+                f"{folder / result.engine}.json states {result.episodes} episodes, {result.engine}.episodes.json "
                 f"holds {len(episodes)}. The files are of different evaluations; evaluate again."
             )
         tables.append(episode_table(result, episodes, run))
@@ -483,13 +488,13 @@ def read_result(path: Path) -> EvalResult:
     return read_typed(EvalResult, path, SCHEMA)
 
 
-def read_episodes(folder: Path, backend: str) -> tuple[Episode, ...]:
+def read_episodes(folder: Path, engine: str) -> tuple[Episode, ...]:
     """Read the episodes of one engine.
 
     Raises:
         FileFormatError: the file is damaged, or a value is impossible.
     """
-    path = folder / f"{backend}.episodes.json"
+    path = folder / f"{engine}.episodes.json"
     episodes = read_json(path, EPISODES_SCHEMA).get("episodes")
     if not isinstance(episodes, list):
         raise FileFormatError(f"{path} has no list 'episodes'. Evaluate again.")
@@ -499,14 +504,14 @@ def read_episodes(folder: Path, backend: str) -> tuple[Episode, ...]:
 
 
 def read_traces(
-    folder: Path, backend: str, joint_names: tuple[str, ...] | None
+    folder: Path, engine: str, joint_names: tuple[str, ...] | None
 ) -> tuple[Trace, ...]:
     """Read the traces of one engine.
 
     Raises:
         FileFormatError: the file is damaged, or its joints are not ``joint_names`` in that order, unless that is None.
     """
-    path = folder / f"{backend}.trace.npz"
+    path = folder / f"{engine}.trace.npz"
     arrays = read_npz(
         path, TRACE_SCHEMA, _TRACE_FIELDS, what="an evaluation trace", check=_trace_problem
     )

@@ -55,7 +55,7 @@ class Engine:
     """An engine to play in."""
 
     name: str
-    """Name of its backend."""
+    """Name of the engine."""
     make: MakeBackend
     version: str
     device: str = "cpu"
@@ -68,15 +68,15 @@ class Engine:
 
 
 def engine(name: str, *, device: str = "cpu", **options: Any) -> Engine:
-    """Return the engine of an installed backend.
+    """Return an installed engine.
 
     Args:
-        name: name of the backend.
-        device: where the backend runs if it can; else it runs on the CPU.
-        options: keywords of the backend.
+        name: name of the engine.
+        device: where the engine runs if it can; else it runs on the CPU.
+        options: keywords of its :class:`~xreset.physics.Backend`.
 
     Raises:
-        BackendUnavailableError: the backend cannot be used here.
+        BackendUnavailableError: the engine cannot be used here.
     """
     version = backend_class(name).engine_version()
     used = device_for(name, device)
@@ -125,7 +125,7 @@ class Trial:
     """Worlds that run at the same time."""
     motion: Retargeted | None = None
     """Motion for the baseline ``ik``; None for other policies."""
-    objects_folder: Path | None = None
+    meshes: Path | None = None
     """Folder of the object meshes; None: the stand-ins."""
     inputs: dict[str, str] = field(default_factory=dict)
     """SHA-256 of the policy and of the demos, or resets for a bank; and ``starts: settled`` if objects came to rest."""
@@ -152,7 +152,7 @@ def load_trial(
     policy: PolicySpec,
     source: str | Path | Data,
     *,
-    objects: str | Path | None = None,
+    meshes: str | Path | None = None,
     seed: int = 0,
     num_envs: int = 64,
     settle: bool = False,
@@ -164,7 +164,7 @@ def load_trial(
         policy: the policy, whose robot and task are taken.
         source: demonstrations, motion or a goal set, or a file of one of these; or a loaded bank. Objects of a goal set
             start as stated, because these starts are perturbed already; only the robot's joints are perturbed.
-        objects: folder of object meshes; default: the folder of the policy's training.
+        meshes: folder of object meshes; default: the folder of the policy's training.
         seed: seed of the perturbations.
         num_envs: worlds that run at the same time.
         settle: whether objects come to rest before episodes begin (:mod:`xreset.resets.settle`), in MuJoCo for every
@@ -177,9 +177,9 @@ def load_trial(
     task = evaluation_task(policy.task)
     if episode_seconds is not None:
         task = with_episodes_of(task, episode_seconds)
-    folder = policy.meshes(objects)
+    folder = policy.meshes_folder(meshes)
     inputs = load_inputs(
-        source, robot=policy.robot, objects=folder, accept=("demos", "motion", "goals")
+        source, robot=policy.robot, meshes=folder, accept=("demos", "motion", "goals")
     )
     hashes = {} if policy.hash is None else {"policy": policy.hash}
     if inputs.hash is not None:
@@ -200,7 +200,7 @@ def load_trial(
         seed=seed,
         num_envs=num_envs,
         motion=inputs.motion() if policy.follows_motion else None,
-        objects_folder=folder,
+        meshes=folder,
         inputs=hashes,
     )
 
@@ -218,16 +218,16 @@ def roll_out(
     engine: Engine,
     trial: Trial,
     *,
-    repetitions: int,
+    episodes: int,
     progress: Progress = unseen,
 ) -> Rollouts:
-    """Play demonstrations ``repetitions`` times each.
+    """Play demonstrations ``episodes`` times each.
 
     Args:
         policy: the policy.
         engine: the engine.
         trial: what is played.
-        repetitions: episodes of each demonstration, each with another perturbation of robot and object.
+        episodes: episodes of each demonstration, each with another perturbation of robot and object.
         progress: called with (control steps done, control steps in all).
     """
     traces: list[Trace] = []
@@ -256,7 +256,7 @@ def roll_out(
         traces.extend(_traces(env, shown, every, states, targets))
 
     return Rollouts(
-        episodes=play_rounds(engine, trial, repetitions, play),
+        episodes=play_rounds(engine, trial, episodes, play),
         traces=tuple(sorted(traces, key=lambda t: t.sequence)),
         control_steps_per_second=steps / seconds,
     )
@@ -288,9 +288,9 @@ class Round:
 
 
 def play_rounds(
-    engine: Engine, trial: Trial, repetitions: int, play: Callable[[Round], None]
+    engine: Engine, trial: Trial, episodes: int, play: Callable[[Round], None]
 ) -> tuple[Episode, ...]:
-    """Play each demonstration ``repetitions`` times, in as many rounds as the worlds of an engine need.
+    """Play each demonstration ``episodes`` times, in as many rounds as the worlds of an engine need.
 
     Args:
         play: plays a round, and calls :meth:`Round.update_metrics` after every control step.
@@ -300,12 +300,12 @@ def play_rounds(
     """
     bank = trial.bank
     count = len(bank.sequence_name)
-    sequence = np.repeat(np.arange(count), repetitions)
-    repetition = np.tile(np.arange(repetitions), count)
+    sequence = np.repeat(np.arange(count), episodes)
+    repetition = np.tile(np.arange(episodes), count)
     objects = [trial.names.index(name) for name in bank.sequence_object[sequence]]
     starts = trial.starts()
     plan = schedule(np.array(objects), trial.num_envs)
-    episodes: list[Episode] = []
+    found: list[Episode] = []
     with trial.worlds(engine, torch.as_tensor(plan.object_index)) as env:
         points = MetricPoints.of(trial.objects, trial.task.object_frame).to(env.device)
         points = points[env.backend.object_index]
@@ -322,8 +322,8 @@ def play_rounds(
                 total=len(plan.rounds),
             )
             play(played)
-            episodes += [_episode(played, world, bank) for world in played.fresh]
-    return tuple(sorted(episodes, key=lambda e: (e.sequence, e.repetition)))
+            found += [_episode(played, world, bank) for world in played.fresh]
+    return tuple(sorted(found, key=lambda e: (e.sequence, e.repetition)))
 
 
 def episode_starts(

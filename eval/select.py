@@ -68,7 +68,7 @@ def select(
         RunError: the folder has no checkpoint.
     """
     run = read_run(folder)
-    meshes = setting.objects or run.objects
+    meshes = setting.meshes or run.meshes
     played: list[Candidate] = []
     best: Candidate | None = None
     order = engines
@@ -79,12 +79,12 @@ def select(
             export_checkpoint(path, file)
             policy = load_policy(file, robot=setting.robot or run.robot)
             trial = load_trial(
-                policy, demos, objects=meshes, seed=setting.seed, num_envs=setting.num_envs
+                policy, demos, meshes=meshes, seed=setting.seed, num_envs=setting.num_envs
             )
             scores: dict[str, float] = {}
             score_to_beat = best.worst if best else -1.0
             for engine in order:
-                rollouts = roll_out(policy.start(None), engine, trial, repetitions=episodes)
+                rollouts = roll_out(policy.start(None), engine, trial, episodes=episodes)
                 scores[engine.name] = float(np.mean([e.task_progress for e in rollouts.episodes]))
                 progress(path.name, engine.name, scores[engine.name])
                 if scores[engine.name] <= score_to_beat:  # the newer of two equal ones wins

@@ -13,7 +13,7 @@ class Place(Options):
 
     robot: str | None = None
     """Name or folder of the robot; default: the policy's, or the file's."""
-    objects: Path | None = None
+    meshes: Path | None = None
     """Folder of real meshes; default: what the policy was trained with, else the stand-ins."""
     seed: int = 0
     """Seed of everything that is drawn; draws are the same in every engine."""

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import numpy as np
 
@@ -77,16 +77,17 @@ class Curve:
 
 @frozen
 class Stress:
-    """Contents of ``stress/BACKEND.json``: a policy's curves in one engine."""
+    """Contents of ``stress/ENGINE.json``: a policy's curves in one engine."""
 
+    RENAMED: ClassVar = {"backend": "engine", "backend_version": "engine_version"}
     schema: str = SCHEMA
     policy: str = ""
     robot: str = ""
     seed: int = 0
     inputs: dict[str, str] = field(default_factory=dict)
     """SHA-256 of the files of policy and demonstrations."""
-    backend: str
-    backend_version: str
+    engine: str
+    engine_version: str
     episodes: int
     task_progress: float
     ci95: Interval
@@ -107,7 +108,7 @@ def stress(
     out: Path,
     *,
     sweeps: Sequence[Property] = SWEEPS,
-    repetitions: int = 2,
+    episodes: int = 2,
     progress: NamedProgress = unseen,
 ) -> list[Stress]:
     """Sweep properties in each engine, and write ``OUT/BACKEND.json`` when an engine has played all of them.
@@ -118,7 +119,7 @@ def stress(
         engines: the engines.
         out: folder for the results.
         sweeps: properties and values.
-        repetitions: episodes of each demonstration, the same for every value.
+        episodes: episodes of each demonstration, the same for every value.
         progress: called with (engine, runs done, runs in all).
 
     Returns:
@@ -143,7 +144,7 @@ def stress(
     def play(engine: Engine, prop: Property | None, value: float) -> tuple[Episode, ...]:
         changed = replace(trial, task=prop.set_in(task, value) if prop else task)
         player = policy.start(trial.motion)
-        return roll_out(player, engine, changed, repetitions=repetitions).episodes
+        return roll_out(player, engine, changed, episodes=episodes).episodes
 
     found = []
     with claim_folder(out):
@@ -189,8 +190,8 @@ def sweep(
         robot=trial.robot.name,
         seed=trial.seed,
         inputs=trial.inputs,
-        backend=engine.name,
-        backend_version=engine.version,
+        engine=engine.name,
+        engine_version=engine.version,
         episodes=len(nominal),
         task_progress=as_is.task_progress,
         ci95=as_is.ci95,
@@ -211,8 +212,8 @@ def sweep(
 
 def write_card(folder: Path, card: Stress) -> None:
     """Write complete results as ``ENGINE.json``."""
-    write_json(folder / f"{card.backend}.json", asdict(card))
-    (folder / f"{card.backend}.partial").unlink(missing_ok=True)
+    write_json(folder / f"{card.engine}.json", asdict(card))
+    (folder / f"{card.engine}.partial").unlink(missing_ok=True)
 
 
 def read_stress(folder: Path, policy: str | None = None) -> tuple[Stress, ...]:
@@ -314,7 +315,7 @@ def _draw(ax: Axes, card: Stress, curve: Curve, color: str) -> None:
     ends = np.array([p.difference_ci95 for p in curve.points]).T
     mean = [100 * p.task_progress for p in curve.points]
     ax.fill_between(x, *(100 * (card.task_progress + ends)), color=color, alpha=0.15, linewidth=0)
-    ax.plot(x, mean, color=color, marker="o", markersize=3, label=card.backend)
+    ax.plot(x, mean, color=color, marker="o", markersize=3, label=card.engine)
     ax.axvline(curve.nominal, color="grey", linewidth=0.7, linestyle=":")
     ax.set_xlabel("factor" if curve.unit == "x" else curve.unit)
     ax.locator_params(axis="x", nbins=5)

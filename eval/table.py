@@ -119,7 +119,7 @@ FIGURES = {
 
 def result_rows(summaries: Sequence[EvalResult]) -> list[tuple[str, ...]]:
     """Return one row of text for each figure: its name, then its value in each engine."""
-    rows = [("version", *(s.backend_version for s in summaries))]
+    rows = [("version", *(s.engine_version for s in summaries))]
     lengths = [_length_text(s) for s in summaries]
     if len(set(lengths)) > 1:
         rows.append(("episode length", *lengths))
@@ -180,7 +180,7 @@ def results_table(summaries: Sequence[EvalResult]) -> Table:
     )
     table.columns[0].no_wrap = True
     for s in summaries:
-        table.add_column(s.backend, justify="right", no_wrap=True)
+        table.add_column(s.engine, justify="right", no_wrap=True)
     for row in result_rows(summaries):
         table.add_row(
             *row, style="bold" if row[0] in ("task progress", "published success") else None

@@ -7,16 +7,16 @@ import xreset
 
 def main(meshes: str, name: str, out: str) -> None:
     """Make demonstrations of the mesh ``meshes/NAME.obj`` and a bank from them, and film the policy's first episode."""
-    thing = xreset.load_object(name, meshes)
+    obj = xreset.load_object(name, meshes)
     demos = xreset.synthesize([name], 2, meshes=meshes)  # or xreset.read_demos("demos.npz")
     policy = xreset.load_policy("many-objects")  # or a run folder, or an .onnx file
 
     # robot states that follow the human hand
-    motion = xreset.retarget_demos(demos, policy.robot, [thing])
+    motion = xreset.retarget_demos(demos, policy.robot, [obj])
     # those that MuJoCo finds stable
-    bank = xreset.make_bank(motion, policy.robot, [thing])
+    bank = xreset.make_bank(motion, policy.robot, [obj])
     # the task that the policy was trained for
-    with policy.make_env([thing], bank, engine="sapien") as env:
+    with policy.make_env([obj], bank, engine="sapien") as env:
         xreset.film(policy, env, out)
 
 

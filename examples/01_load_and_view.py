@@ -19,7 +19,7 @@ def main(out: Path) -> None:
     can = xreset.load_object("soup")
     demos = xreset.synthesize([can.name], 2, seed=0)  # or xreset.read_demos("demos.npz")
     xreset.write_demos(out / "demos.npz", demos)
-    view = load_view(out / "demos.npz", demos=None, robot=None, objects=None)
+    view = load_view(out / "demos.npz", demos=None, robot=None, meshes=None)
     write_png(out / "demos.png", Drawer(view, smooth=True).draw(row=60))
 
     print(

@@ -22,9 +22,9 @@ def main(out: Path, engines: tuple[str, ...] = ("mujoco", "sapien")) -> None:
     for number, result in enumerate(results):
         means = [getattr(result, part) for part in parts]
         places = [i + 0.4 * number for i in range(len(parts))]
-        axes.bar(places, means, width=0.38, label=f"{result.backend} {result.backend_version}")
+        axes.bar(places, means, width=0.38, label=f"{result.engine} {result.engine_version}")
         progress = f"task progress {result.task_progress.mean:.0%} in {result.episodes} episodes"
-        print(f"{result.policy} in {result.backend}: {progress}")
+        print(f"{result.policy} in {result.engine}: {progress}")
     axes.set_xticks(
         [i + 0.2 for i in range(len(parts))], [part.replace("_", "\n") for part in parts]
     )

@@ -201,7 +201,7 @@ def add_evaluation(every):
     mass = next(prop for prop in SWEEPS if prop.option == "object-mass")
     swept = curve(mass, nominal, {2.0: nominal})
     card = Stress(
-        backend="mujoco", backend_version="4", episodes=len(nominal), task_progress=0.5, ci95=(0.4, 0.6),
+        engine="mujoco", engine_version="4", episodes=len(nominal), task_progress=0.5, ci95=(0.4, 0.6),
         curves=(swept,), left_out=("arm-stiffness",),
     )  # fmt: skip
     write_card(path.parent, card)
@@ -219,7 +219,7 @@ def add_evaluation(every):
 
 def add_run(every):
     info = RunInfo(
-        robot="toy", resets="b.npz", resets_hash="ab", objects=None, backend="mujoco", backend_version="4", device="cpu", num_envs=4,
+        robot="toy", resets="b.npz", resets_hash="ab", meshes=None, engine="mujoco", engine_version="4", device="cpu", num_envs=4,
         seed=3, config=TrainConfig(), contract=every.contract,
     )  # fmt: skip
     write_run(every.folder, info)

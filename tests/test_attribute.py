@@ -284,7 +284,7 @@ class CommandTest(InFolder):
         options = ("--demos", "none.npz", "--robot", "ur7e-sharpa", "--towards")
         for message, policy, other in (
             ("Choose two engines", "zero", "mujoco"),
-            ("Unknown backend 'havok'", "zero", "havok"),
+            ("Unknown engine 'havok'", "zero", "havok"),
             ("there is no none.npz", "zero", "sapien"),
         ):
             with self.subTest(message):

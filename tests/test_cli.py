@@ -94,8 +94,8 @@ class UsageTest(TestCase):
                 "resets /nowhere/moves.npz --out /nowhere/bank.npz",
             ),
             (
-                r"Unknown backend 'bulet'\. Choose from: .*pybullet",
-                "engines check --backend bulet",
+                r"Unknown engine 'bulet'\. Choose from: .*pybullet",
+                "engines check --engine bulet",
             ),
             (
                 r"--seed is -1, expected a whole number from 0 to 4294967295",
@@ -129,6 +129,19 @@ class UsageTest(TestCase):
                 self.assertRegex(err + out, words)
                 self.assertNotIn("Traceback", err)
 
+    def test_earlier_names_of_flags_are_taken(self):
+        for words, told in (
+            ("engines check --backend bulet", ["--backend is now --engine"]),
+            ("objects list --objects=none", ["--objects is now --meshes", "no folder 'none'"]),
+            ("demos synth --out x.npz --objects nothing", ["Unknown object 'nothing'"]),
+        ):
+            with self.subTest(words):
+                code, _, err = run(*words.split())
+                self.assertEqual(code, 1)
+                self.assertEqual(len(err.splitlines()), max(2, len(told)) - ("synth" in words))
+                for each in told:
+                    self.assertIn(each, err)
+
     def test_a_student_has_the_robot_of_the_bank(self):
         self.assertIn("default: that of the bank", run("distill", "--help")[1])
 
@@ -143,7 +156,7 @@ class UsageTest(TestCase):
 
     def test_a_gpu_that_is_not_there(self):
         """It is also not there if only its driver knows it."""
-        arguments = "resets none.npz --out x.npz --backend mujoco-warp --device cuda"
+        arguments = "resets none.npz --out x.npz --engine mujoco-warp --device cuda"
         for can_be_used, count in ((True, 0), (False, 1)):
             with (
                 patch("torch.cuda.device_count", return_value=count),
@@ -201,7 +214,7 @@ class UsageTest(TestCase):
         ):
             argv = ["eval", "zero", "--robot", "openarm", "--demos", "x.npz"]
             for name in given:
-                argv += ["--backend", name]
+                argv += ["--engine", name]
             with patch("xreset.eval.evaluate.evaluate", side_effect=KeyboardInterrupt) as evaluate:
                 self.assertEqual(run(*argv)[0], 130)
             self.assertEqual(list(evaluate.call_args.args[2]), expected)

@@ -323,7 +323,7 @@ class CommandTest(InFolder):
             inputs = {"object brick": source, "object robot": "a toy", "robot": "openarm"}
             write_retargeted(f"{self.folder}/r.npz", grasp_and_lift(), inputs=inputs)
             self.assertEqual(object_sources(f"{self.folder}/r.npz")["robot"], "a toy")
-            words = "made with other meshes of brick. Give the same --objects folder"
+            words = "made with other meshes of brick. Give the same --meshes folder"
             self.assertEqual(self.resets()[1].count(words), told)
 
     def test_a_file_that_is_not_motion_is_refused(self):

@@ -252,7 +252,7 @@ class GroupTest(Compared):
             ("b", {}, {"seed": 0}, "Some have the same seed, too"),
             ("c", {"seed": 5}, {"seed": 1}, "not the same seed of the evaluation"),
             ("d", {"inputs": {"demos": "cd"}}, {"seed": 2}, "not the same demonstrations"),
-            ("e", {"backend_version": "5.0"}, {"seed": 3}, "not the same version of mujoco"),
+            ("e", {"engine_version": "5.0"}, {"seed": 3}, "not the same version of mujoco"),
         ):
             self.run_and_results(name, results, **changes)
             found, notes = self.groups("a", name)
@@ -392,8 +392,8 @@ class FairnessTest(Compared):
         for what, episodes, changes, expected in (
             ("seed", (), {"seed": 4}, r"seed of the evaluation \(3: a; 4: seed\)"),
             ("robot", (), {"robot": "x"}, r"robot \(toy: a; x: robot\)"),
-            ("ycb", (), {"objects_folder": "/x"}, r"object meshes \(stand-ins: a; /x: ycb\)\."),
-            ("new", (), {"backend_version": "5"}, r"version of mujoco \(4.0.0: a; 5: new\)"),
+            ("ycb", (), {"meshes": "/x"}, r"object meshes \(stand-ins: a; /x: ycb\)\."),
+            ("new", (), {"engine_version": "5"}, r"version of mujoco \(4.0.0: a; 5: new\)"),
             ("demos", renamed, other, r"demonstrations \(ab: a; cd: demos\)\.$"),
             ("file", (), other, rf"demonstrations \(ab: a; cd: file\)\. .* same names: {same}"),
             ("objects", soups, {}, rf"objects \({both}: a; tomato soup can: ob"),
@@ -406,7 +406,7 @@ class FairnessTest(Compared):
                 self.assertRegex(self.compare("a", what), rf"(?m)^> {note} {expected}")
         with self.subTest("the same meshes, named from here and in full"):
             for name, folder in (("here", "meshes"), ("full", str(Path("meshes").resolve()))):
-                self.write_results(name, objects_folder=folder)
+                self.write_results(name, meshes=folder)
             self.assertNotIn("object meshes", self.compare("here", "full"))
         self.write_results("a", engines=("sapien",), seed=9)
         words = r"seed of the evaluation \(3: a in mujoco; 9: a in sapien\)"

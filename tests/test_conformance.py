@@ -575,7 +575,7 @@ class Harness(InFolder):
 
     def test_command(self):
         file = self.folder / "c.json"
-        words = "engines check --backend mujoco --check free_fall"
+        words = "engines check --engine mujoco --check free_fall"
         command = (*words.split(), "--json", file)
         self.assertIn("no check failed", succeeds(*command))
         data = json.loads(file.read_text())

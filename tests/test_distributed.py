@@ -31,7 +31,7 @@ class TwoProcesses(WithBank):
     def setUpClass(cls):
         super().setUpClass()
         cls.out = cls.folder / "run"
-        new = f"--robot openarm --resets {cls.bank} --backend mujoco --device cpu --num-envs 8 --seed 3"
+        new = f"--robot openarm --resets {cls.bank} --engine mujoco --device cpu --num-envs 8 --seed 3"
         cls.first = cls.train(f"--out {cls.out} --iterations 2 {new} {SMALL}")
         cls.made = sorted(path.name for path in cls.out.rglob("*") if path.is_file())
         cls.second = cls.train(f"--out {cls.out} --iterations 3 --resume")

@@ -743,7 +743,7 @@ class RolloutTest(WithEnv):
         objects = tuple(self.objects)
         parts = {"robot": self.robot, "objects": objects, "bank": self.bank, "task": self.TASK}
         trial = Trial(**parts, num_envs=num_envs, **options)
-        return roll_out(policy, Engine(name="mujoco", make=make, version=""), trial, repetitions=2)
+        return roll_out(policy, Engine(name="mujoco", make=make, version=""), trial, episodes=2)
 
     def test_every_demonstration_is_played_and_the_number_of_worlds_changes_nothing(self):
         one, found = (self.roll_out(ZeroPolicy(7), n) for n in (1, 6))

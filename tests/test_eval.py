@@ -288,7 +288,7 @@ class RecordedTest(TestCase):
         falling.goal_pos[:] = (0.51, 0.3, 0.20)
         trial = load_trial(policy, falling, seed=1)
         with patch("xreset.eval.rollout.TRACE_INTERVAL", 0.0):
-            found = roll_out(policy.start(None), engine("mujoco", workers=0), trial, repetitions=1)
+            found = roll_out(policy.start(None), engine("mujoco", workers=0), trial, episodes=1)
         for episode, trace in zip(found.episodes, found.traces, strict=True):
             points = metric_points(load_object(trace.object))
             turns = Rotation.from_quat(trace.object_quat, scalar_first=True).as_matrix()
@@ -472,7 +472,7 @@ class ResultsTest(InFolder):
 
     def test_files(self):
         found = read_evaluation(self.folder)
-        self.assertEqual([s.backend for s in found], ["mujoco", "sapien"])
+        self.assertEqual([s.engine for s in found], ["mujoco", "sapien"])
         self.assertEqual(found[0], toy_summary("mujoco"))
         traces = read_traces(self.folder, "mujoco", JOINTS)
         for read, made in zip(traces, self.rollouts.traces, strict=True):

@@ -68,7 +68,7 @@ class PluginTest(InFolder, Unavailable):
         with make_backend("someones", scene(), 1) as backend:
             self.assertEqual(backend.name, "someones")
         with contextlib.redirect_stdout(io.StringIO()) as out:
-            main(["engines", "check", "--backend", "someones", "--check", "state_round_trip"])
+            main(["engines", "check", "--engine", "someones", "--check", "state_round_trip"])
         self.assertIn("someones 7.1", out.getvalue())
         self.assertIn("no check failed", out.getvalue())
 
@@ -91,7 +91,7 @@ class PluginTest(InFolder, Unavailable):
                 "from xreset.backends.pool import PoolBackend\n"
                 f"class {backend}(PoolBackend):\n    name = 'someones'\n",
                 backend,
-                "^the backend 'someones' is not complete. Add to SomeonesBackend: "
+                "^the engine 'someones' is not complete. Add to SomeonesBackend: "
                 "capabilities, engine_version, world_class.$",
             ),
             (install, backend, "^pip install their-engine$"),

@@ -98,14 +98,14 @@ class Episodes(Case):
 
     def test_only_some_engines_of_several_folders(self):
         folders = [self.evaluate("a"), self.evaluate("b")]
-        self.assertEqual(len(read_recorded(folders, backends=["sapien"]).episodes), 4)
+        self.assertEqual(len(read_recorded(folders, engines=["sapien"]).episodes), 4)
 
     def test_an_episode_whose_engine_broke_down_is_left_out(self):
         broken = toy_rollouts(self.robot.home).traces[0].object_pos.copy()
         broken[3:] = np.nan
         with self.assertLogs("xreset.eval.export.recorded", "WARNING") as log:
             recording = read_recorded(
-                [self.evaluate(change=self.change_first(object_pos=broken))], backends=["mujoco"]
+                [self.evaluate(change=self.change_first(object_pos=broken))], engines=["mujoco"]
             )
         self.assertIn("demonstration 0 is left out", log.output[0])
         self.assertEqual(list(map(len, recording.episodes["action"])), [5])
@@ -130,7 +130,7 @@ class Episodes(Case):
             with self.subTest(words), self.assertRaisesRegex(error, words):
                 read_recorded(folders)
         with self.assertRaisesRegex(RunError, "no recorded episodes of pybullet"):
-            read_recorded([self.evaluate()], backends=["pybullet"])
+            read_recorded([self.evaluate()], engines=["pybullet"])
         stray = self.evaluate("stray", change=self.change_first(sequence=1_000_000))
         with self.assertRaisesRegex(
             FileFormatError, "a trace of demonstration 1000000, but no episode of it"
@@ -161,7 +161,7 @@ class Arrays(Case):
 
     def test_the_command_takes_engines_and_words(self):
         out = self.folder / "out.npz"
-        options = ("--backend", "sapien", "--task", "Lift the {object}.", "--out", out)
+        options = ("--engine", "sapien", "--task", "Lift the {object}.", "--out", out)
         self.assertIn(
             "2 episodes of ur7e-sharpa", succeeds("export", "npz", self.evaluate(), *options)
         )
@@ -180,7 +180,7 @@ class Arrays(Case):
 class LeRobot(Case):
     def films(self, **options):
         """The episodes of one engine, and a data set with small films of them."""
-        recording = read_recorded([self.evaluate()], backends=["sapien"])
+        recording = read_recorded([self.evaluate()], engines=["sapien"])
         root = self.folder / "set"
         write_lerobot(root, recording, size=(64, 48), **options)
         return recording, root

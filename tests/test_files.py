@@ -11,7 +11,7 @@ import zipfile
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from errno import ENOSPC
-from typing import Literal
+from typing import ClassVar, Literal
 from unittest import TestCase
 from unittest.mock import patch
 
@@ -465,6 +465,14 @@ class TypedTest(TestCase):
         data = asdict(TaskConfig(timestep=0.01))
         del data["timestep"], data["reset"]
         self.assertEqual(from_dict(TaskConfig, data), TaskConfig())
+
+    def test_an_entry_may_have_its_earlier_name(self):
+        class Renamed(Inner):
+            RENAMED: ClassVar = {"length": "size"}
+
+        self.assertEqual(from_dict(Renamed, {"length": 1.5}), Renamed(size=1.5))
+        with self.assertRaisesRegex(FileFormatError, "unknown: length"):
+            from_dict(Renamed, {"length": 1.5, "size": 1.5})
 
     def test_only_a_newer_version_is_named(self):
         for version, is_newer in (

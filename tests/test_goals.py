@@ -123,7 +123,7 @@ class UsedTest(InFolder):
         assert_array_equal(read_goals(f"{self.folder}/goals.npz").family, goals.family)
         policy = load_policy("zero", robot="ur7e-sharpa")
         trial = load_trial(policy, self.folder / "goals.npz", episode_seconds=0.1)
-        rollouts = roll_out(policy.start(None), engine("mujoco", workers=0), trial, repetitions=1)
+        rollouts = roll_out(policy.start(None), engine("mujoco", workers=0), trial, episodes=1)
         self.assertEqual([e.sequence_name for e in rollouts.episodes], goals.sequence_name.tolist())
         for i, trace in enumerate(rollouts.traces):
             assert_allclose(trace.object_pos[0], goals.start_pos[i], atol=1e-6)

@@ -80,7 +80,7 @@ class Judge(InFolder):
         self.enterContext(mock.patch("xreset.inputs.load_robot", return_value=robot()))
         self.enterContext(mock.patch("xreset.inputs.load_objects", return_value=(brick(),)))
         write_bank(f"{self.folder}/bank.npz", bank())
-        words = f"--robot gripper --backend mujoco --squeeze.force 0.2 --json {self.folder}/judge.json --picture {self.folder}/judge.png"
+        words = f"--robot gripper --engine mujoco --squeeze.force 0.2 --json {self.folder}/judge.json --picture {self.folder}/judge.png"
         with redirect_stdout(io.StringIO()) as output:
             main(["robots", "judge", f"{self.folder}/bank.npz", *words.split()])
         self.assertRegex(output.getvalue(), r"brick +│ +3 +│ 0, 0, 0")

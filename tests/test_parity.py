@@ -321,7 +321,7 @@ class Comparing(InFolder):
         cls.result = compare(robot, [can], cls.motion, tested, grasps=6, reference=reference)
 
     def metrics(self, name):
-        tested = next(e for e in self.result.engines if e.backend == name)
+        tested = next(e for e in self.result.engines if e.engine == name)
         return {metric.metric: metric for metric in tested.metrics}
 
     def test_outcomes_are_mixed(self):
@@ -347,7 +347,7 @@ class Comparing(InFolder):
         self.assertTrue(any(label.endswith("as demonstrated") for label in labels))
         closed = {label.rpartition("closed in ")[2] for label in labels if "closed in" in label}
         self.assertGreaterEqual(len(closed), 2, labels)
-        self.assertNotIn(self.result.floor.backend, closed)
+        self.assertNotIn(self.result.floor.engine, closed)
 
     def test_the_exit_code_of_the_command_says_the_verdict(self):
         path = self.folder / "retargeted.npz"
@@ -356,7 +356,7 @@ class Comparing(InFolder):
             with mock.patch(
                 "xreset.eval.engines.agreement.compare", lambda *_, result=result, **__: result
             ):
-                options = ("--backend", "mujoco", "--json", self.folder / "parity.json")
+                options = ("--engine", "mujoco", "--json", self.folder / "parity.json")
                 found, text, _ = xreset("engines", "compare", path, *options)
             self.assertEqual(found, code)
             self.assertIn("press, fingertip", text)
@@ -391,5 +391,5 @@ class Engines(TestCase):
                 "press, fingertip",
                 "closing, outcome",
             ):  # few holds near the edge say little
-                with self.subTest(name, engine=found.backend):
+                with self.subTest(name, engine=found.engine):
                     self.assertTrue(metrics[name].ok, metrics[name])

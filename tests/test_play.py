@@ -133,7 +133,7 @@ class Played(InFolder):
         self.steps(0.1)
         before = session.env.snapshot()
         for choose, name, words in (
-            (session.choose_engine, "nosuch", "Unknown backend 'nosuch'"),
+            (session.choose_engine, "nosuch", "Unknown engine 'nosuch'"),
             (session.choose_object, "nosuch", "Unknown object 'nosuch'"),
             (session.choose_policy, "nosuch", "Unknown policy 'nosuch'"),
         ):

@@ -125,7 +125,7 @@ class FrameTest(TestCase):
 
 
 class VerdictTest(TestCase):
-    def card(self, backend="mujoco", **losses):
+    def card(self, engine="mujoco", **losses):
         """A card; ``action_delay_67=0.2`` is a loss of 20 points in every episode."""
         curves = []
         for prop in REHEARSED:
@@ -135,7 +135,7 @@ class VerdictTest(TestCase):
                 swept[value] = episodes([0.8 - losses.get(f"{name}_{value:g}", 0.0)] * 5)
             curves.append(curve(prop, episodes([0.8] * 5), swept))
         stopped = {"The pose is old.": 2}
-        return toy_card(Rehearsal, backend=backend, curves=tuple(curves), stopped=stopped)
+        return toy_card(Rehearsal, engine=engine, curves=tuple(curves), stopped=stopped)
 
     def test_verdicts(self):
         self.assertEqual(judge([self.card()]), ("Ready for a first, careful trial on a robot.", []))
@@ -174,7 +174,7 @@ class CommandTest(InFolder):
     def test_a_page_from_the_command_line(self):
         demos = self.folder / "demos.npz"
         succeeds("demos", "synth", "--objects", SOUP, "--per-object", 1, "--out", demos)
-        options = ("--demos", demos, "--backend", "mujoco", "--out", self.folder)
+        options = ("--demos", demos, "--engine", "mujoco", "--out", self.folder)
         out = succeeds(
             "rehearse",
             shipped()["soup-can"],

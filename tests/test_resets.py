@@ -181,7 +181,7 @@ class FilterTest(TestCase):
             bank = self.bank(
                 ["mujoco", "moves"], num_envs=2, progress=lambda *now: calls.append(now)
             )
-        self.assertEqual(bank.backends, ("mujoco", "moves"))
+        self.assertEqual(bank.engines, ("mujoco", "moves"))
         self.assertEqual(bank.sequence_index.tolist(), [0, 0, 1])
         self.assertEqual(bank.frame_index.tolist(), [0, 2, 2])
         self.assertEqual(bank.rejected_frame_index.tolist(), [1, 1])

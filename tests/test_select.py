@@ -5,10 +5,9 @@ from dataclasses import replace
 from types import SimpleNamespace
 from unittest.mock import Mock, patch
 
-from tests import toy_grasp
+from tests import toy_grasp, toy_results
 from tests.command import refused, xreset
 from tests.data import InFolder
-from tests.toy_results import episodes
 from xreset import evaluate
 from xreset.errors import FileFormatError, PolicyError, RunError
 from xreset.eval.engines.attribution import attribute
@@ -44,15 +43,17 @@ class SelectTest(InFolder):
         def load_trial(policy, demos, seed, **_):
             return SimpleNamespace(seed=seed)
 
-        def rolled(policy, engine, trial, *, repetitions):
+        def rolled(policy, engine, trial, *, episodes):
             self.played.append((policy, engine.name, trial.seed))
-            return SimpleNamespace(episodes=episodes([SCORES[policy][engine.name]] * repetitions))
+            return SimpleNamespace(
+                episodes=toy_results.episodes([SCORES[policy][engine.name]] * episodes)
+            )
 
         def export(checkpoint, file):
             file.write_bytes(checkpoint.read_bytes())
 
         engines = [SimpleNamespace(name=name, version="1") for name in "abc"]
-        run = SimpleNamespace(objects=None, robot="my/robot")
+        run = SimpleNamespace(meshes=None, robot="my/robot")
         patches = {"load_policy": load_policy, "load_trial": load_trial, "roll_out": rolled}
         patches |= {"export_checkpoint": export, "read_run": lambda folder: run}
         with patch.multiple("xreset.eval.select", **patches):
@@ -106,7 +107,7 @@ class SelectTest(InFolder):
     def test_the_command_takes_the_seed_of_the_starts(self):
         for words, seed in (((), SEED), (("--seed", 5), 5)):
             with patch("xreset.eval.select.select", side_effect=KeyboardInterrupt) as chosen:
-                xreset("select", self.folder, "--demos", self.demos, "--backend", "mujoco", *words)
+                xreset("select", self.folder, "--demos", self.demos, "--engine", "mujoco", *words)
             self.assertEqual(chosen.call_args.args[3].seed, seed)
         told = refused("select", self.folder, "--demos", self.demos, "--seed", -1)
         self.assertIn("--seed is -1, expected a whole number from 0", told)

@@ -106,15 +106,15 @@ class CurveTest(InFolder):
         )
 
     def test_cards_of_another_policy_are_left_out(self):
-        for backend, inputs in (
+        for engine, inputs in (
             ("mujoco", {"policy": "old"}),
             ("sapien", {"policy": "new"}),
             ("pybullet", {}),
         ):
-            card = toy_card(backend=backend, inputs=inputs)
-            write_json(f"{self.folder}/{backend}.json", asdict(card))
+            card = toy_card(engine=engine, inputs=inputs)
+            write_json(f"{self.folder}/{engine}.json", asdict(card))
         self.assertEqual(
-            [c.backend for c in read_stress(self.folder, "new")], ["pybullet", "sapien"]
+            [c.engine for c in read_stress(self.folder, "new")], ["pybullet", "sapien"]
         )
         self.assertEqual(len(read_stress(self.folder)), 3)
 

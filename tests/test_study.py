@@ -109,7 +109,7 @@ class FileTest(Studied):
                 "--hand.object-clearance -0.001 --arm.restarts=8 --hand.jump_limit 1",
                 True,
             ),
-            ("resets", "--closing.spacing 0.005 --num-envs 8 --backend mujoco", True),
+            ("resets", "--closing.spacing 0.005 --num-envs 8 --engine mujoco", True),
             ("resets", "--settle", True),
         ):
             options = text.split()

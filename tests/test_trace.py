@@ -340,7 +340,7 @@ class EvaluationTest(toy_results.InFolder):
         )
         trial = toy_grasp.trial(task, num_envs=1)
         mujoco = engine("mujoco", workers=0)
-        cls.episode = roll_out(toy_grasp.OpenLoop(), mujoco, trial, repetitions=1).traces[1]
+        cls.episode = roll_out(toy_grasp.OpenLoop(), mujoco, trial, episodes=1).traces[1]
 
     def actions(self, **changes):
         """The actions of the episode with some changes."""
@@ -392,7 +392,7 @@ class EvaluationTest(toy_results.InFolder):
         rollouts = toy_results.toy_rollouts(robot.home)
         self.write_results("", rollouts, ("mujoco",), robot.joint_names, robot="openarm")
         out = self.folder / "trace"
-        options = ("--object", SPAM, "--backend", "mujoco", "--backend", "sapien", "--out", out)
+        options = ("--object", SPAM, "--engine", "mujoco", "--engine", "sapien", "--out", out)
         with mock.patch("xreset.eval.rollout.engine", partial(engine, workers=0)):
             said = succeeds("engines", "trace", self.folder / "eval/mujoco.trace.npz", *options)
         data = json.loads((out / "trace.json").read_text())

@@ -97,7 +97,7 @@ class TrainingTest(WithBank):
     def test_what_a_run_holds(self):
         info = read_run(self.out)
         self.assertEqual(info.config, CONFIG)
-        self.assertEqual((info.backend, info.num_envs, info.seed), ("mujoco", 4, 3))
+        self.assertEqual((info.engine, info.num_envs, info.seed), ("mujoco", 4, 3))
         self.assertEqual(
             (info.robot, info.resets, info.resets_hash),
             ("openarm", str(self.bank), file_hash(self.bank)),
@@ -119,10 +119,10 @@ class TrainingTest(WithBank):
         self.changed_run(moved, resets="bank.npz")
         here = os.path.relpath(meshes, Path.cwd()) + "/"  # as stated, where it exists
         for stated, found in (("meshes", str(meshes.resolve())), ("gone", "gone"), (here, here)):
-            self.changed_run(moved, objects=stated)
+            self.changed_run(moved, meshes=stated)
             info = read_run(moved)
             expected = ("openarm", str(self.bank.resolve()), found)
-            self.assertEqual((info.robot, info.resets, info.objects), expected)
+            self.assertEqual((info.robot, info.resets, info.meshes), expected)
 
     def test_goals_need_no_demonstrations(self):
         """Every episode begins at home; fine-tuning continues with the run's networks and configuration; a bank keeps its
@@ -337,7 +337,7 @@ class TrainingTest(WithBank):
         for options, problem in (
             ("", ""),
             (
-                f"--robot openarm --backend mujoco --device cpu --num-envs 4 --seed 3 --resets {self.bank}",
+                f"--robot openarm --engine mujoco --device cpu --num-envs 4 --seed 3 --resets {self.bank}",
                 "",
             ),
             (
@@ -350,10 +350,10 @@ class TrainingTest(WithBank):
             ("--like paper", "Omit --like"),
             ("--config.ppo.horizon 16", "Omit --config"),
             ("--resets None", "--resets is None, but"),
-            ("--backend pybullet", "--backend is pybullet, but .* was started with mujoco"),
+            ("--engine pybullet", "--engine is pybullet, but .* was started with mujoco"),
             ("--robot ur7e-sharpa", "--robot is ur7e-sharpa, but .* was started with openarm"),
             (f"--resets {other}", "--resets is .*other.npz, but .* was started with .*bank.npz"),
-            (f"--objects {self.folder}", "--objects is .*, but .* was started with None"),
+            (f"--meshes {self.folder}", "--meshes is .*, but .* was started with None"),
             (f"--resets {self.bank} --goals {other}", "--goals is .*other.npz, but .* was started"),
         ):
             with self.subTest(options):
@@ -401,7 +401,7 @@ class TrainingTest(WithBank):
         config["task"]["reward"]["own"] = own
         self.changed_run(stranger, config=config)
         like = (
-            f"--like {stranger} --robot openarm --resets {self.bank} --backend mujoco --device cpu "
+            f"--like {stranger} --robot openarm --resets {self.bank} --engine mujoco --device cpu "
             f"--num-envs 4 --iterations 1 --out {self.folder}"
         )
         resume = f"--resume --out {stranger} --iterations 3"

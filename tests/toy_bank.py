@@ -32,7 +32,7 @@ def toy_bank(robot, **changes):
     fields: dict[str, Any] = {
         "robot": robot.name,
         "robot_fingerprint": robot.fingerprint,
-        "backends": ("mujoco",),
+        "engines": ("mujoco",),
         "joint_names": robot.joint_names,
         "joint_pos": np.arange(6)[:, None] * 0.01 + np.arange(num) * 0.001,
         "object_pos": np.stack([[0.6 + i / 100, 0.3, 0.15] for i in range(6)]),

@@ -30,7 +30,7 @@ CONTRACT = Contract(
 )
 
 
-def toy_episode(sequence, repetition, *reached, thing="", **changes):
+def toy_episode(sequence, repetition, *reached, object_name="", **changes):
     """An episode of a demonstration that reached some stages; nothing else is special but for ``changes``."""
     flags = "approach grasp reorient reorient_once out_of_bounds nonfinite overflow"
     distances = "least_distance final_distance final_position_error final_angle"
@@ -38,7 +38,7 @@ def toy_episode(sequence, repetition, *reached, thing="", **changes):
     values = {name: name in reached for name in flags.split()}
     values |= dict.fromkeys(distances.split(), distance)
     values |= dict.fromkeys(("reorientation_progress", "task_progress"), 0.0)
-    values |= {"published_success": distance < 0.02, "object": thing or OBJECTS[sequence]}
+    values |= {"published_success": distance < 0.02, "object": object_name or OBJECTS[sequence]}
     return Episode(
         sequence=sequence,
         sequence_name=f"demo_{sequence}",
@@ -52,7 +52,7 @@ def episodes(scores):
     found = []
     for i, score in enumerate(scores):
         reached = ("approach", "grasp") if score > 0.5 else ("approach",)
-        found.append(toy_episode(i // 2, i % 2, *reached, thing=SOUP, task_progress=score))
+        found.append(toy_episode(i // 2, i % 2, *reached, object_name=SOUP, task_progress=score))
     return tuple(found)
 
 
@@ -97,22 +97,22 @@ def rollouts_with(*progress):
     return replace(rollouts, episodes=tuple(replace(e, task_progress=p) for e, p in both))
 
 
-def toy_summary(backend="mujoco", rollouts=None, **changes):
-    """Return ``BACKEND.json`` of the rollouts; ``changes`` replace arguments of :func:`xreset.eval.results.summarize`."""
+def toy_summary(engine="mujoco", rollouts=None, **changes):
+    """Return ``ENGINE.json`` of the rollouts; ``changes`` replace arguments of :func:`xreset.eval.results.summarize`."""
     arguments: dict[str, Any] = {
-        "backend_version": "4.0.0",
+        "engine_version": "4.0.0",
         "robot": "toy",
         "policy": "zero",
         "seed": 3,
         "inputs": {"demos": "ab"},
-        "objects_folder": None,
+        "meshes": None,
     }
-    return summarize(rollouts or toy_rollouts(), backend=backend, **(arguments | changes))
+    return summarize(rollouts or toy_rollouts(), engine=engine, **(arguments | changes))
 
 
 def toy_card(card_type=Stress, **changes):
     """Return a card of a sweep without curves; ``changes`` replace its fields."""
-    fields = {"backend": "mujoco", "backend_version": "4", "episodes": 4, "task_progress": 0.8}
+    fields = {"engine": "mujoco", "engine_version": "4", "episodes": 4, "task_progress": 0.8}
     fields |= {"ci95": (0.7, 0.9), "curves": (), "left_out": ()}
     return card_type(**(fields | changes))
 
@@ -143,9 +143,9 @@ class InFolder(data.InFolder):
             "robot": "openarm",
             "resets": "resets.npz",
             "resets_hash": "ef" * 32,
-            "objects": None,
-            "backend": "mujoco-warp",
-            "backend_version": "4.0.0",
+            "meshes": None,
+            "engine": "mujoco-warp",
+            "engine_version": "4.0.0",
             "device": "cuda",
             "num_envs": 64,
             "seed": 0,

@@ -331,7 +331,8 @@ def from_dict(cls: type[T], data: Any, where: str = "configuration", version: An
 
     A missing entry takes its default, so files stay readable when a field is added: its default must be what was done
     before. A class may list the fields that it no longer has, with the values that mean what is done now: ``REMOVED:
-    ClassVar[dict[str, Any]]``. Entries with these values are ignored.
+    ClassVar[dict[str, Any]]``. Entries with these values are ignored. It may also list the earlier names of fields:
+    ``RENAMED: ClassVar[dict[str, str]]``, earlier name -> present name.
 
     Args:
         cls: the dataclass.
@@ -369,6 +370,15 @@ def parsed(cls: type[T], data: Any, where: str, version: Any = None) -> tuple[T 
     return None, problems
 
 
+def renamed(cls: type, data: dict[str, Any]) -> dict[str, Any]:
+    """Return the data of a dataclass with the present names of entries; see :func:`from_dict`."""
+    found = dict(data)
+    for earlier, name in getattr(cls, "RENAMED", {}).items():
+        if earlier in found and name not in found:
+            found[name] = found.pop(earlier)
+    return found
+
+
 def _parsed_record(cls: type, data: Any, where: str, problems: list[str]) -> Any:
     if not isinstance(data, dict):
         problems.append(
@@ -376,6 +386,7 @@ def _parsed_record(cls: type, data: Any, where: str, problems: list[str]) -> Any
         )
         return None
     count = len(problems)
+    data = renamed(cls, data)
     removed = getattr(cls, "REMOVED", {})
     for name in sorted(data.keys() & removed.keys()):
         if data[name] != removed[name]:

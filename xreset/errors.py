@@ -41,7 +41,7 @@ class BackendUnavailableError(XResetError):
 
 
 class CapabilityError(XResetError):
-    """A backend cannot do what was asked: the message names the capability, the backend and an alternative."""
+    """An engine cannot do what was asked: the message names the capability, the engine and an alternative."""
 
 
 class PolicyError(XResetError):

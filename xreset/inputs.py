@@ -51,7 +51,7 @@ class Inputs:
     """File of the data; None: the data never were in a file."""
     hash: str | None = None
     """SHA-256 of the file when it was read."""
-    objects_folder: Path | None = None
+    meshes: Path | None = None
     """Folder of object meshes; None: the built-in stand-ins."""
     robot_name: str | None = None
     """Name or folder of the robot, as given or as the file states it; None: demonstrations, and no robot was given."""
@@ -109,7 +109,7 @@ def load_inputs(
     source: str | Path | Data,
     *,
     robot: str | Path | RobotSpec | None = None,
-    objects: str | Path | None = None,
+    meshes: str | Path | None = None,
     only: Iterable[str] = (),
     accept: tuple[Kind, ...] = ("demos", "motion", "bank", "goals"),
 ) -> Inputs:
@@ -118,7 +118,7 @@ def load_inputs(
     Args:
         source: file of ``xreset demos``, ``xreset retarget``, ``xreset resets`` or ``xreset goals``, or its content.
         robot: the robot, its name or its folder; default: the robot that the file names. Demonstrations name none.
-        objects: folder of object meshes; default: the built-in stand-ins.
+        meshes: folder of object meshes; default: the built-in stand-ins.
         only: names of the objects to load; demonstrations of other objects are left out. Default: all objects.
         accept: the kinds of data that the caller can use.
 
@@ -137,7 +137,7 @@ def load_inputs(
         raise XResetError(
             f"Found {shown(data)}, expected Demos, Retargeted, a ResetBank or their file."
         )
-    folder = Path(objects) if objects else None
+    folder = Path(meshes) if meshes else None
     names = data.object_names
     if only:
         names = tuple(dict.fromkeys(canonical_names(only, names)))
@@ -159,7 +159,7 @@ def load_inputs(
         objects=loaded,
         path=path,
         hash=file_hash(path) if path else None,
-        objects_folder=folder,
+        meshes=folder,
         robot_name=robot_name,
         loaded_robot=spec,
     )

@@ -450,7 +450,7 @@ class Backend(ABC):
 
     def _must_be_open(self) -> None:
         if self._closed:
-            raise XResetError(f"The backend {self.name!r} is closed. Build a new one.")
+            raise XResetError(f"The engine {self.name!r} is closed. Build a new one.")
 
     def _indices(self, worlds: Tensor) -> Tensor:
         """Return indices of worlds [M] on the backend's device; ``WrongValueError`` for a mask, or numbers of another
@@ -492,14 +492,14 @@ class Backend(ABC):
         if capability not in self.capabilities:
             what = capability.replace("_", " ")
             raise CapabilityError(
-                f"The backend {self.name!r} does not support {what}. Use another backend."
+                f"The engine {self.name!r} does not support {what}. Use another engine."
             )
 
     def _set(self, name: Parameter, value: Tensor, worlds: Tensor | None) -> None:
         """Set a physical parameter [M, ...]. A backend overrides this method, or the setters, which all call it."""
         self._require(name)
         raise NotImplementedError(
-            f"The backend {self.name!r} declares {name!r} but does not set it."
+            f"The engine {self.name!r} declares {name!r} but does not set it."
         )
 
 

@@ -29,7 +29,7 @@ ENGINES = "xreset.backends"
 """Entry-point group of engines: ``name = "package.module:BackendClass"``."""
 ROBOTS = "xreset.robots"
 """Entry-point group of robots: ``name = "package.module"``, the module next to a ``robot.toml``."""
-_KINDS = {ENGINES: ("backend", BackendUnavailableError), ROBOTS: ("robot", RobotError)}
+_KINDS = {ENGINES: ("engine", BackendUnavailableError), ROBOTS: ("robot", RobotError)}
 """What messages call a plugin of a group, and the class of its errors."""
 
 
@@ -103,7 +103,7 @@ def robot_folder(name_or_folder: str | Path) -> Path:
 
 @dataclass(frozen=True)
 class BackendStatus:
-    """Whether a backend can be used here."""
+    """Whether an engine can be used here."""
 
     name: str
     version: str | None
@@ -115,22 +115,22 @@ class BackendStatus:
 
 
 def backend_names() -> list[str]:
-    """Return the names of all registered backends, in order of registration."""
+    """Return the names of all registered engines, in order of registration."""
     return list(plugins(ENGINES))
 
 
 def backend_class(name: str) -> type[Backend]:
-    """Return the class of a backend.
+    """Return the class of an engine.
 
     Raises:
-        BackendUnavailableError: no backend of that name, or its plugin does not load or is not complete.
+        BackendUnavailableError: no engine of that name, or its plugin does not load or is not complete.
     """
     cls = load_plugin(ENGINES, name)
     from xreset.physics import Backend
 
     if not (isinstance(cls, type) and issubclass(cls, Backend)):
         raise BackendUnavailableError(
-            f"the backend {name!r} is {cls!r}, expected a class that inherits from xreset.physics.Backend."
+            f"the engine {name!r} is {cls!r}, expected a class that inherits from xreset.physics.Backend."
         )
     missing = set(cls.__abstractmethods__)
     for base in cls.__mro__:
@@ -139,16 +139,16 @@ def backend_class(name: str) -> type[Backend]:
                 missing.add(attribute)
     if missing:
         raise BackendUnavailableError(
-            f"the backend {name!r} is not complete. Add to {cls.__name__}: {', '.join(sorted(missing))}."
+            f"the engine {name!r} is not complete. Add to {cls.__name__}: {', '.join(sorted(missing))}."
         )
     return cls
 
 
 def device_for(name: str, device: str) -> str:
-    """Where a backend runs, if those that can run on ``device`` are to run there: on it, or else on the CPU.
+    """Where an engine runs, if those that can run on ``device`` are to run there: on it, or else on the CPU.
 
     Raises:
-        BackendUnavailableError: no backend has that name, or the device is not one.
+        BackendUnavailableError: no engine has that name, or the device is not one.
     """
     return device if _kind(device) in backend_class(name).devices() else "cpu"
 
@@ -184,7 +184,7 @@ def _kind(device: str) -> str:
 
 
 def make_backend(name: str, scene: SceneSpec, num_worlds: int, **options: Any) -> Backend:
-    """Build a backend by name; see :class:`xreset.physics.Backend` for the options.
+    """Build the worlds of an engine by its name; see :class:`xreset.physics.Backend` for the options.
 
     Raises:
         BackendUnavailableError: there is no such engine, or it cannot be used here.
@@ -221,7 +221,7 @@ def refuse_unknown_options(
 
 
 def backend_status(name: str) -> BackendStatus:
-    """Return whether a backend can be used here; never raises."""
+    """Return whether an engine can be used here; never raises."""
     try:
         cls = backend_class(name)
         version = cls.engine_version()

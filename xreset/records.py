@@ -51,6 +51,8 @@ class Field:
     """Whether its last axis holds unit quaternions."""
     dtype: type | None = None
     """Type in which it is written; None: as it is."""
+    earlier: str | None = None
+    """Its name in files of earlier versions, which are still read."""
 
 
 Schema = Mapping[str, Field]
@@ -139,16 +141,17 @@ def read_npz(
         if schema_name is not None:
             check_schema(path, _stated_schema(archive, packed), schema_name, what)
             own |= {"schema": Field((), "U"), "meta": Field((), "U", required=False)}
-        missing = [name for name, field in own.items() if field.required and name not in packed]
+        stored = {name: _stored_name(name, field, packed) for name, field in own.items()}
+        missing = [name for name, field in own.items() if field.required and not stored[name]]
         if missing:
             raise FileFormatError(
                 f"{path} is not valid as {what}: it has no array {missing[0]!r}; "
                 f"found {', '.join(sorted(set(packed) - {'schema'}))}."
             )
-        names = [name for name in own if name in packed]
-        _check_size(path, {name: packed[name] for name in names})
-        for name in names:
-            array = np.asanyarray(archive[name])
+        present = {name: found for name, found in stored.items() if found is not None}
+        _check_size(path, {name: packed[found] for name, found in present.items()})
+        for name, found in present.items():
+            array = np.asanyarray(archive[found])
             # the size of an item as _native gives it
             sizes[name] = array.size * max(
                 array.dtype.itemsize, {"i": 8, "u": 8, "f": 4}.get(array.dtype.kind, 1)
@@ -161,6 +164,11 @@ def read_npz(
     if problem is not None:
         raise FileFormatError(f"{path} is not valid as {what}: {problem}")
     return arrays
+
+
+def _stored_name(name: str, field: Field, packed: Mapping[str, int]) -> str | None:
+    """Return the name that a field has in a file, or None if the file lacks it."""
+    return next((found for found in (name, field.earlier) if found in packed), None)
 
 
 def npz_schema(path: str | Path, *, what: str = "one of xreset's npz files") -> str:

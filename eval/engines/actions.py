@@ -107,13 +107,13 @@ def from_file(source: Path, place: Place, wanted: str | None = None, episode: in
     """
     schema = npz_schema(source)
     if schema == SCHEMA:
-        return read_actions(source, place.robot, lambda name: load_object(name, place.objects))
+        return read_actions(source, place.robot, lambda name: load_object(name, place.meshes))
     if schema == TRACE_SCHEMA:
         return _from_evaluation(source, place, wanted, episode)
     inputs = load_inputs(
         source,
         robot=place.robot,
-        objects=place.objects,
+        meshes=place.meshes,
         only=(wanted,) if wanted else (),
         accept=("demos", "motion"),
     )
@@ -139,7 +139,7 @@ def _from_evaluation(source: Path, place: Place, wanted: str | None, episode: in
         raise DemoError(f"{source} has no {chosen}; it has {', '.join(names)}.")
     _check_episode(episode, len(mine), f"{source} records {len(mine)} episodes of {chosen}")
     found = mine[episode]
-    obj = load_object(chosen, summary.meshes(place.objects))
+    obj = load_object(chosen, summary.meshes_folder(place.meshes))
     return recorded_actions(
         spec, obj, found, label=f"{summary.policy} in {name}, demonstration {found.sequence}"
     )

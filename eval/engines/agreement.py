@@ -158,7 +158,7 @@ def common_states(
 class EngineParity:
     """Results of one engine."""
 
-    backend: str
+    engine: str
     version: str
     device: str
     metrics: tuple[Metric, ...]
@@ -190,7 +190,7 @@ class Parity:
         """Engine and name of every metric that misses its target."""
         names = []
         for tested in self.engines:
-            names += [f"{tested.backend}: {m.metric}" for m in tested.metrics if not m.ok]
+            names += [f"{tested.engine}: {m.metric}" for m in tested.metrics if not m.ok]
         return names
 
 
@@ -212,7 +212,7 @@ def compare(
         motion: where grasps are taken from.
         engines: the engines to measure.
         grasps: number of closings, and of holds from common states.
-        reference: default: the backend ``mujoco``.
+        reference: default: the engine ``mujoco``.
         progress: called with (current try, tries done, tries in all).
 
     Raises:
@@ -263,7 +263,7 @@ def _engine_parity(
     tested: Engine, tries: dict[str, Recording], metrics: tuple[Metric, ...]
 ) -> EngineParity:
     return EngineParity(
-        backend=tested.name,
+        engine=tested.name,
         version=tested.version,
         device=tested.device,
         metrics=metrics,

@@ -169,7 +169,7 @@ def attribute(
             policy.start(trial.motion),
             engine,
             replace(trial, task=task),
-            repetitions=episodes,
+            episodes=episodes,
             progress=partial(progress, label),
         ).episodes
         effect = Effect.of(played, rows[0].episodes if rows else played)

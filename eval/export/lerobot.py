@@ -48,7 +48,7 @@ def export_lerobot(
     *,
     engines: str | Sequence[str] = (),
     robot: str | Path | None = None,
-    objects: str | Path | None = None,
+    meshes: str | Path | None = None,
     task: str | None = None,
     video: bool = True,
     size: tuple[int, int] = (320, 240),
@@ -62,7 +62,7 @@ def export_lerobot(
         out: folder to write; must not exist, or be empty.
         engines: only this engine, or these; empty: all.
         robot: name or folder of the robot; default: as the results name it.
-        objects: folder of meshes; default: as the results name it.
+        meshes: folder of meshes; default: as the results name it.
         task: the task in words; ``{object}`` is replaced by the object's name.
         video: whether a film of each episode is drawn.
         size: width and height of the films [pixels], even.
@@ -73,7 +73,7 @@ def export_lerobot(
         RunError: a folder does not exist, none holds episodes of the engines, or robots or rates differ.
         XResetError: pyarrow or the encoder of films is missing, or the folder is not empty.
     """
-    recording = read_recorded(folders, backends=engines, robot=robot, objects=objects, task=task)
+    recording = read_recorded(folders, engines=engines, robot=robot, meshes=meshes, task=task)
     write_lerobot(Path(out), recording, video=video, size=size, cameras=cameras, progress=progress)
 
 
@@ -288,10 +288,12 @@ def _stats(key: str, rows: np.ndarray) -> dict[str, list[Any]]:
     return lists | {"count": [len(rows)]}
 
 
-def _painter(robot: RobotSpec, size: Size, video: str, thing: str, meshes: Path | None) -> Painter:
+def _painter(
+    robot: RobotSpec, size: Size, video: str, object_name: str, meshes: Path | None
+) -> Painter:
     """Return what draws the episodes of an object for one of the films, always from the same camera, so that episodes
     can be compared."""
-    obj = load_object(thing, meshes)
+    obj = load_object(object_name, meshes)
     if video == VIDEO:
         return partial(draw_state, Renderer(SceneSpec(robot=robot, objects=(obj,)), size=size))
     camera = CAMERAS[video.removeprefix(_DEPTH)]

@@ -80,15 +80,15 @@ def export_npz(
     Raises:
         RunError: a folder does not exist, none holds episodes of the engines, or robots or rates differ.
     """
-    write_arrays(out, read_recorded(folders, backends=engines, robot=robot, task=task))
+    write_arrays(out, read_recorded(folders, engines=engines, robot=robot, task=task))
 
 
 def read_recorded(
     folders: str | Path | Sequence[str | Path],
     *,
-    backends: str | Sequence[str] = (),
+    engines: str | Sequence[str] = (),
     robot: str | Path | None = None,
-    objects: str | Path | None = None,
+    meshes: str | Path | None = None,
     task: str | None = None,
 ) -> RecordedEpisodes:
     """Read the recorded episodes of evaluations: the first of each demonstration and engine.
@@ -97,9 +97,9 @@ def read_recorded(
 
     Args:
         folders: run folders, or folders that ``xreset eval`` wrote into.
-        backends: only this engine, or these; empty: all.
+        engines: only this engine, or these; empty: all.
         robot: name or folder of the robot; None: as the results name it.
-        objects: folder of meshes; None: as the results name it.
+        meshes: folder of meshes; None: as the results name it.
         task: the task in words, in which ``{object}`` stands for the object's name; default: :data:`TASK`.
 
     Raises:
@@ -116,12 +116,12 @@ def read_recorded(
     intervals: dict[float, Path] = {}
     inputs: dict[str, str] = {}
     every = [folders] if isinstance(folders, str | Path) else folders
-    wanted = [backends] if isinstance(backends, str) else backends
+    wanted = [engines] if isinstance(engines, str) else engines
     for folder in every:
         results = results_in(Path(folder))
         evaluation = read_evaluation(results)
         for result in evaluation:
-            engine = result.backend
+            engine = result.engine
             if wanted and engine not in wanted:
                 continue
             name = str(robot or result.robot)
@@ -144,7 +144,7 @@ def read_recorded(
                     continue
                 episode["task"] = (task or TASK).replace("{object}", short_name(trace.object))
                 episode["action"] = action
-                episode["meshes"] = result.meshes(Path(objects) if objects else None)
+                episode["meshes"] = result.meshes_folder(Path(meshes) if meshes else None)
                 rows.append(episode)
     if not rows:
         of = f" of {', '.join(wanted)}" if wanted else ""

@@ -58,11 +58,11 @@ GROWTH = 1.03
 def play(
     policy: str | Path | PolicySpec = "many-objects",
     *,
-    thing: str | None = None,
+    object_name: str | None = None,
     engine: str = "mujoco",
     robot: str | Path | None = None,
     demos: str | Path | None = None,
-    objects: str | Path | None = None,
+    meshes: str | Path | None = None,
     seed: Seed = 0,
     host: str = "127.0.0.1",
     port: int = 8080,
@@ -71,11 +71,11 @@ def play(
 
     Args:
         policy: as for :func:`~xreset.eval.policy_spec.load_policy`.
-        thing: name of the object to begin with; None: the soup can, or else the first object.
+        object_name: name of the object to begin with; None: the soup can, or else the first object.
         engine: name of the engine to begin with.
         robot: default: the policy's.
         demos: starts and goals, from a file of demonstrations, motion or reset states; None: synthetic ones.
-        objects: folder of object meshes; None: the folder of the policy's training, or the stand-ins.
+        meshes: folder of object meshes; None: the folder of the policy's training, or the stand-ins.
         seed: chooses starts and goals.
         host: address to serve at; 0.0.0.0 allows other machines.
         port: port to serve at; if it is taken, the next free one.
@@ -87,11 +87,11 @@ def play(
     with one_thread():
         session = Session(
             policy,
-            thing=thing,
+            object_name=object_name,
             engine=engine,
             robot=robot,
             demos=Path(demos) if demos else None,
-            objects=Path(objects) if objects else None,
+            meshes=Path(meshes) if meshes else None,
             seed=seed,
         )
         try:
@@ -228,8 +228,8 @@ class Page(WebPage):
 
     def _make_scene(self) -> None:
         """Show robot, object and goal of the session in place of earlier ones."""
-        for thing in self._things:
-            thing.remove()
+        for drawn in self._things:
+            drawn.remove()
         session = self.session
         scene = self._server.scene
         obj = session.env.backend.scene.objects[0]
@@ -405,7 +405,7 @@ class Page(WebPage):
         session = self.session
         robot = self._robot_name.value
         policy = self._policy.value
-        thing = self._names[self._object.value]
+        chosen = self._names[self._object.value]
         if robot != session.policy.robot.name:
             choice = partial(session.choose_policy, NOBODY, robot=robot)
         elif policy != session.policy.name:
@@ -414,8 +414,8 @@ class Page(WebPage):
                 self._policies[policy],
                 robot=robot if policy == NOBODY else None,
             )
-        elif thing != session.object_name:
-            choice = partial(session.choose_object, thing)
+        elif chosen != session.object_name:
+            choice = partial(session.choose_object, chosen)
         elif self._engine.value != session.engine:
             choice = partial(session.choose_engine, self._engine.value)
         else:

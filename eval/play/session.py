@@ -119,33 +119,33 @@ class Session:
         self,
         policy: str | Path | PolicySpec = "many-objects",
         *,
-        thing: str | None = None,
+        object_name: str | None = None,
         engine: str = "mujoco",
         robot: str | Path | None = None,
         demos: Path | None = None,
-        objects: Path | None = None,
+        meshes: Path | None = None,
         seed: int = 0,
     ) -> None:
         """Load what is to be played.
 
         Args:
             policy: as for :func:`~xreset.eval.policy_spec.load_policy`.
-            thing: name of the object; None: the soup can, or else the first object.
+            object_name: name of the object; None: the soup can, or else the first object.
             engine: name of the engine.
             robot: default: the policy's.
             demos: starts and goals, from any file of demonstrations, motion or reset states; None: synthetic ones.
-            objects: folder of object meshes; None: the folder of the policy's training, or the stand-ins.
+            meshes: folder of object meshes; None: the folder of the policy's training, or the stand-ins.
             seed: chooses starts and goals.
 
         Raises:
             XResetError: the policy, the object, the robot or the engine cannot be used.
         """
         self._demos = demos
-        self._folder = objects
+        self._folder = meshes
         self._seed = seed
         self.engine = engine
         self.time = 0.0
-        self._open(policy, robot, thing)
+        self._open(policy, robot, object_name)
 
     # Choosing ---------------------------------------------------------------------------------------------------------
 
@@ -181,19 +181,19 @@ class Session:
         self,
         policy: str | Path | PolicySpec,
         robot: str | Path | None,
-        thing: str | None,
+        object_name: str | None,
     ) -> None:
         """Open worlds; where this fails, the session stays as it was."""
         policy = load_policy(policy, robot=robot, seed=self._seed)
-        folder = policy.meshes(self._folder)
+        folder = policy.meshes_folder(self._folder)
         if self._demos is None:
             names = object_names(folder)
         else:
-            names = load_inputs(self._demos, robot=policy.robot, objects=folder).bank.object_names
+            names = load_inputs(self._demos, robot=policy.robot, meshes=folder).bank.object_names
         usual = ALIASES["soup"]
-        thing = canonical_name(thing or (usual if usual in names else names[0]), names)
-        source = self._demos or synthesize([thing], STARTS, self._seed, meshes=folder)
-        inputs = load_inputs(source, robot=policy.robot, objects=folder, only=[thing])
+        name = canonical_name(object_name or (usual if usual in names else names[0]), names)
+        source = self._demos or synthesize([name], STARTS, self._seed, meshes=folder)
+        inputs = load_inputs(source, robot=policy.robot, meshes=folder, only=[name])
         env = self._make_env(policy, inputs, self.engine)
         try:
             player = policy.begin(env)

@@ -224,7 +224,7 @@ def draw_report(data: ReportData) -> tuple[list[Clip], list[Clip]]:
         raise XResetError(
             "no demonstration was recorded in every engine. Evaluate all engines in one command."
         )
-    worst = worst_episodes(shown[shown["engine"] == data.training.first.backend], FAILURES)
+    worst = worst_episodes(shown[shown["engine"] == data.training.first.engine], FAILURES)
     return clips, draw_clips(worst, spec, data.meshes, data.vision, strips=True)
 
 

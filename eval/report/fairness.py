@@ -50,11 +50,11 @@ def _condition_table(trainings: Sequence[Training]) -> Table:
     for training in trainings:
         for engine, result in training.results.items():
             episodes = training.episodes[training.episodes["engine"] == engine]
-            folder = result.objects_folder
+            folder = result.meshes
             row: dict[str, Any] = {
                 "run": training.label,
                 "engine": engine,
-                "version": result.backend_version,
+                "version": result.engine_version,
                 "policy": result.policy,
                 "policy file": result.inputs.get("policy", "")[:12],
                 "robot": result.robot,

@@ -44,7 +44,7 @@ DEFAULT_CURVES = ("task/success", "task/success_from_home")
 
 
 def make_report(
-    folder: Path, out: Path | None = None, *, robot: str | None = None, objects: Path | None = None
+    folder: Path, out: Path | None = None, *, robot: str | None = None, meshes: Path | None = None
 ) -> tuple[Path, ReportData]:
     """Write ``index.html``; return its path, and what it shows.
 
@@ -52,7 +52,7 @@ def make_report(
         folder: a run folder, or a folder of results.
         out: folder of the report; default: ``report`` in the folder.
         robot: name or folder of the robot, for the clips; default: as the run and the results name it.
-        objects: folder of meshes, for the clips; default: as the results name it.
+        meshes: folder of meshes, for the clips; default: as the results name it.
 
     Raises:
         RunError: there are no results.
@@ -60,7 +60,7 @@ def make_report(
         XResetError: the page cannot be written, another command is writing it, or a package for plots is missing.
     """
     out = folder / "report" if out is None else out
-    data = collect(folder, robot, objects)
+    data = collect(folder, robot, meshes)
     with claim_folder(out):
         clips = []
         strips = []
@@ -73,13 +73,13 @@ def make_report(
     return out / "index.html", data
 
 
-def collect(folder: Path, robot: str | None = None, objects: Path | None = None) -> ReportData:
+def collect(folder: Path, robot: str | None = None, meshes: Path | None = None) -> ReportData:
     """Read everything that a report shows.
 
     Args:
         folder: a run folder, or a folder that holds ``ENGINE.json`` files, itself or in ``eval/``.
         robot: name or folder of the robot; default: as the run and the results name it.
-        objects: folder of meshes; default: as the results name it.
+        meshes: folder of meshes; default: as the results name it.
 
     Raises:
         RunError: the folder does not exist or holds no results.
@@ -121,7 +121,7 @@ def collect(folder: Path, robot: str | None = None, objects: Path | None = None)
         stress=stress,
         notes=tuple(notes),
         robot=robot or (run or training.first).robot,
-        meshes=training.first.meshes(objects),
+        meshes=training.first.meshes_folder(meshes),
     )
 
 
@@ -129,7 +129,7 @@ def page(data: ReportData, clips: Sequence[Clip], strips: Sequence[Clip] = ()) -
     """Return the whole page; clips, and strips of failures, may be empty. The page allows no script but its own."""
     script = render("report.js")
     episodes = data.training.episodes
-    first = episodes[episodes["engine"] == data.training.first.backend]
+    first = episodes[episodes["engine"] == data.training.first.engine]
     results = list(data.training.results.values())
     demonstrations: dict[str, list[Any]] = {}
     for i, result in enumerate(results):
@@ -178,9 +178,9 @@ def count_failures(episodes: Table) -> dict[str, int]:
 def headline(data: ReportData) -> str:
     """Return the result in one or two sentences."""
     ranked = sorted(data.training.results.values(), key=lambda s: -s.task_progress.mean)
-    text = f"Task progress is {', '.join(f'{percent(s.task_progress.mean)} in {s.backend}' for s in ranked)}."
+    text = f"Task progress is {', '.join(f'{percent(s.task_progress.mean)} in {s.engine}' for s in ranked)}."
     if data.run is not None and len(ranked) > 1:
-        text += f" The policy was trained in {data.run.backend}."
+        text += f" The policy was trained in {data.run.engine}."
     return text
 
 

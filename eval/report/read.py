@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 
 from xreset.cameras.config import VisionConfig
-from xreset.checks import frozen, names_wrong_arguments
+from xreset.checks import frozen, names_wrong_arguments, renamed
 from xreset.description import load_robot
 from xreset.errors import FileFormatError, RunError, WrongValueError, needs
 from xreset.eval.results import EvalResult, Table, read_evaluation, read_traces, recorded
@@ -74,7 +74,7 @@ class Training(Brief):
 
 def versions(trainings: Iterable[Training], engine: str) -> str:
     """Return the engine's versions in which trainings were evaluated."""
-    found = {t.results[engine].backend_version for t in trainings if engine in t.results}
+    found = {t.results[engine].engine_version for t in trainings if engine in t.results}
     return ", ".join(sorted(found))
 
 
@@ -263,7 +263,7 @@ def read_training(
         results_folder=results,
         facts={} if run is None else run_facts(run, file),
         curves=curves,
-        results={s.backend: s for s in evaluation},
+        results={s.engine: s for s in evaluation},
         episodes=evaluation.to_frame(),
         lift=lift,
     )
@@ -302,6 +302,7 @@ def run_facts(run: dict[str, Any], file: Path) -> dict[str, str]:
     Raises:
         FileFormatError: an entry is missing or has another type.
     """
+    run = renamed(RunInfo, run)
     contract = run.get("contract") or {}
     names = contract.get("objects") or [] if isinstance(contract, dict) else None
     wrong = [name for name, kind in _RUN_TYPES.items() if not isinstance(run.get(name), kind)]
@@ -314,10 +315,10 @@ def run_facts(run: dict[str, Any], file: Path) -> dict[str, str]:
     return {
         "robot": f"{run['robot']} ({str(contract.get('robot_fingerprint'))[:8]})",
         "objects": ", ".join(map(short_name, names or ())) or "-",
-        "meshes": "stand-ins" if run.get("objects") is None else "meshes",
+        "meshes": "stand-ins" if run.get("meshes") is None else "meshes",
         "bank": f"{Path(run['resets']).name} ({run['resets_hash'][:8]})",
         "weights": str(run.get("weights") or "new"),
-        "backend": f"{run.get('backend')} {run.get('backend_version')}",
+        "engine": f"{run.get('engine')} {run.get('engine_version')}",
         "device": run["device"].partition(":")[0],
         "num_envs": str(run.get("num_envs")),
         "seed": str(run["seed"]),

@@ -87,6 +87,7 @@ class Data(Checked):
             "--squeeze.",
             "--transfer.",
             "--settle",
+            "--engine",
             "--backend",
             "--device",
             "--num-envs",
@@ -130,6 +131,7 @@ class Runs(Checked):
     """Trainings that differ in seed (and, with ``alone``, object), or a baseline."""
 
     REMOVED: ClassVar = {"gpus": 1}
+    RENAMED: ClassVar = {"backend": "engine"}
     data: str
     robot: Robot = "ur7e-sharpa"
     objects: tuple[str, ...] = ()
@@ -154,7 +156,7 @@ class Runs(Checked):
     weights: str | None = None
     """An earlier run of the study, whose networks this run begins with: the training of the same seed, and of the same
     object if both train alone."""
-    backend: str = "mujoco-warp"
+    engine: str = "mujoco-warp"
     device: Literal["cuda", "cpu"] = "cuda"
     num_envs: PositiveInt = 4096
     evaluations: tuple[str, ...] = ()

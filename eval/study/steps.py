@@ -180,10 +180,10 @@ class Run:
         info = read_run(self.folder, as_stated=True)
         found: dict[str, Any] = {"seed": info.seed, "config": _without_length(info.config)}
         wanted: dict[str, Any] = {"seed": self.seed, "config": _without_length(self.config)}
-        for name in ("robot", "backend", "num_envs"):
+        for name in ("robot", "engine", "num_envs"):
             found[name] = getattr(info, name)
             wanted[name] = getattr(self.spec, name)
-        found["stand-ins"] = info.objects is None
+        found["stand-ins"] = info.meshes is None
         wanted["stand-ins"] = self.subset.meshes is None
         found["other networks to begin with"] = info.weights is not None
         wanted["other networks to begin with"] = self.weights is not None
@@ -224,14 +224,14 @@ def bank_todo(subset: Subset, robot: str) -> Todo:
     if bank.is_file():
         return "", []
     if subset.data.goals is not None:
-        goals = _xreset("goals", *subset.objects, robot=robot, out=bank, objects=subset.meshes)
+        goals = _xreset("goals", *subset.objects, robot=robot, out=bank, meshes=subset.meshes)
         return "to do", [[*goals, *subset.data.goals]]
     commands = []
     if not motion.is_file():
-        retarget = _xreset("retarget", subset.demos, robot=robot, out=motion, objects=subset.meshes)
+        retarget = _xreset("retarget", subset.demos, robot=robot, out=motion, meshes=subset.meshes)
         commands.append([*retarget, *subset.data.retarget])
     own_robot = robot if Path(robot).is_dir() else None
-    resets = _xreset("resets", motion, out=bank, robot=own_robot, objects=subset.meshes)
+    resets = _xreset("resets", motion, out=bank, robot=own_robot, meshes=subset.meshes)
     return "to do", [*commands, [*resets, *subset.data.resets]]
 
 
@@ -258,13 +258,13 @@ def train_todo(run: Run) -> Todo:
         **length,
         robot=spec.robot,
         **{run.subset.data.states: run.bank},
-        backend=spec.backend,
+        engine=spec.engine,
         device=spec.device,
         num_envs=spec.num_envs,
         seed=run.seed,
         like=spec.recipe,
         weights=run.weights,
-        objects=run.subset.meshes,
+        meshes=run.subset.meshes,
         config=spec.config,
     )
     return left, [command]
@@ -286,7 +286,7 @@ def eval_todo(run: Run, folder: Path, spec: Evaluation, subset: Subset, engines:
         seed=spec.seed,
         num_envs=spec.num_envs,
         out=folder,
-        objects=subset.meshes,
+        meshes=subset.meshes,
     )
     files = {"demos": demos}
     if policy is None:
@@ -303,7 +303,7 @@ def eval_todo(run: Run, folder: Path, spec: Evaluation, subset: Subset, engines:
             if played == wanted and hashes.items() <= result.inputs.items():
                 continue
         missing.append(engine)
-        command += ["--backend", engine]
+        command += ["--engine", engine]
     return (f"in {', '.join(missing)}", [command]) if missing else ("", [])
 
 

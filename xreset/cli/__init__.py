@@ -54,7 +54,7 @@ def main(argv: list[str] | None = None) -> None:
     """
     from xreset.errors import XResetError
 
-    argv = sys.argv[1:] if argv is None else argv
+    argv = _with_present_flags(sys.argv[1:] if argv is None else argv)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             # characters that the terminal lacks are written as escapes
@@ -81,6 +81,31 @@ def main(argv: list[str] | None = None) -> None:
         _fail(argv, f"{error.strerror}: {error.filename}" if error.filename else error.strerror)
     except MemoryError:
         _fail(argv, "Out of memory. Use fewer worlds (--num-envs) or a smaller file.")
+
+
+_RENAMED = {"--backend": "--engine", "--objects": "--meshes"}
+"""Flag of earlier versions -> its present name."""
+_NAME_OBJECTS = (["demos", "synth"], ["demos", "select"], ["demos", "split"])
+"""Commands whose ``--objects`` are names of objects, and always were."""
+
+
+def _with_present_flags(argv: list[str]) -> list[str]:
+    """Return the arguments with the present names of flags, and print what was renamed."""
+    changed = dict(_RENAMED)
+    if argv[:2] in _NAME_OBJECTS:
+        del changed["--objects"]
+    words = []
+    used = {}
+    for word in argv:
+        flag, equals, value = word.partition("=")
+        if flag in changed:
+            used[flag] = changed[flag]
+        words.append(changed.get(flag, flag) + equals + value)
+    for earlier, flag in used.items():
+        print(
+            f"xreset: {earlier} is now {flag}. The next release removes {earlier}.", file=sys.stderr
+        )
+    return words
 
 
 def _fail(argv: list[str], message: str) -> NoReturn:

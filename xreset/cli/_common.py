@@ -45,10 +45,8 @@ RobotName = Annotated[Name, arg(help="Name of a robot, or a folder with a robot.
 Robot = Annotated[
     str | None, arg(help="Name or folder of the robot; default: the policy's, or the file's.")
 ]
-Objects = Annotated[
-    Path | None, arg(help="Folder of real meshes; default: the built-in stand-ins.")
-]
-TrainedObjects = Annotated[
+Meshes = Annotated[Path | None, arg(help="Folder of real meshes; default: the built-in stand-ins.")]
+TrainedMeshes = Annotated[
     Path | None,
     arg(help="Folder of real meshes; default: that of the training, else the stand-ins."),
 ]

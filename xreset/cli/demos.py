@@ -238,7 +238,7 @@ def reflect(
     file: Source,
     *,
     out: Path,
-    objects: Path | None = None,
+    meshes: Path | None = None,
     tolerance: float = 0.004,
 ) -> None:
     """Mirror demonstrations of left hands, so that a right-handed robot can train on them.
@@ -249,14 +249,14 @@ def reflect(
     Args:
         file: Archive with left hands.
         out: Archive to write.
-        objects: Folder of real meshes; default: the built-in stand-ins.
+        meshes: Folder of real meshes; default: the built-in stand-ins.
         tolerance: Largest distance between an object's surface and its reflection, over 95 % of it [m].
     """
     from xreset.demos.archive import demo_objects
     from xreset.demos.mirror import mirrored, symmetry
 
     demos = _read(file).select(sides=["left"])
-    symmetries = {name: symmetry(spec) for name, spec in demo_objects(demos, objects).items()}
+    symmetries = {name: symmetry(spec) for name, spec in demo_objects(demos, meshes).items()}
     for name, found in sorted(symmetries.items()):
         verdict = "mirrored" if found.deviation <= tolerance else "left out: not symmetric enough"
         console.print(f"{name}: {1e3 * found.deviation:.1f} mm from its reflection, {verdict}")

@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 
 from xreset.cameras.config import STUDENT_VISION, VisionConfig
-from xreset.cli._common import Objects, Policy, Several, given_flags, refuse_changes
+from xreset.cli._common import Meshes, Policy, Several, given_flags, refuse_changes
 from xreset.errors import RunError
 
 
@@ -16,10 +16,10 @@ def distill(
     out: Path,
     resets: Path | None = None,
     robot: str | None = None,
-    objects: Objects = None,
+    meshes: Meshes = None,
     camera: Several = (),
     vision: VisionConfig = STUDENT_VISION,
-    backend: str = "mujoco-warp",
+    engine: str = "mujoco-warp",
     device: str | None = None,
     num_envs: int = 1024,
     iterations: int | None = None,
@@ -35,7 +35,7 @@ def distill(
         robot: Name or folder of the robot; default: that of the bank.
         camera: front, side, or wrist; give it again for two cameras. Default: front.
         vision: Images, their timing, and what the policy gets from them.
-        backend: Physics engine to train on.
+        engine: Physics engine to train on.
         device: cpu or cuda; default: cuda where there is a GPU and the engine can use it.
         num_envs: Worlds to simulate (per GPU).
         iterations: Total number of iterations; default: 2000.
@@ -55,8 +55,8 @@ def distill(
             teacher=teacher,
             robot=robot,
             resets=resets,
-            objects=objects,
-            backend=backend,
+            meshes=meshes,
+            engine=engine,
             device=device,
             num_envs=num_envs,
             seed=seed,
@@ -74,8 +74,8 @@ def distill(
         cameras=camera or ("front",),
         vision=vision,
         robot=robot,
-        objects=objects,
-        engine=backend,
+        meshes=meshes,
+        engine=engine,
         device=device,
         num_envs=num_envs,
         iterations=iterations,

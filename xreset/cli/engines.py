@@ -14,7 +14,7 @@ from xreset.cli._common import (
     AllEngines,
     Device,
     Flat,
-    Objects,
+    Meshes,
     PolicyOrBaseline,
     Robot,
     Several,
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 def list_() -> None:
     """List physics engines: name, version, device, and why one cannot be used here."""
-    table = [("backend", "engine version", "device", "available")]
+    table = [("engine", "version", "device", "available")]
     for name in backend_names():
         status = backend_status(name)
         available = "yes" if status.reason is None else f"no: {status.reason}"
@@ -47,7 +47,7 @@ def list_() -> None:
 
 def check(
     *,
-    backend: AllEngines = (),
+    engine: AllEngines = (),
     robot: str | None = None,
     device: Device = "cpu",
     only: Annotated[Several, arg(name="check")] = (),
@@ -68,7 +68,7 @@ def check(
     spec = description.load_robot(robot) if robot else conformance.scene().robot
     runs = []
     failed = 0
-    for name in dict.fromkeys(backend) or usable_engines():
+    for name in dict.fromkeys(engine) or usable_engines():
         status = backend_status(name)
         used = device if device.split(":")[0] in status.device else "cpu"
         make = _maker(name, used)  # refuses an unknown engine, so it comes before the headline
@@ -150,9 +150,9 @@ def compare(
     motion: Source,
     *,
     robot: Robot = None,
-    objects: Objects = None,
+    meshes: Meshes = None,
     only: Several = (),
-    backend: AllEngines = (),
+    engine: AllEngines = (),
     grasps: int = 48,
     device: Device = "cpu",
     json: Path | None = None,
@@ -172,11 +172,11 @@ def compare(
     from xreset.eval.engines import agreement
     from xreset.inputs import load_inputs
 
-    engines = [each for each in quick_engines(backend, device) if each.name != agreement.REFERENCE]
+    engines = [each for each in quick_engines(engine, device) if each.name != agreement.REFERENCE]
     with Progress() as bar:
         move = bar.stages()
         loaded = load_inputs(
-            motion, robot=robot, objects=objects, only=only, accept=("demos", "motion")
+            motion, robot=robot, meshes=meshes, only=only, accept=("demos", "motion")
         )
         grasped = loaded.motion(partial(move, "retargeting"))
         # hashed now, because after minutes of work the file may have changed
@@ -188,7 +188,7 @@ def compare(
     for tested in (result.reference, result.floor, *result.engines):
         if tested.broken_worlds:
             console.print(
-                f"{tested.backend}: {tested.broken_worlds} worlds were not finite or dropped contacts",
+                f"{tested.engine}: {tested.broken_worlds} worlds were not finite or dropped contacts",
                 style="bold red",
             )
     write_measured(json, asdict(result) | {"ok": not result.missed, "inputs": inputs})
@@ -204,8 +204,8 @@ def _print(result: agreement.Parity) -> None:
     closings = holds.pop("closing")
     held = sum(map(sum, holds.values()))
     tried = sum(map(len, holds.values()))
-    reference = result.reference.backend
-    heads = [f"{tested.backend}\n{tested.version}, {tested.device}" for tested in columns]
+    reference = result.reference.engine
+    heads = [f"{tested.engine}\n{tested.version}, {tested.device}" for tested in columns]
     table: list[tuple[str | Text, ...]] = [(f"against {reference}", "target", *heads)]
     for i, row in enumerate(result.floor.metrics):
         cells = []
@@ -230,7 +230,7 @@ def _number(value: float | None, unit: str) -> str:
 def trace(
     source: Source,
     *,
-    backend: Several = (),
+    engine: Several = (),
     reference: str = "mujoco",
     object: str | None = None,
     episode: int = 0,
@@ -241,8 +241,8 @@ def trace(
 
     Args:
         source: Source of the actions. Demonstrations or robot motion: an open-loop grasp and lift. The trace of an
-            evaluation (eval/BACKEND.trace.npz): an episode of the policy. An actions.npz of this command.
-        backend: Engine to compare with the reference; give it again for more. Default: all that can be used here.
+            evaluation (eval/ENGINE.trace.npz): an episode of the policy. An actions.npz of this command.
+        engine: Engine to compare with the reference; give it again for more. Default: all that can be used here.
         reference: Engine that the others are compared with.
         object: Object, if the source has several; default: the first.
         episode: Which of the object's grasps or recorded episodes.
@@ -253,7 +253,7 @@ def trace(
     from xreset.eval.engines import actions, replay
 
     base = rollout.engine(reference, device=place.device)
-    names = [name for name in dict.fromkeys(backend) or usable_engines() if name != reference]
+    names = [name for name in dict.fromkeys(engine) or usable_engines() if name != reference]
     engines = [rollout.engine(name, device=place.device) for name in names]
     with Progress() as bar:
         move = bar.stages()
@@ -274,7 +274,7 @@ def attribute(
     *,
     demos: Path,
     towards: str,
-    backend: str = "mujoco",
+    engine: str = "mujoco",
     only: Several = (),
     episodes: int = 1,
     setting: Flat[Setting] = Setting(),
@@ -290,7 +290,7 @@ def attribute(
         demos: Demonstrations (xreset demos) or retargeted trajectories (xreset retarget): starts and goals, and the
             path of ik. `xreset demos select` makes a file of some objects.
         towards: Engine towards which the properties are changed, usually the one in which the policy does worse.
-        backend: Engine in which the properties are changed.
+        engine: Engine in which the properties are changed.
         only: Property to change; give it again for more. Default: all in which the engines differ.
         episodes: Episodes of each demonstration.
         setting: Robot, meshes, seed of the perturbations of the starts, device and worlds.
@@ -299,29 +299,29 @@ def attribute(
     from xreset.eval import policy_spec, rollout
     from xreset.eval.engines import attribution
 
-    if backend == towards:
-        raise XResetError(f"--backend and --towards are both {backend!r}. Choose two engines.")
+    if engine == towards:
+        raise XResetError(f"--engine and --towards are both {engine!r}. Choose two engines.")
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
-    a, b = (rollout.engine(name, device=setting.device) for name in (backend, towards))
+    a, b = (rollout.engine(name, device=setting.device) for name in (engine, towards))
     played = rollout.load_trial(
-        spec, demos, objects=setting.objects, seed=setting.seed, num_envs=setting.num_envs
+        spec, demos, meshes=setting.meshes, seed=setting.seed, num_envs=setting.num_envs
     )
     out = out or spec.folder.parent / "attribute"
-    folder = played.objects_folder
+    folder = played.meshes
     with Progress() as bar:
         found = attribution.attribute(
             spec, a, b, played, episodes=episodes, only=only, progress=bar.stages()
         )
     demonstrations = len(played.bank.sequence_name)
     counts = f"episodes: {len(found.rows[0].episodes)}, demonstrations: {demonstrations}, seed: {setting.seed}"
-    title = f"{spec.name} on {spec.robot.name}: what costs the skill between {backend} and {towards}\n{counts}"
+    title = f"{spec.name} on {spec.robot.name}: what costs the skill between {engine} and {towards}\n{counts}"
     content = found.as_dict() | {
         "policy": spec.name,
         "robot": spec.robot.name,
         "seed": setting.seed,
         "demonstrations": demonstrations,
         "versions": {a.name: a.version, b.name: b.version},
-        "objects_folder": str(folder) if folder else None,
+        "meshes": str(folder) if folder else None,
         "inputs": played.inputs,
     }
     write_json(out / "attribution.json", content)

@@ -13,7 +13,7 @@ from xreset.eval.setting import Setting
 def evaluate(
     policy: PolicyOrBaseline,
     *,
-    backend: Engines = (),
+    engine: Engines = (),
     demos: Path,
     episodes: int = 5,
     settle: bool = False,
@@ -45,7 +45,7 @@ def evaluate(
         summaries = evaluation.evaluate(
             spec,
             demos,
-            tuple(dict.fromkeys(backend or ("mujoco",))),
+            tuple(dict.fromkeys(engine or ("mujoco",))),
             episodes=episodes,
             settle=settle,
             episode_seconds=episode_seconds,

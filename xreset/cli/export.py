@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from xreset import runtime
-from xreset.cli._common import Policy, Robot, Several, Sources, TrainedObjects
+from xreset.cli._common import Policy, Robot, Several, Sources, TrainedMeshes
 from xreset.cli._terminal import Progress, console
 
 if TYPE_CHECKING:
@@ -17,9 +17,9 @@ def lerobot(
     folders: Sources,
     *,
     out: Path,
-    backend: Several = (),
+    engine: Several = (),
     robot: Robot = None,
-    objects: Path | None = None,
+    meshes: Path | None = None,
     task: str | None = None,
     video: bool = True,
     size: tuple[int, int] = (320, 240),
@@ -31,8 +31,8 @@ def lerobot(
     Args:
         folders: Run folders, or folders that xreset eval wrote into.
         out: Folder to write; must not exist.
-        backend: Only episodes of this engine; give it again for more. Default: all.
-        objects: Folder of meshes; default: as the results name it.
+        engine: Only episodes of this engine; give it again for more. Default: all.
+        meshes: Folder of meshes; default: as the results name it.
         task: The task in words; {object} is replaced by the object's name.
         video: Draw a film of each episode.
         size: Width and height of the films, pixels.
@@ -42,7 +42,7 @@ def lerobot(
     from xreset.eval.export import recorded
 
     recording = recorded.read_recorded(
-        folders, backends=backend, robot=robot, objects=objects, task=task
+        folders, engines=engine, robot=robot, meshes=meshes, task=task
     )
     with Progress() as bar:
         moved = bar.count("episodes")
@@ -56,7 +56,7 @@ def npz(
     folders: Sources,
     *,
     out: Path,
-    backend: Several = (),
+    engine: Several = (),
     robot: Robot = None,
     task: str | None = None,
 ) -> None:
@@ -65,12 +65,12 @@ def npz(
     Args:
         folders: Run folders, or folders that xreset eval wrote into.
         out: File to write.
-        backend: Only episodes of this engine; give it again for more. Default: all.
+        engine: Only episodes of this engine; give it again for more. Default: all.
         task: The task in words; {object} is replaced by the object's name.
     """
     from xreset.eval.export import recorded
 
-    recording = recorded.read_recorded(folders, backends=backend, robot=robot, task=task)
+    recording = recorded.read_recorded(folders, engines=engine, robot=robot, task=task)
     recorded.write_arrays(out, recording)
     _say(recording, out)
 
@@ -80,7 +80,7 @@ def deploy(
     *,
     out: Path,
     robot: Robot = None,
-    objects: TrainedObjects = None,
+    meshes: TrainedMeshes = None,
     object: Several = (),
 ) -> None:
     """Write a policy for a robot: the network, a contract that says what goes in and out, and a runtime.
@@ -93,7 +93,7 @@ def deploy(
     """
     from xreset.eval.export import deploy as deployment
 
-    spec = deployment.export_deploy(policy, out, robot=robot, objects=objects, only=object)
+    spec = deployment.export_deploy(policy, out, robot=robot, meshes=meshes, only=object)
     contract = runtime.read_contract(out)
     named = []
     for name, entry in contract["objects"].items():

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import UseAppendAction
 
-from xreset.cli._common import Names, Objects, Several
+from xreset.cli._common import Meshes, Names, Several
 from xreset.cli._terminal import Progress, console
 from xreset.resets.config import GoalConfig
 
@@ -20,17 +20,17 @@ def goals(
     *,
     robot: str,
     out: Path,
-    objects: Objects = None,
+    meshes: Meshes = None,
     family: Several = (),
     pose: Annotated[tuple[Pose, ...], UseAppendAction] = (),
     draw: GoalConfig = GoalConfig(),
 ) -> None:
     """Give objects starts and goals without demonstrations, for `xreset eval --demos` and `xreset train --goals`.
 
-    Objects start at rest on the table. The robot can reach every goal with the grasp that it has at the start.
+    Meshes start at rest on the table. The robot can reach every goal with the grasp that it has at the start.
 
     Args:
-        names: Objects; default: all.
+        names: Meshes; default: all.
         robot: Name or folder of the robot.
         out: Goal set to write.
         family: Kind of goal: lift, yaw, tilt-x, tilt-y (lifted, and turned by 60 degrees about an axis of the world) or
@@ -42,7 +42,7 @@ def goals(
 
     with Progress() as bar:
         made = goal_sets.make_goals(
-            names or None, robot=robot, meshes=objects, families=family or None, poses=pose, config=draw,
+            names or None, robot=robot, meshes=meshes, families=family or None, poses=pose, config=draw,
             progress=bar.count("goals within reach"),
         )  # fmt: skip
     goal_sets.write_goals(out, made, draw)

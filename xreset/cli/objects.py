@@ -13,17 +13,17 @@ from xreset.objects.properties import Properties
 from xreset.spec import ObjectSpec
 
 
-def list_(*, objects: Path | None = None) -> None:
+def list_(*, meshes: Path | None = None) -> None:
     """List the built-in objects, or the objects of a folder of meshes.
 
     Args:
-        objects: Folder of real meshes; default: the built-in stand-ins.
+        meshes: Folder of real meshes; default: the built-in stand-ins.
     """
     from xreset.objects import catalogue
 
     table = [_HEAD]
-    for name in catalogue.object_names(objects):
-        table.append(_cells(catalogue.load_object(name, objects)))
+    for name in catalogue.object_names(meshes):
+        table.append(_cells(catalogue.load_object(name, meshes)))
     show_table(table)
 
 
@@ -41,7 +41,7 @@ def import_(
 ) -> None:
     """Cut a mesh, or every mesh of a folder, into convex pieces, and keep them for later runs.
 
-    A mesh file goes into a folder of objects (--out), which other commands take as --objects. NAME.toml in this folder
+    A mesh file goes into a folder of objects (--out), which other commands take as --meshes. NAME.toml in this folder
     holds mass and friction.
 
     Args:
@@ -121,7 +121,7 @@ def _cells(obj: ObjectSpec) -> tuple[str, ...]:
 def make(*, out: Path, count: int = 40, seed: int = 0) -> None:
     """Make random shapes to train with: boxes, cans, cups, eggs, wedges, bottles, hammers and bananas.
 
-    Demonstrations of them: xreset demos synth --objects FOLDER.
+    Demonstrations of them: xreset demos synth --meshes FOLDER.
 
     Args:
         out: Folder of objects to write; it must not exist.

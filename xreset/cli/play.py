@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from xreset.cli._common import Host, Policy, Port, Robot, TrainedObjects
+from xreset.cli._common import Host, Policy, Port, Robot, TrainedMeshes
 
 
 def play(
     policy: Policy = "many-objects",
     *,
     object: str | None = None,
-    backend: str = "mujoco",
+    engine: str = "mujoco",
     robot: Robot = None,
     demos: Path | None = None,
-    objects: TrainedObjects = None,
+    meshes: TrainedMeshes = None,
     seed: int = 0,
     host: Host = "127.0.0.1",
     port: Port = 8080,
@@ -23,7 +23,7 @@ def play(
 
     Args:
         object: Object to begin with; default: the soup can, or else the first one.
-        backend: Physics engine to begin with.
+        engine: Physics engine to begin with.
         demos: Starts and goals: demonstrations, robot motion, reset states or a goal set. Default: synthetic
             demonstrations.
         seed: Seed of starts and goals.
@@ -32,11 +32,11 @@ def play(
 
     page.play(
         policy,
-        thing=object,
-        engine=backend,
+        object_name=object,
+        engine=engine,
         robot=robot,
         demos=demos,
-        objects=objects,
+        meshes=meshes,
         seed=seed,
         host=host,
         port=port,

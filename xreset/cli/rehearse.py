@@ -13,7 +13,7 @@ def rehearse(
     policy: Policy,
     *,
     demos: Path | None = None,
-    backend: Several = (),
+    engine: Several = (),
     fault: Several = (),
     episodes: int = 1,
     real_time: bool = False,
@@ -25,7 +25,7 @@ def rehearse(
     Args:
         demos: Demonstrations whose starts and goals are played. Default: two synthetic demonstrations of each of the
             policy's objects.
-        backend: Physics engine; give it again for more engines. Default: all that can be used here, but not
+        engine: Physics engine; give it again for more engines. Default: all that can be used here, but not
             MuJoCo-Warp on a CPU, where it is slow.
         fault: Fault to try, or NAME=VALUE,VALUE... for values of your own (delays in ms, errors in mm or degrees,
             pushes of the object in m/s); give it again for more. Default: all.
@@ -40,7 +40,7 @@ def rehearse(
     from xreset.eval import policy_spec
     from xreset.eval import rehearse as rehearsal
 
-    engines = quick_engines(backend, setting.device)
+    engines = quick_engines(engine, setting.device)
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
     folder = out or spec.folder.parent / "rehearsal"
     with Progress() as bar:
@@ -56,7 +56,7 @@ def rehearse(
             **vars(setting),
         )
     table = [
-        ("fault", *(f"{card.backend}, {100 * card.task_progress:.0f} % without" for card in found))
+        ("fault", *(f"{card.engine}, {100 * card.task_progress:.0f} % without" for card in found))
     ]
     table += [(name, *limits) for name, limits in rehearsal.limits(found)]
     show_table(

@@ -16,7 +16,7 @@ def report(
     *,
     out: Path | None = None,
     robot: Robot = None,
-    objects: Path | None = None,
+    meshes: Path | None = None,
     film: Path | None = None,
 ) -> None:
     """Make a self-contained HTML page of a run's evaluations.
@@ -25,13 +25,13 @@ def report(
         run: Run folder, folder of results (for example of a baseline), or name of a policy that ships with xreset (then
             runs/NAME).
         out: Folder for index.html; default: report/ in the run folder.
-        objects: Folder of real meshes, for the clips; default: as the results name it.
+        meshes: Folder of real meshes, for the clips; default: as the results name it.
         film: MP4 to write as well: every object in every engine, next to each other.
     """
     from xreset.eval.report import clips, make
 
     with console.status("drawing clips"):
-        html, data = make.make_report(run_folder(run), out, robot=robot, objects=objects)
+        html, data = make.make_report(run_folder(run), out, robot=robot, meshes=meshes)
     console.print(table.results_table(list(data.training.results.values())))
     console.print(make.headline(data))
     show_notes(data.notes)

@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 from tyro.conf import arg
 
-from xreset.cli._common import Device, Objects, Several, Source, show_accounts
+from xreset.cli._common import Device, Meshes, Several, Source, show_accounts
 from xreset.cli._terminal import Progress, console, show_notes
 from xreset.errors import XResetError
 from xreset.files import file_hash
@@ -20,9 +20,9 @@ def resets(
     retargeted: Source,
     *,
     out: Path,
-    backend: Several = (),
+    engine: Several = (),
     robot: str | None = None,
-    objects: Objects = None,
+    meshes: Meshes = None,
     num_envs: int = 64,
     device: Device = "cpu",
     limits: Annotated[FilterConfig, arg(name="filter")] = FilterConfig(),
@@ -36,7 +36,7 @@ def resets(
     Args:
         retargeted: File made by `xreset retarget`.
         out: Reset bank to write.
-        backend: Physics engine to test the states in; give it again to keep only states that are stable in all engines.
+        engine: Physics engine to test the states in; give it again to keep only states that are stable in all engines.
             Default: mujoco.
         robot: Folder of the robot, if it is not known by name.
         num_envs: Worlds at a time.
@@ -60,24 +60,24 @@ def resets(
     from xreset.resets.transfer import add_transfers
     from xreset.retarget.file import check_retargeted, object_sources, read_retargeted
 
-    backends = list(dict.fromkeys(backend)) or ["mujoco"]
+    engines = list(dict.fromkeys(engine)) or ["mujoco"]
     motion = read_retargeted(retargeted)
     stated = object_sources(retargeted)
     made_from = {"retargeted": file_hash(retargeted)}
     spec = load_robot(robot or motion.robot)
     check_retargeted(retargeted, motion, spec)
-    loaded = load_objects(motion.object_names, objects)
+    loaded = load_objects(motion.object_names, meshes)
     scene = (spec, loaded)
     if changed := [o.name for o in loaded if stated.get(o.name, o.source) != o.source]:
-        meshes = f"{retargeted} was made with other meshes of {', '.join(changed)}"
-        show_notes([f"{meshes}. Give the same --objects folder."])
+        warning = f"{retargeted} was made with other meshes of {', '.join(changed)}"
+        show_notes([f"{warning}. Give the same --meshes folder."])
     where = {"num_envs": num_envs, "device": device}
-    title = f"states stable in {', '.join(backends)}"
+    title = f"states stable in {', '.join(engines)}"
     with Progress() as bar:
         bank = make_bank(
             motion,
             *scene,
-            backends,
+            engines,
             limits=limits,
             closing=closing,
             squeeze=squeeze,
@@ -89,11 +89,11 @@ def resets(
             bank = add_transfers(bank, motion, *scene, transfer, progress=count, **where)
         if settle:
             count = bar.count("start poses come to rest")
-            bank, at_rest = settle_starts(bank, *scene, backends[0], progress=count, **where)
+            bank, at_rest = settle_starts(bank, *scene, engines[0], progress=count, **where)
             moved = f"{at_rest.sum()} of {len(at_rest)} objects came to rest at the start"
             console.print(f"{moved}; the others start as recorded")
     config = {
-        "backends": backends,
+        "engines": engines,
         "num_envs": num_envs,
         "filter": asdict(limits),
         "closing": asdict(closing),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from xreset.cli._common import Objects, Source, show_accounts
+from xreset.cli._common import Meshes, Source, show_accounts
 from xreset.cli._terminal import Progress, console, show_notes
 from xreset.files import file_hash
 from xreset.retarget.arm.config import ArmConfig
@@ -19,7 +19,7 @@ def retarget(
     *,
     robot: str,
     out: Path,
-    objects: Objects = None,
+    meshes: Meshes = None,
     max_per_object: int | None = None,
     device: str = "cpu",
     hand: HandConfig = HandConfig(),
@@ -53,7 +53,7 @@ def retarget(
                 f"{left} of {len(chosen)} sequences are of left hands. For a right hand: xreset demos mirror"
             ]
         )
-    specs = demo_objects(chosen, objects)
+    specs = demo_objects(chosen, meshes)
     config = RetargetConfig(hand=hand, arm=arm)
     with Progress() as bar:
         result = retarget_demos(

@@ -11,7 +11,7 @@ from rich.text import Text
 from xreset.cli._common import (
     AllEngines,
     Device,
-    Objects,
+    Meshes,
     Robot,
     RobotName,
     Source,
@@ -122,7 +122,7 @@ def place(
     /,
     *,
     demos: Path,
-    objects: Objects = None,
+    meshes: Meshes = None,
     max_per_object: int = 2,
     write: bool = False,
     search: PlaceConfig = PlaceConfig(),
@@ -143,7 +143,7 @@ def place(
     spec = description.load_robot(robot)
     every = archive.read_demos(demos)
     chosen = every.select(max_per_object=max_per_object, spread=True)
-    specs = list(archive.demo_objects(chosen, objects).values())
+    specs = list(archive.demo_objects(chosen, meshes).values())
     with Progress() as bar:
         paths = pipeline.wrist_paths(chosen, spec, specs, progress=bar.count("hand retargeting"))
         grounded = pipeline.rest_on_table(every, specs)
@@ -176,8 +176,8 @@ def judge(
     /,
     *,
     robot: Robot = None,
-    objects: Objects = None,
-    backend: AllEngines = (),
+    meshes: Meshes = None,
+    engine: AllEngines = (),
     states: int = 8,
     squeeze: SqueezeConfig = SqueezeConfig(force=5.0, reach=0.01),
     num_envs: int = 32,
@@ -203,8 +203,8 @@ def judge(
     from xreset.pictures import render
     from xreset.robot_tools import judge as judging
 
-    loaded = inputs.load_inputs(bank, robot=robot, objects=objects, accept=("bank",))
-    names = list(dict.fromkeys(backend)) or usable_engines()
+    loaded = inputs.load_inputs(bank, robot=robot, meshes=meshes, accept=("bank",))
+    names = list(dict.fromkeys(engine)) or usable_engines()
     with Progress() as bar:
         found = judging.judge(
             loaded.bank, loaded.robot, loaded.objects, names, states=states, squeeze=squeeze, num_envs=num_envs,

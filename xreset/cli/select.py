@@ -13,7 +13,7 @@ def select(
     folder: Source,
     *,
     demos: Path,
-    backend: Several = (),
+    engine: Several = (),
     most: int = 8,
     episodes: int = 2,
     setting: Flat[Setting] = Setting(seed=1_000_003),
@@ -26,7 +26,7 @@ def select(
     Args:
         folder: Run folder.
         demos: Demonstrations whose starts and goals are played.
-        backend: Physics engine; give it again for more engines. Default: all that can be used here, but not
+        engine: Physics engine; give it again for more engines. Default: all that can be used here, but not
             MuJoCo-Warp on a CPU, where it is slow.
         most: Largest number of checkpoints to play, spread over the training; the newest is included.
         episodes: Episodes of each demonstration.
@@ -35,7 +35,7 @@ def select(
     """
     from xreset.eval import select as selection
 
-    engines = quick_engines(backend, setting.device)
+    engines = quick_engines(engine, setting.device)
 
     def say(name: str, engine: str, score: float) -> None:
         console.print(f"{name} in {engine}: {100 * score:.1f} %")

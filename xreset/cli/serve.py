@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 
-from xreset.cli._common import Policy, Robot, Several, TrainedObjects
+from xreset.cli._common import Policy, Robot, Several, TrainedMeshes
 
 
 def serve(
@@ -13,7 +13,7 @@ def serve(
     host: str = "127.0.0.1",
     port: int = 8765,
     robot: Robot = None,
-    objects: TrainedObjects = None,
+    meshes: TrainedMeshes = None,
     object: Several = (),
 ) -> None:
     """Serve a policy to a robot's computer over a WebSocket (docs/live.md has the messages).
@@ -26,7 +26,7 @@ def serve(
     from xreset.eval.export import deploy
 
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
-    deploy.serve(policy, host=host, port=port, robot=robot, objects=objects, only=object)
+    deploy.serve(policy, host=host, port=port, robot=robot, meshes=meshes, only=object)
 
 
 COMMAND = serve

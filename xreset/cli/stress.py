@@ -17,7 +17,7 @@ def stress(
     policy: PolicyOrBaseline,
     *,
     demos: Path,
-    backend: Engines = (),
+    engine: Engines = (),
     property: Several = (),
     episodes: int = 2,
     setting: Flat[Setting] = Setting(),
@@ -39,11 +39,11 @@ def stress(
     from xreset.eval import policy_spec, rollout
     from xreset.eval import stress as sweeps
 
-    engines = rollout.chosen_engines(backend or "mujoco", setting.device)
+    engines = rollout.chosen_engines(engine or "mujoco", setting.device)
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
     folder = out or spec.folder.parent / "stress"
     played = rollout.load_trial(
-        spec, demos, objects=setting.objects, seed=setting.seed, num_envs=setting.num_envs
+        spec, demos, meshes=setting.meshes, seed=setting.seed, num_envs=setting.num_envs
     )
     with Progress() as bar:
         found = sweeps.stress(
@@ -52,11 +52,11 @@ def stress(
             engines,
             folder,
             sweeps=properties,
-            repetitions=episodes,
+            episodes=episodes,
             progress=bar.stages(),
         )
     sweeps.write_plot(folder / "stress.png", found, f"{spec.name}: robustness")
-    table = [("property", "value", *(result.backend for result in found))]
+    table = [("property", "value", *(result.engine for result in found))]
     swept = sweeps.by_property(found)
     tried = set(swept).union(*(result.left_out for result in found))
     for prop in properties:
@@ -76,7 +76,7 @@ def stress(
     for result in found:
         if result.left_out:
             console.print(
-                f"left out in {result.backend}, which cannot set them: {', '.join(result.left_out)}"
+                f"left out in {result.engine}, which cannot set them: {', '.join(result.left_out)}"
             )
     console.print(f"results and picture in {folder}")
 

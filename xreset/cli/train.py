@@ -8,7 +8,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from xreset.cli._common import Objects, given_flags, refuse_changes
+from xreset.cli._common import Meshes, given_flags, refuse_changes
 from xreset.errors import RunError
 from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import default_config, starting_config
@@ -20,8 +20,8 @@ def train(
     robot: str | None = None,
     resets: Path | None = None,
     goals: Path | None = None,
-    objects: Objects = None,
-    backend: str = "mujoco-warp",
+    meshes: Meshes = None,
+    engine: str = "mujoco-warp",
     device: str | None = None,
     num_envs: int = 4096,
     iterations: int | None = None,
@@ -41,7 +41,7 @@ def train(
         resets: Reset bank, made by `xreset resets`.
         goals: Goal set, made by `xreset goals`. With --resets, its starts and goals are added to the demonstrated ones;
             without, every episode begins at home.
-        backend: Physics engine to train on.
+        engine: Physics engine to train on.
         device: cpu or cuda; default: cuda where there is a GPU and the engine can use it.
         num_envs: Worlds to simulate (per GPU).
         iterations: Total number of iterations; default: the configuration's.
@@ -77,8 +77,8 @@ def train(
             robot=robot,
             resets=resets,
             goals=goals,
-            objects=objects,
-            backend=backend,
+            meshes=meshes,
+            engine=engine,
             device=device,
             num_envs=num_envs,
             seed=seed,
@@ -101,8 +101,8 @@ def train(
         goals=goals,
         config=config,
         robot=robot,
-        objects=objects,
-        engine=backend,
+        meshes=meshes,
+        engine=engine,
         device=device,
         num_envs=num_envs,
         iterations=iterations,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from rich.progress import track
 
-from xreset.cli._common import Host, Objects, Port, Robot, Source
+from xreset.cli._common import Host, Meshes, Port, Robot, Source
 from xreset.cli._terminal import console
 from xreset.errors import XResetError
 from xreset.files import write_whole
@@ -18,7 +18,7 @@ def view(
     file: Source,
     *,
     demos: Path | None = None,
-    objects: Objects = None,
+    meshes: Meshes = None,
     robot: Robot = None,
     sequence: int | None = None,
     frame: int | None = None,
@@ -43,7 +43,7 @@ def view(
     """
     from xreset.pictures.view import load
 
-    shown = load.load_view(file, demos=demos, robot=robot, objects=objects)
+    shown = load.load_view(file, demos=demos, robot=robot, meshes=meshes)
     if png is None and mp4 is None:
         _serve(shown, host, port, sequence, frame or 0)
         return

@@ -438,7 +438,7 @@ def write_demos(
     )
 
 
-def demo_objects(demos: Demos, folder: Path | None = None) -> dict[str, ObjectSpec]:
+def demo_objects(demos: Demos, meshes: Path | None = None) -> dict[str, ObjectSpec]:
     """Return the objects of the demonstrations by name: stand-ins, or the meshes of a folder.
 
     Raises:
@@ -447,13 +447,13 @@ def demo_objects(demos: Demos, folder: Path | None = None) -> dict[str, ObjectSp
     """
     names = list(dict.fromkeys(demos.object_name.tolist()))
     try:
-        canonical_names(names, object_names(folder))
+        canonical_names(names, object_names(meshes))
     except ObjectError as error:
-        hint = "" if folder else " Or give a folder of meshes (objects=... or --objects)."
+        hint = "" if meshes else " Or give a folder of meshes (meshes=... or --meshes)."
         raise DemoError(
             f"The demonstrations need objects that are not there. {error}{hint}"
         ) from None
-    return {name: load_object(name, folder) for name in names}
+    return {name: load_object(name, meshes) for name in names}
 
 
 def _offsets(lengths: Sequence[int] | np.ndarray) -> np.ndarray:

@@ -62,7 +62,7 @@ _OPENING = np.array([0.0, 0.4, 0.2] * 4 + [-0.15, -0.1, 0.0, 0.3, 0.3])
 
 
 def synthesize(
-    objects: Iterable[str] | None = None,
+    names: Iterable[str] | None = None,
     per_object: int = 4,
     seed: Seed = 0,
     *,
@@ -77,7 +77,7 @@ def synthesize(
     The same arguments give the same arrays, and a sequence does not depend on the other sequences.
 
     Args:
-        objects: names, official or the paper's; None for all.
+        names: names of objects, official or the paper's; None for all.
         per_object: sequences of each object.
         seed: chooses all that varies: place and heading of the object, grasp, paths, timing, goal pose.
         fps: frames per second; a sequence lasts about 2.4 s.
@@ -97,7 +97,7 @@ def synthesize(
     if side not in ("right", "left"):
         raise DemoError(f"side is {side!r}, expected 'right' or 'left'.")
     folder = Path(meshes) if meshes else None
-    specs = load_objects(objects, folder)
+    specs = load_objects(names, folder)
     parts = []
     for spec in specs:
         starts = [_start(spec, np.array(up), side) for up in _REST_UP.get(spec.name, (_Z,))]

@@ -16,7 +16,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from xreset.checks import Checked, NonNegativeInt, PositiveInt, Rule, Share, from_dict, frozen
 from xreset.errors import PolicyError, RunError, WrongValueError
@@ -36,16 +36,21 @@ TEACHER = "teacher.onnx"
 class RunInfo(Checked):
     """Contents of ``run.json``."""
 
+    RENAMED: ClassVar = {
+        "objects": "meshes",
+        "backend": "engine",
+        "backend_version": "engine_version",
+    }
     robot: str
     """Name or folder, as given."""
     resets: str
     """Path of the reset bank, or of a goal set."""
     resets_hash: str
     """SHA-256 of this file."""
-    objects: str | None
+    meshes: str | None
     """Folder of object meshes; None: the built-in stand-ins."""
-    backend: str
-    backend_version: str
+    engine: str
+    engine_version: str
     device: str
     num_envs: PositiveInt
     seed: NonNegativeInt
@@ -90,7 +95,7 @@ def read_run(folder: str | Path, *, as_stated: bool = False) -> RunInfo:
     if as_stated:
         return info
     found = {}
-    for name in ("robot", "resets", "objects"):
+    for name in ("robot", "resets", "meshes"):
         path = getattr(info, name)
         if path and path not in robot_names() and not os.path.exists(path):
             places = (above / path for above in folder.resolve().parents)

@@ -62,7 +62,7 @@ def train(
     recipe: str | None = None,
     config: TrainConfig | None = None,
     robot: str | Path | None = None,
-    objects: str | Path | None = None,
+    meshes: str | Path | None = None,
     engine: str = "mujoco-warp",
     device: str | None = None,
     num_envs: int = 4096,
@@ -87,7 +87,7 @@ def train(
             and ``goals``, the run of ``weights``.
         config: the whole configuration, instead of a recipe.
         robot: name or folder of the robot; default: the robot that the bank names.
-        objects: folder of object meshes; default: the built-in stand-ins.
+        meshes: folder of object meshes; default: the built-in stand-ins.
         engine: name of the physics engine.
         device: cpu or cuda; default: cuda if there is a GPU that the engine can use.
         num_envs: number of worlds, in each process.
@@ -130,7 +130,7 @@ def train(
             f"The engine {engine!r} does not run on {device!r}. Omit the device, or choose another engine."
         )
     data = _bank_or_goals(bank, goals)
-    load = partial(load_inputs, robot=robot, objects=objects, accept=("bank", "goals"))
+    load = partial(load_inputs, robot=robot, meshes=meshes, accept=("bank", "goals"))
     inputs = load(data)
     if isinstance(inputs.data, GoalSet):
         config = from_home(config)
@@ -156,9 +156,9 @@ def train(
             robot=str(inputs.robot_name),
             resets=str(inputs.path),
             resets_hash=str(inputs.hash),
-            objects=str(inputs.objects_folder) if inputs.objects_folder else None,
-            backend=engine,
-            backend_version=version,
+            meshes=str(inputs.meshes) if inputs.meshes else None,
+            engine=engine,
+            engine_version=version,
             device=device,
             num_envs=num_envs,
             seed=seed,
@@ -211,7 +211,7 @@ def resume(
     if iterations is not None:
         info = replace(info, config=replace(info.config, iterations=iterations))
     inputs = load_inputs(
-        info.resets, robot=info.robot, objects=info.objects, accept=("bank", "goals")
+        info.resets, robot=info.robot, meshes=info.meshes, accept=("bank", "goals")
     )
     if inputs.hash != info.resets_hash:
         raise RunError(
@@ -445,7 +445,7 @@ def _train(
         inputs.objects,
         inputs.bank,
         info.config.task,
-        engine=info.backend,
+        engine=info.engine,
         num_envs=info.num_envs,
         device=device,
         seed=seed,

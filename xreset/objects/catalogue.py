@@ -17,11 +17,11 @@ ALIASES = {alias: name for name, alias in ALIAS_OF.items()}
 """The paper's names -> official names."""
 
 
-def object_names(folder: str | Path | None = None) -> tuple[str, ...]:
+def object_names(meshes: str | Path | None = None) -> tuple[str, ...]:
     """Official names of the built-in objects, or of the meshes in a folder."""
-    if folder is None:
+    if meshes is None:
         return STAND_INS
-    return tuple(mesh_files(folder))
+    return tuple(mesh_files(meshes))
 
 
 def mesh_files(folder: str | Path) -> dict[str, Path]:
@@ -102,37 +102,37 @@ def _keys(name: str) -> tuple[str, str]:
     return key, key.partition("_")[2]
 
 
-def load_object(name: str, folder: str | Path | None = None) -> ObjectSpec:
+def load_object(name: str, meshes: str | Path | None = None) -> ObjectSpec:
     """Load an object by any of its names.
 
     Args:
         name: official name, name without number, or the paper's name.
-        folder: folder of real meshes (``NAME.obj``, ``NAME/textured_simple.obj`` or ``NAME/textured.obj``); None for
+        meshes: folder of real meshes (``NAME.obj``, ``NAME/textured_simple.obj`` or ``NAME/textured.obj``); None for
             the stand-in. An object that is asked for by its official name has it, whatever its mesh is called.
 
     Raises:
         ObjectError: unknown object, or no usable mesh of it in the folder.
     """
-    if folder is None:
+    if meshes is None:
         return stand_in(canonical_name(name))
-    files = mesh_files(folder)
+    files = mesh_files(meshes)
     try:
         full = canonical_name(name, files)
     except ObjectError as error:
         raise ObjectError(
-            f"{error} These are the meshes in {folder}; omit the folder for the built-in objects."
+            f"{error} These are the meshes in {meshes}; omit the folder for the built-in objects."
         ) from None
     return import_mesh(files[full], name if name in STAND_INS else full)
 
 
 def load_objects(
-    names: Iterable[str] | None, folder: str | Path | None = None
+    names: Iterable[str] | None, meshes: str | Path | None = None
 ) -> tuple[ObjectSpec, ...]:
     """Load objects in the order of their names, as :func:`load_object` does. A single name gives one object, None gives
     all of :func:`object_names`."""
     if names is None:
-        names = object_names(folder)
+        names = object_names(meshes)
     names = (names,) if isinstance(names, str) else tuple(names)
     if not names:
         raise ObjectError("No object is named. Name one or several, or give None for all.")
-    return tuple(load_object(name, folder) for name in names)
+    return tuple(load_object(name, meshes) for name in names)

@@ -63,7 +63,7 @@ class ResetBank(Brief):
     robot: OneText
     robot_fingerprint: OneText
     """:attr:`xreset.spec.RobotSpec.fingerprint` of the robot that the bank was made for."""
-    backends: Annotated[tuple[str, ...], Field(("B",), "U")]
+    engines: Annotated[tuple[str, ...], Field(("B",), "U", earlier="backends")]
     """Engines in which every state was stable."""
     joint_names: JointNames
 
@@ -107,7 +107,7 @@ class ResetBank(Brief):
     rejected_frame_part: Annotated[np.ndarray, Field(("C",), "f", within=(0.0, 1.0))] | None = None
     transferred: Annotated[np.ndarray, Field(("L",), "b")] | None = None
     """[L] bool: whether the hand has a grasp of another demonstration, which holds the object at full weight in all
-    ``backends`` (:func:`xreset.resets.transfer.add_transfers`); None: no state has (:attr:`own_grasp`)."""
+    ``engines`` (:func:`xreset.resets.transfer.add_transfers`); None: no state has (:attr:`own_grasp`)."""
 
     @property
     def num_states(self) -> int:
@@ -162,7 +162,7 @@ def no_states(robot: RobotSpec) -> dict[str, Any]:
         "robot": robot.name,
         "robot_fingerprint": robot.fingerprint,
         "joint_names": robot.joint_names,
-        "backends": (),
+        "engines": (),
         "reason_names": (),
     }
     lengths: dict[Any, Any] = {"L": 0, "C": 0, "J": len(robot.joints)}

@@ -132,7 +132,7 @@ def make_bank(
     rejected = {f"rejected_{name}": values[~keep] for name, values in columns.items()}
     return replace(
         starts_and_goals(retargeted, robot, objects),
-        backends=engines,
+        engines=engines,
         joint_pos=stable.joint_pos.numpy(),
         joint_target=stable.joint_target.numpy() if squeeze.presses else None,
         object_pos=stable.object_pos.numpy(),

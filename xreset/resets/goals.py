@@ -83,7 +83,7 @@ class _Episode:
 
 
 def make_goals(
-    objects: Iterable[str] | None = None,
+    names: Iterable[str] | None = None,
     *,
     robot: str | Path | RobotSpec,
     meshes: str | Path | None = None,
@@ -98,7 +98,7 @@ def make_goals(
     other objects.
 
     Args:
-        objects: names of the objects; None: all.
+        names: names of the objects; None: all.
         robot: the robot, its name or its folder: its reach decides which goals are kept.
         meshes: folder of real meshes; None: the built-in stand-ins.
         families: some of :data:`FAMILIES`; None: all of them, or none if there are ``poses``.
@@ -117,7 +117,7 @@ def make_goals(
         families = () if poses else FAMILIES
     if unknown := [family for family in families if family not in FAMILIES]:
         raise GoalError(f"Unknown family {unknown[0]!r}. Choose from: {', '.join(FAMILIES)}.")
-    loaded = load_objects(objects, meshes)
+    loaded = load_objects(names, meshes)
     robot = load_robot(robot)
     own = [_own_pose(pose) for pose in poses]
     for obj in loaded:

@@ -112,12 +112,12 @@ def add_transfers(
     used = objects_named(objects, bank.object_name[grasp])
     scene = SceneSpec(robot=robot, objects=tuple(used.values()))
     count = len(pose)
-    work = count * (1 + len(bank.backends))
+    work = count * (1 + len(bank.engines))
     states, is_reached = _carried(
         bank, grasp, poses, pose, robot, lambda done: progress(done, work)
     )
     held = np.flatnonzero(is_reached)
-    for number, engine in enumerate(bank.backends, start=1):
+    for number, engine in enumerate(bank.engines, start=1):
         if not len(held):
             break
         before = number * count

@@ -70,7 +70,7 @@ _TILE = (224, 176)
 class Judged:
     """What became of the tried states of one object in one engine."""
 
-    backend: str
+    engine: str
     object_name: str
     """``all`` in a sum over objects."""
     tried: int
@@ -118,7 +118,7 @@ def judge(
     bank: ResetBank,
     robot: RobotSpec,
     objects: Sequence[ObjectSpec],
-    backends: Sequence[str] = ("mujoco",),
+    engines: Sequence[str] = ("mujoco",),
     *,
     states: int = 8,
     squeeze: SqueezeConfig = SqueezeConfig(force=5.0, reach=0.01),
@@ -132,7 +132,7 @@ def judge(
         bank: states that physics accepted.
         robot: the bank's robot.
         objects: the bank's objects.
-        backends: names of engines.
+        engines: names of engines.
         states: number of states of each object: those in the air in which the thumb and another finger are nearest to
             the object, as many from each demonstration as possible. States in grasps of other demonstrations are left
             out: they were chosen because they hold.
@@ -156,18 +156,18 @@ def judge(
     groups = {name: np.flatnonzero(tried.object_name == name) for name in names}
     rows = []
     shots: dict[str, np.ndarray] = {}
-    for number, backend in enumerate(backends):
+    for number, engine in enumerate(engines):
         before = number * count
         table = probe(
-            backend, scene, tried.object_name, start, partial(_play, Kinematics(robot)), gravity=0.0,
+            engine, scene, tried.object_name, start, partial(_play, Kinematics(robot)), gravity=0.0,
             steps=_CLOSE_STEPS, num_envs=num_envs, device=device,
-            progress=lambda done, before=before: progress(before + done, len(backends) * count),
+            progress=lambda done, before=before: progress(before + done, len(engines) * count),
         )  # fmt: skip
         verdicts = table[:, : 1 + len(PHASES)].astype(int)
         for name, mine in {**groups, "all": np.arange(count)}.items():
             able, hold, lift, turn = verdicts[mine].sum(axis=0).tolist()
             row = Judged(
-                backend=backend,
+                engine=engine,
                 object_name=name,
                 tried=len(mine),
                 hold=hold,
@@ -356,7 +356,7 @@ def judge_picture(
             if phase != "start":
                 caption = [
                     phase,
-                    *(f"{row.backend} {getattr(row, phase) / row.tried:.0%}" for row in rows),
+                    *(f"{row.engine} {getattr(row, phase) / row.tried:.0%}" for row in rows),
                 ]
             tiles.append(add_caption(tile, caption, 1 + len(rows)))
         pictures.append(np.hstack(tiles))

@@ -92,8 +92,8 @@ class Variation:
         missing = [name.replace("_", " ") for name in needed if name not in backend.capabilities]
         if missing:
             raise CapabilityError(
-                f"The backend {backend.name!r} cannot set {', '.join(missing)} in each world, which this task draws. "
-                "Use another backend, or in a training leave these ranges of task.randomization at their defaults."
+                f"The engine {backend.name!r} cannot set {', '.join(missing)} in each world, which this task draws. "
+                "Use another engine, or in a training leave these ranges of task.randomization at their defaults."
             )
 
     def _keep_parameters(self, drawn: Drawn, backend: Backend) -> dict[str, Tensor]:

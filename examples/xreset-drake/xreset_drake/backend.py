@@ -64,9 +64,9 @@ class DrakeWorld(World):
     ) -> None:
         """See :class:`World`."""
         robot = mechanism(scene.robot)
-        thing = scene.objects[object_index]
-        self._inertia = object_inertia(thing)
-        self._at = at = build_model(scene, robot, thing, self._inertia, settings)
+        obj = scene.objects[object_index]
+        self._inertia = object_inertia(obj)
+        self._at = at = build_model(scene, robot, obj, self._inertia, settings)
         self._internal_steps = settings.internal_steps
         self._dt = scene.timestep / settings.internal_steps
         mimics = scene.robot.mimics

@@ -119,7 +119,7 @@ def friction_of_other(pair: float) -> float:
 
 
 def build_model(
-    scene: SceneSpec, robot: Mechanism, thing: ObjectSpec, inertia: Inertia, settings: DrakeSettings
+    scene: SceneSpec, robot: Mechanism, obj: ObjectSpec, inertia: Inertia, settings: DrakeSettings
 ) -> DrakeModel:
     """Build the diagram of one world."""
     builder = DiagramBuilder()
@@ -140,7 +140,7 @@ def build_model(
     instance = plant.AddModelInstance("robot")
     plant.set_gravity_enabled(instance, not scene.robot.gravity_compensated)
     bodies = _add_robot(parts, robot, instance)
-    body = _add_object(parts, thing, inertia)
+    body = _add_object(parts, obj, inertia)
     plant.Finalize()
     _filter_collisions(scene_graph, parts, robot)
     diagram = builder.Build()
@@ -281,12 +281,12 @@ def _add_robot(parts: _Parts, robot: Mechanism, instance: ModelInstanceIndex) ->
     return bodies
 
 
-def _add_object(parts: _Parts, thing: ObjectSpec, inertia: Inertia) -> RigidBody:
+def _add_object(parts: _Parts, obj: ObjectSpec, inertia: Inertia) -> RigidBody:
     plant = parts.plant
     instance = plant.AddModelInstance("object")
     plant.set_gravity_enabled(instance, False)
     body = plant.AddRigidBody("object", instance, spatial_inertia(inertia))
-    for piece in thing.pieces:
+    for piece in obj.pieces:
         parts.attach(body, piece, Surface("object"))
     return body
 

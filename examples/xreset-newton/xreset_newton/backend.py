@@ -54,9 +54,9 @@ class NewtonWorld(World):
     ) -> None:
         """See :class:`World`."""
         robot = mechanism(scene.robot)
-        thing = scene.objects[object_index]
-        self._inertia = object_inertia(thing)
-        self._at = at = build_model(scene, robot, thing, self._inertia, settings)
+        obj = scene.objects[object_index]
+        self._inertia = object_inertia(obj)
+        self._at = at = build_model(scene, robot, obj, self._inertia, settings)
         model = self._model = at.model
         self._tips = len(scene.robot.fingertips)
         self._joints = MovingJoints(scene.robot, robot.joint_names)

@@ -59,7 +59,7 @@ class NewtonModel:
 def build_model(
     scene: SceneSpec,
     robot: Mechanism,
-    thing: ObjectSpec,
+    obj: ObjectSpec,
     inertia: Inertia,
     settings: NewtonSettings,
 ) -> NewtonModel:
@@ -85,7 +85,7 @@ def build_model(
     )
     _add_robot(builder, shapes, robot)
     body = builder.add_body(**_mass(inertia), label="object")
-    for piece in thing.pieces:
+    for piece in obj.pieces:
         shapes.add(body, piece, Surface("object"))
     model = builder.finalize(device="cpu")
     model.steel.rigid_body_angular_damping.zero_()  # by default Newton brakes what spins, by 5 % a second

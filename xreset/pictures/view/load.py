@@ -30,7 +30,7 @@ def load_view(
     *,
     demos: Path | None = None,
     robot: str | None = None,
-    objects: Path | None = None,
+    meshes: Path | None = None,
 ) -> View:
     """Read demonstrations, robot trajectories, a reset bank or a goal set.
 
@@ -38,12 +38,12 @@ def load_view(
         path: the file.
         demos: demonstrations that trajectories or a bank were made from: shows the human hand too.
         robot: name or folder of the robot; default: the one that the file names.
-        objects: folder of real meshes; None for the stand-ins.
+        meshes: folder of real meshes; None for the stand-ins.
 
     Raises:
         XResetError: a file, the robot or an object cannot be used, or the files do not belong together.
     """
-    inputs = load_inputs(path, robot=robot, objects=objects)
+    inputs = load_inputs(path, robot=robot, meshes=meshes)
     data = inputs.data
     if isinstance(data, Demos):
         if demos is not None or robot is not None:

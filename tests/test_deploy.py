@@ -326,6 +326,12 @@ class ContractTest(InFolder):
         np.testing.assert_array_equal(*targets)
         self.assertIn("brick: 5 joint targets", run("12_served_policy", server.url, 3))
         remote.set_goal([0.5, 0.3, 0.3], [0, 1, 0, 0])
+        with (
+            patch("xreset.live.serve._MOST_CLIENTS", 1),
+            connect(server.url) as another,
+            self.assertRaisesRegex(WebSocketException, "1 clients are connected"),
+        ):
+            another.recv(timeout=5)
         with self.assertRaises(WebSocketException):  # a page in a browser
             connect(server.url, origin="http://elsewhere.example")  # type: ignore[arg-type]
 

@@ -1,11 +1,16 @@
 """A live episode, without a browser: every way in which a user can interfere."""
 
+from importlib.util import find_spec
+from unittest import skipUnless
+from unittest.mock import patch
+
 import numpy as np
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from torch.testing import assert_close
 
 from tests.data import InFolder
+from tests.test_view import send_value
 from xreset.errors import XResetError
 from xreset.eval.play.record import write_film, write_trace
 from xreset.eval.play.session import AWAY, Session
@@ -150,6 +155,33 @@ class Played(InFolder):
         session.env.backend.set_state(session.env.backend.state())
         self.assertRaisesRegex(XResetError, "broke down. A new episode has begun", session.step)
         self.assertLess(self.steps(0.1).distance, 1.0)
+
+    @skipUnless(find_spec("viser"), "viser is not installed")
+    def test_no_message_of_a_visitor_ends_the_page(self):
+        from xreset.eval.play.page import Page
+
+        page = Page(self.session, port=8960)
+        self.addCleanup(page.close)
+        for control, value in (
+            (page._speed, 0.0),
+            (page._object, "nonsense"),
+            (page._engine, "nonsense"),
+            (page._policy, "/etc"),
+            (page._robot_name, "/etc"),
+            (page._input, "nonsense"),
+        ):
+            with self.subTest(value=value, control=control), patch.object(page, "_notify") as told:
+                send_value(page, control, value)
+                self.session.step()
+                page._write()
+                page.tick()
+                told.assert_not_called()
+        with patch.object(page, "_notify") as told:
+            page._enqueue(self.session.grab, "no link", "nowhere")
+            page._enqueue(page._move_goal, np.zeros(7), np.zeros(2))
+            page.tick()
+        self.assertEqual(told.call_count, 2)
+        self.session.step()
 
     def test_film_and_trace(self):
         session = self.session

@@ -13,11 +13,13 @@ from importlib.util import find_spec
 from unittest import mock, skipUnless
 from xml.etree import ElementTree
 
+import msgspec
 import numpy as np
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
 from tests import toy_bank
+from tests.browser import wait_until
 from tests.command import refused, succeeds
 from tests.data import InOneFolder
 from tests.toy_bank import SOUP, SPAM
@@ -82,6 +84,21 @@ def toy_retargeted(robot):
         hand_error=np.full(TOTAL, 0.0121),
         wrist_error=np.full(TOTAL, 0.0032),
     )
+
+
+def send_value(page, control, value):
+    """Give a control of a page a value, as a visitor with a program of his own can."""
+    import viser
+    from websockets.sync.client import connect
+    from websockets.typing import Subprotocol
+
+    protocol = Subprotocol(f"viser-v{viser.__version__}")
+    message = {"type": "GuiUpdateMessage", "uuid": control._impl.uuid}
+    message |= {"updates": {"value": value}}
+    before = control.update_timestamp
+    with connect(page.url.replace("http", "ws"), subprotocols=[protocol]) as socket:
+        socket.send(msgspec.msgpack.encode(message))
+        wait_until(lambda: control.update_timestamp != before, "the value to arrive")
 
 
 class WithFiles(InOneFolder):
@@ -274,6 +291,29 @@ class Served(WithFiles):
         page.show()
         self.assertIn("nothing", page._text.content)
 
+    def test_no_message_of_a_visitor_ends_the_page(self):
+        page = self.page(self.retargeted)
+        page._play.value = True
+        for control, values in (
+            (page._speed, (0, -1, float("nan"))),
+            (page._frame, (-5, 10**6)),
+            (page._sequence, ("nonsense", "")),
+            (page._reason, ("nonsense",)),
+        ):
+            for value in values:
+                with self.subTest(control=control, value=value):
+                    send_value(page, control, value)
+                    page._choose()
+                    page.tick()
+                    page.show()
+                    self.assertIn(page.row, range(TOTAL))
+        with (
+            mock.patch.object(page, "tick", side_effect=[ValueError("x"), KeyboardInterrupt]),
+            self.assertLogs("xreset"),
+            self.assertRaises(KeyboardInterrupt),
+        ):
+            page.serve()
+
     def test_text_of_a_file_is_shown_as_text(self):
         """A browser shows that none of it runs: tests/test_view_browser.py."""
         name = "<iframe srcdoc='<script>1</script>'></iframe> **b** ![c](d) &amp;"
@@ -322,8 +362,14 @@ class OwnPageOnly(WithFiles):
             ("evil.example:8080", "http://evil.example:8080", "0.0.0.0", False),
             ("", None, "127.0.0.1", False),
             ("127.0.0.1:8080", "null", "127.0.0.1", False),
+            ("mypc:8080", "http://mypc:8080", "0.0.0.0", True),
+            ("mypc.local:8080", "http://mypc.local:8080", "0.0.0.0", True),
+            ("other.local:8080", "http://other.local:8080", "0.0.0.0", False),
         ):
-            with self.subTest(host=host, origin=origin):
+            with (
+                self.subTest(host=host, origin=origin),
+                mock.patch("xreset.pictures.view.server.gethostname", return_value="MyPC"),
+            ):
                 self.assertEqual(is_own_page(host, origin, served), expected)
 
     def test_the_server(self):

@@ -23,7 +23,14 @@ from xreset.eval.plots import COLORS
 from xreset.eval.policy_spec import PolicySpec
 from xreset.pictures.meshes import GOAL_COLOR, OBJECT_COLOR, rgb
 from xreset.pictures.view.colors import TOUCH_COLOR
-from xreset.pictures.view.server import RobotMeshes, WebPage, as_html, serve_until_interrupted
+from xreset.pictures.view.server import (
+    RobotMeshes,
+    WebPage,
+    as_html,
+    bounded,
+    chosen,
+    serve_until_interrupted,
+)
 from xreset.plugins import backend_names, robot_names
 from xreset.policies import shipped
 from xreset.tensors import one_thread
@@ -141,13 +148,11 @@ class Page(WebPage):
         self._server.on_client_disconnect(self._on_disconnect)
         self._draw()
 
-    def serve(self) -> None:
-        """Play until interrupted. While nobody looks, time stands still."""
-        while True:
-            self.tick()
-
     def tick(self) -> None:
-        """Do what visitors have asked for, take a control step if one is due, and wait for the next one."""
+        """Do what visitors have asked for, take a control step if one is due, and wait for the next one.
+
+        While nobody looks, time stands still.
+        """
         self._run_queue()
         now = time.monotonic()
         watched = bool(self._server.get_clients())
@@ -161,7 +166,7 @@ class Page(WebPage):
         self._step()
         if now - self._drawn > FRAME:
             self._draw()
-        self._due = max(self._due + self.session.control_dt / self._speed.value, now - BEHIND)
+        self._due = max(self._due + self.session.control_dt / bounded(self._speed), now - BEHIND)
         time.sleep(max(0.0, self._due - time.monotonic()))
 
     def close(self) -> None:
@@ -180,7 +185,7 @@ class Page(WebPage):
                 return
             try:
                 action()
-            except XResetError as error:
+            except Exception as error:  # a visitor may send anything
                 self._notify("That does not work", str(error))
 
     def _step(self) -> None:
@@ -403,9 +408,10 @@ class Page(WebPage):
     def _open_chosen(self) -> None:
         """Open what the controls say, unless it is open already."""
         session = self.session
-        robot = self._robot_name.value
-        policy = self._policy.value
-        chosen = self._names[self._object.value]
+        robot = chosen(self._robot_name, session.policy.robot.name)
+        policy = chosen(self._policy, session.policy.name)
+        engine = chosen(self._engine, session.engine)
+        object_name = self._names.get(self._object.value, session.object_name)
         if robot != session.policy.robot.name:
             choice = partial(session.choose_policy, NOBODY, robot=robot)
         elif policy != session.policy.name:
@@ -414,10 +420,10 @@ class Page(WebPage):
                 self._policies[policy],
                 robot=robot if policy == NOBODY else None,
             )
-        elif chosen != session.object_name:
-            choice = partial(session.choose_object, chosen)
-        elif self._engine.value != session.engine:
-            choice = partial(session.choose_engine, self._engine.value)
+        elif object_name != session.object_name:
+            choice = partial(session.choose_object, object_name)
+        elif engine != session.engine:
+            choice = partial(session.choose_engine, engine)
         else:
             return
         with self._loading():
@@ -447,9 +453,10 @@ class Page(WebPage):
         self._forces.show(times, forces, session.policy.robot.fingertip_names)
         rewards = np.array([moment.reward for moment in moments])
         self._rewards.show(times, rewards, session.terms)
-        shown = session.inputs[self._input.value]
+        name = chosen(self._input, self._input.options[0])
+        shown = session.inputs[name]
         inputs = np.array([moment.inputs[shown] for moment in moments])
-        columns = [f"{self._input.value} {i}" for i in range(inputs.shape[1])]
+        columns = [f"{name} {i}" for i in range(inputs.shape[1])]
         self._inputs.show(times, inputs, columns)
 
     def _status(self) -> tuple[str, str]:
@@ -470,13 +477,13 @@ class Page(WebPage):
             )
         if self._paused:
             return where, f"{session.engine}, paused"
-        reason = ", slowed by this machine" if self._factor < 0.9 * self._speed.value else ""
+        reason = ", slowed by this machine" if self._factor < 0.9 * bounded(self._speed) else ""
         return where, f"{session.engine}: {self._factor:.2f} x real time{reason}"
 
     # Saving -----------------------------------------------------------------------------------------------------------
 
     def _save_film(self, client: Any) -> None:
-        moments = last_moments(self.session, self._seconds.value)
+        moments = last_moments(self.session, bounded(self._seconds))
         note = client.add_notification(
             "Drawing the film", "It takes a while. Go on playing.", loading=True
         )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
+import socket
 from collections.abc import Callable
 from typing import Any
 
@@ -24,6 +25,8 @@ with needs("websockets", "serve"):
     from websockets.sync.server import Server, ServerConnection, serve
 
 _MAX_MESSAGE_BYTES = 1 << 20
+_MOST_CLIENTS = 16
+"""Each has a network of its own in memory."""
 _PING_TIMEOUT = 5.0
 """Time in which a client must answer a ping, and time between pings [s]."""
 
@@ -55,10 +58,11 @@ class PolicyServer:
         self._clients: set[ServerConnection] = set()
         self._log = logging.getLogger("xreset")
         try:
+            is_ipv6 = ":" in host
+            family = socket.AF_INET6 if is_ipv6 else socket.AF_INET
             self._server: Server = serve(
                 self._answer_client,
-                host,
-                port,
+                sock=socket.create_server((host, port), family=family),
                 origins=[None],  # no page in a browser
                 max_size=_MAX_MESSAGE_BYTES,
                 compression=None,
@@ -68,9 +72,10 @@ class PolicyServer:
             )
         except OSError as error:
             raise XResetError(
-                f"Cannot listen at {host}:{port}: {error.strerror}. Choose another --port."
+                f"Cannot listen at {host}:{port}: {error.strerror}. Choose another --port or --host."
             ) from error
-        self.url = f"ws://{host}:{self._server.socket.getsockname()[1]}"
+        name = f"[{host}]" if is_ipv6 else host
+        self.url = f"ws://{name}:{self._server.socket.getsockname()[1]}"
 
     def serve(self) -> None:
         """Serve until :meth:`close`."""
@@ -85,6 +90,11 @@ class PolicyServer:
     def _answer_client(self, client: ServerConnection) -> None:
         """Answer a client until it disconnects."""
         who = "{}:{}".format(*client.remote_address[:2])
+        if len(self._clients) >= _MOST_CLIENTS:
+            client.close(
+                1013, f"{_MOST_CLIENTS} clients are connected, which is the largest number"
+            )
+            return
         try:
             self._clients.add(client)
             self._log.warning("%s has connected.", who)

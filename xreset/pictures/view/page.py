@@ -13,11 +13,9 @@ from xreset.errors import XResetError
 from xreset.pictures.meshes import GOAL_COLOR, OBJECT_COLOR, Color, rgb
 from xreset.pictures.view.colors import HUMAN_COLOR, REACHED_COLOR, TOUCH_COLOR, reason_color
 from xreset.pictures.view.data import BONES, GOOD, View
-from xreset.pictures.view.server import RobotMeshes, WebPage, as_html
+from xreset.pictures.view.server import IDLE, RobotMeshes, WebPage, as_html, bounded, chosen
 
 _ALL = "all"
-_IDLE = 0.1
-"""Time between two checks of the play button [s]."""
 
 
 class Page(WebPage):
@@ -63,7 +61,7 @@ class Page(WebPage):
         """The row that is shown; None if no row meets the controls."""
         if not len(self._rows):
             return None
-        return int(self._rows[min(self._frame.value, len(self._rows) - 1)])
+        return int(self._rows[min(bounded(self._frame), len(self._rows) - 1)])
 
     def show(self) -> None:
         """Update the scene and the text from the controls."""
@@ -73,18 +71,17 @@ class Page(WebPage):
                 self._text.content = as_html("nothing meets this choice")
                 return
             self._scene.show(row)
-            number = min(self._frame.value + 1, len(self._rows))
+            number = min(bounded(self._frame) + 1, len(self._rows))
             position = f"{number} of {len(self._rows)}"
             self._text.content = as_html(*self.view.text(row), position)
 
-    def serve(self) -> None:
-        """Play while the play button is on, until interrupted."""
-        while True:
-            if self._play.value and len(self._rows) > 1:
-                time.sleep(1.0 / (self.view.rate * self._speed.value))
-                self._step(1)
-            else:
-                time.sleep(_IDLE)
+    def tick(self) -> None:
+        """Show the next frame while the play button is on."""
+        if self._play.value and len(self._rows) > 1:
+            time.sleep(1.0 / (self.view.rate * bounded(self._speed)))
+            self._step(1)
+        else:
+            time.sleep(IDLE)
 
     def _make_controls(self, sequence: int | None) -> None:
         gui: Any = self._server.gui
@@ -109,12 +106,12 @@ class Page(WebPage):
 
     def _choose(self) -> None:
         with self._lock:
-            chosen = {}
-            if self._sequence.value != _ALL:
-                chosen["sequence"] = int(self._sequence.value.partition(":")[0])
-            if self._reason.value != _ALL:
-                chosen["reason"] = self._reasons[self._reason.value]
-            self._rows = self.view.choose(**chosen)
+            sequence = chosen(self._sequence, _ALL)
+            reason = chosen(self._reason, _ALL)
+            self._rows = self.view.choose(
+                sequence=None if sequence == _ALL else int(sequence.partition(":")[0]),
+                reason=self._reasons.get(reason),
+            )
             self._frame.max = _slider_end(self._rows)
             self._frame.value = 0
             self.show()
@@ -122,7 +119,7 @@ class Page(WebPage):
     def _step(self, by: int) -> None:
         with self._lock:
             if len(self._rows):  # setting the slider calls show, as if the user had moved it
-                self._frame.value = (self._frame.value + by) % len(self._rows)
+                self._frame.value = (bounded(self._frame) + by) % len(self._rows)
 
 
 def _slider_end(rows: np.ndarray) -> int:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from html import escape
@@ -21,6 +23,11 @@ from xreset.geometry.urdf import link_meshes
 from xreset.pictures.meshes import TABLE_COLORS, Color, link_colors, rgb, tint
 from xreset.pictures.render import Camera
 from xreset.spec import RobotSpec, TableSpec
+from xreset.text import plain
+
+_LOG = logging.getLogger("xreset")
+IDLE = 0.1
+"""Time between two looks at the controls [s]."""
 
 
 class WebPage:
@@ -72,9 +79,36 @@ class WebPage:
             host = "localhost"
         return f"http://{host}:{self._server.get_port()}"
 
+    def serve(self) -> None:
+        """Serve until interrupted. No error ends it, because a visitor may send anything."""
+        last = ""
+        while True:
+            try:
+                self.tick()
+            except Exception as error:
+                problem = plain(f"{type(error).__name__}: {error}")[:200]
+                if problem != last:
+                    _LOG.warning("A visitor's message could not be carried out. %s", problem)
+                last = problem
+                time.sleep(IDLE)
+
+    def tick(self) -> None:
+        """Do once what is due, and wait for the next time."""
+        raise NotImplementedError
+
     def close(self) -> None:
         """Stop the server."""
         self._server.stop()
+
+
+def chosen(dropdown: Any, otherwise: Any) -> Any:
+    """Return the value of a drop-down; ``otherwise`` if a visitor has sent one that is not among its options."""
+    return dropdown.value if dropdown.value in dropdown.options else otherwise
+
+
+def bounded(slider: Any) -> Any:
+    """Return the value of a slider; its least value if a visitor has sent one that is outside."""
+    return slider.value if slider.min <= slider.value <= slider.max else slider.min
 
 
 def as_html(first: str, *others: str) -> str:
@@ -181,6 +215,7 @@ def is_own_page(host: str, origin: str | None, served: str) -> bool:
     try:
         ip_address(name)
     except ValueError:
-        if name not in ("localhost", served, gethostname(), getfqdn()):
+        own = ("localhost", served, gethostname(), getfqdn(), f"{gethostname()}.local")
+        if name not in [each.lower() for each in own]:  # browsers write names in small letters
             return False
     return origin is None or origin in (f"http://{host}", f"https://{host}")

@@ -84,7 +84,7 @@ class World(ABC):
 
     @abstractmethod
     def contacts(self) -> Iterable[tuple[int, np.ndarray]] | ContactArrays:
-        """Return the contacts of the object in the last physics step.
+        """Return the contacts of the object in the last internal step.
 
         Either a list with a pair for each contact: what touches the object (an index of a fingertip, or ``TABLE`` or
         ``OTHER_LINK`` of :mod:`~xreset.backends.rigid`), and its force on the object [3]. Or a tuple of their sums: tip

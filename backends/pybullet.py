@@ -58,8 +58,8 @@ from xreset.physics import Capability, unavailable
 from xreset.spec import GRAVITY, SceneSpec, Shape
 
 INTERNAL_STEPS = 2
-"""Bullet steps per physics step. Objects creep in a grasp by 2 mm in 2 s with 2, by 4 mm with 1, which is 1.6 times as
-fast."""
+"""Internal steps per physics step. Objects creep in a grasp by 2 mm in 2 s with 2, by 4 mm with 1, which is 1.6 times
+as fast."""
 _SOLVER_ITERATIONS = 50
 _GEOM_INITIALIZE_SAT_FEATURES = 4
 """Bullet's flag of a collision shape, which PyBullet does not name: contacts between polyhedra are found on faces."""
@@ -180,7 +180,7 @@ class PybulletWorld(World):
         return self._frames.locate(rows[:, :3], rows[:, [6, 3, 4, 5]], rows[:, 7:10], rows[:, 10:])
 
     def contacts(self) -> list[tuple[int, np.ndarray]]:
-        """See :meth:`World.contacts`. The forces are those of the last of Bullet's steps."""
+        """See :meth:`World.contacts`. The forces are those of the last internal step."""
         found = []
         # All contacts: when asked for a body, PyBullet swaps the two bodies and the normal, but not the friction.
         for contact in self._p.getContactPoints():

@@ -314,7 +314,8 @@ class MovingJoints:
         self.multiplier = np.array([mimic.multiplier for mimic in mimics])
         self.offset = np.array([mimic.offset for mimic in mimics])
         self.shares = np.zeros((len(robot.joints), self.count))
-        """[J, D] how each drive's torque is shared: see :func:`drive_shares`."""
+        """[J, D] how each drive's torque is shared by its joint and those that follow it, so that the couplings have
+        nothing to do. An engine in reduced coordinates, without couplings, does not need it."""
         self.shares[:, [*self.driven, *self.mimic]] = drive_shares(robot)
         self.nominal = np.stack([drive_values(robot, name) for name in ("kp", "kd", "effort")])
         """[3, J] stiffness, damping and effort limit."""

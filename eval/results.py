@@ -86,6 +86,7 @@ class Episode:
     reorient_once: bool
     """Whether the object was at the goal at any time."""
     reorientation_progress: Share
+    """1 - least / first distance to the goal, the largest of four keypoints of the object."""
     task_progress: Share
     out_of_bounds: bool
     nonfinite: bool
@@ -99,7 +100,7 @@ class Episode:
     final_distance: NonNegativeFloat | None = None
     """This distance in the last reading, or the last before an early end [m]."""
     final_position_error: NonNegativeFloat | None = None
-    """Distance of the object's origin from the goal in the same reading [m]."""
+    """Distance of the object's origin, in the task's ``object_frame``, from the goal in the same reading [m]."""
     final_angle: NonNegativeFloat | None = None
     """Angle between the object and the goal in the same reading [rad]."""
 

@@ -89,6 +89,7 @@ class CollisionBitsTest(TestCase):
         expected = {("base", "wrist"), ("base", "pad_b"), ("column", "wrist"), ("column", "jaw_a"), ("column", "pad_b"),
                     ("wrist", "pad_b"), ("jaw_a", "pad_b")}  # fmt: skip
         self.assertCountEqual(hits, {frozenset(pair) for pair in expected})
+        self.assertCountEqual(map(frozenset, mech.colliding_links), hits)
 
 
 class FrictionTest(TestCase):

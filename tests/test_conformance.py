@@ -15,9 +15,12 @@ import torch
 from tests.command import refused, succeeds
 from tests.data import InFolder
 from xreset.backends.conformance import CHECKS, CheckResult, Measure, run
+from xreset.backends.conformance.results import largest
+from xreset.backends.conformance.scene import objects
 from xreset.backends.mjcf_model import OBJECT
 from xreset.backends.mujoco import MujocoBackend, MujocoWorld
 from xreset.backends.rigid import OTHER_LINK, TABLE, conjugate, rotate
+from xreset.cli import engines
 from xreset.errors import BackendUnavailableError, XResetError
 from xreset.physics import KnownDifference
 
@@ -565,6 +568,23 @@ class Harness(InFolder):
 
     def test_unknown_check(self):
         self.assertRaisesRegex(XResetError, "free_fall", run, MujocoBackend, only=["no_such_check"])
+        known = KnownDifference(check="free_fal", measure="x", bound=2.0, reason="r")
+        with (
+            mock.patch.object(MujocoBackend, "known_differences", (known,)),
+            self.assertRaisesRegex(XResetError, "known_differences names unknown checks: free_fal"),
+        ):
+            run(partial(MujocoBackend, workers=0), only=["free_fall"])
+
+    def test_a_failure_says_by_how_much_and_where(self):
+        errors = [("lift", torch.tensor(0.01)), ("turn", torch.tensor([0.0, -0.01204]))]
+        measured, where = largest(iter(errors))
+        failed = Measure(what="peak", measured=measured, tolerance=0.012, unit="rad", where=where)
+        self.assertEqual(engines._text(failed), "peak: 0.01204, tolerance 0.012 rad (turn)")
+        passed = replace(failed, measured=0.0119)
+        self.assertEqual(engines._text(passed), "peak: 0.0119, tolerance 0.012 rad")
+        with mock.patch.object(MujocoWorld, "set_object_gravity", lambda *_: None):
+            [result] = run(partial(MujocoBackend, workers=0), only=["object_gravity"])
+        self.assertIn(result.measures[0].where, {obj.name for obj in objects()})
 
     def test_a_backend_that_cannot_be_built_is_not_a_failed_check(self):
         def make(scene, num_worlds, *, object_index=None):

@@ -14,6 +14,8 @@ from tests.toy_retarget import FLOAT, slope
 from tests.toy_robot import toy_hand_arm
 from xreset import robots
 from xreset.backends.conformance.scene import gripper
+from xreset.backends.conformance.scene import shape as placed
+from xreset.backends.rigid import mechanism, vertices
 from xreset.errors import RobotError
 from xreset.geometry.dynamics import drive_shares, mass_matrix
 from xreset.geometry.kinematics import Kinematics
@@ -44,6 +46,26 @@ class DriveSharesTest(unittest.TestCase):
         M = mass_matrix(free, home) + np.diag([*armature, 0.0])
         acceleration = np.linalg.solve(M, shares.T @ np.arange(1.0, 1 + len(robot.joints)))
         self.assertAlmostEqual(acceleration[-1], mimic.multiplier * acceleration[source], places=9)
+
+
+class MechanismTest(unittest.TestCase):
+    def test_limits_are_those_of_the_followers_too(self):
+        robot = mechanism(gripper())
+        jaw = robot.robot.joint_names.index("jaw_a_slide")
+        lower, upper = robot.limits
+        assert_allclose((lower[jaw], upper[jaw]), (0.002 / 1.1, 0.06))  # jaw_b is at 1.1 q - 0.002
+
+    def test_every_shape_has_vertices(self):
+        for kind, size, extent in (
+            ("box", (0.1, 0.2, 0.3), (0.1, 0.2, 0.3)),
+            ("hull", (0.1, 0.2, 0.3), (0.1, 0.2, 0.3)),
+            ("sphere", (0.1,), (0.1, 0.1, 0.1)),
+            ("cylinder", (0.1, 0.3), (0.1, 0.1, 0.3)),
+            ("capsule", (0.1, 0.3), (0.1, 0.1, 0.4)),
+        ):
+            corners = vertices(placed(kind, size, (1.0, 2.0, 3.0)))
+            assert_allclose(np.ptp(corners, axis=0) / 2, extent, rtol=0.01, err_msg=kind)
+            assert_allclose(corners.max(axis=0) - extent, (1.0, 2.0, 3.0), atol=2e-3)
 
 
 class UrdfTest(InFolder):

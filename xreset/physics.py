@@ -150,7 +150,10 @@ class Links(Tensors):
 
 @frozen
 class Contacts(Tensors):
-    """Contact forces *on the object*, world frame, of the last physics step (zero right after a state is set)."""
+    """Contact forces *on the object*, world frame, of the last internal step (zero right after a state is set).
+
+    An engine takes one or several internal steps in a physics step.
+    """
 
     tip_force: Tensor
     """[N, E, 3] net force of each finger's contact links on the object [N]."""

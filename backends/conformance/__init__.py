@@ -18,6 +18,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 from xreset.backends.conformance import (
     contact_checks,
     grasp_checks,
@@ -97,6 +99,12 @@ def run(
     bench = Bench(make, scene(robot))
     results = []
     try:
+        declared = {difference.check for difference in bench.backend.known_differences}
+        if unknown := sorted(declared.difference(known)):
+            raise XResetError(
+                f"{type(bench.backend).__name__}.known_differences names unknown checks: {', '.join(unknown)}. "
+                f"Choose from: {', '.join(known)}."
+            )
         for check in CHECKS:
             if check.name in wanted:
                 start = time.perf_counter()
@@ -130,6 +138,8 @@ def _run_one(check: Check, bench: Bench) -> CheckResult:
         return ended("failed", f"{type(error).__name__}: {error}")
     backend = bench.backend
     for what, found in errors.items():
+        if what.rpartition(" ")[2].startswith("joint_") and isinstance(found, Tensor):
+            found = zip(bench.scene.robot.joint_names, found.movedim(-1, 0), strict=True)
         measured, where = largest(found)
         tolerance, unit = check.limit(what, backend.device.type, _TABLE["states"])
         known = None

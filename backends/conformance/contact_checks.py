@@ -33,17 +33,19 @@ def resting_weight(bench: Bench) -> Measured:
     contacts = worlds.contacts()
     moved = worlds.state().object_pos - start.object_pos
     weight = GRAVITY * bench.masses
-    return {
-        "force right after setting": torch.cat(
-            (fresh.table_force[:, None], fresh.tip_force), dim=1
-        ),
-        "vertical force": contacts.table_force[:, 2] / weight - 1.0,
-        "horizontal force": contacts.table_force[:, :2] / weight[:, None],
-        "force of the fingers": contacts.tip_force,
-        "fingers that say they touch": float(contacts.tip_touch.sum()),
-        "sinking": moved[:, 2],
-        "sliding": moved[:, :2],
-    }
+    return bench.by_object(
+        {
+            "force right after setting": torch.cat(
+                (fresh.table_force[:, None], fresh.tip_force), dim=1
+            ),
+            "vertical force": contacts.table_force[:, 2] / weight - 1.0,
+            "horizontal force": contacts.table_force[:, :2] / weight[:, None],
+            "force of the fingers": contacts.tip_force,
+            "fingers that say they touch": contacts.tip_touch.sum(dim=1),
+            "sinking": moved[:, 2],
+            "sliding": moved[:, :2],
+        }
+    )
 
 
 def resting_on_a_side(bench: Bench) -> Measured:
@@ -56,8 +58,8 @@ def resting_on_a_side(bench: Bench) -> Measured:
     worlds = bench.worlds()
     worlds.advance(start, SETTLE)
     force = worlds.contacts().table_force / (GRAVITY * bench.masses)[:, None]
-    stable = [i for i, obj in enumerate(bench.objects) if obj.name != "can"]  # a can rolls
-    return {"vertical force": force[stable, 2] - 1.0, "horizontal force": force[stable, :2]}
+    force[[obj.name == "can" for obj in bench.objects]] = torch.tensor([0.0, 0.0, 1.0])  # it rolls
+    return bench.by_object({"vertical force": force[:, 2] - 1.0, "horizontal force": force[:, :2]})
 
 
 def rest_and_bounce(bench: Bench) -> Measured:

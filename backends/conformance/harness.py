@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from functools import cached_property
@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.backends.conformance.results import Skipped
+from xreset.backends.conformance.results import Measured, Skipped
 from xreset.backends.conformance.scene import gripper
 from xreset.geometry.collision import table_clearance
 from xreset.geometry.kinematics import Kinematics
@@ -152,6 +152,10 @@ class Bench:
     def objects(self) -> list[ObjectSpec]:
         """The object of each shared world."""
         return [self.scene.objects[i] for i in self.object_index]
+
+    def by_object(self, errors: Mapping[str, Tensor]) -> Measured:
+        """Return errors [N, ...] of the shared worlds, named by their objects."""
+        return named([obj.name for obj in self.objects], errors)
 
     @property
     def masses(self) -> Tensor:
@@ -306,6 +310,14 @@ def small_motion(kinematics: Kinematics) -> Tensor:
     lower, upper = finite_limits(kinematics)
     step = 0.05 * (upper - lower)
     return torch.where(kinematics.home > (lower + upper) / 2, -step, step).float()
+
+
+def named(names: Iterable[str], errors: Mapping[str, Tensor], dim: int = 0) -> Measured:
+    """Return errors whose rows along a dimension have names: of joints, links or objects."""
+    parts = list(names)
+    return {
+        what: list(zip(parts, error.movedim(dim, 0), strict=True)) for what, error in errors.items()
+    }
 
 
 def state_errors(found: State, expected: State, words: str = "") -> dict[str, Tensor]:

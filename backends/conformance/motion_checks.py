@@ -33,12 +33,14 @@ def free_fall(bench: Bench) -> Measured:
     t = steps * h
     gravity = torch.tensor([0.0, 0.0, -GRAVITY])
     off = end.object_pos - (start.object_pos + throw * t + gravity * t * t / 2)
-    return {
-        "velocity": end.object_linvel - throw - gravity * t,
-        "pos, horizontal": off[:, :2],
-        "pos, vertical": off[:, 2],
-        "spin": end.object_angvel,
-    }
+    return bench.by_object(
+        {
+            "velocity": end.object_linvel - throw - gravity * t,
+            "pos, horizontal": off[:, :2],
+            "pos, vertical": off[:, 2],
+            "spin": end.object_angvel,
+        }
+    )
 
 
 def free_spin(bench: Bench) -> Measured:
@@ -71,13 +73,15 @@ def free_spin(bench: Bench) -> Measured:
     off = end.object_pos - start.object_pos - torch.tensor(moved)
     velocity = com_velocity + gravity * t - np.cross(omega, arm)
     orientation = turn_of(end.object_quat)
-    return {
-        "pos, horizontal": off[:, :2],
-        "pos, vertical": off[:, 2],
-        "linvel": end.object_linvel - torch.tensor(velocity),
-        "orientation": (orientation * turn.inv()).magnitude(),
-        "angvel": end.object_angvel - torch.tensor(omega),
-    }
+    return bench.by_object(
+        {
+            "pos, horizontal": off[:, :2],
+            "pos, vertical": off[:, 2],
+            "linvel": end.object_linvel - torch.tensor(velocity),
+            "orientation": torch.tensor((orientation * turn.inv()).magnitude()),
+            "angvel": end.object_angvel - torch.tensor(omega),
+        }
+    )
 
 
 def long_spin(bench: Bench) -> Measured:
@@ -101,14 +105,13 @@ def long_spin(bench: Bench) -> Measured:
         """[N, 3] centre of mass."""
         return state.object_pos + quat_rotate(state.object_quat, com)
 
-    names = [obj.name for obj in bench.objects]
     before = momentum(start)
-    return {
-        "angular momentum": zip(
-            names, (momentum(end) - before).norm(dim=1) / before.norm(dim=1), strict=True
-        ),
-        "centre of mass": zip(names, center(end) - center(start), strict=True),
-    }
+    return bench.by_object(
+        {
+            "angular momentum": (momentum(end) - before).norm(dim=1) / before.norm(dim=1),
+            "centre of mass": center(end) - center(start),
+        }
+    )
 
 
 def object_gravity(bench: Bench) -> Measured:
@@ -119,7 +122,7 @@ def object_gravity(bench: Bench) -> Measured:
     end = worlds.advance(bench.in_the_air(), _STEPS)
     full = GRAVITY * _STEPS * bench.scene.timestep
     off = -end.object_linvel[:, 2] - fraction * full
-    return {"velocity gained": off / full, "spin gained": end.object_angvel}
+    return bench.by_object({"velocity gained": off / full, "spin gained": end.object_angvel})
 
 
 def object_wrench(bench: Bench) -> Measured:
@@ -145,11 +148,13 @@ def object_wrench(bench: Bench) -> Measured:
     omega = torch.linalg.solve(inertia, twist.expand_as(com)) * t  # the object has hardly turned
     arm = quat_rotate(state.object_quat, com)
     com_velocity = state.object_linvel + torch.linalg.cross(state.object_angvel, arm)
-    return {
-        "velocity of the centre of mass": _relative_difference(com_velocity, gained),
-        "angular velocity": _relative_difference(state.object_angvel, omega),
-        "push after the state was set": after.object_linvel[:, :2],
-    }
+    return bench.by_object(
+        {
+            "velocity of the centre of mass": _relative_difference(com_velocity, gained),
+            "angular velocity": _relative_difference(state.object_angvel, omega),
+            "push after the state was set": after.object_linvel[:, :2],
+        }
+    )
 
 
 def _relative_difference(found: Tensor, expected: Tensor) -> Tensor:

@@ -168,7 +168,9 @@ def largest(errors: Found) -> tuple[float, str]:
     if isinstance(errors, Tensor | np.ndarray | float | int):
         return float(np.abs(np.asarray(errors, dtype=np.float64)).max(initial=0.0)), ""
     found = [(largest(error)[0], name) for name, error in errors]
-    return max(found, key=lambda pair: math.inf if math.isnan(pair[0]) else pair[0])
+    return max(
+        found, key=lambda pair: math.inf if math.isnan(pair[0]) else pair[0], default=(0.0, "")
+    )
 
 
 def judge(measures: Iterable[Measure]) -> Verdict:

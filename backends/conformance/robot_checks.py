@@ -13,7 +13,13 @@ import torch
 from scipy.integrate import solve_ivp
 from torch import Tensor
 
-from xreset.backends.conformance.harness import Bench, Worlds, finite_limits, replace_fields
+from xreset.backends.conformance.harness import (
+    Bench,
+    Worlds,
+    finite_limits,
+    named,
+    replace_fields,
+)
 from xreset.backends.conformance.results import Measured, Skipped
 from xreset.backends.rigid import mechanism, object_inertia
 from xreset.geometry.dynamics import com_jacobian, drive_values
@@ -187,7 +193,8 @@ def drive_scale(bench: Bench) -> Measured:
         # What was set before must not matter.
         for factors in (scales.flip(0), scales):
             worlds.set_parameter("drives", factors[:, :, None].expand(-1, -1, len(way)))
-        return {"path": path(worlds, slice(None)) - torch.cat(expected, dim=1)}
+        off = path(worlds, slice(None)) - torch.cat(expected, dim=1)
+    return named(scene.robot.joint_names, {"path": off}, dim=-1)
 
 
 def _with_drives(scene: SceneSpec, **values: np.ndarray) -> SceneSpec:
@@ -261,7 +268,8 @@ def own_weight(bench: Bench) -> Measured:
     rise = jacobian.linear[:, :, 2]  # [N, L, J]
     stiffness = torch.as_tensor(drive_values(scene.robot, "kp"))
     sag = GRAVITY * torch.einsum("l,nlj->nj", mass, rise) / stiffness
-    return {
+    off = {
         "sag": start.joint_pos.double() - q - sag,
         "difference between worlds": q - q[:1],
     }
+    return named(scene.robot.joint_names, off, dim=-1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from xreset.backends.conformance.harness import (
     Bench,
+    named,
     small_motion,
     stacked,
     state_errors,
@@ -67,7 +69,7 @@ def links_after_set(bench: Bench) -> Measured:
         state = bench.random_state(seed)
         worlds.set(state)
         errors.append(_link_errors(bench.kinematics, state, worlds.links()))
-    return stacked(errors)
+    return _by_link(bench, stacked(errors))
 
 
 def links_after_steps(bench: Bench) -> Measured:
@@ -104,13 +106,16 @@ def joint_order(bench: Bench) -> Measured:
         worlds.step(240)
         moved = (worlds.state().joint_pos - start.joint_pos) / motion
     wrong = moved - torch.eye(count)
-    return {
-        "pos": links["pos"],
-        "angle": links["angle"],
+    of_joints = {
         "joint_pos": found["joint_pos"],
         "joint_vel": found["joint_vel"],
         "way missing of the joint named": wrong.diagonal(),
         "way of others": wrong - torch.diag(wrong.diagonal()),
+    }
+    return {
+        "pos": links["pos"],
+        "angle": links["angle"],
+        **named(scene.robot.joint_names, of_joints, dim=-1),
     }
 
 
@@ -170,5 +175,15 @@ def _errors_on_the_way(bench: Bench, chosen: Tensor) -> Measured:
     for _ in range(6):
         worlds.step(4)
         now = _link_errors(bench.kinematics, worlds.state(), worlds.links())
-        errors.append({what: error[:, chosen] for what, error in now.items()})
-    return stacked(errors)
+        errors.append(now)
+    return _by_link(bench, stacked(errors), chosen.tolist())
+
+
+def _by_link(
+    bench: Bench, errors: Mapping[str, Tensor], chosen: Sequence[bool] | None = None
+) -> Measured:
+    """Return errors [T, N, K, ...] of the tracked links, or of those chosen [K], by their names."""
+    links = np.array(bench.scene.robot.tracked_links)
+    keep = np.ones(len(links), dtype=bool) if chosen is None else np.array(chosen)
+    kept = {what: error[:, :, keep] for what, error in errors.items()}
+    return named(links[keep].tolist(), kept, dim=2)

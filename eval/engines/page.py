@@ -109,6 +109,6 @@ def _verdict(check: Json | None) -> str:
     return f"**failed, {share}**"
 
 
-def _amount(measure: Json, entry: str) -> str:
-    """Return a number with two significant digits and its unit; a number that is not finite is a text in the file."""
-    return f"{float(measure[entry]):.2g} {measure['unit']}".rstrip()
+def _amount(measure: Json, entry: str, digits: int = 2) -> str:
+    """Return a number with its unit; a number that is not finite is a text in the file."""
+    return f"{float(measure[entry]):.{digits}g} {measure['unit']}".rstrip()

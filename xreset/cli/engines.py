@@ -143,7 +143,14 @@ def _print_check(result: conformance.CheckResult, verbose: bool) -> None:
 def _text(measure: conformance.Measure | None) -> str:
     if measure is None:
         return ""
-    return f"{measure.what}: {measure.measured:.2g}, tolerance {measure.tolerance:.2g} {measure.unit}".rstrip()
+    digits = 2 if measure.verdict == "passed" else 3
+    measured, tolerance = (f"{x:.{digits}g}" for x in (measure.measured, measure.tolerance))
+    if measured == tolerance:  # show on which side it is
+        measured = f"{measure.measured:.6g}"
+    text = f"{measure.what}: {measured}, tolerance {tolerance} {measure.unit}".rstrip()
+    if measure.where and measure.verdict != "passed":
+        text += f" ({measure.where})"
+    return text
 
 
 def compare(

@@ -40,7 +40,7 @@ class RewardInput:
     best_reach: Tensor
     """[N] smallest mean fingertip distance of the episode, this step included [m]."""
     tip_force: Tensor
-    """[N, E, 3] force of each finger's contact links on the object [N], world frame, in the last physics step."""
+    """[N, E, 3] force of each finger's contact links on the object [N], world frame, in the last internal step."""
     state: State
     """[N, ...] state of joints and object, without noise."""
     goal_pos: Tensor

@@ -190,7 +190,7 @@ class DrakeWorld(World):
         )
 
     def contacts(self) -> list[tuple[int, np.ndarray]]:
-        """See :meth:`World.contacts`: of the last of Drake's steps, which is what its output ports report."""
+        """See :meth:`World.contacts`: of the last internal step, which is what Drake's output ports report."""
         if self._lost is not None:
             return []
         found = []

@@ -67,6 +67,8 @@ HAND = _hand(*map(_finger, _PLACES))
 ARM = (ROBOTS / "arm.urdf").read_text()
 MJCF = (ROBOTS / "hand.xml").read_text()
 """The same hand, but for one actuator."""
+_AXES = ("1 0 0", "0 1 0", "0 0 1")
+_COPIES = '<replicate count="5001"><geom size="0.01"/></replicate></body></worldbody>'
 JAW = (ROBOTS / "jaw.xml").read_text()
 """Two fingers on parallelograms: rods that are pinned to the pads keep these parallel."""
 
@@ -325,29 +327,186 @@ class Toy(Robots):
         self.assertRegex(notes, "bars of a linkage: l_rod, r_rod")
 
     def test_damaged_or_huge_mjcf_is_refused(self):
-        def asset(text):
-            return f"<asset>{text}</asset><worldbody>"
-
-        copies = '<replicate count="30000"><geom size="0.01"/></replicate></body>'
-        texture = '<texture name="h" type="2d" builtin="flat" width="30000" height="30000"/>'
         world = "<worldbody>"
+        curve = "0.1 0.8 0 0 0"
+        tendon = '<tendon><fixed name="t"><joint joint="f1_1" coef="nan"/></fixed></tendon>'
+        not_finite = "not finite, or far too large .MuJoCo's "
         for words, old, new in (
-            ("orientation that is not finite", 'euler="0 0 0.9"', 'euler="-inf 0 0"'),
+            (f"{not_finite}body_quat", 'euler="0 0 0.9"', 'euler="-inf 0 0"'),
+            (f"{not_finite}body_pos", 'pos="0.085 0 0"', 'pos="inf 0 0"'),
+            (f"{not_finite}eq_data", curve, "nan 1 0 0 0"),
+            (f"{not_finite}tendon", "<actuator>", f'{tendon}<actuator><position tendon="t"/>'),
+            (f"{not_finite}jnt_axis", 'axis="0 1 0"', 'axis="0 1e300 0"'),
             ("size 1e-300 m, expected 1e-06 m or more", '"0.018 0.007 0.007"', '"1e-300 1 1"'),
-            (
-                "has a hfield",
-                world,
-                asset('<hfield name="h" nrow="40000" ncol="40000" size="1 1 1 1"/>'),
-            ),
-            ("has a flexcomp", world, asset('<flexcomp name="f" count="3000 3000 100"/>')),
-            ("has a replicate", "</body></worldbody>", f"{copies}</worldbody>"),
-            ("a texture has 9e.08 entries", world, asset(texture)),
-            ("a size has 2e.09 entries", world, f'<size nkey="2000000000"/>{world}'),
-            ("a size has 1e.08 entries", world, f'<size nuser_body="1e8"/>{world}'),
+            ("5010 shapes. Use 5000 at most", "</body></worldbody>", _COPIES),
             ("Give the file that includes it", MJCF, "<mujocoinclude/>"),
+            ("has no robot", MJCF, "<mujoco><worldbody><body name='a'/></worldbody></mujoco>"),
         ):
             with self.subTest(words), self.assertRaisesRegex(RobotError, words):
-                self.read("hand.xml", MJCF.replace(old, new))
+                self.read("hand.xml", MJCF.replace(old, new, 1))
+        texture = '<texture name="h" type="2d" builtin="flat" width="9000" height="9000"/>'
+        self.file("big.xml", f"<mujocoinclude><asset>{texture}</asset></mujocoinclude>")
+        for new in ('<include file="big.xml"/>', '<sensor><user dim="30000000"/></sensor>'):
+            with self.subTest(new), mock.patch.dict(os.environ, XRESET_MAX_FILE_MB="100"):
+                text = MJCF.replace(world, f"{new}{world}")
+                words = "takes more than 100 MB of memory.* Leave out .*XRESET_MAX_FILE_MB"
+                self.assertRaisesRegex(RobotError, words, self.read, "hand.xml", text)
+
+    def test_what_an_mjcf_has_and_a_robot_has_not_is_used_or_named(self):
+        spring = 'name="f1_1" stiffness="2" frictionloss="0.1"'
+        slack = '<tendon><fixed name="slack"><joint joint="f3_1" coef="1"/></fixed></tendon>'
+        scene = '<body name="cube"><freejoint/><geom size="0.1"/></body></worldbody>'
+        off = '<default><geom contype="0" conaffinity="0" group="{}"/></default><worldbody>'
+        pair = '<contact><pair geom1="p" geom2="q"/></contact></mujoco>'
+        pairs = MJCF.replace("<geom", '<geom name="p"', 1).replace("</mujoco>", pair)
+        pairs = pairs.replace(
+            '<geom type="box" pos="0.02', '<geom name="q" type="box" pos="0.02', 1
+        )
+        for text, words in (
+            (
+                MJCF.replace('name="f1_1"', spring, 1),
+                "springs of joints: f1_1.*friction of joints: f1",
+            ),
+            (
+                MJCF.replace("<actuator>", f"{slack}<actuator>"),
+                "tendons without an actuator: slack",
+            ),
+            (
+                MJCF.replace("</worldbody>", scene),
+                "left out: bodies of the world .* no joint: cube",
+            ),
+            (
+                pairs.replace("<worldbody>", off.format(3)),
+                "shapes of collision groups .* base, f1_a",
+            ),
+            (pairs.replace("<worldbody>", off.format(0)), "visual shapes .* f1_b, f2_a"),
+        ):
+            with self.subTest(words):
+                tree, notes = self.read("hand.xml", text)
+                self.assertRegex(notes, words)
+                self.assertEqual([link.name for link in tree.links if not link.collisions], [])
+        slides = [
+            f'<joint name="b{i}" type="slide" axis="{axis}"/>' for i, axis in enumerate(_AXES)
+        ]
+        text = MJCF.replace('name="base">', f'name="base">{"".join(slides)}')
+        exclude = '<contact><exclude body1="f1_a" body2="f2_a"/></contact></mujoco>'
+        made = import_robot(
+            self.arm,
+            self.file("hand.xml", text.replace("</mujoco>", exclude)),
+            self.folder / "mine",
+        )
+        said = " ".join(made.guessed)
+        self.assertIn("left out: joints that only let the hand float: b0, b1, b2", said)
+        self.assertIn("never collide, because the MJCF says so: f1_a and f2_a", said)
+        self.assertEqual(len(load_robot(made.folder).joint_names), 10)
+        self.assertIn(("f1_a", "f2_a"), load_robot(made.folder).collision_exclude)
+
+    def test_numbers_that_no_robot_has(self):
+        fixed = re.sub(
+            r'<mimic joint="f1_1"[^>]*>', "", HAND
+        )  # what follows it would be fixed, too
+        for text, words, field, value in (
+            (HAND.replace('value="0.05"', 'value="30"'), "size does not allow.*f1_a", "lower", 0),
+            (HAND.replace('value="0.05"', 'value="1e-6"'), "size does not allow.*f1_a", "lower", 0),
+            (fixed.replace('upper="1.5"', 'upper="0"', 1), "fixed, .*: f1_1", "type", "fixed"),
+            (HAND.replace('upper="1.5"', 'upper="86"'), "86, are read as degrees", "upper", 1.501),
+            (HAND.replace('upper="1.5"', 'upper="1e4"', 1), "limits .* have: f1_1", "upper", 6.283),
+            (HAND.replace('velocity="5"', 'velocity="1e5"'), "a speed that a", "velocity", 3.142),
+        ):
+            with self.subTest(words):
+                tree, notes = self.read("hand.urdf", text)
+                self.assertRegex(notes, words)
+                found = getattr(tree.above["f1_a"], field)
+                self.assertEqual(found if isinstance(found, str) else round(found, 3), value)
+                self.assertLess(tree.link("f1_a").mass, 0.1)
+        weak = self.file("weak.urdf", ARM.replace('effort="60"', 'effort="1"'))
+        text = MJCF.replace('name="f1_1"', 'name="f1_1" armature="1"', 1).replace(
+            'kp="3"', 'kp="900"'
+        )
+        text = text.replace('forcerange="-2 2"', 'forcerange="-999 999"')
+        made = import_robot(weak, self.file("hand.xml", text), self.folder / "weak")
+        said = " ".join(made.guessed)
+        for words in (
+            r"efforts that such joints do not have: j0 \(1\), .*f1_1 \(999\)",
+            r"armature that no finger has: f1_1 \(1\)",
+            r"too stiff for them: f1_1 \(900\)",
+        ):
+            self.assertRegex(said, words)
+        self.assertEqual({finding.level for finding in made.findings}, {"ok", "warning"})
+        self.assertNotIn("drives", [x.topic for x in made.findings if x.level == "warning"])
+        for text, words in (
+            (
+                HAND.replace("0.085", "85"),
+                "'f1_1' is 85 m from its parent link.*millimetres",
+            ),
+            (HAND.replace('size="0.036', 'size="36'), "'f1_a' has shapes of 36 m, expected"),
+            (
+                HAND.replace('size="0.036', 'size="2'),
+                "'f1_a' of the hand measures 2 m, expected 0.7",
+            ),
+            (HAND.replace('upper="1.5"', 'upper="0.02"'), "no joint turns by more than 0.02 rad"),
+            (
+                HAND.replace('"revolute"', '"continuous"'),
+                "no joint of a finger has limits that say",
+            ),
+            (
+                HAND.replace("collision>", "other>"),
+                "the last link of a finger, 'f1_b', has no collision",
+            ),
+        ):
+            with self.subTest(words):
+                self.assertRaisesRegex(RobotError, words, self.imported, text)
+        self.assertFalse((self.folder / "mine").exists())
+
+    def test_urdfs_that_a_strict_reader_refuses(self):
+        prefixed = HAND.replace('velocity="5"', 'velocity="5" drake:acceleration="2"')
+        prefixed = prefixed.replace("<robot name", "<robot xmlns:x").replace(
+            "</robot>", "<drake:a/></robot>"
+        )
+        self.assertEqual(self.read("named.urdf", prefixed)[0].name, "named")
+        shown = HAND.replace("collision>", "visual>")
+        tree, notes = self.read("shown.urdf", shown)
+        self.assertTrue(tree.link("f1_b").collisions)
+        self.assertIn("visual shapes collide where there is no other: base, f1_a, f1_b", notes)
+        self.file("tip.stl", "version https://git-lfs.github.com/spec/v1\noid sha256:1\nsize 9")
+        stale = "file:///home/somebody/catkin_ws/src/tip.stl"
+        pointer = HAND.replace('<box size="0.036 0.014 0.014"/>', f'<mesh filename="{stale}"/>')
+        for text, words in (
+            (pointer, "tip.stl is a Git LFS pointer, not the file itself. Run `git lfs pull`"),
+            (HAND.replace('"1.5"', '"${pi/2}"'), "is xacro.*Run xacro first"),
+            (HAND.replace("</robot>", "<xacro:finger/></robot>"), "is xacro.*<xacro:finger>"),
+        ):
+            with self.subTest(words):
+                self.assertRaisesRegex(RobotError, words, self.read, "hand.urdf", text)
+
+    def test_a_narrow_vote_names_the_other_finger_and_the_user_decides(self):
+        """Names of five fingers count from the thumb on; of four they say nothing."""
+        places = {"thumb": ((0.085, 0.06, -0.03), "0.9 0 0")}
+        with mock.patch.dict(_PLACES, places):
+            hand = _hand(*map(_finger, _PLACES)).replace("thumb", "f4")
+        with self.assertRaises(RobotError) as refused:
+            self.imported(hand)
+        self.assertIn("--thumb", str(refused.exception))
+        for finger in ("f4", "f1"):
+            out = self.folder / finger
+            import_robot(self.arm, self.file("hand.urdf", hand), out, thumb=f"{finger}_b")
+            self.assertEqual(errors(out), [])
+            self.assertEqual(load_robot(out).fingertips[0].contact_links, (f"{finger}_b",))
+
+    def test_of_two_hands_the_thumb_chooses_one(self):
+        hands = []
+        for side, y in (("left", 0.4), ("right", -0.4)):
+            hand = HAND.partition(">")[2].replace("</robot>", "")
+            hand = re.sub(r'"(base|(?:f\d|thumb)_\w)"', rf'"{side}_\1"', hand)
+            mount = f'<joint name="{side}" type="fixed"><parent link="torso"/><child link="{side}_base"/>'
+            hands.append(f'{hand}{mount}<origin xyz="0 {y} 0"/></joint>')
+        both = f'<robot name="both"><link name="torso"/>{"".join(hands)}</robot>'
+        words = "has 2 hands, with the fingers left_f1_b, .*; right_f1_b, .*Choose one with --thumb"
+        self.assertRaisesRegex(RobotError, words, self.imported, both)
+        spec = load_robot(self.imported(both, thumb="right_thumb_a"))
+        self.assertEqual(spec.hand_root, "right_base")
+        self.assertEqual(len(spec.hand_indices), 4)
+        self.assertFalse([name for name in load_urdf(spec.urdf).link_names if "left" in name])
 
     def test_what_is_mounted_on_the_flange_is_removed(self):
         gripper = '<link name="{0}"/><joint name="{0}" type="fixed"><parent link="l5"/><child link="{0}"/></joint>'
@@ -551,10 +710,7 @@ class Published(Robots):
             "\n".join(made.guessed),
             "WRJ2, WRJ1 move the whole hand: they are the last joints of the arm",
         )
-        thumb, *others, little = spec.fingertips
-        swapped = (replace(thumb, link=little.link), *others, replace(little, link=thumb.link))
         for changes, problems, expected in (
-            ({"fingertips": swapped}, checks._fingers, "little 'thumb_tip_frame' can meet"),
             (
                 {"hand_root": "forearm"},
                 checks._fingers,

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import re
 import reprlib
+from collections.abc import Sequence
 from typing import Any
 
+_LISTED = 8
+"""Names that are listed of many."""
 _REPR = reprlib.Repr()
 _REPR.maxlevel = 2
 _REPR.maxdict = 4
@@ -20,6 +23,12 @@ def shown(value: Any) -> str:
     except ValueError:  # Python refuses to write thousands of digits
         text = "a number of thousands of digits"
     return text if len(text) <= 200 else f"{text[:160]}...{text[-30:]}"
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names, separated by commas; of many, the first ones, and how many more there are."""
+    more = len(names) - _LISTED
+    return ", ".join(names) if more < 2 else f"{', '.join(names[:_LISTED])} and {more} more"
 
 
 class Brief:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.text import Text
@@ -25,6 +26,9 @@ from xreset.plugins import robot_names
 from xreset.resets.config import SqueezeConfig
 from xreset.robot_tools import placement
 from xreset.robot_tools.placement import PlaceConfig
+
+if TYPE_CHECKING:
+    from xreset.robot_tools.check import Finding
 
 
 def list_robots() -> None:
@@ -58,18 +62,22 @@ def check(robot: RobotName, /, *, picture: Path | None = None) -> None:
     from xreset.robot_tools import check as checks
     from xreset.robot_tools import picture as pictures
 
-    styles = {"ok": "green", "skipped": "dim", "warning": "yellow", "error": "bold red"}
     findings = checks.check(robot)
+    _print_findings(findings)
+    if picture is not None and findings[-1].topic not in ("description", "URDF"):
+        render.write_png(picture, pictures.robot_picture(description.load_robot(robot)))
+        console.print(f"wrote {picture}")
+    if any(finding.level == "error" for finding in findings):
+        raise SystemExit(1)
+
+
+def _print_findings(findings: Sequence[Finding]) -> None:
+    styles = {"ok": "green", "skipped": "dim", "warning": "yellow", "error": "bold red"}
     for finding in findings:
         level = (f"{finding.level:8}", styles[finding.level])
         console.print(Text.assemble(level, f" {finding.topic}: {finding.message}"))
     levels = [finding.level for finding in findings]
-    if picture is not None and findings[-1].topic not in ("description", "URDF"):
-        render.write_png(picture, pictures.robot_picture(description.load_robot(robot)))
-        console.print(f"wrote {picture}")
     console.print(f"{levels.count('error')} errors, {levels.count('warning')} warnings")
-    if "error" in levels:
-        raise SystemExit(1)
 
 
 def import_(
@@ -113,8 +121,8 @@ def import_(
         console.print(f"{title}:")
         for line in lines:
             console.print(f"  - {line}")
-    console.print(f"wrote {out / 'robot.toml'}, robot.urdf and robot.png; checking it")
-    check(str(out))
+    console.print(f"wrote {out / 'robot.toml'}, robot.urdf and robot.png; its check:")
+    _print_findings(made.findings)
 
 
 def place(

@@ -18,10 +18,11 @@ from scipy.spatial import ConvexHull
 from torch import Tensor
 
 from xreset.checks import frozen
+from xreset.errors import RobotError
 from xreset.geometry.collision import SelfCollision, bounding_ball, support_points
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.shapes import half_spaces, plane_heights, shape_mesh, transformed
+from xreset.geometry.shapes import half_spaces, plane_heights, shape_mesh, surface_of, transformed
 from xreset.geometry.solids import link_field
 from xreset.spec import Geometry, Shape
 from xreset.tensors import Tensors
@@ -39,6 +40,8 @@ STAND_IN = 3.5e-3
 deeper in each other than any ball, and the exact test measures how far two shapes must move to separate. With this
 value the LEAP hand loses 1 % of its frames to that test, without it 90 %."""
 
+_LARGEST_LINK = 0.7
+"""[m] Length of a link of a hand."""
 _INWARD_STEPS = 8
 """Steps that move a point of a surface inwards from one face after the other."""
 
@@ -80,6 +83,12 @@ def hand_balls(hand: Kinematics, collision: SelfCollision) -> Balls:
     for name in hand.link_names:
         if shapes := hand.tree.link(name).collisions:
             solids[name] = shapes
+            size = float(np.ptp(surface_of(shapes)[0], axis=0).max())
+            if size > _LARGEST_LINK:
+                raise RobotError(
+                    f"link {name!r} of the hand measures {size:.3g} m, expected {_LARGEST_LINK:g} m at most. Are its "
+                    'shapes in other units? State the scale of a mesh, such as scale="0.001 0.001 0.001".'
+                )
     links = tuple(solids)
     balls = [link_balls(shapes) for shapes in solids.values()]
     centers = [own for own, _ in balls]

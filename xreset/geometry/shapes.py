@@ -30,6 +30,8 @@ _MOST_HULL_POINTS = 300
 _ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz")
 _PER_VERTEX_BYTE = 8
 """Bytes of memory of a mesh per byte of its vertices: faces, and copies on the way."""
+_POINTER = b"version https://git-lfs"
+"""Beginning of the small text that Git has in place of a large file."""
 _GLTF_NUMBERS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 CYLINDER_SECTIONS = 48
 """Sides of the prism that stands for a cylinder in a surface mesh."""
@@ -175,6 +177,7 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
         raise ObjectError(f"There is no mesh at {shown(str(path))}.")
     if path.suffix.lower() in _ARCHIVES or zipfile.is_zipfile(path):
         raise ObjectError(f"{path} is an archive. Unpack it, and give the mesh.")
+    refuse_pointer(path)
     try:
         size = path.stat().st_size
         if path.suffix.lower() in (".gltf", ".glb"):
@@ -196,6 +199,15 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces) or not len(mesh.vertices):
         raise ObjectError(f"{path} contains no triangles. It is empty or damaged.")
     return mesh
+
+
+def refuse_pointer(path: Path) -> None:
+    """Raise ``ObjectError`` for the text that Git LFS has in place of a file which it has not fetched."""
+    with open(path, "rb") as file:
+        if file.read(len(_POINTER)) == _POINTER:
+            raise ObjectError(
+                f"{path} is a Git LFS pointer, not the file itself. Run `git lfs pull` in its repository."
+            )
 
 
 def _check_memory(path: Path, size: int) -> None:

@@ -16,14 +16,15 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 from xml.etree import ElementTree
-from xml.etree.ElementTree import Element
+from xml.etree.ElementTree import Element, SubElement
+from xml.parsers import expat
 
 import numpy as np
 
 from xreset.checks import frozen
 from xreset.errors import ObjectError, RobotError
 from xreset.files import max_bytes
-from xreset.geometry.shapes import hull, load_mesh, shape_mesh
+from xreset.geometry.shapes import hull, load_mesh, refuse_pointer, shape_mesh, surface_of
 from xreset.spec import Geometry, MimicSpec, RobotSpec, Shape
 from xreset.text import is_plain, shown
 
@@ -40,6 +41,10 @@ _LARGEST = 1e6
 """Larger numbers in a URDF are errors: masses [kg], positions [m], inertias [kg m^2], but not limits."""
 _SMALLEST = 1e-6
 """[m] Smallest size of a shape."""
+_LINK_SIZES = (5e-4, 10.0)
+"""[m] Lengths of the shapes of a link; meshes that are smaller or larger are in other units."""
+_FAR = 10.0
+"""[m] Largest distance of a joint from its parent link, and of a shape from its link."""
 _SHORTEST_AXIS = 1e-9
 """Length of a vector that still states a direction."""
 _FOLDERS_ABOVE = 3
@@ -98,6 +103,8 @@ class RobotTree:
     links: tuple[Link, ...]
     joints: tuple[Joint, ...]
     """Joint i's child is link i + 1."""
+    exclude: tuple[tuple[str, str], ...] = ()
+    """Pairs of links that never collide, as an MJCF has them."""
 
     @property
     def link_names(self) -> tuple[str, ...]:
@@ -237,44 +244,79 @@ def link_meshes(robot: RobotSpec) -> dict[str, trimesh.Trimesh]:
     return meshes
 
 
-def load_urdf(path: str | Path) -> RobotTree:
+def load_urdf(path: str | Path, *, visuals: bool = False) -> RobotTree:
     """Read a URDF; it is read again only after a change of the file or of a mesh.
 
     ``<capsule radius length/>`` is accepted in addition to the standard shapes. Mesh files are searched next to the
     URDF (``package://NAME/`` also in the three folders above it).
+
+    Args:
+        path: the file.
+        visuals: visual shapes are used for links that have no collision shape, and are fixed to none that has one.
 
     Raises:
         RobotError: the file is missing or damaged, a mesh is missing, the links form no tree, or a joint type is not
             supported.
     """
     path = Path(path).resolve()
-    files = (path, *mesh_files(path))
-    return _load(path, tuple(file.stat().st_mtime_ns for file in files))
+    files = (path, *mesh_files(path, "*" if visuals else "collision"))
+    return _load(path, tuple(file.stat().st_mtime_ns for file in files), visuals)
 
 
 def parse_xml(path: Path) -> Element:
-    """Return the root element of a file, or raise ``RobotError``; expat refuses entities that grow to any size."""
+    """Return the root element of a file, or raise ``RobotError``; expat refuses entities that grow to any size.
+
+    Attributes and elements of other namespaces, such as ``drake:acceleration``, are left out.
+    """
     if not os.path.isfile(path):  # Path.is_file() raises OSError for a name that is too long
         raise RobotError(
             f"{shown(str(path))} is not a file. Expected a robot's URDF or MJCF there."
         )
+    builder = ElementTree.TreeBuilder()
+    parser = expat.ParserCreate()  # does not ask for the declaration of a prefix
+    parser.StartElementHandler = builder.start
+    parser.EndElementHandler = builder.end
+    parser.CharacterDataHandler = builder.data
     try:
         if path.stat().st_size > max_bytes() // 16:
             raise ValueError("it is too large to describe a robot")
-        return ElementTree.parse(path).getroot()
-    except (OSError, ElementTree.ParseError, ValueError, LookupError) as error:  # also encodings
+        refuse_pointer(path)
+        parser.Parse(path.read_bytes(), True)
+        root = builder.close()
+    except (OSError, expat.ExpatError, ObjectError, ValueError, LookupError) as error:
         raise RobotError(f"{path} cannot be read as XML: {shown(str(error))}") from error
+    _refuse_xacro(path, root)
+    for element in root.iter():
+        for name in [*element.keys()]:
+            if ":" in name or name == "xmlns":
+                del element.attrib[name]
+        for child in [*element]:
+            if ":" in child.tag:
+                element.remove(child)
+    return root
 
 
-def mesh_files(urdf: Path) -> list[Path]:
-    """Return the mesh files of a URDF's collision shapes, as far as they exist."""
-    meshes = parse_xml(urdf).iterfind("link/collision/geometry/mesh")
+def _refuse_xacro(path: Path, root: Element) -> None:
+    for element in root.iter():
+        found = [text for text in element.attrib.values() if "${" in text or "$(" in text]
+        if element.tag.startswith("xacro:"):
+            found.append(f"<{element.tag}>")
+        if found:
+            raise RobotError(
+                f"{path} is xacro, from which a URDF is still to be made: it has {shown(found[0])}. Run xacro first: "
+                "`xacro FILE > robot.urdf`."
+            )
+
+
+def mesh_files(urdf: Path, kind: str = "collision") -> list[Path]:
+    """Return the mesh files of a URDF's shapes of a kind, as far as they exist."""
+    meshes = parse_xml(urdf).iterfind(f"link/{kind}/geometry/mesh")
     files = [find_mesh(mesh.get("filename", ""), urdf) for mesh in meshes]
     return [file for file in files if file is not None]
 
 
 @lru_cache(maxsize=16)
-def _load(path: Path, changed: tuple[int, ...]) -> RobotTree:
+def _load(path: Path, changed: tuple[int, ...], visuals: bool = False) -> RobotTree:
     """Read a URDF and its meshes; their times of change [ns] make the cache read changed files again."""
     xml = parse_xml(path)
     if xml.tag == "mujoco":
@@ -285,6 +327,9 @@ def _load(path: Path, changed: tuple[int, ...]) -> RobotTree:
         )
     try:
         with np.errstate(invalid="ignore"):  # check_tree refuses what is not finite
+            xml.set("name", xml.get("name") or path.stem)
+            if visuals:
+                _use_visuals(xml, path)
             robot = _parsed(xml)
             links = [_link(link, path) for link in robot.links]
             joints = [_joint(joint) for joint in robot.joints]
@@ -309,6 +354,10 @@ def _parsed(xml: Element) -> yourdfpy.Robot:
         if shape.tag == "capsule":
             shape.tag = "cylinder"
             shape.set("radius", f"-{shape.get('radius')}")
+    for kind in ("link", "joint"):
+        for part in xml.iterfind(kind):
+            if part.get("name") is None:
+                raise RobotError(f"a {kind} has no name.")
     for joint in xml.iterfind("joint"):
         for end in ("parent", "child"):
             if joint.find(end) is None:
@@ -317,6 +366,49 @@ def _parsed(xml: Element) -> yourdfpy.Robot:
     return yourdfpy.URDF.load(
         file, build_scene_graph=False, load_meshes=False, filename_handler=lambda name: name
     ).robot
+
+
+def _use_visuals(xml: Element, path: Path) -> None:
+    """Make collision shapes of the visual ones in all bodies that have no collision shape, if the last body of a chain
+    is such a one: then the file's collision shapes are not complete."""
+    carriers = {}
+    joints = [joint for joint in xml.iterfind("joint") if joint.find("child") is not None]
+    for joint in joints:
+        if joint.get("type") == "fixed":
+            carriers[_end(joint, "child")] = _end(joint, "parent")
+
+    def body(name: str) -> str:
+        """Return the link that carries a link by fixed joints."""
+        for _ in carriers:
+            name = carriers.get(name, name)
+        return name
+
+    links = xml.findall("link")
+    bodies = [body(link.get("name", "")) for link in links]
+    carrying = {body(_end(joint, "parent")) for joint in joints if joint.get("type") != "fixed"}
+    solid = set()
+    shown_only = set()
+    for link, name in zip(links, bodies, strict=True):
+        if link.find("collision") is not None:
+            solid.add(name)
+        if link.find("visual") is not None:
+            shown_only.add(name)
+    shown_only -= solid
+    if shown_only <= carrying:
+        return
+    for link, name in zip(links, bodies, strict=True):
+        if name not in shown_only:
+            continue
+        for visual in link.findall("visual"):
+            mesh = visual.find("geometry/mesh")
+            if mesh is None or find_mesh(mesh.get("filename", ""), path):
+                shape = SubElement(link, "collision")
+                shape.extend(part for part in visual if part.tag in ("origin", "geometry"))
+
+
+def _end(joint: Element, end: str) -> str:
+    found = joint.find(end)
+    return "" if found is None else found.get("link", "")
 
 
 def _ordered(name: str, links: list[Link], joints: list[Joint]) -> RobotTree:
@@ -364,8 +456,8 @@ def _ordered(name: str, links: list[Link], joints: list[Joint]) -> RobotTree:
 
 
 def check_tree(tree: RobotTree) -> None:
-    """Raise ``RobotError`` for numbers that are not finite or too large; limits of continuous joints may be
-    infinite."""
+    """Raise ``RobotError`` for numbers that are not finite or too large, and for sizes that no robot has; limits of
+    continuous joints may be infinite."""
     for link in tree.links:
         parts = [link.com, link.inertia, link.mass]
         for shape in link.collisions:
@@ -384,16 +476,43 @@ def check_tree(tree: RobotTree) -> None:
             raise RobotError(
                 f"link {link.name!r} has a negative mass, or a number that is not finite or far too large."
             )
+        _check_size(link)
     for joint in tree.joints:
         numbers = [*joint.axis, joint.effort, joint.stiffness, joint.rotor]
         if not ((np.abs(joint.T_parent_joint) < _LARGEST).all() and np.isfinite(numbers).all()):
             raise RobotError(
                 f"joint {joint.name!r} has a number that is not finite, or far too large."
             )
+        distance = np.linalg.norm(joint.T_parent_joint[:3, 3])
+        if distance > _FAR:
+            raise RobotError(
+                f"joint {joint.name!r} is {distance:.3g} m from its parent link, far too much for a robot. Are these "
+                "millimetres? State metres."
+            )
         if math.isnan(joint.velocity) or not joint.lower <= joint.upper:
             raise RobotError(
                 f"joint {joint.name!r} has the limits {joint.lower} to {joint.upper}. Expected the lower one first."
             )
+
+
+def _check_size(link: Link) -> None:
+    if not link.collisions:
+        return
+    vertices, _ = surface_of(link.collisions)
+    size = float(np.ptp(vertices, axis=0).max())
+    is_mesh = all(shape.geometry.kind == "hull" for shape in link.collisions)
+    least, most = _LINK_SIZES
+    if size > most or (is_mesh and size < least):
+        raise RobotError(
+            f"link {link.name!r} has shapes of {size:.3g} m, expected {least:g} to {most:g} m. If a mesh is in other "
+            'units, state its scale: scale="0.001 0.001 0.001" for millimetres, "1 1 1" for metres.'
+        )
+    distance = float(np.abs(vertices).max())
+    if distance > _FAR:
+        raise RobotError(
+            f"link {link.name!r} has a shape {distance:.3g} m away from it, far too much. Are these millimetres? "
+            "State metres."
+        )
 
 
 def _checked_name(name: str | None) -> str:
@@ -456,9 +575,11 @@ def _mesh_hull(mesh: yourdfpy.Mesh, link: str, path: Path) -> Geometry:
             raise ObjectError("a vertex is not finite, or too far away")
         scale = 1.0 if mesh.scale is None else np.asarray(mesh.scale, dtype=float)
         return hull(vertices * np.broadcast_to(scale, 3), HULL_TOLERANCE).geometry
-    except (ObjectError, ValueError) as error:
+    except ObjectError as error:
+        raise RobotError(f"link {link!r} uses the mesh {shown(name)}: {error}") from error
+    except ValueError as error:
         raise RobotError(
-            f"link {link!r} uses the mesh {name!r}, which cannot be read: {shown(str(error))}"
+            f"link {link!r} uses the mesh {shown(name)}, which cannot be read: {shown(str(error))}"
         ) from error
 
 
@@ -467,8 +588,8 @@ def find_mesh(name: str, urdf: Path) -> Path | None:
     relative = Path(name.split("://", 1)[-1])
     folders = [folder for folder in urdf.parents[: _FOLDERS_ABOVE + 1] if folder != folder.parent]
     names = [relative]
-    if name.startswith("package://"):  # the package's own folder may be above
-        names.append(Path(*relative.parts[1:]))
+    if "://" in name or relative.is_absolute():  # the first folders are those of another machine
+        names += [Path(*relative.parts[begin:]) for begin in range(1, len(relative.parts))]
     try:
         for each in names:
             for folder in folders:

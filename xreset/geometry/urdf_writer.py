@@ -23,6 +23,7 @@ FRAME_MASS = 1e-4
 """Mass of a link that is only a frame [kg]; some engines invent a mass of 1 kg for a link that has none."""
 FRAME_INERTIA = 1e-7
 """Moment of inertia of such a link about every axis [kg m^2]."""
+_DECIMALS = 12
 
 
 def pose(
@@ -138,7 +139,11 @@ def _add_link(robot: Element, link: Link) -> None:
             strict=True,
         )
     )
-    _add(inertial, "inertia", **moments)
+    least = np.linalg.eigvalsh(link.inertia)[0]
+    decimals = _DECIMALS
+    if least > 0:  # small moments keep four digits
+        decimals = max(decimals, 4 - int(np.floor(np.log10(least))))
+    _add(inertial, "inertia", decimals, **moments)
     for number, shape in enumerate(link.collisions):
         collision = SubElement(element, "collision")
         _add_origin(collision, shape.T_body_shape)
@@ -159,15 +164,17 @@ def _add_origin(element: Element, T: np.ndarray) -> None:
     _add(element, "origin", xyz=T[:3, 3], rpy=roll_pitch_yaw(T[:3, :3]))
 
 
-def _add(parent: Element, tag: str, **attributes: str | ArrayLike) -> None:
-    """Add an element whose attributes are texts, numbers or vectors."""
+def _add(
+    parent: Element, tag: str, decimals: int = _DECIMALS, **attributes: str | ArrayLike
+) -> None:
+    """Add an element whose attributes are texts, or numbers or vectors, rounded to some decimals."""
     texts = {}
     for name, value in attributes.items():
-        texts[name] = value if isinstance(value, str) else _text(value)
+        texts[name] = value if isinstance(value, str) else _text(value, decimals)
     SubElement(parent, tag, texts)
 
 
-def _text(values: ArrayLike) -> str:
-    """Return numbers, separated by spaces, with nine significant digits."""
-    numbers = [f"{round(float(value), 12):.9g}" for value in np.ravel(values)]
+def _text(values: ArrayLike, decimals: int) -> str:
+    """Return numbers, separated by spaces, with nine significant digits at most."""
+    numbers = [f"{round(float(value), decimals):.9g}" for value in np.ravel(values)]
     return " ".join("0" if number == "-0" else number for number in numbers)

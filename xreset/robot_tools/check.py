@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from xreset.description import DESCRIPTION, load_robot
-from xreset.errors import XResetError
+from xreset.errors import RobotError, XResetError
 from xreset.geometry.collision import SelfCollision, table_clearance
 from xreset.geometry.dynamics import damping_ratio, drive_inertia
 from xreset.geometry.kinematics import Kinematics
@@ -35,8 +35,6 @@ _LISTED = 4
 """Pairs of links that are named, most frequent first."""
 _PALM = 0.12
 """[m] Largest distance from the palm's frame to the nearest joint of a finger: a human palm is 10 cm long."""
-_LESS_OPPOSED = 0.75
-"""Share of the best fingertip's opposition that a thumb has at least. Index fingers have up to 0.73 (Allegro)."""
 
 
 @dataclass(frozen=True)
@@ -117,6 +115,8 @@ def _topic(topic: str, problems: Problems, otherwise: str = "") -> list[Finding]
     """Return the findings of a topic; what needs a package that is not installed is skipped."""
     try:
         found = [Finding(level, topic, message) for level, message in problems]
+    except RobotError as error:
+        return [Finding("error", topic, str(error))]
     except XResetError as error:
         return [Finding("skipped", topic, str(error))]
     return found or [Finding("ok", topic, otherwise)]
@@ -181,10 +181,11 @@ def _links(spec: RobotSpec, tree: RobotTree, wrong: list[str]) -> Problems:
     inside = tree.below(spec.hand_root)[1:]
     for tip in spec.fingertips:
         if solid.isdisjoint(tip.contact_links):
-            links = ", ".join(tip.contact_links)
+            links = ", ".join(tip.contact_links) or "its links"
             yield (
                 "error",
-                f"fingertip {tip.name!r}: none of {links} has a collision shape, so it can touch nothing.",
+                f"fingertip {tip.name!r}: none of {links} has a collision shape, so it can touch nothing. Give the "
+                "last link of the finger one.",
             )
         if tip.link not in inside:
             text = f"{tip.link!r} is not below the hand's root {spec.hand_root!r}."
@@ -308,12 +309,16 @@ def _thumb(spec: RobotSpec) -> Problems:
             "warning",
             "no fingertip can come near another and press against it. Are the joints' limits right?",
         )
-    elif scores[0] < _LESS_OPPOSED * scores[best]:
+    elif scores[0] == 0:
         yield (
-            "error",
-            f"the thumb {tips[0]!r} can meet {met(0)} pad to pad, {names[best]} {tips[best]!r} can meet {met(best)} "
-            "more often: is that the thumb? Then import again with "
-            f"--thumb {tips[best]}, or make it the first fingertip, with keypoint thumb4.",
+            "warning",
+            f"the thumb {tips[0]!r} can meet no other fingertip pad to pad. Are its joints' limits right?",
+        )
+    elif best:
+        yield (
+            "ok",
+            f"the thumb {tips[0]!r}, as the description has it, can meet {met(0)} pad to pad; {names[best]} "
+            f"{tips[best]!r} can meet {met(best)} more often",
         )
 
 

@@ -6,9 +6,11 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from xreset.checks import frozen
 from xreset.errors import RobotError
@@ -31,7 +33,7 @@ _NAMES = {
 }
 """What words in the names of a finger's links and joints begin with, and the codes in names such as ``rh_FFdistal`` and
 ``THJ5``, as the Shadow hand has them; "middle" may also be a bone, so it comes last."""
-_BONE = r"(?=j\d|base|hub|knuckle|metacarpal|proximal|middle|distal|tip)"
+_BONE = r"(?=_?(j\d|base|hub|knuckle|meta|prox|mid|dist|tip))"
 _HUMAN = (0.0, 0.45, 0.73)
 """Positions of a human finger's joints between its first one and its tip: knuckle, middle joint, last joint (rounded
 averages)."""
@@ -44,6 +46,12 @@ _PALM_BEHIND = 0.04
 """[m] The palm's center behind the knuckles."""
 _SIDE = 0.1
 """A thumb that is less than this share of the fingers' width beside their middle is opposite it."""
+_NARROW = 0.7
+"""Share of the thumb's points from which another finger may be the thumb as well."""
+_SPREAD = 0.01
+"""Spread of the directions of parallel fingers: 1 - length of the mean of the unit vectors."""
+_HANDS_APART = 0.2
+"""[m] Distance of the fingers of two hands."""
 _SHORTEST = 1e-6
 """[m] Length of a finger from which its direction is known."""
 _BEND = 0.15
@@ -64,6 +72,11 @@ class Finger:
     points: np.ndarray
     """[links + 1, 3] its joints, in the middle of the finger, and its tip in the frame of the hand's root, straight."""
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of its links and joints."""
+        return (*self.links, *self.joints, *self.fixed_links)
+
 
 class Hand:
     """A hand, with what its geometry tells of palm and fingers."""
@@ -81,10 +94,14 @@ class Hand:
         if not tree.moved_by:
             raise RobotError("the hand has no joint that moves. Are its joints fixed in the file?")
         self._take(tree, folder)
-        still = self._joints_of_other_parts()
-        if still:
-            notes.append(f"joints that move no finger are fixed at 0: {', '.join(still)}")
-            tree = with_fixed(tree, still)
+        while True:  # a hand of several hands, and its fingers of several limbs
+            tree = self._one_hand(thumb)
+            still = [] if tree is not self.tree else self._joints_of_other_parts()
+            if still:
+                notes.append(f"joints that move no finger are fixed at 0: {', '.join(still)}")
+                tree = with_fixed(tree, still)
+            if tree is self.tree:
+                break
             self._take(tree, folder)
         wrist = [
             joint.name for link, joint in tree.moved_by.items() if self.root in tree.below(link)
@@ -149,25 +166,59 @@ class Hand:
         the names of another chain state a finger, or a drive of the hand moves it, nothing is certain: no joint is
         returned.
         """
-        chains = self._chains()
-        hands = []
-        for joint in self.tree.joints:
-            if joint.parent == self.root:
-                inside = self.tree.below(joint.child)
-                own = [chain for chain in chains if chain.links[-1] in inside]
-                if len(own) > 1 and self._can_meet(own):
-                    hands.append(own)
+        hands = [own for own in self._hands().values() if self._can_meet(own)]
         if len(hands) != 1:
             return []
         drives = set.union(*map(self._drives_of, hands[0]))
         still = []
-        for chain in chains:
-            if chain in hands[0]:
+        for chain in self._chains():
+            if chain.links in [finger.links for finger in hands[0]]:
                 continue
             if chain.name or drives & self._drives_of(chain):
                 return []
             still += [joint for joint in chain.joints if joint not in still]
         return still
+
+    def _hands(self) -> dict[str, list[Finger]]:
+        """Return the fingers below each child of the root that has several."""
+        chains = self._chains()
+        hands = {}
+        for joint in self.tree.joints:
+            if joint.parent == self.root:
+                inside = self.tree.below(joint.child)
+                own = [chain for chain in chains if chain.links[-1] in inside]
+                if len(own) > 1:
+                    hands[joint.child] = own
+        return hands
+
+    def _one_hand(self, thumb: str | None) -> RobotTree:
+        """Return the tree, without the other hands if it has several."""
+        hands = self._hands()
+        tips = []
+        drives = []
+        begins = []
+        for own in hands.values():
+            tips.append(", ".join(finger.links[-1] for finger in own))
+            drives.append(set.union(*map(self._drives_of, own)))
+            begins.append([self._at[finger.links[0]][:3, 3] for finger in own])
+        gaps = [cdist(a, b).min() for a, b in combinations(begins, 2)]
+        if not gaps or min(gaps) < _HANDS_APART or any(a & b for a, b in combinations(drives, 2)):
+            return self.tree
+        tree = self.tree
+        for child, own in hands.items():
+            if any(thumb in one.names for one in own):
+                others = [root for root in hands if root != child]
+                self._notes.append(
+                    f"left out, because {thumb} is of another hand: {', '.join(others)}"
+                )
+                removed = set().union(*map(tree.below, others))
+                links = tuple(link for link in tree.links if link.name not in removed)
+                joints = tuple(joint for joint in tree.joints if joint.child not in removed)
+                return replace(tree, links=links, joints=joints)
+        raise RobotError(
+            f"the file has {len(hands)} hands, with the fingers {'; '.join(tips)}. Choose one with --thumb, the name of "
+            "a link of its thumb."
+        )
 
     def _can_meet(self, chains: list[Finger]) -> bool:
         """Return whether the tips of any two chains can meet. Only joints below the last link of all chains move."""
@@ -222,32 +273,44 @@ class Hand:
     def _find_thumb(self, chains: list[Finger], thumb: str | None) -> Finger:
         """Return the chain with the stated link or joint, the one that is called so, or the one that opposes the
         others."""
-        links = [", ".join(chain.links) for chain in chains]
+        links = [", ".join(one.links) for one in chains]
         known = "; ".join(links)
-        if thumb is None:
-            marked = [chain for chain in chains if chain.name == "thumb"]
-        else:
-            marked = [
-                chain
-                for chain in chains
-                if thumb in (*chain.links, *chain.joints, *chain.fixed_links)
-            ]
+        unnamed = [one for one in chains if not one.name]
+        if thumb is not None:
+            marked = [one for one in chains if thumb in (*one.links, *one.joints, *one.fixed_links)]
             if len(marked) != 1:
                 raise RobotError(
                     f"--thumb {thumb!r} is in {len(marked)} fingers; their links are {known}."
                 )
+        else:
+            marked = [one for one in chains if one.name == "thumb"]
+            if not marked and len(chains) > 2 and len(unnamed) == 1:
+                marked = unnamed
         if len(marked) == 1:
             return marked[0]
         scores = np.sqrt(self._meetings(chains, self.root)).sum(axis=1)
-        first = scores.argmax()
-        if scores[first] == 0 and len(chains) > 2:
+        if len(chains) == 2:
+            why = "it can oppose the others" if scores[0] else "the two are alike"
+            self._notes.append(
+                f"the thumb is the finger of {links[0]}: {why} (--thumb says another)"
+            )
+            return chains[0]
+        if not scores.any():
             raise RobotError(
                 f"no finger can oppose the others. Name a link of the thumb with --thumb: {known}."
             )
-        why = "it can oppose the others" if scores[first] else "the two are alike"
-        self._notes.append(
-            f"the thumb is the finger of {links[first]}: {why} (--thumb says another)"
-        )
+        points = scores / scores.max() + _beside_others(chains) + _first_of_five(chains)
+        for i, one in enumerate(chains):
+            if unnamed and one.name:
+                points[i] = 0.0
+        second, first = points.argsort()[-2:]
+        note = f"the thumb is the finger of {links[first]}: it can oppose the others, beside which it begins"
+        if points[second] > _NARROW * points[first]:
+            note += (
+                f". The vote is narrow: {chains[second].links[-1]} has {points[second]:.2f} points, "
+                f"{chains[first].links[-1]} {points[first]:.2f}. The picture shows which is right"
+            )
+        self._notes.append(f"{note} (--thumb says another)")
         return chains[first]
 
     def _chains(self) -> list[Finger]:
@@ -324,6 +387,11 @@ class Hand:
             if np.linalg.norm(apart) < 0.01:  # the jaw is closed where its joint is at 0
                 apart = self._opened(fingers)
             z = np.cross(x, apart)
+        if not self.bent and not is_jaw:
+            raise RobotError(
+                "no joint of a finger has limits that say to which side it bends, such as 0..1.5 rad: they are "
+                "continuous, or go as far to either side. State the limits in the hand's file."
+            )
         if np.linalg.norm(z) < 0.01:
             raise RobotError(
                 "the fingers do not bend to one side when their joints move, so the palm's inner side is unknown."
@@ -359,6 +427,7 @@ class Hand:
         wrist[:3, 3] -= (_WRIST_BEHIND - _PALM_BEHIND) * palm[:3, 0]
         self._add_frame("palm_frame", self.root, palm)
         self._add_frame("wrist_frame", self.root, wrist)
+        absent = []
         for finger in fingers:
             last = finger.links[-1]
             ends = (last, *finger.fixed_links)
@@ -371,7 +440,11 @@ class Hand:
             self.tips.append(tip)
             R = self._at[last][:3, :3].T @ palm[:3, :3]
             self._add_frame(tip.link, last, transform(R, self._in_link(last, finger.points[-1])))
-            for keypoint, near in _keypoint_joints(finger).items():
+            follow = _keypoint_joints(finger)
+            for number in range(1, 4):
+                if f"{finger.name}{number}" not in follow:
+                    absent.append(f"{finger.name}{number}")
+            for keypoint, near in follow.items():
                 link = finger.links[near]
                 middle = self._in_link(link, finger.points[near])
                 if np.linalg.norm(middle) > _OFF_MIDDLE:
@@ -379,6 +452,10 @@ class Hand:
                     link = f"{keypoint}_frame"
                 self.keypoints.append(KeypointSpec(keypoint=keypoint, link=link))
             self.keypoints.append(KeypointSpec(keypoint=tip.keypoint, link=tip.link))
+        if absent:
+            self._notes.append(
+                f"no link follows these joints of a person (1 is a finger's base, 4 its tip): {', '.join(absent)}"
+            )
 
     def _add_frame(self, name: str, parent: str, T: np.ndarray) -> None:
         tree = self.tree
@@ -431,6 +508,34 @@ class Hand:
             return origin
         axis = self._at[link][:3, :3] @ self.tree.above[link].axis
         return origin + axis * ((bounding_ball(cloud)[0] - origin) @ axis)
+
+
+def _beside_others(chains: list[Finger]) -> np.ndarray:
+    """[F] from 0 to 2: how parallel the other fingers are, and how far a finger begins beside the line on which the
+    others begin."""
+    bases = np.array([one.points[0] for one in chains])
+    ends = np.array([one.points[-1] for one in chains])
+    directions = (ends - bases) / np.linalg.norm(ends - bases, axis=1, keepdims=True)
+    spreads = []
+    beside = []
+    for i in range(len(chains)):
+        spreads.append(1 - np.linalg.norm(np.delete(directions, i, axis=0).mean(axis=0)) + _SPREAD)
+        others = np.delete(bases, i, axis=0)
+        middle = others.mean(axis=0)
+        off = np.linalg.svd(others - middle)[2][1:]  # directions across the line
+        own = np.linalg.norm(off @ (bases[i] - middle))
+        rest = np.linalg.norm((others - middle) @ off.T) / len(others) ** 0.5
+        beside.append(own / max(own + rest, _SHORTEST))
+    return min(spreads) / np.array(spreads) + np.array(beside)
+
+
+def _first_of_five(chains: list[Finger]) -> np.ndarray:
+    """[F] 1 for the first finger of a hand of five whose names count the fingers from 1 on."""
+    texts = [re.split(r"(\d+)", one.links[-1]) for one in chains]
+    for parts in zip(*texts, strict=False):
+        if set(parts) == set("12345"):
+            return np.array([float(part == "1") for part in parts])
+    return np.zeros(len(chains))
 
 
 def _index_side(thumb: Finger, others: list[Finger]) -> tuple[np.ndarray, str]:

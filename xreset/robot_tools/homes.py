@@ -18,6 +18,8 @@ from xreset.spec import RobotSpec
 
 _STEPS = (-0.15, 0.0, 0.15)
 """[m] Steps along each axis to other places that are tried."""
+_TRIED = 500
+"""Random arm joints among which a home is sought that is clear of the table."""
 _CLEAR = 0.10
 """[m] A home that is higher than this above the table keeps the spread around it clear of the table."""
 
@@ -46,8 +48,25 @@ def hold_near(robot: RobotSpec, T_world_root: np.ndarray) -> tuple[RobotSpec, st
     chosen = int(reached[(height > _CLEAR).numpy().argmax()])  # the first one, if all are low
     step = (100 * steps[chosen]).tolist()
     moved = f", moved by ({', '.join(f'{value:.0f}' for value in step)}) cm" if any(step) else ""
-    positions = rounded(joints[chosen, 0].numpy(), model.lower.numpy(), model.upper.numpy())
+    return _with_arm_at(robot, model, joints[chosen, 0].numpy()), moved
+
+
+def hold_up(robot: RobotSpec) -> RobotSpec:
+    """Return the robot with the home, nearest to its own, that is clear of the table; its own if there is none."""
+    model = ArmModel(robot)
+    hand = torch.as_tensor(robot.home[model.hand.joint_indices])
+    own = torch.as_tensor(robot.home[robot.arm_indices])
+    draw = torch.rand(_TRIED, len(own), generator=torch.Generator().manual_seed(0), dtype=own.dtype)
+    joints = torch.cat((own[None], model.lower + draw * (model.upper - model.lower)))
+    joints = joints[(joints - own).norm(dim=1).argsort(stable=True)]
+    height = table_clearance(model.kinematics, model.full(joints, hand), model.table)
+    clear = (height > _CLEAR).numpy()
+    return _with_arm_at(robot, model, joints[int(clear.argmax())].numpy())
+
+
+def _with_arm_at(robot: RobotSpec, model: ArmModel, joints: np.ndarray) -> RobotSpec:
+    positions = rounded(joints, model.lower.numpy(), model.upper.numpy())
     spec_joints = [*robot.joints]
     for index, position in zip(robot.arm_indices, positions.tolist(), strict=True):
         spec_joints[index] = replace(spec_joints[index], home=position)
-    return replace(robot, joints=tuple(spec_joints)), moved
+    return replace(robot, joints=tuple(spec_joints))

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xreset.checks import frozen
-from xreset.description import DESCRIPTION, load_robot
+from xreset.description import DESCRIPTION
 from xreset.errors import RobotError
 from xreset.files import atomic_folder, is_occupied
 from xreset.geometry.collision import SelfCollision
@@ -24,19 +24,36 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import roll_pitch_yaw, surface_of
 from xreset.geometry.urdf import Joint, RobotTree
 from xreset.geometry.urdf_writer import axes, pose
+from xreset.robot_tools.check import Finding, check
 from xreset.robot_tools.draft import description_text, draft_spec
 from xreset.robot_tools.fingers import Hand
-from xreset.robot_tools.homes import hold_near
-from xreset.robot_tools.sources import bare, combined, last_link, read_source, renamed
+from xreset.robot_tools.homes import hold_near, hold_up
+from xreset.robot_tools.sources import (
+    bare,
+    combined,
+    grounded,
+    last_link,
+    read_source,
+    renamed,
+)
 from xreset.spec import RobotSpec, SceneSpec
+from xreset.text import listed
 
 _ROTOR = 1e-3
 """[kg m^2] Rotor inertia on the diagonal of moving hand links where none is stated: finger links alone are too light
 for a step of 1/240 s. The inertia of a link means the same in every engine, which armature does not (as in the built-in
 robots)."""
-_HAND_EFFORT = 1.0
-_ARM_EFFORT = 50.0
+_ROTORS = (1e-6, 0.05)
+"""[kg m^2] Rotor inertias of a hand that are believed."""
+_EFFORT = {"hand": 1.0, "arm": 50.0}
 """[N m] Effort limits of joints without a stated one."""
+_EFFORTS = {
+    ("hand", "revolute"): (0.01, 50.0),
+    ("hand", "prismatic"): (0.5, 1000.0),
+    ("arm", "revolute"): (2.0, 3000.0),
+    ("arm", "prismatic"): (20.0, 30_000.0),
+}
+"""[N m or N] Effort limits that are believed."""
 _STABLE = 0.8
 """Share of the largest kp that is stable in engines that integrate drives explicitly: kd times the step stays below the
 inertia."""
@@ -64,6 +81,8 @@ class Imported:
     """What was not stated anywhere."""
     to_say: tuple[str, ...]
     """What only a person can say."""
+    findings: tuple[Finding, ...]
+    """What its check finds: no errors."""
 
 
 def import_robot(
@@ -92,7 +111,8 @@ def import_robot(
         thumb: a link or joint of the thumb, where names and geometry do not tell.
 
     Raises:
-        RobotError: a file cannot be read, the folder exists, or no fingers are found; the message says what to do.
+        RobotError: a file cannot be read, the folder exists, no fingers are found, or the robot would fail its check;
+            the message says what to do.
     """
     if is_occupied(out):
         raise RobotError(f"{out} is there already; give another folder, or remove it.")
@@ -118,7 +138,7 @@ def import_robot(
                 f"{hand} holds the arm as well: it has all joints of {arm}. Leave out --arm, or remove the arm's links "
                 "and joints from the hand's file."
             )
-        hand_tree = renamed(hand_tree, carrier.tree)
+        hand_tree = renamed(grounded(hand_tree, notes), carrier.tree)
     to_say = [*_TO_SAY]
     with atomic_folder(out) as work:
         found = Hand(hand_tree, work, thumb, notes)
@@ -127,6 +147,7 @@ def import_robot(
         else:
             tree, mounting = _carried(found, carrier, offset, rpy, notes)
             to_say.insert(0, mounting)
+        tree = _with_efforts(tree, found.root, notes)
         tree = replace(tree, name=name or out.resolve().name)
         spec = draft_spec(
             tree, found.root, work, tips=found.tips, keypoints=found.keypoints, bent=found.bent
@@ -137,14 +158,28 @@ def import_robot(
             )
         spec = _with_arm_home(spec, found.palm_in_hand, notes)
         spec = _with_drives(spec, tree, notes)
-        pairs = SelfCollision(Kinematics(spec)).overlapping_at_home
-        if pairs:
-            listed = "; ".join(f"{a} and {b}" for a, b in pairs)
-            notes.append(f"never collide, because they meet at home: {listed}")
-        spec = replace(spec, collision_exclude=tuple(pairs))
+        spec = replace(spec, collision_exclude=_excluded(tree))
+        at_home = tuple(SelfCollision(Kinematics(spec)).overlapping_at_home)
+        for why, pairs in (
+            ("the MJCF says so", spec.collision_exclude),
+            ("they meet at home", at_home),
+        ):
+            if pairs:
+                names = "; ".join(f"{a} and {b}" for a, b in pairs)
+                notes.append(f"never collide, because {why}: {names}")
+        spec = replace(spec, collision_exclude=(*spec.collision_exclude, *at_home))
         (work / DESCRIPTION).write_text(description_text(spec, notes))
-        load_robot(work)
-    return Imported(folder=out, guessed=tuple(notes), to_say=tuple(to_say))
+        findings = check(work)
+        errors = [finding for finding in findings if finding.level == "error"]
+        if errors:
+            more = f" There are {len(errors) - 1} more errors." if len(errors) > 1 else ""
+            raise RobotError(
+                f"the robot is not written, because it would fail its check: {errors[0].topic}: {errors[0].message}"
+                f"{more}"
+            )
+    return Imported(
+        folder=out, guessed=tuple(notes), to_say=tuple(to_say), findings=tuple(findings)
+    )
 
 
 @frozen
@@ -262,15 +297,52 @@ def _with_rotors(hand: Hand, notes: list[str]) -> RobotTree:
     """Return the tree of a hand whose moving links carry their rotors."""
     inside = hand.tree.below(hand.root)[1:]
     links = []
+    wrong = []
     for link in hand.tree.links:
         joint = hand.tree.moved_by.get(link.name)
         if joint is not None and link.name in inside:
-            link = replace(link, inertia=link.inertia + (joint.rotor or _ROTOR) * np.eye(3))
+            rotor = joint.rotor or _ROTOR
+            if not _ROTORS[0] <= rotor <= _ROTORS[1]:
+                wrong.append(f"{joint.name} ({rotor:g})")
+                rotor = _ROTOR
+            link = replace(link, inertia=link.inertia + rotor * np.eye(3))
         links.append(link)
     notes.append(
         f"moving links of the hand carry {_ROTOR:g} kg m^2 of rotor inertia, or what the MJCF states as armature"
     )
+    if wrong:
+        notes.append(f"with {_ROTOR:g} in place of an armature that no finger has: {listed(wrong)}")
     return replace(hand.tree, links=tuple(links))
+
+
+def _with_efforts(tree: RobotTree, hand_root: str, notes: list[str]) -> RobotTree:
+    """Return a tree whose driven joints have efforts that arms and hands can have."""
+    inside = tree.below(hand_root)[1:]
+    joints = []
+    without = []
+    wrong = []
+    for joint in tree.joints:
+        if joint.type != "fixed" and joint.mimic is None:
+            group = "hand" if joint.child in inside else "arm"
+            least, most = _EFFORTS[group, joint.type]
+            if not joint.effort:
+                without.append(joint.name)
+            elif not least <= joint.effort <= most:
+                wrong.append(f"{joint.name} ({joint.effort:g})")
+                joint = replace(joint, effort=_EFFORT[group])
+        joints.append(joint)
+    rule = f"they get {_EFFORT['arm']:g} (arm) or {_EFFORT['hand']:g} N m (hand)"
+    if without:
+        notes.append(f"no effort is stated for {listed(without)}; {rule}")
+    if wrong:
+        notes.append(f"efforts that such joints do not have: {listed(wrong)}; {rule}")
+    return replace(tree, joints=tuple(joints))
+
+
+def _excluded(tree: RobotTree) -> tuple[tuple[str, str], ...]:
+    """Return the pairs of different links with shapes that the tree excludes."""
+    solid = {link.name for link in tree.links if link.collisions}
+    return tuple((a, b) for a, b in tree.exclude if a != b and {a, b} <= solid)
 
 
 # Home, drives, collisions ---------------------------------------------------------------------------------------------
@@ -286,7 +358,7 @@ def _with_arm_home(spec: RobotSpec, T_hand_palm: np.ndarray, notes: list[str]) -
             "the arm does not reach over the table from where it stands: `xreset robots place` finds a better place "
             "and home"
         )
-        return spec
+        return hold_up(spec)
     held, moved = found
     notes.append(f"home: the palm over the table, looking down{moved}; fingers bent a little")
     return held
@@ -297,26 +369,30 @@ def _with_drives(spec: RobotSpec, tree: RobotTree, notes: list[str]) -> RobotSpe
 
     The rule: stiff enough that the effort is reached within 0.35 rad, and not too stiff for the step of the engines.
     """
-    without = [joint.name for joint in spec.joints if not tree.joint(joint.name).effort]
     joints = []
+    softer = []
     for joint, inertia in zip(spec.joints, drive_inertia(spec, spec.home), strict=True):
         stated = tree.joint(joint.name)
+        effort = stated.effort or _EFFORT[joint.group]
         if joint.group == "arm":
-            effort = stated.effort or _ARM_EFFORT
             kp = float(np.clip(effort * 15, 300, 2000))
             factor = 2.0
         else:
-            effort = stated.effort or _HAND_EFFORT
-            kp = stated.stiffness or float(np.clip(effort / 0.35, 0.5, 10))
+            kp = float(np.clip(effort / 0.35, 0.5, 10))
             factor = 1.8
-        if not stated.stiffness:
-            kp = min(kp, float(f"{_STABLE * inertia / (factor * SceneSpec.timestep) ** 2:.3g}"))
+        stable = float(f"{_STABLE * inertia / (factor * SceneSpec.timestep) ** 2:.3g}")
+        if joint.group == "hand" and stated.stiffness > max(stable, 10 * kp):
+            softer.append(f"{joint.name} ({stated.stiffness:g})")
+            kp = min(kp, stable)
+        elif joint.group == "hand" and stated.stiffness:
+            kp = stated.stiffness
+        else:
+            kp = min(kp, stable)
         kd = float(f"{factor * np.sqrt(kp * inertia):.3g}")
         joints.append(replace(joint, drive=replace(joint.drive, kp=kp, kd=kd, effort=effort)))
-    if without:
+    if softer:
         notes.append(
-            f"no effort is stated for {', '.join(without)}; they get {_ARM_EFFORT:g} (arm) or {_HAND_EFFORT:g} N m "
-            "(hand)"
+            f"with the stiffness of the rule in place of one too stiff for them: {listed(softer)}"
         )
     notes.append(
         "drives: kd = 1.8 sqrt(kp I) in the hand, critical in the arm, with the inertia I about the joint at home"

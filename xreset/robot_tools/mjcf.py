@@ -2,51 +2,73 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+import tempfile
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
 
 from xreset.errors import ObjectError, RobotError
+from xreset.files import RAISE_LIMIT, max_bytes
 from xreset.geometry.shapes import hull, transform
 from xreset.geometry.urdf import HULL_TOLERANCE, Joint, Link, RobotTree, check_tree
 from xreset.geometry.urdf_writer import fixed, frame
 from xreset.robot_tools.couplings import SLIDE, Couplings, Pull, joint_name
 from xreset.spec import Geometry, MimicSpec, Shape
+from xreset.text import listed
 
-_MOST = 2**22
-"""Largest product of the numbers of an element that decide how much memory MuJoCo takes."""
+_COMPILE = """
+import resource, sys
+import mujoco
+source, target, most = sys.argv[1:]
+with open("/proc/self/statm") as pages:
+    limit = int(pages.read().split()[0]) * resource.getpagesize() + int(most)
+resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+resource.setrlimit(resource.RLIMIT_CPU, (30, 30))
+try:
+    model = mujoco.MjModel.from_xml_path(source)
+except ValueError as error:
+    print(error)
+    sys.exit(1)
+except Exception:
+    sys.exit(2)
+mujoco.MjData(model)
+mujoco.mj_saveModel(model, target)
+"""
+"""Program that compiles a model in a process whose memory and time are limited: small files can ask for any amount."""
+_LARGEST = 1e10
+"""Larger numbers are errors."""
+_PARTS = ("actuator_", "body_", "dof_", "eq_", "geom_", "jnt_", "qpos", "tendon_", "wrap_")
+"""Beginnings of the names of the arrays that are read."""
+_COLLISION_GROUP = 3
+"""Makers put collision shapes into this group or a later one, and visual ones into earlier groups."""
+_MOST_SHAPES = 5000
 _SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "box": 3, "mesh": 0, "plane": 0}
 """Numbers of a shape's size that count."""
 
 
-def read_mjcf(path: Path, root: ElementTree.Element, notes: list[str]) -> RobotTree:
-    """Read an MJCF whose root element is ``root``; what had to be assumed is appended to ``notes``.
+def read_mjcf(path: Path, notes: list[str]) -> RobotTree:
+    """Read an MJCF; what had to be assumed, and what is left out, is appended to ``notes``.
 
     Raises:
         RobotError: it cannot be read, or uses what xreset does not have; the message names all of it.
     """
-    _check_sizes(path, root)
-    try:
-        model = mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
-        raise RobotError(f"{path} is not valid MJCF: {error}") from error
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    if not np.isfinite(data.geom_xmat).all() or not np.isfinite(data.ximat).all():
-        raise RobotError(f"{path} has an orientation that is not finite.")
-    problems = _unsupported(model)
+    model = _compiled(path)
+    _check_numbers(path, model)
+    solid = _solid(model, notes)
+    problems = _unsupported(model, solid)
     pulls = _pulls(model, problems, notes)
     _refuse(path, problems)
     couplings = Couplings(model, [*pulls.values()])
     _refuse(path, couplings.problems)
     notes += couplings.notes
-    tree = _tree(path, model, couplings)
+    _left_out(model, notes)
+    tree = _tree(path, model, couplings, solid, notes)
     joints = {joint.name: joint for joint in tree.joints}
     for actuator, pull in pulls.items():
         joint, lever = couplings.lever(pull)
@@ -79,28 +101,42 @@ def _refuse(path: Path, problems: list[str]) -> None:
         )
 
 
-def _check_sizes(path: Path, root: ElementTree.Element) -> None:
-    """Raise ``RobotError`` for a small file that takes much memory when MuJoCo reads it."""
-    for tag in ("flexcomp", "hfield", "replicate"):
-        if root.find(f".//{tag}") is not None:
+def _compiled(path: Path) -> mujoco.MjModel:
+    """Return the compiled model of a file."""
+    most = max_bytes()
+    with tempfile.TemporaryDirectory() as folder:
+        binary = f"{folder}/model.mjb"
+        command = [sys.executable, "-P", "-c", _COMPILE, str(path.resolve()), binary, str(most)]
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, errors="replace")
+        if done.returncode == 1 and "alloc" not in done.stdout:
+            raise RobotError(f"{path} is not valid MJCF: {done.stdout.strip()}")
+        if done.returncode:
             raise RobotError(
-                f"{path} has a {tag}, which no robot needs. Leave it out, or write out what it stands for."
+                f"{path} takes more than {most >> 20} MB of memory, or half a minute, when MuJoCo reads it. Leave out "
+                f"what a robot does not need, such as textures, height fields and sensors. {RAISE_LIMIT}"
             )
-    for element in [*root.iter("size"), *root.iter("texture")]:
-        entries = 1.0
-        for name, text in element.items():
-            if name.startswith(("nkey", "nuser", "width", "height")):
-                with suppress(ValueError):  # MuJoCo says what is wrong
-                    entries *= float(text)
-        if entries > _MOST:
-            raise RobotError(
-                f"{path}: a {element.tag} has {entries:.3g} entries, expected at most {_MOST}. "
-                "Leave it out: robots need none."
-            )
+        return mujoco.MjModel.from_binary_path(binary)
 
 
-def _unsupported(model: mujoco.MjModel) -> list[str]:
-    """Return every feature of a model that a robot of xreset cannot have."""
+def _check_numbers(path: Path, model: mujoco.MjModel) -> None:
+    """Raise ``RobotError`` for numbers that are not finite or far too large, and for directions without a length."""
+    for name in dir(model):
+        is_stated = name.startswith(_PARTS) and not name.endswith(
+            "0"
+        )  # the others follow from them
+        values = getattr(model, name) if is_stated else None
+        if isinstance(values, np.ndarray) and values.dtype.kind == "f":
+            wrong = ~(np.abs(values) < _LARGEST)
+            if name.endswith(("_axis", "quat")):
+                wrong = ~(np.abs(np.linalg.norm(values, axis=-1) - 1) < 1e-6)
+            if wrong.any():
+                raise RobotError(
+                    f"{path} has a number that is not finite, or far too large (MuJoCo's {name})."
+                )
+
+
+def _unsupported(model: mujoco.MjModel, solid: np.ndarray) -> list[str]:
+    """Return every feature of a model that a robot of xreset cannot have; ``solid`` are its collision shapes."""
     problems = []
     for joint in map(model.joint, range(model.njnt)):
         if joint.type[0] == int(mujoco.mjtJoint.mjJNT_BALL):
@@ -109,11 +145,13 @@ def _unsupported(model: mujoco.MjModel) -> list[str]:
             )
     for geom in map(model.geom, range(model.ngeom)):
         kind = _kind(geom)
-        if _is_solid(geom) and kind not in _SIZES:
+        if solid[geom.id] and kind not in _SIZES:
             body = model.body(geom.bodyid[0]).name
             problems.append(
                 f"the {kind} {geom.name or geom.id!r} of body {body!r}. Replace it by a capsule, box or mesh"
             )
+    if model.ngeom > _MOST_SHAPES:
+        problems.append(f"{model.ngeom} shapes. Use {_MOST_SHAPES} at most")
     if model.nflex:
         problems.append("flexible bodies. Leave them out, or make them rigid")
     return problems
@@ -146,35 +184,101 @@ def _pulls(model: mujoco.MjModel, problems: list[str], notes: list[str]) -> dict
     return pulls
 
 
-def _tree(path: Path, model: mujoco.MjModel, couplings: Couplings) -> RobotTree:
-    """Return links and joints of a model, from its poses where the joints are at 0 or held.
+def _left_out(model: mujoco.MjModel, notes: list[str]) -> None:
+    """Note everything of a model that a robot of xreset does not have."""
+    names = [joint_name(model, joint) for joint in range(model.njnt)]
+    is_free = model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)
+    damped = np.flatnonzero((model.dof_damping > 0) | (model.dof_frictionloss > 0))
+    by_tendon = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)
+    slack = np.setdiff1d(np.arange(model.ntendon), model.actuator_trnid[by_tendon, 0])
+    for what, left in (
+        ("free joints", [names[i] for i in np.flatnonzero(is_free)]),
+        ("springs of joints", [names[i] for i in np.flatnonzero(model.jnt_stiffness)]),
+        ("damping and friction of joints", [names[i] for i in np.unique(model.dof_jntid[damped])]),
+        ("tendons without an actuator", [model.tendon(i).name or f"{i}" for i in slack]),
+    ):
+        if left:
+            notes.append(f"left out: {what}: {listed(left)}")
+    counts = {
+        "cameras": model.ncam,
+        "lights": model.nlight,
+        "sensors": model.nsensor,
+        "keyframes": model.nkey,
+    }
+    parts = [f"{count} {what}" for what, count in counts.items() if count]
+    if parts:
+        notes.append(f"left out: {', '.join(parts)}")
+
+
+def _solid(model: mujoco.MjModel, notes: list[str]) -> np.ndarray:
+    """[G] bool: the shapes of a model that collide.
+
+    If the last body of a chain has none, the file lets shapes collide by other means, and bodies without one get those
+    of the collision groups, or all of theirs.
+    """
+    on_robot = model.geom_bodyid > 0
+    switched_on = on_robot & ((model.geom_contype | model.geom_conaffinity) > 0)
+    solid = switched_on.copy()
+    solid[np.concatenate((model.pair_geom1, model.pair_geom2))] = True
+    solid &= on_robot
+    body = model.body_weldid[model.geom_bodyid]
+    moving = np.unique(model.jnt_bodyid[model.jnt_type >= SLIDE])
+    ends = np.setdiff1d(moving, model.body_weldid[model.body_parentid[moving]])
+    if not np.setdiff1d(np.intersect1d(ends, body), body[solid]).size:
+        return solid
+    groups = on_robot & (model.geom_group >= _COLLISION_GROUP)
+    groups &= ~np.isin(body, body[switched_on])
+    solid |= groups
+    visual = on_robot & ~np.isin(body, body[solid])
+    solid |= visual
+    for what, used in (("shapes of collision groups", groups), ("visual shapes", visual)):
+        bodies = [model.body(i).name or f"body{i}" for i in np.unique(model.geom_bodyid[used])]
+        if bodies:
+            notes.append(f"{what} collide where no contact is switched on: {listed(bodies)}")
+    return solid
+
+
+def _tree(
+    path: Path,
+    model: mujoco.MjModel,
+    couplings: Couplings,
+    solid: np.ndarray,
+    notes: list[str],
+) -> RobotTree:
+    """Return links and joints of a model, from its poses where the joints are at 0 or held; ``solid`` are the shapes
+    that collide.
 
     The origin of a link is at its joint, which may be away from the body's origin.
     """
     names = [model.body(i).name or f"body{i}" for i in range(model.nbody)]
-    tops = [names[i] for i in range(1, model.nbody) if model.body_parentid[i] == 0]
-    if len(tops) != 1:
-        raise RobotError(
-            f"{path}: expected one body in the world, found {', '.join(tops) or 'none'}."
-        )
+    hinged = np.unique(model.jnt_bodyid[model.jnt_type >= SLIDE])
+    tops = np.flatnonzero(model.body_parentid[1:] == 0) + 1
+    kept = np.intersect1d(tops, model.body_rootid[hinged])
+    if not len(kept):
+        raise RobotError(f"{path} has no body with a hinge or a slide, so it has no robot.")
+    absent = [names[i] for i in tops if i not in kept]
+    if absent:
+        notes.append(f"left out: bodies of the world that have no joint: {listed(absent)}")
+    root = names[kept[0]]
+    if len(kept) > 1 or kept[0] in hinged:
+        root = "world_frame"
+        names[0] = root
+    links = {root: frame(root)}
+    joints = []
+    poses = {root: np.eye(4)}
     data = mujoco.MjData(model)
     data.qpos[model.jnt_qposadr[model.jnt_type >= SLIDE]] = 0.0
     for joint, line in couplings.lines.items():
         if not line.multiplier:
             data.qpos[model.jnt_qposadr[joint]] = line.offset
     mujoco.mj_kinematics(model, data)
-    links = {}
-    joints = []
-    poses = {}
     for number in range(1, model.nbody):
+        if model.body_rootid[number] not in kept:
+            continue
         body = model.body(number)
         name = names[number]
         moving = np.flatnonzero((model.jnt_bodyid == number) & (model.jnt_type >= SLIDE)).tolist()
         above = names[int(body.parentid[0])]
-        if number == 1 and moving:
-            raise RobotError(
-                f"{path}: the first body {body.name!r} has joints; put it into a body that does not move."
-            )
         turn = data.xmat[number].reshape(3, 3).T
         T = transform(turn.T, data.xpos[number])
         children = [*(f"{name}_axis{i}" for i in range(len(moving) - 1)), name]
@@ -192,7 +296,7 @@ def _tree(path: Path, model: mujoco.MjModel, couplings: Couplings) -> RobotTree:
             joints.append(placed)
             above = child
         poses[name] = T
-        if not moving and number > 1:
+        if not moving and name != root:
             joints.append(fixed(above, name, np.linalg.inv(poses[above]) @ T))
         R = turn @ data.ximat[number].reshape(3, 3)
         links[name] = Link(
@@ -200,14 +304,16 @@ def _tree(path: Path, model: mujoco.MjModel, couplings: Couplings) -> RobotTree:
             mass=float(body.mass[0]),
             com=turn @ (data.xipos[number] - T[:3, 3]),
             inertia=R @ np.diag(body.inertia) @ R.T,
-            collisions=tuple(_shapes(model, data, number, T)),
+            collisions=tuple(_shapes(model, data, number, solid, T)),
         )
-    order = [tops[0], *(joint.child for joint in joints)]
+    order = [root, *(joint.child for joint in joints)]
+    pairs = [(names[pair >> 16], names[pair & 0xFFFF]) for pair in model.exclude_signature.tolist()]
     return RobotTree(
         name=path.stem,
-        root=tops[0],
+        root=root,
         links=tuple(links[name] for name in order),
         joints=tuple(joints),
+        exclude=tuple(pair for pair in pairs if {*pair} <= {*order}),
     )
 
 
@@ -230,13 +336,17 @@ def _motion(model: mujoco.MjModel, couplings: Couplings, number: int) -> dict[st
 
 
 def _shapes(
-    model: mujoco.MjModel, data: mujoco.MjData, body: int, T_world_link: np.ndarray
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    body: int,
+    solid: np.ndarray,
+    T_world_link: np.ndarray,
 ) -> Iterator[Shape]:
     """Yield the collision shapes of a body."""
     for number in np.flatnonzero(model.geom_bodyid == body):
         geom = model.geom(number)
         kind = _kind(geom)
-        if not _is_solid(geom) or kind == "plane":
+        if not solid[number] or kind == "plane":
             continue
         T = np.linalg.inv(T_world_link) @ transform(data.geom_xmat[number], data.geom_xpos[number])
         geometry = Geometry(kind=kind, size=tuple(map(float, geom.size[: _SIZES[kind]])))
@@ -256,7 +366,3 @@ def _shapes(
 def _kind(geom: mujoco._structs._MjModelGeomViews) -> Any:
     """Return the name of a kind of shape, which may be one that the project does not have."""
     return mujoco.mjtGeom(int(geom.type[0])).name.removeprefix("mjGEOM_").lower()
-
-
-def _is_solid(geom: mujoco._structs._MjModelGeomViews) -> bool:
-    return bool(geom.contype[0] or geom.conaffinity[0])

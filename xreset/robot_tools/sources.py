@@ -7,21 +7,44 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from xml.etree.ElementTree import Element
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from xreset.errors import RobotError, needs
-from xreset.geometry.shapes import surface_of
-from xreset.geometry.urdf import Link, RobotTree, load_urdf, parse_xml
+from xreset.geometry.shapes import shape_mesh, surface_of
+from xreset.geometry.urdf import Joint, Link, RobotTree, load_urdf, parse_xml
 from xreset.geometry.urdf_writer import FRAME_INERTIA, FRAME_MASS, fixed
 from xreset.objects.decompose import mass_of_shapes
+from xreset.text import listed
 
 _DENSITY = 1000.0
 """[kg/m^3] Density of links whose mass is not stated."""
+_DENSITIES = (5.0, 50_000.0)
+"""[kg/m^3] Densities that links have by the volume of their shapes; shapes may leave out a part of a link."""
+_MOST_MASS = 500.0
+"""[kg] Mass of a link without shapes."""
 _ROTOR_AT_MOST = 0.01
 """[kg m^2] Reflected inertia of a rotor that descriptions add to light links."""
 _TURNS = 2 * math.pi
 """[rad] Range in either direction of a joint without limits."""
+_SLIDE = 0.1
+"""[m] The same of a joint that slides."""
+_FARTHEST = {"revolute": 2 * _TURNS, "prismatic": 5.0}
+"""[rad or m] Farthest limit of a joint."""
+_UNITS = {
+    "revolute": ("degrees", math.pi / 180, 360.0),
+    "prismatic": ("millimetres", 1e-3, 1000.0),
+}
+"""In which unit limits beyond these are taken to be, how large it is [rad or m], and the farthest limit in it."""
+_LEAST_RANGE = 1e-3
+"""[rad or m] A joint with a smaller range is fixed."""
+_LEAST_TURN = math.radians(3)
+"""Some joint of a robot turns farther [rad]."""
+_SPEED = math.pi
+_SPEEDS = (0.01, 100.0)
+"""[rad/s or m/s] Largest speed of a joint without a stated one, and bounds of stated ones."""
 _FLANGES = (
     "tool0",
     "flange",
@@ -60,10 +83,27 @@ def read_source(path: str | Path, notes: list[str]) -> RobotTree:
     if root.tag == "mujoco":
         with needs(f"mujoco, which reads {path},", "mujoco", RobotError):
             from xreset.robot_tools.mjcf import read_mjcf
-        tree = read_mjcf(path, root, notes)
+        tree = read_mjcf(path, notes)
     else:
-        tree = load_urdf(path)
-    return _with_masses(_with_limits(tree, path, notes), notes)
+        tree = load_urdf(path, visuals=True)
+        _note_urdf(root, tree, notes)
+    tree = _with_speeds(_with_ranges(tree, path, notes), notes)
+    return _with_masses(_with_sources(tree, path, notes), notes)
+
+
+def _note_urdf(root: Element, tree: RobotTree, notes: list[str]) -> None:
+    """Note what a URDF lacks, and what of it is left out."""
+    collide = {link.get("name") for link in root.iterfind("link[collision]")}
+    visual = [link.name for link in tree.links if link.collisions and link.name not in collide]
+    if visual:
+        notes.append(f"visual shapes collide where there is no other: {listed(visual)}")
+    damped = []
+    for joint in root.iterfind("joint"):
+        values = [value for part in joint.iterfind("dynamics") for value in part.attrib.values()]
+        if joint.get("type") != "fixed" and any(value.strip(" 0.") for value in values):
+            damped.append(joint.get("name", ""))
+    if damped:
+        notes.append(f"left out: damping and friction of joints: {listed(damped)}")
 
 
 def last_link(arm: RobotTree) -> str:
@@ -105,6 +145,25 @@ def bare(arm: RobotTree, flange: str, notes: list[str]) -> RobotTree:
     return replace(arm, links=links, joints=joints)
 
 
+def grounded(hand: RobotTree, notes: list[str]) -> RobotTree:
+    """Return a hand without the virtual joints that let it float: joints after each other, before any shape, of which
+    one slides or there are three or more."""
+    link = hand.root
+    virtual = []
+    while not hand.link(link).collisions:
+        joints = [joint for joint in hand.joints if joint.parent == link]
+        if len(joints) != 1:
+            break
+        if joints[0].type != "fixed":
+            virtual.append(joints[0])
+        link = joints[0].child
+    if len(virtual) < 3 and all(joint.type == "revolute" for joint in virtual):
+        return hand
+    names = [joint.name for joint in virtual]
+    notes.append(f"left out: joints that only let the hand float: {listed(names)}")
+    return with_fixed(hand, names)
+
+
 def with_fixed(tree: RobotTree, names: Sequence[str]) -> RobotTree:
     """Return a tree in which some joints are fixed at 0."""
     joints = []
@@ -135,7 +194,14 @@ def renamed(hand: RobotTree, arm: RobotTree) -> RobotTree:
         child = link_name(joint.child)
         joints.append(replace(joint, name=name, parent=parent, child=child, mimic=mimic))
     links = [replace(link, name=link_name(link.name)) for link in hand.links]
-    return replace(hand, root=link_name(hand.root), links=tuple(links), joints=tuple(joints))
+    exclude = [(link_name(a), link_name(b)) for a, b in hand.exclude]
+    return replace(
+        hand,
+        root=link_name(hand.root),
+        links=tuple(links),
+        joints=tuple(joints),
+        exclude=tuple(exclude),
+    )
 
 
 def combined(arm: RobotTree, hand: RobotTree, flange: str, T_flange_hand: np.ndarray) -> RobotTree:
@@ -145,21 +211,85 @@ def combined(arm: RobotTree, hand: RobotTree, flange: str, T_flange_hand: np.nda
         root=arm.root,
         links=(*arm.links, *hand.links),
         joints=(*arm.joints, fixed(flange, hand.root, T_flange_hand), *hand.joints),
+        exclude=(*arm.exclude, *hand.exclude),
     )
 
 
-def _with_limits(tree: RobotTree, path: Path, notes: list[str]) -> RobotTree:
-    """Return the tree with finite limits, and with mimic joints that follow a joint that follows nothing; a mimic joint
-    has the limits that its source gives it."""
+def _with_ranges(tree: RobotTree, path: Path, notes: list[str]) -> RobotTree:
+    """Return the tree with finite limits that joints can have; a joint without a range is fixed."""
+    units = {}
+    for kind, (name, unit, most) in _UNITS.items():
+        moving = [joint for joint in tree.moved_by.values() if joint.type == kind]
+        ends = [max(abs(joint.lower), abs(joint.upper)) for joint in moving]
+        stated = [end for end in ends if math.isfinite(end)]
+        far = [end for end in stated if _FARTHEST[kind] < end <= most]
+        units[kind] = 1.0
+        if far and 2 * len(far) >= len(stated):
+            units[kind] = unit
+            notes.append(f"limits of joints, up to {max(far):g}, are read as {name}")
+        elif kind == "revolute" and len(stated) > 1 and max(stated) < _LEAST_TURN:
+            raise RobotError(
+                f"{path}: no joint turns by more than {max(stated):.2g} rad. Are the limits in other units? A URDF "
+                'states radians; an MJCF states degrees, or <compiler angle="radian"/>.'
+            )
+    joints = []
+    fixed = []
+    unlimited = []
+    for joint in tree.joints:
+        if joint.type == "fixed":
+            joints.append(joint)
+            continue
+        unit = units[joint.type]
+        joint = replace(joint, lower=joint.lower * unit, upper=joint.upper * unit)
+        if max(abs(joint.lower), abs(joint.upper)) > _FARTHEST[joint.type]:
+            far = _TURNS if joint.type == "revolute" else _SLIDE
+            unlimited.append(joint.name)
+            joint = replace(joint, lower=-far, upper=far)
+        elif joint.upper - joint.lower < _LEAST_RANGE:
+            fixed.append(joint.name)
+            joint = replace(_at(joint, joint.lower), type="fixed", mimic=None)
+        joints.append(joint)
+    if unlimited:
+        notes.append(
+            f"without limits that a joint can have: {listed(unlimited)}; they get one turn, or 0.1 m, in either "
+            "direction"
+        )
+    if fixed:
+        notes.append(f"fixed, because their limits leave no range: {listed(fixed)}")
+    return replace(tree, joints=tuple(joints))
+
+
+def _at(joint: Joint, position: float) -> Joint:
+    """Return a joint whose position 0 is at another position."""
+    motion = np.eye(4)
+    if joint.type == "prismatic":
+        motion[:3, 3] = position * joint.axis
+    else:
+        motion[:3, :3] = Rotation.from_rotvec(position * joint.axis).as_matrix()
+    return replace(joint, T_parent_joint=joint.T_parent_joint @ motion)
+
+
+def _with_speeds(tree: RobotTree, notes: list[str]) -> RobotTree:
+    """Return the tree with speeds that joints can have."""
+    joints = []
+    changed = []
+    for joint in tree.joints:
+        if joint.type != "fixed" and not _SPEEDS[0] <= joint.velocity <= _SPEEDS[1]:
+            joint = replace(joint, velocity=_SPEED)
+            changed.append(joint.name)
+        joints.append(joint)
+    if changed:
+        notes.append(
+            f"without a speed that a joint can have: {listed(changed)}; they get {_SPEED:.2f} rad/s or m/s"
+        )
+    return replace(tree, joints=tuple(joints))
+
+
+def _with_sources(tree: RobotTree, path: Path, notes: list[str]) -> RobotTree:
+    """Return the tree with mimic joints that follow a joint that follows nothing; a mimic joint has the limits that its
+    source gives it."""
     joints = []
     for joint in tree.joints:
-        if joint.type != "fixed" and not np.isfinite((joint.lower, joint.upper)).all():
-            notes.append(
-                f"the joint {joint.name!r} has no limits; it gets one turn in either direction"
-            )
-            joint = replace(joint, lower=-_TURNS, upper=_TURNS)
-        if joint.type != "fixed" and not 0 < joint.velocity < math.inf:
-            joint = replace(joint, velocity=math.pi)
         if joint.type == "fixed":
             joint = replace(joint, mimic=None)
         joints.append(joint)
@@ -210,26 +340,37 @@ def _with_masses(tree: RobotTree, notes: list[str]) -> RobotTree:
     links = []
     replaced: dict[str, list[str]] = {}
     for link in tree.links:
-        why = "have an inertia that their mass and size do not allow"
-        if link.mass <= 0:
-            why = "have no mass"
-        least = 0.0 if link.collisions else FRAME_MASS
-        if link.mass > least and plausible(link):
-            links.append(link)
-        elif link.collisions:
-            links.append(_with_mass_of_shapes(link))
-            replaced.setdefault(why, []).append(f"{link.name} ({links[-1].mass:.3g} kg)")
-        else:
+        if link.collisions:
+            why, mass = _better_mass(link)
+            if why:
+                link = _with_mass_of_shapes(link, mass)
+                replaced.setdefault(why, []).append(f"{link.name} ({link.mass:.3g} kg)")
+        elif link.mass > _MOST_MASS:
+            raise RobotError(f"link {link.name!r} has {link.mass:.3g} kg. Are these grams?")
+        elif link.mass <= FRAME_MASS or not plausible(link):
             mass = max(link.mass, FRAME_MASS)
-            links.append(replace(link, mass=mass, inertia=np.eye(3) * FRAME_INERTIA))
+            link = replace(link, mass=mass, inertia=np.eye(3) * FRAME_INERTIA)
+        links.append(link)
     for why, names in replaced.items():
-        notes.append(f"these links {why}, and get that of their shapes: {', '.join(names)}")
+        notes.append(f"these links {why}, and get that of their shapes: {listed(names)}")
     return replace(tree, links=tuple(links))
 
 
-def _with_mass_of_shapes(link: Link) -> Link:
+def _better_mass(link: Link) -> tuple[str, float]:
+    """Return what is wrong with a link (nothing: empty), and its mass [kg], 0 if that is wrong."""
+    volume = float(sum(shape_mesh(shape).volume for shape in link.collisions))
+    if link.mass <= 0:
+        return "have no mass", 0.0
+    if not _DENSITIES[0] * volume <= link.mass <= _DENSITIES[1] * volume and volume > 0:
+        return "have a mass that their size does not allow", 0.0
+    if not plausible(link):
+        return "have an inertia that their mass and size do not allow", link.mass
+    return "", link.mass
+
+
+def _with_mass_of_shapes(link: Link, mass: float) -> Link:
     volume, com, inertia = mass_of_shapes(link.collisions)
-    mass = link.mass if link.mass > 0 else _DENSITY * volume
+    mass = mass or _DENSITY * volume
     inertia = inertia * mass
     if not (np.isfinite(com).all() and np.isfinite(inertia).all()):
         raise RobotError(

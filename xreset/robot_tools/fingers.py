@@ -216,8 +216,8 @@ class Hand:
                 joints = tuple(joint for joint in tree.joints if joint.child not in removed)
                 return replace(tree, links=links, joints=joints)
         raise RobotError(
-            f"the file has {len(hands)} hands, with the fingers {'; '.join(tips)}. Choose one with --thumb, the name of "
-            "a link of its thumb."
+            f"the file has {len(hands)} hands, with the fingers {'; '.join(tips)}. Choose one with --thumb, the name "
+            "of a link of its thumb."
         )
 
     def _can_meet(self, chains: list[Finger]) -> bool:

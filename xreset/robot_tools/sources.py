@@ -99,7 +99,8 @@ def _note_urdf(root: Element, tree: RobotTree, notes: list[str]) -> None:
         notes.append(f"visual shapes collide where there is no other: {listed(visual)}")
     damped = []
     for joint in root.iterfind("joint"):
-        values = [value for part in joint.iterfind("dynamics") for value in part.attrib.values()]
+        dynamics = joint.find("dynamics")
+        values = [] if dynamics is None else [*dynamics.attrib.values()]
         if joint.get("type") != "fixed" and any(value.strip(" 0.") for value in values):
             damped.append(joint.get("name", ""))
     if damped:

@@ -111,6 +111,8 @@ class Geometry(TestCase):
         self.assertLessEqual(plane_heights(points, half_spaces(few)).max(), 5e-4)
         self.assertLess(len(few.geometry.vertices), 200)
         self.assertTrue((few.geometry.vertices[:, None] == points).all(axis=-1).any(axis=1).all())
+        with patch("xreset.geometry.shapes.MANY_POINTS", 1000):  # without the exact hull
+            assert_allclose(hull(points, 5e-4).geometry.vertices, few.geometry.vertices)
 
     def test_winding_number_counts_overlaps(self):
         a = trimesh.creation.box((2, 2, 2))
@@ -211,6 +213,16 @@ class MeshImport(InFolder):
         self.assertEqual(inside_out.notes, ())
         mesh = trimesh.Trimesh(inside_out.obj.vertices, inside_out.obj.faces, process=False)
         self.assertGreater(mesh.volume, 0)
+
+    def test_specks_far_from_a_scan_are_left_out_with_a_note(self):
+        speck = trimesh.creation.icosphere(1, 0.001)
+        speck.apply_translation((0.4, 0.0, 0.0))
+        near = speck.copy()
+        near.apply_translation((-0.34, 0.0, 0.0))
+        result = self.load(BOX + speck, facts="mass = 0.2")
+        self.assertEqual(result.notes, ("1 specks, up to 349 mm away from the rest, are left out",))
+        assert_allclose(np.ptp(result.obj.vertices, axis=0), (0.1, 0.06, 0.04))
+        self.assertEqual(self.load(BOX + near, facts="mass = 0.2").notes, ())
 
     @CUTS
     def test_concave_mesh_is_cut_and_cached(self):

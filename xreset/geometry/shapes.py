@@ -27,6 +27,10 @@ if TYPE_CHECKING:
 
 _MOST_HULL_POINTS = 300
 """Number of points in a hull that every engine accepts."""
+MANY_POINTS = 400_000
+"""Points of a mesh from which its exact hull takes too long."""
+_ROWS = 20_000
+"""Points whose heights are computed together."""
 _ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz")
 _PER_VERTEX_BYTE = 8
 """Bytes of memory of a mesh per byte of its vertices: faces, and copies on the way."""
@@ -125,7 +129,7 @@ def hull(points: np.ndarray, tolerance: float = 0.0) -> Shape:
     points = np.asarray(points, dtype=float)
     try:
         if tolerance > 0 and len(points) > _MOST_HULL_POINTS:
-            points = _outermost(points, tolerance)
+            points = outermost(points, tolerance)
         convex = ConvexHull(points)
     except (QhullError, ValueError) as error:
         reason = str(error).splitlines()[0]
@@ -143,23 +147,34 @@ def hull(points: np.ndarray, tolerance: float = 0.0) -> Shape:
     return Shape(geometry=Geometry(kind="hull", vertices=points[convex.vertices], faces=triangles))
 
 
-def _outermost(points: np.ndarray, tolerance: float) -> np.ndarray:
+def outermost(points: np.ndarray, tolerance: float) -> np.ndarray:
     """Select points [n, 3] of a hull that no other point exceeds by more than the tolerance.
 
     The points farthest beyond the faces of the hull so far are added until the hull is good enough.
     """
-    points = points[ConvexHull(points).vertices]
+    if len(points) <= MANY_POINTS:
+        points = points[ConvexHull(points).vertices]
     directions = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1.0
     chosen = np.unique((points @ directions.T).argmax(axis=0))
+    beyond_hull = np.arange(len(points))
     while True:
         planes = ConvexHull(points[chosen]).equations
-        beyond = plane_heights(points, planes)
-        farthest = beyond.argmax(axis=0)
-        worst = beyond.max(axis=0)
-        missing = np.unique(farthest[worst > max(tolerance, worst.max() / 2)])
-        if not len(missing):
+        farthest = np.zeros(len(planes), dtype=np.int64)
+        worst = np.full(len(planes), -np.inf)
+        still = []
+        for begin in range(0, len(beyond_hull), _ROWS):
+            part = beyond_hull[begin : begin + _ROWS]
+            beyond = plane_heights(points[part], planes)
+            rows = beyond.argmax(axis=0)
+            heights = beyond[rows, np.arange(len(planes))]
+            better = heights > worst
+            worst[better] = heights[better]
+            farthest[better] = part[rows[better]]
+            still.append(part[beyond.max(axis=1) > tolerance])
+        beyond_hull = np.concatenate(still)
+        if not len(beyond_hull):
             return points[chosen]
-        chosen = np.union1d(chosen, missing)
+        chosen = np.union1d(chosen, farthest[worst > max(tolerance, worst.max() / 2)])
 
 
 def load_mesh(path: Path) -> trimesh.Trimesh:

@@ -19,10 +19,12 @@ from scipy.spatial import ConvexHull, cKDTree
 from xreset.checks import frozen
 from xreset.errors import ObjectError, needs
 from xreset.geometry.shapes import (
+    MANY_POINTS,
     half_spaces,
     hull,
     mass_properties,
     mesh_arrays,
+    outermost,
     plane_heights,
     shape_mesh,
     triangle_normals,
@@ -117,11 +119,16 @@ def decompose(mesh: trimesh.Trimesh, settings: Settings = Settings()) -> Pieces:
         QhullError: the mesh spans no volume.
     """
     surface = _Surface(*mesh_arrays(mesh))
-    around = mesh.convex_hull
+    points = mesh.vertices
+    if len(points) > MANY_POINTS:
+        points = outermost(np.asarray(points), _EXACT)
+        around = shape_mesh(hull(points))
+    else:
+        around = mesh.convex_hull
     finished = True
     depth = settings.hull_depth * np.linalg.norm(mesh.extents) or settings.tolerance
     if surface.deviation(around.vertices, around.faces) <= depth:
-        shapes = [limited_hull(mesh.vertices)]
+        shapes = [limited_hull(points)]
         piece = shape_mesh(shapes[0])
         deviation = surface.deviation(piece.vertices, piece.faces)
         if mesh.is_volume and mesh.body_count > 1:

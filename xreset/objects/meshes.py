@@ -36,6 +36,10 @@ _FLAT = 1e-5
 """A thinner mesh is flat [m]."""
 _HOLLOW = 120.0
 """A closed mesh of a lower density is a shell [kg/m^3]."""
+_SPECK_AREA = 0.01
+"""Largest share of a mesh's area that a part has which is a speck."""
+_SPECK_GAP = 0.2
+"""How far such a part is from the largest one, as a share of its length."""
 _FEW_MM = 0.002
 """Deviation of pieces from the surface that is worth a note [m]."""
 
@@ -98,21 +102,24 @@ def import_with_notes(path: str | Path, name: str) -> Import:
         ObjectError: the file is missing, damaged, empty or flat, or not in metres.
     """
     path = Path(path)
-    mesh = read_mesh(path)
+    notes = []
+    mesh = _without_specks(read_mesh(path), notes)
     own = properties_of(path)
     source = file_hash(path)
+    cut = " ".join((source, *notes))  # earlier versions cut specks, too
     try:
         settings = Settings()
         if own.tolerance is not None:
             settings = Settings(hull_depth=0.0, tolerance=own.tolerance)
-        pieces = cached_pieces(mesh, source, settings)
+        pieces = cached_pieces(mesh, cut, settings)
     except ObjectError as error:
         raise ObjectError(f"{path}: {error}") from error
     except QhullError as error:
         raise ObjectError(
             f"{path} spans no volume: it is flat, or damaged. A solid object is needed."
         ) from error
-    notes = [] if mesh.is_volume else [_how_closed(mesh, pieces)]
+    if not mesh.is_volume:
+        notes.append(_how_closed(mesh, pieces))
     mass, mass_source = _mass(path, name, own, pieces.volume, notes)
     com = pieces.com
     inertia = pieces.inertia * mass
@@ -206,6 +213,8 @@ def add_mesh(
     facts = target.with_suffix(".toml")
     properties = properties or Properties()
     known = replace(properties, tolerance=properties.tolerance or Settings.tolerance).to_toml()
+    if not scale > 0:
+        raise ObjectError(f"--scale is {scale:g}, expected the metres in a unit of the file.")
     if target.exists() or (facts.exists() and facts.read_bytes() != known.encode()):
         raise ObjectError(
             f"{target} or its .toml is there already. Nothing was changed; choose another --name or --out."
@@ -271,6 +280,35 @@ def _checked(mesh: trimesh.Trimesh, path: Path) -> trimesh.Trimesh:
     if not len(mesh.faces) or mesh.extents.min() < _FLAT:
         raise ObjectError(f"{path} is flat: {_size(mesh)}; a solid object is needed.")
     return _parted(mesh)
+
+
+def _without_specks(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
+    """Return a mesh without small parts that are far from its largest part, as scans have them; they are noted."""
+    import trimesh
+
+    labels = trimesh.graph.connected_component_labels(mesh.edges_unique, len(mesh.vertices))
+    if labels.max() == 0:
+        return mesh
+    part = labels[mesh.faces[:, 0]]
+    area = np.bincount(part, mesh.area_faces, minlength=labels.max() + 1)
+    low = np.full((len(area), 3), np.inf)
+    high = np.full((len(area), 3), -np.inf)
+    np.minimum.at(low, labels, mesh.vertices)
+    np.maximum.at(high, labels, mesh.vertices)
+    main = area.argmax()
+    gap = np.maximum(low - high[main], low[main] - high).max(axis=1)
+    is_speck = (area < _SPECK_AREA * area.sum()) & (
+        gap > _SPECK_GAP * (high[main] - low[main]).max()
+    )
+    if not is_speck.any():
+        return mesh
+    notes.append(
+        f"{is_speck.sum()} specks, up to {1e3 * gap[is_speck].max():.0f} mm away from the rest, are left out"
+    )
+    kept = mesh.copy()
+    kept.update_faces(~is_speck[part])
+    kept.remove_unreferenced_vertices()
+    return kept
 
 
 def _parted(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

@@ -14,7 +14,8 @@ from xreset.checks import Checked, Seed, frozen, names_wrong_arguments
 from xreset.description import load_robot
 from xreset.env import ManipulationEnv, make_env
 from xreset.errors import PolicyError
-from xreset.learning.run import policy_file, read_choice, read_run
+from xreset.learning.exported import read_policy
+from xreset.learning.run import read_choice, read_run
 from xreset.objects.catalogue import object_names
 from xreset.policies import results_folder
 from xreset.policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_contract
@@ -188,7 +189,8 @@ def load_policy(
         return _baseline(name, robot, seed)
     path = Path(policy)
     run = read_run(path) if os.path.isdir(path) else None
-    file = policy_file(policy, also=BASELINES)
+    loaded = read_policy(policy, also=BASELINES)
+    file = loaded.path
     folder = file.parent
     if run is not None:
         name = path.name
@@ -198,7 +200,6 @@ def load_policy(
     else:
         folder = results_folder(name)
     choice = read_choice(folder)
-    loaded = OnnxPolicy(file)
     contract = loaded.contract
     spec = load_robot(robot or contract.robot)
     check_contract(str(file), contract, spec, contract.task)

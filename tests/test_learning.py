@@ -23,7 +23,7 @@ from xreset.checks import from_dict
 from xreset.errors import FileFormatError
 from xreset.learning.config import ModelConfig, PpoConfig, ScheduleConfig, TrainConfig
 from xreset.learning.distributed import Processes
-from xreset.learning.export import export_onnx
+from xreset.learning.export import exported
 from xreset.learning.model import PointNetLstmModel, ReturnCritic
 from xreset.learning.ppo import SequencePpo, first_steps, piece_states
 from xreset.learning.runner import TrainingRunner
@@ -474,9 +474,8 @@ class ExportTest(InFolder):
         }
         contract = policy_contract(robots.load("openarm"), task, ())
         file = self.folder / "policy.onnx"
-        export_onnx(
-            model, file, replace(contract, observation_layout=layout, joint_names=tuple("abcde"))
-        )
+        contract = replace(contract, observation_layout=layout, joint_names=tuple("abcde"))
+        file.write_bytes(exported(model, contract))
         self.assertNotIn(
             b".py", file.read_bytes(), "nothing of the exporting machine is in the file"
         )

@@ -40,13 +40,13 @@ from xreset.files import claim, file_hash
 from xreset.learning.checkpoint import load_moments, read_checkpoint
 from xreset.learning.clock import read_lift
 from xreset.learning.config import ScheduleConfig, TrainConfig
+from xreset.learning.exported import read_policy
 from xreset.learning.recipes import RECIPES, own_terms_flag
 from xreset.learning.run import (
     Candidate,
     Choice,
     checkpoints,
     latest_checkpoint,
-    policy_file,
     read_run,
     write_choice,
 )
@@ -495,8 +495,9 @@ class TrainingTest(WithBank):
         policy = out / "policy.onnx"
         contract = OnnxPolicy(policy).contract
         policy.unlink()
-        newest_policy = policy_file(out).read_bytes()
-        self.assertEqual(OnnxPolicy(policy).contract, contract)
+        newest_policy = read_policy(out).content
+        self.assertEqual(read_policy(out).contract, contract)
+        self.assertFalse(policy.exists(), "loading writes nothing")
         names = ("000002.pt", "000001.pt")
         candidates = tuple(Candidate(name=name, task_progress={"mujoco": 0.5}) for name in names)
         choice = Choice(
@@ -505,7 +506,7 @@ class TrainingTest(WithBank):
         words = "000001.pt, .* of 2 checkpoints in 1 engines; the newest, 000002.pt, has 50"
         self.assertRegex(choice.sentence(), words)
         write_choice(out, choice)
-        first = policy_file(out).read_bytes()
+        first = read_policy(out).content
         self.assertNotEqual(first, newest_policy)
         own = self.folder / "first.onnx"
         export_checkpoint(out / "checkpoints" / "000001.pt", own)
@@ -523,13 +524,16 @@ class TrainingTest(WithBank):
         ):
             with self.subTest(problem), self.assertRaisesRegex(XResetError, problem):
                 export_checkpoint(checkpoint, target)
-        written = policy.stat().st_mtime_ns
+        policy.write_bytes(first)
         os.utime(latest_checkpoint(out), (2e9, 2e9))  # copied: its time says nothing
-        policy_file(out)
-        self.assertEqual(policy.stat().st_mtime_ns, written)
+        with patch("xreset.learning.export.exported_checkpoint") as again:
+            self.assertEqual(read_policy(out).content, first)
+        again.assert_not_called()
+        policy.write_bytes(first[:1000])
+        self.assertEqual(read_policy(out).content, first, "a damaged file is not played")
         shutil.copy(out / "checkpoints" / "000002.pt", out / "checkpoints" / "000003.pt")
         self.assertNotEqual(
-            policy_file(out).read_bytes(), first, "the choice did not know the newest one"
+            read_policy(out).content, first, "the choice did not know the newest one"
         )
 
     def test_what_cannot_be_trained_is_refused_and_leaves_no_run(self):

@@ -34,6 +34,8 @@ METADATA_KEY = "xreset"
 """Key of the ONNX metadata entry that holds the contract as JSON."""
 VERSION_KEY = "xreset-version"
 """Key of the ONNX metadata entry that holds the version and commit of xreset."""
+CHECKPOINT_KEY = "xreset-checkpoint"
+"""Key of the entry with the SHA-256 of the checkpoint."""
 INPUTS = ("flat", "cloud", "h_in", "c_in")
 """Inputs of the ONNX graph: the two flat groups of ``TaskConfig.policy_groups`` in one [N, D], the clouds [N, H, P, K]
 or images, and the LSTM's state, two tensors [1, N, units]."""
@@ -155,23 +157,30 @@ class OnnxPolicy:
     """A trained policy from an ONNX file, with its recurrent state.
 
     Attributes:
+        path: the file.
         name: name of the file, or of its folder if the file is called ``policy.onnx``.
         contract: see :func:`policy_contract`.
         content: content of the file.
         hash: SHA-256 of the content.
+        checkpoint: SHA-256 of the checkpoint that it was exported from; None: it states none.
     """
 
     @names_wrong_arguments
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, content: bytes | None = None) -> None:
         """Load the file.
+
+        Args:
+            path: file, or what messages call the content.
+            content: content of the file; None: it is read.
 
         Raises:
             PolicyError: it is missing, damaged, or not a policy of xreset.
         """
         path = Path(path)
-        if not path.is_file():
+        self.path = path
+        if content is None and not path.is_file():
             raise PolicyError(f"There is no policy file {path}.")
-        if path.stat().st_size > max_bytes():
+        if content is None and path.stat().st_size > max_bytes():
             raise PolicyError(
                 f"{path} has {path.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows."
             )
@@ -182,7 +191,7 @@ class OnnxPolicy:
         # Otherwise onnxruntime's threads spin between the steps, which costs as much as the physics.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         try:
-            self.content = path.read_bytes()
+            self.content = path.read_bytes() if content is None else content
             self.hash = sha256(self.content).hexdigest()
             self._session = onnxruntime.InferenceSession(
                 self.content,
@@ -193,6 +202,7 @@ class OnnxPolicy:
             metadata = self._session.get_modelmeta().custom_metadata_map
         except Exception as error:
             raise PolicyError(_why_unreadable(path, error)) from error
+        self.checkpoint = metadata.get(CHECKPOINT_KEY)
         self.contract = _read_contract(path, metadata)
         self._state: list[np.ndarray] | None = None
         self._try_step(path)

@@ -15,11 +15,12 @@ from typing import TYPE_CHECKING
 import torch
 from tensordict import TensorDict
 
-from xreset.files import atomic_write, check_suffix, code_version, file_hash, must_exist
+from xreset.files import check_suffix, code_version, file_hash, must_exist, write_whole
 from xreset.learning.checkpoint import must_fit, read_checkpoint
 from xreset.learning.model import ExportedPolicy, PointNetLstmModel, make_actor
 from xreset.learning.run import read_run
 from xreset.policy import (
+    CHECKPOINT_KEY,
     INPUTS,
     METADATA_KEY,
     OUTPUTS,
@@ -31,22 +32,14 @@ from xreset.policy import (
 if TYPE_CHECKING:
     from onnx import ModelProto
 
-_CHECKPOINT_KEY = "xreset-checkpoint"
-"""Key of the ONNX metadata entry that holds the SHA-256 of the checkpoint."""
 
-
-def export_onnx(
-    actor: PointNetLstmModel,
-    path: str | Path,
-    contract: Contract,
-    *,
-    checkpoint: Path | None = None,
-) -> None:
-    """Write the deterministic policy as one ONNX file.
+def exported(
+    actor: PointNetLstmModel, contract: Contract, *, checkpoint: Path | None = None
+) -> bytes:
+    """Return the deterministic policy as the content of one ONNX file.
 
     Args:
         actor: trained actor.
-        path: file to write.
         contract: what the policy needs to run: see :func:`xreset.policy.policy_contract`.
         checkpoint: file with the actor's weights, of which the policy states the hash; None: there is none.
     """
@@ -80,10 +73,9 @@ def export_onnx(
         VERSION_KEY: code_version(),
     }
     if checkpoint is not None:
-        entries[_CHECKPOINT_KEY] = file_hash(checkpoint)
+        entries[CHECKPOINT_KEY] = file_hash(checkpoint)
     onnx.helper.set_model_props(model, entries)
-    with atomic_write(path) as out:
-        out.write(model.SerializeToString())
+    return model.SerializeToString()
 
 
 def _drop_exporter_notes(model: ModelProto) -> None:
@@ -118,7 +110,7 @@ def _quiet() -> Iterator[None]:
 def export_checkpoint(checkpoint: str | Path, policy: str | Path) -> None:
     """Write the policy of one checkpoint of a training as an ONNX file.
 
-    :func:`~xreset.eval.policy_spec.load_policy` with a run folder exports the newest one, or the one that
+    :func:`~xreset.eval.policy_spec.load_policy` with a run folder takes the newest one, or the one that
     ``xreset select`` chose.
 
     Args:
@@ -130,8 +122,12 @@ def export_checkpoint(checkpoint: str | Path, policy: str | Path) -> None:
         FileFormatError: there is no such checkpoint, or it or the run's description is damaged.
         XResetError: the name of the policy does not end in ``.onnx``, or the file cannot be written.
     """
-    checkpoint = Path(checkpoint)
     check_suffix("policy", policy, ".onnx")
+    write_whole(policy, exported_checkpoint(Path(checkpoint)))
+
+
+def exported_checkpoint(checkpoint: Path) -> bytes:
+    """Return the content of the file that :func:`export_checkpoint` writes; errors as there."""
     must_exist(checkpoint, "checkpoint")
     folder = checkpoint.parent.parent
     run = read_run(folder)
@@ -142,17 +138,4 @@ def export_checkpoint(checkpoint: str | Path, policy: str | Path) -> None:
     actor = make_actor(example, len(run.contract.joint_names), run.config)
     with must_fit(checkpoint):
         actor.load_state_dict(read_checkpoint(checkpoint).policy_state_dict)
-    export_onnx(actor, policy, run.contract, checkpoint=checkpoint)
-
-
-def is_exported_from(policy: Path, checkpoint: Path) -> bool:
-    """Return whether a policy was exported from a checkpoint."""
-    import onnx
-    from google.protobuf.message import DecodeError
-
-    try:
-        model = onnx.load(str(policy), load_external_data=False)
-    except DecodeError:
-        return False
-    entries = {entry.key: entry.value for entry in model.metadata_props}
-    return entries.get(_CHECKPOINT_KEY) == file_hash(checkpoint)
+    return exported(actor, run.contract, checkpoint=checkpoint)

@@ -13,17 +13,15 @@ RUN/eval/, RUN/report/       made by ``xreset eval`` and ``xreset report``
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, ClassVar
 
 from xreset.checks import Checked, NonNegativeInt, PositiveInt, Rule, Share, from_dict, frozen
-from xreset.errors import PolicyError, RunError, WrongValueError
+from xreset.errors import RunError, WrongValueError
 from xreset.files import read_json, read_typed, write_json
 from xreset.learning.config import TrainConfig
 from xreset.plugins import robot_names
-from xreset.policies import shipped
 from xreset.task.contract import Contract
 from xreset.text import shown
 
@@ -116,52 +114,6 @@ def latest_checkpoint(folder: Path) -> Path:
             f"{folder} has no checkpoint yet. Give a run folder, or train it: xreset train --out {folder} --resume"
         )
     return found[-1]
-
-
-def policy_file(policy: str | Path, *, also: Sequence[str] = ()) -> Path:
-    """Return the file of a policy: a run folder's, an exported one, or one that ships with xreset, in this order.
-
-    Args:
-        policy: folder, file or name.
-        also: further names that the error lists.
-
-    Raises:
-        PolicyError: there is none of that name.
-    """
-    if os.path.isdir(policy):  # unlike Path.is_dir, it takes names of any length
-        return _exported_policy(Path(policy))
-    path = Path(policy)
-    if path.suffix == ".onnx" or os.path.exists(path):
-        return path
-    files = shipped()
-    if str(policy) not in files:
-        known = ", ".join((*also, *files))
-        raise PolicyError(
-            f"Unknown policy {str(policy)!r}. Give a run folder, a .onnx file, or one of: {known}."
-        )
-    return files[str(policy)]
-
-
-def _exported_policy(folder: Path) -> Path:
-    """Return the run's ``policy.onnx``, exported if it is missing or old.
-
-    It is the policy of the newest checkpoint, unless ``xreset select`` chose one and the run has had no newer one
-    since. A run that was copied without its checkpoints keeps its policy.
-    """
-    policy = folder / "policy.onnx"
-    if policy.exists() and not checkpoints(folder):
-        return policy
-    checkpoint = latest_checkpoint(folder)
-    choice = read_choice(folder)
-    if choice is not None and choice.candidates[0].name == checkpoint.name:
-        chosen = checkpoint.with_name(choice.chosen)
-        checkpoint = chosen if chosen.exists() else checkpoint
-    # rsl-rl, which playing a file does not need
-    from xreset.learning.export import export_checkpoint, is_exported_from
-
-    if not policy.exists() or not is_exported_from(policy, checkpoint):
-        export_checkpoint(checkpoint, policy)
-    return policy
 
 
 # The checkpoint that ``xreset select`` chose --------------------------------------------------------------------------

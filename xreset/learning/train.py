@@ -29,6 +29,7 @@ from xreset.inputs import Inputs, load_inputs
 from xreset.learning.config import TrainConfig
 from xreset.learning.distributed import Processes, leave
 from xreset.learning.export import export_checkpoint
+from xreset.learning.exported import read_policy
 from xreset.learning.recipes import (
     default_config,
     from_home,
@@ -41,7 +42,6 @@ from xreset.learning.run import (
     RunInfo,
     checkpoints,
     latest_checkpoint,
-    policy_file,
     read_run,
     write_run,
 )
@@ -139,12 +139,12 @@ def train(
     start = None
     if weights is not None:
         start = _checkpoint_to_start_from(Path(weights), inputs, config)
-    teacher_file = None if teacher is None else policy_file(teacher)
-    if teacher_file is not None:
-        _check_teacher(teacher_file, inputs, config)
+    teacher_policy = None if teacher is None else read_policy(teacher)
+    if teacher_policy is not None:
+        _check_teacher(teacher_policy, inputs, config)
     with _new_run(out):
-        if teacher_file is not None:
-            write_whole(out / TEACHER, teacher_file.read_bytes())
+        if teacher_policy is not None:
+            write_whole(out / TEACHER, teacher_policy.content)
         # the training reads its own file, so that it has the same data as a resumed one, and values are checked
         if isinstance(data, GoalSet):
             write_goals(out / "goals.npz", data)
@@ -258,7 +258,7 @@ def distill(
     if config is None:
         wanted = [cameras] if isinstance(cameras, str | CameraConfig) else cameras
         chosen = tuple(_camera(each) for each in wanted)
-        teacher_task = OnnxPolicy(policy_file(teacher)).contract.task
+        teacher_task = read_policy(teacher).contract.task
         try:
             vision = replace(vision or STUDENT_VISION, cameras=chosen)
         except ValueError as error:
@@ -343,15 +343,15 @@ def _checkpoint_to_start_from(run: Path, inputs: Inputs, config: TrainConfig) ->
     return latest_checkpoint(run)
 
 
-def _check_teacher(teacher: Path, inputs: Inputs, config: TrainConfig) -> None:
+def _check_teacher(teacher: OnnxPolicy, inputs: Inputs, config: TrainConfig) -> None:
     """Refuse the policy of a teacher that does not fit the robot and the task."""
-    contract = OnnxPolicy(teacher).contract
+    contract = teacher.contract
     if contract.task.vision.cameras:
         raise PolicyError(
-            f"{teacher} sees through cameras itself. Give a teacher that is told pose and shape."
+            f"{teacher.path} sees through cameras itself. Give a teacher that is told pose and shape."
         )
     check_contract(
-        str(teacher), contract, inputs.robot, replace(config.task, vision=VisionConfig())
+        str(teacher.path), contract, inputs.robot, replace(config.task, vision=VisionConfig())
     )
 
 

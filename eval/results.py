@@ -468,7 +468,10 @@ def read_evaluation(folder: Path, run: str = "") -> Evaluation:
     tables = []
     if os.path.isdir(folder):
         files = [f for f in folder.glob("*.json") if not f.name.endswith(".episodes.json")]
-        results = [read_result(file) for file in sorted(files, key=lambda f: f.stem)]
+        for file in sorted(files, key=lambda f: f.stem):
+            result = read_result(file)
+            check_name(file, result.engine)
+            results.append(result)
     for result in results:
         episodes = read_episodes(folder, result.engine)
         if len(episodes) != result.episodes:
@@ -478,6 +481,15 @@ def read_evaluation(folder: Path, run: str = "") -> Evaluation:
             )
         tables.append(episode_table(result, episodes, run))
     return Evaluation(results, tables)
+
+
+def check_name(path: Path, engine: str) -> None:
+    """Refuse, with ``FileFormatError``, results of an engine in a file of another name, because copies count twice."""
+    if path.stem != engine:
+        raise FileFormatError(
+            f"{path} has the results of {engine}, expected in {engine}.json. If it is a copy, move it out of the "
+            "folder."
+        )
 
 
 def read_result(path: Path) -> EvalResult:

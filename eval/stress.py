@@ -19,7 +19,7 @@ from xreset.checks import frozen
 from xreset.errors import XResetError
 from xreset.eval.plots import COLORS, picture
 from xreset.eval.policy_spec import PolicySpec
-from xreset.eval.results import Episode
+from xreset.eval.results import Episode, check_name
 from xreset.eval.rollout import Engine, Trial, roll_out
 from xreset.eval.sensitivity import SWEEPS, Effect, Property, amount, nominal_task
 from xreset.eval.stats import Interval
@@ -227,7 +227,11 @@ def read_stress(folder: Path, policy: str | None = None) -> tuple[Stress, ...]:
     Raises:
         FileFormatError: a file is damaged, or of another version.
     """
-    found = [read_typed(Stress, path, SCHEMA) for path in sorted(folder.glob("*.json"))]
+    found = []
+    for path in sorted(folder.glob("*.json")):
+        card = read_typed(Stress, path, SCHEMA)
+        check_name(path, card.engine)
+        found.append(card)
     return tuple(
         card for card in found if policy is None or card.inputs.get("policy", policy) == policy
     )

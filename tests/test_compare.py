@@ -1,6 +1,7 @@
 """Several trainings side by side: what is read, what is taken together, what is unfair, and what is written."""
 
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from unittest import mock
@@ -112,6 +113,22 @@ class ReadTest(Compared):
                 read_training(a)
             (a / name).write_text(whole)
         self.assertEqual(read_training(str(a)).label, "a")
+        copy = a / "eval" / "mujoco (1).json"
+        shutil.copy(a / "eval" / "mujoco.json", copy)
+        words = r"mujoco \(1\).json has the results of mujoco, expected in mujoco.json"
+        self.assertRaisesRegex(FileFormatError, words, read_training, a)
+
+    def test_a_resumed_run_counts_even_if_the_clock_ran_back(self):
+        first = pd.DataFrame({"task/grasped": 0.1}, index=range(1, 11))
+        resumed = pd.DataFrame({"task/grasped": 0.2}, index=range(6, 11))
+        a = self.write_curves("a", first)
+        (file,) = a.glob("events*")
+        file.rename(a / "events.out.tfevents.2000.x")
+        self.write_curves("a", resumed)
+        (other,) = set(a.glob("events*")) - {a / "events.out.tfevents.2000.x"}
+        other.rename(a / "events.out.tfevents.1000.x")
+        found = read_curves(a)["task/grasped"]
+        assert_allclose(found, [0.1] * 5 + [0.2] * 5, rtol=1e-6)
 
     def test_event_files_that_are_not_whole(self):
         """Cut anywhere: the head is missed, what is left of a tail is read as it was."""

@@ -21,6 +21,7 @@ from tests.toy_training import CONFIG
 from xreset import robots
 from xreset.checks import from_dict
 from xreset.errors import FileFormatError
+from xreset.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from xreset.learning.config import ModelConfig, PpoConfig, ScheduleConfig, TrainConfig
 from xreset.learning.distributed import Processes
 from xreset.learning.export import exported
@@ -485,6 +486,20 @@ class ExportTest(InFolder):
                 assert_close(policy.act(seen(t)), model(seen(t)).clamp(-1, 1), atol=1e-5, rtol=0)
 
 
+class CheckpointTest(InFolder):
+    def test_a_small_file_does_not_fill_the_memory(self):
+        path = self.folder / "000001.pt"
+        weights = {"weight": torch.zeros(1).expand(10**11)}
+        counters = {"iteration": 1, "env_steps": 1, "elapsed": 0.1, "learning_rate": 1e-3}
+        write_checkpoint(
+            path,
+            Checkpoint(actor_state_dict=weights, optimizer_state_dict={"state": {}}, **counters),
+        )
+        self.assertLess(path.stat().st_size, 10_000)
+        with self.assertRaisesRegex(FileFormatError, "expected tensors of finite numbers"):
+            read_checkpoint(path)
+
+
 class ConfigTest(TestCase):
     def test_table_viii(self):
         ppo = TrainConfig().ppo
@@ -510,6 +525,11 @@ class ConfigTest(TestCase):
                 "iterations is 1.5, expected a whole number above 0",
             ),
             (ModelConfig, {"initial_std": "1"}, "initial_std is '1', expected a number above 0"),
+            (
+                ResetConfig,
+                {"random_gravity": "false"},
+                "random_gravity is 'false', expected True or False",
+            ),
             (
                 ResetConfig,
                 {"object_share": {"soup": "3"}},

@@ -81,6 +81,9 @@ class Names(TestCase):
             canonical_names([3])  # type: ignore[list-item]
         for name in ("035_power_drill", "power_drill", "Power Drill"):
             self.assertEqual(canonical_name(name), "035_power_drill")
+        for known, name in (("wine_glass", "glass"), ("big_mug", "mug"), ("2nd_mug", "mug")):
+            with self.subTest(known), self.assertRaisesRegex(ObjectError, "Unknown object"):
+                canonical_name(name, [known])
         with self.assertRaisesRegex(
             ObjectError, r"'teapot'.*003_cracker_box \(cheez-its\).*037_scissors"
         ):
@@ -259,6 +262,16 @@ class MeshImport(InFolder):
         with patch.dict(os.environ, {"XRESET_CACHE": f"{self.folder}/file"}):
             self.assertEqual(len(self.load(BOX).obj.pieces), 1)
         with (
+            patch.dict(os.environ),
+            patch("pathlib.Path.home", side_effect=RuntimeError("Could not determine home")),
+        ):
+            for name in ("XRESET_CACHE", "XDG_CACHE_HOME"):
+                os.environ.pop(name, None)
+            self.assertEqual(len(self.load(BOX).obj.pieces), 1)
+        for _ in range(2):
+            with patch("xreset.objects.cache.read_npz", side_effect=PermissionError(13, "denied")):
+                self.assertEqual(len(self.load(BOX).obj.pieces), 1)
+        with (
             patch.dict("sys.modules", {"manifold3d": None}),
             self.assertRaisesRegex(ObjectError, r"pip install 'xreset\[objects\]'"),
         ):
@@ -299,6 +312,7 @@ class MeshImport(InFolder):
         for name, scale, words in (
             ("brick", 0.001, "there already"),
             ("other", 1.0, "millimetres"),
+            ("mirrored", -0.1, "scale is -0.1, expected a number above 0"),
             ("other", 1e-6, r"0\.0001 x .* m, expected 0\.005 to 2 m.*--scale"),
             ("../other", 0.001, "cannot be an object's name"),
         ):

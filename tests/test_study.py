@@ -198,14 +198,15 @@ class PlanTest(Studied):
             self.assertEqual(found, played)
 
     def test_changes_of_the_recipe_are_flags(self):
-        changes = "task.reset = { random_gravity = false, demo_probability = 0.25 }\nmodel.pointnet = [8, 6]\ntask.action.hand_zero = 'middle'\n"
+        changes = "task.reset = { random_gravity = false, demo_probability = 0.25, object_share = { 010_potted_meat_can = 3.0 } }\nmodel.pointnet = [8, 6]\ntask.action.hand_zero = 'middle'\n"
         changes += "schedule.success_position = [[0, 0.05], [1, 0.01]]\n"
         plan = self.plan(f"{BASE}[runs.a]\nsteps = 1e6\nnum_envs = 64\n[runs.a.config]\n{changes}")
         (train,) = (s for s in plan.steps.values() if s.kind == "train")
         (planned,) = plan.runs
         reset = RECIPES["minutes"].config.task.reset
         self.assertEqual(planned.config.iterations, 977)
-        changed = replace(reset, random_gravity=False, demo_probability=0.25)
+        shares = {"010_potted_meat_can": 3.0}
+        changed = replace(reset, random_gravity=False, demo_probability=0.25, object_share=shares)
         self.assertEqual(planned.config.task.reset, changed)
         (command,) = train.todo()[1]
         with patch("xreset.learning.train.train") as start:

@@ -131,8 +131,8 @@ Number = Annotated[float, Rule("a finite number of at most 1e9", lambda x: abs(x
 
 class Checked:
     """Base of dataclasses whose fields are checked: making one with a value that breaks its field's rule, with an
-    unknown word, or with something else in place of a dataclass raises ``WrongValueError``, which names every such
-    field."""
+    unknown word, or with something else in place of a truth or a dataclass raises ``WrongValueError``, which names
+    every such field."""
 
     def __post_init__(self) -> None:
         wrong = []
@@ -170,18 +170,20 @@ def _marks(hint: Any) -> list[Any]:
 
 @cache
 def _choices_of(cls: type) -> dict[str, Any]:
-    """Field name -> type, of the fields that take one of a few words or an object of a dataclass."""
+    """Field name -> type, of the fields that take a truth, one of a few words or an object of a dataclass."""
     choices = {}
     for name, hint in get_type_hints(cls).items():
         for part in _parts(hint):
             item = get_args(part)[0] if get_origin(part) is tuple else part
-            if get_origin(item) is Literal or is_dataclass(item):
+            if item is bool or get_origin(item) is Literal or is_dataclass(item):
                 choices[name] = hint
     return choices
 
 
 def _described(hint: Any) -> str:
     """Return what messages call a type of :func:`_choices_of`."""
+    if hint is bool:
+        return "True or False"
     if get_origin(hint) is Literal:
         return f"one of {', '.join(map(repr, get_args(hint)))}"
     if _is_union(hint):
@@ -281,7 +283,9 @@ def _rules_of(function: Callable[..., Any]) -> dict[str, list[Any]]:
     return {name: found for name, found in marks.items() if found}
 
 
-_WIDER: dict[Any, Any] = {int: Integral, float: Real, Sequence: Iterable, tuple: Iterable}
+_WIDER: dict[Any, Any] = {
+    bool: (bool, np.bool_), int: Integral, float: Real, Sequence: Iterable, tuple: Iterable,
+}  # fmt: skip
 
 
 def _hint_of(function: Callable[..., Any], name: str) -> Any:

@@ -80,6 +80,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     Raises:
         XResetError: the folder cannot be made or written.
     """
+    path = Path(os.path.realpath(path))
     try:
         with _temporary(path.parent, Path.mkdir) as temporary:
             remove_leftovers(path.parent)

@@ -4,6 +4,7 @@ results."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -144,9 +145,13 @@ def read_curves(folder: Path) -> Table:
         FileFormatError: an event file is damaged.
         XResetError: there are event files, and TensorBoard, which reads them, cannot be imported.
     """
-    scalars = []
+    files = []
     for file in sorted(folder.glob("events.out.tfevents.*")):
-        scalars += _scalars(file)
+        if found := list(_scalars(file)):
+            files.append(found)
+    # By where each begins, as a resumed run begins later: the names hold a clock, which may have run back.
+    files.sort(key=lambda found: found[0][1])
+    scalars = list(chain.from_iterable(files))
     table: Table = pd.DataFrame(scalars, columns=["tag", "iteration", "value"])
     # A resumed run repeats the iterations after its checkpoint; the later values count.
     return table.drop_duplicates(["tag", "iteration"], keep="last").pivot(

@@ -15,6 +15,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -265,7 +266,7 @@ def train_todo(run: Run) -> Todo:
         like=spec.recipe,
         weights=run.weights,
         meshes=run.subset.meshes,
-        config=spec.config,
+        config=_with_tables(spec.config, TrainConfig()),
     )
     return left, [command]
 
@@ -305,6 +306,21 @@ def eval_todo(run: Run, folder: Path, spec: Evaluation, subset: Subset, engines:
         missing.append(engine)
         command += ["--engine", engine]
     return (f"in {', '.join(missing)}", [command]) if missing else ("", [])
+
+
+def _with_tables(changes: dict[str, Any], config: Any) -> dict[str, Any]:
+    """Return nested changes of a configuration, with the fields that are tables as lists of names and values, which is
+    what their options take."""
+    found = {}
+    for name, value in changes.items():
+        default = getattr(config, name)
+        if isinstance(default, dict):
+            found[name] = list(chain.from_iterable(value.items()))
+        elif isinstance(value, dict):
+            found[name] = _with_tables(value, default)
+        else:
+            found[name] = value
+    return found
 
 
 def _xreset(verb: str, *words: object, **options: Any) -> list[str]:

@@ -20,10 +20,18 @@ from xreset.text import shown
 def _are_tensors(values: Any) -> bool:
     if not isinstance(values, dict):
         return False
-    return all(
-        isinstance(value, torch.Tensor) and bool(value.isfinite().all())
-        for value in values.values()
-    )
+    return all(map(_is_finite, values.values()))
+
+
+def _is_finite(value: Any) -> bool:
+    """Return whether a value is a tensor of finite numbers, all of which are stored.
+
+    One stored number may stand for any number of them, and testing these would fill the memory.
+    """
+    if not isinstance(value, torch.Tensor):
+        return False
+    is_stored = value.numel() * value.element_size() <= value.untyped_storage().nbytes()
+    return is_stored and bool(value.isfinite().all())
 
 
 def _is_optimizer(values: dict[str, Any]) -> bool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import shutil
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -161,9 +160,8 @@ def write_deployed(policy: bytes, contract: dict[str, Any], out: Path) -> None:
         raise PolicyError(f"{out} exists already. Choose another folder, or remove it.")
     with atomic_folder(out) as folder:
         (folder / files.POLICY).write_bytes(policy)
-        shutil.copytree(
-            Path(files.__file__).parent,
-            folder / "runtime",
-            ignore=shutil.ignore_patterns("__pycache__"),
-        )
+        runtime = folder / "runtime"
+        runtime.mkdir()
+        for module in Path(files.__file__).parent.glob("*.py"):
+            (runtime / module.name).write_bytes(module.read_bytes())
         write_json(folder / files.CONTRACT, contract)

@@ -46,29 +46,38 @@ def cached_pieces(mesh: trimesh.Trimesh, source: str, settings: Settings) -> Pie
     """
     cutter = [found.version for found in distributions(name="manifold3d")]
     identity = json.dumps([SCHEMA_NAME, source, asdict(settings), _ALGORITHM, cutter])
-    path = cache_folder() / "objects" / f"{hashlib.sha256(identity.encode()).hexdigest()}.npz"
-    if path.is_file():
-        try:
-            arrays = read_npz(path, SCHEMA_NAME, SCHEMA, what="cached convex pieces")
-            shapes = tuple(
-                hull(part) for part in np.split(arrays["vertices"], arrays["offsets"][1:-1])
-            )
-            numbers: dict[str, Any] = {name: arrays[name][()] for name in _NUMBERS}
-            finished = bool(arrays.get("finished", True))  # 0.2 kept no others
-            return Pieces(shapes=shapes, finished=finished, **numbers)
-        except (FileFormatError, ObjectError):
-            path.unlink(missing_ok=True)  # damaged: make it again
+    folder = cache_folder()
+    if folder is None:
+        return decompose(mesh, settings)
+    path = folder / "objects" / f"{hashlib.sha256(identity.encode()).hexdigest()}.npz"
+    with suppress(OSError):  # a cache that cannot be read or written costs time, nothing else
+        if path.is_file():
+            try:
+                return _read_pieces(path)
+            except (FileFormatError, ObjectError):
+                path.unlink(missing_ok=True)  # damaged: make it again
     pieces = decompose(mesh, settings)
     parts = [np.asarray(piece.geometry.vertices) for piece in pieces.shapes]
     arrays = {"vertices": np.concatenate(parts), "offsets": np.cumsum([0, *map(len, parts)])}
     arrays |= {name: np.asarray(getattr(pieces, name)) for name in (*_NUMBERS, "finished")}
-    with suppress(XResetError):  # a cache that cannot be written costs time, nothing else
+    with suppress(XResetError, OSError):
         write_npz(path, SCHEMA_NAME, arrays, inputs={"mesh": source})
     return pieces
 
 
-def cache_folder() -> Path:
-    """``XRESET_CACHE``, or ``xreset`` in the user's cache folder."""
+def _read_pieces(path: Path) -> Pieces:
+    arrays = read_npz(path, SCHEMA_NAME, SCHEMA, what="cached convex pieces")
+    shapes = tuple(hull(part) for part in np.split(arrays["vertices"], arrays["offsets"][1:-1]))
+    numbers: dict[str, Any] = {name: arrays[name][()] for name in _NUMBERS}
+    finished = bool(arrays.get("finished", True))  # 0.2 kept no others
+    return Pieces(shapes=shapes, finished=finished, **numbers)
+
+
+def cache_folder() -> Path | None:
+    """``XRESET_CACHE``, or ``xreset`` in the user's cache folder; None: the user has no home."""
     if os.environ.get("XRESET_CACHE"):
         return Path(os.environ["XRESET_CACHE"])
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "xreset"
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "xreset"
+    except RuntimeError:
+        return None

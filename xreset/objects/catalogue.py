@@ -11,7 +11,7 @@ from xreset.objects.meshes import import_mesh
 from xreset.objects.standins import STAND_INS, stand_in
 from xreset.objects.ycb import ALIAS_OF
 from xreset.spec import ObjectSpec
-from xreset.text import shown
+from xreset.text import short_name, shown
 
 ALIASES = {alias: name for name, alias in ALIAS_OF.items()}
 """The paper's names -> official names."""
@@ -99,7 +99,7 @@ def _key(name: str) -> str:
 def _keys(name: str) -> tuple[str, str]:
     """Return the names of an object with and without its number."""
     key = _key(name)
-    return key, key.partition("_")[2]
+    return key, short_name(key, "_")
 
 
 def load_object(name: str, meshes: str | Path | None = None) -> ObjectSpec:

@@ -166,7 +166,7 @@ def _mass(
             return MASSES[name], "published (YCB)"
         density = DEFAULT_DENSITY
         notes.append(
-            f"its mass is unknown: {density * volume:.3f} kg is assumed, by a density of"
+            f"its mass is unknown: {density * volume:.3g} kg is assumed, by a density of"
             f" {density:.0f} kg/m^3. State `mass` in {path.with_suffix('.toml').name}"
         )
     return density * volume, f"{density:g} kg/m^3"
@@ -248,7 +248,8 @@ def read_mesh(path: Path, *, scale: float = 1.0) -> trimesh.Trimesh:
     Raises:
         ObjectError: the file is missing, damaged, too large, empty or flat, or not in metres once scaled.
     """
-
+    if not scale > 0:
+        raise ObjectError(f"scale is {scale:g}, expected a number above 0.")
     mesh = load_mesh(path)
     try:
         if scale != 1.0:

@@ -23,6 +23,18 @@ OBJECT = -3
 MIN_FRICTION = 1e-4
 """Sliding friction of the object's own geoms, and the smallest of any pair."""
 
+MOST_BRAKING = 50.0
+"""Fastest deceleration [m/s^2] of sliding that a contact demands from the solver.
+
+MuJoCo solves contacts with friction as a convex problem. Its solution meets, for a contact that slides, not "no motion
+along the normal" but "a motion along the normal of mu times the slip that friction could not remove" (Anitescu 2006,
+Optimization-based simulation of nonsmooth rigid multibody dynamics; Castro et al. 2022, An unconstrained convex
+formulation of compliant contact). So a slab that starts to slide at 1 m/s hops by 10 mm, and a pushed one loses the
+finger and the table. De Saxce and Feng (1998, The bipotential method) give the cure: take mu times the slip from the
+motion along the normal that the contact asks for. Both engines do that with the slip at the beginning of a step, after
+they have limited it to what this deceleration removes. Without the limit, fast impacts would press deeper.
+"""
+
 
 @frozen
 class SceneModel:

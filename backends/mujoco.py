@@ -28,7 +28,7 @@ except ImportError as error:
     raise unavailable("mujoco", "'xreset[mujoco]'", error) from error
 
 from xreset.backends.mjcf import KNOWN_DIFFERENCES, compile_scene
-from xreset.backends.mjcf_model import MIN_FRICTION, SceneModel
+from xreset.backends.mjcf_model import MIN_FRICTION, MOST_BRAKING, SceneModel
 
 _FULL = (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL)
 """The engine's warnings that a buffer for contacts or constraints was full."""
@@ -118,12 +118,12 @@ class MujocoWorld(World):
         self._ctrl[:] = targets
 
     def step(self, n: int) -> None:
-        if self._ahead:
+        for _ in range(n):
+            if not self._ahead:
+                mujoco.mj_step1(self._model, self._data)
+            self._ahead = False
+            keep_sliding_contacts(self._data)
             mujoco.mj_step2(self._model, self._data)
-            n -= 1
-        if n:
-            mujoco.mj_step(self._model, self._data, n)
-        self._ahead = False
         before = self._overflows
         self._overflows = sum(warning.number for warning in self._full)
         self._overflowed = self._overflows > before
@@ -237,6 +237,27 @@ def _compiled(scene: SceneSpec, object_index: int) -> SceneModel:
     if model is None:
         model = _MODELS[key] = compile_scene(scene, object_index, sensors=True)
     return model
+
+
+def keep_sliding_contacts(data: mujoco.MjData) -> None:
+    """Lower the reference accelerations of contacts by what would throw sliding bodies up.
+
+    :data:`~xreset.backends.mjcf_model.MOST_BRAKING` has the reason. Call it between ``mj_step1`` and ``mj_step2``.
+    """
+    first = data.ne + data.nf + data.nl  # the rows of contacts come last
+    if first == data.nefc:
+        return
+    # of each contact: along the normal, two of sliding, one of spinning
+    reference = data.efc_aref[first:].reshape(-1, 4)
+    contact = data.contact
+    friction = contact.friction
+    if len(friction) > len(reference):
+        friction = friction[contact.efc_address >= 0]
+    braking = np.hypot(reference[:, 1], reference[:, 2])
+    if braking.max() > MOST_BRAKING:
+        reference[:, 1:3] *= (MOST_BRAKING / np.maximum(braking, MOST_BRAKING))[:, None]
+        braking = np.minimum(braking, MOST_BRAKING)
+    reference[:, 0] -= np.hypot(friction[:, 0] * braking, friction[:, 2] * reference[:, 3])
 
 
 def _rotate(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:

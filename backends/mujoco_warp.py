@@ -291,7 +291,7 @@ class MujocoWarpBackend(Backend):
 
         Even on the CPU a graph saves most of the time.
         """
-        step = partial(engine_step(self._warp_device, self._model), self._model, self._data)
+        step = partial(engine_step(self._warp_device), self._model, self._data)
         # The kinematics of the present positions are always there: a step begins after them, and all that changes them
         # ends with them.
         kinematics = partial(mjw.fwd_kinematics, self._model, self._data)

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import warp as wp
 
-from xreset.backends.mjcf_model import OBJECT
+from xreset.backends.mjcf_model import MOST_BRAKING, OBJECT
 from xreset.backends.rigid import TABLE
 
 _OBJECT = wp.constant(OBJECT)
 _TABLE = wp.constant(TABLE)
+_MOST_BRAKING = wp.constant(MOST_BRAKING)
+_Frictions = wp.types.vector(length=5, dtype=float)
 
 
 @wp.func
@@ -284,3 +286,36 @@ def read_contacts(
         wp.atomic_add(tip_force, world, other, force)
         if local[0] > 0.0:
             tip_touch[world, other] = True
+
+
+@wp.kernel(enable_backward=False)
+def keep_sliding_contacts(
+    nacon: wp.array[int],
+    naconmax: int,
+    contact_world: wp.array[int],
+    contact_efc: wp.array2d[int],
+    contact_friction: wp.array[_Frictions],
+    # In and out.
+    reference: wp.array2d[float],
+):
+    """Take from a contact's reference acceleration what would throw sliding bodies up; see ``MOST_BRAKING``."""
+    contact = wp.tid()
+    if contact >= wp.min(nacon[0], naconmax):
+        return
+    normal = contact_efc[contact, 0]
+    first = contact_efc[contact, 1]
+    second = contact_efc[contact, 2]
+    spin = contact_efc[contact, 3]
+    if normal < 0 or spin < 0:  # the contact is too far, or there was no room for it
+        return
+    world = contact_world[contact]
+    friction = contact_friction[contact]
+    slip = wp.vec2(reference[world, first], reference[world, second])
+    braking = wp.length(slip)
+    if braking > _MOST_BRAKING:
+        slip = slip * (_MOST_BRAKING / braking)
+        reference[world, first] = slip[0]
+        reference[world, second] = slip[1]
+    sliding = friction[0] * wp.length(slip)
+    spinning = friction[2] * reference[world, spin]
+    reference[world, normal] -= wp.sqrt(sliding * sliding + spinning * spinning)

@@ -42,10 +42,15 @@ def correct_engine() -> None:
     )
 
 
-def engine_step(device: Any, model: Any) -> Callable[[Any, Any], None]:
+def engine_step(device: Any) -> Callable[[Any, Any], None]:
     """Return what advances a model and data, whose kinematics are there, by one step."""
     step = _replacement("mujoco_warp_step")
-    if step is None or model.opt.integrator != mjw.IntegratorType.IMPLICITFAST:
+    if step is None:
+        warnings.warn(
+            f"MuJoCo-Warp {mjw.__version__} steps in another way than {_TESTED}: objects that slide hop. Install "
+            f"mujoco-warp=={_TESTED}",
+            stacklevel=3,
+        )
         return mjw.step
     return partial(step.forked_step, wp.Stream(device) if device.is_cuda else None)
 

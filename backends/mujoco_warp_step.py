@@ -13,6 +13,8 @@ import warp as wp
 from mujoco_warp._src import forward
 from mujoco_warp._src.smooth import tendon_armature
 
+from xreset.backends import mujoco_warp_kernels as kernels
+
 ORIGINAL = (forward.step, forward._forward, forward.fwd_position)
 """The engine's functions that :func:`forked_step` replaces."""
 KNOWN_SOURCE = "f65bf1f9a5f3ba09"
@@ -33,6 +35,18 @@ def constraints(m: Any, d: Any) -> None:
     """Find contacts and rows of constraints."""
     mjw.collision(m, d)
     mjw.make_constraint(m, d)
+    keep_contacts(d)
+
+
+def keep_contacts(d: Any) -> None:
+    """Keep sliding objects on the table: see :data:`~xreset.backends.mjcf_model.MOST_BRAKING`."""
+    contact = d.contact
+    wp.launch(
+        kernels.keep_sliding_contacts,
+        dim=d.naconmax,
+        inputs=[d.nacon, d.naconmax, contact.worldid, contact.efc_address, contact.friction],
+        outputs=[d.efc.aref],
+    )
 
 
 def finish(m: Any, d: Any) -> None:

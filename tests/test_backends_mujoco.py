@@ -12,6 +12,7 @@ import mujoco
 import mujoco_warp
 import numpy as np
 import torch
+from mujoco_warp._src import constraint
 from torch import tensor
 from torch.testing import assert_close
 
@@ -26,7 +27,13 @@ from xreset.backends.mjcf_model import SceneModel
 from xreset.backends.mujoco import MujocoBackend, MujocoWorld
 from xreset.backends.mujoco_warp import MujocoWarpBackend
 from xreset.backends.mujoco_warp_setup import contact_room, differing_fields
-from xreset.backends.mujoco_warp_step import constraints, finish, forked_step, smooth_dynamics
+from xreset.backends.mujoco_warp_step import (
+    constraints,
+    finish,
+    forked_step,
+    keep_contacts,
+    smooth_dynamics,
+)
 from xreset.errors import BackendUnavailableError, ObjectError, RobotError, XResetError
 from xreset.plugins import device_for, make_backend
 from xreset.spec import FingertipSpec, SceneSpec
@@ -265,8 +272,16 @@ class Steps(TestCase):
             smooth_dynamics(m, d)
             finish(m, d)
 
+        def make_constraint(m, d):
+            mujoco_warp.make_constraint(m, d)
+            keep_contacts(d)
+
+        def engine_step(m, d):
+            with patch.object(constraint, "make_constraint", make_constraint):
+                mujoco_warp.step(m, d)
+
         results = []
-        for step in (mujoco_warp.step, partial(forked_step, None), reversed_step):
+        for step in (engine_step, partial(forked_step, None), reversed_step):
             with (
                 patch.object(mujoco_warp_backend, "engine_step", return_value=step),
                 MujocoWarpBackend(scene(), 8) as backend,

@@ -467,16 +467,20 @@ class FrictionSquared(MujocoWorld):
         super().set_friction(np.square(friction))
 
 
-@breaks("sliding_height")
+@breaks("sliding_height", "pushed_object")
 class SlidingObjectsThrownUp(MujocoWorld):
-    def set_state(self, state):
-        super().set_state(state)
-        self._object_linvel[2] += 0.6 * np.linalg.norm(state["object_linvel"][:2])
+    """As MuJoCo's own step does."""
+
+    def step(self, n):
+        mujoco.mj_step(self._model, self._data, n)
+        self._ahead = False
 
 
-@remodelled("slope")
-def friction_pyramid(model, at):
-    model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+@breaks("slope")
+class FrictionPyramid(SlidingObjectsThrownUp):
+    def __init__(self, scene, object_index):
+        super().__init__(scene, object_index)
+        self._model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
 
 
 @breaks("torsional_friction_set")

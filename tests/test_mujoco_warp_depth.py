@@ -2,7 +2,7 @@
 
 import warnings
 from unittest import TestCase
-from unittest.mock import Mock, patch
+from unittest.mock import patch
 
 import mujoco
 import mujoco_warp as mjw
@@ -95,23 +95,18 @@ class OtherVersions(TestCase):
         correct.assert_not_called()
 
     def test_what_is_corrected_depends_on_the_code_and_not_on_the_version(self):
-        model = Mock()
-        model.opt.integrator = mjw.IntegratorType.IMPLICITFAST
         with patch.object(mjw, "__version__", "4.0.1"), warnings.catch_warnings():
             warnings.simplefilter("error")
             correct_engine()
-            self.assertIs(
-                engine_step(wp.get_device("cpu"), model).func, mujoco_warp_step.forked_step
-            )
+            self.assertIs(engine_step(wp.get_device("cpu")).func, mujoco_warp_step.forked_step)
         self.assertIs(collision_convex.multicontact, mujoco_warp_depth.multicontact_with_depth)
 
-    def test_another_step_or_integrator_is_left_to_the_engine(self):
-        model = Mock()
-        model.opt.integrator = mjw.IntegratorType.EULER
-        self.assertIs(engine_step(wp.get_device("cpu"), model), mjw.step)
-        model.opt.integrator = mjw.IntegratorType.IMPLICITFAST
-        with patch.object(mujoco_warp_step, "KNOWN_SOURCE", "another"):
-            self.assertIs(engine_step(wp.get_device("cpu"), model), mjw.step)
+    def test_another_step_is_left_to_the_engine_and_said(self):
+        with (
+            patch.object(mujoco_warp_step, "KNOWN_SOURCE", "another"),
+            self.assertWarnsRegex(UserWarning, "objects that slide hop"),
+        ):
+            self.assertIs(engine_step(wp.get_device("cpu")), mjw.step)
 
     def test_the_log_level_of_the_process_stays_as_it_was(self):
         level = wp.config.log_level

@@ -24,6 +24,7 @@ _FOOT = 0.02  # m from the frame of the foot down to its sole
 _DEPTH = 0.01  # m that the target is below the surface: 10 N
 _FRICTIONS = ((0.4, 0.7, 0.9), (0.6, 0.3, 0.5))  # each of the three is once the largest of a pair
 _DRAG = 0.01  # m/s
+_PUSH = 0.2  # m/s
 
 
 def pressing(bench: Bench) -> Measured:
@@ -101,6 +102,32 @@ def robot_friction(bench: Bench) -> Measured:
                 )
             )
     return {f"on the {place}": found for place, found in errors.items()}
+
+
+def pushed_object(bench: Bench) -> Measured:
+    """Push an object along the table: from 0.1 s after the impact on, the foot and the table touch it in every step."""
+    scene = _scene(bench, presser(thumb=("foot",)))
+    start = _on(scene, ["object"], depth=0.0)
+    slide = scene.robot.joint_names.index("slide")
+    press = scene.robot.joint_names.index("press")
+    half = scene.objects[0].vertices[:, 0].max()
+    target = start.joint_pos.clone()
+    target[:, slide] -= half + _FOOT
+    target[:, press] -= 0.035  # the sole is 5 mm above the table
+    start = replace(start, joint_pos=target, joint_target=target.clone())
+    forces = []
+    with bench.other(scene) as worlds:
+        worlds.set(start)
+        for _ in range(round(0.6 / scene.timestep)):
+            target[:, slide] += _PUSH * scene.timestep
+            worlds.set_targets(target)
+            worlds.step(1)
+            contacts = worlds.contacts()
+            forces.append(torch.stack((contacts.tip_force[0, 0, 0], contacts.table_force[0, 2])))
+    pushing = torch.stack(forces) > 0.01 * GRAVITY * scene.objects[0].mass
+    touched = int(pushing[:, 0].nonzero()[0])
+    away = 1.0 - pushing[touched + round(0.1 / scene.timestep) :].float().mean(0)
+    return {"without the foot": away[0], "without the table": away[1]}
 
 
 def joint_friction(bench: Bench) -> Measured:

@@ -10,7 +10,7 @@ import tracemalloc
 import zipfile
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
-from errno import ENOSPC
+from errno import EACCES, EMFILE, ENOSPC
 from typing import ClassVar, Literal
 from unittest import TestCase
 from unittest.mock import patch
@@ -346,6 +346,13 @@ class NpzTest(InFolder):
                 file.write_bytes(content)
                 with self.refused(words):
                     read_toml(file, "test/1")
+
+    def test_a_file_that_may_not_be_read_is_not_called_damaged(self):
+        self.write()
+        for number, words in ((EACCES, "Permission denied"), (EMFILE, "Too many open")):
+            wrong = OSError(number, os.strerror(number))
+            with patch("xreset.files.os.open", side_effect=wrong), self.refused(words):
+                self.read()
 
     def test_wrong_schema_and_version(self):
         self.write("test/2")

@@ -400,7 +400,8 @@ def file_hash(path: str | Path) -> str:
 
 
 def must_exist(path: Path, what: str) -> None:
-    """Refuse, with ``FileFormatError``, a path where no regular file is; ``what`` it ought to be is for the message."""
+    """Refuse, with ``FileFormatError``, a path where no regular file is, or one that may not be read; ``what`` it ought
+    to be is for the message."""
     try:
         mode = path.stat().st_mode
     except FileNotFoundError:
@@ -412,6 +413,10 @@ def must_exist(path: Path, what: str) -> None:
         raise FileFormatError(f"there is no {shown(str(path))} ({what}): {error}.") from error
     if not stat.S_ISREG(mode):
         raise FileFormatError(f"{path} is a folder or a device, expected a file ({what}).")
+    try:
+        os.close(os.open(path, os.O_RDONLY))
+    except OSError as error:  # no right to read it, or too many open files
+        raise FileFormatError(f"{path} cannot be read: {error.strerror}.") from error
 
 
 def check_suffix(name: str, path: str | Path, suffix: str) -> None:

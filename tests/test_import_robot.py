@@ -478,6 +478,9 @@ class Toy(Robots):
         ):
             with self.subTest(words):
                 self.assertRaisesRegex(RobotError, words, self.read, "hand.urdf", text)
+        asset = '<asset><mesh file="tip.stl"/></asset><worldbody>'
+        text = MJCF.replace("<worldbody>", asset)
+        self.assertRaisesRegex(RobotError, "tip.stl is a Git LFS p", self.read, "hand.xml", text)
 
     def test_a_narrow_vote_names_the_other_finger_and_the_user_decides(self):
         """Names of five fingers count from the thumb on; of four they say nothing."""

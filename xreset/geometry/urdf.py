@@ -283,7 +283,9 @@ def parse_xml(path: Path) -> Element:
         refuse_pointer(path)
         parser.Parse(path.read_bytes(), True)
         root = builder.close()
-    except (OSError, expat.ExpatError, ObjectError, ValueError, LookupError) as error:
+    except ObjectError as error:
+        raise RobotError(str(error)) from error
+    except (OSError, expat.ExpatError, ValueError, LookupError) as error:
         raise RobotError(f"{path} cannot be read as XML: {shown(str(error))}") from error
     _refuse_xacro(path, root)
     for element in root.iter():

@@ -202,7 +202,9 @@ class Hand:
             drives.append(set.union(*map(self._drives_of, own)))
             begins.append([self._at[finger.links[0]][:3, 3] for finger in own])
         gaps = [cdist(a, b).min() for a, b in combinations(begins, 2)]
-        if not gaps or min(gaps) < _HANDS_APART or any(a & b for a, b in combinations(drives, 2)):
+        thumbs = [one for one in self._chains() if one.name == "thumb"]
+        is_one = not gaps or (min(gaps) < _HANDS_APART and len(thumbs) < 2)
+        if is_one or any(a & b for a, b in combinations(drives, 2)):
             return self.tree
         tree = self.tree
         for child, own in hands.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import tempfile
@@ -15,7 +16,7 @@ import numpy as np
 
 from xreset.errors import ObjectError, RobotError
 from xreset.files import RAISE_LIMIT, max_bytes
-from xreset.geometry.shapes import hull, transform
+from xreset.geometry.shapes import hull, refuse_pointer, transform
 from xreset.geometry.urdf import HULL_TOLERANCE, Joint, Link, RobotTree, check_tree
 from xreset.geometry.urdf_writer import fixed, frame
 from xreset.robot_tools.couplings import SLIDE, Couplings, Pull, joint_name
@@ -109,6 +110,7 @@ def _compiled(path: Path) -> mujoco.MjModel:
         command = [sys.executable, "-P", "-c", _COMPILE, str(path.resolve()), binary, str(most)]
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, errors="replace")
         if done.returncode == 1 and "alloc" not in done.stdout:
+            _refuse_pointers([path.parent / name for name in re.findall("'([^']+)'", done.stdout)])
             raise RobotError(f"{path} is not valid MJCF: {done.stdout.strip()}")
         if done.returncode:
             raise RobotError(
@@ -116,6 +118,15 @@ def _compiled(path: Path) -> mujoco.MjModel:
                 f"what a robot does not need, such as textures, height fields and sensors. {RAISE_LIMIT}"
             )
         return mujoco.MjModel.from_binary_path(binary)
+
+
+def _refuse_pointers(files: list[Path]) -> None:
+    try:
+        for file in files:
+            if file.is_file():
+                refuse_pointer(file)
+    except ObjectError as error:
+        raise RobotError(str(error)) from error
 
 
 def _check_numbers(path: Path, model: mujoco.MjModel) -> None:

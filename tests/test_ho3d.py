@@ -100,7 +100,10 @@ class Ho3d(InFolder):
             ("objName is", {"objName": lambda i, v: ("thing",)}),
             ("no frame with an object", {"objTrans": lambda i, v: v * np.nan}),
             ("object changes", {"objName": lambda i, v: f"thing_{i}"}),
-            ("Use --order", {"handJoints3D": lambda i, v: None if v is None else v[WRONG_ORDER]}),
+            (
+                "State the order",
+                {"handJoints3D": lambda i, v: None if v is None else v[WRONG_ORDER]},
+            ),
         ):
             self.write(**changes)
             self.refused(words)

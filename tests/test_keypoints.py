@@ -127,18 +127,18 @@ class Synthetic(InFolder):
         from_wrist = points - points[:, :1]
         swelling = np.linspace(0.4, 2.5, len(points))[:, None, None]
         for words, changed in (
-            ("Is --units m right", 1e3 * points),
-            ("Use --order mano", written(points, "mano")),
-            ("centred on the hand", points - points.mean(axis=1, keepdims=True)),
-            ("so the keypoints are not metric", points[:, :1] + swelling * from_wrist),
+            ("Is the unit right", 1e3 * points),
+            ("--order mano", written(points, "mano")),
+            ("relative to the hand", points - points.mean(axis=1, keepdims=True)),
+            ("The keypoints are not metric", points[:, :1] + swelling * from_wrist),
         ):
             self.refused(words, keypoints=changed)
         other = "It is the other hand .*or the coordinates are left-handed"
         self.refused(other, side=np.array("left"))
         self.refused("file says 20 frames per second, but --fps says 10", fps=np.array(20.0))
         for words, changes in (
-            ("Is --units mm right", {"units": "mm"}),
-            ("Use --order (mediapipe|openpose)", {"order": "mano"}),
+            ("Is the unit right", {"units": "mm"}),
+            ("--order mediapipe", {"order": "mano"}),
             ("file says side 'right', but --side says 'left'", {"side": "left"}),
         ):
             self.refused(words, replace(PLAIN, **changes))
@@ -147,7 +147,7 @@ class Synthetic(InFolder):
         seen["object_quat_wxyz"] = turn.as_quat(scalar_first=True)
         self.refused("Are these the camera's coordinates", **seen)
         inverse = replace(PLAIN, frame="camera", table_from_camera=np.linalg.inv(CAMERA))
-        self.refused("or is that matrix the inverse", inverse, **seen)
+        self.refused("matrix may be inverted: its inverse puts", inverse, **seen)
 
     def test_damage_is_named(self):
         self.refused("no frame has all 21 keypoints", keypoints=np.full_like(self.points, np.nan))
@@ -177,6 +177,15 @@ class Synthetic(InFolder):
         time[-1] = 2e8
         self.refused("more than 100000 frames", replace(PLAIN, fps=30.0), time=time)
 
+    def test_rounded_times_have_the_rate_that_was_meant(self):
+        frames = np.arange(len(self.points))
+        for rate, digits in ((60.0, 6), (60.0, 3), (120.0, 4), (30 / 1.001, 6), (25.3, 6)):
+            time = (1.7e9 + frames / rate).round(digits)
+            with self.subTest(rate=rate, digits=digits):
+                demos = read_keypoints(self.npz(time=time), replace(PLAIN, fps=None))
+                self.assertAlmostEqual(demos.fps, rate, delta=1e-3)
+        self.refused("file says 30 frames", replace(PLAIN, fps=None), time=time, fps=np.array(30.0))
+
     def test_names_and_frames_without_a_hand(self):
         self.points[:3] = np.nan
         for name, official in (("soup", "005_tomato_soup_can"), ("my_cup", "my_cup")):
@@ -199,13 +208,23 @@ class Synthetic(InFolder):
                 re.sub(r"(?m)(^a,[^,]*,right,0.9,)[^,]*", r"\1oops", first),
             ),
             ("lacks the columns .*z20", first.replace("z20", "depth")),
-            ("shorter than", first.split("\n")[0] + "\n3\n"),
+            ("line 2 has 1 cells, .* 74 columns.*cut off", first.split("\n")[0] + "\n3\n"),
+            ("separated by semicolons", first.replace(",", ";")),
+            ("more than 21 keypoints, such as x21.*OpenXR", first.replace("confidence", "x21")),
             ("same name", first.replace("z20", "z19")),
             ("column side changes", first.replace(",right,", ",left,", 1)),
         ):
             path.write_text(text)
             with self.subTest(words), self.assertRaisesRegex(DemoError, words):
                 read_keypoints(path, PLAIN)
+
+    def test_comments_capitals_and_a_side_with_one(self):
+        path = self.folder / "A.CSV"
+        columns = {"object": "soup", "side": "Right"}
+        write_csv(path, self.points, self.demos.object_pos, self.turn, columns=columns)
+        path.write_text(f"# a tracker\n{path.read_text()}# the end\n")
+        self.same(read_keypoints(path, PLAIN))
+        self.same(read_keypoints(self.folder, PLAIN))
 
     def test_command(self):
         source = self.folder / "in"

@@ -9,7 +9,7 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from torch import tensor
 
-from tests.command import succeeds
+from tests.command import refused, succeeds
 from tests.data import InOneFolder, data_dir
 from tests.toy_retarget import FLOAT, arm_targets, box_object, check_gradient, double, hand_targets
 from tests.toy_robot import toy_motion, toy_robot
@@ -20,7 +20,7 @@ from xreset.geometry.collision import table_clearance
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_angle, quat_from_axis_angle, quat_to_matrix
 from xreset.geometry.surface import Surface
-from xreset.records import arrays_of, write_npz
+from xreset.records import arrays_of, stated_doubts, write_npz
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.arm.model import ArmModel
 from xreset.retarget.arm.solve import track
@@ -349,20 +349,18 @@ class PipelineTest(InOneFolder):
         self.assertEqual(np.flatnonzero(self.result.contact[self.first])[0], first)
         self.assertGreater(first, 0)
 
-    def test_a_hand_far_from_a_moving_object_is_warned_of(self):
-        assert_array_equal(self.result.untouched, [False, False])
-        contact = self.result.contact.copy()
-        contact[self.first][self.result.first_contact[0] + 2 :] = False
-        gone = replace(self.result, contact=contact)
-        assert_array_equal(gone.untouched, [True, False])
-        away = self.demos.select(indices=[0])
-        away = replace(away, hand_keypoints=away.hand_keypoints + np.float32(0.3))
-        left = np.full(1, "left")
-        write_demos(f"{self.folder}/away.npz", replace(away, hand_side=left))
+    def test_a_wrong_recording_is_refused_unless_it_is_trusted(self):
+        left = replace(self.demos.select(indices=[0]), hand_side=np.full(1, "left"))
+        write_demos(f"{self.folder}/left.npz", left)
         quick = "--robot ur7e-sharpa --hand.tolerance 0.1 --arm.restarts 1 --arm.branches 1"
-        said = self.commanded("away", quick)
-        self.assertIn("In 1 of 1 sequences the object moves while no hand", said)
+        out = self.folder / "left-robot.npz"
+        words = "As a left hand its fingers bend"
+        said = refused("retarget", f"{self.folder}/left.npz", "--out", out, *quick.split())
+        self.assertIn(words, said)
+        said = self.commanded("left", f"{quick} --trust-recordings")
+        self.assertIn(words, said)
         self.assertIn("1 of 1 sequences are of left hands", said)
+        self.assertIn(words, stated_doubts(out)[0])
 
     def test_the_file_says_what_the_robot_does(self):
         result = self.result

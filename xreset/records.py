@@ -29,7 +29,7 @@ from xreset.files import (
     max_bytes,
     must_exist,
 )
-from xreset.text import is_plain, shown
+from xreset.text import is_plain, plain, shown
 
 T = TypeVar("T")
 
@@ -371,6 +371,30 @@ def write_record(
     if problem := record_problem(cls, arrays, check):
         raise error(f"{path} was not written, because it could not be read: {problem}")
     write_npz(path, schema_name, arrays, **provenance)
+
+
+def read_meta(path: str | Path) -> dict[str, Any]:
+    """Return what an npz file states about its making: ``config``, ``inputs``; empty if it states nothing.
+
+    Raises:
+        FileFormatError: the file is missing or damaged.
+    """
+    field = {"meta": Field((), "U", required=False)}
+    text = read_npz(path, None, field, what="a file of xreset").get("meta")
+    try:
+        meta = json.loads(str(text))
+    except (ValueError, RecursionError):
+        return {}
+    return meta if isinstance(meta, dict) else {}
+
+
+def stated_doubts(path: str | Path) -> list[str]:
+    """Return the doubts about demonstrations that a file made from them states in its configuration."""
+    config = read_meta(path).get("config")
+    doubts = config.get("doubts") if isinstance(config, dict) else None
+    if not isinstance(doubts, list):
+        return []
+    return [plain(text) for text in doubts if isinstance(text, str)]
 
 
 def record_problem(cls: type, arrays: Arrays, check: Callable[[Arrays], str | None]) -> str | None:

@@ -66,6 +66,8 @@ def import_keypoints(
     object: str | None = None,
     side: Literal["right", "left"] | None = None,
     subject: str = "unknown",
+    meshes: Path | None = None,
+    trust_recordings: bool = False,
 ) -> None:
     """Read 21 hand keypoints and object poses of any tracker and write an archive of demonstrations.
 
@@ -83,6 +85,8 @@ def import_keypoints(
         object: Name of the grasped object, if the files do not state it.
         side: Side of the hand, if the files do not state it.
         subject: Name of the person, if the files do not state it.
+        meshes: Folder of the objects' meshes, to examine the recordings with.
+        trust_recordings: Take recordings that are certainly wrong all the same.
     """
     from xreset.demos.keypoints import Convention, read_keypoints, read_transform
 
@@ -97,14 +101,14 @@ def import_keypoints(
         side=side,
         subject=subject,
     )
-    demos = read_keypoints(path, convention)
+    demos = read_keypoints(path, convention, meshes=meshes, trust=trust_recordings)
     config = {
         "dataset": "keypoints",
         **vars(convention),
         "table_from_camera": None if T is None else T.tolist(),
     }
     inputs = {"keypoints": path} if path.is_file() else {}
-    _save(demos, out, config, **inputs)
+    _save(demos, out, config, meshes, **inputs)
 
 
 def synth(
@@ -290,13 +294,14 @@ def add_noise(
     )
 
 
-def describe(file: Source) -> None:
+def describe(file: Source, *, meshes: Path | None = None) -> None:
     """Describe an archive of demonstrations, object by object, and warn of implausible sequences.
 
     Args:
         file: The archive.
+        meshes: Folder of the objects' meshes, to examine the recordings with.
     """
-    _print_summary(_read(file), file)
+    _print_summary(_read(file), file, meshes)
 
 
 def _read(file: Path) -> Demos:
@@ -305,18 +310,22 @@ def _read(file: Path) -> Demos:
     return read_demos(file)
 
 
-def _save(made: Demos, out: Path, config: dict[str, Any], **inputs: Path) -> None:
-    """Write demonstrations and print their summary; inputs: the files that they were made from, by kind."""
+def _save(
+    made: Demos, out: Path, config: dict[str, Any], meshes: Path | None = None, **inputs: Path
+) -> None:
+    """Write demonstrations and print their summary; meshes: what to examine them with; inputs: the files that they
+    were made from, by kind."""
     from xreset.demos.archive import write_demos
 
     write_demos(
         out, made, config=config, inputs={name: file_hash(path) for name, path in inputs.items()}
     )
-    _print_summary(made, out)
+    _print_summary(made, out, meshes)
 
 
-def _print_summary(demos: Demos, path: Path) -> None:
-    from xreset.demos.plausible import doubts, start_to_goal
+def _print_summary(demos: Demos, path: Path, meshes: Path | None) -> None:
+    from xreset.demos.archive import start_to_goal
+    from xreset.demos.examine import examine, surfaces_of
 
     table = [("object", "right", "left", "frames", "hand", "lift, cm", "goal, cm", "goal, deg")]
     for name in demos.object_names:
@@ -344,7 +353,7 @@ def _print_summary(demos: Demos, path: Path) -> None:
     console.print(
         f"{path}: {demos.num_sequences} sequences, {demos.num_frames} frames at {demos.fps:g} per second"
     )
-    show_notes(doubts(demos))
+    show_notes(map(str, examine(demos, surfaces_of(demos, meshes))))
 
 
 COMMAND = {

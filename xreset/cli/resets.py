@@ -54,6 +54,7 @@ def resets(
         )
     from xreset.description import load_robot
     from xreset.objects.catalogue import load_objects
+    from xreset.records import stated_doubts
     from xreset.resets.bank import write_bank
     from xreset.resets.filter import make_bank
     from xreset.resets.settle import settle_starts
@@ -63,6 +64,8 @@ def resets(
     engines = list(dict.fromkeys(engine)) or ["mujoco"]
     motion = read_retargeted(retargeted)
     stated = object_sources(retargeted)
+    doubts = stated_doubts(retargeted)
+    show_notes(doubts)
     made_from = {"retargeted": file_hash(retargeted)}
     spec = load_robot(robot or motion.robot)
     check_retargeted(retargeted, motion, spec)
@@ -99,6 +102,7 @@ def resets(
         "closing": asdict(closing),
         "squeeze": asdict(squeeze),
         "settle": settle,
+        "doubts": doubts,
     }
     if transfer.per_pose:
         config["transfer"] = asdict(transfer)

@@ -21,6 +21,7 @@ def retarget(
     out: Path,
     meshes: Meshes = None,
     max_per_object: int | None = None,
+    trust_recordings: bool = False,
     device: str = "cpu",
     hand: HandConfig = HandConfig(),
     arm: ArmConfig = ArmConfig(),
@@ -32,12 +33,12 @@ def retarget(
         robot: Name of a robot, or the folder of its description.
         out: File to write.
         max_per_object: Use only the first sequences of each object, at most this many.
+        trust_recordings: Use demonstrations that are certainly wrong all the same.
         device: Where hand retargeting runs: cpu or cuda. The arm runs on the CPU.
         hand: Weights of hand retargeting.
         arm: Weights and effort of the arm's inverse kinematics.
     """
-    from xreset.demos.archive import demo_objects, levelled, on_something, read_demos
-    from xreset.demos.plausible import doubts
+    from xreset.demos.archive import demo_objects, read_demos
     from xreset.description import load_robot
     from xreset.retarget.file import write_retargeted
     from xreset.retarget.pipeline import RetargetConfig, retarget_demos
@@ -46,7 +47,6 @@ def retarget(
     chosen = read_demos(demos)
     if max_per_object is not None:
         chosen = chosen.select(max_per_object=max_per_object)
-    show_notes(doubts(chosen))
     if left := np.count_nonzero(chosen.hand_side == "left"):
         show_notes(
             [
@@ -55,6 +55,12 @@ def retarget(
         )
     specs = demo_objects(chosen, meshes)
     config = RetargetConfig(hand=hand, arm=arm)
+    doubts = []
+
+    def note(doubt: str) -> None:
+        doubts.append(doubt)
+        show_notes([doubt])
+
     with Progress() as bar:
         result = retarget_demos(
             chosen,
@@ -63,11 +69,18 @@ def retarget(
             config,
             progress=bar.count("sequences"),
             device=device,
+            trust=trust_recordings,
+            note=note,
         )
     write_retargeted(
         out,
         result,
-        config={"retarget": asdict(config), "robot": robot, "max_per_object": max_per_object},
+        config={
+            "retarget": asdict(config),
+            "robot": robot,
+            "max_per_object": max_per_object,
+            "doubts": doubts,
+        },
         inputs={"demos": file_hash(demos), "robot": spec.fingerprint}
         | {f"object {s.name}": s.source for s in specs.values()},
     )
@@ -78,19 +91,6 @@ def retarget(
     tips = result.hand_error[result.annotated]
     if len(tips):
         console.print(f"fingertips are {1e3 * tips.mean():.1f} mm from the human's on average")
-    if len(untouched := result.sequence_name[result.untouched]):
-        show_notes(
-            [
-                f"In {len(untouched)} of {len(chosen)} sequences the object moves while no hand touches it. Are both in"
-                " the same frame, and recorded at the same times? Repair them, or leave them out (xreset demos split)."
-                f" First: {untouched[0]}."
-            ]
-        )
-    for index in np.flatnonzero(on_something(levelled(chosen), specs)):
-        console.print(
-            f"{chosen.sequence_name[index]}: the object starts on top of something that is not in the scene; "
-            "it was not lowered to the table."
-        )
     console.print(f"{int(result.valid.sum())} valid frames of {len(result.valid)} in {out}")
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from rich.progress import track
 
 from xreset.cli._common import Host, Meshes, Port, Robot, Source
-from xreset.cli._terminal import console
+from xreset.cli._terminal import console, show_notes
 from xreset.errors import XResetError
 from xreset.files import write_whole
 from xreset.pictures.view import data
@@ -44,6 +44,7 @@ def view(
     from xreset.pictures.view import load
 
     shown = load.load_view(file, demos=demos, robot=robot, meshes=meshes)
+    show_notes(shown.notes)
     if png is None and mp4 is None:
         _serve(shown, host, port, sequence, frame or 0)
         return

@@ -41,6 +41,8 @@ SIDES = ("right", "left")
 _ON_TABLE = 0.020
 """Largest height above the table at which an object counts as standing on it [m]. In 270 sequences of DexYCB all but
 one are within 12 mm; that one is 44 mm up."""
+_SAME_RATE = 1e-4
+"""Frame rates that differ by less than this share are rounded ones: 59.999 and 60."""
 _HAND = 0.5
 """Largest distance of a keypoint from its wrist [m]; the longest hand on record has 0.33 m."""
 OneText = Annotated[str, Field((), "U")]
@@ -308,9 +310,10 @@ def merge_demos(parts: Sequence[Demos]) -> Demos:
     if not parts:
         raise DemoError("There are no demonstrations to join.")
     rates = sorted({round(float(part.fps), 3) for part in parts})
-    if len(rates) > 1:
+    if rates[-1] > (1 + _SAME_RATE) * rates[0]:
         raise DemoError(
-            f"Demonstrations in one file must have one frame rate, but these have the frame rates {rates}."
+            f"Demonstrations in one file must have one frame rate, but these have the frame rates {rates}. Import them"
+            " with --fps, which resamples files that have times."
         )
     parts = [levelled(part) for part in parts]
     joined = {}
@@ -376,11 +379,6 @@ def _start_height(demos: Demos, objects: Mapping[str, ObjectSpec]) -> np.ndarray
     return np.array(heights)
 
 
-def on_something(demos: Demos, objects: Mapping[str, ObjectSpec]) -> np.ndarray:
-    """[S] bool: whether the object starts so high that it must stand on something else than the table."""
-    return _start_height(demos, objects) > _ON_TABLE
-
-
 def grounded(demos: Demos, objects: Mapping[str, ObjectSpec]) -> Demos:
     """Shift every sequence along z so that its object's lowest vertex is at z = 0 in the first frame.
 
@@ -396,6 +394,14 @@ def grounded(demos: Demos, objects: Mapping[str, ObjectSpec]) -> Demos:
         hand_keypoints=(demos.hand_keypoints + shift[:, None]).astype(demos.hand_keypoints.dtype),
         object_pos=(demos.object_pos + shift).astype(demos.object_pos.dtype),
     )
+
+
+def start_to_goal(demos: Demos) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distance [S] in metres and the angle [S] in radians from each object's first to its last pose."""
+    start_pos, start_quat = demos.start_pose
+    goal_pos, goal_quat = demos.goal_pose
+    turn = turn_of(goal_quat) * turn_of(start_quat).inv()
+    return np.linalg.norm(goal_pos - start_pos, axis=1), turn.magnitude()
 
 
 def read_demos(path: str | Path) -> Demos:

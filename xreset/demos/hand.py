@@ -6,12 +6,23 @@ thumb is on the +z side; a left hand is the mirror image in x. Lengths are round
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation  # which the help of `xreset view` must not load
+
+Order = Literal["mano", "mediapipe", "openpose"]
+ORDERS: Mapping[Order, tuple[int, ...]] = {
+    "mano": (0, 13, 14, 15, 16, 1, 2, 3, 17, 4, 5, 6, 18, 10, 11, 12, 19, 7, 8, 9, 20),
+    "mediapipe": tuple(range(21)),
+    "openpose": tuple(range(21)),
+}
+"""Index of each of :data:`xreset.spec.KEYPOINTS` in another order. MANO: the 16 joints of the model (wrist, index,
+middle, little, ring, thumb, base to end), then the tips of thumb, index, middle, ring and little finger (Romero et al.
+2017; HO-3D's order too)."""
 
 PARENTS = np.array([0, 1, 2, 3, 0, 5, 6, 7, 0, 9, 10, 11, 0, 13, 14, 15, 0, 17, 18, 19])
 """[20] the keypoint before each of the keypoints 1 to 20: the other end of its bone."""

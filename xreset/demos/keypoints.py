@@ -9,7 +9,8 @@ fits. ``docs/demonstrations.md`` has the layout of the files.
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Iterator
 from itertools import groupby
 from pathlib import Path
 from typing import Literal
@@ -21,6 +22,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from xreset.checks import frozen, is_rigid
 from xreset.demos import hand
 from xreset.demos.archive import SIDES, Demos, merge_demos, one_sequence
+from xreset.demos.examine import examine, refuse_wrong, surfaces_of
+from xreset.demos.hand import ORDERS, Order
 from xreset.errors import DemoError
 from xreset.files import max_bytes
 from xreset.geometry.shapes import transformed
@@ -28,40 +31,17 @@ from xreset.objects.catalogue import official_name
 from xreset.records import RATE, UNIT_TOLERANCE, Arrays, Field, read_npz
 from xreset.text import is_plain, shown
 
-Order = Literal["mano", "mediapipe", "openpose"]
 Motion = tuple[np.ndarray, np.ndarray, Rotation]
 """Keypoints [F, 21, 3], object positions [F, 3] and F object orientations."""
-
-ORDERS: Mapping[Order, tuple[int, ...]] = {
-    "mano": (0, 13, 14, 15, 16, 1, 2, 3, 17, 4, 5, 6, 18, 10, 11, 12, 19, 7, 8, 9, 20),
-    "mediapipe": tuple(range(21)),
-    "openpose": tuple(range(21)),
-}
-"""Index of each of :data:`xreset.spec.KEYPOINTS` in another order. MANO: the 16 joints of the model (wrist, index,
-middle, little, ring, thumb, base to end), then the tips of thumb, index, middle, ring and little finger (Romero et al.
-2017; HO-3D's order too)."""
 
 MAX_FRAMES = 100_000
 """Most frames that a sequence may be resampled to: 55 minutes at 30 per second, in half a gigabyte."""
 
 _KNUCKLES = [0, 5, 9, 13, 17]
-_PALM = (60.0, 140.0)
-"""Range of distances from the wrist to the middle finger's knuckle [mm]: 90 to 100 in DexYCB, with room for children
-and trackers."""
-_ORDER_RATIO = 1.1
-"""A hand in a wrong order has longer bones by at least this factor: 1.29 (MANO's read as MediaPipe's) and 1.50 at the
-median."""
-_BONE_SPREAD = 0.3
-"""Largest relative standard deviation of a bone's length over a sequence; a tracker's noise is below, image coordinates
-are above."""
-_CURL = 0.015
-"""Fingers that bend this far to the back of the hand, at the median of a sequence, are those of the other hand [m]."""
-_CENTERED = 0.05
-"""Keypoints whose mean is always this close to the origin are relative to the hand [m]."""
-_START = (-0.1, 0.7)
-"""Range of heights at which an object's origin may start above the table [m]."""
 _UNEVEN = 0.1
 """Largest relative deviation of a time step from the median one for frames that count as evenly spaced."""
+_USUAL_RATES = (24 / 1.001, 30 / 1.001, 60 / 1.001, 120 / 1.001)
+"""Rates of video that are no whole numbers [1/s]."""
 _MATRIX_BYTES = 1 << 16
 """Largest file of a matrix of 4 x 4 numbers."""
 
@@ -108,9 +88,21 @@ class Convention:
     """The demonstrating person."""
 
 
-def read_keypoints(path: str | Path, convention: Convention) -> Demos:
+def read_keypoints(
+    path: str | Path,
+    convention: Convention,
+    *,
+    meshes: str | Path | None = None,
+    trust: bool = False,
+) -> Demos:
     """Read a tracker's sequences: an npz (one sequence), a CSV (one, or several with a column ``sequence``), or a
     folder of them.
+
+    Args:
+        path: the file or folder.
+        convention: what the numbers mean.
+        meshes: folder of the objects' meshes, which the sequences are examined with; None: without meshes.
+        trust: whether sequences are taken that are certainly wrong (:mod:`xreset.demos.examine`).
 
     Returns:
         The demonstrations in metres and in the table frame. The wrist's orientation is that of five keypoints (wrist
@@ -134,7 +126,7 @@ def read_keypoints(path: str | Path, convention: Convention) -> Demos:
         files = [
             file
             for file in sorted(path.rglob("*"))
-            if file.suffix in (".npz", ".csv") and file.is_file()
+            if file.suffix.lower() in (".npz", ".csv") and file.is_file()
         ]
         if not files:
             raise DemoError(
@@ -143,13 +135,14 @@ def read_keypoints(path: str | Path, convention: Convention) -> Demos:
     parts = []
     for file in files:
         name = file.relative_to(folder).with_suffix("").as_posix()
-        if file.suffix == ".csv":
+        if file.suffix.lower() == ".csv":
             sequences = _read_csv(file, name)
         else:
             arrays = read_npz(file, None, _FILE, what="a tracker's keypoints")
             sequences = [{"sequence": np.array(name)} | arrays]
         for arrays in sequences:
-            parts.append(sequence_of(arrays, f"{file}, sequence {arrays['sequence']}", convention))
+            what = f"{file}, sequence {arrays['sequence']}"
+            parts.append(sequence_of(arrays, what, convention, meshes=meshes, trust=trust))
     return merge_demos(parts)
 
 
@@ -183,32 +176,30 @@ def read_transform(path: str | Path) -> np.ndarray:
 def _read_csv(path: Path, name: str) -> Iterator[Arrays]:
     """Yield the arrays of each sequence of a table with one row for each frame, as an npz would hold them; an empty
     cell is NaN. The rows of a sequence follow one another."""
-    arrays = {}
     try:
-        if path.stat().st_size > max_bytes():
-            raise ValueError(
-                f"it has {path.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows"
-            )
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            rows = [row for row in csv.reader(file, strict=True) if row]
-        columns = list(zip(*rows, strict=True))
-        table = {column.strip(): cells for column, *cells in columns}
-        if len(table) < len(columns):
-            raise ValueError("several columns have the same name")
-        if len(rows) < 2:
-            raise ValueError("it has no frame")
+        table = _table(path)
+        arrays = {}
         for field, names in _COLUMNS.items():
             missing = sorted(set(names) - set(table))
             if not missing:
-                numbers = np.column_stack([_numbers(table[column]) for column in names])
+                numbers = np.column_stack([_numbers(table, column) for column in names])
                 arrays[field] = numbers.reshape(-1, *_FILE[field].shape[1:])
             elif field == "keypoints" or len(missing) < len(names):
                 raise ValueError(
-                    f"it lacks the columns {shown(missing)} of {field} (docs/demonstrations.md)"
+                    f"it lacks the columns {shown(missing)} of {field}; its first line is"
+                    f" {shown(','.join(table))} (docs/demonstrations.md)"
                 )
+        beyond = sorted(name for name in table if re.fullmatch("[xyz][0-9]+", name))
+        beyond = [name for name in beyond if name not in _COLUMNS["keypoints"]]
+        if beyond:
+            raise ValueError(
+                f"it has columns of more than 21 keypoints, such as {beyond[0]}. Keep those of wrist, thumb, index,"
+                " middle, ring and little finger, four each: of OpenXR's 26 points number 1, 2 to 5, 7 to 10, 12 to"
+                " 15, 17 to 20 and 22 to 25"
+            )
     except (OSError, ValueError, csv.Error) as error:
         raise DemoError(f"{path} cannot be read as a CSV table: {error}.") from error
-    frames = range(len(rows) - 1)
+    frames = range(len(arrays["keypoints"]))
     sequences = table.get("sequence", [name] * len(frames))
     for sequence, part in groupby(frames, key=sequences.__getitem__):
         own = list(part)
@@ -227,18 +218,63 @@ def _read_csv(path: Path, name: str) -> Iterator[Arrays]:
         yield found
 
 
-def _numbers(cells: Sequence[str]) -> np.ndarray:
-    return np.array([float(cell.strip() or "nan") for cell in cells])
+def _table(path: Path) -> dict[str, list[str]]:
+    """Return the cells below each column's name. Lines that begin with # are comments."""
+    if path.stat().st_size > max_bytes():
+        raise ValueError(
+            f"it has {path.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows"
+        )
+    with open(path, newline="", encoding="utf-8-sig") as file:
+        lines = csv.reader(file, strict=True)
+        rows = [(lines.line_num, row) for row in lines if row and not row[0].startswith("#")]
+    if len(rows) < 2:
+        raise ValueError("it has no frame")
+    names = [name.strip() for name in rows[0][1]]
+    for separator, word in ((";", "semicolons"), ("\t", "tabs")):
+        if len(names) == 1 and separator in names[0]:
+            raise ValueError(
+                f"its cells are separated by {word}, expected commas, and points in decimal numbers"
+            )
+    if len(set(names)) < len(names):
+        raise ValueError("several columns have the same name")
+    for number, row in rows:
+        if len(row) != len(names):
+            cut = " It is the last line: the file is cut off." * (number == rows[-1][0])
+            raise ValueError(
+                f"line {number} has {len(row)} cells, but the first line names {len(names)} columns.{cut} Repair or"
+                " remove this line"
+            )
+    cells = zip(*(row for _, row in rows[1:]), strict=True)
+    return {name: list(column) for name, column in zip(names, cells, strict=True)}
+
+
+def _numbers(table: dict[str, list[str]], column: str) -> np.ndarray:
+    try:
+        return np.array([float(cell.strip() or "nan") for cell in table[column]])
+    except ValueError as error:
+        raise ValueError(f"column {column}: {error}") from error
 
 
 # One sequence ---------------------------------------------------------------------------------------------------------
 
 
-def sequence_of(arrays: Arrays, what: str, convention: Convention) -> Demos:
-    """Return one sequence from the arrays of a file; see :func:`read_keypoints` for errors, in which ``what`` names the
-    sequence."""
+def sequence_of(
+    arrays: Arrays,
+    what: str,
+    convention: Convention,
+    *,
+    meshes: str | Path | None = None,
+    trust: bool = False,
+) -> Demos:
+    """Return one sequence from the arrays of a file; see :func:`read_keypoints` for options and errors, in which
+    ``what`` names the sequence."""
     try:
-        return _sequence(arrays, convention)
+        sequence = _sequence(arrays, convention)
+        if not trust:
+            surfaces = surfaces_of(sequence, meshes)
+            found = examine(sequence, surfaces, camera=convention.table_from_camera)
+            refuse_wrong(found, trust=False)
+        return sequence
     except DemoError as error:
         raise DemoError(f"{what}: {error}") from None
 
@@ -250,10 +286,12 @@ def _sequence(arrays: Arrays, convention: Convention) -> Demos:
     valid = np.isfinite(points).all(axis=(1, 2))
     if not valid.any():
         raise DemoError("no frame has all 21 keypoints.")
+    arrays = dict(arrays)
+    if "side" in arrays:
+        arrays["side"] = np.char.lower(arrays["side"])
     side = _text(arrays, "side", convention.side)
     if side not in SIDES:
         raise DemoError(f"the side is {shown(side)}, expected right or left.")
-    _check_hand(points[valid], convention, side)
     points[~valid] = np.nan
     points = points[:, ORDERS[convention.order]]
     T_table = np.eye(4) if convention.table_from_camera is None else convention.table_from_camera
@@ -261,12 +299,6 @@ def _sequence(arrays: Arrays, convention: Convention) -> Demos:
     pos, turn = _object_pose(arrays)
     pos = transformed(scale * pos, T_table)
     turn = Rotation.from_matrix(T_table[:3, :3]) * turn
-    if not _START[0] <= pos[0, 2] <= _START[1]:
-        raise DemoError(
-            f"the object starts at z = {pos[0, 2]:.3f} m, but it must start on a table whose top is at z = 0. Are"
-            " these the camera's coordinates (--coordinates camera --table-from-camera FILE), or is that matrix the"
-            " inverse of what it should be?"
-        )
     fps, (points, pos, turn) = _evenly(arrays, convention, (points, pos, turn))
     valid = np.asarray(np.isfinite(points).all(axis=(1, 2)))
     return one_sequence(
@@ -294,52 +326,6 @@ def _text(arrays: Arrays, field: str, option: str | None) -> str:
     if not text or not is_plain(text):
         raise DemoError(f"the {field} is {shown(text)}, expected a name of printable characters.")
     return text
-
-
-def _check_hand(points: np.ndarray, convention: Convention, side: str) -> None:
-    """Refuse keypoints [F, 21, 3] in metres, in the file's order, that contradict the convention; the likeliest cause
-    comes first."""
-    order = ORDERS[convention.order]
-    palm = 1e3 * float(np.median(np.linalg.norm(points[:, order[9]] - points[:, 0], axis=1)))
-    if not _PALM[0] <= palm <= _PALM[1]:
-        raise DemoError(
-            f"from the wrist to the middle finger's knuckle it is {palm:.3g} mm, expected 60 to 140 mm. Is --units"
-            f" {convention.units} right? Keypoints must be metric and in space, not those of an image."
-        )
-    lengths = {
-        name: np.median(hand.bone_lengths(points[:, ORDERS[name]]).sum(axis=1)) for name in ORDERS
-    }
-    best = min(lengths, key=lambda name: lengths[name])
-    if lengths[convention.order] > _ORDER_RATIO * lengths[best]:
-        raise DemoError(
-            f"in the order {convention.order} the bones of the hand are {lengths[convention.order]:.2f} m long"
-            f" together, in the order {best} {lengths[best]:.2f} m. Use --order {best}."
-        )
-    points = points[:, order]
-    bones = hand.bone_lengths(points)
-    spread = np.median(bones.std(axis=0) / bones.mean(axis=0))
-    if spread > _BONE_SPREAD:
-        raise DemoError(
-            f"the lengths of the hand's bones change by {spread:.0%} (standard deviation) during the sequence, so the"
-            " keypoints are not metric. MediaPipe's normalised landmarks, for example, are coordinates of the image."
-        )
-    if len(points) > 1 and np.linalg.norm(points.mean(axis=1), axis=1).max() < _CENTERED:
-        raise DemoError(
-            "the keypoints are centred on the hand in every frame, like MediaPipe's world landmarks, so the place of"
-            " the hand is unknown. Add the hand's position in the camera's or the table's frame first."
-        )
-    palm_normal = np.cross(points[:, 5] - points[:, 0], points[:, 17] - points[:, 0])
-    if side == "left":
-        palm_normal *= -1
-    palm_normal /= np.linalg.norm(palm_normal, axis=1, keepdims=True)
-    fingers = points[:, [8, 12, 16, 20]] - points[:, [5, 9, 13, 17]]
-    curl = np.median((fingers * palm_normal[:, None]).sum(axis=-1))
-    if curl < -_CURL:
-        raise DemoError(
-            f"as a {side} hand its fingers bend {-1e3 * curl:.0f} mm towards the back of the hand. It is the other"
-            " hand (--side), or the coordinates are left-handed, as Unity's are: negate one axis of keypoints and"
-            " poses."
-        )
 
 
 def _object_pose(arrays: Arrays) -> tuple[np.ndarray, Rotation]:
@@ -396,13 +382,19 @@ def _evenly(arrays: Arrays, convention: Convention, motion: Motion) -> tuple[flo
         raise DemoError(
             f"by its times it has {own:.4g} frames per second. Times must be in seconds."
         )
+    stated = float(arrays.get("fps", own))
+    if abs(stated / own - 1) > _UNEVEN:
+        raise DemoError(
+            f"the file says {stated:g} frames per second, but by its times it has {own:.4g}. Remove one of them."
+        )
     even = np.abs(steps * own - 1).max() <= _UNEVEN
     if convention.fps is None and not even:
         raise DemoError(
             f"frames are {1e3 * steps.min():.1f} to {1e3 * steps.max():.1f} ms apart. Add --fps to resample them"
             " evenly."
         )
-    rate = convention.fps or float(round(own, 3))
+    own = _rate(time) if even else own
+    rate = convention.fps or own
     if even and abs(rate / own - 1) < 1e-3:
         return rate, motion
     frames = (time[-1] - time[0]) * rate + 1e-6
@@ -416,6 +408,21 @@ def _evenly(arrays: Arrays, convention: Convention, motion: Motion) -> tuple[flo
     # keypoints next to a frame without a hand become NaN
     points, pos = (interp1d(time, values, axis=0)(at) for values in (points, pos))
     return rate, (points, pos, Slerp(time, turn)(at))
+
+
+def _rate(time: np.ndarray) -> float:
+    """Return the rate of evenly spaced times [F]: a usual one if the times are its own but for rounding."""
+    frames = np.arange(len(time)) - (len(time) - 1) / 2
+    exact = 1e-9 + 2 * float(np.spacing(np.abs(time).max()))
+    time = time - time[0]
+    digits = next((d for d in range(7) if np.abs(time - time.round(d)).max() < exact), 7)
+    step = float(frames @ time / (frames @ frames))
+    rounding = max(0.6 * 10.0**-digits, 0.01 * step)
+    for usual in (float(round(1 / step)), *_USUAL_RATES):
+        off = time - time.mean() - frames / usual
+        if np.abs(off).max() <= rounding:
+            return usual
+    return float(round(1 / step, 3))
 
 
 def _wrist(points: np.ndarray, side: str) -> Rotation:

@@ -5,14 +5,17 @@ Shape letters: F frames, K keypoints, N points.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 from scipy.spatial import cKDTree
 
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.shapes import half_spaces, plane_heights, shape_mesh, surface_of, turn_of
 from xreset.spec import ObjectSpec, Shape
+from xreset.tensors import one_thread
 
 _SAMPLE_SPACING = 0.003
 """Typical distance of the samples that narrow the search for the nearest triangle [m]."""
@@ -38,6 +41,8 @@ class Surface:
         """Sample the surface and fill the grid, which takes 0.1 s to 1 s."""
         import trimesh
 
+        self.obj = obj
+        """The object."""
         mesh = trimesh.Trimesh(*surface_of(obj.pieces), process=False)
         self._triangles = np.asarray(mesh.triangles)
         corners = self._triangles.reshape(-1, 3)
@@ -79,6 +84,13 @@ class Surface:
         """[N, 3] at most ``count`` points, evenly drawn from the samples of the surface."""
         points = np.asarray(self._tree.data)
         return points[:: -(-len(points) // count)]
+
+    def signed_distance(self, points: np.ndarray) -> np.ndarray:
+        """[...] signed distances of points [..., 3], negative inside, from the grid [m]."""
+        flat = torch.as_tensor(points.reshape(-1, 3))
+        with one_thread():
+            distance, _ = self.field.signed_distance(flat, torch.zeros(len(flat), dtype=torch.long))
+        return distance.numpy().reshape(points.shape[:-1])
 
     def nearest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Nearest surface points [N, 3] of points [N, 3], exact on the triangles of the nearest samples, and distances
@@ -130,6 +142,24 @@ class Surface:
             in_world = np.einsum("fij,fkj->fki", rotation, touched) + object_pos[:, None]
             points[contact] = in_world[contact]
         return points, contact
+
+
+_KNOWN: dict[bytes, Surface] = {}
+"""Surfaces that were prepared in this process, by the object's shape."""
+_MOST_KNOWN = 64
+
+
+def prepared_surface(obj: ObjectSpec) -> Surface:
+    """Return an object's surface, prepared once in a process."""
+    shape = hashlib.sha256()
+    for array in (obj.vertices, obj.faces, obj.com, *surface_of(obj.pieces)):
+        shape.update(np.ascontiguousarray(array).tobytes())
+    key = shape.digest()
+    if key not in _KNOWN:
+        if len(_KNOWN) == _MOST_KNOWN:
+            _KNOWN.clear()
+        _KNOWN[key] = Surface(obj)
+    return _KNOWN[key]
 
 
 def _nodes_inside(pieces: Sequence[Shape], nodes: np.ndarray) -> np.ndarray:

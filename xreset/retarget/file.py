@@ -5,7 +5,6 @@ Shape letters: S sequences, F frames of all sequences, J joints, E fingertips, R
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -33,7 +32,7 @@ from xreset.records import (
     RATE,
     Arrays,
     Field,
-    read_npz,
+    read_meta,
     read_record,
     write_record,
 )
@@ -100,15 +99,6 @@ class Retargeted(ObjectMotions):
         first = self.first_contact[owner]
         return (first >= 0) & (np.arange(len(owner)) - self.frame_offsets[owner] >= first)
 
-    @property
-    def untouched(self) -> np.ndarray:
-        """[S] bool: whether the human does not touch the object in most of the annotated frames in which the object is
-        more than 5 cm from its start. This is true of no sequence of DexYCB."""
-        owner = self.sequence_of_frame
-        moved = np.linalg.norm(self.object_pos - self.start_pose[0][owner], axis=1) > 0.05
-        touching = np.bincount(owner, moved & self.contact)
-        return 2 * touching < np.bincount(owner, moved & self.annotated)
-
     def accounts(self) -> list[Account]:
         """Count valid frames and the reasons of invalid ones, by object and phase."""
         reason = np.where(self.valid, "", np.asarray(self.reason_names)[self.reason])
@@ -156,13 +146,11 @@ def check_retargeted(path: str | Path, data: Retargeted, robot: RobotSpec) -> No
 def object_sources(path: str | Path) -> dict[str, str]:
     """Return object name -> :attr:`~xreset.spec.ObjectSpec.source` of the objects that the file was made with; empty if
     it does not state them."""
-    meta = read_npz(path, SCHEMA, {}, what="a file of xreset retarget").get("meta")
-    try:
-        inputs = json.loads(str(meta))["inputs"]
-        objects = [name for name in inputs if name.startswith("object ")]
-        return {name.removeprefix("object "): inputs[name] for name in objects}
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+    inputs = read_meta(path).get("inputs")
+    if not isinstance(inputs, dict):
         return {}
+    objects = [name for name in inputs if name.startswith("object ")]
+    return {name.removeprefix("object "): inputs[name] for name in objects}
 
 
 def _check(arrays: Arrays) -> str | None:

@@ -5,6 +5,7 @@ Shape letters: F frames of all sequences, S sequences of a batch padded to T fra
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import field, replace
 
@@ -14,9 +15,10 @@ from torch import Tensor
 
 from xreset.checks import frozen
 from xreset.demos.archive import Demos, grounded, levelled
+from xreset.demos.examine import examine, refuse_wrong
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.rotations import matrix_to_quat
-from xreset.geometry.surface import Surface
+from xreset.geometry.surface import Surface, prepared_surface
 from xreset.progress import Progress, unseen
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.arm.model import ArmModel, ArmTargets
@@ -30,6 +32,7 @@ from xreset.retarget.validity import REASONS, Thresholds, classify
 from xreset.spec import ObjectSpec, RobotSpec, checked_objects, objects_named
 from xreset.tensors import one_thread
 
+_log = logging.getLogger(__name__)
 _SEQUENCES_PER_BATCH = 24
 """Enough to use the processor well; few enough to keep memory below about 1 GB and to show progress."""
 _THUMB = slice(1, 5)
@@ -57,6 +60,8 @@ def retarget_demos(
     *,
     progress: Callable[[float, int], None] = unseen,
     device: str = "cpu",
+    trust: bool = False,
+    note: Callable[[str], None] = _log.warning,
 ) -> Retargeted:
     """Retarget demonstrations. Sequences are independent of one another; the same arguments give the same result.
 
@@ -67,17 +72,23 @@ def retarget_demos(
         config: weights and limits.
         progress: called with the sequences done and the sequences in all.
         device: where hand retargeting runs; the arm runs on the CPU.
+        trust: whether demonstrations are taken that are certainly wrong.
+        note: called with each doubt about the demonstrations (:mod:`xreset.demos.examine`).
 
     Returns:
         Trajectories of every sequence. In a sequence without an annotated hand the robot stays at home and no frame is
         valid.
 
     Raises:
-        DemoError: an object of the demonstrations is not among ``objects``.
+        DemoError: an object of the demonstrations is not among ``objects``, or demonstrations are certainly wrong.
         RobotError: the robot's description does not allow retargeting.
     """
     config = config or RetargetConfig()
     objects = checked_objects(robot, objects)
+    named = objects_named(objects, demos.object_names)
+    surfaces = {name: prepared_surface(spec) for name, spec in named.items()}
+    for doubt in refuse_wrong(examine(demos, surfaces), trust=trust):
+        note(doubt)
     hands = HandMotions(demos, robot, objects, config, device=device)
     demos = hands.demos
     arm = ArmModel(robot)
@@ -171,7 +182,8 @@ class HandMotions:
         """The robot's hand."""
         self._config = config.hand
         surfaces = {
-            name: Surface(spec) for name, spec in objects_named(objects, demos.object_names).items()
+            name: prepared_surface(spec)
+            for name, spec in objects_named(objects, demos.object_names).items()
         }
         _, self._object_index = np.unique(demos.object_name, return_inverse=True)
         self._fields = DistanceFields.join([surface.field for surface in surfaces.values()])

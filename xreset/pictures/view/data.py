@@ -65,6 +65,8 @@ class View:
     """[N] mean distance of the robot's fingertips from the human's [m]."""
     wrist_error: np.ndarray | None = None
     """[N] distance of the hand from its target [m]."""
+    notes: tuple[str, ...] = ()
+    """Doubts about the demonstrations."""
     own_grasp: np.ndarray | None = None
     """[N] bool: False where the robot has a grasp of another demonstration."""
     human_keypoints: np.ndarray | None = None

@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 
 from xreset.demos.archive import Demos, ObjectMotions, read_demos
+from xreset.demos.examine import examine
 from xreset.errors import XResetError
-from xreset.geometry.surface import Surface
+from xreset.geometry.surface import prepared_surface
 from xreset.inputs import Inputs, load_inputs
 from xreset.objects.catalogue import canonical_name
 from xreset.pictures.view.data import View
+from xreset.records import stated_doubts
 from xreset.resets.bank import ResetBank
 from xreset.resets.goals import GoalSet
 from xreset.retarget.file import Retargeted
@@ -59,18 +61,22 @@ def load_view(
         if not data.num_states:
             raise XResetError(f"{path} holds no state: physics rejected all of them.")
         view = _bank_view(data, inputs)
+    view = replace(view, notes=tuple(stated_doubts(path)))
     if demos is not None:
         view = replace(view, **_human_of(path, demos, view))
     return view
 
 
 def _demos_view(demos: Demos, inputs: Inputs) -> View:
+    surfaces = {spec.name: prepared_surface(spec) for spec in inputs.objects}
+    notes = [str(finding) for finding in examine(demos, surfaces)]
     demos, human = _human(demos, inputs.objects)
     contact = human["human_touching"].any(axis=1)
     touched = [np.logical_or.accumulate(contact[demos.frames(s)]) for s in range(len(demos))]
     return View(
         kind="demonstrations",
         robot=None,
+        notes=tuple(notes),
         **_motion(demos, inputs.objects),
         post_contact=np.concatenate(touched),
         reason=tuple("" if valid else "not annotated" for valid in demos.hand_valid),
@@ -161,7 +167,9 @@ def _human(demos: Demos, objects: Sequence[ObjectSpec]) -> tuple[Demos, dict[str
     keypoints = np.where(
         demos.hand_valid[:, None, None], demos.hand_keypoints.astype(np.float64), np.nan
     )
-    surfaces = {spec.name: Surface(spec) for spec in objects if spec.name in demos.object_name}
+    surfaces = {
+        spec.name: prepared_surface(spec) for spec in objects if spec.name in demos.object_name
+    }
     _, touching = human_contacts(demos, surfaces, RetargetConfig().contact_distance)
     return demos, {"human_keypoints": keypoints, "human_touching": touching}
 

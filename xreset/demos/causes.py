@@ -1,0 +1,564 @@
+"""Where hand, object and table are in a recording, what contradicts itself there, and causes that are tried.
+
+A cause is a change of the recording that undoes it, such as the inverse of the camera's matrix. The likeliest cause is
+the first one whose change leaves no contradiction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from xreset.checks import frozen
+from xreset.geometry.shapes import transformed
+from xreset.geometry.surface import Surface
+from xreset.spec import TableSpec
+
+MOVED = 0.05
+"""An object farther from its start than this has moved [m]."""
+_SETTLED = 0.013
+"""Largest distance of an object's lowest vertex from the table at the start [m]: -0.008 to 0.011 in 591 of 600
+sequences of DexYCB; in the other nine the object stands on another one, 0.044 to 0.137 above the table."""
+_SUNK = -0.030
+"""An object that starts below this cannot be on the table [m]."""
+_BELOW = 0.04
+"""An object that gets this much deeper into the table than at the start does not move on it [m]."""
+_LOOKS = 24
+"""Frames of a recording in which the height of the object is looked at."""
+_STACKED = 0.20
+"""An object that starts above this cannot be on another object [m]."""
+_ORIGIN = (-0.1, 0.7)
+"""Range of heights at which an object's origin may start above the table, if its mesh is unknown [m]."""
+_NEAR = 0.015
+"""Largest distance of the nearest keypoint from the surface, at the median over frames in which the object has moved
+[m]: 0.009 in DexYCB."""
+_GRIP = 0.036
+"""The same of the thumb's tip and of the nearest other fingertip, whichever is farther [m]: 0.034."""
+_DEPTH = 0.045
+"""Largest sum of the depths of keypoints in the object, each beyond 5 mm, at the median over the same frames [m]:
+0.033."""
+_AWAY = 0.10
+"""A hand at this distance does not hold the object [m]."""
+_ARM = 0.40
+"""The same for the distance from the object's origin, if its mesh is unknown [m]."""
+_SLIP = 1.6
+"""Largest speed of the hand in the object's frame, in speeds of the object: 0.93 in DexYCB."""
+_BETTER = 0.7
+"""A change that reduces the slip by this factor is better: in DexYCB, no lag has less than 0.76."""
+_BETTER_TURN = 0.72
+"""The same of another order of the quaternions' numbers: 0.76."""
+_BETTER_INVERSE = 0.5
+"""The same of inverse orientations: 0.53."""
+_STANDS = 0.92
+"""The same if it also makes an object stand that would fall over."""
+_KNOWN = 0.35
+"""Share of steps that must be known."""
+_LEAST_LAG = 0.05
+"""[s]"""
+_LARGEST_LAG = 1.0
+"""[s]"""
+_BASE = 0.1
+"""Time over which speeds are measured, longer than a tracker's noise matters [s]."""
+_LEAST_STEP = 0.02
+"""Motion of the object in this time that counts [m]."""
+_SUPPORT = 0.015
+"""Vertices this close above the lowest one support an object [m]: poses are tilted by some degrees."""
+_OVERHANG = 0.010
+"""An object whose center of mass is farther outside of its support than this would fall over [m]."""
+_BEHIND = -0.10
+"""Smallest distance along y from the object to the place where the hand is first seen [m]: 0.05 in DexYCB."""
+
+
+class Contradiction(NamedTuple):
+    """Something about the places of hand, object and table that cannot be, or hardly."""
+
+    clause: str
+    wrong: bool
+    """Whether it cannot be."""
+
+
+@frozen
+class Recording:
+    """One sequence of F frames in double precision."""
+
+    name: str
+    side: str
+    fps: float
+    points: np.ndarray
+    """[F, 21, 3] keypoints; NaN where the hand was not seen."""
+    wrist: np.ndarray
+    """[F, 4] orientation of the wrist (w, x, y, z); NaN where the hand was not seen."""
+    pos: np.ndarray
+    """[F, 3] of the object."""
+    turn: Rotation
+    """F orientations of the object."""
+    surface: Surface | None = None
+    """Surface of the object; None: unknown."""
+    camera: np.ndarray | None = None
+    """[4, 4] pose of the camera in the table frame that positions were converted with; None: none, or unknown."""
+
+    @cached_property
+    def seen(self) -> np.ndarray:
+        """[F] bool: whether the hand was seen."""
+        return np.asarray(np.isfinite(self.points).all(axis=(1, 2)))
+
+    @cached_property
+    def in_object(self) -> np.ndarray:
+        """[F, 21, 3] keypoints in the object's frame."""
+        return _in_frame(self.pos, self.matrix, self.points)
+
+    @cached_property
+    def moved(self) -> np.ndarray:
+        """[F] bool: whether the object has moved from its start."""
+        return np.linalg.norm(self.pos - self.pos[0], axis=1) > MOVED
+
+    @cached_property
+    def start_height(self) -> float:
+        """Height of the object's lowest vertex in the first frame, or of its origin if its mesh is unknown [m]."""
+        return float(self.pos[0, 2]) if self.surface is None else self._lowest(0)
+
+    @cached_property
+    def least_height(self) -> float:
+        """Height of the object's lowest vertex in any of some frames [m]."""
+        frames = np.linspace(0, len(self.pos) - 1, _LOOKS).astype(int)
+        return min(self._lowest(frame) for frame in np.unique(frames).tolist())
+
+    def _lowest(self, frame: int) -> float:
+        """Return the height of the object's lowest vertex in a frame [m]."""
+        assert self.surface is not None
+        up = self.matrix[frame, 2]
+        return float(self.pos[frame, 2] + (self.surface.obj.vertices @ up).min())
+
+    @cached_property
+    def distances(self) -> np.ndarray:
+        """[M, 21] distances of the keypoints from the object's surface, negative inside, or from its origin if its mesh
+        is unknown, in the M frames with a hand in which the object has moved [m]."""
+        local = self.in_object[self.moved & self.seen]
+        if self.surface is None:
+            return np.linalg.norm(local, axis=2)
+        return self.surface.signed_distance(local)
+
+    @cached_property
+    def matrix(self) -> np.ndarray:
+        """[F, 3, 3] rotation matrices of the object."""
+        return self.turn.as_matrix()
+
+    def slip(self, lag: int = 0) -> float:
+        """Mean speed of the hand in the object's frame, in speeds of the object, where the object moves; NaN without
+        enough frames.
+
+        Args:
+            lag: frames by which the hand is late: its numbers are taken from later frames. Most of the steps without
+                the lag must be known with it.
+        """
+        base, begin, step = self._steps
+        last = len(self.points) - 1
+        own = []
+        for frame in (begin, begin + base):
+            hand = self.points[(frame + lag).clip(0, last)]
+            own.append(_in_frame(self.pos[frame], self.matrix[frame], hand))
+        speed = np.linalg.norm(own[1] - own[0], axis=2).mean(axis=1)
+        counts = np.isfinite(speed) & (begin + lag >= 0) & (begin + base + lag <= last)
+        if counts.sum() < max(4, _KNOWN * len(begin)):
+            return np.nan
+        return float(speed[counts].sum() / step[counts].sum())
+
+    @cached_property
+    def _steps(self) -> tuple[int, np.ndarray, np.ndarray]:
+        """Length of a step in frames, the frames in which a step begins that moves the object, and the object's
+        motion in each of these steps [m]."""
+        base = max(1, round(_BASE * self.fps))
+        step = np.linalg.norm(self.pos[base:] - self.pos[:-base], axis=1)
+        begin = np.flatnonzero(step > _LEAST_STEP)
+        return base, begin, step[begin]
+
+    @cached_property
+    def off_table(self) -> float:
+        """Distance from the object to the table's top in the first frame, from above; 0 above it [m]."""
+        at = self.pos[0]
+        if self.surface is not None:
+            at = at + self.turn[0].apply(self.surface.obj.com)
+        table = TableSpec()
+        beyond = np.abs(at[:2] - table.center) - table.half_size[:2]
+        return float(np.linalg.norm(beyond.clip(0.0)))
+
+    @cached_property
+    def falls(self) -> bool:
+        """Whether the object would fall over at the start; False if its mesh is unknown."""
+        if self.surface is None:
+            return False
+        obj = self.surface.obj
+        corners = self.turn[0].apply(obj.vertices)
+        low = corners[corners[:, 2] < corners[:, 2].min() + _SUPPORT, :2]
+        com = self.turn[0].apply(obj.com)[:2]
+        # two more points: a support that is a point or a line spans no area
+        low = np.concatenate((low, low[:1] + np.array([[1e-4, 0.0], [0.0, 1e-4], [1e-4, 1e-4]])))
+        sides = ConvexHull(low, qhull_options="QJ").equations
+        return bool((sides[:, :2] @ com + sides[:, 2]).max() > _OVERHANG)
+
+    @cached_property
+    def contradictions(self) -> list[Contradiction]:
+        """Contradictions between the places of hand, object and table."""
+        return [*_of_start(self), *_of_hand(self)]
+
+
+def length_text(length: float) -> str:
+    """Return a length [m] in words: ``47 mm``, ``41 cm``, ``3.2 m``."""
+    size = abs(length)
+    if size < 0.0995:
+        return f"{1e3 * size:.0f} mm"
+    return f"{100 * size:.0f} cm" if size < 1.995 else f"{size:.3g} m"
+
+
+def _in_frame(pos: np.ndarray, matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """[F, K, 3] points in frames at positions [F, 3] with rotation matrices [F, 3, 3]."""
+    return np.einsum("fji,fkj->fki", matrix, points - pos[:, None])
+
+
+def _of_start(r: Recording) -> Iterator[Contradiction]:
+    """Yield contradictions between the object's start and the table."""
+    height = r.start_height
+    if r.surface is None:
+        if not _ORIGIN[0] <= height <= _ORIGIN[1]:
+            yield Contradiction(
+                f"the object starts at z = {height:.3f} m, but the table's top is at z = 0", True
+            )
+    elif height < -_SETTLED:
+        yield Contradiction(
+            f"the object starts {length_text(height)} inside the table", height < _SUNK
+        )
+    elif height > _SETTLED:
+        yield Contradiction(
+            f"the object starts {length_text(height)} above the table", height > _STACKED
+        )
+    if r.surface is not None and (low := r.least_height) < min(height, 0.0) - _BELOW:
+        yield Contradiction(f"it is {length_text(low)} inside the table later", False)
+    if r.off_table > 0:
+        yield Contradiction(f"it starts {length_text(r.off_table)} beside the table's top", True)
+
+
+def _of_hand(r: Recording) -> Iterator[Contradiction]:
+    """Yield contradictions between the hand and the object."""
+    distance = r.distances
+    if len(distance):
+        yield from _of_grip(distance, known=r.surface is not None)
+    if (slip := r.slip()) > _SLIP:
+        yield Contradiction(
+            f"the hand moves past the object at {slip:.1f} times the object's speed", False
+        )
+    if r.seen.any():
+        ahead = float(r.points[np.argmax(r.seen), 0, 1] - r.pos[0, 1])
+        if ahead < _BEHIND:
+            yield Contradiction(
+                "the hand comes from the -y side, but the person should be at +y", False
+            )
+
+
+def _of_grip(distance: np.ndarray, *, known: bool) -> Iterator[Contradiction]:
+    """Yield a contradiction of the distances [M, 21] of keypoints from a moved object's surface; known: whether the
+    surface is, and not only the origin."""
+    nearest = float(np.median(distance.min(axis=1)))
+    if not known:
+        if nearest > _ARM:
+            yield Contradiction(f"the hand is {length_text(nearest)} from the moving object", True)
+        return
+    fingers = distance[:, [8, 12, 16, 20]].min(axis=1)
+    grip = float(np.median(np.maximum(distance[:, 4], fingers)))
+    depth = float(np.median((-distance - 0.005).clip(0.0).sum(axis=1)))
+    where = "the surface of the moving object"
+    if nearest > _NEAR:
+        yield Contradiction(f"the hand is {length_text(nearest)} from {where}", nearest > _AWAY)
+    elif grip > _GRIP:
+        yield Contradiction(f"thumb or fingers are {length_text(grip)} from {where}", False)
+    elif depth > _DEPTH:
+        deepest = -float(np.median(distance.min(axis=1)))
+        yield Contradiction(f"the hand is {length_text(deepest)} inside the moving object", False)
+
+
+# Causes ---------------------------------------------------------------------------------------------------------------
+
+
+class Cause(NamedTuple):
+    """A cause, and the recording without it."""
+
+    text: str
+    """The cause and its remedy."""
+    recording: Recording
+
+
+def likeliest_cause(r: Recording) -> tuple[str, bool]:
+    """Return the first cause whose change leaves no contradiction, or else what to look at; and whether the cause is
+    certain."""
+    for causes, certain in ((_conventions(r), True), (_places(r), False)):
+        for cause in causes:
+            if _fits(cause.recording, r, r.slip() * 1.1 + 0.02):
+                return cause.text, certain
+    return _advice(r), False
+
+
+def unnoticed_cause(r: Recording) -> str:
+    """Return the cause of a recording without contradictions whose hand and object fit far better after a change; empty
+    if there is none."""
+    slip = r.slip()
+    if np.isnan(slip):
+        return ""
+    for causes, better in (
+        (_clocks(r), _BETTER),
+        (_orders(r), _BETTER_TURN),
+        (_inverses(r), _BETTER_INVERSE),
+    ):
+        for cause in causes:
+            stands = r.falls and not cause.recording.falls
+            if _fits(cause.recording, r, slip * (_STANDS if stands else better)):
+                return cause.text
+    return ""
+
+
+def _fits(other: Recording, r: Recording, slip: float) -> bool:
+    """Return whether a changed recording has no contradiction and slips at most so much."""
+    if not (np.isnan(slip) or other.slip() <= slip):
+        return False
+    leans = other.falls and not r.falls
+    return not leans and not other.contradictions
+
+
+def _conventions(r: Recording) -> Iterator[Cause]:
+    """Yield other meanings of the numbers, the likeliest first."""
+    yield from _cameras(r)
+    yield from _units(r)
+    yield from _clocks(r)
+    yield from _orders(r)
+    yield from _inverses(r)
+    yield from _mirrors(r)
+    points = np.einsum("fij,fkj->fki", r.matrix, r.points) + r.pos[:, None]
+    yield Cause(
+        "The keypoints may be given in the object's frame: convert them to the table's frame.",
+        replace(r, points=points),
+    )
+
+
+def _places(r: Recording) -> Iterator[Cause]:
+    """Yield other origins of the mesh, and axes of the table's frame if the object is far from its top."""
+    yield from _origins(r)
+    if any(contradiction.wrong for contradiction in r.contradictions) or r.start_height > 0:
+        yield from _axes(r)
+
+
+def _placed(r: Recording, hand: np.ndarray | None, obj: np.ndarray | None) -> Recording:
+    """Return a recording whose hand and object are moved by matrices [4, 4]; None: it stays."""
+    points = r.points
+    pos = r.pos
+    turn = r.turn
+    if hand is not None:
+        points = transformed(points, hand)
+    if obj is not None:
+        pos = transformed(pos, obj)
+        turn = Rotation.from_matrix(obj[:3, :3]) * turn
+    return replace(r, points=points, pos=pos, turn=turn)
+
+
+def _cameras(r: Recording) -> Iterator[Cause]:
+    """Yield errors of the camera's pose, and of what it was applied to."""
+    if r.camera is None:
+        return
+    T = r.camera
+    back = np.linalg.inv(T)
+    flipped = T @ np.diag([1.0, -1.0, -1.0, 1.0]) @ back
+    for of, hand, obj in (
+        ("", True, True),
+        (" of the hand", True, False),
+        (" of the object", False, True),
+    ):
+        for text, change in (
+            (
+                f"The camera's matrix may be inverted: its inverse puts the object on the table. Write the inverse{of}"
+                " into the file of --table-from-camera.",
+                back @ back,
+            ),
+            (
+                f"The coordinates{of} may be those of the table already: use --coordinates table for hand and object.",
+                back,
+            ),
+            (
+                f"The axes{of} may be OpenGL's (y up, z backwards): negate y and z of positions and poses{of}.",
+                flipped,
+            ),
+        ):
+            yield Cause(text, _placed(r, change if hand else None, change if obj else None))
+
+
+def _axes(r: Recording) -> Iterator[Cause]:
+    """Yield other axes of the table's frame."""
+    for name, axis, angle in (
+        ("y", "x", 90),
+        ("-y", "x", -90),
+        ("-z", "x", 180),
+        ("x", "y", -90),
+        ("-x", "y", 90),
+    ):
+        matrix = np.eye(4)
+        matrix[:3, :3] = Rotation.from_euler(axis, angle, degrees=True).as_matrix()
+        text = f"The {name} axis may point up: turn all poses so that z does."
+        for heading in (0, 180, 90, -90):
+            turned = _about_z(heading) @ matrix
+            yield Cause(text, _placed(r, turned, turned))
+    for angle in (180, 90, -90):
+        matrix = _about_z(angle)
+        text = (
+            f"The table's frame may be turned by {abs(angle)} degrees about z: the person should be at +y. Turn all"
+            " poses."
+        )
+        yield Cause(text, _placed(r, matrix, matrix))
+        center = np.eye(4)
+        center[:2, 3] = TableSpec().center
+        about_center = center @ matrix @ np.linalg.inv(center)
+        yield Cause(text, _placed(r, about_center, about_center))
+
+
+def _about_z(degrees: float) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+    return matrix
+
+
+def _mirrors(r: Recording) -> Iterator[Cause]:
+    """Yield mirror images of the hand, in the camera's frame and in the table's."""
+    T = np.eye(4) if r.camera is None else r.camera
+    for axis in range(3):
+        mirror = np.eye(4)
+        mirror[axis, axis] = -1.0
+        yield Cause(
+            "The hand may be mirrored, as in the picture of a selfie camera, so that the side is wrong as well: negate"
+            f" {'xyz'[axis]} of the keypoints, and give the other --side.",
+            _placed(r, T @ mirror @ np.linalg.inv(T), None),
+        )
+
+
+def _orders(r: Recording) -> Iterator[Cause]:
+    """Yield other orders of the numbers of the object's quaternions."""
+    to_table = _turn_to_table(r)
+    numbers = (to_table.inv() * r.turn).as_quat(scalar_first=True)
+    for order, shift in (("(x, y, z, w)", 1), ("(w, x, y, z)", -1)):
+        quats = np.roll(numbers, shift, axis=1)
+        yield Cause(
+            f"The object's quaternions may be in the order {order}: name them so.",
+            replace(r, turn=to_table * Rotation.from_quat(quats, scalar_first=True)),
+        )
+
+
+def _inverses(r: Recording) -> Iterator[Cause]:
+    """Yield inverse orientations and poses of the object."""
+    to_table = _turn_to_table(r)
+    T = np.eye(4) if r.camera is None else r.camera
+    inverse = (to_table.inv() * r.turn).inv()
+    pos = transformed(r.pos, np.linalg.inv(T))
+    yield Cause(
+        "The object's orientations may be inverted: transpose its matrices, or negate x, y and z of its quaternions.",
+        replace(r, turn=to_table * inverse),
+    )
+    yield Cause(
+        "The object's poses may be inverted, those of the camera in the object's frame: invert them.",
+        replace(r, turn=to_table * inverse, pos=transformed(-inverse.apply(pos), T)),
+    )
+
+
+def _turn_to_table(r: Recording) -> Rotation:
+    return Rotation.identity() if r.camera is None else Rotation.from_matrix(r.camera[:3, :3])
+
+
+def _units(r: Recording) -> Iterator[Cause]:
+    """Yield other units of the object's positions."""
+    T = np.eye(4) if r.camera is None else r.camera
+    own = transformed(r.pos, np.linalg.inv(T))
+    for scale, unit in (
+        (1e3, "a thousandth"),
+        (1e-3, "a thousand times"),
+        (1e2, "a hundredth"),
+        (1e-2, "a hundred times"),
+        (10.0, "a tenth"),
+        (0.1, "ten times"),
+    ):
+        yield Cause(
+            f"The object's positions may be in another unit: their numbers are {unit} of what they should be. Use one"
+            " unit for hand and object.",
+            replace(r, pos=transformed(scale * own, T)),
+        )
+
+
+def _clocks(r: Recording) -> Iterator[Cause]:
+    """Yield the hand played backwards, and the lag of the hand that fits best."""
+    backwards = replace(r, points=r.points[::-1])
+    yield Cause("The hand may be played backwards: reverse its frames.", backwards)
+    step = max(1, round(r.fps / 30))
+    largest = min(round(_LARGEST_LAG * r.fps), len(r.pos) - 2)
+    lags = list(range(-largest, largest + 1, step))
+    slips = np.array([r.slip(lag) for lag in lags])
+    if np.isfinite(slips).any():
+        lag = lags[int(np.nanargmin(slips))]
+        seconds = abs(lag) / r.fps
+        if seconds > _LEAST_LAG:
+            when = "late" if lag > 0 else "early"
+            yield Cause(
+                f"The clocks of hand and object may differ: with the hand {1e3 * seconds:.0f} ms {when}, both move"
+                " together. Shift its times.",
+                replace(r, points=_later(r.points, lag)),
+            )
+
+
+def _later(points: np.ndarray, lag: int) -> np.ndarray:
+    """[F, ...] values that are taken from later frames; NaN beyond the ends."""
+    moved = np.full_like(points, np.nan)
+    count = len(points) - abs(lag)
+    moved[max(-lag, 0) :][:count] = points[max(lag, 0) :][:count]
+    return moved
+
+
+def _origins(r: Recording) -> Iterator[Cause]:
+    """Yield other origins of the object's mesh."""
+    if r.surface is None:
+        return
+    obj = r.surface.obj
+    low = obj.vertices.min(axis=0)
+    high = obj.vertices.max(axis=0)
+    middle = (low + high) / 2
+    for name, origin in (
+        ("the center of its box", middle),
+        ("its center of mass", obj.com),
+        ("the mean of its vertices", obj.vertices.mean(axis=0)),
+        ("the middle of its lowest face", np.append(middle[:2], low[2])),
+    ):
+        yield Cause(
+            f"The poses may be those of a mesh whose origin is {name}. Use the mesh that was tracked, or move its"
+            " origin.",
+            replace(r, pos=r.pos - r.turn.apply(origin)),
+        )
+
+
+def _advice(r: Recording) -> str:
+    """Return what to look at if no cause was found by trying."""
+    fits_hand = not list(_of_hand(r))
+    if not fits_hand:
+        return (
+            "Are hand and object in the same frame and unit, recorded at the same times, and is the mesh the one that"
+            " was tracked?"
+        )
+    if r.off_table > 0 or r.surface is None:
+        return (
+            "Are these the camera's coordinates (--coordinates camera --table-from-camera FILE), or is that matrix the"
+            " inverse of what it should be?"
+        )
+    if r.start_height > 0:
+        return (
+            "It may stand on something that is not in the scene, or the recording begins after the lift. Otherwise the"
+            " table's top is not at z = 0 in these coordinates, or the poses are those of a mesh with another origin."
+        )
+    return (
+        "The poses may be those of a mesh with another origin, or the table's top is not at z = 0 in these coordinates."
+        " Retargeting raises object and hand onto the table."
+    )

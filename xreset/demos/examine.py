@@ -1,0 +1,468 @@
+"""The examination of recordings: what cannot be or is unlikely, and the likeliest cause.
+
+Numbers of a recording may all be allowed and still mean something else: coordinates of a camera, another mesh origin,
+clocks that differ. A mesh tells most of it. What is certainly wrong is refused (:func:`refuse_wrong`), the rest is
+said. The limits are far outside of what 600 sequences of DexYCB have; their own extremes stand next to each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from xreset.checks import frozen
+from xreset.demos.archive import Demos, demo_objects, levelled
+from xreset.demos.causes import MOVED, Recording, length_text, likeliest_cause, unnoticed_cause
+from xreset.demos.hand import ORDERS, bone_lengths
+from xreset.errors import DemoError
+from xreset.geometry.shapes import turn_of
+from xreset.geometry.surface import Surface, prepared_surface
+
+TRUST = "If the recording is right all the same, add --trust-recordings (in Python: trust=True)."
+"""The one way to use what is refused."""
+
+_ONE_POINT = 0.01
+"""A hand whose keypoints are all this close to its wrist is none [m]."""
+_LONGEST_BONE = 0.25
+"""[m] 0.100."""
+_PALM = (0.060, 0.140)
+"""Distance from the wrist to the middle finger's knuckle [m]: 0.089 to 0.100, with room for children and trackers."""
+_ORDER_RATIO = 1.1
+"""A hand in a wrong order has longer bones by at least this factor: 1.29 (MANO's read as MediaPipe's) and 1.50 at the
+median."""
+_BONE_SPREAD = 0.3
+"""Largest relative standard deviation of a bone's length over a sequence; a tracker's noise is below, image coordinates
+are above."""
+_CURL = 0.015
+"""Fingers that bend this far to the back of the hand, at the median of a sequence, are those of the other hand [m]."""
+_SKELETON = (0.69, 0.95)
+"""Length of an adult hand's bones together [m]: 0.74 to 0.84."""
+_ALONG = 0.9
+"""Cosine of wrist and fingers: at least 0.983; 0.35 and -0.67 at the median if read in a wrong order."""
+_THUMB_RATIO = 0.75
+"""The thumb's first joint is nearer to the wrist than this share of a knuckle's distance: 0.53."""
+_ADULT = 0.79
+"""Mean length of the bones of DexYCB's people [m]."""
+_ONE_PLACE = 0.01
+"""A wrist, or the center of a hand, that moves less than this while the object moves stays at one point [m]."""
+_SPEED_TIME = 0.1
+"""Time over which the hand's speed is measured [s]."""
+_MOVES = 0.05
+"""An object that is faster moves [m/s]."""
+_RETURN = 0.030
+"""A hand that leaves its path by this much for one frame jumps [m]: 0.008."""
+_OBJECT_RETURN = 0.040
+"""The same of an object [m]: 0.015."""
+_TURN_RETURN = np.radians(45.0)
+"""The same of its orientation [rad]: 20 degrees."""
+_HAND_SPEED = (0.35, 2.5)
+"""Largest speed of the hand in a sequence [m/s]: 0.52 to 1.95."""
+_OBJECT_SPEED = 5.0
+"""Speed of an object from frame to frame [m/s]: at most 1.7 in 599 of 600 sequences, 3.2 in the other."""
+_REACH = 0.2
+"""A hand that comes from nearer than this need not be fast [m]."""
+_COPIES = 0.3
+"""Share of frames in motion that repeat the frame before: 0."""
+_FROZEN = 0.3
+"""Longest time for which a hand may stay exactly where it is while its object moves [s]: 0."""
+_NEVER_TURNS = np.radians(0.1)
+"""Smallest angle by which an object that moves turns [rad]: some degrees."""
+_SAME_PLACE = 0.02
+"""Distance from the start within which the goal counts as reached [m] (:data:`xreset.eval.metrics.GOAL_DISTANCE`)."""
+_SAME_TURN = np.radians(15.0)
+"""The same for the angle [rad]."""
+
+
+@frozen
+class Finding:
+    """What an examination has found in some sequences."""
+
+    name: str
+    """What was examined, such as ``place`` or ``jumps``."""
+    wrong: bool
+    """Whether the sequences are certainly wrong, and refused."""
+    found: str
+    """What was found in the first sequence, as a sentence."""
+    cause: str
+    """The likeliest cause and its remedy."""
+    sequences: tuple[str, ...] = ()
+    """Names of the sequences."""
+    examined: int = 1
+    """Number of sequences that were examined."""
+
+    def __str__(self) -> str:
+        where = (
+            f"{len(self.sequences)} of {self.examined} sequences, the first is {self.sequences[0]}"
+        )
+        return (
+            f"{where}: {self.found} {self.cause}"
+            if self.examined > 1
+            else f"{self.found} {self.cause}"
+        )
+
+
+def examine(
+    demos: Demos,
+    surfaces: Mapping[str, Surface] | None = None,
+    *,
+    camera: np.ndarray | None = None,
+) -> list[Finding]:
+    """Examine demonstrations; what is certainly wrong comes first.
+
+    Args:
+        demos: as recorded: objects are not yet put onto the table.
+        surfaces: of the objects, by name; without them, whatever needs a mesh is left out.
+        camera: [4, 4] pose of the camera in the table frame that positions were converted with.
+    """
+    demos = levelled(demos)
+    merged: dict[tuple[str, bool, str], Finding] = {}
+    for index, name in enumerate(demos.sequence_name.tolist()):
+        recording = _recording(demos, index, surfaces or {}, camera)
+        with np.errstate(all="ignore"):  # numbers of damaged files overflow
+            found = list(_findings(recording))
+        for finding in found:
+            key = (finding.name, finding.wrong, finding.cause)
+            first = merged.get(key, replace(finding, examined=len(demos)))
+            merged[key] = replace(first, sequences=(*first.sequences, name))
+    return sorted(merged.values(), key=lambda finding: not finding.wrong)
+
+
+def surfaces_of(demos: Demos, folder: str | Path | None) -> dict[str, Surface]:
+    """Return the surfaces of the objects of demonstrations by name, from a folder of meshes; without one, none.
+
+    Raises:
+        DemoError: the folder lacks an object.
+        ObjectError: a mesh cannot be used.
+    """
+    if folder is None:
+        return {}
+    return {
+        name: prepared_surface(spec) for name, spec in demo_objects(demos, Path(folder)).items()
+    }
+
+
+def refuse_wrong(found: Sequence[Finding], *, trust: bool) -> list[str]:
+    """Return what was found as notes.
+
+    Args:
+        trust: whether what is certainly wrong is a note, too.
+
+    Raises:
+        DemoError: something is certainly wrong; the message has all of it.
+    """
+    wrong = [str(finding) for finding in found if finding.wrong]
+    if wrong and not trust:
+        raise DemoError(" ".join((*wrong, TRUST)))
+    return [str(finding) for finding in found]
+
+
+def _recording(
+    demos: Demos, index: int, surfaces: Mapping[str, Surface], camera: np.ndarray | None
+) -> Recording:
+    """Return one sequence, the hand's numbers as NaN where it was not seen."""
+    frames = demos.frames(index)
+    seen = demos.hand_valid[frames]
+    return Recording(
+        name=str(demos.sequence_name[index]),
+        side=str(demos.hand_side[index]),
+        fps=float(demos.fps),
+        points=np.where(seen[:, None, None], demos.hand_keypoints[frames], np.nan).astype(float),
+        wrist=demos.wrist_quat_wxyz[frames].astype(float),
+        pos=demos.object_pos[frames].astype(float),
+        turn=turn_of(demos.object_quat_wxyz[frames]),
+        surface=surfaces.get(str(demos.object_name[index])),
+        camera=camera,
+    )
+
+
+def _findings(r: Recording) -> Iterator[Finding]:
+    """Yield what is found in one sequence. A hand that is none, or in another convention, hides everything else."""
+    hand = list(_of_hand(r)) if r.seen.any() else []
+    yield from hand
+    if any(finding.wrong for finding in hand):
+        return
+    yield from _of_place(r)
+    yield from _of_motion(r)
+
+
+def _of_place(r: Recording) -> Iterator[Finding]:
+    """Yield what is found about the places of hand, object and table: one finding with one cause."""
+    found = r.contradictions
+    if found:
+        sentence = ", and ".join(contradiction.clause for contradiction in found)
+        cause, certain = likeliest_cause(r)
+        yield Finding(
+            name="place",
+            wrong=certain or any(contradiction.wrong for contradiction in found),
+            found=f"{sentence[0].upper()}{sentence[1:]}.",
+            cause=cause,
+        )
+    elif cause := unnoticed_cause(r):
+        yield Finding(
+            name="together",
+            wrong=True,
+            found="Hand and object do not move together while the object moves.",
+            cause=cause,
+        )
+
+
+def _of_hand(r: Recording) -> Iterator[Finding]:
+    """Yield what is found about the hand's shape. The first thing that is certainly wrong is the last one."""
+    points = r.points[r.seen]
+    size = np.linalg.norm(points - points[:, :1], axis=2).max(axis=1)
+    absent = size < _ONE_POINT * (np.median(size) > _ONE_POINT)
+    if absent.any():
+        yield Finding(
+            name="absent",
+            wrong=True,
+            found=f"In {np.count_nonzero(absent)} of {len(r.seen)} frames all keypoints are at one point.",
+            cause="Leave cells empty, or write NaN, where the hand was not seen; 0 and -1 are places.",
+        )
+        return
+    bones = bone_lengths(points)
+    if misread := _order_problem(points):
+        yield Finding(
+            name="order",
+            wrong=True,
+            found=misread,
+            cause="State the order (--order), or put the keypoints into the order of xreset.spec.KEYPOINTS.",
+        )
+        return
+    palm = float(np.median(np.linalg.norm(points[:, 9] - points[:, 0], axis=1)))
+    if not _PALM[0] <= palm <= _PALM[1]:
+        yield Finding(
+            name="size",
+            wrong=True,
+            found=f"From the wrist to the middle finger's knuckle it is {1e3 * palm:.3g} mm, expected 60 to 140 mm.",
+            cause="Is the unit right (--units)? Keypoints must be metric and in space, not those of an image.",
+        )
+        return
+    spread = np.median(bones.std(axis=0) / bones.mean(axis=0))
+    if spread > _BONE_SPREAD:
+        yield Finding(
+            name="bones",
+            wrong=True,
+            found=f"The lengths of the hand's bones change by {spread:.0%} (standard deviation).",
+            cause="The keypoints are not metric. MediaPipe's normalised landmarks, for example, are coordinates of the"
+            " image.",
+        )
+        return
+    long = bones.max(axis=1) > _LONGEST_BONE
+    if long.any():
+        frame = int(np.flatnonzero(r.seen)[np.argmax(long)])
+        yield Finding(
+            name="bones",
+            wrong=True,
+            found=f"In {np.count_nonzero(long)} of {len(r.seen)} frames, first in frame {frame}, a bone of the hand is"
+            f" {length_text(float(bones.max()))} long.",
+            cause="A keypoint that was not seen may be written as a number: leave its cells empty, or write NaN.",
+        )
+        return
+    if centered := _centered_problem(r):
+        yield centered
+        return
+    curl = _curl(points, r.side)
+    if curl < -_CURL:
+        yield Finding(
+            name="side",
+            wrong=True,
+            found=f"As a {r.side} hand its fingers bend {-1e3 * curl:.0f} mm towards the back of the hand.",
+            cause="It is the other hand (--side), or the coordinates are left-handed, as Unity's are: negate one axis"
+            " of keypoints and poses.",
+        )
+        return
+    yield from _doubts_of_hand(r, bones)
+
+
+def _skeleton(points: np.ndarray) -> float:
+    return float(np.median(bone_lengths(points).sum(axis=1)))
+
+
+def _order_problem(points: np.ndarray) -> str:
+    """Return what shows that keypoints [F, 21, 3] are in another order; empty if nothing does."""
+    mano = np.array(ORDERS["mano"])
+    reversed_fingers = np.arange(1, 21).reshape(5, 4)[:, ::-1]
+    tips_first = np.append(0, reversed_fingers)
+    orders = {
+        "in MANO's order (--order mano)": mano,
+        "in MediaPipe's order (--order mediapipe)": np.argsort(mano),
+        "if each finger goes from tip to base": tips_first,
+    }
+    own = _skeleton(points)
+    lengths = {name: _skeleton(points[:, order]) for name, order in orders.items()}
+    best = min(lengths, key=lambda name: lengths[name])
+    if own > _ORDER_RATIO * lengths[best]:
+        return f"The bones of the hand are {own:.2f} m long together, but {lengths[best]:.2f} m {best}."
+    from_wrist = np.linalg.norm(points[:, 1::4] - points[:, :1], axis=2)
+    bases = np.median(from_wrist, axis=0)
+    thumb = int(np.argmin(bases))
+    if bases[thumb] < _THUMB_RATIO * bases[0]:
+        order = " The fingers may go from the little finger to the thumb." * (thumb == 4)
+        return f"Of the five fingers, number {thumb + 1} begins next to the wrist, as only a thumb does.{order}"
+    return ""
+
+
+def _centered_problem(r: Recording) -> Finding | None:
+    """Return the finding that the hand's place is unknown."""
+    points = r.points[r.seen]
+    still = np.ptp(r.pos[r.seen], axis=0).max() < MOVED
+    if len(points) < 2 or still:
+        return None
+    for what, at in (
+        ("The wrist stays at one point", points[:, 0]),
+        ("The center of the hand stays at one point", points.mean(axis=1)),
+    ):
+        if np.ptp(at, axis=0).max() < _ONE_PLACE:
+            return Finding(
+                name="place of the hand",
+                wrong=True,
+                found=f"{what} while the object moves.",
+                cause="The keypoints are relative to the hand, like MediaPipe's world landmarks or a hand model's"
+                " joints. Add the hand's position in the camera's or the table's frame first.",
+            )
+    return None
+
+
+def _curl(points: np.ndarray, side: str) -> float:
+    """Return how far fingers bend towards the palm, at the median of keypoints [F, 21, 3] [m]."""
+    palm_normal = np.cross(points[:, 5] - points[:, 0], points[:, 17] - points[:, 0])
+    if side == "left":
+        palm_normal *= -1
+    palm_normal /= np.linalg.norm(palm_normal, axis=1, keepdims=True).clip(1e-9)
+    fingers = points[:, [8, 12, 16, 20]] - points[:, [5, 9, 13, 17]]
+    return float(np.median((fingers * palm_normal[:, None]).sum(axis=-1)))
+
+
+def _doubts_of_hand(r: Recording, bones: np.ndarray) -> Iterator[Finding]:
+    """Yield what no or hardly any human hand does."""
+    length = float(np.median(bones.sum(axis=1)))
+    if not _SKELETON[0] <= length <= _SKELETON[1]:
+        yield _doubt(
+            "size",
+            f"The bones of the hand are {length:.2f} m long together, those of adults {_SKELETON[0]:.2f} to"
+            f" {_SKELETON[1]:.2f} m.",
+            f"Its scale may be wrong by a factor of {_ADULT / length:.2f}, unless it is a child's hand.",
+        )
+    # a right hand's fingers point along the wrist's -x axis, a left hand's along +x
+    points = r.points[r.seen]
+    fingers = points[:, [5, 9, 13, 17]].mean(axis=1) - points[:, 0]
+    fingers /= np.linalg.norm(fingers, axis=1, keepdims=True).clip(1e-9)
+    along = (turn_of(r.wrist[r.seen]).apply([1.0, 0.0, 0.0]) * fingers).sum(axis=1)
+    cosine = np.median(-along if r.side == "right" else along)
+    if cosine < _ALONG:
+        yield _doubt(
+            "wrist",
+            f"The wrist's orientations do not point along the fingers (cosine {cosine:.2f}, expected 1).",
+            "Are they MANO's root, in the table frame, and quaternions (w, x, y, z)? Check those of the objects too.",
+        )
+    wrist = r.points[:, 0]
+    jumps = np.flatnonzero(_returns(wrist) > _RETURN) + 1
+    if len(jumps):
+        yield _doubt(
+            "jumps",
+            f"The hand jumps in {len(jumps)} frames, first in frame {jumps[0]} by"
+            f" {length_text(_step(wrist, jumps[0]))}.",
+            "Leave the hand's cells empty in these frames.",
+        )
+    yield from _doubts_of_speed(r, jumps)
+
+
+def _doubts_of_speed(r: Recording, jumps: np.ndarray) -> Iterator[Finding]:
+    """Yield doubts about speeds and about frames that repeat; jumps: frames that do not count."""
+    wrist = r.points[:, 0].copy()
+    wrist[jumps] = np.nan
+    base = max(1, round(_SPEED_TIME * r.fps))
+    if len(wrist) <= base:
+        return
+    speed = np.linalg.norm(wrist[base:] - wrist[:-base], axis=1) * r.fps / base
+    if not np.isfinite(speed).any():
+        return
+    fastest = float(np.nanmax(speed))
+    place = wrist[r.seen & np.isfinite(wrist[:, 0])]
+    came_from = np.linalg.norm(place - place[0], axis=1).max()
+    if fastest > _HAND_SPEED[1] or (fastest < _HAND_SPEED[0] and came_from > _REACH):
+        yield _doubt(
+            "speed",
+            f"The fastest that the hand moves is {fastest:.2g} m/s; people reach with {_HAND_SPEED[0]:g} to"
+            f" {_HAND_SPEED[1]:g} m/s.",
+            f"Is the rate of {r.fps:g} frames per second right (--fps)?",
+        )
+    same = (r.points[1:] == r.points[:-1]).all(axis=(1, 2))
+    around = np.pad(r.pos, ((1, 1), (0, 0)), mode="edge")
+    moves = np.linalg.norm(around[3:] - around[:-3], axis=1) * r.fps > 3 * _MOVES
+    longest = _longest_run(same & moves) / r.fps
+    if longest > _FROZEN:
+        yield _doubt(
+            "frozen",
+            f"The hand does not move at all for {longest:.1f} s while the object moves.",
+            "The tracker may have lost it: leave the hand's cells empty in these frames.",
+        )
+    elif moves.any() and (copies := (same & moves).sum() / moves.sum()) > _COPIES:
+        yield _doubt(
+            "copies",
+            f"In {copies:.0%} of the frames in which the object moves, the hand is an exact copy of the frame before.",
+            "It may have been recorded at a lower rate: remove the copies, and state the times.",
+        )
+
+
+def _of_motion(r: Recording) -> Iterator[Finding]:
+    """Yield doubts about the object's motion."""
+    turn = (r.turn[-1] * r.turn[0].inv()).magnitude()
+    if np.linalg.norm(r.pos[-1] - r.pos[0]) < _SAME_PLACE and turn < _SAME_TURN:
+        yield _doubt(
+            "goal",
+            "It begins with the object at its goal already.",
+            "A policy that leaves the object untouched solves such a demonstration.",
+        )
+    if len(r.pos) < 3:
+        return
+    speed = r.fps * np.linalg.norm(np.diff(r.pos, axis=0), axis=1)
+    angle = (r.turn[1:] * r.turn[:-1].inv()).magnitude()
+    across = (r.turn[2:] * r.turn[:-2].inv()).magnitude()
+    turned = np.minimum(angle[1:], angle[:-1]) - across > _TURN_RETURN
+    jumps = np.zeros(len(r.pos), dtype=bool)
+    jumps[1:] |= speed > _OBJECT_SPEED
+    jumps[1:-1] |= (_returns(r.pos) > _OBJECT_RETURN) | turned
+    if jumps.any():
+        yield _doubt(
+            "jumps",
+            f"The object jumps from frame to frame, first in frame {np.argmax(jumps)}.",
+            "Poses that were not seen may be written as numbers. Repair these frames, or leave the sequence out"
+            " (xreset demos split).",
+        )
+    if r.moved.any() and (r.turn * r.turn[0].inv()).magnitude().max() < _NEVER_TURNS:
+        yield _doubt(
+            "turn",
+            "The object moves but does not turn at all.",
+            "Its orientations may be missing, or those of the first frame.",
+        )
+    if (r.moved & r.seen).sum() == 0 and r.moved.any():
+        yield _doubt(
+            "unseen",
+            "The hand is not seen in any frame in which the object has moved.",
+            "No state with a grasp can come from it.",
+        )
+
+
+def _doubt(name: str, found: str, cause: str) -> Finding:
+    return Finding(name=name, wrong=False, found=found, cause=cause)
+
+
+def _returns(path: np.ndarray) -> np.ndarray:
+    """[F-2] how far a path [F, 3] leaves for one frame and comes back [m]; NaN where it is unknown."""
+    step = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    across = np.linalg.norm(path[2:] - path[:-2], axis=1)
+    return np.minimum(step[1:], step[:-1]) - across
+
+
+def _step(path: np.ndarray, frame: int) -> float:
+    return float(np.linalg.norm(path[frame] - path[frame - 1]))
+
+
+def _longest_run(flags: np.ndarray) -> int:
+    """Return the length of the longest run of true flags."""
+    ends = np.flatnonzero(np.diff(np.concatenate(([0], flags.astype(int), [0]))))
+    return int((ends[1::2] - ends[::2]).max(initial=0))

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial.transform import Rotation
 
 from tests.data import InFolder, InOneFolder
 from tests.toy_retarget import FLOAT, slope
@@ -15,7 +16,7 @@ from tests.toy_robot import toy_hand_arm
 from xreset import robots
 from xreset.backends.conformance.scene import gripper
 from xreset.backends.conformance.scene import shape as placed
-from xreset.backends.rigid import mechanism, vertices
+from xreset.backends.rigid import MovingJoints, TrackedLinks, mechanism, vertices
 from xreset.errors import RobotError
 from xreset.geometry.dynamics import drive_shares, mass_matrix
 from xreset.geometry.kinematics import Kinematics
@@ -66,6 +67,22 @@ class MechanismTest(unittest.TestCase):
             corners = vertices(placed(kind, size, (1.0, 2.0, 3.0)))
             assert_allclose(np.ptp(corners, axis=0) / 2, extent, rtol=0.01, err_msg=kind)
             assert_allclose(corners.max(axis=0) - extent, (1.0, 2.0, 3.0), atol=2e-3)
+
+    def test_tracked_links_are_those_of_the_kinematics(self):
+        made = mechanism(gripper())
+        kinematics = Kinematics(made.robot)
+        rng = np.random.default_rng(0)
+        for _ in range(20):
+            q = rng.uniform(-1.0, 1.0, len(made.robot.joints)) * np.pi
+            moving = MovingJoints(made.robot, made.joint_names)
+            pos, quat, linvel, angvel = TrackedLinks(made).locate(*moving.spread(q, q))
+            links = kinematics.jacobian(torch.tensor(q), made.robot.tracked_links)
+            assert_allclose(pos, links.pos, atol=1e-12)
+            assert_allclose(
+                Rotation.from_quat(quat, scalar_first=True).as_matrix(), links.rot, atol=1e-12
+            )
+            assert_allclose(linvel, links.linear.numpy() @ q, atol=1e-12)
+            assert_allclose(angvel, links.angular.numpy() @ q, atol=1e-12)
 
 
 class UrdfTest(InFolder):

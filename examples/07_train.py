@@ -10,13 +10,12 @@ from xreset.learning.config import ModelConfig, PpoConfig
 def main(bank: str, out: str) -> None:
     """Write the run folder ``out``: configuration, checkpoints, curves for TensorBoard, and ``policy.onnx``."""
     config = xreset.TrainConfig(
-        model=ModelConfig(pointnet=(16, 32, 16), lstm=32, mlp=(32,)),  # the default is the paper's
+        model=ModelConfig(pointnet=(16, 32, 16), lstm=32, mlp=(32,)),  # small, for a CPU
         ppo=PpoConfig(horizon=8, minibatch_size=64),
         iterations=2,
     )
     episodes = replace(config.task.termination, episode_seconds=2.0)
     config = replace(config, task=replace(config.task, termination=episodes))
-    # or recipe="minutes", on a GPU
     xreset.train(bank, out=out, config=config, engine="mujoco", num_envs=8)
     policy = xreset.load_policy(out)
     print(

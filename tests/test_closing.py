@@ -183,11 +183,12 @@ class FingersTest(TestCase):
     def test_a_squeeze_by_weight_equals_one_with_that_force(self):
         fingers, joints = self.fingers(0.0201)
         weight = 9.81 * toy_grasp.brick().mass
-        by_force = squeeze_targets(ROBOT, fingers, joints, SqueezeConfig(force=1.0 + 2 * weight))
+        by_force = squeeze_targets(
+            ROBOT, fingers, joints, SqueezeConfig(force=1.0 + 2 * weight, weight=0.0)
+        )
         by_weight = squeeze_targets(ROBOT, fingers, joints, SqueezeConfig(force=1.0, weight=2.0))
         assert_allclose(by_weight, by_force, atol=1e-9)
         self.assertTrue(SqueezeConfig(weight=1.0).presses)
-        self.assertRaisesRegex(ValueError, "no force to balance", SqueezeConfig, balanced=True)
 
     def test_levers_lead_from_the_centre_of_mass_to_the_finger(self):
         fingers, joints = self.fingers(0.0201)
@@ -219,7 +220,9 @@ class FingersTest(TestCase):
         fingers, joints = self.fingers(0.0201, 0.0501)
 
         def squeezed(force, robot=ROBOT):
-            return squeeze_targets(robot, fingers, joints, SqueezeConfig(force=force))
+            return squeeze_targets(
+                robot, fingers, joints, SqueezeConfig(force=force, weight=0.0, balanced=False)
+            )
 
         for force in (1.0, 2.5):
             target = squeezed(force)
@@ -282,6 +285,13 @@ class TargetsTest(InFolder):
         assert_close(chosen.joint_target, chosen.joint_pos + 0.25)
 
 
+PLAIN = (
+    *("--closing.spacing", "None", "--squeeze.force", "0", "--squeeze.weight", "0"),
+    *("--squeeze.no-balanced", "--transfer.per-pose", "0"),
+)
+"""Options for a bank of frames that do not press."""
+
+
 @skipUnless(find_spec("mujoco"), "MuJoCo is not installed")
 class CommandTest(InFolder):
     def setUp(self):
@@ -299,10 +309,10 @@ class CommandTest(InFolder):
 
     def test_everything_at_once(self):
         """Jaws close by 30 mm (33 mm on one side): five states between; held by 2.5 N a side, and not without."""
-        plain, _ = self.resets()
+        plain, _ = self.resets(*PLAIN)
         self.assertEqual((plain.num_states, plain.num_pressing), (3, 0))
         self.assertEqual((plain.joint_target, plain.frame_part), (None, None))
-        bank, out = self.resets("--closing.spacing", "0.0056", "--squeeze.force", "2.5")
+        bank, out = self.resets(*PLAIN, "--closing.spacing", "0.0056", "--squeeze.force", "2.5")
         assert bank.frame_part is not None
         assert_allclose(bank.frame_part * 6, [0, 1, 2, 3, 4, 5, 0, 0], atol=1e-5)
         self.assertEqual(bank.frame_index.tolist(), [0] * 6 + [1, 2])
@@ -346,6 +356,6 @@ class CommandTest(InFolder):
         with patch(
             "xreset.resets.filter.squeeze_targets", still
         ):  # the last state's targets are 1 rad (m) away
-            bank, _ = self.resets("--squeeze.force", "2.5")
+            bank, _ = self.resets(*PLAIN, "--squeeze.force", "2.5")
         self.assertEqual((bank.num_states, bank.num_pressing), (3, 0))
         assert_array_equal(bank.targets, bank.joint_pos)

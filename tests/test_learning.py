@@ -502,7 +502,7 @@ class CheckpointTest(InFolder):
 
 class ConfigTest(TestCase):
     def test_table_viii(self):
-        ppo = TrainConfig().ppo
+        ppo = PpoConfig()
         self.assertEqual((ppo.minibatches(4096), ppo.horizon, ppo.sequence_length), (2, 16, 4))
         # no minibatch has less than two worlds
         small = replace(ppo, minibatch_size=1)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.testing import assert_allclose
 
-from tests.toy_bank import SOUP, SPAM, in_this_process, toy_retargeted
+from tests.toy_bank import ONLY_FRAMES, SOUP, SPAM, in_this_process, toy_retargeted
 from xreset import FilterConfig, SqueezeConfig, robots
 from xreset.errors import DemoError
 from xreset.objects.catalogue import load_objects
@@ -85,7 +85,7 @@ class FilterTest(TestCase):
         """The reasons, one or none, for which a state with the soup can at ``pos`` is rejected."""
         motion = toy_retargeted(self.robot, [SOUP], [0, 1], object_pos=np.array([pos]))
         with made_of({"mujoco": backend_class}):
-            bank = make_bank(motion, self.robot, self.objects[:1])
+            bank = make_bank(motion, self.robot, self.objects[:1], **ONLY_FRAMES)
         return reasons(bank)
 
     def test_what_stays_is_accepted_and_what_moves_is_not(self):
@@ -124,6 +124,7 @@ class FilterTest(TestCase):
         return toy_retargeted(self.robot, [SOUP, SPAM], [0, 3, 6], **(values | changes))
 
     def bank(self, engine="mujoco", **options):
+        options = ONLY_FRAMES | options
         return make_bank(self.retargeted(), self.robot, self.objects, engine, **options)
 
     def test_the_bank_holds_what_was_accepted_and_why_the_rest_was_not(self):
@@ -206,12 +207,14 @@ class FilterTest(TestCase):
             mock.patch("xreset.resets.filter.fingers_of"),
             mock.patch("xreset.resets.filter.squeeze_targets", pressed),
         ):
-            return make_bank(motion, self.robot, self.objects, **options), tries
+            return make_bank(motion, self.robot, self.objects, **ONLY_FRAMES | options), tries
 
     def test_targets_that_press_are_tried_with_the_same_objects_for_the_stated_steps(self):
         """Three states come after contact; the last is out of bounds with targets that press."""
         bank, tries = self.tried(
-            [[-1] * 5, [-1, -1, 0]], limits=FilterConfig(steps=3), squeeze=SqueezeConfig(force=1.0)
+            [[-1] * 5, [-1, -1, 0]],
+            limits=FilterConfig(steps=3),
+            squeeze=SqueezeConfig(force=1.0, weight=0.0),
         )
         (names, plain, steps), (pressing_names, pressing, pressing_steps) = tries
         self.assertEqual(names, [SOUP] * 3 + [SPAM] * 2)

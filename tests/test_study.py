@@ -35,7 +35,7 @@ from xreset.eval.study.steps import XRESET, Step, flags
 from xreset.eval.study.tables import fill
 from xreset.files import claim
 from xreset.learning.clock import read_lift, write_lift
-from xreset.learning.recipes import RECIPES
+from xreset.learning.config import TrainConfig
 from xreset.learning.run import checkpoints, latest_checkpoint
 
 HEAD = 'schema = "xreset-study/1"\nabout = "A test."\n'
@@ -203,7 +203,7 @@ class PlanTest(Studied):
         plan = self.plan(f"{BASE}[runs.a]\nsteps = 1e6\nnum_envs = 64\n[runs.a.config]\n{changes}")
         (train,) = (s for s in plan.steps.values() if s.kind == "train")
         (planned,) = plan.runs
-        reset = RECIPES["minutes"].config.task.reset
+        reset = TrainConfig().task.reset
         self.assertEqual(planned.config.iterations, 977)
         shares = {"010_potted_meat_can": 3.0}
         changed = replace(reset, random_gravity=False, demo_probability=0.25, object_share=shares)

@@ -39,7 +39,7 @@ from xreset.errors import FileFormatError, PolicyError, RunError, XResetError
 from xreset.files import claim, file_hash
 from xreset.learning.checkpoint import load_moments, read_checkpoint
 from xreset.learning.clock import read_lift
-from xreset.learning.config import ScheduleConfig, TrainConfig
+from xreset.learning.config import ModelConfig, PpoConfig, ScheduleConfig, TrainConfig
 from xreset.learning.exported import read_policy
 from xreset.learning.recipes import RECIPES, own_terms_flag
 from xreset.learning.run import (
@@ -51,7 +51,7 @@ from xreset.learning.run import (
     write_choice,
 )
 from xreset.learning.runner import TrainingRunner, _stop_on_interrupt
-from xreset.task.config import RandomizationConfig
+from xreset.task.config import RandomizationConfig, TaskConfig
 
 try:
     import xreset.backends.mujoco  # noqa: F401
@@ -297,27 +297,35 @@ class TrainingTest(WithBank):
             return started.call_args.kwargs["config"]
 
         self.assertEqual(parsed(), TrainConfig())
-        minutes = parsed("--like", "minutes", "--config.ppo.entropy", "0.001")
+        self.assertEqual(RECIPES["default"].config, TrainConfig())
+        parts = (TaskConfig(), ModelConfig(), PpoConfig())
+        paper = RECIPES["paper"].config
+        self.assertEqual(
+            (paper.task, paper.model, paper.ppo), parts, "their defaults are the paper's"
+        )
+        minutes = parsed("--recipe", "minutes", "--config.ppo.entropy", "0.001")
         self.assertEqual(
             (minutes.ppo.desired_kl, minutes.ppo.entropy, minutes.model.initial_std),
             (0.02, 0.001, 0.3),
         )
-        robust = parsed("--like", "robust")
+        robust = parsed("--recipe", "robust")
         self.assertEqual(
             replace(robust, task=replace(robust.task, randomization=RandomizationConfig())),
             RECIPES["minutes"].config,
         )
+        lstm = replace(robust.model, lstm=256)
+        self.assertEqual(replace(robust, model=lstm, iterations=2600), TrainConfig())
         self.assertEqual(
-            parsed(f"--like={self.out}", "--config.save-interval", "7"),
+            parsed(f"--recipe={self.out}", "--config.save-interval", "7"),
             replace(CONFIG, save_interval=7),
         )
         for arguments, problem in (
             (
-                ("--like", "nothing"),
-                "no recipe and no run folder 'nothing'. Recipes: paper, .*; minutes, what taught",
+                ("--recipe", "nothing"),
+                "no recipe and no run folder 'nothing'. Recipes: default, .*; paper, the paper's tables",
             ),
-            (("--like", str(self.folder)), "is not a run folder"),
-            (("--like", "minutes", "--resume"), "Omit --like"),
+            (("--recipe", str(self.folder)), "is not a run folder"),
+            (("--recipe", "minutes", "--resume"), "Omit --recipe"),
             (("--weights", str(self.out), "--resume"), "Omit --weights"),
             (("--resume", "--config.ppo.entropy", "0.001"), "Omit --config, or start another run"),
             (("--resume",), "run is not a run folder"),
@@ -347,7 +355,7 @@ class TrainingTest(WithBank):
             ("--seed 5", "--seed is 5, but"),
             ("--seed=0", "--seed is 0, but .* was started with 3"),
             ("--num_envs 4096", "--num-envs is 4096, but .* was started with 4"),
-            ("--like paper", "Omit --like"),
+            ("--recipe paper", "Omit --recipe"),
             ("--config.ppo.horizon 16", "Omit --config"),
             ("--resets None", "--resets is None, but"),
             ("--engine pybullet", "--engine is pybullet, but .* was started with mujoco"),
@@ -401,7 +409,7 @@ class TrainingTest(WithBank):
         config["task"]["reward"]["own"] = own
         self.changed_run(stranger, config=config)
         like = (
-            f"--like {stranger} --robot openarm --resets {self.bank} --engine mujoco --device cpu "
+            f"--recipe {stranger} --robot openarm --resets {self.bank} --engine mujoco --device cpu "
             f"--num-envs 4 --iterations 1 --out {self.folder}"
         )
         resume = f"--resume --out {stranger} --iterations 3"
@@ -544,8 +552,8 @@ class TrainingTest(WithBank):
         for words, options in (
             ("is not a run folder", {"weights": self.folder, "goals": toy_goals(self.robot)}),
             ("another observation layout", {"weights": self.out, "config": short}),
-            (r"{'lstm': 12}, .*{'lstm': 16}.*--like", {"weights": self.out, "config": wide}),
-            (r"layout .*--like .*run$", {"weights": self.out, "config": short}),
+            (r"{'lstm': 12}, .*{'lstm': 16}.*--recipe", {"weights": self.out, "config": wide}),
+            (r"layout .*--recipe .*run$", {"weights": self.out, "config": short}),
             ("many-objects has no critic .* Give a run folder", {"weights": "many-objects"}),
             ("000002.pt is a file. Give the folder", {"weights": latest_checkpoint(self.out)}),
             (f"folder above has one: give {self.out}", {"weights": self.out / "checkpoints"}),

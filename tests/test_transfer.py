@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from tests import toy_grasp
-from tests.command import refused, succeeds
+from tests.command import succeeds
 from tests.data import InFolder
 from tests.test_closing import ROBOT
 from tests.toy_bank import in_this_process, toy_retargeted
@@ -234,12 +234,6 @@ class TransferTest(TestCase):
         other = replace(self.data, sequence_name=np.array(["a", "b", "c"]))
         with self.assertRaisesRegex(DemoError, "3 demonstrations, and they are not the 3 of the"):
             add_transfers(self.bank, other, ROBOT, OBJECTS)
-        plain = bank(self.data)
-        with self.assertRaisesRegex(DemoError, "0 of 3 states press. Make the bank with --squeeze"):
-            add_transfers(plain, self.data, ROBOT, OBJECTS)
-        low = motion(first=(0.0, 0.019, 0.01))
-        with self.assertRaisesRegex(DemoError, "raised by more than 2 cm.* 3 of 3 states press"):
-            add_transfers(bank(low, FIRMLY), low, ROBOT, OBJECTS)
         found, _ = tried(self.bank, self.data)
         with self.assertRaisesRegex(DemoError, "already has 6 states in grasps of other"):
             add_transfers(found, self.data, ROBOT, OBJECTS)
@@ -252,10 +246,15 @@ class TransferTest(TestCase):
         with self.assertRaisesRegex(ValueError, "poses is 0, expected a whole number above 0"):
             TransferConfig(poses=0)
 
-    def test_none_are_added_by_default(self):
-        self.assertIs(
-            add_transfers(self.bank, self.data, ROBOT, OBJECTS, TransferConfig()), self.bank
-        )
+    def test_none_are_added_without_a_grasp_in_the_air_that_presses(self):
+        low = motion(first=(0.0, 0.019, 0.01))
+        for name, base, data, config in (
+            ("no state at a pose", self.bank, self.data, TransferConfig(per_pose=0)),
+            ("no state presses", bank(self.data), self.data, TransferConfig()),
+            ("no object is raised", bank(low, FIRMLY), low, TransferConfig()),
+        ):
+            with self.subTest(name):
+                self.assertIs(add_transfers(base, data, ROBOT, OBJECTS, config), base)
 
     @MUJOCO
     def test_a_grasp_that_does_not_hold_the_weight_is_left_out(self):
@@ -377,9 +376,8 @@ class CommandTest(InFolder):
         return read_bank(path), config, out
 
     def test_everything_at_once(self):
-        press = ("--squeeze.force", "2.5")
-        plain, config, out = self.resets(*press)
-        self.assertNotIn("transfer", config)
+        press = ("--closing.spacing", "None", "--squeeze.force", "2.5", "--squeeze.weight", "0")
+        plain, config, out = self.resets(*press, "--transfer.per-pose", "0")
         self.assertNotIn("grasps of other", out)
         bank, config, out = self.resets(*press, "--transfer.per-pose", "1", "--transfer.poses", "2")
         self.assertEqual(
@@ -396,18 +394,23 @@ class CommandTest(InFolder):
             if name != "transferred":
                 assert_array_equal(getattr(own, name), values, name)
         data = read_retargeted(self.motion)
-        again = add_transfers(
-            make_bank(data, ROBOT, OBJECTS, squeeze=SqueezeConfig(force=2.5)),
+        again = make_bank(
             data,
             ROBOT,
             OBJECTS,
-            TransferConfig(per_pose=1, poses=2),
+            closing=None,
+            squeeze=SqueezeConfig(force=2.5, weight=0.0),
+            transfer=TransferConfig(per_pose=1, poses=2),
         )
         assert_array_equal(again.joint_pos, bank.joint_pos)
 
-    def test_without_states_that_press_it_is_refused_before_any_work(self):
-        out = refused(
-            "resets", self.motion, "--out", self.folder / "b.npz", "--transfer.per-pose", "8"
-        )
-        self.assertIn("Add --squeeze.force 5", " ".join(out.split()))
-        self.assertFalse((self.folder / "b.npz").exists())
+    def test_the_defaults_are_those_of_the_headline_results(self):
+        bank, config, _ = self.resets()
+        self.assertEqual(config["closing"], {"spacing": 0.005, "within": 0.1})
+        pressing = {"force": 5.0, "weight": 1.0, "balanced": True, "reach": 0.005}
+        self.assertEqual(config["squeeze"], pressing)
+        transfer = {"per_pose": 8, "poses": 4, "candidates": 40, "seed": 0}
+        self.assertEqual(config["transfer"], transfer)
+        again = make_bank(read_retargeted(self.motion), ROBOT, OBJECTS)
+        for name, values in vars(bank).items():
+            assert_array_equal(getattr(again, name), values, name)

@@ -10,6 +10,8 @@ from xreset import ResetBank, Retargeted, make_backend
 
 SOUP = "005_tomato_soup_can"
 SPAM = "010_potted_meat_can"
+ONLY_FRAMES = {"closing": None, "squeeze": None, "transfer": None}
+"""Arguments of `make_bank` for a bank of states that are frames and do not press."""
 
 
 def in_this_process():

@@ -142,7 +142,7 @@ class Runs(Checked):
     """Largest number of demonstrations of each object."""
     policy: Literal["ik", "zero", "random"] | None = None
     """A baseline, which is evaluated and not trained."""
-    recipe: str = "minutes"
+    recipe: str = "default"
     config: dict[str, Any] = field(default_factory=dict)
     """Changes of the recipe, nested as the configuration is."""
     seeds: Annotated[

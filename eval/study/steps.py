@@ -263,7 +263,7 @@ def train_todo(run: Run) -> Todo:
         device=spec.device,
         num_envs=spec.num_envs,
         seed=run.seed,
-        like=spec.recipe,
+        recipe=spec.recipe,
         weights=run.weights,
         meshes=run.subset.meshes,
         config=_with_tables(spec.config, TrainConfig()),

@@ -83,7 +83,7 @@ def main(argv: list[str] | None = None) -> None:
         _fail(argv, "Out of memory. Use fewer worlds (--num-envs) or a smaller file.")
 
 
-_RENAMED = {"--backend": "--engine", "--objects": "--meshes"}
+_RENAMED = {"--backend": "--engine", "--objects": "--meshes", "--like": "--recipe"}
 """Flag of earlier versions -> its present name."""
 _NAME_OBJECTS = (["demos", "synth"], ["demos", "select"], ["demos", "split"])
 """Commands whose ``--objects`` are names of objects, and always were."""

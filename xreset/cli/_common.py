@@ -119,7 +119,7 @@ def refuse_changes(out: Path, **options: Any) -> None:
         if not is_same:
             raise RunError(
                 f"{flag} is {value}, but {out} was started with {found}, and --resume continues it as it was. "
-                f"Omit {flag}, or start another run with its networks: --weights {out} --like {out}"
+                f"Omit {flag}, or start another run with its networks: --weights {out} --recipe {out}"
             )
 
 

@@ -11,7 +11,6 @@ from tyro.conf import arg
 
 from xreset.cli._common import Device, Meshes, Several, Source, show_accounts
 from xreset.cli._terminal import Progress, console, show_notes
-from xreset.errors import XResetError
 from xreset.files import file_hash
 from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig, TransferConfig
 
@@ -44,14 +43,10 @@ def resets(
         closing: Extra states between frames in which the hand closes in on the object.
         squeeze: How hard fingers press in states after contact, and which fingers.
         transfer: Extra states at poses of each demonstration, in grasps of other demonstrations of the same object
-            that hold its full weight in every engine.
+            that hold its full weight in every engine. There are none if no finger presses.
         settle: Let objects come to rest (in the first engine) before episodes begin at home. Default: the recorded
             poses, as in the paper, from which one object in eleven turns by more than 10 degrees.
     """
-    if transfer.per_pose and not squeeze.presses:
-        raise XResetError(
-            "--transfer.per-pose transfers grasps that press, but no state presses. Add --squeeze.force 5."
-        )
     from xreset.description import load_robot
     from xreset.objects.catalogue import load_objects
     from xreset.records import stated_doubts
@@ -84,10 +79,11 @@ def resets(
             limits=limits,
             closing=closing,
             squeeze=squeeze,
+            transfer=None,
             progress=bar.count(title),
             **where,
         )
-        if transfer.per_pose:
+        if transfer.per_pose and squeeze.presses:
             count = bar.count("grasps of other demonstrations")
             bank = add_transfers(bank, motion, *scene, transfer, progress=count, **where)
         if settle:
@@ -101,11 +97,10 @@ def resets(
         "filter": asdict(limits),
         "closing": asdict(closing),
         "squeeze": asdict(squeeze),
+        "transfer": asdict(transfer),
         "settle": settle,
         "doubts": doubts,
     }
-    if transfer.per_pose:
-        config["transfer"] = asdict(transfer)
     write_bank(out, bank, config=config, inputs=made_from)
     accounts = bank.accounts()
     show_accounts(accounts, f"{bank.robot}: {title}")

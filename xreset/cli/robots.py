@@ -23,7 +23,7 @@ from xreset.cli._common import (
 from xreset.cli._terminal import Progress, console, show_table
 from xreset.errors import RobotError
 from xreset.plugins import robot_names
-from xreset.resets.config import SqueezeConfig
+from xreset.resets.config import JUDGE_SQUEEZE, SqueezeConfig
 from xreset.robot_tools import placement
 from xreset.robot_tools.placement import PlaceConfig
 
@@ -187,7 +187,7 @@ def judge(
     meshes: Meshes = None,
     engine: AllEngines = (),
     states: int = 8,
-    squeeze: SqueezeConfig = SqueezeConfig(force=5.0, reach=0.01),
+    squeeze: SqueezeConfig = JUDGE_SQUEEZE,
     num_envs: int = 32,
     device: Device = "cpu",
     picture: Path | None = None,

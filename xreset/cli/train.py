@@ -28,7 +28,7 @@ def train(
     minutes: float = math.inf,
     seed: int = 0,
     resume: bool = False,
-    like: str = "paper",
+    recipe: str = "default",
     weights: Path | None = None,
     wandb: str | None = None,
     config: TrainConfig = TrainConfig(),
@@ -49,14 +49,14 @@ def train(
             kernels is not counted.
         seed: Seed of every random number.
         resume: Continue the run in --out from its newest checkpoint. Name reward terms of your own again.
-        like: Where the configuration starts from: a recipe (paper, published, minutes, robust, live) or another
+        recipe: Where the configuration starts from: a recipe (default, robust, live, paper, published) or another
             run's folder. Flags change what they name. Reward terms of your own are not taken from a run; name them
-            again. Default: paper; with --weights and --goals, the run of --weights.
+            again. Default: the recipe of the headline results; with --weights and --goals, the run of --weights.
         weights: Another run's folder: start with the networks of its newest checkpoint, including the standard
             deviation of the actions and, if it adapts, the learning rate.
         wandb: Project of Weights & Biases to which learning curves are sent as well. Needs the package wandb, and a
             login.
-        config: Task, model and algorithm. The defaults shown are those of --like.
+        config: Task, model and algorithm. The defaults shown are those of --recipe.
     """
     from xreset.learning import train as training
 
@@ -67,10 +67,10 @@ def train(
     if resume:
         for flag in given_flags():
             name = flag.partition(".")[0]
-            if name in ("--like", "--config") and flag != "--config.task.reward.own":
+            if name in ("--recipe", "--config") and flag != "--config.task.reward.own":
                 raise RunError(
                     f"--resume continues with the run's own configuration. Omit {name}, or start another run with this "
-                    f"run's networks: --weights {out} --like {out}"
+                    f"run's networks: --weights {out} --recipe {out}"
                 )
         refuse_changes(
             out,
@@ -114,14 +114,14 @@ def train(
 
 
 def command_for(arguments: list[str]) -> Callable[..., None]:
-    """Return :func:`train` with the defaults of ``--like``, which must be known before the other flags are read."""
+    """Return :func:`train` with the defaults of ``--recipe``, which must be known before the other flags are read."""
     parser = ArgumentParser(add_help=False, allow_abbrev=False)
-    for flag in ("--like", "--weights", "--goals", "--resets"):
+    for flag in ("--recipe", "--weights", "--goals", "--resets"):
         parser.add_argument(flag, nargs="?")  # tyro reports a missing value
     given = parser.parse_known_args(arguments)[0]
-    like = given.like
-    if like:
-        config = starting_config(like)
+    recipe = given.recipe
+    if recipe:
+        config = starting_config(recipe)
     else:
-        like, config = default_config(given.resets, given.goals, given.weights)
-    return partial(train, like=like, config=config)
+        recipe, config = default_config(given.resets, given.goals, given.weights)
+    return partial(train, recipe=recipe, config=config)

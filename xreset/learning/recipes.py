@@ -32,9 +32,20 @@ def _read_recipes() -> dict[str, Recipe]:
         about = changes.pop("about")
         base = changes.pop("extends", None)
         config = recipes[base].config if base else TrainConfig()
-        config = from_dict(TrainConfig, merged(asdict(config), changes), f"{_FILE}: {name}")
+        changed = merged(asdict(config), _with_none(changes))
+        config = from_dict(TrainConfig, changed, f"{_FILE}: {name}")
         recipes[name] = Recipe(config=config, about=about)
     return recipes
+
+
+def _with_none(changes: dict[str, Any]) -> dict[str, Any]:
+    """Return nested changes with None in place of the text ``"None"``, because TOML has no word for it."""
+    found = {}
+    for name, value in changes.items():
+        found[name] = _with_none(value) if isinstance(value, dict) else value
+        if value == "None":
+            found[name] = None
+    return found
 
 
 _FILE = Path(__file__).with_name("recipes.toml")
@@ -47,39 +58,40 @@ def default_config(bank: Any, goals: Any, weights: str | Path | None) -> tuple[s
     """Return where the configuration comes from if nothing is said, and the configuration.
 
     With goals and the weights of a run, it is that run's configuration. If there is no bank then, the schedule of
-    demonstrated states is left out. In all other cases it is the paper's configuration.
+    demonstrated states is left out. In all other cases it is the recipe ``default``.
     """
     if goals is None or weights is None or not (Path(weights) / "run.json").is_file():
-        return "paper", TrainConfig()
+        return "default", TrainConfig()
     config = starting_config(str(weights))
     if bank is None:
         config = replace(config, schedule=replace(config.schedule, demo_probability=()))
     return str(weights), config
 
 
-def starting_config(like: str) -> TrainConfig:
+def starting_config(recipe: str) -> TrainConfig:
     """Return the configuration of a recipe, or of a run without the reward terms that its user added.
 
     Such a term names code to import. A file must not decide that, so the user has to name the terms again. A note on
     standard error says so.
 
     Args:
-        like: name of a recipe, or a run folder.
+        recipe: name of a recipe, or a run folder.
 
     Raises:
         RunError: it is neither.
     """
-    if like in RECIPES:
-        return RECIPES[like].config
-    if not Path(like).exists():
-        recipes = "; ".join(f"{name}, {recipe.about}" for name, recipe in RECIPES.items())
-        raise RunError(f"There is no recipe and no run folder {like!r}. Recipes: {recipes}.")
-    config = read_run(like).config
+    if recipe in RECIPES:
+        return RECIPES[recipe].config
+    if not Path(recipe).exists():
+        known = "; ".join(f"{name}, {each.about}" for name, each in RECIPES.items())
+        raise RunError(f"There is no recipe and no run folder {recipe!r}. Recipes: {known}.")
+    config = read_run(recipe).config
     reward = config.task.reward
     if reward.own:
         print(
-            f"{like} was trained with reward terms of your own. They are off unless you name them again, because a run "
-            f"folder must not decide which code is imported. If you trust this code, add {own_terms_flag(reward.own)}.",
+            f"{recipe} was trained with reward terms of your own. They are off unless you name them again, because a "
+            "run folder must not decide which code is imported. If you trust this code, add "
+            f"{own_terms_flag(reward.own)}.",
             file=sys.stderr,
         )
     return replace(config, task=replace(config.task, reward=replace(reward, own={})))
@@ -117,7 +129,8 @@ def resume_command(folder: Path, own: dict[str, float]) -> str:
 
 
 def student_config(teacher: TaskConfig, vision: VisionConfig) -> TrainConfig:
-    """Return the configuration of a distillation: ``student.toml``, with images up to 33 ms older than the newest.
+    """Return the configuration of a distillation: ``student.toml``, with images up to 33 ms older than the newest. What
+    it does not name is as in the recipe ``paper``.
 
     Args:
         teacher: the teacher's task, without cameras.
@@ -127,4 +140,5 @@ def student_config(teacher: TaskConfig, vision: VisionConfig) -> TrainConfig:
     changes = tomllib.loads(_STUDENT.read_text())
     latency = round(1 / 30 / teacher.control_dt, 3)
     changes["task"]["randomization"]["camera_latency"] = [0.0, latency]
-    return from_dict(TrainConfig, merged({"task": asdict(task)}, changes), str(_STUDENT))
+    base = asdict(replace(RECIPES["paper"].config, task=task))
+    return from_dict(TrainConfig, merged(base, changes), str(_STUDENT))

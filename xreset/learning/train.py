@@ -82,9 +82,9 @@ def train(
             are no demonstrated states, and every episode begins at home.
         out: run folder to make.
         goals: goal set, or its file. With a bank, its starts and goals are added to the demonstrated ones.
-        recipe: where the configuration comes from: a recipe such as ``minutes``, or another run's folder. Reward terms
-            of the user's own are not taken from a run: name them in ``config``. Default: ``paper``; with ``weights``
-            and ``goals``, the run of ``weights``.
+        recipe: where the configuration comes from: a recipe such as ``paper``, or another run's folder. Reward terms of
+            the user's own are not taken from a run: name them in ``config``. Default: the recipe of the headline
+            results; with ``weights`` and ``goals``, the run of ``weights``.
         config: the whole configuration, instead of a recipe.
         robot: name or folder of the robot; default: the robot that the bank names.
         meshes: folder of object meshes; default: the built-in stand-ins.
@@ -325,7 +325,7 @@ def _checkpoint_to_start_from(run: Path, inputs: Inputs, config: TrainConfig) ->
             f"{run} is a run of xreset distill and has no critic, so no training can start from it. Give a run of "
             f"xreset train (--weights), or continue the distillation: --out {run} --resume"
         )
-    start = f"Start from its configuration, with recipe=... or --like {run}"
+    start = f"Start from its configuration, with recipe=... or --recipe {run}"
     try:
         check_contract(str(run), other.contract, inputs.robot, config.task)
     except PolicyError as error:

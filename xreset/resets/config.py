@@ -1,4 +1,6 @@
-"""Options of a reset bank: limits of the physics filter, and states and targets beyond it, which are off by default."""
+"""Options of a reset bank: limits of the physics filter, and states and targets beyond it.
+
+The defaults are those of the headline results (docs/results.md)."""
 
 from __future__ import annotations
 
@@ -11,7 +13,6 @@ from xreset.checks import (
     PositiveInt,
     frozen,
 )
-from xreset.errors import WrongValueError
 
 
 @frozen
@@ -32,8 +33,8 @@ class FilterConfig(Checked):
 class ClosingConfig(Checked):
     """More states where a hand closes in on an object (:mod:`xreset.resets.closing`)."""
 
-    spacing: Length | None = None
-    """Farthest that any fingertip moves from one state to the next [m], such as 0.005. None: no states are added."""
+    spacing: Length | None = 0.005
+    """Farthest that any fingertip moves from one state to the next [m]. None: no states are added."""
     within: PositiveFloat = 0.10
     """States are added between two frames if a finger is nearer than this to the object in one of them [m]."""
 
@@ -42,23 +43,16 @@ class ClosingConfig(Checked):
 class SqueezeConfig(Checked):
     """Drive targets that press (:func:`xreset.resets.fingers.squeeze_targets`)."""
 
-    force: NonNegativeFloat = 0.0
-    """Normal force of each finger that presses [N]. 0: targets are the joints' positions."""
-    weight: NonNegativeFloat = 0.0
-    """Further force, as a share of the object's weight, such as 1. With one force for all objects, heavy ones slip and
-    light ones tilt."""
-    balanced: bool = False
+    force: NonNegativeFloat = 5.0
+    """Normal force of each finger that presses [N]. If ``weight`` is 0 as well, targets are the joints' positions."""
+    weight: NonNegativeFloat = 1.0
+    """Further force, as a share of the object's weight. With one force for all objects, heavy ones slip and light ones
+    tilt."""
+    balanced: bool = True
     """Whether the forces on an object nearly cancel: the thumb presses as hard as all fingers that oppose it together.
     The mean force stays the same."""
     reach: PositiveFloat = 0.005
     """A finger presses if it is nearer than this to the object [m]."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.balanced and not self.presses:
-            raise WrongValueError(
-                "balanced is True and there is no force to balance. Set force or weight"
-            )
 
     @property
     def presses(self) -> bool:
@@ -66,12 +60,16 @@ class SqueezeConfig(Checked):
         return self.force > 0 or self.weight > 0
 
 
+JUDGE_SQUEEZE = SqueezeConfig(force=5.0, weight=0.0, balanced=False, reach=0.01)
+"""How fingers press when a robot is judged (``xreset robots judge``): with the same force on every object."""
+
+
 @frozen
 class TransferConfig(Checked):
     """More states, in grasps of other demonstrations of the same object (:mod:`xreset.resets.transfer`)."""
 
-    per_pose: NonNegativeInt = 0
-    """Most states at each pose, such as 8. 0: no states are added."""
+    per_pose: NonNegativeInt = 8
+    """Most states at each pose. 0: no states are added."""
     poses: PositiveInt = 4
     """Most poses of each demonstration: evenly from the first frame in which the object is raised by 3 cm to the last,
     usually the goal. 1: the first only."""

@@ -72,7 +72,7 @@ def add_transfers(
     retargeted: Retargeted,
     robot: RobotSpec,
     objects: Sequence[ObjectSpec],
-    config: TransferConfig = TransferConfig(per_pose=8),
+    config: TransferConfig = TransferConfig(),
     *,
     num_envs: PositiveInt = 64,
     device: str = "cpu",
@@ -83,11 +83,10 @@ def add_transfers(
 
     The new states come after those of the bank, and :attr:`ResetBank.transferred` marks them. The hand keeps the joints
     and the drive targets of the grasp, and its place at the object. An object of which the bank has a single
-    demonstration gets no state.
+    demonstration gets no state, and so does a bank without a state that presses on an object in the air.
 
     Args:
-        bank: its states after contact must press (:class:`xreset.resets.config.SqueezeConfig`). The hand must hold the
-            object in every engine of the bank.
+        bank: made by ``make_bank(transfer=None)``. The hand must hold the object in every engine of the bank.
         retargeted: the motion that the bank was made from.
         robot: the robot of both.
         objects: the objects of both.
@@ -97,8 +96,8 @@ def add_transfers(
         progress: called with what is done and what is to be done in all.
 
     Raises:
-        DemoError: no state of the bank presses on an object in the air, the bank has transferred states already, the
-            motion has other demonstrations than the bank, or an object is not among ``objects``.
+        DemoError: the bank has transferred states already, the motion has other demonstrations than the bank, or an
+            object is not among ``objects``.
         FileFormatError: the bank's states are for a robot with other joints, or for other meshes.
         XResetError: coal, which retargeting needs too, is not installed.
     """
@@ -107,6 +106,8 @@ def add_transfers(
     if not config.per_pose:
         return bank
     grasps = _grasps(bank, retargeted, robot)
+    if not len(grasps):
+        return bank
     poses = _raised_poses(retargeted, config.poses)
     pose, grasp = _candidates(bank, grasps, poses, config)
     used = objects_named(objects, bank.object_name[grasp])
@@ -157,14 +158,7 @@ def _grasps(bank: ResetBank, retargeted: Retargeted, robot: RobotSpec) -> np.nda
     presses = (bank.targets[:, hand] != bank.joint_pos[:, hand]).any(axis=1)
     start_pos, _ = retargeted.start_pose
     raised = bank.object_pos[:, 2] - start_pos[bank.sequence_index, 2]
-    grasps = np.flatnonzero(presses & (raised > _CARRIED))
-    if not len(grasps):
-        raise DemoError(
-            f"No state of the bank presses on an object that is raised by more than {100 * _CARRIED:g} cm, so there "
-            f"is no grasp for other demonstrations: {presses.sum()} of {bank.num_states} states press. Make the bank "
-            "with --squeeze.force 5, from demonstrations that lift their objects."
-        )
-    return grasps
+    return np.flatnonzero(presses & (raised > _CARRIED))
 
 
 def _raised_poses(retargeted: Retargeted, count: int) -> _Poses:

@@ -35,7 +35,7 @@ from xreset.physics import Backend, State
 from xreset.pictures.render import Camera, Renderer, add_caption
 from xreset.progress import unseen
 from xreset.resets.bank import ResetBank, check_states
-from xreset.resets.config import SqueezeConfig
+from xreset.resets.config import JUDGE_SQUEEZE, SqueezeConfig
 from xreset.resets.fingers import Fingers, fingers_of, squeeze_targets
 from xreset.resets.probe import probe
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, checked_objects, objects_named
@@ -121,7 +121,7 @@ def judge(
     engines: Sequence[str] = ("mujoco",),
     *,
     states: int = 8,
-    squeeze: SqueezeConfig = SqueezeConfig(force=5.0, reach=0.01),
+    squeeze: SqueezeConfig = JUDGE_SQUEEZE,
     num_envs: PositiveInt = 32,
     device: str = "cpu",
     progress: Callable[[float, int], None] = unseen,

@@ -142,6 +142,23 @@ class UsageTest(TestCase):
                 for each in told:
                     self.assertIn(each, err)
 
+    def test_help_of_training_is_short_and_fits_a_terminal(self):
+        with patch.dict(os.environ, COLUMNS="80"):
+            words = run("train", "--help")[1]
+            parts = run("train", "--help-config")[1]
+            reset = run("train", "--recipe", "paper", "--help-config", "task.reset")[1]
+        self.assertLessEqual(len(words.splitlines()), 80)
+        for text in (words, reset):
+            self.assertLessEqual(max(map(len, text.splitlines())), 80)
+        self.assertNotIn("{None}", words)
+        self.assertNotIn("--config.task", words)
+        for name in ("task.observation.noise", "ppo", "schedule"):
+            self.assertIn(f" {name} ", parts)
+        self.assertRegex(reset, r"--config.task.reset.random-gravity[\s\S]*\(default: True\)")
+        self.assertNotIn("--config.task.reward", reset)
+        refusal = run("train", "--help-config", "tusk")[2]
+        self.assertIn("no part 'tusk'. Choose from: task, task.action", refusal)
+
     def test_a_student_has_the_robot_of_the_bank(self):
         self.assertIn("default: that of the bank", run("distill", "--help")[1])
 

@@ -128,17 +128,26 @@ def _run(argv: list[str]) -> None:
     module = import_module(f"xreset.cli.{name}")
     import tyro
 
-    from xreset.cli._options import checked
+    from xreset.cli._options import OPTIONAL, checked
 
     command = module.command_for(arguments) if hasattr(module, "command_for") else module.COMMAND
-    how: dict[str, Any] = {"prog": f"xreset {name}", "description": COMMANDS[name]}
+    how: dict[str, Any] = {
+        "prog": f"xreset {name}",
+        "description": COMMANDS[name],
+        "registry": OPTIONAL,
+    }
     if not isinstance(command, dict):
         tyro.cli(checked(command), args=arguments, **how)
         return
     for words in (2, 1):  # a verb may have two words
         verb = " ".join(arguments[:words])
         if verb in command:
-            tyro.cli(checked(command[verb]), args=arguments[words:], prog=f"xreset {name} {verb}")
+            tyro.cli(
+                checked(command[verb]),
+                args=arguments[words:],
+                prog=f"xreset {name} {verb}",
+                registry=OPTIONAL,
+            )
             return
     verbs = {verb: checked(function) for verb, function in command.items()}
     tyro.extras.subcommand_cli_from_dict(verbs, args=arguments, **how)

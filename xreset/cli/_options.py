@@ -1,14 +1,19 @@
-"""Check the options of a command, by their names, before the command begins."""
+"""Check the options of a command, by their names, before the command begins, and show them."""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial, wraps
 from inspect import signature
 from pathlib import Path
-from typing import Any
+from types import NoneType, UnionType
+from typing import Any, Union, get_args
+
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from xreset.checks import LARGEST_SEED, LAST_PORT, Options
 from xreset.errors import XResetError
@@ -53,7 +58,43 @@ def checked(command: Callable[..., None]) -> Callable[..., None]:
                     claims.enter_context(claim(path))
             command(*positional, **named)
 
+    run.__doc__ = _reflowed(command.__doc__ or "")
     return run
+
+
+def _reflowed(docstring: str) -> str:
+    """Return a docstring with each paragraph and each argument's text on one line, because the terminal's width decides
+    where lines end."""
+    lines: list[str] = []
+    for line in docstring.splitlines():
+        begins = not line.strip() or re.match(r"    (Args:|    \w+: )", line)
+        if begins or not lines or not lines[-1].strip() or lines[-1].endswith("Args:"):
+            lines.append(line)
+        else:
+            lines[-1] += f" {line.strip()}"
+    return "\n".join(lines)
+
+
+OPTIONAL = ConstructorRegistry()
+"""How options that may be left out are read and shown: as ``PATH``, and not as ``{None}|PATH``."""
+
+
+@OPTIONAL.primitive_rule
+def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    parts = get_args(info.type)
+    if info.type_origin not in (Union, UnionType) or len(parts) != 2 or parts[1] is not NoneType:
+        return None
+    spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(parts[0], info.markers))
+    if not isinstance(spec, PrimitiveConstructorSpec) or spec.nargs != 1:
+        return None
+    return replace(
+        spec,
+        instance_from_str=lambda text: None if text == ["None"] else spec.instance_from_str(text),
+        is_instance=lambda value: value is None or spec.is_instance(value),
+        str_from_instance=lambda value: (
+            ["None"] if value is None else spec.str_from_instance(value)
+        ),
+    )
 
 
 def _check(options: dict[str, Any]) -> None:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from argparse import ArgumentParser
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Iterator
+from dataclasses import fields, is_dataclass
+from functools import partial, wraps
+from inspect import signature
 from pathlib import Path
+from typing import Annotated, Any
 
 from xreset.cli._common import Meshes, given_flags, refuse_changes
+from xreset.cli._terminal import show_table
 from xreset.errors import RunError
 from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import default_config, starting_config
@@ -49,9 +54,10 @@ def train(
             kernels is not counted.
         seed: Seed of every random number.
         resume: Continue the run in --out from its newest checkpoint. Name reward terms of your own again.
-        recipe: Where the configuration starts from: a recipe (default, robust, live, paper, published) or another
-            run's folder. Flags change what they name. Reward terms of your own are not taken from a run; name them
-            again. Default: the recipe of the headline results; with --weights and --goals, the run of --weights.
+        recipe: Where the configuration starts from: a recipe (default, robust, live, paper, published) or another run's
+            folder. Options --config.* change it; see them with xreset train --help-config [PART]. Reward terms of your
+            own are not taken from a run; name them again. Default: the recipe of the headline results; with --weights
+            and --goals, the run of --weights.
         weights: Another run's folder: start with the networks of its newest checkpoint, including the standard
             deviation of the actions and, if it adapts, the learning rate.
         wandb: Project of Weights & Biases to which learning curves are sent as well. Needs the package wandb, and a
@@ -113,15 +119,71 @@ def train(
     )
 
 
+_HELP_CONFIG = "--help-config"
+
+
 def command_for(arguments: list[str]) -> Callable[..., None]:
     """Return :func:`train` with the defaults of ``--recipe``, which must be known before the other flags are read."""
     parser = ArgumentParser(add_help=False, allow_abbrev=False)
     for flag in ("--recipe", "--weights", "--goals", "--resets"):
         parser.add_argument(flag, nargs="?")  # tyro reports a missing value
+    parser.add_argument(_HELP_CONFIG, nargs="?", const="")
     given = parser.parse_known_args(arguments)[0]
     recipe = given.recipe
     if recipe:
         config = starting_config(recipe)
     else:
         recipe, config = default_config(given.resets, given.goals, given.weights)
+    if given.help_config is not None:
+        _show_config(given.help_config.removeprefix("config."), config)
+        raise SystemExit(0)
+    if not {"-h", "--help"}.isdisjoint(arguments):
+        return partial(_without_configuration(train), recipe=recipe)
     return partial(train, recipe=recipe, config=config)
+
+
+def _without_configuration(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command whose help leaves out the configuration, which has a help of its own."""
+
+    @wraps(command)
+    def short(**options: Any) -> None:
+        command(**options)
+
+    whole = signature(command)
+    kept = [each for each in whole.parameters.values() if each.name != "config"]
+    vars(short)["__signature__"] = whole.replace(parameters=kept)
+    return short
+
+
+def _show_config(part: str, config: TrainConfig) -> None:
+    """Print the options of a part of the configuration, such as ``task.reward``; or, without a part, all parts."""
+    import tyro
+
+    from xreset.cli._options import OPTIONAL
+
+    parts = dict(_parts(config))
+    if part and part not in parts:
+        raise RunError(f"The configuration has no part {part!r}. Choose from: {', '.join(parts)}.")
+    if not part:
+        show_table([("PART", "options"), *((name, _summary(each)) for name, each in parts.items())])
+        return
+
+    def options(chosen: Any) -> None: ...
+
+    named = Annotated[type(parts[part]), tyro.conf.arg(name=f"config.{part}")]
+    options.__annotations__["chosen"] = named
+    options.__defaults__ = (parts[part],)
+    tyro.cli(options, prog="xreset train", args=["--help"], registry=OPTIONAL)
+
+
+def _parts(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the names of a configuration's parts, and the parts, in order."""
+    for field in fields(config):
+        value = getattr(config, field.name)
+        if is_dataclass(value):
+            yield prefix + field.name, value
+            yield from _parts(value, f"{prefix}{field.name}.")
+
+
+def _summary(part: Any) -> str:
+    return (inspect.getdoc(type(part)) or "").partition("\n")[0]

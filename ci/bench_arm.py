@@ -14,7 +14,7 @@ from rich.console import Console
 from xreset import robots
 from xreset.demos.archive import demo_objects, read_demos
 from xreset.demos.synth import synthesize
-from xreset.retarget.arm.config import ArmConfig
+from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track
 from xreset.retarget.pipeline import wrist_paths
@@ -64,7 +64,7 @@ def run(options: Options, console: Console) -> None:
         parts = [getattr(path, name)[mask] for path, mask in zip(paths, above, strict=True)]
         fields[name] = torch.cat(parts)[chosen][:, None]
     alone = ArmTargets(**fields)
-    config = replace(ArmConfig(), restarts=16, reseeds=0, collision_weight=0.0)
+    config = replace(ArmSearch(), restarts=16, reseeds=0, collision_weight=0.0)
     within = _follows(
         track(model, alone, replace(SOLVED, table_depth=1e9, self_depth=1e9), config)[1], 1e9
     )[:, 0]

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from xreset import robots
 from xreset.demos.archive import Demos, demo_objects, read_demos
-from xreset.retarget.hand.config import HandConfig
+from xreset.retarget.hand.config import HandWeights
 from xreset.retarget.hand.model import HandModel
 from xreset.retarget.pipeline import HandMotions, RetargetConfig, rest_on_table
 from xreset.spec import ObjectSpec
@@ -36,9 +36,9 @@ _REFERENCE = (
 )
 """Measured on two CPU cores with the Sharpa hand on the same nine sequences, after 70 s of compiling."""
 _CONFIGS = {
-    "default": HandConfig(),
-    "contact weight 20": HandConfig(contact_weight=20.0),
-    "paper's terms and the jump wall": HandConfig(clearance_weight=0.0),
+    "default": HandWeights(),
+    "contact weight 20": HandWeights(contact_weight=20.0),
+    "paper's terms and the jump wall": HandWeights(clearance_weight=0.0),
 }
 
 
@@ -127,7 +127,7 @@ def one_per_object(demos: Demos) -> Demos:
 
 
 def errors(
-    demos: Demos, objects: Mapping[str, ObjectSpec], options: Options, config: HandConfig
+    demos: Demos, objects: Mapping[str, ObjectSpec], options: Options, config: HandWeights
 ) -> Errors:
     """Retarget the hand and measure."""
     robot = robots.load(options.robot)

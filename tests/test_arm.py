@@ -20,7 +20,7 @@ from xreset.description import load_robot as load
 from xreset.errors import RobotError
 from xreset.geometry.kinematics import Kinematics
 from xreset.plugins import robot_folder
-from xreset.retarget.arm.config import ArmConfig
+from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import splice, spread_over, track
 from xreset.retarget.validity import Thresholds, classify
@@ -184,7 +184,7 @@ class DirectionTest(TestCase):
     def valid(self, targets, **changes):
         """[T] which frames the arm follows."""
         thresholds = Thresholds(table_depth=1e9, self_depth=1e9)
-        config = ArmConfig(restarts=4, branches=1, collision_weight=0.0, **changes)
+        config = ArmSearch(restarts=4, branches=1, collision_weight=0.0, **changes)
         return classify(track(self.model, targets, thresholds, config)[1], thresholds)[0] == 0
 
     def test_both_ends_are_tried(self):

@@ -13,7 +13,7 @@ from xreset import robots, synthesize
 from xreset.demos.archive import demo_objects
 from xreset.geometry.rotations import quat_from_axis_angle, quat_rotate
 from xreset.geometry.surface import Surface
-from xreset.retarget.hand.config import HandConfig
+from xreset.retarget.hand.config import HandWeights
 from xreset.retarget.hand.cost import system
 from xreset.retarget.hand.jaw import jaw_keypoints, jaw_state
 from xreset.retarget.hand.model import HandModel, HandState
@@ -69,14 +69,14 @@ class PadsTest(TestCase):
 
     def test_a_jaw_that_holds_is_turned_to_the_faces(self):
         _, targets = self.aslant(math.radians(20))
-        self.assertLess(self.degrees_off(targets, HandConfig()), 5.0)
-        self.assertGreater(self.degrees_off(targets, HandConfig(pad_weight=0.0)), 15.0)
+        self.assertLess(self.degrees_off(targets, HandWeights()), 5.0)
+        self.assertGreater(self.degrees_off(targets, HandWeights(pad_weight=0.0)), 15.0)
         _, free = self.aslant(math.radians(20), held=False)
-        self.assertGreater(self.degrees_off(free, HandConfig()), 15.0)
+        self.assertGreater(self.degrees_off(free, HandWeights()), 15.0)
 
     def test_gradient_is_the_derivative_of_the_cost(self):
         state, targets = self.aslant(math.radians(17), frames=2)
-        config = HandConfig(clearance_weight=0.0)
+        config = HandWeights(clearance_weight=0.0)
         without = dataclasses.replace(config, pad_weight=0.0)
         cost, free = (
             system(self.model, targets, each, state).cost.item() for each in (config, without)
@@ -87,7 +87,7 @@ class PadsTest(TestCase):
     def test_an_object_is_held_between_the_human_s_thumb_and_a_finger(self):
         demos = synthesize(["soup"], per_object=1, seed=1)
         objects = list(demo_objects(demos).values())
-        config = HandConfig(clearance_weight=0.0, iterations=0)
+        config = HandWeights(clearance_weight=0.0, iterations=0)
         hands = HandMotions(demos, self.model.robot, objects, RetargetConfig(hand=config))
         [(*_, targets, _)] = hands.batches()
         self.assertFalse(targets.held[0, 0])
@@ -121,7 +121,7 @@ class AnalyticMapTest(TestCase):
         at["wrist"][:] = (0, 0, 0.2)
         field = Surface(box_object(((0, 0, 0), (0.05, 0.05, 0.05)))).field
         targets = hand_targets(torch.as_tensor(jaw_keypoints(model, hand))[None], field)
-        motion = retarget_hand(model, targets, HandConfig(jaw="analytic"))
+        motion = retarget_hand(model, targets, jaw="analytic")
         tips = model.keypoints(motion)[0, 0, model.is_tip]
         self.assertAlmostEqual(motion.joints.item(), 0.0)
         assert_close(tips[:, 0].abs(), torch.full((2,), 0.0425, dtype=FLOAT), atol=1e-3, rtol=0)

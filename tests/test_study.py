@@ -100,13 +100,13 @@ class FileTest(Studied):
         message = r"is \[.*\], expected options that begin with --"
         for command, text, is_given in (
             ("retarget", "--picture /tmp/victim.png", False),
-            ("retarget", "--hand.iterations 4 --out=/tmp/victim.npz", False),
+            ("retarget", "--jaw analytic --out=/tmp/victim.npz", False),
             ("retarget", "-h", False),
             ("resets", "--settle --out /tmp/victim.npz", False),
             ("resets", "--robot /tmp", False),
             (
                 "retarget",
-                "--hand.object-clearance -0.001 --arm.restarts=8 --hand.jump_limit 1",
+                "--jaw analytic --device cpu",
                 True,
             ),
             ("resets", "--closing.spacing 0.005 --num-envs 8 --engine mujoco", True),

@@ -77,7 +77,7 @@ class Data(Checked):
     synthetic_seed: Seed = 0
     meshes: str | None = None
     """Folder of meshes, relative to ``--data``; None: the stand-ins."""
-    retarget: Annotated[tuple[str, ...], _options("--hand.", "--arm.", "--device")] = ()
+    retarget: Annotated[tuple[str, ...], _options("--jaw", "--hand.jaw", "--device")] = ()
     """Further options of ``xreset retarget``."""
     resets: Annotated[
         tuple[str, ...],

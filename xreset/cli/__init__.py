@@ -83,7 +83,12 @@ def main(argv: list[str] | None = None) -> None:
         _fail(argv, "Out of memory. Use fewer worlds (--num-envs) or a smaller file.")
 
 
-_RENAMED = {"--backend": "--engine", "--objects": "--meshes", "--like": "--recipe"}
+_RENAMED = {
+    "--backend": "--engine",
+    "--objects": "--meshes",
+    "--like": "--recipe",
+    "--hand.jaw": "--jaw",
+}
 """Flag of earlier versions -> its present name."""
 _NAME_OBJECTS = (["demos", "synth"], ["demos", "select"], ["demos", "split"])
 """Commands whose ``--objects`` are names of objects, and always were."""

@@ -10,8 +10,7 @@ import numpy as np
 from xreset.cli._common import Meshes, Source, show_accounts
 from xreset.cli._terminal import Progress, console, show_notes
 from xreset.files import file_hash
-from xreset.retarget.arm.config import ArmConfig
-from xreset.retarget.hand.config import HandConfig
+from xreset.retarget.hand.config import Jaw
 
 
 def retarget(
@@ -23,8 +22,7 @@ def retarget(
     max_per_object: int | None = None,
     trust_recordings: bool = False,
     device: str = "cpu",
-    hand: HandConfig = HandConfig(),
-    arm: ArmConfig = ArmConfig(),
+    jaw: Jaw = "fingertips",
 ) -> None:
     """Turn human demonstrations into robot motion.
 
@@ -35,8 +33,8 @@ def retarget(
         max_per_object: Use only the first sequences of each object, at most this many.
         trust_recordings: Use demonstrations that are certainly wrong all the same.
         device: Where hand retargeting runs: cpu or cuda. The arm runs on the CPU.
-        hand: Weights of hand retargeting.
-        arm: Weights and effort of the arm's inverse kinematics.
+        jaw: What a parallel jaw follows: the human's fingertips, like every hand, or the published paper's analytic map
+            from thumb tip to fingers.
     """
     from xreset.demos.archive import demo_objects, read_demos
     from xreset.description import load_robot
@@ -54,7 +52,7 @@ def retarget(
             ]
         )
     specs = demo_objects(chosen, meshes)
-    config = RetargetConfig(hand=hand, arm=arm)
+    config = RetargetConfig(jaw=jaw)
     doubts = []
 
     def note(doubt: str) -> None:

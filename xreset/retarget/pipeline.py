@@ -13,18 +13,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.checks import frozen
+from xreset.checks import Checked, frozen
 from xreset.demos.archive import Demos, grounded, levelled
 from xreset.demos.examine import examine, refuse_wrong
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.rotations import matrix_to_quat
 from xreset.geometry.surface import Surface, prepared_surface
 from xreset.progress import Progress, unseen
-from xreset.retarget.arm.config import ArmConfig
+from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track
 from xreset.retarget.file import Retargeted
-from xreset.retarget.hand.config import HandConfig
+from xreset.retarget.hand.config import HandWeights, Jaw
 from xreset.retarget.hand.jaw import jaw_keypoints
 from xreset.retarget.hand.model import HandModel, HandState, HandTargets
 from xreset.retarget.hand.solve import retarget_hand
@@ -42,11 +42,12 @@ _FINGERS = slice(5, None)
 
 
 @frozen
-class RetargetConfig:
-    """Weights and limits of retargeting. With robot, objects and demonstrations they determine the result."""
+class RetargetConfig(Checked):
+    """Options and constants of retargeting. With robot, objects and demonstrations they determine the result."""
 
-    hand: HandConfig = field(default_factory=HandConfig)
-    arm: ArmConfig = field(default_factory=ArmConfig)
+    jaw: Jaw = "fingertips"
+    hand: HandWeights = HandWeights()
+    arm: ArmSearch = ArmSearch()
     thresholds: Thresholds = field(default_factory=Thresholds)
     contact_distance: float = 0.020
     """A human keypoint nearer than this to the object's surface touches it [m]."""
@@ -180,7 +181,7 @@ class HandMotions:
         """Find the contacts; arguments and errors as of :func:`retarget_demos`."""
         self.model = HandModel(robot, device=device)
         """The robot's hand."""
-        self._config = config.hand
+        self._config = config
         surfaces = {
             name: prepared_surface(spec)
             for name, spec in objects_named(objects, demos.object_names).items()
@@ -212,7 +213,7 @@ class HandMotions:
             is_frame = np.arange(lengths[sequences].max()) < lengths[sequences, None]
             targets = self._targets(sequences, rows, is_frame)
             with one_thread():
-                motion = retarget_hand(self.model, targets, self._config)
+                motion = retarget_hand(self.model, targets, self._config.hand, jaw=self._config.jaw)
             yield rows, is_frame, targets, motion
             progress(begin + len(sequences), len(todo))
 

@@ -17,7 +17,7 @@ from xreset.geometry.balls import bounding_balls, joined
 from xreset.geometry.collision import SelfCollision, height_above_table, table_points
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matrix_to_quat, matvec, quat_angle
-from xreset.retarget.arm.config import ArmConfig
+from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.validity import Measures, Thresholds, classify
 from xreset.spec import RobotSpec, TableSpec
 from xreset.tensors import Tensors
@@ -193,7 +193,7 @@ class ArmProblem(ArmTargets):
     """[S, T, G, 4, 4] see :meth:`ArmModel.hand_poses`; computed once from the targets."""
     model: ArmModel
     thresholds: Thresholds
-    config: ArmConfig
+    config: ArmSearch
 
     def repeated(self, count: int) -> ArmProblem:
         """Return the problem with every sequence repeated, copies next to each other: [S count, ...]."""

@@ -28,7 +28,7 @@ from xreset.geometry.rotations import (
     quat_multiply,
     quat_to_axis_angle,
 )
-from xreset.retarget.arm.config import ArmConfig
+from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmModel, ArmProblem, ArmTargets, arm_jump
 from xreset.retarget.least_squares import Quadratic, damped, free_to_move, minimize
 from xreset.retarget.validity import REASONS, Measures, Thresholds, classify
@@ -57,7 +57,7 @@ class Paths(Tensors):
 
 
 def track(
-    model: ArmModel, targets: ArmTargets, thresholds: Thresholds, config: ArmConfig | None = None
+    model: ArmModel, targets: ArmTargets, thresholds: Thresholds, config: ArmSearch | None = None
 ) -> tuple[Tensor, Measures]:
     """Find arm joints along the hand's path.
 
@@ -75,7 +75,7 @@ def track(
         model=model,
         hand_poses=model.hand_poses(targets.hand_joints),
         thresholds=thresholds,
-        config=config or ArmConfig(),
+        config=config or ArmSearch(),
     )
     forwards = branches(problem)
     joints, worth = best_path(problem, forwards)
@@ -239,7 +239,7 @@ def _first_frame_solutions(problem: ArmProblem) -> Tensor:
     return torch.stack(chosen) if chosen else home.new_zeros(0, number, len(home))
 
 
-def _random_starts(model: ArmModel, config: ArmConfig) -> Tensor:
+def _random_starts(model: ArmModel, config: ArmSearch) -> Tensor:
     """[restarts, n] starts of a first frame, the same for every sequence: home, then random ones within the limits and
     within half a turn of home."""
     home = model.home

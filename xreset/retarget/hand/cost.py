@@ -24,7 +24,7 @@ from xreset.geometry.rotations import (
 )
 from xreset.retarget.hand import terms
 from xreset.retarget.hand.clearance import Distances, Objects, pad_distances, too_near
-from xreset.retarget.hand.config import HandConfig
+from xreset.retarget.hand.config import HandWeights
 from xreset.retarget.hand.model import HandModel, HandState, HandTargets
 from xreset.retarget.least_squares import Quadratic
 
@@ -42,7 +42,7 @@ class HandSystem(Quadratic):
 
 
 def system(
-    model: HandModel, targets: HandTargets, config: HandConfig, state: HandState
+    model: HandModel, targets: HandTargets, config: HandWeights, state: HandState
 ) -> HandSystem:
     """Compute the cost of every sequence and its Gauss-Newton approximation."""
     sequences, frames, joints = state.joints.shape
@@ -76,7 +76,7 @@ def system(
 
 
 def _frame_costs(
-    model: HandModel, targets: HandTargets, config: HandConfig, state: HandState
+    model: HandModel, targets: HandTargets, config: HandWeights, state: HandState
 ) -> Quadratic:
     """Compute the cost [B] of single frames and its approximation."""
     scale = config.length_scale
@@ -109,7 +109,7 @@ def _frame_costs(
 
 
 def _keypoint_terms(
-    model: HandModel, targets: HandTargets, config: HandConfig, bodies: PointJacobian
+    model: HandModel, targets: HandTargets, config: HandWeights, bodies: PointJacobian
 ) -> Quadratic:
     """Compute the terms of the keypoints and of the bones between them."""
     scale = config.length_scale

@@ -22,7 +22,7 @@ from xreset.geometry.rotations import (
     quat_multiply,
     quat_normalize,
 )
-from xreset.retarget.hand.config import HandConfig
+from xreset.retarget.hand.config import HandWeights, Jaw
 from xreset.retarget.hand.cost import HandSystem, system
 from xreset.retarget.hand.jaw import jaw_state
 from xreset.retarget.hand.model import HandModel, HandState, HandTargets
@@ -36,7 +36,11 @@ _GROWTH_STEPS = 6
 
 
 def retarget_hand(
-    model: HandModel, targets: HandTargets, config: HandConfig | None = None
+    model: HandModel,
+    targets: HandTargets,
+    config: HandWeights | None = None,
+    *,
+    jaw: Jaw = "fingertips",
 ) -> HandState:
     """Find hand motions that minimize the cost; sequences are independent of one another.
 
@@ -44,15 +48,16 @@ def retarget_hand(
         model: the hand.
         targets: human motion to follow; a sequence must have at least one annotated frame.
         config: weights and limits.
+        jaw: what a parallel jaw follows.
 
     Returns:
         The motions, on the targets' device; joints are within their limits.
     """
-    config = config or HandConfig()
+    config = config or HandWeights()
     device = targets.keypoints.device
     targets = targets.to(model.device)
     human = _gaps_filled(targets)
-    if model.is_jaw and config.jaw == "analytic":
+    if model.is_jaw and jaw == "analytic":
         return jaw_state(model, human).to(device)
     root_pos, root_quat = _align_root(model, human)
     joints = model.kinematics.clamp(model.home).expand(*targets.annotated.shape, -1)
@@ -66,7 +71,7 @@ def retarget_hand(
 
 
 def _minimize(
-    model: HandModel, targets: HandTargets, config: HandConfig, start: HandState
+    model: HandModel, targets: HandTargets, config: HandWeights, start: HandState
 ) -> HandState:
     """Return the best state that Levenberg-Marquardt finds from a first guess."""
 

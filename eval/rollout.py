@@ -284,7 +284,7 @@ class Round:
         """Add the reading after a control step to the metrics."""
         position = reading.task_state.object_pos
         table = self.env.backend.scene.table
-        self.metrics.update(reading, out_of_bounds(position, table, self.env.task.termination))
+        self.metrics.update(reading, out_of_bounds(position, table))
 
 
 def play_rounds(

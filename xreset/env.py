@@ -491,9 +491,7 @@ class ManipulationEnv:
         reading = self.reading()
         broken = reading.health.nonfinite
         self._mark_faults(reading)
-        lost = ~broken & out_of_bounds(
-            reading.task_state.object_pos, self.backend.scene.table, self.task.termination
-        )
+        lost = ~broken & out_of_bounds(reading.task_state.object_pos, self.backend.scene.table)
         reach = reading.tip_distance.mean(dim=-1)
         self._best_reach.copy_(
             torch.where(broken, self._best_reach, torch.minimum(self._best_reach, reach))

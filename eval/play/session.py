@@ -301,11 +301,7 @@ class Session:
     def lost(self) -> bool:
         """Whether the object has left the table."""
         env = self.env
-        return bool(
-            out_of_bounds(
-                env.backend.state().object_pos, env.backend.scene.table, env.task.termination
-            )
-        )
+        return bool(out_of_bounds(env.backend.state().object_pos, env.backend.scene.table))
 
     def cloud(self) -> np.ndarray:
         """[P, 3] the newest points of the object's surface that the policy observes, world frame [m]."""

@@ -65,7 +65,7 @@ class ModelConfig(Checked):
 class PpoConfig(Checked):
     """Proximal policy optimization."""
 
-    REMOVED: ClassVar = {"critic_learning_rate": None, "clip_values": True}
+    REMOVED: ClassVar = {"critic_learning_rate": None, "clip_values": True, "grad_norm": 1.0}
 
     horizon: Annotated[int, Rule("a number above 1", lambda steps: steps > 1)] = 16
     """Control steps per world and iteration. Not 1: rsl-rl stores LSTM states from a run's second step on."""
@@ -90,7 +90,6 @@ class PpoConfig(Checked):
     explores nothing. The paper's library uses 1e-4."""
     value_loss: NonNegativeFloat = 1.0
     """Weight of the value loss. Not in the paper."""
-    grad_norm: PositiveFloat = 1.0
     average: Share = 0.0
     """The policy that is exported has the mean of the weights over about this share of the iterations, the latest ones;
     0: it has the last weights. Iteration t has the weight 1 / (1 + average (t - 1)) in the running mean

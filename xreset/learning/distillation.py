@@ -19,7 +19,7 @@ from torch import Tensor
 from xreset.learning.config import TrainConfig
 from xreset.learning.distributed import Processes
 from xreset.learning.model import make_actor
-from xreset.learning.ppo import first_steps, piece_states
+from xreset.learning.ppo import GRAD_NORM, first_steps, piece_states
 from xreset.learning.teacher import load_teacher
 
 
@@ -50,7 +50,7 @@ class SequenceDistillation(Distillation):
             num_learning_epochs=p.mini_epochs,
             gradient_length=1,
             learning_rate=p.learning_rate,
-            max_grad_norm=p.grad_norm,
+            max_grad_norm=GRAD_NORM,
             device=device,
             multi_gpu_cfg=processes.ranks,
         )

@@ -23,6 +23,8 @@ from xreset.learning.model import LstmState, ReturnCritic, make_actor, make_crit
 
 BOUND = 1.1
 """Mean of an action beyond which ``bounds_loss`` pulls it back."""
+GRAD_NORM = 1.0
+"""Largest norm of a network's gradient (Table VIII); a longer one is shortened to it."""
 SLOWEST = 1e-5
 FASTEST = 1e-2
 """Limits of an adaptive learning rate (rsl-rl's)."""
@@ -78,7 +80,7 @@ class SequencePpo(PPO):
             value_loss_coef=p.value_loss,
             entropy_coef=p.entropy,
             learning_rate=p.learning_rate,
-            max_grad_norm=p.grad_norm,
+            max_grad_norm=GRAD_NORM,
             schedule=p.schedule,
             desired_kl=p.desired_kl,
             device=device,

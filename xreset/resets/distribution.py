@@ -119,6 +119,8 @@ class _Grouped:
         return self.rows[torch.minimum(torch.maximum(place, first), last)]  # against rounding
 
 
+GRAVITY_CLIP = 0.3
+"""Home resets: the gravity fraction is clipped to 1 +- this. The paper does not state its limits."""
 _MEMORY = 0.05
 """Weight of an episode in its demonstration's rate of success, which is thus over the last twenty episodes or so."""
 _LEAST_FAILURE = 0.05
@@ -279,7 +281,7 @@ class ResetDistribution:
             object_quat=object_quat,
             goal_pos=goal_pos,
             goal_quat=goal_quat,
-            gravity_fraction=gravity.clamp(1.0 - c.home_gravity_clip, 1.0 + c.home_gravity_clip),
+            gravity_fraction=gravity.clamp(1.0 - GRAVITY_CLIP, 1.0 + GRAVITY_CLIP),
             state=torch.full((m,), -1, device=device),
             sequence=sequence,
         )

@@ -13,7 +13,6 @@ from xreset.plugins import device_for, make_backend
 from xreset.resets.config import FilterConfig
 from xreset.schedule import schedule
 from xreset.spec import SceneSpec
-from xreset.task.config import TerminationConfig
 from xreset.task.terminations import out_of_bounds
 
 Judge = Callable[[Backend, State], Tensor]
@@ -86,7 +85,7 @@ def rejection(backend: Backend, start: State, limits: FilterConfig) -> Tensor:
     state = backend.state()
     health = backend.health()
     tests = (
-        out_of_bounds(state.object_pos, backend.scene.table, TerminationConfig()),
+        out_of_bounds(state.object_pos, backend.scene.table),
         state.object_linvel.norm(dim=-1) > limits.linear_velocity,
         state.object_angvel.norm(dim=-1) > limits.angular_velocity,
         state.joint_vel.abs().amax(dim=-1) > limits.joint_velocity,

@@ -240,23 +240,12 @@ class RewardConfig(Checked):
 
 @frozen
 class TerminationConfig(Checked):
-    """When an episode ends. The paper names the out-of-bounds termination, not its bounds."""
+    """When an episode ends; :mod:`xreset.task.terminations` has the bounds of the scene."""
+
+    REMOVED: ClassVar = {"object_low": -0.05, "object_high": 1.0, "margin": 0.10}
 
     episode_seconds: float = 5.0
     """Time limit [s], from one control step to 1,000,000 s. Its end is not a failure: the value is bootstrapped."""
-    object_low: FiniteFloat = -0.05
-    """The object is out of bounds when its origin is below this height [m]: it has left the table."""
-    object_high: FiniteFloat = 1.0
-    """The object is out of bounds when its origin is above this height [m]."""
-    margin: FiniteFloat = 0.10
-    """The object is out of bounds when its origin is farther than this outside the table's edges [m]."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.object_low < self.object_high:
-            raise WrongValueError(
-                f"object_low is {self.object_low}, expected less than object_high, which is {self.object_high}"
-            )
 
 
 @frozen
@@ -268,6 +257,7 @@ class ResetConfig(Checked):
         "frontier_over": "bank",
         "frontier_power": 1.0,
         "frontier_rate": 0.1,
+        "home_gravity_clip": 0.3,
     }
 
     demo_probability: Share = 0.5
@@ -278,8 +268,6 @@ class ResetConfig(Checked):
     """Bank resets: gravity fraction U(0, 1); False: 1 (the paper's ablation, and better in docs/lab-book.md)."""
     home_gravity_std: NonNegativeFloat = 1.0
     """Home resets: standard deviation of the object's gravity [m/s^2] around 9.81; 0 is exactly full gravity."""
-    home_gravity_clip: NonNegativeFloat = 0.3
-    """Home resets: the gravity fraction is clipped to 1 +- this. The paper does not state its limits."""
     spawn_xy: NonNegativeFloat = 0.02
     """Home resets: the object is moved by U(-x, x) in both directions [m]."""
     spawn_yaw: NonNegativeFloat = 0.4363323129985824
@@ -378,11 +366,11 @@ class RandomizationConfig(Checked):
     off by default; docs/sim-to-sim.md has their effect on policies.
     """
 
+    REMOVED: ClassVar = {"friction_buckets": 250}
+
     enabled: bool = True
     friction: Range = (0.5, 1.0)
     """Range of the object material's coefficient."""
-    friction_buckets: PositiveInt = 250
-    """Number of distinct materials."""
     elastomer: NonNegativeFloat = 0.8
     """Coefficient of the fingertips' material. The friction of a pair is the mean of its two materials, as in the
     paper's simulator."""

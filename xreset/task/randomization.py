@@ -73,18 +73,20 @@ def pair_friction(
     return torch.stack([(material + other) / 2 for other in others], dim=-1)
 
 
+MATERIALS = 250
+"""Number of distinct materials of objects (Table IX)."""
+
+
 def sample_friction(count: int, c: RandomizationConfig, generator: torch.Generator) -> Tensor:
-    """[M, 3] pair friction of objects, each of one of ``friction_buckets`` evenly spaced materials.
+    """[M, 3] pair friction of objects, each of one of :data:`MATERIALS` evenly spaced materials.
 
     Without randomization it is the material in the middle.
     """
     low, high = c.friction
     if not c.enabled:
         return pair_friction(torch.full((count,), (low + high) / 2, device=generator.device), c)
-    bucket = torch.randint(
-        c.friction_buckets, (count,), generator=generator, device=generator.device
-    )
-    material = low + (high - low) * (bucket + 0.5) / c.friction_buckets
+    bucket = torch.randint(MATERIALS, (count,), generator=generator, device=generator.device)
+    material = low + (high - low) * (bucket + 0.5) / MATERIALS
     link = None
     if c.hand_friction is not None:
         link = sample_range(count, c.hand_friction, generator)

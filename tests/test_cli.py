@@ -157,7 +157,7 @@ class UsageTest(TestCase):
         self.assertRegex(reset, r"--config.task.reset.random-gravity[\s\S]*\(default: True\)")
         self.assertNotIn("--config.task.reward", reset)
         refusal = run("train", "--help-config", "tusk")[2]
-        self.assertIn("no part 'tusk'. Choose from: task, task.action", refusal)
+        self.assertIn("no part 'tusk'. Choose from: all, task, task.action", refusal)
 
     def test_a_student_has_the_robot_of_the_bank(self):
         self.assertIn("default: that of the bank", run("distill", "--help")[1])

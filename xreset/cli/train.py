@@ -161,7 +161,7 @@ def _show_config(part: str, config: TrainConfig) -> None:
 
     from xreset.cli._options import OPTIONAL
 
-    parts = dict(_parts(config))
+    parts = {"all": config, **dict(_parts(config))}
     if part and part not in parts:
         raise RunError(f"The configuration has no part {part!r}. Choose from: {', '.join(parts)}.")
     if not part:
@@ -170,7 +170,9 @@ def _show_config(part: str, config: TrainConfig) -> None:
 
     def options(chosen: Any) -> None: ...
 
-    named = Annotated[type(parts[part]), tyro.conf.arg(name=f"config.{part}")]
+    named = Annotated[
+        type(parts[part]), tyro.conf.arg(name="config" if part == "all" else f"config.{part}")
+    ]
     options.__annotations__["chosen"] = named
     options.__defaults__ = (parts[part],)
     tyro.cli(options, prog="xreset train", args=["--help"], registry=OPTIONAL)

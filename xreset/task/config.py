@@ -240,7 +240,7 @@ class RewardConfig(Checked):
 
 @frozen
 class TerminationConfig(Checked):
-    """When an episode ends; :mod:`xreset.task.terminations` has the bounds of the scene."""
+    """When an episode ends. xreset/task/terminations.py has the bounds of the scene."""
 
     REMOVED: ClassVar = {"object_low": -0.05, "object_high": 1.0, "margin": 0.10}
 

@@ -48,6 +48,8 @@ def surfaces(objects):
     return {name: prepared_surface(spec) for name, spec in objects.items()}
 
 
+CONVEX = {"005_tomato_soup_can", "006_mustard_bottle", "009_gelatin_box", "040_large_marker"}
+"""Objects whose meshes need not be cut."""
 SILENT = {"mesh: origin 2 cm", "mesh: origin -2 cm", "mesh: origin 5 cm", "mesh: origin -5 cm"}
 SILENT |= {"mesh: origin at its bottom", "time: rate times 0.2"}
 """Kinds, up to an axis, that may pass."""
@@ -64,15 +66,14 @@ class Right(TestCase):
             self.assertFalse([str(found) for found in examine(noisy) if found.wrong])
 
     def test_recorded_demonstrations(self):
-        """The hand of one sequence is never seen while its object moves, and some objects stand on others."""
+        """Of 600 sequences, some objects stand on others, and one hand is never seen while its object moves."""
         for name in ARCHIVES:
             demos = read_demos(data_dir() / f"dexycb_{name}.npz")
-            found = {each.name for each in examine(demos)}
-            self.assertLessEqual(found, {"unseen"})
-            few = demos.select(max_per_object=2, spread=True)
-            known = surfaces(demo_objects(few, data_dir() / "ycb20"))
-            for each in examine(few, known):
-                self.assertRegex(str(each), "It may stand on something|is not seen in any frame")
+            self.assertLessEqual({each.name for each in examine(demos)}, {"unseen"})
+            known = sorted(CONVEX.intersection(demos.object_names))
+            some = demos.select(objects=known)
+            for each in examine(some, surfaces(demo_objects(some, data_dir() / "ycb20"))):
+                self.assertRegex(str(each), "It may stand on something")
 
 
 class Wrong(InFolder):

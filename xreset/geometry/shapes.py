@@ -154,8 +154,12 @@ def outermost(points: np.ndarray, tolerance: float) -> np.ndarray:
     """
     if len(points) <= MANY_POINTS:
         points = points[ConvexHull(points).vertices]
-    directions = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1.0
-    chosen = np.unique((points @ directions.T).argmax(axis=0))
+        directions = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1.0
+        chosen = np.unique((points @ directions.T).argmax(axis=0))
+    else:
+        first = outermost(points[:: len(points) // _ROWS + 1], tolerance)
+        points = np.concatenate((first, points))
+        chosen = np.arange(len(first))
     beyond_hull = np.arange(len(points))
     while True:
         planes = ConvexHull(points[chosen]).equations

@@ -60,6 +60,8 @@ _FEW = 0.625
 """Share of the allowed number that pieces are joined to; the others are for the pieces that deviate most then."""
 _EXACT = 1e-4
 """Accuracy of the deviation [m]."""
+_OUTSIDE = 5e-4
+"""How far points of a mesh with very many may be outside its hull [m]."""
 _NEAREST = 8
 """Triangles of a surface that the distance of a point is computed from."""
 _BATCH = 2000
@@ -121,7 +123,7 @@ def decompose(mesh: trimesh.Trimesh, settings: Settings = Settings()) -> Pieces:
     surface = _Surface(*mesh_arrays(mesh))
     points = mesh.vertices
     if len(points) > MANY_POINTS:
-        points = outermost(np.asarray(points), _EXACT)
+        points = outermost(np.asarray(points), _OUTSIDE)
         around = shape_mesh(hull(points))
     else:
         around = mesh.convex_hull

@@ -213,8 +213,6 @@ def add_mesh(
     facts = target.with_suffix(".toml")
     properties = properties or Properties()
     known = replace(properties, tolerance=properties.tolerance or Settings.tolerance).to_toml()
-    if not scale > 0:
-        raise ObjectError(f"--scale is {scale:g}, expected the metres in a unit of the file.")
     if target.exists() or (facts.exists() and facts.read_bytes() != known.encode()):
         raise ObjectError(
             f"{target} or its .toml is there already. Nothing was changed; choose another --name or --out."

@@ -129,8 +129,11 @@ def _against_built(
     worlds = bench.worlds()
     # Parameters are single precision. A rounded friction alone moves the points where a can touches the table.
     nominal = Parameters.nominal(bench.scene, torch.tensor(bench.object_index)).given()
-    usual = [name for name in _BUILT_IN if name in bench.backend.capabilities]
-    parameters = {name: nominal[name] for name in usual} | parameters
+    usual: dict[Parameter, Tensor] = {}
+    for name in _BUILT_IN:
+        if name in bench.backend.capabilities:
+            usual[name] = nominal[name]
+    parameters = usual | parameters
     for name, value in parameters.items():
         for rows in ([3, 0], [1, 2]):
             worlds.set_parameter(name, value, rows)

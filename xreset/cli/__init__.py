@@ -15,6 +15,7 @@ from io import TextIOWrapper
 from typing import Any, NoReturn
 
 COMMANDS = {
+    "run": "Take demonstrations to a trained, evaluated policy: all steps with one command.",
     "demos": "Import, synthesize, select, merge and describe human demonstrations.",
     "objects": "List objects, import meshes, and make random shapes.",
     "robots": "List, check, import, place and judge robots.",

@@ -1,0 +1,44 @@
+"""`xreset run`: the commands that it gives, and what it leaves out when it is given again."""
+
+from unittest import TestCase
+from unittest.mock import patch
+
+from tests.command import refused
+from tests.data import InFolder
+from xreset.cli import main
+from xreset.cli import run as command
+from xreset.demos.archive import write_demos
+from xreset.demos.synth import synthesize
+from xreset.errors import RunError
+
+
+class Run(InFolder, TestCase):
+    def run_it(self, demos="soup.npz"):
+        """Run with real motion and bank; return the verbs of all steps."""
+        verbs = []
+
+        def step(words):
+            verbs.append(words[0])
+            if words[0] in ("retarget", "resets"):
+                main(words)
+
+        with patch.object(command, "main", step):
+            command.run(self.folder / demos, robot="ur7e-sharpa", out=self.folder / "v0.1")
+        return verbs
+
+    def test_steps_that_are_done_are_left_out(self):
+        for name, seed in (("soup.npz", 0), ("other.npz", 1)):
+            write_demos(self.folder / name, synthesize(["soup"], 1, fps=5, seed=seed))
+        self.assertEqual(self.run_it(), ["retarget", "resets", "train", "eval", "report"])
+        self.assertEqual(self.run_it(), ["train", "eval", "report"])
+        (self.folder / "v0.1/resets.npz").unlink()
+        self.assertEqual(self.run_it(), ["resets", "train", "eval", "report"])
+        with self.assertRaisesRegex(RunError, "another archive of demonstrations"):
+            self.run_it("other.npz")
+
+    def test_nothing_is_made_for_an_unknown_robot(self):
+        demos = self.folder / "soup.npz"
+        out = self.folder / "out"
+        write_demos(demos, synthesize(["soup"], 1, fps=5))
+        refused("run", demos, "--robot", "nobody", "--out", out)
+        self.assertFalse(out.exists())

@@ -23,7 +23,7 @@ from xreset.geometry.rotations import quat_angle
 from xreset.objects.sampling import Frame, keypoints, metric_points
 from xreset.spec import ObjectSpec
 from xreset.task.reading import Reading
-from xreset.task.rewards import contact_gate, point_distances
+from xreset.task.rewards import CONTACT_FORCE, contact_gate, point_distances
 from xreset.tensors import Tensors
 
 STAGE_SCORES = (0.0, 0.33, 0.66, 1.0)
@@ -34,9 +34,6 @@ APPROACH_DISTANCE = 0.05
 """Largest distance of a fingertip from the object in the stage approach [m]."""
 LIFT = 0.01
 """Least height of the object above its start in the stage grasp [m]."""
-CONTACT_FORCE = 0.1
-"""Force from which a finger counts as in contact [N], whatever the reward's ``contact_threshold`` is. Not in the
-paper."""
 GOAL_DISTANCE = 0.02
 """Largest distance of the object's origin from the goal in the stage reorientation [m]."""
 GOAL_ANGLE = 0.2617993877991494

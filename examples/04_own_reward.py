@@ -1,6 +1,6 @@
 """A reward term of your own: a function that the configuration names. Nothing in xreset changes.
 
-PYTHONPATH=examples xreset train ... --config.task.reward.own 04_own_reward:upright 0.5
+PYTHONPATH=examples xreset train ... --config.task.reward.terms.04_own_reward:upright.weight 0.5
 """
 
 import sys
@@ -31,7 +31,8 @@ def main(bank: Path) -> None:
     states = xreset.read_bank(bank)
     objects = [xreset.load_object(name) for name in states.object_names]
     term = f"{Path(__file__).stem}:upright"  # module:function
-    task = TaskConfig(reward=RewardConfig(own={term: 0.5}))
+    terms = RewardConfig().terms | {term: {"weight": 0.5}}
+    task = TaskConfig(reward=RewardConfig(terms=terms))
     with xreset.make_env(robot, objects, states, task, num_envs=16) as env:
         paid = torch.stack(
             [

@@ -28,7 +28,12 @@ except XResetError as error:
 
 IDEAL = DepthNoise(spread=0.0, step=0.0, holes=0.0, edges=0.0)
 ABOVE = CameraConfig(pos=(0.57, 0.3, 0.5), target=(0.57, 0.3, 0.0), noise=IDEAL)
-TASK = TaskConfig(distance_points=8, observation=ObservationConfig(cloud_points=4, cloud="paired"))
+TASK = TaskConfig(
+    distance_points=8,
+    observation=ObservationConfig(
+        cloud_points=4, perception={"paired_cloud": {"noise": 0.002, "scale": 1.0}}
+    ),
+)
 SIZE = {"width": 32, "height": 24}
 VISION = VisionConfig(cameras=(ABOVE, replace(ABOVE, pos=(1.0, 0.2, 0.4))), interval=1, **SIZE)
 

@@ -33,7 +33,10 @@ except (ImportError, XResetError) as error:
     raise SkipTest(str(error)) from error
 
 TASK = TaskConfig(
-    observation=ObservationConfig(cloud_points=16, cloud="paired"), distance_points=64
+    observation=ObservationConfig(
+        cloud_points=16, perception={"paired_cloud": {"noise": 0.002, "scale": 1.0}}
+    ),
+    distance_points=64,
 )
 SMALL = replace(CONFIG.model, conv=(4, 4), initial_std=0.1)
 IMAGES = VisionConfig(cameras=(FRONT, WRIST), width=16, height=12)

@@ -17,6 +17,8 @@ import xreset
 import xreset.runtime
 from tests.command import succeeds
 from xreset.cli import COMMANDS
+from xreset.cli._terms import take_terms
+from xreset.learning.config import TrainConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [*(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "AGENTS.md", "SECURITY.md"))]
@@ -110,6 +112,8 @@ class DocumentedTest(TestCase):
                 with self.subTest(page=page.name, command=" ".join(words)):
                     self.assertIn(words[0], COMMANDS)
                     help_text = help_of(command_of(words))
+                    if words[0] == "train":
+                        take_terms(TrainConfig(), words)  # these options are not in the help
                     options = {
                         word.partition("=")[0] for word in words if re.match(r"--[a-z]", word)
                     }

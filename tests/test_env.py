@@ -44,8 +44,8 @@ from xreset.task.config import (
     evaluation_task,
 )
 from xreset.task.observations import layout
-from xreset.task.randomization import Drawn
 from xreset.task.tracker import Tracker
+from xreset.task.worlds import Worlds
 
 try:
     from xreset.backends.mujoco import MujocoBackend
@@ -58,9 +58,7 @@ TASK = TaskConfig(
     observation=ObservationConfig(cloud_points=16),
     distance_points=64,
 )
-QUIET = replace(
-    TASK, observation=replace(TASK.observation, noise=evaluation_task(TASK).observation.noise)
-)
+QUIET = replace(TASK, observation=TASK.observation.without_noise())
 
 
 class BreakableBackend(MujocoBackend):
@@ -217,9 +215,9 @@ class RefusalTest(WithEnv):
             (lambda: env.reset(torch.tensor([N])), "^worlds is .*, expected indices from 0 to 2"),
             (lambda: env.reset([0, -1]), r"^worlds is \[0, -1\], expected indices from 0 to 2"),
             (lambda: env.reset(start=env.backend.state()), "^start is State.*, expected Reset"),
-            (lambda: env.restore({}), "^The snapshot has no 'goal_pos'"),
+            (lambda: env.restore({}), "^The snapshot has no 'episode.joint_pos'"),
             (lambda: env.restore({name: value[:2] for name, value in before.items()}),
-             r"^goal_pos of the snapshot has the shape \(2, 3\), expected \(3, 3\)"),
+             r"^episode.joint_pos of the snapshot has the shape \(2, 7\), expected \(3, 7\)"),
         ):  # fmt: skip
             with self.subTest(words), self.assertRaisesRegex(XResetError, words):
                 call()
@@ -277,7 +275,9 @@ class StepTest(WithEnv):
                 readings.append(reading)
         distance = torch.stack([reading.tip_distance.mean(dim=-1) for reading in readings])
         best = distance.cummin(dim=0).values
-        assert_close(torch.stack(reach), 1 - torch.tanh(best[1:] / TASK.reward.reach_width))
+        assert_close(
+            torch.stack(reach), 1 - torch.tanh(best[1:] / TASK.reward.terms["reach"]["width"])
+        )
         self.assertTrue((distance > best + 1e-3).any(), "the hand moved away at times")
 
     def test_a_reset_of_one_world_leaves_the_others_as_they_are(self):
@@ -333,7 +333,7 @@ class ResetTest(WithEnv):
 
     def test_ends_of_episodes_from_home_count_for_their_demonstration(self):
         """World 0 ends from home at its goal, world 1 elsewhere, world 2 at its goal from a state of the bank."""
-        near = RewardConfig(contact="near", near_tips=10.0, near_palm=10.0)
+        near = RewardConfig(gate={"near": {"tips": 10.0, "palm": 10.0}})
         reset = replace(TASK.reset, demo_probability=0.0, adaptive_share=0.5)
         env = self.make(replace(TASK, reward=near, reset=reset))
         state = env.backend.state()
@@ -451,9 +451,9 @@ class RobustnessTest(WithEnv):
         faulty = replace(QUIET, randomization=faults)
         for scale in (0.0, 0.5):
             env = self.make(faulty)
-            env.drawn.fault_scale.fill_(scale)
+            env.worlds.fault_scale.fill_(scale)
             env.reset()
-            kept = env.drawn.lasting
+            kept = env.worlds.buffers
             names = "commands.delay poses.delay proprio.delay lost_actions tracker.bias"
             for name in names.split():
                 self.assertEqual(kept[name].any(), scale > 0, name)
@@ -465,13 +465,13 @@ class RobustnessTest(WithEnv):
                     assert_close(seen, env.backend.state().object_pos, atol=1e-6, rtol=0)
 
     def test_a_delay_jitters_within_its_range(self):
-        drawn = Drawn(200, torch.device("cpu"))
+        worlds = Worlds(200, torch.device("cpu"))
         jitter = TrackerConfig(jitter=3.0)
         tracker = Tracker(
-            drawn, RandomizationConfig(observation_latency=(2.0, 2.0), tracker=jitter)
+            worlds, RandomizationConfig(observation_latency=(2.0, 2.0), tracker=jitter)
         )
         generator = torch.Generator().manual_seed(0)
-        drawn.draw(torch.ones(200, dtype=torch.bool), generator)
+        worlds.draw(torch.ones(200, dtype=torch.bool), generator)
         upright = tensor([1.0, 0, 0, 0]).expand(200, 4)
         for step in range(4):
             now = torch.full((200, 3), float(step))
@@ -538,7 +538,7 @@ class RobustnessTest(WithEnv):
             with patch.object(env.backend, "contacts", lambda pressed=pressed: pressed):
                 env.reset()
             force = env.get_observations()["proprio"][:, -6:]
-            gain = force / (TASK.observation.contact_force_scale * 0.1)
+            gain = force / (TASK.observation.proprio["tip_force"]["scale"] * 0.1)
             assert_close(gain, gain[:, :1].expand_as(gain))
             self.assertTrue((gain > low - 1e-5).all() and (gain < high + 1e-5).all())
             self.assertEqual(len(gain[:, 0].unique()), distinct)

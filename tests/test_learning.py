@@ -468,7 +468,11 @@ class ExportTest(InFolder):
 
         model = PointNetLstmModel(seen(0), GROUPS, A, SMALL, stochastic=True)
         model.update_normalization(seen(9))
-        task = TaskConfig(observation=ObservationConfig(cloud_points=10, cloud="paired"))
+        task = TaskConfig(
+            observation=ObservationConfig(
+                cloud_points=10, perception={"paired_cloud": {"noise": 0.002, "scale": 1.0}}
+            )
+        )
         layout = {
             "policy": {"all": 7},
             "proprio": {"all": 9},
@@ -607,7 +611,7 @@ class ChangingSettings(TestCase):
     def test_a_training_moves_its_limit_of_success_its_faults_and_its_starts(self):
         """On straight lines between the points."""
         env = Mock(success_position=torch.zeros(()))
-        env.drawn.fault_scale = torch.zeros(())
+        env.worlds.fault_scale = torch.zeros(())
         env.resets.demo_probability = torch.zeros(())
         schedule = ScheduleConfig(
             success_position=((0.2, 0.05), (1.0, 0.01)),
@@ -623,7 +627,7 @@ class ChangingSettings(TestCase):
         ):
             TrainingRunner._follow_schedule(runner, progress)
             self.assertAlmostEqual(float(env.success_position), limit)
-            self.assertAlmostEqual(float(env.drawn.fault_scale), scale)
+            self.assertAlmostEqual(float(env.worlds.fault_scale), scale)
             share = float(env.resets.demo_probability)
             self.assertAlmostEqual(share, max(0.0, 1 - progress), places=6)
 

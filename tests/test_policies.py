@@ -25,7 +25,9 @@ from xreset.policy import OnnxPolicy, observation_shapes, policy_contract
 from xreset.task.config import ObservationConfig, TaskConfig, TerminationConfig
 
 TASK = TaskConfig(
-    observation=ObservationConfig(cloud_history=2, cloud_points=8),
+    observation=ObservationConfig(
+        cloud_points=8, perception={"cloud": {"frames": 2, "noise": 0.002, "scale": 1.0}}
+    ),
     termination=TerminationConfig(episode_seconds=0.5),
     distance_points=32,
 )

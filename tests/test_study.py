@@ -254,13 +254,13 @@ class PlanTest(Studied):
             self.plan(HEAD + DATA + "[data.both]\ndemos = 'a.npz'\ngoals = []\n" + RUN)
 
     def test_what_does_not_fit_is_refused(self):
-        own = "own = { 'module:term' = 1.0 }\n"
+        own = "terms = { 'module:term' = { weight = 1.0 } }\n"
         gravity = r"runs\.a\.config\.task\.reset.*unknown: gravity"
         for text, error, message in (
             (
                 f"[runs.a.config.task.reward]\n{own}",
                 RunError,
-                "a.config.task.reward.own names code",
+                "a.config.task.reward.terms names code .module:term",
             ),
             ("[runs.a.config.task.reset]\ngravity = 1\n", FileFormatError, gravity),
             ("[runs.a]\nobjects = ['cup']\n", ObjectError, "Unknown object 'cup'"),

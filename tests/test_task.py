@@ -19,8 +19,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_robot
 from xreset.cameras.config import FRONT, VisionConfig
-from xreset.checks import from_dict
-from xreset.errors import DemoError, PolicyError, RunError, XResetError
+from xreset.checks import from_dict, merged
+from xreset.cli._terms import take_terms
+from xreset.errors import DemoError, FileFormatError, PolicyError, RunError, XResetError
 from xreset.geometry.rotations import (
     quat_angle,
     quat_conjugate,
@@ -39,8 +40,8 @@ from xreset.spec import TableSpec
 from xreset.task import observations as obs
 from xreset.task.actions import ActionSpace
 from xreset.task.config import (
+    GROUPS,
     ActionConfig,
-    NoiseConfig,
     ObservationConfig,
     PushConfig,
     RandomizationConfig,
@@ -53,19 +54,21 @@ from xreset.task.config import (
 from xreset.task.latency import DelayLine
 from xreset.task.pushes import Pushes
 from xreset.task.randomization import (
-    Drawn,
     pair_friction,
     sample_drives,
     sample_friction,
     sample_offset,
 )
 from xreset.task.reading import Reading, step_log
-from xreset.task.rewards import Reward, RewardInput, compute_reward, contact_gate
+from xreset.task.rewards import Reward, RewardFunction, RewardInput, contact_gate
 from xreset.task.terminations import out_of_bounds
 from xreset.task.tracker import Tracker
+from xreset.task.worlds import Worlds
 
 IDENTITY = tensor([1.0, 0, 0, 0])
 FAR = {"best_reach": 1e3}
+CONFIG = RECIPES["paper"].config
+OPEN = {"near": {"tips": 9.0, "palm": 9.0}}
 
 
 def generator(seed=0):
@@ -89,7 +92,14 @@ def one_number(x):
     return x.object_pos[:, 2].mean()
 
 
+def near(distance, width):
+    return 1 - math.tanh(distance / width)
+
+
 class RewardTest(TestCase):
+    PRESS = tensor([[0.6, 0.0, 0.8], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    SQUEEZE = tensor([[3.0, 0, 1], [0, 0, 0], [-3.0, 0, 1]])
+
     def reward(self, config=None, **changes):
         """One world: three fingers that do not press, object at its goal, no action; ``changes`` replace inputs (without batch)."""
         x = {
@@ -109,9 +119,7 @@ class RewardTest(TestCase):
         x = {name: torch.as_tensor(value) for name, value in (x | changes).items()}
         x = {k: v if k in ("is_arm", "success_position") else v[None] for k, v in x.items()}
         state = State.at_rest(torch.zeros(1, 4), x.pop("object_pos"), x.pop("object_quat"))
-        return compute_reward(RewardInput(state=state, **x), config or RewardConfig())
-
-    PRESS = tensor([[0.6, 0.0, 0.8], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        return RewardFunction(config or RewardConfig())(RewardInput(state=state, **x))
 
     def assert_terms(self, reward, **expected):
         """The named terms have these values, every other term is zero, and the total is a hundredth of the sum."""
@@ -120,34 +128,63 @@ class RewardTest(TestCase):
         assert_close(found, zeros | expected, atol=5e-6, rtol=0)
         self.assertAlmostEqual(reward.total, 0.01 * sum(expected.values()), delta=5e-6)
 
-    def test_terms(self):
-        """At the goal with no contact nothing but reach is paid; with it, 1 + 4 + 4 + 10."""
+    def test_each_term(self):
+        """What a term with weight 2 pays; the gate is open, unless one is named."""
         gone = {"best_reach": 0.01, "tip_distance": [0.1, 0.2, 0.3]}
-        wide = {"reach_width": 0.4, "reach_near": 0.5, "reach_near_width": 0.1}
-        opposing = {"contact": "opposing"}
-        press = FAR | {"tip_force": self.PRESS}
-        squeeze = FAR | {"tip_force": [[3.0, 0, 1], [0, 0, 0], [-3.0, 0, 1]]}
-        held = {"grasp": 1.0, "position": 4.0, "rotation": 4.0, "success": 10.0}
         away = {"object_pos": [0.5, 0.36, 0.02], "object_quat": turned(60, (0.0, 0.6, 0.8))}
-        moving = FAR | {"action": [1.0, -0.5, 0, 0], "previous_action": [1.0, 0.5, 0.2, 0]}
-
-        def near(x):
-            return 1 - math.tanh(x)
-
-        errors = {"position": 4 * near(0.1 / 0.2), "rotation": 4 * near(math.pi / 3 / 1.5)}
-        for config, changes, expected in (
-            ({}, gone, {"reach": near(0.1)}),
-            ({"reach_distance": "present"}, gone, {"reach": near(2.0)}),
-            (wide, {}, {"reach": near(0.5), "reach_near": 0.5 * near(2.0)}),
-            (opposing, press, {"grasp": 1.0}),
-            (opposing, squeeze, held),
-            ({}, FAR, {}),
-            ({}, press, held),
-            ({}, press | away, {"grasp": 1.0} | errors),
-            ({}, moving, {"action": -0.005 * 1.25, "action_rate": -0.005 * 1.04}),
+        moving = {"action": [3.0, -0.5, 0, 0], "previous_action": [1.0, 0.5, 0.2, 0]}
+        points = [[0.05, 0, 0], [0, 0.05, 0], [-0.05, 0, 0], [0, -0.05, 0]]
+        turn = {"points": points, "object_quat": turned(20.0)}
+        d = 0.1 * math.sin(math.radians(10))
+        just = {"success_position": 1.01 * d}
+        parts = {"arm": 0.5, "hand": 0.1}
+        apart = {"palm_distance": 0.7, "tip_distance": [1.0, 2.0, 3.0]}
+        for name, parameters, changes, expected in (
+            ("best_reach", {"width": 0.1}, gone, near(0.01, 0.1)),
+            ("reach", {"width": 0.4}, gone, near(0.2, 0.4)),
+            ("grasp", {"force": 0.9}, {"tip_force": self.PRESS}, 1.0),
+            ("grasp", {"force": 1.0}, {"tip_force": self.PRESS}, 0.0),
+            ("position", {"width": 0.2}, away, near(0.1, 0.2)),
+            ("rotation", {"width": 1.5}, away, near(math.pi / 3, 1.5)),
+            ("points", {"zero": 0.3}, turn, 1 - d / 0.3),
+            ("near_success", {"most": 15.0}, turn | just, 15 / (1 + 10 * d)),
+            ("near_success", {"most": 15.0}, turn | {"success_position": 0.99 * d}, 0.0),
+            ("proximity", {"cap": 3.0}, {}, 0.6),
+            ("proximity", {"cap": 3.0}, apart, 3.0),
+            ("palm_proximity", {"cap": 0.5}, {}, 0.2),
+            ("palm_proximity", {"cap": 0.5}, apart, 0.5),
+            ("action", {"limited": True}, moving, 1.25),
+            ("action", {"limited": False}, moving, 9.25),
+            ("action_rate", {"limited": True}, moving, 1.04),
+            ("action_rate", {"limited": False}, moving, 5.04),
+            ("action_rate_of_parts", parts | {"limited": True}, moving, 0.5 + 0.1 * 0.04),
+            ("out_of_bounds", {}, {"out_of_bounds": True}, 1.0),
         ):
-            with self.subTest(config=config, changes=list(changes)):
-                self.assert_terms(self.reward(RewardConfig(**config), **changes), **expected)
+            terms = {"named": {"function": name, "weight": 2.0} | parameters}
+            config = RewardConfig(terms=terms, gate=OPEN)
+            with self.subTest(name, **parameters):
+                self.assert_terms(self.reward(config, **changes), named=2 * expected)
+
+    def test_the_gate_closes_four_terms(self):
+        """At the goal without contact nothing but reach is paid; with it, 1 + 4 + 4 + 10."""
+        held = {"grasp": 1.0, "position": 4.0, "rotation": 4.0, "success": 10.0}
+        touching = {"touching": {"force": 0.1}}
+        opposing = {"opposing": {"force": 0.1}}
+        for gate, changes, expected in (
+            (touching, {}, {}),
+            (touching, {"tip_force": self.PRESS}, held),
+            (opposing, {"tip_force": self.PRESS}, {"grasp": 1.0}),
+            (opposing, {"tip_force": self.SQUEEZE}, held),
+            (OPEN, {}, held | {"grasp": 0.0}),
+            ({"near": {"tips": 0.5, "palm": 9.0}}, {}, {}),
+            ({"near": {"tips": 9.0, "palm": 0.1}}, {}, {}),
+        ):
+            with self.subTest(gate, **changes):
+                reward = self.reward(RewardConfig(gate=gate), **FAR, **changes)
+                self.assert_terms(reward, **expected)
+                self.assertEqual(reward.gate, "position" in expected)
+                self.assertEqual(reward.success, "success" in expected)
+                self.assertEqual(reward.grasped, "tip_force" in changes)
 
     def test_the_published_reward(self):
         """Numbers from the published paper: -2.5 min(P, 3) - 2.5 min(M, 0.5) + G (3 (1.4 - 3 d) + [d <= 0.02] 15 / (1 + 10 d))."""
@@ -181,58 +218,6 @@ class RewardTest(TestCase):
                 self.assertEqual((reward.gate, reward.success), (gate, success))
                 self.assertAlmostEqual(reward.total, 0.01 / 30 * expected, delta=5e-7)
 
-    def test_each_term_of_the_points_counts_a_turn(self):
-        points = [[0.05, 0, 0], [0, 0.05, 0], [-0.05, 0, 0], [0, -0.05, 0]]
-        turn = FAR | {"tip_force": self.PRESS, "points": points, "object_quat": turned(20.0)}
-        d = 0.1 * math.sin(math.radians(10))
-        paid = self.reward(RewardConfig(points=4.2), **turn).terms["points"]
-        self.assertAlmostEqual(paid, 4.2 * (1 - d / (1.4 / 3)), delta=5e-6)
-        paid = self.reward(RewardConfig(success_shape="points"), **turn).terms["success"]
-        self.assertAlmostEqual(paid, 10 / (1 + 10 * d), delta=5e-6)
-        for limit, success in ((0.99 * d, False), (1.01 * d, True)):
-            reward = self.reward(
-                RewardConfig(success_shape="points"), **turn, success_position=limit
-            )
-            self.assertEqual(reward.success, success)
-
-    def test_a_term_of_the_users_own_is_added(self):
-        config = RewardConfig(own={f"{__name__}:height": 0.5})
-        self.assert_terms(self.reward(config, **FAR), **{f"{__name__}:height": 0.05})
-        task = TaskConfig(reward=config)
-        self.assertEqual(from_dict(TaskConfig, json.loads(json.dumps(asdict(task)))), task)
-        self.assertEqual(evaluation_task(task).reward, RewardConfig())
-
-    def test_a_term_that_was_defined_again_is_the_new_one(self):
-        name = f"{__name__}:height"
-        with patch(f"{__name__}.height", lambda x: 2 * x.object_pos[:, 2]):
-            self.assert_terms(self.reward(RewardConfig(own={name: 0.5}), **FAR), **{name: 0.1})
-        self.assert_terms(self.reward(RewardConfig(own={name: 0.5}), **FAR), **{name: 0.05})
-
-    def test_what_is_not_a_reward_term_is_refused(self):
-        for name, problem in (
-            ("no_such_module:f", "No module named"),
-            (f"{__name__}:no_such_function", "no attribute"),
-            (f"{__name__}:IDENTITY", "expected a function"),
-            (f"{__name__}:one_number", r"gave \(\). Return a tensor of shape \(1,\)"),
-        ):
-            with self.subTest(name), self.assertRaisesRegex(RunError, problem):
-                self.reward(RewardConfig(own={name: 1.0}))
-        words = "expected module:function and a finite number"
-        for own in ({"height": 1.0}, {"module:": 1.0}, {"a:b": math.nan}, {math.sin: 1.0}, ["a:b"]):
-            with self.subTest(own), self.assertRaisesRegex(ValueError, words):
-                RewardConfig(own=own)
-
-    def test_unknown_words_and_other_objects_are_refused(self):
-        for make, words in (
-            (lambda: TaskConfig(object_frame="centre"), "is 'centre', expected one of 'mesh', 'center'"),
-            (lambda: TaskConfig(reward={"grasp": 2}), "reward is {'grasp': 2}, expected RewardConfig"),
-            (lambda: VisionConfig(cameras="front"), "cameras is 'front', expected several of: CameraConfig"),
-            (lambda: TrainConfig(task=None), "task is None, expected TaskConfig"),
-            (lambda: TrainConfig(iterations=0), "iterations is 0, expected a whole number above 0"),
-        ):  # fmt: skip
-            with self.subTest(words), self.assertRaisesRegex(XResetError, words):
-                make()
-
     def test_success_needs_two_centimetres_and_fifteen_degrees_and_contact(self):
         for distance, degrees, changes, expected in (
             (0.0195, 14.8, {}, True),
@@ -247,6 +232,63 @@ class RewardTest(TestCase):
             reward = self.reward(**(inputs | changes))
             self.assertEqual(reward.success, expected, (distance, degrees, changes))
             self.assertEqual(reward.terms["success"], 10.0 * expected)
+
+    def test_a_term_of_the_users_own_is_added_and_evaluations_leave_it_out(self):
+        own = f"{__name__}:height"
+        terms = RewardConfig().terms | {own: {"weight": 0.5}}
+        config = RewardConfig(terms=terms | {"reach": {"weight": 0.0, "width": 1.0}})
+        self.assert_terms(self.reward(config), **{own: 0.05})
+        self.assertEqual(config.own, {own: {"weight": 0.5}})
+        task = TaskConfig(reward=config)
+        self.assertEqual(from_dict(TaskConfig, json.loads(json.dumps(asdict(task)))), task)
+        self.assertEqual([*evaluation_task(task).reward.terms], [*RewardConfig().terms])
+        with patch(f"{__name__}.height", lambda x, *, most=2.0: most * x.object_pos[:, 2]):
+            self.assert_terms(self.reward(config), **{own: 0.1})  # defined again, as in a notebook
+            other = RewardConfig(terms={own: {"weight": 0.5, "most": 3.0}})
+            self.assert_terms(self.reward(other), **{own: 0.15})
+        self.assertEqual(float(self.reward(RewardConfig(terms={})).total), 0.0)
+
+    def test_what_is_not_a_term_is_refused(self):
+        for name, term, error, problem in (
+            ("no_such_module:f", {}, RunError, "No module named"),
+            (f"{__name__}:no_such_function", {}, RunError, "no attribute"),
+            (f"{__name__}:IDENTITY", {}, RunError, "expected a function"),
+            (f"{__name__}:one_number", {}, RunError, r"gave \(\). Return a tensor of shape \(1,\)"),
+            (f"{__name__}:height", {"most": 1.0}, ValueError, r"height does not fit height .unknown: most; known: "),
+            ("raech", {"width": 1.0}, ValueError, "Unknown reward term 'raech'. Choose from: reach, best_reach"),
+            ("reach", {"width": -1.0}, ValueError, r"terms\.reach\.width is -1.0, expected a number above 0"),
+            ("reach", {"width": 1.0, "with": 1.0}, ValueError, "unknown: with .width\\?.; known: width"),
+            ("reach", {}, ValueError, r"terms\.reach does not fit reach .missing: width"),
+        ):  # fmt: skip
+            with self.subTest(name, **term), self.assertRaisesRegex(error, problem):
+                self.reward(RewardConfig(terms={name: {"weight": 1.0} | term}))
+        with self.assertRaisesRegex(ValueError, "Unknown gate 'ajar'. Choose from: touching"):
+            self.reward(RewardConfig(gate={"ajar": {}}))
+        for terms in (
+            {"height": {}},
+            {"a:b": {"weight": math.nan}},
+            {"a:b": {"weight": "1"}},
+            {"a:b": {"weight": 1.0, "most": [1.0]}},
+            {"a:b": 1.0},
+            ["a:b"],
+        ):
+            with (
+                self.subTest(terms),
+                self.assertRaisesRegex(ValueError, "terms is .* with a weight"),
+            ):
+                RewardConfig(terms=terms)
+
+    def test_unknown_words_and_other_objects_are_refused(self):
+        for make, words in (
+            (lambda: TaskConfig(object_frame="centre"), "is 'centre', expected one of 'mesh', 'center'"),
+            (lambda: TaskConfig(reward={"grasp": 2}), "reward is {'grasp': 2}, expected RewardConfig"),
+            (lambda: ObservationConfig(perception={}), "perception is {}, expected one term"),
+            (lambda: VisionConfig(cameras="front"), "cameras is 'front', expected several of: CameraConfig"),
+            (lambda: TrainConfig(task=None), "task is None, expected TaskConfig"),
+            (lambda: TrainConfig(iterations=0), "iterations is 0, expected a whole number above 0"),
+        ):  # fmt: skip
+            with self.subTest(words), self.assertRaisesRegex(XResetError, words):
+                make()
 
     def test_the_contact_gate_needs_the_thumb_and_another_finger(self):
         for forces, expected in (
@@ -275,6 +317,138 @@ class RewardTest(TestCase):
             forces = tensor([hand])
             self.assertEqual(contact_gate(forces, 0.1), touches, hand)
             self.assertEqual(contact_gate(forces, 0.1, opposing=True), opposes, hand)
+
+
+MINUTES = {
+    "observation": {
+        "cloud": "paired", "rotation": "matrix", "cloud_scale": 5.0, "contact_force_scale": 0.03,
+        "joint_target": True,
+    },
+    "reward": {
+        "reach_width": 0.4, "reach_near": 1.0, "reach_distance": "present", "contact": "opposing",
+        "raw_actions": True,
+    },
+}  # fmt: skip
+PUBLISHED = {
+    "observation": {
+        "content": "published", "cloud": "paired", "cloud_scale": 5.0,
+        "noise": dict.fromkeys(("joint_pos", "joint_vel", "object_pos", "object_rot", "cloud"), 0.0),
+    },
+    "reward": {
+        "reach": 0.0, "grasp": 0.0, "position": 0.0, "rotation": 0.0, "proximity": -2.5, "palm_proximity": -2.5,
+        "contact": "near", "points": 4.2, "success": 15.0, "success_shape": "points", "action_rate_arm": -0.05,
+        "scale": 0.01 / 30,
+    },
+}  # fmt: skip
+PAPER = {
+    "observation": {"rotation": "quaternion"},
+    "reward": {"tracking": "presence", "contact": "any"},
+}
+
+
+class EarlierOptionsTest(TestCase):
+    """Files of 0.1 to 0.3 have options in place of terms."""
+
+    def test_they_mean_terms(self):
+        live = {"observation": MINUTES["observation"] | {"rotation": "to_goal"}}
+        for name, options in (
+            ("paper", PAPER),
+            ("minutes", MINUTES),
+            ("live", MINUTES | live),
+            ("published", PUBLISHED),
+        ):
+            task = RECIPES[name].config.task
+            found = from_dict(TaskConfig, options)
+            with self.subTest(name):
+                self.assertEqual(found.observation, task.observation)
+                self.assertEqual(found.reward, task.reward)
+                self.assertEqual([*found.reward.terms], [*task.reward.terms])
+                for group in GROUPS:
+                    names = [[*getattr(each.observation, group)] for each in (found, task)]
+                    self.assertEqual(*names, "the order of random draws")
+
+    def test_options_that_no_recipe_has(self):
+        options = {"cloud_history": 3, "joint_vel_scale": 0.2, "content": "published"}
+        found = from_dict(ObservationConfig, options)
+        self.assertEqual(found.perception, {"cloud": {"frames": 3, "noise": 0.002, "scale": 1.0}})
+        self.assertEqual(found.privileged["true_joint_vel"], {"scale": 0.2})
+        options = {
+            "success": 0.0,
+            "success_shape": "points",
+            "own": {"a:b": 2.0},
+            "action_rate": 0.0,
+        }
+        found = from_dict(RewardConfig, options).terms
+        self.assertEqual(found["success"]["weight"], 0.0)
+        self.assertEqual(found["a:b"], {"weight": 2.0})
+        self.assertNotIn("action_rate", found)
+
+    def test_wrong_values_are_refused(self):
+        for part, options, words in (
+            (
+                "reward",
+                {"contact": "gentle"},
+                r"reward\.contact is 'gentle', expected one of 'any'",
+            ),
+            ("reward", {"tracking": "speed"}, "tracking is 'speed'. This option was removed"),
+            ("reward", {"contact": "any", "grip": 1}, "unknown: grip"),
+            ("observation", {"rotation": [1]}, r"observation\.rotation is \[1\], expected one of"),
+            ("observation", {"cloud_points": 10**9}, "at most 100,000 points"),
+        ):
+            with self.subTest(words), self.assertRaisesRegex(FileFormatError, words):
+                from_dict(TaskConfig, {part: options})
+
+
+class FlagsTest(TestCase):
+    """Flags and studies change terms alike."""
+
+    def test_flags_that_set_terms(self):
+        terms = "--config.task.reward.terms."
+        near_gate = {"terms": {}, "gate": {"near": {"tips": 0.6, "palm": 2}, "touching": False}}
+        gate = "--config.task.reward.gate."
+        for flags, changes in (
+            (f"{terms}reach.width .4", {"reward": {"terms": {"reach": {"width": 0.4}}}}),
+            (f"{terms}action-rate.limited=False", {"reward": {"terms": {"action_rate": {"limited": False}}}}),
+            (f"{terms}grasp false", {"reward": {"terms": {"grasp": False}}}),
+            (f"{terms}pk.my_terms:up.weight -5", {"reward": {"terms": {"pk.my_terms:up": {"weight": -5}}}}),
+            (f"{gate}near.tips 0.6 {gate}near.palm 2 {gate}touching false", {"reward": near_gate}),
+            (
+                "--config.task.observation.proprio.joint-target true --config.task.observation.proprio.tip_pos false",
+                {"observation": {"proprio": {"joint_target": {}, "tip_pos": False}}},
+            ),
+        ):  # fmt: skip
+            arguments = ["--out", "x", *flags.split(), "--config.task.reward.scale", "2"]
+            with self.subTest(flags):
+                found = take_terms(CONFIG, arguments)
+                expected = merged(asdict(CONFIG), {"task": changes})
+                self.assertEqual(found, from_dict(TrainConfig, expected))
+                self.assertNotEqual(found, CONFIG)
+                self.assertEqual(arguments, ["--out", "x", "--config.task.reward.scale", "2"])
+        self.assertIs(take_terms(CONFIG, ["--out", "x"]), CONFIG)
+        changed = merged(
+            {"reach": {"weight": 1.0, "width": 0.1}}, {"reach": {"function": "best_reach"}}
+        )
+        self.assertEqual(
+            changed, {"reach": {"function": "best_reach"}}, "parameters of another function"
+        )
+
+    def test_flags_that_set_no_term_are_refused(self):
+        for flags, error, words in (
+            (
+                "--config.task.reward.terms.reach.width nan",
+                FileFormatError,
+                "expected terms: name -> ",
+            ),
+            ("--config.task.reward.terms.reach 3", FileFormatError, "expected terms: name -> "),
+            ("--config.task.reward.reach-width 3", RunError, "reach_width is no option any more"),
+            (
+                "--config.task.observation.rotation=matrix",
+                RunError,
+                "rotation is no option any more",
+            ),
+        ):
+            with self.subTest(flags), self.assertRaisesRegex(error, words):
+                take_terms(CONFIG, flags.split())
 
 
 class TerminationTest(TestCase):
@@ -361,9 +535,9 @@ class ActionTest(TestCase):
 
 class LatencyTest(TestCase):
     def test_values_come_late_and_are_mixed_between_whole_steps(self):
-        drawn = Drawn(5, torch.device("cpu"))
-        line = DelayLine(drawn, "line", 1, 2.0, lambda _: tensor([0.0, 0.5, 1.0, 1.5, 2.0]))
-        drawn.draw(torch.ones(5, dtype=torch.bool), generator())
+        worlds = Worlds(5, torch.device("cpu"))
+        line = DelayLine(worlds, "line", 1, 2.0, lambda _: tensor([0.0, 0.5, 1.0, 1.5, 2.0]))
+        worlds.draw(torch.ones(5, dtype=torch.bool), generator())
         line.fill(torch.ones(5, dtype=torch.bool), torch.zeros(5, 1))
 
         def delayed(value):
@@ -462,11 +636,11 @@ class PushTest(TestCase):
 
     def pushed(self, **config):
         """Pushes after a step, and the offsets of the joints' targets."""
-        drawn = Drawn(self.N, torch.device("cpu"))
+        worlds = Worlds(self.N, torch.device("cpu"))
         config = PushConfig(object_velocity=0.5, object_spin=4.0, arm_torque=0.3, **config)
-        pushes = Pushes(drawn, self.backend, config, self.IS_ARM)
+        pushes = Pushes(worlds, self.backend, config, self.IS_ARM)
         g = generator()
-        drawn.draw(torch.ones(self.N, dtype=torch.bool), g)
+        worlds.draw(torch.ones(self.N, dtype=torch.bool), g)
         return pushes, pushes.act(self.state, self.mass, self.scale, g)
 
     def test_pushes_are_as_large_as_stated_in_any_direction(self):
@@ -507,14 +681,14 @@ class TrackerTest(TestCase):
 
     def tracker(self, latency=(0.0, 0.0), scale=1.0, enabled=True, **faults):
         """A function that observes poses [N, 3], [N, 4]; ``fresh`` [N] are worlds that have just begun."""
-        drawn = Drawn(self.N, torch.device("cpu"))
-        drawn.fault_scale.fill_(scale)
+        worlds = Worlds(self.N, torch.device("cpu"))
+        worlds.fault_scale.fill_(scale)
         config = RandomizationConfig(
             enabled=enabled, observation_latency=latency, tracker=TrackerConfig(**faults)
         )
-        tracker = Tracker(drawn, config)
+        tracker = Tracker(worlds, config)
         g = generator()
-        drawn.draw(torch.ones(self.N, dtype=torch.bool), g)
+        worlds.draw(torch.ones(self.N, dtype=torch.bool), g)
 
         def observe(pos, quat=IDENTITY, fresh=False):
             fresh = torch.as_tensor(fresh).expand(self.N)
@@ -913,9 +1087,6 @@ class ResetTest(TestCase):
         assert_close(quiet.joint_pos, torch.full((5, 7), 0.01))
 
 
-QUIET = NoiseConfig(joint_pos=0.0, joint_vel=0.0, object_pos=0.0, object_rot=0.0, cloud=0.0)
-
-
 class ObservationTest(TestCase):
     N = 5
     J = 7
@@ -950,79 +1121,104 @@ class ObservationTest(TestCase):
             tip_force=10 * rand(self.E, 3),
             tip_distance=rand(self.E).abs(),
             reward=rand(),
+            generator=generator(),
         )
-        self.config = ObservationConfig(noise=QUIET, contact_force_scale=0.1, joint_vel_scale=0.2)
-        self.shown = self.terms(self.x, self.config)
+        still = merged(asdict(ObservationConfig()), {"proprio": {"joint_vel": {"scale": 0.2}}})
+        self.config = ObservationConfig(**still).without_noise()
 
     def terms(self, x, config):
-        """The terms of policy and proprio by name."""
-        widths = obs.layout(self.J, self.E, config)
-        policy = self.split(obs.policy_group(x, config, generator()), widths["policy"])
-        return policy | self.split(obs.proprio_group(x, config, generator()), widths["proprio"])
+        """Value of every term by name, in all groups; the layout has their widths."""
+        found = {}
+        for group in GROUPS:
+            found |= obs.Observer(config).terms(group, x)
+        return found
 
-    def split(self, group, widths):
-        self.assertEqual(tuple(group.shape), (self.N, sum(widths.values())))
-        return dict(zip(widths, group.split(list(widths.values()), dim=-1), strict=True))
+    def value(self, x=None, **term):
+        """The value of one term, given by name and parameters."""
+        config = ObservationConfig(policy=term)
+        (value,) = obs.Observer(config).terms("policy", x or self.x).values()
+        return value
 
-    def test_without_noise_the_proprio_group_is_exact(self):
-        for name in ("pos", "linvel", "angvel"):
-            assert_close(self.shown[f"palm_{name}"], getattr(self.x.links, name)[:, 0])
-        assert_close(self.shown["tip_pos"], self.x.links.pos[:, 1:].flatten(1))
-        assert_close(self.shown["joint_vel"], 0.2 * self.x.state.joint_vel)
+    def test_each_term_that_is_a_quantity(self):
+        x = self.x
+        state = x.state
+        scaled = {"joint_pos": state.joint_pos, "target_pos": x.joint_target}
+        expected = {
+            "object_pos": x.observed_pos,
+            "goal_pos": x.goal_pos,
+            "gravity_fraction": x.gravity_fraction[:, None],
+            "previous_action": x.previous_action,
+            "joint_vel": 0.2 * state.joint_vel,
+            "true_joint_vel": 0.2 * state.joint_vel,
+            "joint_target": x.joint_target - state.joint_pos,
+            "palm_pos": x.links.pos[:, 0],
+            "palm_linvel": x.links.linvel[:, 0],
+            "palm_angvel": x.links.angvel[:, 0],
+            "tip_pos": x.links.pos[:, 1:].flatten(1),
+            "tip_force": (0.1 * x.tip_force).clamp(-1.0, 1.0).flatten(1),
+            "object_linvel": state.object_linvel,
+            "object_angvel": state.object_angvel,
+            "goal_offset": x.goal_pos - state.object_pos,
+            "least_tip_distance": x.tip_distance.amin(1, keepdim=True),
+            "reward": x.reward[:, None],
+        }
         # limits -2, 3 become -1, 1
-        assert_close(self.shown["joint_pos"], (self.x.state.joint_pos - 0.5) / 2.5)
-        force = self.shown["tip_force"]
-        self.assertEqual(force.abs().max(), 1.0)
-        small = self.x.tip_force.abs() < 10
-        assert_close(force.view(self.N, self.E, 3)[small], 0.1 * self.x.tip_force[small])
+        expected |= {name: (value - 0.5) / 2.5 for name, value in scaled.items()}
+        parameters = {name: {"noise": 0.0} for name in ("object_pos", "joint_pos")}
+        parameters |= {"joint_vel": {"noise": 0.0, "scale": 0.2}, "true_joint_vel": {"scale": 0.2}}
+        parameters |= {"tip_force": {"scale": 0.1}}
+        for name, value in expected.items():
+            with self.subTest(name):
+                assert_close(self.value(**{name: parameters.get(name, {})}), value)
 
-    def test_one_rotation_is_one_observation(self):
+    def test_each_term_that_is_a_rotation(self):
+        """A rotation is one observation, whatever the sign of its quaternion, and leads where it should."""
+        x = self.x
         negated = replace(
-            self.x,
-            state=replace(self.x.state, object_quat=-self.x.state.object_quat),
-            links=replace(self.x.links, quat=-self.x.links.quat),
-            observed_quat=-self.x.observed_quat,
-            goal_quat=-self.x.goal_quat,
-            start_quat=-self.x.start_quat,
+            x,
+            state=replace(x.state, object_quat=-x.state.object_quat),
+            links=replace(x.links, quat=-x.links.quat),
+            observed_quat=-x.observed_quat,
+            goal_quat=-x.goal_quat,
+            start_quat=-x.start_quat,
         )
-        for rotation in ("quaternion", "matrix", "to_goal"):
-            c = replace(self.config, rotation=rotation)
-            assert_close(obs.goal_group(negated, c), obs.goal_group(self.x, c))
-            assert_close(self.terms(negated, c), self.terms(self.x, c))
-        for name, own in (
-            ("object_quat", self.x.observed_quat),
-            ("palm_quat", self.x.links.quat[:, 0]),
+        palm = x.links.quat[:, 0]
+        to_goal = quat_multiply(x.goal_quat, quat_conjugate(x.observed_quat))
+        for name, parameters, quat in (
+            ("object_quat", {"noise": 0.0}, x.observed_quat),
+            ("goal_quat", {}, x.goal_quat),
+            ("palm_quat", {}, palm),
+            ("object_rotation", {"noise": 0.0}, x.observed_quat),
+            ("goal_rotation", {}, x.goal_quat),
+            ("palm_rotation", {}, palm),
+            ("rotation_to_goal", {"noise": 0.0}, to_goal),
+            ("rotation_from_start", {}, quat_multiply(x.goal_quat, quat_conjugate(x.start_quat))),
         ):
-            quat = self.shown[name]
-            self.assertTrue((quat[:, 0] >= 0).all(), name)
-            assert_close(quat_angle(quat, own), torch.zeros(self.N), atol=1e-3, rtol=0)
+            found = self.value(**{name: parameters})
+            with self.subTest(name):
+                assert_close(self.value(negated, **{name: parameters}), found)
+                if name.endswith("quat"):
+                    self.assertTrue((found[:, 0] >= 0).all())
+                    assert_close(quat_angle(found, quat), torch.zeros(self.N), atol=1e-3, rtol=0)
+                else:
+                    for axis, column in zip(torch.eye(3), found.split(3, dim=-1)):
+                        assert_close(column, quat_rotate(quat, axis.expand(self.N, 3)))
+        turn = quat_from_axis_angle(self.value(goal_turn={}))
+        corrected = quat_multiply(turn, x.state.object_quat)
+        assert_close(quat_angle(corrected, x.goal_quat), torch.zeros(self.N), atol=2e-3, rtol=0)
 
-    def test_a_rotation_to_the_goal_turns_the_object_there(self):
-        c = replace(self.config, rotation="to_goal")
-        columns = self.terms(self.x, c)["rotation_to_goal"].split(3, dim=-1)
-        for axis, column in zip(torch.eye(3), columns):
-            own = quat_rotate(quat_conjugate(self.x.observed_quat), axis.expand(self.N, 3))
-            assert_close(column, quat_rotate(self.x.goal_quat, own))
-
-    def test_with_cameras_a_goal_may_be_a_rotation_from_the_start(self):
-        c = replace(self.config, rotation="to_goal")
-        widths = obs.layout(self.J, self.E, c, VisionConfig(cameras=(FRONT,)))["goal"]
-        self.assertEqual([*widths], ["goal_pos", "rotation_from_start", "previous_action"])
+    def test_with_cameras_a_goal_does_not_depend_on_the_axes_of_a_mesh(self):
+        c = RECIPES["live"].config.task.observation
+        widths = obs.layout(self.J, self.E, c, VisionConfig(cameras=(FRONT,)))
+        self.assertEqual([*widths], ["goal", "proprio", "view"])
+        self.assertEqual([*widths["goal"]], ["goal_pos", "rotation_from_start", "previous_action"])
         drawn_otherwise = turned(100, (0.6, 0.0, 0.8)).expand(self.N, 4)
         quats = {
             n: quat_multiply(getattr(self.x, n), drawn_otherwise)
             for n in ("start_quat", "goal_quat")
         }
-        found = obs.goal_group(self.x, c)
-        assert_close(obs.goal_group(replace(self.x, **quats), c), found)
-        shown = self.split(
-            obs.goal_group(self.x, self.config), {"pos": 3, "quat": 4, "action": self.J}
-        )
-        angle = quat_angle(shown["quat"], self.x.goal_quat)
-        assert_close(angle, torch.zeros(self.N), atol=1e-3, rtol=0)
-        columns = self.split(found, widths)["rotation_from_start"]
-        axis = quat_rotate(quat_conjugate(self.x.start_quat), tensor([1.0, 0.0, 0.0]))
-        assert_close(quat_rotate(self.x.goal_quat, axis), columns[:, :3])
+        observed = obs.Observer(c).group
+        assert_close(observed("goal", replace(self.x, **quats)), observed("goal", self.x))
 
     def test_the_published_observation(self):
         c = RECIPES["published"].config.task.observation
@@ -1031,7 +1227,7 @@ class ObservationTest(TestCase):
         # the paper's 648 inputs
         self.assertEqual((flat, flat + widths["perception"]["paired_cloud"]), (72, 648))
         points = torch.randn(self.N, 64, 3, generator=generator())
-        found = obs.policy_group(replace(self.x, points=points), c, generator())
+        found = obs.Observer(c).group("policy", replace(self.x, points=points))
         cloud = quat_rotate(self.x.observed_quat[:, None], points) + self.x.observed_pos[:, None]
         distance = (self.x.links.pos[:, :, None] - cloud[:, None]).norm(dim=-1).amin(dim=-1)
         vectors = found[:, :-1].unflatten(1, (-1, 3))
@@ -1041,82 +1237,65 @@ class ObservationTest(TestCase):
         gaps = (ends[:, :, None] - cloud[:, None]).norm(dim=-1).amin(dim=-1)
         self.assertLess(gaps.max(), 1e-5)
 
-    def test_the_critic_observes_what_the_published_policy_does_not(self):
-        c = replace(RECIPES["published"].config.task.observation, joint_vel_scale=0.2)
-        shown = obs.proprio_group(self.x, c, generator())
-        angles = torch.cat((self.x.state.joint_pos, self.x.joint_target), dim=-1)
-        assert_close(shown, (angles - 0.5) / 2.5)  # limits -2, 3 become -1, 1
-        found = obs.privileged_group(self.x, c)
-        assert_close(found[:, :15], obs.privileged_group(self.x, ObservationConfig()))
-        assert_close(found[:, 15 : 15 + self.J], 0.2 * self.x.state.joint_vel)
-        forces = (c.contact_force_scale * self.x.tip_force).clamp(-1.0, 1.0)
-        assert_close(found[:, 15 + self.J :], forces.flatten(1))
-
-    def test_privileged_group(self):
-        found = obs.privileged_group(self.x, ObservationConfig())
-        x = self.x
-        state = self.x.state
-        turn = quat_from_axis_angle(found[:, 9:12])
-        axis = tensor([1.0, 0, 0]).expand(self.N, 3)
-        corrected = quat_rotate(turn, quat_rotate(state.object_quat, axis))
-        assert_close(corrected, quat_rotate(x.goal_quat, axis), atol=1e-5, rtol=0)
-        expected = torch.column_stack(
-            (
-                *(state.object_linvel, state.object_angvel, x.goal_pos - state.object_pos),
-                *(found[:, 9:12], x.tip_distance.amin(1), x.gravity_fraction, x.reward),
-            )
-        )
-        assert_close(found, expected)
+    def test_the_layout_has_the_widths_and_the_order_of_the_groups(self):
+        for name, recipe in RECIPES.items():
+            c = recipe.config.task.observation
+            x = replace(self.x, points=torch.zeros(self.N, c.cloud_points, 3))
+            for group, widths in obs.layout(self.J, self.E, c).items():
+                value = obs.Observer(c).group(group, x)
+                self.assertEqual(value[0].numel(), sum(widths.values()), (name, group))
+                self.assertEqual([*widths], [*getattr(c, group)])
 
     def test_clouds(self):
         points = torch.randn(self.N, 10, 3, generator=generator(1))
         x = replace(self.x, points=points)
         now = quat_rotate(self.x.observed_quat[2], points[2, 7]) + self.x.observed_pos[2]
         goal = quat_rotate(self.x.goal_quat[2], points[2, 7]) + self.x.goal_pos[2]
-        scaled = replace(self.config, cloud_scale=5.0)
-        for config, expected in (
-            (self.config, now),
-            (scaled, 5.0 * now),
-            (replace(scaled, cloud="paired"), 5.0 * torch.cat((now, goal, goal - now))),
+        for name, parameters, expected in (
+            ("cloud", {"frames": 3, "scale": 1.0}, now),
+            ("cloud", {"frames": 1, "scale": 5.0}, 5.0 * now),
+            ("paired_cloud", {"scale": 5.0}, 5.0 * torch.cat((now, goal, goal - now))),
         ):
-            cloud = obs.cloud_frame(x, config, generator())
-            self.assertEqual(tuple(cloud.shape), (self.N, 10, config.cloud_shape[2]))
-            assert_close(cloud[2, 7], expected)
-
-    def test_rotations_as_columns_of_the_matrix(self):
-        c = replace(self.config, rotation="matrix", joint_target=True)
-        x = replace(self.x, observed_quat=turned(90)[None].expand(self.N, 4))
-        shown = self.terms(x, c)
-        columns = tensor([0.0, 1, 0, -1, 0, 0]).expand(self.N, 6)
-        assert_close(shown["object_rotation"], columns)
-        for axis, column in zip(torch.eye(3), shown["palm_rotation"].split(3, dim=-1)):
-            assert_close(column, quat_rotate(x.links.quat[:, 0], axis.expand(self.N, 3)))
-        assert_close(shown["joint_target"], x.joint_target - x.state.joint_pos)
-        assert_close(shown["tip_force"], self.shown["tip_force"])
+            c = ObservationConfig(perception={name: {"noise": 0.0} | parameters}, cloud_points=10)
+            cloud = obs.Observer(c).group("perception", x)
+            shape = (parameters.get("frames", 1), 10, len(expected))
+            self.assertEqual((tuple(cloud.shape[1:]), obs.cloud_shape(c)), (shape, shape))
+            for frame in cloud[2, :, 7]:
+                assert_close(frame, expected)
 
     def test_noise_has_the_configured_spread_and_touches_only_what_is_measured(self):
         many = torch.zeros(4000, dtype=torch.long)
-        same = ("joint_lower", "joint_upper")
+        same = ("joint_lower", "joint_upper", "generator")
         x = replace(self.x, **{k: v[many] for k, v in vars(self.x).items() if k not in same})
-        noise = NoiseConfig(
-            joint_pos=0.01, joint_vel=0.1, object_pos=0.02, object_rot=0.05, cloud=0.03
-        )
-        c = replace(self.config, noise=noise)
-        policy = obs.policy_group(x, c, generator())
-        spread = torch.cat((policy, obs.proprio_group(x, c, generator())), dim=-1).std(dim=0)
-        expected = torch.zeros_like(spread)
-        expected[:3] = 0.02
-        joints = policy.shape[1]
-        expected[joints : joints + self.J] = 0.01 / 2.5
-        expected[joints + self.J : joints + 2 * self.J] = 0.1 * 0.2
-        rotation = policy[:, 3:7]
-        spread[3:7] = 0.0
-        assert_close(spread, expected, rtol=0.1, atol=1e-6)
-        angle = quat_angle(rotation, x.observed_quat).square().mean().sqrt()
+        noise = {
+            "policy": {"object_pos": {"noise": 0.02}, "object_quat": {"noise": 0.05}},
+            "proprio": {"joint_pos": {"noise": 0.01}, "joint_vel": {"noise": 0.1}},
+            "perception": {"cloud": {"noise": 0.03}},
+        }
+        c = ObservationConfig(**merged(asdict(self.config), noise))
+        terms = self.terms(replace(x, points=torch.zeros(len(many), 1000, 3)), c)
+        expected = {"object_pos": 0.02, "joint_pos": 0.01 / 2.5, "joint_vel": 0.1 * 0.2}
+        for name, value in terms.items():
+            if name not in ("object_quat", "cloud"):
+                spread = torch.full(value.shape[1:], expected.get(name, 0.0))
+                assert_close(value.std(dim=0), spread, rtol=0.1, atol=1e-6)
+        angle = quat_angle(terms["object_quat"], x.observed_quat).square().mean().sqrt()
         self.assertAlmostEqual(angle, 0.05 * math.sqrt(3), delta=0.005)
-        x = replace(self.x, points=torch.zeros(self.N, 1000, 3))
-        cloud = obs.cloud_frame(x, c, generator())
-        self.assertAlmostEqual((cloud - self.x.observed_pos[:, None]).std(), 0.03, delta=0.001)
+        away = terms["cloud"][:, 0] - x.observed_pos[:, None]
+        self.assertAlmostEqual(away.std(), 0.03, delta=0.001)
+
+    def test_what_is_not_an_observation_is_refused(self):
+        for name, parameters, words in (
+            ("smell", {}, "Unknown observation 'smell'. Choose from: object_pos"),
+            (
+                "joint_vel",
+                {"noise": 0.1},
+                r"policy\.joint_vel does not fit joint_vel .missing: scale",
+            ),
+            ("tip_force", {"scale": "x"}, r"policy\.tip_force\.scale is 'x', expected float"),
+        ):
+            with self.subTest(words), self.assertRaisesRegex(ValueError, words):
+                self.value(**{name: parameters})
 
 
 class EvaluationTaskTest(TestCase):
@@ -1135,7 +1314,7 @@ class EvaluationTaskTest(TestCase):
         fixed = {
             "reset": replace(task.reset, demo_probability=0.0, home_gravity_std=0.0),
             "randomization": replace(task.randomization, enabled=False),
-            "observation": replace(task.observation, noise=QUIET),
+            "observation": task.observation.without_noise(),
         }
         self.assertEqual(evaluation_task(task), replace(task, **fixed))
 
@@ -1152,8 +1331,7 @@ class PolicyTest(TestCase):
 
     def test_its_own_robot_and_task_are_accepted(self):
         contract = asdict(policy_contract(self.robot, self.TASK, (SOUP,)))
-        for name in ("cloud_scale", "rotation"):  # which files of earlier versions do not have
-            del contract["task"]["observation"][name]
+        contract["task"]["observation"] = {"cloud_history": 5}  # a file of an earlier version
         for task in (self.TASK, evaluation_task(self.TASK)):
             check_contract("p.onnx", parsed_contract("p.onnx", contract), self.robot, task)
 
@@ -1174,13 +1352,19 @@ class PolicyTest(TestCase):
             self.refused(words, **{name: value})
         fewer, scaled = (
             {"observation": replace(self.TASK.observation, **change)}
-            for change in ({"cloud_history": 3}, {"cloud_scale": 5.0})
+            for change in (
+                {"perception": {"cloud": {"frames": 3, "noise": 0.002, "scale": 1.0}}},
+                {"perception": {"cloud": {"frames": 5, "noise": 0.1, "scale": 5.0}}},
+            )
         )
         home = {"action": ActionConfig(hand_zero="home")}
         for words, changes in (
             ("observation layout .perception.cloud: 960, here 576", fewer),
             ("another action mapping .hand_zero: 'middle', here 'home'", home),
-            ("another scale of observations .cloud_scale: 1.0, here 5.0", scaled),
+            (
+                "another scale of observations .perception: .*'scale': 1.0.*, here .*'scale': 5.0",
+                scaled,
+            ),
             ("another time between actions .control_dt: 0.01666.*, here 0.02083", {"substeps": 5}),
         ):
             self.refused(words, replace(self.TASK, **changes))

@@ -37,8 +37,13 @@ CONFIG = TrainConfig(
         timestep=1 / 120,
         substeps=2,
         action=ActionConfig(arm_step=0.01, hand_zero="home"),
-        observation=ObservationConfig(cloud_points=8, cloud_history=1),
-        reward=RewardConfig(reach_near=1.0),
+        observation=ObservationConfig(
+            cloud_points=8, perception={"cloud": {"frames": 1, "noise": 0.002, "scale": 1.0}}
+        ),
+        reward=RewardConfig(
+            terms=RewardConfig().terms
+            | {"reach_near": {"function": "best_reach", "weight": 1.0, "width": 0.05}}
+        ),
         termination=TerminationConfig(episode_seconds=1.0),
         reset=ResetConfig(demo_probability=1.0),
         distance_points=32,

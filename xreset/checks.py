@@ -12,10 +12,10 @@ import sys
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass, make_dataclass
 from difflib import get_close_matches
 from functools import cache, wraps
-from inspect import cleandoc, getsource, signature
+from inspect import Parameter, cleandoc, getsource, signature
 from itertools import pairwise
 from math import inf, isfinite
 from numbers import Integral, Real
@@ -322,12 +322,26 @@ _MOST_NAMED = 20
 
 
 def merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """Return ``base`` with nested changes."""
+    """Return ``base`` with nested changes.
+
+    A change ``false`` removes a table. A table that names another ``function`` replaces the former one.
+    """
     result = dict(base)
     for name, value in changes.items():
-        both = isinstance(value, dict) and isinstance(base.get(name), dict)
-        result[name] = merged(base[name], value) if both else value
+        before = base.get(name)
+        result[name] = value
+        if not isinstance(before, dict):
+            continue
+        if value is False:
+            del result[name]
+        elif isinstance(value, dict) and _is_same_function(name, before, value):
+            result[name] = merged(before, value)
     return result
+
+
+def _is_same_function(name: str, before: dict[str, Any], value: dict[str, Any]) -> bool:
+    named = value.get("function")
+    return named is None or named == before.get("function", name)
 
 
 def from_dict(cls: type[T], data: Any, where: str = "configuration", version: Any = None) -> T:
@@ -336,7 +350,8 @@ def from_dict(cls: type[T], data: Any, where: str = "configuration", version: An
     A missing entry takes its default, so files stay readable when a field is added: its default must be what was done
     before. A class may list the fields that it no longer has, with the values that mean what is done now: ``REMOVED:
     ClassVar[dict[str, Any]]``. Entries with these values are ignored. It may also list the earlier names of fields:
-    ``RENAMED: ClassVar[dict[str, str]]``, earlier name -> present name.
+    ``RENAMED: ClassVar[dict[str, str]]``, earlier name -> present name. ``EARLIER: ClassVar`` is a dataclass of the
+    fields of earlier versions; its method ``entries`` returns what they are called today.
 
     Args:
         cls: the dataclass.
@@ -400,6 +415,12 @@ def _parsed_record(cls: type, data: Any, where: str, problems: list[str]) -> Any
             )
     data = {name: value for name, value in data.items() if name not in removed}
     names = [f.name for f in fields(cls)]
+    earlier = getattr(cls, "EARLIER", None)
+    if earlier is not None and data.keys() & ({f.name for f in fields(earlier)} - set(names)):
+        options = _parsed_record(earlier, data, where, problems)
+        if options is None:
+            return None
+        data = options.entries()
     required = {
         f.name for f in fields(cls) if f.default is MISSING and f.default_factory is MISSING
     }
@@ -433,6 +454,32 @@ def _parsed_record(cls: type, data: Any, where: str, problems: list[str]) -> Any
     except ValueError as error:
         problems.append(f"{where}: {error}.")
         return None
+
+
+def parsed_arguments(
+    function: Callable[..., Any], given: Any, where: str
+) -> tuple[dict[str, Any], list[str]]:
+    """Return arguments of a function with the types of its annotations, and a sentence for each problem.
+
+    Args:
+        function: the function; its first argument is not one of these.
+        given: arguments by name, as JSON and TOML have them.
+        where: name of the arguments in messages.
+    """
+    value, problems = parsed(_arguments_of(function), given, where)
+    return vars(value) if value is not None else {}, problems
+
+
+@cache
+def _arguments_of(function: Callable[..., Any]) -> type:
+    """Return a dataclass whose fields are the arguments of a function, without the first one."""
+    _, *parameters = signature(function).parameters.values()
+    described: list[Any] = []
+    for parameter in parameters:
+        field_type = _hint_of(function, parameter.name)
+        default = () if parameter.default is Parameter.empty else (parameter.default,)
+        described.append((parameter.name, field_type, *default))
+    return make_dataclass(function.__name__, described, kw_only=True)
 
 
 def _shortened(texts: list[str]) -> list[str]:
@@ -490,6 +537,8 @@ def _parsed_value(hint: Any, value: Any, where: str, problems: list[str]) -> Any
         if value not in arguments:
             return wrong(_described(hint))
         return value
+    if issubclass(hint, dict):
+        return hint(value) if isinstance(value, dict) else wrong("an object")
     kinds = (int, float) if hint is float else hint
     is_bool = hint is not bool and isinstance(value, bool)
     is_large = isinstance(value, int) and abs(value) > _LARGEST

@@ -31,11 +31,11 @@ from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, checked_objects
 from xreset.task import observations as obs
 from xreset.task.actions import ActionSpace
 from xreset.task.config import TaskConfig
-from xreset.task.randomization import Drawn
 from xreset.task.reading import Reading, step_log
-from xreset.task.rewards import Reward, RewardInput, compute_reward, own_term
+from xreset.task.rewards import Reward, RewardFunction, RewardInput
 from xreset.task.terminations import out_of_bounds
 from xreset.task.variation import Variation
+from xreset.task.worlds import Worlds
 from xreset.tensors import where
 from xreset.text import shown
 
@@ -44,23 +44,6 @@ if TYPE_CHECKING:
 
     from xreset.pictures.render import Renderer
     from xreset.task.vision import Vision
-
-
-_LASTING = (
-    "goal_pos",
-    "goal_quat",
-    "start_quat",
-    "gravity_fraction",
-    "sequence",
-    "bank_state",
-    "_episode_length",
-    "_target",
-    "_previous_action",
-    "_best_reach",
-    "_reward",
-    "_cloud",
-)
-"""Buffers that carry each world from step to step, in addition to the engine's state."""
 
 
 def _check_shape(name: str, value: Tensor, like: Tensor) -> None:
@@ -138,7 +121,7 @@ class ManipulationEnv:
         success_position: [] limit of success [m]; a schedule may overwrite ``task.reward.success_position`` here.
         nonfinite_count: [] number of episodes that ended because a number was not finite.
         overflow_count: [] number of episodes that ended because the engine dropped contacts.
-        drawn: what is drawn at each reset in addition to the start.
+        worlds: everything that lasts from step to step, in addition to the engine's state.
         variation: differences between the worlds, such as masses and delays.
         vision: the cameras; None: the task has none.
     """
@@ -155,10 +138,10 @@ class ManipulationEnv:
             resets: where episodes start, on the backend's device.
             seed: seed of every random number that the environment draws.
         """
-        for name in task.reward.own:
-            own_term(name)  # a term that cannot be loaded is refused now, not after the first step
         self.backend = backend
         self.task = task
+        self._reward_function = RewardFunction(task.reward)
+        self._observer = obs.Observer(task.observation)
         self.resets = resets
         self.cfg = task  # rsl-rl's name of the configuration
         self.device = backend.device
@@ -200,56 +183,56 @@ class ManipulationEnv:
         """Make every buffer that a step writes to."""
         from tensordict import TensorDict
 
-        self.drawn = Drawn(self.num_envs, self.device)
-        zeros = self.drawn.zeros
+        self.worlds = Worlds(self.num_envs, self.device)
+        keep = self.worlds.keep
+        zeros = self.worlds.zeros
         no_world = zeros().bool()
         # Only the shapes of this draw are used. Another generator draws it, so that episodes do not depend on it.
         unused = torch.Generator(device=self.device)
         self._new_start = self.resets.sample(self.backend.object_index, unused).clone()
-        # How each world's episode began, and its present joint targets. Resets write into these tensors, and the names
-        # below share them.
-        episode = self._new_start.clone()
-        self.goal_pos = episode.goal_pos
-        self.goal_quat = episode.goal_quat
-        self.start_quat = episode.object_quat
-        self.gravity_fraction = episode.gravity_fraction
-        self.sequence = episode.sequence
-        self.bank_state = episode.state
-        self._target = episode.joint_target
-        self._episode = episode
+        # How each world's episode began, and its present joint targets. Resets write into these tensors.
+        self._episode = self.worlds.keep_bundle("episode", self._new_start.clone())
+        self.goal_pos = self._episode.goal_pos
+        self.goal_quat = self._episode.goal_quat
+        self.start_quat = self._episode.object_quat
+        self.gravity_fraction = self._episode.gravity_fraction
+        self.sequence = self._episode.sequence
+        self.bank_state = self._episode.state
+        self._target = self._episode.joint_target
+        self._episode_length = keep("episode_length", zeros().long())
+        self._previous_action = keep("previous_action", zeros(self.num_actions))
+        self._best_reach = keep("best_reach", zeros())
+        """[N] smallest mean distance of the fingertips to the object in the episode [m]."""
+        self._reward = keep("reward", zeros())
+        self._cloud = keep("cloud", zeros(*obs.cloud_shape(self.task.observation)))
+        self._bad_action = keep("bad_action", no_world.clone())
+        """[N] bool: an action of the episode was not finite."""
+        self._over = keep("over", no_world.clone())
+        """[N] bool: the episode is over, and the world waits for its reset."""
         self.nonfinite_count = torch.zeros((), dtype=torch.long, device=self.device)
         self.overflow_count = self.nonfinite_count.clone()
-        self._episode_length = zeros().long()
+        # What follows is written anew in each step.
         self._action = zeros(self.num_actions)
-        self._previous_action = zeros(self.num_actions)
         self._sent_target = zeros(self.num_actions)
         """[N, J] joint targets that reach the drives: late, lost or pushed (``variation``)."""
-        self._best_reach = zeros()
-        """[N] smallest mean distance of the fingertips to the object in the episode [m]."""
-        self._reward = zeros()
-        self._cloud = zeros(*self.task.observation.cloud_shape)
         self._time_out = no_world.clone()
         """[N] bool: the episode ends now, and not because the object is out of bounds."""
-        self._bad_action = no_world.clone()
-        """[N] bool: an action of the episode was not finite."""
         self._faulty = no_world.clone()
         """[N] bool: the simulation failed in this step."""
         self._reset_mask = no_world.clone()
         """[N] bool: the world is reset now, or its episode has just begun."""
-        self._over = no_world.clone()
-        """[N] bool: the episode is over, and the world waits for its reset."""
         task = self.task
         tips = len(self.backend.scene.robot.fingertips)
         layout = obs.layout(self.num_actions, tips, task.observation)
         width = sum(layout["proprio"].values())
         self.variation = Variation(
-            self.drawn, self.backend, task.randomization, self.actions.is_arm, width
+            self.worlds, self.backend, task.randomization, self.actions.is_arm, width
         )
         self.vision: Vision | None = None
         if task.vision.cameras:
             from xreset.task.vision import Vision  # Warp, which other tasks do not need
 
-            self.vision = Vision(self.drawn, self.backend, task)
+            self.vision = Vision(self.worlds, self.backend, task)
         self._log_names: tuple[str, ...] = ()
         self._log_values = torch.zeros(0, device=self.device)
         self._observations = TensorDict({}, batch_size=[self.num_envs], device=self.device)
@@ -371,15 +354,13 @@ class ManipulationEnv:
             ) from error
         if start is not None:
             self._new_start[worlds] = start
-        lasting = self._lasting
-        before = {name: value.clone() for name, value in lasting.items()}
+        before = self.worlds.clone()
         self._sample_resets(start is None)
         self._write_resets()
         self._take_images()
         self._compute_observations()
-        others = ~self._reset_mask
-        for name, value in before.items():
-            lasting[name][others] = value[others]
+        # all worlds were observed, and those that go on have their own observations
+        self.worlds.copy(before, ~self._reset_mask)
 
     # The present state
 
@@ -425,7 +406,7 @@ class ManipulationEnv:
 
     def snapshot(self) -> dict[str, Tensor]:
         """Return the state of all worlds on the CPU, without random numbers and warm starts, for :meth:`restore`."""
-        values = self._lasting | vars(self.backend.state())
+        values = self.worlds.buffers | vars(self.backend.state())
         return {name: value.to("cpu", copy=True) for name, value in values.items()}
 
     @names_wrong_arguments
@@ -435,12 +416,12 @@ class ManipulationEnv:
         Raises:
             XResetError: the snapshot is of another task, or of another number of worlds.
         """
-        present = self._lasting | vars(self.backend.state())
+        present = self.worlds.buffers | vars(self.backend.state())
         for name, value in present.items():
             if name not in snapshot:
                 raise XResetError(f"The snapshot has no {name!r}. Take one of the same task.")
             _check_shape(f"{name} of the snapshot", snapshot[name], value)
-        for name, value in self._lasting.items():
+        for name, value in self.worlds.buffers.items():
             value.copy_(snapshot[name])
         self._reset_mask.fill_(True)
         state = State(**{f.name: snapshot[f.name] for f in fields(State)})
@@ -448,12 +429,6 @@ class ManipulationEnv:
         self._reset_mask.zero_()
 
     # Parts
-
-    @property
-    def _lasting(self) -> dict[str, Any]:
-        """Every buffer that carries a world from step to step: :data:`_LASTING`, what is drawn, and observations."""
-        own = {name: getattr(self, name) for name in _LASTING}
-        return own | self.drawn.lasting | dict(self._observations.items())
 
     def _task_origin(self, pos: Tensor, quat: Tensor) -> Tensor:
         """Return positions [N, 3] of the object's origin in the task, given poses of its mesh frame."""
@@ -480,8 +455,6 @@ class ManipulationEnv:
         state = self.backend.state()
         self._bad_action |= ~self._action.isfinite().all(dim=1)
         self._action.nan_to_num_(0.0, 0.0, 0.0)
-        if not self.task.reward.raw_actions:
-            self._action.clamp_(-1.0, 1.0)
         target = self.actions.targets(self._action, self._target, state.joint_pos)
         self._target.copy_(self.variation.received_targets(target, self._target, self.generator))
         self._sent_target.copy_(self.variation.sent_targets(self._target, state, self.generator))
@@ -496,7 +469,7 @@ class ManipulationEnv:
         self._best_reach.copy_(
             torch.where(broken, self._best_reach, torch.minimum(self._best_reach, reach))
         )
-        reward = compute_reward(self._reward_input(reading, lost), self.task.reward)
+        reward = self._reward_function(self._reward_input(reading, lost))
         self._reward.copy_(torch.where(broken, 0.0, reward.total))
         if self.variation.pushes is not None:
             self.variation.pushes.gate.copy_(reward.gate & ~broken)
@@ -576,7 +549,7 @@ class ManipulationEnv:
         if from_distribution:
             start.map(Tensor.copy_, self.resets.sample(self.backend.object_index, self.generator))
         self.variation.begin_episodes(fresh, start.joint_target)
-        self.drawn.draw(fresh, self.generator)
+        self.worlds.draw(fresh, self.generator)
         self._episode.map(Tensor.copy_, where(fresh, start, self._episode))
         self._previous_action.masked_fill_(fresh[:, None], 0)
         for cleared in (self._episode_length, self._reward, self._over):
@@ -613,28 +586,27 @@ class ManipulationEnv:
     def _compute_observations(self) -> None:
         """Refresh the observations. In fresh worlds the present cloud and reach become the whole history."""
         reading = self.reading()
-        c = self.task.observation
         self._best_reach.copy_(
             torch.where(self._reset_mask, reading.tip_distance.mean(dim=-1), self._best_reach)
         )
         x = self._observation_input(reading)
-        frame = obs.cloud_frame(x, c, self.generator)[:, None]
-        history = torch.cat((self._cloud[:, 1:], frame), dim=1)
-        self._cloud.copy_(where(self._reset_mask, frame, history))
+        observed = self._observer.group
+        cloud = observed("perception", x)
+        history = torch.cat((self._cloud[:, 1:], cloud[:, -1:]), dim=1)
+        self._cloud.copy_(where(self._reset_mask, cloud, history))
         groups = {
-            "policy": obs.policy_group(x, c, self.generator),
-            "proprio": self.variation.observed_proprio(
-                obs.proprio_group(x, c, self.generator), self._reset_mask
-            ),
+            "policy": observed("policy", x),
+            "proprio": self.variation.observed_proprio(observed("proprio", x), self._reset_mask),
             "perception": self._cloud,
-            "privileged": obs.privileged_group(x, c),
+            "privileged": observed("privileged", x),
         }
         if self.vision is not None:
-            groups["goal"] = obs.goal_group(x, c)
+            groups["goal"] = observed("goal", x)
             groups["view"] = self.vision.observe(self._reset_mask, self.generator)
         for name, value in groups.items():
             if name not in self._observations:
-                self._observations[name] = torch.zeros_like(value)
+                buffer = torch.zeros_like(value)
+                self._observations[name] = self.worlds.keep(f"observations.{name}", buffer)
             self._observations[name].copy_(value)
 
     def _observation_input(self, reading: Reading) -> obs.ObservationInput:
@@ -660,4 +632,5 @@ class ManipulationEnv:
             tip_force=reading.contacts.tip_force * self.variation.force_gain,
             tip_distance=reading.tip_distance,
             reward=self._reward,
+            generator=self.generator,
         )

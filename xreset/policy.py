@@ -17,12 +17,12 @@ import torch
 from torch import Tensor
 
 from xreset.checks import names_wrong_arguments, parsed
-from xreset.errors import PolicyError, needs
+from xreset.errors import PolicyError, WrongValueError, needs
 from xreset.files import max_bytes, parse_json
 from xreset.spec import RobotSpec
 from xreset.task.config import TaskConfig
 from xreset.task.contract import SCHEMA, Contract
-from xreset.task.observations import layout
+from xreset.task.observations import Observer, cloud_shape, layout
 from xreset.text import shown
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ def check_contract(source: str, contract: Contract, robot: RobotSpec, task: Task
 def _meaning(contract: Contract) -> dict[str, dict[str, Any]]:
     """Return the entries that define what observations and actions mean, by part of the contract and name."""
     task = asdict(contract.task)
-    del task["observation"]["noise"]
+    observation = asdict(contract.task.observation.without_noise())
     widths = {}
     for group, terms in contract.observation_layout.items():
         widths |= {f"{group}.{term}": width for term, width in terms.items()}
@@ -118,7 +118,7 @@ def _meaning(contract: Contract) -> dict[str, dict[str, Any]]:
         "time between actions": {"control_dt": contract.control_dt},
         "observation layout": widths,
         "action mapping": task["action"],
-        "scale of observations": task["observation"],
+        "scale of observations": observation,
         "frame of objects": {"object_frame": task["object_frame"]},
         "set of cameras": task["vision"],
     }
@@ -133,7 +133,12 @@ def parsed_contract(source: str, contract: Any, version: str | None = None) -> C
         version: the version of xreset that exported the policy, if it states it.
     """
     typed, problems = parsed(Contract, contract, f"The contract of {source}", version)
-    if typed is None:
+    if typed is not None:
+        try:
+            Observer(typed.task.observation)
+        except WrongValueError as error:
+            problems = [f"The contract of {source}: {error}"]
+    if typed is None or problems:
         raise PolicyError(" ".join([*problems, "Export the policy again."]))
     return typed
 
@@ -150,7 +155,12 @@ def observation_shapes(contract: Contract, source: str) -> dict[str, tuple[int, 
             f"{source} does not state what it observes of {', '.join(missing)}. Export it again."
         )
     widths = {name: (sum(contract.observation_layout[name].values()),) for name in flat}
-    return widths | {picture: contract.task.picture_shape}
+    return widths | {picture: picture_shape(contract.task)}
+
+
+def picture_shape(task: TaskConfig) -> tuple[int, ...]:
+    """Return the shape of the last of ``task.policy_groups`` for one world."""
+    return task.vision.view_shape if task.vision.cameras else cloud_shape(task.observation)
 
 
 class OnnxPolicy:

@@ -201,9 +201,9 @@ def _runs(plan: Plan, group: str) -> Iterator[Run]:
     config = from_dict(TrainConfig, changed, f"runs.{group}.config")
     if plan.study.data[spec.data].goals is not None:
         config = from_home(config)
-    if config.task.reward.own:
+    if own := ", ".join(config.task.reward.own):
         raise RunError(
-            f"runs.{group}.config.task.reward.own names code, which a study may not. Use xreset train."
+            f"runs.{group}.config.task.reward.terms names code ({own}), which a study may not. Use xreset train."
         )
     if spec.steps is not None:
         iterations = round(spec.steps / (spec.num_envs * config.ppo.horizon))

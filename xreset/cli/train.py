@@ -14,6 +14,7 @@ from typing import Annotated, Any
 
 from xreset.cli._common import Meshes, given_flags, refuse_changes
 from xreset.cli._terminal import show_table
+from xreset.cli._terms import take_terms
 from xreset.errors import RunError
 from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import default_config, starting_config
@@ -62,7 +63,8 @@ def train(
             deviation of the actions and, if it adapts, the learning rate.
         wandb: Project of Weights & Biases to which learning curves are sent as well. Needs the package wandb, and a
             login.
-        config: Task, model and algorithm. The defaults shown are those of --recipe.
+        config: Task, model and algorithm. The defaults shown are those of --recipe. Terms of rewards and observations:
+            --config.task.reward.terms.reach.width 0.4.
     """
     from xreset.learning import train as training
 
@@ -73,7 +75,8 @@ def train(
     if resume:
         for flag in given_flags():
             name = flag.partition(".")[0]
-            if name in ("--recipe", "--config") and flag != "--config.task.reward.own":
+            is_own = flag.startswith("--config.task.reward.terms.") and ":" in flag
+            if name in ("--recipe", "--config") and not is_own:
                 raise RunError(
                     f"--resume continues with the run's own configuration. Omit {name}, or start another run with this "
                     f"run's networks: --weights {out} --recipe {out}"
@@ -123,7 +126,10 @@ _HELP_CONFIG = "--help-config"
 
 
 def command_for(arguments: list[str]) -> Callable[..., None]:
-    """Return :func:`train` with the defaults of ``--recipe``, which must be known before the other flags are read."""
+    """Return :func:`train` with the defaults of ``--recipe``, which must be known before the other flags are read.
+
+    Flags of terms are taken from the arguments.
+    """
     parser = ArgumentParser(add_help=False, allow_abbrev=False)
     for flag in ("--recipe", "--weights", "--goals", "--resets"):
         parser.add_argument(flag, nargs="?")  # tyro reports a missing value
@@ -134,6 +140,7 @@ def command_for(arguments: list[str]) -> Callable[..., None]:
         config = starting_config(recipe)
     else:
         recipe, config = default_config(given.resets, given.goals, given.weights)
+    config = take_terms(config, arguments)
     if given.help_config is not None:
         _show_config(given.help_config.removeprefix("config."), config)
         raise SystemExit(0)

@@ -19,6 +19,7 @@ from xreset.task.config import (
     RewardConfig,
     TaskConfig,
 )
+from xreset.task.terms import Terms
 
 Widths = Annotated[
     tuple[int, ...],
@@ -179,18 +180,41 @@ TASK = TaskConfig(
     substeps=4,
     action=ActionConfig(hand="relative", arm_step=0.06, hand_step=0.1),
     observation=ObservationConfig(
-        cloud="paired",
-        rotation="matrix",
-        cloud_scale=5.0,
-        contact_force_scale=0.03,
-        joint_target=True,
+        policy=Terms(
+            object_pos={"noise": 0.003},  # m
+            object_rotation={"noise": 0.02},  # rad
+            goal_pos={},
+            goal_rotation={},
+            gravity_fraction={},
+            previous_action={},
+        ),
+        proprio=Terms(
+            joint_pos={"noise": 0.005},  # rad
+            joint_vel={"noise": 0.05, "scale": 0.1},  # rad/s, s/rad
+            palm_pos={},
+            palm_rotation={},
+            palm_linvel={},
+            palm_angvel={},
+            tip_pos={},
+            tip_force={"scale": 0.03},  # 1/N
+            joint_target={},
+        ),
+        perception=Terms(paired_cloud={"noise": 0.002, "scale": 5.0}),  # m, 1/m
+        goal=Terms(goal_pos={}, goal_rotation={}, previous_action={}),
     ),
     reward=RewardConfig(
-        reach_width=0.4,
-        reach_near=1.0,
-        reach_distance="present",
-        contact="opposing",
-        raw_actions=True,
+        terms=Terms(
+            reach={"weight": 1.0, "width": 0.4},  # m
+            reach_near={"function": "reach", "weight": 1.0, "width": 0.05},
+            grasp={"weight": 1.0, "force": 0.1},  # N
+            position={"weight": 4.0, "width": 0.2},  # m
+            rotation={"weight": 4.0, "width": 1.5},  # rad
+            success={"weight": 10.0, "rotation": 0.2617993877991494},  # 15 degrees
+            action={"weight": -0.005, "limited": False},
+            action_rate={"weight": -0.005, "limited": False},
+            out_of_bounds={"weight": -500.0},
+        ),
+        gate=Terms(opposing={"force": 0.1}),  # N
     ),
     # Policies for nine objects that draw half of the demonstrations by how often they fail had 2.5 points more task
     # progress after 40 M steps from scratch, and 1.6 points more after 38 M further steps. With full gravity in

@@ -27,6 +27,7 @@ from xreset.policy import (
     VERSION_KEY,
     Contract,
     observation_shapes,
+    picture_shape,
 )
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ def exported(
     state = torch.zeros(1, n, policy.lstm_dim)
     example = (
         torch.zeros(n, policy.flat_dim),
-        torch.zeros(n, *contract.task.picture_shape),
+        torch.zeros(n, *picture_shape(contract.task)),
         state,
         state.clone(),
     )

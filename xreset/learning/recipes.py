@@ -5,7 +5,9 @@ from __future__ import annotations
 import shlex
 import sys
 import tomllib
+from collections.abc import Mapping
 from dataclasses import asdict, replace
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +33,10 @@ def _read_recipes() -> dict[str, Recipe]:
     for name, changes in tomllib.loads(_FILE.read_text()).items():
         about = changes.pop("about")
         base = changes.pop("extends", None)
-        config = recipes[base].config if base else TrainConfig()
-        changed = merged(asdict(config), _with_none(changes))
+        config = asdict(recipes[base].config if base else TrainConfig())
+        for table in changes.pop("replaces", ()):
+            reduce(dict.__getitem__, table.split("."), config).clear()
+        changed = merged(config, _with_none(changes))
         config = from_dict(TrainConfig, changed, f"{_FILE}: {name}")
         recipes[name] = Recipe(config=config, about=about)
     return recipes
@@ -88,13 +92,14 @@ def starting_config(recipe: str) -> TrainConfig:
     config = read_run(recipe).config
     reward = config.task.reward
     if reward.own:
+        flags = own_terms_flags(reward.own)
         print(
             f"{recipe} was trained with reward terms of your own. They are off unless you name them again, because a "
             "run folder must not decide which code is imported. If you trust this code, add "
-            f"{own_terms_flag(reward.own)}.",
+            f"{flags}.",
             file=sys.stderr,
         )
-    return replace(config, task=replace(config.task, reward=replace(reward, own={})))
+    return replace(config, task=replace(config.task, reward=reward.without_own()))
 
 
 def from_home(config: TrainConfig) -> TrainConfig:
@@ -113,19 +118,20 @@ def from_home(config: TrainConfig) -> TrainConfig:
     return config
 
 
-def own_terms_flag(own: dict[str, float]) -> str:
-    """Return the option of ``xreset train`` that names reward terms of the user's own."""
-    terms = []
-    for name, weight in own.items():
-        number = str(float(weight)).removesuffix(".0")  # reads back as the same weight
-        terms.append(f"{shlex.quote(plain(name))} {number}")
-    return " ".join(["--config.task.reward.own", *terms])
+def own_terms_flags(own: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the options of ``xreset train`` that name reward terms of the user's own."""
+    flags = []
+    for name, term in own.items():
+        for parameter, value in term.items():
+            flag = f"--config.task.reward.terms.{name}.{parameter}={value}"
+            flags.append(shlex.quote(plain(flag)))
+    return " ".join(flags)
 
 
-def resume_command(folder: Path, own: dict[str, float]) -> str:
+def resume_command(folder: Path, own: Mapping[str, Mapping[str, Any]]) -> str:
     """Return the command that continues a run, with the reward terms of the user's own."""
     words = f"xreset train --out {shlex.quote(str(folder))} --resume"
-    return f"{words} {own_terms_flag(own)}" if own else words
+    return f"{words} {own_terms_flags(own)}" if own else words
 
 
 def student_config(teacher: TaskConfig, vision: VisionConfig) -> TrainConfig:
@@ -136,7 +142,7 @@ def student_config(teacher: TaskConfig, vision: VisionConfig) -> TrainConfig:
         teacher: the teacher's task, without cameras.
         vision: the cameras of the student.
     """
-    task = replace(teacher, vision=vision, reward=replace(teacher.reward, own={}))
+    task = replace(teacher, vision=vision, reward=teacher.reward.without_own())
     changes = tomllib.loads(_STUDENT.read_text())
     latency = round(1 / 30 / teacher.control_dt, 3)
     changes["task"]["randomization"]["camera_latency"] = [0.0, latency]

@@ -162,7 +162,7 @@ class TrainingRunner:
         if schedule.success_position:
             self.env.success_position.fill_(value_at(schedule.success_position, progress))
         if schedule.faults:
-            self.env.drawn.fault_scale.fill_(value_at(schedule.faults, progress))
+            self.env.worlds.fault_scale.fill_(value_at(schedule.faults, progress))
         if schedule.teacher and isinstance(self.alg, SequenceDistillation):
             self.alg.teacher_share = value_at(schedule.teacher, progress)
 

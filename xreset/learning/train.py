@@ -33,7 +33,7 @@ from xreset.learning.exported import read_policy
 from xreset.learning.recipes import (
     default_config,
     from_home,
-    own_terms_flag,
+    own_terms_flags,
     starting_config,
     student_config,
 )
@@ -51,6 +51,7 @@ from xreset.policies import shipped
 from xreset.policy import OnnxPolicy, check_contract, policy_contract
 from xreset.resets.bank import ResetBank, read_bank, write_bank
 from xreset.resets.goals import GoalSet, read_goals, with_goals, write_goals
+from xreset.task.rewards import RewardFunction
 from xreset.text import shown
 
 
@@ -180,7 +181,7 @@ def resume(
     *,
     iterations: int | None = None,
     minutes: float = math.inf,
-    own: Mapping[str, float] | None = None,
+    own: Mapping[str, Mapping[str, Any]] | None = None,
     wandb: str | None = None,
 ) -> Path:
     """Continue a run from its newest checkpoint, and export its policy; see :func:`train`.
@@ -189,8 +190,8 @@ def resume(
         out: the run's folder.
         iterations: number of iterations in all; default: as the run was started.
         minutes: most time to train now.
-        own: the user's own reward terms with which the run was started. They name code to import, which a file must not
-            decide.
+        own: the user's own reward terms with which the run was started: name -> parameters. They name code to import,
+            which a file must not decide.
         wandb: as for :func:`train`.
 
     Raises:
@@ -203,7 +204,7 @@ def resume(
     info = read_run(out)
     expected = info.config.task.reward.own
     if expected != dict(own or {}):
-        fix = f"add {own_terms_flag(expected)} (or own=...)" if expected else "omit them"
+        fix = f"add {own_terms_flags(expected)} (or own={expected})" if expected else "omit them"
         raise RunError(
             f"{out} was trained with {len(expected)} reward terms of your own, but {len(own or {})} were named. "
             f"A run folder must not decide which code is imported. If you trust this code, {fix}."
@@ -295,7 +296,9 @@ def _check_minutes(minutes: float) -> None:
 
 
 def _check_config(config: TrainConfig, inputs: Inputs, *, has_teacher: bool) -> None:
-    """Refuse, with ``RunError``, a schedule without effect, and bank states where there are none."""
+    """Refuse, with ``XResetError``, a schedule without effect, bank states where there are none, and unknown terms of
+    the reward."""
+    RewardFunction(config.task.reward)
     if config.schedule.teacher and not has_teacher:
         raise RunError(
             "schedule.teacher is for xreset distill, and this training has no teacher. Leave it empty: "

@@ -6,6 +6,7 @@ import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,8 @@ from xreset.runtime import check_contract
 from xreset.runtime import contract as files
 from xreset.spec import MimicSpec, ObjectSpec, RobotSpec
 from xreset.task.actions import ActionSpace
-from xreset.task.config import TaskConfig
+from xreset.task.config import ObservationConfig, TaskConfig
+from xreset.task.legacy import ObservationOptions
 
 FRAMES = {
     "world": "z up; the top of the table is at z = 0; the root link of the robot is at kinematics.base",
@@ -53,7 +55,7 @@ def deploy_contract(
             process.
 
     Raises:
-        PolicyError: the policy has cameras.
+        PolicyError: the policy has cameras, or observes something that the runtime cannot compute.
         LiveError: the task has options that the runtime does not support.
     """
     if task.vision.cameras:
@@ -69,8 +71,6 @@ def deploy_contract(
             "points": points.astype(np.float32).tolist(),
             "center": center(each).astype(np.float32).tolist(),
         }
-    observation = asdict(task.observation)
-    observation.pop("noise")
     contract = {
         "schema": files.SCHEMA,
         "xreset": code_version(),
@@ -83,7 +83,7 @@ def deploy_contract(
         "units": UNITS,
         "joints": _joints(robot, task),
         "fingertips": list(robot.fingertip_names),
-        "observation": observation,
+        "observation": _observation_options(task.observation),
         "observation_layout": trained.observation_layout,
         "action": asdict(task.action),
         "kinematics": _chain(robot),
@@ -92,6 +92,41 @@ def deploy_contract(
     }
     check_contract(contract, f"The task of {robot.name}")
     return contract | {files.DIGEST: files.digest(contract)}
+
+
+def _observation_options(c: ObservationConfig) -> dict[str, Any]:
+    """Return the options of :mod:`xreset.runtime` that mean these observations."""
+    (cloud,) = c.perception.values()
+    given = {
+        "cloud_points": c.cloud_points,
+        "cloud_history": cloud.get("frames", 5),
+        "cloud_scale": cloud["scale"],
+        "contact_force_scale": c.proprio.get("tip_force", {}).get("scale", 0.1),
+        "joint_vel_scale": c.proprio.get("joint_vel", {}).get("scale", 0.1),
+    }
+    wanted = _flat_terms(c)
+    for content, rotation, form, joint_target in product(
+        ("draft", "published"),
+        ("quaternion", "matrix", "to_goal"),
+        ("history", "paired"),
+        (False, True),
+    ):
+        options = ObservationOptions(
+            content=content, rotation=rotation, cloud=form, joint_target=joint_target, **given
+        )
+        if _flat_terms(ObservationConfig(**options.entries())) == wanted:
+            found = asdict(options)
+            del found["noise"]
+            return found
+    raise PolicyError(
+        "The policy observes terms that the runtime cannot compute. Use the observations of a recipe."
+    )
+
+
+def _flat_terms(c: ObservationConfig) -> list[tuple[str, dict[str, Any]]]:
+    """Return what a policy without cameras observes, in order."""
+    quiet = c.without_noise()
+    return [*quiet.policy.items(), *quiet.proprio.items(), *quiet.perception.items()]
 
 
 def _joints(robot: RobotSpec, task: TaskConfig) -> list[dict[str, Any]]:

@@ -5,15 +5,15 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import field, replace
 from math import isfinite
 from numbers import Real
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from xreset.cameras.config import VisionConfig
 from xreset.checks import (
     Checked,
-    FiniteFloat,
     NonNegativeFloat,
     PositiveFloat,
     PositiveInt,
@@ -23,30 +23,14 @@ from xreset.checks import (
     frozen,
 )
 from xreset.errors import WrongValueError, XResetError
+from xreset.task.legacy import ObservationOptions, RewardOptions
+from xreset.task.terms import Named, OneTerm, Terms, Weighted
 from xreset.text import shown
 
 LONGEST_EPISODE = 1e6
 """Longest episode [s]: the largest time that a file of traces may hold."""
 
 PositiveRange = Annotated[Range, Rule("factors above 0", lambda x: x[0] > 0)]
-
-
-_OWN_TERMS = (
-    "module:function and a finite number (a function of a notebook is named __main__:function)"
-)
-
-
-def _are_own_terms(own: dict[str, float]) -> bool:
-    if not isinstance(own, dict):
-        return False
-    return all(_is_own_term(name, weight) for name, weight in own.items())
-
-
-def _is_own_term(name: str, weight: float) -> bool:
-    if not isinstance(name, str):
-        return False
-    module, _, function = name.partition(":")
-    return bool(module) and bool(function) and isfinite(weight)
 
 
 def _are_shares(shares: dict[str, float]) -> bool:
@@ -86,71 +70,87 @@ class ActionConfig(Checked):
     meets the object with its knuckles. Not in the paper."""
 
 
-@frozen
-class NoiseConfig(Checked):
-    """Standard deviations of the observation noise. The paper says which observations are noisy, not by how much."""
-
-    joint_pos: NonNegativeFloat = 0.005
-    """[rad]"""
-    joint_vel: NonNegativeFloat = 0.05
-    """[rad/s]"""
-    object_pos: NonNegativeFloat = 0.003
-    """[m]"""
-    object_rot: NonNegativeFloat = 0.02
-    """[rad], about a random axis."""
-    cloud: NonNegativeFloat = 0.002
-    """[m], per point."""
+def _terms(**terms: dict[str, Any]) -> Any:
+    """Return a field whose default is these terms."""
+    return field(default_factory=lambda: Terms(deepcopy(terms)))
 
 
 @frozen
 class ObservationConfig(Checked):
-    """What the policy observes (appendix C): the groups ``policy``, ``proprio`` and ``perception``.
+    """What policy and critic observe: groups of named terms, in order (``xreset/task/observations.py``).
 
-    The critic also observes the group ``privileged``.
+    The policy gets ``policy``, ``proprio`` and ``perception``; with cameras ``goal``, ``proprio`` and images. The
+    critic gets ``policy``, ``proprio``, ``perception`` and ``privileged``. The paper says which observations are noisy
+    (appendix C), not by how much.
     """
 
-    cloud_points: PositiveInt = 64
-    """Points per cloud (P)."""
-    cloud: Literal["history", "paired"] = "history"
-    """What the policy observes of the object's surface points. ``history``: their positions in the last
-    ``cloud_history`` frames (the draft of the paper). ``paired``: the position of every point, its position at the
-    goal, and the goal's minus the present one, in this frame only (the published paper). It shows the pose error point
-    by point."""
-    cloud_history: PositiveInt = 5
-    """Frames of cloud history, oldest first."""
-    rotation: Literal["quaternion", "matrix", "to_goal"] = "quaternion"
-    """``quaternion``: a quaternion with w >= 0, which jumps where w is 0. ``matrix``: the first two columns of the
-    rotation matrix, which never jump (Zhou et al. 2019, On the Continuity of Rotation Representations). ``to_goal``: in
-    place of the orientations of object and goal, the columns of the rotation that leads from one to the other, along
-    the world's axes. It does not depend on the axes of the mesh file. A policy with cameras observes the rotation
-    from the start of the episode to the goal."""
-    cloud_scale: PositiveFloat = 1.0
-    """Factor on the clouds' coordinates [1/m]."""
-    contact_force_scale: NonNegativeFloat = 0.1
-    """Factor on fingertip forces [1/N] before they are limited to [-1, 1]."""
-    joint_target: bool = False
-    """Whether the policy observes the distance from each joint to its drive's target [rad]. With relative hand targets
-    no other observation contains it."""
-    joint_vel_scale: NonNegativeFloat = 0.1
-    """Factor on joint velocities [s/rad]."""
-    content: Literal["draft", "published"] = "draft"
-    """What the policy observes besides the points. ``draft``: poses of object and goal, previous action, joints and
-    their velocities, palm, fingertips, forces. ``published``: joint positions and their drives' targets between the
-    joint limits, the vectors from the fingertips to the nearest of the object's points, and the palm's distance to its
-    nearest one [m]. The published paper does not state the form of this geometry, but its number of inputs agrees."""
-    noise: NoiseConfig = field(default_factory=NoiseConfig)
+    EARLIER: ClassVar = ObservationOptions
+
+    cloud_points: Annotated[
+        PositiveInt, Rule("at most 100,000 points", lambda points: points <= 100_000)
+    ] = 64
+    """Points on the surface of the object (P)."""
+    policy: Named = _terms(
+        object_pos={"noise": 0.003},  # m
+        object_quat={"noise": 0.02},  # rad
+        goal_pos={},
+        goal_quat={},
+        gravity_fraction={},
+        previous_action={},
+    )
+    """Object and goal."""
+    proprio: Named = _terms(
+        joint_pos={"noise": 0.005},  # rad
+        joint_vel={"noise": 0.05, "scale": 0.1},  # rad/s, s/rad
+        palm_pos={},
+        palm_quat={},
+        palm_linvel={},
+        palm_angvel={},
+        tip_pos={},
+        tip_force={"scale": 0.1},  # 1/N
+    )
+    """The robot."""
+    perception: OneTerm = _terms(
+        cloud={"frames": 5, "noise": 0.002, "scale": 1.0},  # steps, m, 1/m
+    )
+    """Surface points of the object."""
+    privileged: Named = _terms(
+        object_linvel={},
+        object_angvel={},
+        goal_offset={},
+        goal_turn={},
+        least_tip_distance={},
+        gravity_fraction={},
+        reward={},
+    )
+    """For the critic only."""
+    goal: Named = _terms(goal_pos={}, goal_quat={}, previous_action={})
+    """What a policy with cameras gets instead of ``policy``."""
 
     @property
-    def cloud_shape(self) -> tuple[int, int, int]:
-        """Shape of one world's cloud: frames (H), points (P), numbers per point (K)."""
-        if self.cloud == "paired":
-            return 1, self.cloud_points, 9
-        return self.cloud_history, self.cloud_points, 3
+    def cloud_scale(self) -> float:
+        """Factor on the coordinates of points and of cameras' views [1/m]."""
+        (cloud,) = self.perception.values()
+        return cloud.get("scale", 1.0)
+
+    def without_noise(self) -> ObservationConfig:
+        """Return the same observations without noise."""
+        quiet = {}
+        for group in GROUPS:
+            terms = getattr(self, group).items()
+            quiet[group] = Terms(
+                {name: term | {"noise": 0.0} if "noise" in term else term for name, term in terms}
+            )
+        return replace(self, **quiet)
+
+
+GROUPS = ("policy", "proprio", "perception", "privileged", "goal")
+"""Tables of observations."""
 
 
 @frozen
 class RewardConfig(Checked):
-    """Weights and widths of the reward (appendix D.d)."""
+    """The reward: named terms with weights (``xreset/task/rewards.py``). Defaults are appendix D.d of the paper."""
 
     REMOVED: ClassVar = {
         "tracking": "presence",
@@ -160,82 +160,37 @@ class RewardConfig(Checked):
         "rotation_near": 0.0,
         "rotation_near_width": 0.3,
     }
+    EARLIER: ClassVar = RewardOptions
 
-    reach: FiniteFloat = 1.0
-    """Weight of 1 - tanh(d / ``reach_width``), with d the mean distance of the fingertips to the object."""
-    reach_width: PositiveFloat = 0.1
-    """Distance [m] at which 1 - tanh(d / width) falls to 0.24. Not in the paper."""
-    reach_near: FiniteFloat = 0.0
-    """Weight of a second reach term with its own width. One width is too little: 0.1 m pays nothing at home, 36 cm
-    away, and with 0.4 m the last centimetres, in which fingers wrap around the object, pay less than moving costs."""
-    reach_near_width: PositiveFloat = 0.05
-    """Width of ``reach_near`` [m]."""
-    reach_distance: Literal["best", "present"] = "best"
-    """Distance that both reach terms pay for. ``best``: the smallest of the episode (the paper), so that a hand that
-    moves away is still paid. ``present``: the present distance (as in Isaac Lab's dexterous lift), so that a hand that
-    has missed stays near and tries again."""
-    grasp: FiniteFloat = 1.0
-    """Reward while the thumb and another finger press on the object."""
-    position: FiniteFloat = 4.0
-    """Weight of 1 - tanh(position error / ``position_width``), gated (``contact``)."""
-    position_width: PositiveFloat = 0.2
-    """[m]"""
-    rotation: FiniteFloat = 4.0
-    """Weight of 1 - tanh(rotation error / ``rotation_width``), gated."""
-    rotation_width: PositiveFloat = 1.5
-    """[rad]"""
-    proximity: FiniteFloat = 0.0
-    """Weight of the sum over fingertips of their distances to the object's surface points [m], at most
-    ``proximity_cap``. The published paper has -2.5."""
-    proximity_cap: PositiveFloat = 3.0
-    """Largest sum that ``proximity`` counts [m] (the published paper)."""
-    palm_proximity: FiniteFloat = 0.0
-    """Weight of the palm's distance to the object's surface points [m], at most ``palm_proximity_cap``. The published
-    paper has -2.5."""
-    palm_proximity_cap: PositiveFloat = 0.5
-    """Largest distance that ``palm_proximity`` counts [m] (the published paper)."""
-    points: FiniteFloat = 0.0
-    """Weight of 1 - d / ``points_zero``, gated, with d the mean distance of 64 surface points to the goal. The
-    published paper's 3 (1.4 - 3 d) is 4.2 with ``points_zero`` 1.4 / 3."""
-    points_zero: PositiveFloat = 1.4 / 3
-    """Distance d beyond which ``points`` is negative [m]."""
-    success: FiniteFloat = 10.0
-    """Weight of success, gated."""
-    success_shape: Literal["pose", "points"] = "pose"
-    """``pose``: paid while position and rotation are within the next two limits (the draft). ``points``: paid times
-    1 / (1 + 10 d) while d, the mean distance of 64 surface points to the goal [m], is at most ``success_position`` (the
-    published paper)."""
+    terms: Weighted = _terms(
+        reach={"function": "best_reach", "weight": 1.0, "width": 0.1},  # m
+        grasp={"weight": 1.0, "force": 0.1},  # N
+        position={"weight": 4.0, "width": 0.2},  # m
+        rotation={"weight": 4.0, "width": 1.5},  # rad
+        success={"weight": 10.0, "rotation": 0.2617993877991494},  # 15 degrees
+        action={"weight": -0.005, "limited": True},
+        action_rate={"weight": -0.005, "limited": True},
+        out_of_bounds={"weight": -500.0},
+    )
+    """The terms, in the order in which they are added. ``--config.task.reward.terms.reach.width 0.4`` changes one.
+    Weight 0 switches a term off. The object is at its goal where the term ``success`` is not 0. A term
+    ``module:function`` is the user's own (docs/own-reward.md)."""
+    gate: OneTerm = _terms(touching={"force": 0.1})  # N
+    """Condition of the terms position, rotation, points and success."""
     success_position: PositiveFloat = 0.02
-    """Largest position error [m] (section V)."""
-    success_rotation: PositiveFloat = 0.2617993877991494
-    """Largest rotation error [rad]: 15 degrees (section V)."""
-    action: FiniteFloat = -0.005
-    """Weight of the sum of squares of the action."""
-    action_rate: FiniteFloat = -0.005
-    """Weight of the sum of squares of the action's change since the last step."""
-    action_rate_arm: FiniteFloat | None = None
-    """Weight of the arm's part of ``action_rate``; None: the weight ``action_rate``. The published paper has -0.05."""
-    out_of_bounds: FiniteFloat = -500.0
-    """Reward when the object leaves the scene (``task.termination``)."""
-    contact: Literal["any", "opposing", "near"] = "any"
-    """What opens the gate of ``position``, ``rotation``, ``points`` and ``success``. ``any``: the thumb and another
-    finger press (the paper). ``opposing``: their forces on the object are also more than 90 degrees apart, as in a
-    grasp. ``near``: fingertips and palm are near the object, whether or not they touch it (the published
-    paper). ``grasp`` is paid for ``any``."""
-    near_tips: PositiveFloat = 0.6
-    """Largest sum of the fingertips' distances to the object [m] (the published paper)."""
-    near_palm: PositiveFloat = 0.2
-    """Largest distance of the palm to the object [m] (the published paper)."""
-    contact_threshold: NonNegativeFloat = 0.1
-    """Force [N] from which a finger counts as in contact. Not in the paper."""
-    raw_actions: bool = False
-    """Whether ``action`` and ``action_rate`` penalise actions before they are limited to [-1, 1]. Beyond the limits
-    exploration noise has no effect, and only a penalty of the raw action pulls the mean back (as in Isaac Lab's action
-    terms)."""
-    own: Annotated[dict[str, float], Rule(_OWN_TERMS, _are_own_terms)] = field(default_factory=dict)
-    """Reward terms of the user: ``module:function`` -> weight (docs/own-reward.md)."""
+    """Largest distance to the goal that is a success [m] (section V)."""
     scale: PositiveFloat = 0.01
     """Factor on the total (Table VIII)."""
+
+    @property
+    def own(self) -> Terms:
+        """The terms of the user: ``module:function``."""
+        return Terms({name: term for name, term in self.terms.items() if ":" in name})
+
+    def without_own(self) -> RewardConfig:
+        """Return the reward without the terms of the user."""
+        kept = {name: term for name, term in self.terms.items() if ":" not in name}
+        return replace(self, terms=Terms(kept))
 
 
 @frozen
@@ -349,8 +304,8 @@ class PushConfig(Checked):
     """Largest torque on each joint of the arm, as a share of the joint's effort limit. The joint's target is moved by
     torque / stiffness, which acts like the torque itself until the drive reaches its effort limit."""
     when: Literal["always", "gated"] = "always"
-    """``gated``: the object is pushed only while the gate of the reward is open (``task.reward.contact``). Pushes on
-    the arm are never gated."""
+    """``gated``: the object is pushed only while the gate of the reward is open (``task.reward.gate``). Pushes on the
+    arm are never gated."""
 
     @property
     def moves_object(self) -> bool:
@@ -485,8 +440,8 @@ class TaskConfig(Checked):
     object_frame: Literal["mesh", "center"] = "mesh"
     """Origin of the object in observations, rewards, ends of episodes, perturbed starts and goals, and the draft's
     metrics. ``mesh``: the origin of the mesh file (the paper). ``center``: the center of volume of the convex hull,
-    which does not depend on the file's origin and axes. With ``observation.rotation="to_goal"`` and
-    ``observation.cloud="paired"`` the file's axes have no effect either."""
+    which does not depend on the file's origin and axes. With the observations of the recipe ``live`` the file's axes
+    have no effect either."""
     distance_points: PositiveInt = 256
     """Surface points per object for fingertip distances."""
 
@@ -501,11 +456,6 @@ class TaskConfig(Checked):
         if self.vision.cameras:
             return "goal", "proprio", "view"
         return "policy", "proprio", "perception"
-
-    @property
-    def picture_shape(self) -> tuple[int, int, int]:
-        """Shape of the last of :attr:`policy_groups` for one world."""
-        return self.vision.view_shape if self.vision.cameras else self.observation.cloud_shape
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -536,14 +486,13 @@ def evaluation_task(task: TaskConfig) -> TaskConfig:
     :data:`EVALUATION_TIMESTEP` if a whole number of them makes a control step. Reward terms of the user are removed: no
     metric depends on them, and an evaluation does not need their module.
     """
-    zero = NoiseConfig(joint_pos=0.0, joint_vel=0.0, object_pos=0.0, object_rot=0.0, cloud=0.0)
     substeps = round(task.control_dt / EVALUATION_TIMESTEP)
     if substeps and abs(substeps * EVALUATION_TIMESTEP - task.control_dt) < 1e-9:
         task = replace(task, timestep=EVALUATION_TIMESTEP, substeps=substeps)
     return replace(
         task,
-        observation=replace(task.observation, noise=zero),
-        reward=replace(task.reward, own={}),
+        observation=task.observation.without_noise(),
+        reward=task.reward.without_own(),
         reset=replace(
             task.reset,
             demo_probability=0.0,

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from xreset.task.randomization import Drawn, Sample
+from xreset.task.worlds import Sample, Worlds
 from xreset.tensors import where
 
 
@@ -19,7 +19,7 @@ class DelayLine:
 
     def __init__(
         self,
-        drawn: Drawn,
+        worlds: Worlds,
         name: str,
         width: int,
         longest: float,
@@ -31,21 +31,21 @@ class DelayLine:
         """Allocate.
 
         Args:
-            drawn: what is drawn at each reset; the line adds its buffers.
+            worlds: state of the worlds; the line adds its buffers.
             name: prefix of the buffers' names.
             width: D, numbers of a value.
             longest: largest delay [steps].
             sample: draws the delays [steps].
             by_column: whether each of the D numbers has a delay of its own.
-            is_fault: see :meth:`Drawn.keep`.
+            is_fault: see :meth:`Worlds.keep`.
         """
         self.longest = longest
         if longest:
             steps = math.ceil(longest) + 1
-            self.values = drawn.keep(f"{name}.values", drawn.zeros(steps, width))
+            self.values = worlds.keep(f"{name}.values", worlds.zeros(steps, width))
             """[N, K, D]"""
-            delays = drawn.zeros(width if by_column else 1)
-            self.delay = drawn.keep(f"{name}.delay", delays, sample, is_fault=is_fault)
+            delays = worlds.zeros(width if by_column else 1)
+            self.delay = worlds.keep(f"{name}.delay", delays, sample, is_fault=is_fault)
             """[N, 1] steps, or [N, D]."""
 
     def fill(self, fresh: Tensor, value: Tensor) -> None:

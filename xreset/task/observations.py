@@ -1,20 +1,21 @@
-"""Observations (the paper's appendix C), as pure functions, and the layout that a policy file carries.
+"""Observations (the paper's appendix C): named terms as pure functions, and the layout that a policy file carries.
 
-Groups: ``policy`` (object pose, goal pose, gravity fraction, previous action), ``proprio`` (joints, palm, fingertips,
-contact forces), ``perception`` (cloud history or paired points) and, for the critic only, ``privileged``. With cameras
-there are also ``goal`` (goal pose, previous action) and ``view`` (images or points).
-Shape letters: N worlds, J joints, E fingertips, P points, K numbers per point, H history.
+:class:`~xreset.task.config.ObservationConfig` and the recipes list terms of this module, group by group. A term returns
+[N, D]; the numbers of a group are those of its terms, in order. To add an observation, write a function here and name
+it in a recipe. Terms with ``noise`` (a standard deviation) draw random numbers, in the order of the configuration.
+Shape letters: N worlds, J joints, E fingertips, P points, K numbers per point, H frames of history.
 """
 
 from __future__ import annotations
 
+from functools import cached_property
 from math import prod
 
 import torch
 from torch import Tensor
 
 from xreset.cameras.config import VisionConfig
-from xreset.checks import frozen
+from xreset.checks import NonNegativeFloat, PositiveFloat, PositiveInt, frozen
 from xreset.geometry.rotations import (
     quat_conjugate,
     quat_from_axis_angle,
@@ -24,7 +25,8 @@ from xreset.geometry.rotations import (
     quat_to_matrix,
 )
 from xreset.physics import Links, State
-from xreset.task.config import ObservationConfig
+from xreset.task.config import GROUPS, ObservationConfig
+from xreset.task.terms import Functions
 
 
 @frozen
@@ -66,6 +68,290 @@ class ObservationInput:
     """[N, E] distance from each fingertip to the object's surface points [m]."""
     reward: Tensor
     """[N] of the last step, scaled; 0 when an episode begins."""
+    generator: torch.Generator
+    """Source of the noise."""
+
+    def noisy(self, values: Tensor, std: float) -> Tensor:
+        """Return values with normal noise."""
+        return values + std * self._normal(values)
+
+    def noisy_quat(self, std: float) -> Tensor:
+        """[N, 4] observed orientation, turned about a random axis by a normal angle [rad]."""
+        error = quat_from_axis_angle(std * self._normal(self.observed_pos))
+        return quat_multiply(error, self.observed_quat)
+
+    def _normal(self, like: Tensor) -> Tensor:
+        return torch.randn(
+            like.shape, generator=self.generator, device=like.device, dtype=like.dtype
+        )
+
+    def scaled(self, joint_pos: Tensor) -> Tensor:
+        """[N, J] joint positions between their limits, in [-1, 1]."""
+        return 2.0 * (joint_pos - self.joint_lower) / (self.joint_upper - self.joint_lower) - 1.0
+
+    @cached_property
+    def world_points(self) -> Tensor:
+        """[N, P, 3] the object's points in the world frame, at the pose that the tracker reports [m]."""
+        return quat_rotate(self.observed_quat[:, None], self.points) + self.observed_pos[:, None]
+
+    @cached_property
+    def to_nearest_point(self) -> Tensor:
+        """[N, 1 + E, 3] vectors from the palm and the fingertips to the object's nearest points [m]."""
+        offsets = self.world_points[:, None] - self.links.pos[:, :, None]
+        nearest = offsets.square().sum(dim=-1).argmin(dim=-1)
+        return offsets.gather(2, nearest[:, :, None, None].expand(-1, -1, 1, 3))[:, :, 0]
+
+
+TERMS = Functions("observation")
+"""Name -> observation."""
+
+
+# The object and its goal ----------------------------------------------------------------------------------------------
+
+
+@TERMS.add
+def object_pos(x: ObservationInput, *, noise: NonNegativeFloat) -> Tensor:
+    """[N, 3] position that the tracker reports [m]; ``noise`` [m]."""
+    return x.noisy(x.observed_pos, noise)
+
+
+@TERMS.add
+def object_quat(x: ObservationInput, *, noise: NonNegativeFloat) -> Tensor:
+    """[N, 4] orientation that the tracker reports, as a quaternion with w >= 0, which jumps where w is 0; ``noise``
+    [rad], about a random axis."""
+    return _positive(x.noisy_quat(noise))
+
+
+@TERMS.add
+def object_rotation(x: ObservationInput, *, noise: NonNegativeFloat) -> Tensor:
+    """[N, 6] as ``object_quat``, but the first two columns of the rotation matrix, which never jump (Zhou et al. 2019,
+    On the Continuity of Rotation Representations)."""
+    return _columns(x.noisy_quat(noise))
+
+
+@TERMS.add
+def goal_pos(x: ObservationInput) -> Tensor:
+    """[N, 3] [m]"""
+    return x.goal_pos
+
+
+@TERMS.add
+def goal_quat(x: ObservationInput) -> Tensor:
+    """[N, 4] orientation of the goal, with w >= 0."""
+    return _positive(x.goal_quat)
+
+
+@TERMS.add
+def goal_rotation(x: ObservationInput) -> Tensor:
+    """[N, 6] orientation of the goal: two columns of its matrix."""
+    return _columns(x.goal_quat)
+
+
+@TERMS.add
+def rotation_to_goal(x: ObservationInput, *, noise: NonNegativeFloat) -> Tensor:
+    """[N, 6] columns of the rotation that leads from the object to its goal, along the world's axes. It does not depend
+    on the axes of the mesh file."""
+    return _columns(quat_multiply(x.goal_quat, quat_conjugate(x.noisy_quat(noise))))
+
+
+@TERMS.add
+def rotation_from_start(x: ObservationInput) -> Tensor:
+    """[N, 6] columns of the rotation from the start of the episode to the goal, for policies with cameras: no image
+    shows the axes in which a mesh was drawn."""
+    return _columns(quat_multiply(x.goal_quat, quat_conjugate(x.start_quat)))
+
+
+@TERMS.add
+def gravity_fraction(x: ObservationInput) -> Tensor:
+    """[N, 1] share of the object's weight that acts."""
+    return x.gravity_fraction[:, None]
+
+
+@TERMS.add
+def tip_to_object(x: ObservationInput) -> Tensor:
+    """[N, 3 E] vectors from the fingertips to the object's nearest points [m]. The published paper does not state the
+    form of this geometry, but its number of inputs agrees."""
+    return x.to_nearest_point[:, 1:].flatten(1)
+
+
+@TERMS.add
+def palm_distance(x: ObservationInput) -> Tensor:
+    """[N, 1] distance from the palm to the object's nearest point [m]."""
+    square = x.to_nearest_point[:, 0].square().sum(dim=-1, keepdim=True)
+    # Some processors round torch's square root of float32 differently; xreset.runtime always rounds correctly.
+    return square.double().sqrt().to(square.dtype)
+
+
+# The robot ------------------------------------------------------------------------------------------------------------
+
+
+@TERMS.add
+def previous_action(x: ObservationInput) -> Tensor:
+    """[N, J] in [-1, 1]."""
+    return x.previous_action
+
+
+@TERMS.add
+def joint_pos(x: ObservationInput, *, noise: NonNegativeFloat) -> Tensor:
+    """[N, J] joint positions between their limits, in [-1, 1]; ``noise`` [rad]."""
+    return x.scaled(x.noisy(x.state.joint_pos, noise))
+
+
+@TERMS.add
+def joint_vel(x: ObservationInput, *, noise: NonNegativeFloat, scale: NonNegativeFloat) -> Tensor:
+    """[N, J] joint velocities times ``scale`` [s/rad]; ``noise`` [rad/s]."""
+    return scale * x.noisy(x.state.joint_vel, noise)
+
+
+@TERMS.add
+def target_pos(x: ObservationInput) -> Tensor:
+    """[N, J] targets of the drives between the joints' limits, in [-1, 1]."""
+    return x.scaled(x.joint_target)
+
+
+@TERMS.add
+def joint_target(x: ObservationInput) -> Tensor:
+    """[N, J] distance from each joint to its drive's target [rad]. With relative hand targets no other observation of
+    the draft contains it."""
+    return x.joint_target - x.state.joint_pos
+
+
+@TERMS.add
+def palm_pos(x: ObservationInput) -> Tensor:
+    """[N, 3] [m]"""
+    return x.links.pos[:, 0]
+
+
+@TERMS.add
+def palm_quat(x: ObservationInput) -> Tensor:
+    """[N, 4] with w >= 0."""
+    return _positive(x.links.quat[:, 0])
+
+
+@TERMS.add
+def palm_rotation(x: ObservationInput) -> Tensor:
+    """[N, 6] two columns of the palm's matrix."""
+    return _columns(x.links.quat[:, 0])
+
+
+@TERMS.add
+def palm_linvel(x: ObservationInput) -> Tensor:
+    """[N, 3] [m/s]"""
+    return x.links.linvel[:, 0]
+
+
+@TERMS.add
+def palm_angvel(x: ObservationInput) -> Tensor:
+    """[N, 3] [rad/s]"""
+    return x.links.angvel[:, 0]
+
+
+@TERMS.add
+def tip_pos(x: ObservationInput) -> Tensor:
+    """[N, 3 E] [m]"""
+    return x.links.pos[:, 1:].flatten(1)
+
+
+@TERMS.add
+def tip_force(x: ObservationInput, *, scale: NonNegativeFloat) -> Tensor:
+    """[N, 3 E] fingertip forces times ``scale`` [1/N], limited to [-1, 1]."""
+    return (scale * x.tip_force).clamp(-1.0, 1.0).flatten(1)
+
+
+# Surface points -------------------------------------------------------------------------------------------------------
+
+
+@TERMS.add
+def cloud(
+    x: ObservationInput, *, frames: PositiveInt, noise: NonNegativeFloat, scale: PositiveFloat
+) -> Tensor:
+    """[N, H, P, 3] positions of the object's points in the last frames, oldest first (the draft of the paper). These
+    are those of a new episode, all equal; the environment keeps the frames of the steps before.
+
+    Args:
+        x: the step.
+        frames: H.
+        noise: standard deviation [m], per point.
+        scale: factor on the coordinates [1/m].
+    """
+    frame = scale * x.noisy(x.world_points, noise)
+    return frame[:, None].expand(-1, frames, -1, -1)
+
+
+@TERMS.add
+def paired_cloud(x: ObservationInput, *, noise: NonNegativeFloat, scale: PositiveFloat) -> Tensor:
+    """[N, 1, P, 9] position of every point, its position at the goal, and the goal's minus the present one, in this
+    frame only (the published paper): the pose error point by point."""
+    here = x.noisy(x.world_points, noise)
+    goal = quat_rotate(x.goal_quat[:, None], x.points) + x.goal_pos[:, None]
+    return scale * torch.cat((here, goal, goal - here), dim=-1)[:, None]
+
+
+# For the critic -------------------------------------------------------------------------------------------------------
+
+
+@TERMS.add
+def object_linvel(x: ObservationInput) -> Tensor:
+    """[N, 3] true velocity of the object [m/s]."""
+    return x.state.object_linvel
+
+
+@TERMS.add
+def object_angvel(x: ObservationInput) -> Tensor:
+    """[N, 3] true angular velocity of the object [rad/s]."""
+    return x.state.object_angvel
+
+
+@TERMS.add
+def goal_offset(x: ObservationInput) -> Tensor:
+    """[N, 3] true vector from the object to its goal [m]."""
+    return x.goal_pos - x.state.object_pos
+
+
+@TERMS.add
+def goal_turn(x: ObservationInput) -> Tensor:
+    """[N, 3] true rotation vector from the object to its goal [rad]."""
+    return quat_to_axis_angle(quat_multiply(x.goal_quat, quat_conjugate(x.state.object_quat)))
+
+
+@TERMS.add
+def least_tip_distance(x: ObservationInput) -> Tensor:
+    """[N, 1] least distance of a fingertip to the object [m]."""
+    return x.tip_distance.min(dim=-1, keepdim=True).values
+
+
+@TERMS.add
+def reward(x: ObservationInput) -> Tensor:
+    """[N, 1] reward of the last step."""
+    return x.reward[:, None]
+
+
+@TERMS.add
+def true_joint_vel(x: ObservationInput, *, scale: NonNegativeFloat) -> Tensor:
+    """[N, J] joint velocities without noise, times ``scale`` [s/rad]."""
+    return scale * x.state.joint_vel
+
+
+# Groups ---------------------------------------------------------------------------------------------------------------
+
+
+class Observer:
+    """The observations of a configuration."""
+
+    def __init__(self, config: ObservationConfig) -> None:
+        """Find the functions; errors as for :meth:`xreset.task.terms.Functions.bound`."""
+        self._groups = {
+            group: TERMS.bound(f"task.observation.{group}", getattr(config, group))
+            for group in GROUPS
+        }
+
+    def terms(self, group: str, x: ObservationInput) -> dict[str, Tensor]:
+        """Return the values [N, ...] of a group's terms, by name."""
+        return {name: function(x) for name, function in self._groups[group].items()}
+
+    def group(self, group: str, x: ObservationInput) -> Tensor:
+        """[N, ...] the values of a group's terms, next to each other."""
+        return torch.cat(list(self.terms(group, x).values()), dim=-1)
 
 
 def layout(
@@ -74,175 +360,62 @@ def layout(
     """Return the number of values of every term, by group, in order. A policy fits a task only if its layout is equal.
 
     ``perception`` has H * P * K values. With cameras the groups are ``goal``, ``proprio`` and ``view``.
+
+    Raises:
+        WrongValueError: as for :class:`Observer`.
     """
-    rotation = "rotation"
-    width = 6
-    if c.rotation == "quaternion":
-        rotation = "quat"
-        width = 4
-    if c.content == "published":
-        policy = {"tip_to_object": 3 * num_tips, "palm_distance": 1}
-        proprio = {"joint_pos": num_joints, "target_pos": num_joints}
-    else:
-        poses = {
-            "object_pos": 3,
-            f"object_{rotation}": width,
-            "goal_pos": 3,
-            f"goal_{rotation}": width,
-        }
-        if c.rotation == "to_goal":
-            poses = {"object_pos": 3, "goal_pos": 3, "rotation_to_goal": 6}
-        policy = poses | {"gravity_fraction": 1, "previous_action": num_joints}
-        proprio = {
-            "joint_pos": num_joints,
-            "joint_vel": num_joints,
-            "palm_pos": 3,
-            f"palm_{rotation}": width,
-            "palm_linvel": 3,
-            "palm_angvel": 3,
-            "tip_pos": 3 * num_tips,
-            "tip_force": 3 * num_tips,
-        }
-        if c.joint_target:
-            proprio["joint_target"] = num_joints
+    observer = Observer(c)
+    x = _example(num_joints, num_tips, c.cloud_points)
+
+    def widths(group: str) -> dict[str, int]:
+        return {name: value[0].numel() for name, value in observer.terms(group, x).items()}
+
     if vision is None or not vision.cameras:
-        cloud = "cloud" if c.cloud == "history" else "paired_cloud"
-        return {"policy": policy, "proprio": proprio, "perception": {cloud: prod(c.cloud_shape)}}
-    goal_rotation = "rotation_from_start" if c.rotation == "to_goal" else f"goal_{rotation}"
-    return {
-        "goal": {"goal_pos": 3, goal_rotation: width, "previous_action": num_joints},
-        "proprio": proprio,
-        "view": {vision.view: prod(vision.view_shape)},
-    }
+        return {group: widths(group) for group in ("policy", "proprio", "perception")}
+    view = {vision.view: prod(vision.view_shape)}
+    return {"goal": widths("goal"), "proprio": widths("proprio"), "view": view}
 
 
-def policy_group(x: ObservationInput, c: ObservationConfig, generator: torch.Generator) -> Tensor:
-    """[N, 15 + J] object pose (noisy), goal pose, gravity fraction, previous action.
-
-    With ``rotation="matrix"`` there are four numbers more, with ``to_goal`` two less. With ``content="published"``,
-    [N, 3 E + 1] vectors from the fingertips to the object's nearest points, and the palm's distance to its nearest
-    point [m].
-    """
-    if c.content == "published":
-        return _vectors_to_object(x)
-    pos = _noisy(x.observed_pos, c.noise.object_pos, generator)
-    error = quat_from_axis_angle(c.noise.object_rot * _normal(x.observed_pos, generator))
-    quat = quat_multiply(error, x.observed_quat)
-    if c.rotation == "to_goal":
-        to_goal = quat_multiply(x.goal_quat, quat_conjugate(quat))
-        poses = (pos, x.goal_pos, _encoded(to_goal, c))
-    else:
-        poses = (pos, _encoded(quat, c), x.goal_pos, _encoded(x.goal_quat, c))
-    return torch.cat((*poses, x.gravity_fraction[:, None], x.previous_action), dim=-1)
+def cloud_shape(c: ObservationConfig) -> tuple[int, ...]:
+    """Return the shape of one world's points: frames (H), points (P), numbers per point (K)."""
+    x = _example(1, 1, c.cloud_points)
+    return tuple(Observer(c).group("perception", x)[0].shape)
 
 
-def _vectors_to_object(x: ObservationInput) -> Tensor:
-    """[N, 3 E + 1] vectors from the fingertips to the object's nearest points, and the palm's distance to its own."""
-    offsets = _world_points(x)[:, None] - x.links.pos[:, :, None]
-    nearest = offsets.square().sum(dim=-1).argmin(dim=-1)
-    vectors = offsets.gather(2, nearest[:, :, None, None].expand(-1, -1, 1, 3))[:, :, 0]
-    square = vectors[:, 0].square().sum(dim=-1, keepdim=True)
-    # Some processors round torch's square root of float32 differently; xreset.runtime always rounds correctly.
-    palm_distance = square.double().sqrt().to(square.dtype)
-    return torch.cat((vectors[:, 1:].flatten(1), palm_distance), dim=-1)
+def _example(num_joints: int, num_tips: int, num_points: int) -> ObservationInput:
+    """Return an input with N = 1, whose numbers mean nothing."""
+
+    def zeros(*shape: int) -> Tensor:
+        return torch.zeros(1, *shape)
+
+    joints = zeros(num_joints)
+    link = zeros(1 + num_tips, 3)
+    return ObservationInput(
+        state=State.at_rest(joints, zeros(3), zeros(4)),
+        links=Links(pos=link, quat=zeros(1 + num_tips, 4), linvel=link, angvel=link),
+        joint_target=joints,
+        joint_lower=joints[0],
+        joint_upper=joints[0],
+        points=zeros(num_points, 3),
+        observed_pos=zeros(3),
+        observed_quat=zeros(4),
+        goal_pos=zeros(3),
+        goal_quat=zeros(4),
+        start_quat=zeros(4),
+        gravity_fraction=zeros(),
+        previous_action=joints,
+        tip_force=zeros(num_tips, 3),
+        tip_distance=zeros(num_tips),
+        reward=zeros(),
+        generator=torch.Generator(),  # torch's own random numbers stay as they are
+    )
 
 
-def goal_group(x: ObservationInput, c: ObservationConfig) -> Tensor:
-    """[N, 7 + J] goal pose, previous action. Without quaternions there are two numbers more.
-
-    With ``rotation="to_goal"``, the goal's orientation is given as the rotation from the start of the episode to the
-    goal, because no image shows the axes in which a mesh was drawn.
-    """
-    rotation = x.goal_quat
-    if c.rotation == "to_goal":
-        rotation = quat_multiply(x.goal_quat, quat_conjugate(x.start_quat))
-    return torch.cat((x.goal_pos, _encoded(rotation, c), x.previous_action), dim=-1)
+def _positive(quat: Tensor) -> Tensor:
+    """[..., 4] the quaternion of the same rotation with w >= 0."""
+    return torch.where(quat[..., :1] < 0, -quat, quat)
 
 
-def proprio_group(x: ObservationInput, c: ObservationConfig, generator: torch.Generator) -> Tensor:
-    """[N, 2 J + 13 + 6 E] joints, palm, fingertips and limited contact forces, in the order of :func:`layout`.
-
-    Palm and fingertips are in the world frame. Joint positions are scaled to [-1, 1] between their limits. Without
-    quaternions there are two numbers more, with ``joint_target`` J more. With ``content="published"``, [N, 2 J]
-    positions and drives' targets, both scaled.
-    """
-    pos = _noisy(x.state.joint_pos, c.noise.joint_pos, generator)
-    if c.content == "published":
-        return torch.cat((_scaled(pos, x), _scaled(x.joint_target, x)), dim=-1)
-    terms = [
-        _scaled(pos, x),
-        c.joint_vel_scale * _noisy(x.state.joint_vel, c.noise.joint_vel, generator),
-        x.links.pos[:, 0],
-        _encoded(x.links.quat[:, 0], c),
-        x.links.linvel[:, 0],
-        x.links.angvel[:, 0],
-        x.links.pos[:, 1:].flatten(1),
-        _limited_force(x, c),
-    ]
-    if c.joint_target:
-        terms.append(x.joint_target - x.state.joint_pos)
-    return torch.cat(terms, dim=-1)
-
-
-def privileged_group(x: ObservationInput, c: ObservationConfig) -> Tensor:
-    """[N, 15] object velocities, pose error (a vector [m] and a rotation vector [rad]), least fingertip distance [m],
-    gravity fraction and reward; for the critic only.
-
-    With ``content="published"``, [N, 15 + J + 3 E]: joint velocities and contact forces follow, because the policy
-    does not observe them.
-    """
-    to_goal = quat_multiply(x.goal_quat, quat_conjugate(x.state.object_quat))
-    terms = [
-        x.state.object_linvel,
-        x.state.object_angvel,
-        x.goal_pos - x.state.object_pos,
-        quat_to_axis_angle(to_goal),
-        x.tip_distance.min(dim=-1, keepdim=True).values,
-        x.gravity_fraction[:, None],
-        x.reward[:, None],
-    ]
-    if c.content == "published":
-        terms += [c.joint_vel_scale * x.state.joint_vel, _limited_force(x, c)]
-    return torch.cat(terms, dim=-1)
-
-
-def cloud_frame(x: ObservationInput, c: ObservationConfig, generator: torch.Generator) -> Tensor:
-    """[N, P, K] one frame of the object's points in the world frame, times ``cloud_scale``.
-
-    The present positions are noisy. With ``cloud="paired"`` the goal positions and the differences follow them.
-    """
-    cloud = _noisy(_world_points(x), c.noise.cloud, generator)
-    if c.cloud == "history":
-        return c.cloud_scale * cloud
-    goal = quat_rotate(x.goal_quat[:, None], x.points) + x.goal_pos[:, None]
-    return c.cloud_scale * torch.cat((cloud, goal, goal - cloud), dim=-1)
-
-
-def _world_points(x: ObservationInput) -> Tensor:
-    """[N, P, 3] the object's points in the world frame, at the pose that the tracker reports [m]."""
-    return quat_rotate(x.observed_quat[:, None], x.points) + x.observed_pos[:, None]
-
-
-def _scaled(joint_pos: Tensor, x: ObservationInput) -> Tensor:
-    """[N, J] joint positions between their limits, in [-1, 1]."""
-    return 2.0 * (joint_pos - x.joint_lower) / (x.joint_upper - x.joint_lower) - 1.0
-
-
-def _limited_force(x: ObservationInput, c: ObservationConfig) -> Tensor:
-    """[N, 3 E] fingertip forces, scaled and limited to [-1, 1]."""
-    return (c.contact_force_scale * x.tip_force).clamp(-1.0, 1.0).flatten(1)
-
-
-def _noisy(values: Tensor, std: float, generator: torch.Generator) -> Tensor:
-    return values + std * _normal(values, generator)
-
-
-def _normal(like: Tensor, generator: torch.Generator) -> Tensor:
-    return torch.randn(like.shape, generator=generator, device=like.device, dtype=like.dtype)
-
-
-def _encoded(quat: Tensor, c: ObservationConfig) -> Tensor:
-    """[..., 4] or [..., 6] a rotation as the policy observes it: the same numbers for q and -q."""
-    if c.rotation == "quaternion":
-        return torch.where(quat[..., :1] < 0, -quat, quat)
+def _columns(quat: Tensor) -> Tensor:
+    """[..., 6] first two columns of a rotation's matrix."""
     return quat_to_matrix(quat)[..., :2].mT.flatten(-2)

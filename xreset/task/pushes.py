@@ -10,7 +10,8 @@ from torch import Tensor
 from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
 from xreset.physics import Backend, State
 from xreset.task.config import PushConfig
-from xreset.task.randomization import Drawn, sample_offset, sample_range, symmetric, uniform
+from xreset.task.randomization import sample_offset, sample_range, symmetric, uniform
+from xreset.task.worlds import Worlds
 
 
 class Pushes:
@@ -22,7 +23,9 @@ class Pushes:
         gate: [N] bool, whether the reward's gate was open after the last step.
     """
 
-    def __init__(self, drawn: Drawn, backend: Backend, config: PushConfig, is_arm: Tensor) -> None:
+    def __init__(
+        self, worlds: Worlds, backend: Backend, config: PushConfig, is_arm: Tensor
+    ) -> None:
         """Allocate, and register what is drawn at each reset; ``is_arm`` [J] bool."""
         self.config = config
         low, high = (log(limit) for limit in config.probability)
@@ -34,16 +37,16 @@ class Pushes:
         drives = [joint.drive for joint in scene.robot.joints]
         offsets = torch.tensor([each.effort / each.kp for each in drives], device=backend.device)
         self._largest_offset = torch.where(is_arm, offsets, 0.0) * config.arm_torque
-        self._probability = drawn.keep(
+        self._probability = worlds.keep(
             "pushes.probability",
-            drawn.zeros(),
-            lambda generator: sample_range(drawn.num_worlds, (low, high), generator).exp(),
+            worlds.zeros(),
+            lambda generator: sample_range(worlds.num_worlds, (low, high), generator).exp(),
             is_fault=True,
         )
         """[N] probability of a push in a control step."""
-        self.force = drawn.zeros(3)
-        self.torque = drawn.zeros(3)
-        self.gate = drawn.keep("pushes.gate", drawn.zeros().bool())
+        self.force = worlds.zeros(3)
+        self.torque = worlds.zeros(3)
+        self.gate = worlds.keep("pushes.gate", worlds.zeros().bool())
 
     def act(
         self, state: State, mass: Tensor, inertia_scale: Tensor | float, generator: torch.Generator

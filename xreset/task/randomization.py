@@ -1,62 +1,13 @@
-"""What is drawn at each reset: buffers, and physical parameters (the paper's Table IX) as pure functions."""
+"""What is drawn at each reset: physical parameters (the paper's Table IX), as pure functions."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from xreset.task.config import RandomizationConfig
-from xreset.tensors import where
-
-Sample = Callable[[torch.Generator], Tensor]
-"""Draws new values of a buffer, as many as it has."""
-
-
-class Drawn:
-    """Buffers of N worlds. Those with a sample are drawn again when an episode begins, in the order of their creation.
-
-    Attributes:
-        lasting: all buffers by name, for a snapshot.
-        fault_scale: [] factor on the drawn faults of a real control loop.
-    """
-
-    def __init__(self, num_worlds: int, device: torch.device) -> None:
-        """Start without buffers."""
-        self.num_worlds = num_worlds
-        self.device = device
-        self.lasting: dict[str, Tensor] = {}
-        self.fault_scale = torch.ones((), device=device)
-        self._samples: list[tuple[Sample, Tensor, bool]] = []
-
-    def zeros(self, *shape: int) -> Tensor:
-        """[N, ...] zeros that do not last."""
-        return torch.zeros(self.num_worlds, *shape, device=self.device)
-
-    def keep(
-        self, name: str, buffer: Tensor, sample: Sample | None = None, *, is_fault: bool = False
-    ) -> Tensor:
-        """Add a buffer [N, ...], and return it.
-
-        Args:
-            name: the buffer's name in a snapshot.
-            buffer: [N, ...] its first values.
-            sample: draws its values; None: it is not drawn.
-            is_fault: whether drawn values are multiplied by :attr:`fault_scale`.
-        """
-        self.lasting[name] = buffer
-        if sample is not None:
-            self._samples.append((sample, buffer, is_fault))
-        return buffer
-
-    def draw(self, fresh: Tensor, generator: torch.Generator) -> None:
-        """Draw new values for the worlds of a mask [N]. All worlds draw, so that no GPU waits for a count."""
-        for sample, buffer, is_fault in self._samples:
-            values = sample(generator).view_as(buffer)
-            if is_fault:
-                values = values * self.fault_scale
-            buffer.copy_(where(fresh, values, buffer))
 
 
 def pair_friction(

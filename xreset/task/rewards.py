@@ -1,4 +1,4 @@
-"""The object-centric rewards of both versions of the paper, as a pure function.
+"""The object-centric rewards of both versions of the paper: terms as pure functions, and their weighted sum.
 
 The draft (appendix D.d):
 r = r_reach + r_grasp + 4 r_p + 4 r_R + 10 r_success - 0.005 |a_t|^2 - 0.005 |a_t - a_{t-1}|^2 - 500 r_oob
@@ -8,23 +8,27 @@ distance d of surface points to the goal, and G = 1 where P <= 0.6 and M <= 0.2:
 r = -2.5 min(P, 3) - 2.5 min(M, 0.5) + G 3 (1.4 - 3 d) + G [d <= 0.02] 15 / (1 + 10 d) - 0.005 |a_t|^2
 - 0.05 |arm's a_t - a_{t-1}|^2 - 0.005 |hand's a_t - a_{t-1}|^2 - 500 r_oob
 
-The learner gets ``scale`` r. Weights and widths are fields of :class:`~xreset.task.config.RewardConfig`.
+:class:`~xreset.task.config.RewardConfig` and the recipes list terms of this module with weights. The learner gets
+``scale`` r. To add a term, write a function here and name it in a recipe.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from importlib import import_module
-from typing import Any, cast
+from dataclasses import field, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from xreset.checks import frozen
+from xreset.checks import FiniteFloat, NonNegativeFloat, PositiveFloat, frozen
 from xreset.errors import RunError
 from xreset.geometry.rotations import quat_angle, quat_rotate
 from xreset.physics import State
 from xreset.task.config import RewardConfig
+from xreset.task.terms import Functions
+
+CONTACT_FORCE = 0.1
+"""Force [N] from which a finger counts as in contact in curves and results. Not in the paper."""
 
 
 @frozen
@@ -52,7 +56,7 @@ class RewardInput:
     start_quat: Tensor
     """[N, 4]"""
     action: Tensor
-    """[N, J] this step's action, limited to [-1, 1] unless ``raw_actions`` is set."""
+    """[N, J] this step's action. Beyond [-1, 1] it has no more effect."""
     previous_action: Tensor
     """[N, J] 0 in the first step of an episode."""
     out_of_bounds: Tensor
@@ -65,6 +69,8 @@ class RewardInput:
     """[J] bool: the joint is one of the arm's; the others are the hand's."""
     success_position: Tensor
     """[] largest distance to the goal that counts as success [m]: the configuration's, or a schedule's."""
+    gate: Tensor = field(default_factory=lambda: torch.tensor(True))
+    """[N] bool: the condition ``task.reward.gate`` holds. The condition itself does not read it."""
 
     @property
     def object_pos(self) -> Tensor:
@@ -76,6 +82,185 @@ class RewardInput:
         """[N, 4] present orientation of the object, of ``state``."""
         return self.state.object_quat
 
+    @cached_property
+    def position_error(self) -> Tensor:
+        """[N] distance of the object from its goal [m]."""
+        return (self.object_pos - self.goal_pos).norm(dim=-1)
+
+    @cached_property
+    def rotation_error(self) -> Tensor:
+        """[N] angle between the object's orientation and its goal [rad]."""
+        return quat_angle(self.object_quat, self.goal_quat)
+
+    @cached_property
+    def points_error(self) -> Tensor:
+        """[N] mean distance of the object's surface points from their places at the goal [m]."""
+        distances = point_distances(
+            self.object_pos, self.object_quat, self.goal_pos, self.goal_quat, self.points
+        )
+        return distances.mean(dim=-1)
+
+    def actions(self, *, limited: bool) -> tuple[Tensor, Tensor]:
+        """[N, J] this action and the previous one, limited to [-1, 1] or not.
+
+        Only a penalty of the action without limits pulls a mean back that is beyond them, where exploration noise has
+        no effect (as in Isaac Lab's action terms).
+        """
+        if not limited:
+            return self.action, self.previous_action
+        return self.action.clamp(-1.0, 1.0), self.previous_action.clamp(-1.0, 1.0)
+
+
+# Conditions that open the gate ----------------------------------------------------------------------------------------
+
+GATES = Functions("gate")
+"""Name -> condition [N] bool of ``task.reward.gate``."""
+
+
+@GATES.add
+def touching(x: RewardInput, *, force: NonNegativeFloat) -> Tensor:
+    """The thumb and another finger press with this force [N] at least (the paper)."""
+    return contact_gate(x.tip_force, force)
+
+
+@GATES.add
+def opposing(x: RewardInput, *, force: NonNegativeFloat) -> Tensor:
+    """As ``touching``, and their forces on the object are more than 90 degrees apart, as in a grasp."""
+    return contact_gate(x.tip_force, force, opposing=True)
+
+
+@GATES.add
+def near(x: RewardInput, *, tips: PositiveFloat, palm: PositiveFloat) -> Tensor:
+    """Fingertips and palm are near the object, whether or not they touch it (the published paper: 0.6 and 0.2).
+
+    Args:
+        x: the step.
+        tips: largest sum of the fingertips' distances to the object [m].
+        palm: largest distance of the palm to the object [m].
+    """
+    return (x.tip_distance.sum(dim=-1) <= tips) & (x.palm_distance <= palm)
+
+
+# Terms ----------------------------------------------------------------------------------------------------------------
+
+TERMS = Functions("reward term", own=True)
+"""Name -> term [N] of ``task.reward.terms``, before its weight."""
+
+
+@TERMS.add
+def reach(x: RewardInput, *, width: PositiveFloat) -> Tensor:
+    """1 - tanh(d / width), with d the mean distance of the fingertips to the object, as in Isaac Lab's dexterous lift.
+
+    A hand that has missed stays near and tries again. One width is too little: 0.1 m pays nothing at home, 36 cm away,
+    and with 0.4 m the last centimetres, in which fingers wrap around the object, pay less than moving costs.
+
+    Args:
+        x: the step.
+        width: distance at which this falls to 0.24 [m]. Not in the paper.
+    """
+    return 1.0 - torch.tanh(x.tip_distance.mean(dim=-1) / width)
+
+
+@TERMS.add
+def best_reach(x: RewardInput, *, width: PositiveFloat) -> Tensor:
+    """As ``reach``, for the smallest distance of the episode (the paper): a hand that moves away is still paid."""
+    return 1.0 - torch.tanh(x.best_reach / width)
+
+
+@TERMS.add
+def grasp(x: RewardInput, *, force: NonNegativeFloat) -> Tensor:
+    """1 while the thumb and another finger press with this force [N] at least."""
+    return contact_gate(x.tip_force, force)
+
+
+@TERMS.add
+def position(x: RewardInput, *, width: PositiveFloat) -> Tensor:
+    """1 - tanh(position error / width [m]) while the gate is open."""
+    return x.gate * (1.0 - torch.tanh(x.position_error / width))
+
+
+@TERMS.add
+def rotation(x: RewardInput, *, width: PositiveFloat) -> Tensor:
+    """1 - tanh(rotation error / width [rad]) while the gate is open."""
+    return x.gate * (1.0 - torch.tanh(x.rotation_error / width))
+
+
+@TERMS.add
+def points(x: RewardInput, *, zero: PositiveFloat) -> Tensor:
+    """1 - d / zero while the gate is open, with d the mean distance of 64 surface points to the goal [m].
+
+    The published paper's 3 (1.4 - 3 d) is weight 4.2 with ``zero`` 1.4 / 3.
+
+    Args:
+        x: the step.
+        zero: distance beyond which this is negative [m].
+    """
+    return x.gate * (1.0 - x.points_error / zero)
+
+
+@TERMS.add
+def success(x: RewardInput, *, rotation: PositiveFloat) -> Tensor:
+    """1 while the gate is open and the object's pose is near the goal (section V: 2 cm and 15 degrees).
+
+    Args:
+        x: the step; ``task.reward.success_position`` is the largest position error.
+        rotation: largest rotation error [rad].
+    """
+    is_near = x.position_error < x.success_position
+    return x.gate & is_near & (x.rotation_error < rotation)
+
+
+@TERMS.add
+def near_success(x: RewardInput, *, most: FiniteFloat) -> Tensor:
+    """most / (1 + 10 d) while the gate is open and d, as in ``points``, is at most ``task.reward.success_position``
+    (the published paper, with ``most`` 15)."""
+    is_near = x.gate & (x.points_error <= x.success_position)
+    return most * is_near / (1.0 + 10.0 * x.points_error)
+
+
+@TERMS.add
+def proximity(x: RewardInput, *, cap: PositiveFloat) -> Tensor:
+    """Sum of the fingertips' distances to the object [m], at most ``cap`` (the published paper: 3, weight -2.5)."""
+    return x.tip_distance.sum(dim=-1).clamp_max(cap)
+
+
+@TERMS.add
+def palm_proximity(x: RewardInput, *, cap: PositiveFloat) -> Tensor:
+    """The palm's distance to the object [m], at most ``cap`` (the published paper: 0.5, weight -2.5)."""
+    return x.palm_distance.clamp_max(cap)
+
+
+@TERMS.add
+def action(x: RewardInput, *, limited: bool) -> Tensor:
+    """Sum of squares of the action; see :meth:`RewardInput.actions`."""
+    now, _ = x.actions(limited=limited)
+    return now.square().sum(dim=-1)
+
+
+@TERMS.add
+def action_rate(x: RewardInput, *, limited: bool) -> Tensor:
+    """Sum of squares of the action's change since the last step."""
+    now, before = x.actions(limited=limited)
+    return (now - before).square().sum(dim=-1)
+
+
+@TERMS.add
+def action_rate_of_parts(
+    x: RewardInput, *, arm: FiniteFloat, hand: FiniteFloat, limited: bool
+) -> Tensor:
+    """As ``action_rate``, with a factor for the arm and one for the hand (the published paper: 0.05 and 0.005)."""
+    now, before = x.actions(limited=limited)
+    return (torch.where(x.is_arm, arm, hand) * (now - before).square()).sum(dim=-1)
+
+
+@TERMS.add
+def out_of_bounds(x: RewardInput) -> Tensor:
+    """1 when the object leaves the scene (``task.termination``)."""
+    return x.out_of_bounds
+
+
+# The sum --------------------------------------------------------------------------------------------------------------
+
 
 @frozen
 class Reward:
@@ -86,38 +271,57 @@ class Reward:
     terms: dict[str, Tensor]
     """Name -> [N] weighted term, before ``scale``."""
     grasped: Tensor
-    """[N] bool: the thumb and at least one other finger press on the object."""
+    """[N] bool: the thumb and at least one other finger press on the object with :data:`CONTACT_FORCE`."""
     gate: Tensor
     """[N] bool: position, rotation, points and success are paid."""
     success: Tensor
-    """[N] bool: the gate is open, and the object is at its goal (``success_shape``)."""
+    """[N] bool: the term ``success`` is not 0; no world without such a term."""
 
 
-OwnTerm = Callable[[RewardInput], Tensor]
-"""A reward term of the user: returns [N] before its weight. On a GPU it is replayed as part of a graph, so it must not
-ask for the value of a tensor (``if``, ``item``, ``nonzero``)."""
+class RewardFunction:
+    """The reward of a configuration: a function of a step."""
+
+    def __init__(self, config: RewardConfig) -> None:
+        """Find the functions; errors as for :meth:`xreset.task.terms.Functions.bound`."""
+        (self._gate,) = GATES.bound("task.reward.gate", config.gate).values()
+        self._scale = config.scale
+        self._weights: dict[str, float] = {}
+        used = {}
+        for name, term in config.terms.items():
+            parameters = dict(term)
+            weight = parameters.pop("weight")
+            if weight or name == "success":
+                self._weights[name] = float(weight)
+                used[name] = parameters
+        self._terms = TERMS.bound("task.reward.terms", used)
+
+    def __call__(self, x: RewardInput) -> Reward:
+        """Return the reward of one control step."""
+        grasped = contact_gate(x.tip_force, CONTACT_FORCE)
+        gate = self._gate(x)
+        x = replace(x, gate=gate)
+        success = torch.zeros_like(gate)
+        terms = {}
+        for name, function in self._terms.items():
+            value = _checked(name, function(x), x.best_reach)
+            if name == "success":
+                success = value.abs() > 0  # False where the value is NaN
+            terms[name] = self._weights[name] * value
+        values = list(terms.values()) or [torch.zeros_like(x.best_reach)]
+        total = self._scale * torch.stack(values).sum(dim=0)
+        return Reward(total=total, terms=terms, grasped=grasped, gate=gate, success=success)
 
 
-def own_term(name: str) -> OwnTerm:
-    """Return the function that ``task.reward.own`` names as ``module:function``, as it is now: a notebook may have
-    defined it again.
-
-    Raises:
-        RunError: the module cannot be imported, or has no such function.
-    """
-    module, _, function = name.partition(":")
-    try:
-        found: Any = getattr(import_module(module), function)
-    except Exception as error:  # a user's module may fail in any way
-        reason = f"{type(error).__name__}: {error}"
+def _checked(name: str, value: Tensor, like: Tensor) -> Tensor:
+    if not isinstance(value, Tensor) or value.shape != like.shape:
+        found = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
         raise RunError(
-            f"the reward term {name!r} cannot be loaded ({reason}). Is its folder in PYTHONPATH?"
-        ) from error
-    if not callable(found):
-        raise RunError(
-            f"the reward term {name!r} is {found!r}, expected a function of a RewardInput."
+            f"The reward term {name!r} gave {found}. Return a tensor of shape {tuple(like.shape)}: one value a world."
         )
-    return cast(OwnTerm, found)
+    return value.to(like.dtype)
+
+
+# Geometry -------------------------------------------------------------------------------------------------------------
 
 
 def contact_gate(tip_force: Tensor, threshold: float, *, opposing: bool = False) -> Tensor:
@@ -146,62 +350,3 @@ def point_distances(
     here = pos[:, None] + quat_rotate(quat[:, None], points)
     goal = goal_pos[:, None] + quat_rotate(goal_quat[:, None], points)
     return (here - goal).norm(dim=-1)
-
-
-def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
-    """Return the reward of one control step."""
-    grasped = contact_gate(x.tip_force, c.contact_threshold)
-    gate = grasped
-    if c.contact == "opposing":
-        gate = contact_gate(x.tip_force, c.contact_threshold, opposing=True)
-    if c.contact == "near":
-        gate = (x.tip_distance.sum(dim=-1) <= c.near_tips) & (x.palm_distance <= c.near_palm)
-    position_error = (x.object_pos - x.goal_pos).norm(dim=-1)
-    rotation_error = quat_angle(x.object_quat, x.goal_quat)
-    points_error = position_error  # replaced below if a term needs the mean over the points
-    if c.points or c.success_shape == "points":
-        distances = point_distances(x.object_pos, x.object_quat, x.goal_pos, x.goal_quat, x.points)
-        points_error = distances.mean(dim=-1)
-    if c.success_shape == "points":
-        success = gate & (points_error <= x.success_position)
-        success_reward = c.success * success / (1.0 + 10.0 * points_error)
-    else:
-        is_near = position_error < x.success_position
-        success = gate & is_near & (rotation_error < c.success_rotation)
-        success_reward = c.success * success
-    change = (x.action - x.previous_action).square()
-    if c.action_rate_arm is None:
-        action_rate = c.action_rate * change.sum(dim=-1)
-    else:
-        action_rate = (torch.where(x.is_arm, c.action_rate_arm, c.action_rate) * change).sum(dim=-1)
-    reach = x.best_reach if c.reach_distance == "best" else x.tip_distance.mean(dim=-1)
-    terms = {
-        "reach": c.reach * (1.0 - torch.tanh(reach / c.reach_width)),
-        "reach_near": c.reach_near * (1.0 - torch.tanh(reach / c.reach_near_width)),
-        "grasp": c.grasp * grasped,
-        "position": c.position * gate * (1.0 - torch.tanh(position_error / c.position_width)),
-        "rotation": c.rotation * gate * (1.0 - torch.tanh(rotation_error / c.rotation_width)),
-        "success": success_reward,
-        "action": c.action * x.action.square().sum(dim=-1),
-        "action_rate": action_rate,
-        "out_of_bounds": c.out_of_bounds * x.out_of_bounds,
-    }
-    if c.proximity:
-        terms["proximity"] = c.proximity * x.tip_distance.sum(dim=-1).clamp_max(c.proximity_cap)
-    if c.palm_proximity:
-        terms["palm_proximity"] = c.palm_proximity * x.palm_distance.clamp_max(c.palm_proximity_cap)
-    if c.points:
-        terms["points"] = c.points * gate * (1.0 - points_error / c.points_zero)
-    for name, weight in c.own.items():
-        terms[name] = weight * _checked(name, own_term(name)(x), position_error)
-    total = c.scale * torch.stack(list(terms.values())).sum(dim=0)
-    return Reward(total=total, terms=terms, grasped=grasped, gate=gate, success=success)
-
-
-def _checked(name: str, value: Tensor, like: Tensor) -> Tensor:
-    if not isinstance(value, Tensor) or value.shape != like.shape:
-        found = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
-        raise RunError(
-            f"The reward term {name!r} gave {found}. Return a tensor of shape {tuple(like.shape)}: one value a world."
-        )
-    return value.to(like.dtype)

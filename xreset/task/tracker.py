@@ -10,35 +10,36 @@ from torch import Tensor
 from xreset.geometry.rotations import quat_from_axis_angle, quat_multiply
 from xreset.task.config import RandomizationConfig, TrackerConfig
 from xreset.task.latency import DelayLine
-from xreset.task.randomization import Drawn, sample_range, symmetric, uniform
+from xreset.task.randomization import sample_range, symmetric, uniform
+from xreset.task.worlds import Worlds
 
 
 class Tracker:
     """Fixed buffers of N worlds. A fault that is off costs nothing and draws no random number."""
 
-    def __init__(self, drawn: Drawn, config: RandomizationConfig) -> None:
+    def __init__(self, worlds: Worlds, config: RandomizationConfig) -> None:
         """Allocate, and register what is drawn at each reset."""
         c = config.tracker if config.enabled else TrackerConfig()
         self._config = c
-        self._fault_scale = drawn.fault_scale
-        delay = partial(sample_range, drawn.num_worlds, config.observation_latency)
+        self._fault_scale = worlds.fault_scale
+        delay = partial(sample_range, worlds.num_worlds, config.observation_latency)
         longest = config.longest("observation_latency")
-        self._delays = DelayLine(drawn, "poses", 7, longest, delay)
+        self._delays = DelayLine(worlds, "poses", 7, longest, delay)
         if c.has_errors:
-            shape = (drawn.num_worlds, 6)
-            device = drawn.device
+            shape = (worlds.num_worlds, 6)
+            device = worlds.device
             bias = torch.tensor([c.position_bias] * 3 + [c.rotation_bias] * 3, device=device)
             noise = [c.position_noise] * 3 + [c.rotation_noise] * 3
             self._noise = torch.tensor(noise, device=device)
-            self._bias = drawn.keep(
+            self._bias = worlds.keep(
                 "tracker.bias",
-                drawn.zeros(6),
+                worlds.zeros(6),
                 lambda generator: bias * symmetric(shape, generator),
                 is_fault=True,
             )
         if c.skips_steps:
-            self._wait = drawn.keep("tracker.wait", drawn.zeros())
-            self._last = drawn.keep("tracker.last", drawn.zeros(7))
+            self._wait = worlds.keep("tracker.wait", worlds.zeros())
+            self._last = worlds.keep("tracker.last", worlds.zeros(7))
 
     def observe(
         self, pos: Tensor, quat: Tensor, fresh: Tensor, generator: torch.Generator

@@ -16,8 +16,6 @@ from xreset.task.config import RandomizationConfig
 from xreset.task.latency import DelayLine
 from xreset.task.pushes import Pushes
 from xreset.task.randomization import (
-    Drawn,
-    Sample,
     own_friction,
     sample_drives,
     sample_friction,
@@ -26,6 +24,7 @@ from xreset.task.randomization import (
     uniform,
 )
 from xreset.task.tracker import Tracker
+from xreset.task.worlds import Sample, Worlds
 
 
 class Variation:
@@ -42,7 +41,7 @@ class Variation:
 
     def __init__(
         self,
-        drawn: Drawn,
+        worlds: Worlds,
         backend: Backend,
         config: RandomizationConfig,
         is_arm: Tensor,
@@ -51,7 +50,7 @@ class Variation:
         """Allocate.
 
         Args:
-            drawn: what is drawn at each reset; this object adds its buffers.
+            worlds: state of the worlds; this object adds its buffers.
             backend: the worlds.
             config: what is drawn.
             is_arm: [J] bool.
@@ -61,28 +60,28 @@ class Variation:
             CapabilityError: the engine cannot set a parameter that is drawn.
         """
         c = config
-        n = drawn.num_worlds
+        n = worlds.num_worlds
         self._is_arm = is_arm
         self._config = config
-        self.parameters = self._keep_parameters(drawn, backend)
+        self.parameters = self._keep_parameters(worlds, backend)
         self._check_capabilities(backend)
         self.force_gain: Tensor | float = 1.0
         if c.draws("force_gain"):
             gain = partial(sample_range, n, c.force_gain)
-            self.force_gain = drawn.keep("force_gain", drawn.zeros(1, 1), gain)
+            self.force_gain = worlds.keep("force_gain", worlds.zeros(1, 1), gain)
         longest = max(c.longest("action_latency"), c.longest("hand_latency"))
         self._commands = DelayLine(
-            drawn, "commands", len(is_arm), longest, self._sample_action_latency, by_column=True
+            worlds, "commands", len(is_arm), longest, self._sample_action_latency, by_column=True
         )
-        self.tracker = Tracker(drawn, c)
+        self.tracker = Tracker(worlds, c)
         age = partial(sample_range, n, c.proprio_latency)
         longest = c.longest("proprio_latency")
-        self._proprio = DelayLine(drawn, "proprio", proprio_width, longest, age)
+        self._proprio = DelayLine(worlds, "proprio", proprio_width, longest, age)
         self._lost_actions: Tensor | None = None
         if c.draws("lost_actions"):
             share = partial(sample_range, n, c.lost_actions)
-            self._lost_actions = drawn.keep("lost_actions", drawn.zeros(1), share, is_fault=True)
-        self.pushes = Pushes(drawn, backend, c.push, is_arm) if c.draws("push") else None
+            self._lost_actions = worlds.keep("lost_actions", worlds.zeros(1), share, is_fault=True)
+        self.pushes = Pushes(worlds, backend, c.push, is_arm) if c.draws("push") else None
 
     def _check_capabilities(self, backend: Backend) -> None:
         """Raise ``CapabilityError`` if the engine cannot set a parameter that is drawn."""
@@ -96,10 +95,10 @@ class Variation:
                 "Use another engine, or in a training leave these ranges of task.randomization at their defaults."
             )
 
-    def _keep_parameters(self, drawn: Drawn, backend: Backend) -> dict[str, Tensor]:
+    def _keep_parameters(self, worlds: Worlds, backend: Backend) -> dict[str, Tensor]:
         """Return the physical parameters that are drawn, by name."""
         c = self._config
-        n = drawn.num_worlds
+        n = worlds.num_worlds
         objects = backend.scene.objects
         nominal = Parameters.nominal(backend.scene, backend.object_index).to(backend.device).given()
         offset_of_object = own_friction([o.friction for o in objects], c).to(backend.device)
@@ -125,7 +124,7 @@ class Variation:
         if c.draws("object_com"):
             samples["object_com"] = partial(sample_offset, n, c.object_com)
         return {
-            name: drawn.keep(name, torch.zeros_like(nominal[name]), sample)
+            name: worlds.keep(name, torch.zeros_like(nominal[name]), sample)
             for name, sample in samples.items()
         }
 

@@ -12,7 +12,8 @@ from xreset.errors import XResetError
 from xreset.physics import Backend, State
 from xreset.task.config import TaskConfig
 from xreset.task.latency import DelayLine
-from xreset.task.randomization import Drawn, sample_offset, sample_range
+from xreset.task.randomization import sample_offset, sample_range
+from xreset.task.worlds import Worlds
 
 
 class Vision:
@@ -22,7 +23,7 @@ class Vision:
         cameras: the cameras.
     """
 
-    def __init__(self, drawn: Drawn, backend: Backend, task: TaskConfig) -> None:
+    def __init__(self, worlds: Worlds, backend: Backend, task: TaskConfig) -> None:
         """Allocate, register what is drawn at each reset, and start the renderer.
 
         Raises:
@@ -31,7 +32,7 @@ class Vision:
         self._backend = backend
         c = task.randomization
         vision = task.vision
-        n = drawn.num_worlds
+        n = worlds.num_worlds
         cameras = Cameras(
             backend.scene, backend.object_index, vision, scale=task.observation.cloud_scale
         )
@@ -43,19 +44,19 @@ class Vision:
             ("camera_fov", cameras.fov_scale, partial(sample_range, count, c.camera_fov)),
             ("camera_noise", cameras.noise_scale, partial(sample_range, n, c.camera_noise)),
         ):
-            drawn.keep(name, buffer, sample if c.draws(name) else None)
-        drawn.keep("images", cameras.image)
-        drawn.keep("views", cameras.view)
+            worlds.keep(name, buffer, sample if c.draws(name) else None)
+        worlds.keep("images", cameras.image)
+        worlds.keep("views", cameras.view)
 
         def age(generator: torch.Generator) -> Tensor:
-            steps = torch.full((n,), vision.latency, device=drawn.device)
+            steps = torch.full((n,), vision.latency, device=worlds.device)
             if c.draws("camera_latency"):
                 steps = steps + sample_range(n, c.camera_latency, generator)
             return steps.round()
 
         width = cameras.view[0].numel()
         longest = round(vision.latency + c.longest("camera_latency"))
-        self._delay = DelayLine(drawn, "delayed_views", width, longest, age, is_fault=False)
+        self._delay = DelayLine(worlds, "delayed_views", width, longest, age, is_fault=False)
 
     def aim(self, state: State, goal_pos: Tensor, goal_quat: Tensor, episode_step: Tensor) -> None:
         """Move the renderer's bodies and cameras to the present state.

@@ -1,0 +1,114 @@
+"""Tables of named terms: functions that a configuration chooses, with their parameters.
+
+A table maps names to parameters, such as ``{"reach": {"weight": 1.0, "width": 0.1}}``. A name is that of a function.
+One function can be there twice: ``{"far": {"function": "reach", "width": 0.4}, ...}``. In a table that may have
+functions of the user, they are called ``module:function``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from importlib import import_module
+from math import isfinite
+from typing import Annotated, Any
+
+from xreset.checks import Rule, parsed_arguments
+from xreset.errors import RunError, WrongValueError
+
+
+class Terms(dict[str, dict[str, Any]]):
+    """Named terms, in order: name -> parameters, which are numbers, words, and true or false."""
+
+    def __or__(self, others: Mapping[str, dict[str, Any]]) -> Terms:  # pyright: ignore
+        """Return these terms and others, which replace those of the same names."""
+        return Terms({**self, **others})
+
+
+def _are_terms(terms: Any) -> bool:
+    return isinstance(terms, dict) and all(
+        isinstance(name, str) and isinstance(term, dict) and all(map(_is_value, term.values()))
+        for name, term in terms.items()
+    )
+
+
+def _is_value(value: Any) -> bool:
+    return isinstance(value, str) or isfinite(value)
+
+
+def _are_weighted(terms: Any) -> bool:
+    return _are_terms(terms) and all(
+        isinstance(term.get("weight"), int | float) for term in terms.values()
+    )
+
+
+_FORM = "name -> parameter -> finite number or word"
+Named = Annotated[Terms, Rule(f"terms: {_FORM}", _are_terms)]
+OneTerm = Annotated[Terms, Rule(f"one term: {_FORM}", lambda x: _are_terms(x) and len(x) == 1)]
+Weighted = Annotated[Terms, Rule(f"terms: {_FORM}, with a weight in each", _are_weighted)]
+
+
+class Functions(dict[str, Callable[..., Any]]):
+    """The functions that a table may name. The first argument of a function is its input, the others are parameters."""
+
+    def __init__(self, kind: str, *, own: bool = False) -> None:
+        """Start without functions.
+
+        Args:
+            kind: what messages call one of them.
+            own: whether a table may also name functions of the user.
+        """
+        self._kind = kind
+        self._own = own
+
+    def add(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Decorate a function: add it under its own name."""
+        self[function.__name__] = function
+        return function
+
+    def bound(self, where: str, terms: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+        """Return the functions of a table, with their parameters, by name of the term.
+
+        Functions of the user are as they are now: a notebook may have defined one again.
+
+        Args:
+            where: the table's place in the configuration, for messages.
+            terms: the table.
+
+        Raises:
+            WrongValueError: a function is unknown, or a parameter is unknown, missing or wrong.
+            RunError: a module of the user cannot be imported, or has no such function.
+        """
+        found = {}
+        for name, term in terms.items():
+            given = dict(term)
+            function = self._find(name, given.pop("function", name))
+            arguments, problems = parsed_arguments(function, given, f"{where}.{name}")
+            if problems:
+                raise WrongValueError("\n".join(problems))
+            found[name] = partial(function, **arguments)
+        return found
+
+    def _find(self, term: str, function: str) -> Callable[..., Any]:
+        if self._own and ":" in term:
+            return _imported(self._kind, term)
+        if function not in self:
+            raise WrongValueError(
+                f"Unknown {self._kind} {function!r}. Choose from: {', '.join(self)}."
+            )
+        return self[function]
+
+
+def _imported(kind: str, name: str) -> Callable[..., Any]:
+    """Return the function ``module:function`` of the user."""
+    module, _, function = name.partition(":")
+    try:
+        found = getattr(import_module(module), function)
+    except Exception as error:  # a user's module may fail in any way
+        reason = f"{type(error).__name__}: {error}"
+        raise RunError(
+            f"the {kind} {name!r} cannot be loaded ({reason}). Is its folder in PYTHONPATH?"
+        ) from error
+    if not callable(found):
+        raise RunError(f"the {kind} {name!r} is {found!r}, expected a function.")
+    return found

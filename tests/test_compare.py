@@ -168,7 +168,8 @@ class ReadTest(Compared):
         self.write_results("a")
         file.write_text(file.read_text().replace('"iterations"', '"cycles"'))
         facts = self.training("a").facts
-        self.assertEqual((facts["cycles"], facts.get("iterations")), ("10000", None))
+        expected = (str(TrainConfig().iterations), None)
+        self.assertEqual((facts["cycles"], facts.get("iterations")), expected)
         self.assertEqual(facts["task.randomization.friction"], "[0.5, 1.0]")
 
 
@@ -430,7 +431,8 @@ class FairnessTest(Compared):
         self.assertRegex(self.compare("a"), words)
 
     def test_policies_that_play_another_task(self):
-        short = TrainConfig(task=TaskConfig(termination=TerminationConfig(episode_seconds=2.5)))
+        task = replace(TrainConfig().task, termination=TerminationConfig(episode_seconds=2.5))
+        short = TrainConfig(task=task)
         self.run_and_results("short", config=short)
         self.run_and_results("usual")
         expected = r"not the same task.termination.episode_seconds \(2.5: short; 5: usual\)"
@@ -438,7 +440,8 @@ class FairnessTest(Compared):
 
     def test_episodes_of_another_length(self):
         """The length of an evaluation counts, and not that of the training, if the result states it."""
-        short = TrainConfig(task=TaskConfig(termination=TerminationConfig(episode_seconds=2.5)))
+        task = replace(TrainConfig().task, termination=TerminationConfig(episode_seconds=2.5))
+        short = TrainConfig(task=task)
         self.run_and_results("earlier")  # of a version that did not state the length
         for name, config, seconds, words in (
             ("usual", None, 5.0, ""),

@@ -27,10 +27,10 @@ def goals(
 ) -> None:
     """Give objects starts and goals without demonstrations, for `xreset eval --demos` and `xreset train --goals`.
 
-    Meshes start at rest on the table. The robot can reach every goal with the grasp that it has at the start.
+    Objects start at rest on the table. The robot can reach every goal with the grasp that it has at the start.
 
     Args:
-        names: Meshes; default: all.
+        names: Objects; default: all.
         robot: Name or folder of the robot.
         out: Goal set to write.
         family: Kind of goal: lift, yaw, tilt-x, tilt-y (lifted, and turned by 60 degrees about an axis of the world) or

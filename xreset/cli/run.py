@@ -18,8 +18,8 @@ from xreset.records import read_npz
 _RETARGET = 0.025
 _RESETS = 0.055
 _EPISODE = 1.0
-"""Measured seconds of one core: to retarget a frame, to make the bank's states of a frame (UR7e + Sharpa, nine YCB
-objects), and to play an episode of 5 s in one engine."""
+"""About how many seconds of one core it takes to retarget a frame, to make the bank's states of a frame, and to play an
+episode of 5 s in one engine (UR7e + Sharpa, nine YCB objects)."""
 
 
 def run(
@@ -36,7 +36,7 @@ def run(
     iterations: int | None = None,
     seed: int = 0,
     episodes: int = 5,
-) -> Path:
+) -> None:
     """Take demonstrations to a trained policy: retarget, make the bank, train, evaluate in several engines, report.
 
     Each step is a command of its own, which is printed; --help of the command lists what it can do besides. The files
@@ -63,7 +63,6 @@ def run(
 
     archive = read_demos(demos)
     spec = load_robot(robot)
-    out = Path(out)
     engines = [each.name for each in quick_engines(engine, "cpu")]
     _show_times(len(archive.sequence_name), archive.num_frames, minutes, episodes, engines)
     motion = out / "motion.npz"
@@ -90,7 +89,6 @@ def run(
     if missing:
         _step("eval", out, demos=demos, episodes=episodes, seed=seed, meshes=meshes, engine=missing)
     _step("report", out, meshes=meshes)
-    return out
 
 
 def _show_times(

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from xreset.backends.rigid import OTHER_LINK, Inertia, Mechanism, vertices
-from xreset.checks import frozen
+from xreset.files.checks import frozen
 from xreset.geometry.shapes import roll_pitch_yaw, transform
 from xreset.geometry.urdf import Joint
 from xreset.spec import Shape

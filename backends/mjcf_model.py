@@ -14,7 +14,7 @@ from xreset.backends.rigid import (
     TrackedFrames,
     matrix_to_quat,
 )
-from xreset.checks import frozen
+from xreset.files.checks import frozen
 from xreset.spec import SceneSpec
 
 OBJECT = -3

@@ -25,7 +25,7 @@ from xreset.physics import (
     no_readings,
     unavailable,
 )
-from xreset.plugins import existing_device
+from xreset.physics.plugins import existing_device
 from xreset.spec import SceneSpec
 
 try:
@@ -45,7 +45,7 @@ from xreset.backends.mujoco_warp_setup import (
     engine_step,
     fill_batched,
 )
-from xreset.torch_warp import TorchStream, quiet
+from xreset.physics.torch_warp import TorchStream, quiet
 
 _DRIVE_FIELDS = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange")
 _SET_PER_WORLD = (

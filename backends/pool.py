@@ -29,9 +29,9 @@ from xreset.backends.workers import (
 )
 from xreset.errors import CapabilityError, WrongValueError, XResetError
 from xreset.physics import Backend, Contacts, Health, Links, MassProperties, Parameter, State
-from xreset.plugins import refuse_unknown_options
+from xreset.physics.plugins import refuse_unknown_options
+from xreset.physics.tensors import Tensors
 from xreset.spec import SceneSpec
-from xreset.tensors import Tensors
 
 _Bundle = TypeVar("_Bundle", bound=Tensors)
 

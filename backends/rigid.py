@@ -15,8 +15,8 @@ from itertools import combinations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xreset.checks import frozen
 from xreset.errors import ObjectError, RobotError, WrongValueError, XResetError
+from xreset.files.checks import frozen
 from xreset.geometry.dynamics import drive_shares, drive_values
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import pose_matrix, shape_mesh, transformed

@@ -34,9 +34,9 @@ from xreset.backends.rigid import (
     sum_contacts,
 )
 from xreset.errors import WrongValueError, XResetError
+from xreset.files.text import shown
 from xreset.physics import Contacts, Links, Parameter, Parameters, State, no_readings
 from xreset.spec import GRAVITY, SceneSpec
-from xreset.text import shown
 
 if TYPE_CHECKING:
     from xreset.backends.pool import World

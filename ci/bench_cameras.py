@@ -21,7 +21,7 @@ from rich.table import Table
 from xreset import robots
 from xreset.cameras.config import FRONT, VisionConfig
 from xreset.cameras.sensor import Cameras
-from xreset.env import make_env, make_scene
+from xreset.env.manipulation import make_env, make_scene
 from xreset.objects.catalogue import load_objects
 from xreset.physics import State
 from xreset.task.config import TaskConfig

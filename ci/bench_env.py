@@ -15,9 +15,9 @@ from rich.console import Console
 from rich.table import Table
 
 from xreset import robots
-from xreset.env import ManipulationEnv, make_scene
+from xreset.env.manipulation import ManipulationEnv, make_scene
 from xreset.objects.catalogue import load_objects
-from xreset.plugins import make_backend
+from xreset.physics.plugins import make_backend
 from xreset.resets.bank import ResetBank
 from xreset.resets.distribution import ResetDistribution
 from xreset.spec import RobotSpec
@@ -57,7 +57,7 @@ def motion(robot: RobotSpec, folder: Path) -> ResetBank:
     """Starts and goals of one synthetic demonstration."""
     from xreset.demos.archive import write_demos
     from xreset.demos.synth import synthesize
-    from xreset.inputs import load_inputs
+    from xreset.resets.inputs import load_inputs
 
     file = folder / "demos.npz"
     write_demos(file, synthesize([OBJECT], 1, seed=0))

@@ -18,7 +18,7 @@ from benchlib import Options
 from rich.console import Console
 
 from xreset.learning.config import ModelConfig
-from xreset.plugins import make_backend
+from xreset.physics.plugins import make_backend
 
 BAND = Path(__file__).with_name("learning.json")
 _GPU_WORLDS = 2048

@@ -35,10 +35,10 @@ from rich.table import Table
 from xreset import robots
 from xreset.backends.pool import PoolBackend, World
 from xreset.backends.workers import usable_cores
-from xreset.env import make_scene
+from xreset.env.manipulation import make_scene
 from xreset.objects.catalogue import load_objects
 from xreset.physics import Backend, State
-from xreset.plugins import backend_class, make_backend
+from xreset.physics.plugins import backend_class, make_backend
 from xreset.spec import GRAVITY, SceneSpec
 from xreset.task.config import TaskConfig
 

@@ -26,12 +26,12 @@ from benchlib import OBJECT, Options, rate, run_time, seconds_of
 from rich.console import Console
 from rich.table import Table
 
-from xreset.env import ManipulationEnv, make_env
-from xreset.inputs import load_inputs
+from xreset.env.manipulation import ManipulationEnv, make_env
 from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import starting_config
 from xreset.learning.runner import TrainingRunner
-from xreset.plugins import backend_status
+from xreset.physics.plugins import backend_status
+from xreset.resets.inputs import load_inputs
 
 
 def add_arguments(group: argparse._ArgumentGroup) -> None:

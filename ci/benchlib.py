@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from xreset.physics import State
-from xreset.plugins import backend_names, backend_status
+from xreset.physics.plugins import backend_names, backend_status
 from xreset.spec import ObjectSpec, RobotSpec
 
 OBJECT = "005_tomato_soup_can"

@@ -17,9 +17,9 @@ from bench_env import motion
 from benchlib import OBJECT
 
 from xreset import robots
-from xreset.env import ManipulationEnv, make_scene
+from xreset.env.manipulation import ManipulationEnv, make_scene
 from xreset.objects.catalogue import load_objects
-from xreset.plugins import backend_names, backend_status, make_backend
+from xreset.physics.plugins import backend_names, backend_status, make_backend
 from xreset.resets.distribution import ResetDistribution
 from xreset.task.config import TaskConfig
 

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from xreset.checks import PositiveInt, Seed
 from xreset.errors import XResetError
 from xreset.eval.policy_spec import PolicySpec, load_policy
 from xreset.eval.results import (
@@ -18,9 +17,10 @@ from xreset.eval.results import (
     write_results,
 )
 from xreset.eval.rollout import Engine, chosen_engines, load_trial, roll_out
-from xreset.files import claim_folder
-from xreset.inputs import Data
-from xreset.progress import unseen
+from xreset.files.checks import PositiveInt, Seed
+from xreset.files.progress import unseen
+from xreset.files.storage import claim_folder
+from xreset.resets.inputs import Data
 
 
 def evaluate(

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from xreset.env import ManipulationEnv
+from xreset.env.manipulation import ManipulationEnv
 from xreset.errors import XResetError
 from xreset.eval.policy_spec import PolicySpec, load_policy
 from xreset.eval.report.clips import encode_mp4
-from xreset.files import check_suffix, write_whole
+from xreset.files.storage import check_suffix, write_whole
 
 
 def film(

@@ -18,13 +18,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.checks import frozen
+from xreset.files.checks import frozen
 from xreset.geometry.rotations import quat_angle
 from xreset.objects.sampling import Frame, keypoints, metric_points
+from xreset.physics.tensors import Tensors
 from xreset.spec import ObjectSpec
 from xreset.task.reading import Reading
 from xreset.task.rewards import CONTACT_FORCE, contact_gate, point_distances
-from xreset.tensors import Tensors
 
 STAGE_SCORES = (0.0, 0.33, 0.66, 1.0)
 """Task progress if the highest stage is: none, approach, grasp, reorientation."""

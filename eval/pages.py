@@ -8,8 +8,8 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from xreset.eval.table import cell, escape, markdown
-from xreset.files import code_version
-from xreset.text import short_name
+from xreset.files.storage import code_version
+from xreset.files.text import short_name
 
 
 def percent(share: float, digits: int = 0) -> str:

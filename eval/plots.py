@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from xreset.errors import needs
-from xreset.files import write_whole
+from xreset.files.storage import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

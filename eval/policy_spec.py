@@ -10,20 +10,20 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from xreset.checks import Checked, Seed, frozen, names_wrong_arguments
-from xreset.description import load_robot
-from xreset.env import ManipulationEnv, make_env
+from xreset.env.manipulation import ManipulationEnv, make_env
 from xreset.errors import PolicyError
+from xreset.files.checks import Checked, Seed, frozen, names_wrong_arguments
+from xreset.files.text import Brief, shown
+from xreset.geometry.description import load_robot
 from xreset.learning.exported import read_policy
 from xreset.learning.run import read_choice, read_run
 from xreset.objects.catalogue import object_names
-from xreset.policies import results_folder
-from xreset.policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_contract
+from xreset.policy.onnx_policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_contract
+from xreset.policy.shipped import results_folder
 from xreset.resets.bank import ResetBank
 from xreset.retarget.file import Retargeted
 from xreset.spec import ObjectSpec, RobotSpec
 from xreset.task.config import TaskConfig, evaluation_task
-from xreset.text import Brief, shown
 
 if TYPE_CHECKING:
     from tensordict import TensorDict

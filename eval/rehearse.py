@@ -14,7 +14,6 @@ from dataclasses import field, replace
 from pathlib import Path
 from typing import Any
 
-from xreset.checks import PositiveInt, Seed, frozen
 from xreset.demos.synth import synthesize
 from xreset.eval.pages import render
 from xreset.eval.plots import COLORS, svg
@@ -33,11 +32,12 @@ from xreset.eval.stress import (
     sweep,
     write_card,
 )
-from xreset.files import claim_folder, write_whole
-from xreset.inputs import Data
+from xreset.files.checks import PositiveInt, Seed, frozen
+from xreset.files.progress import unseen
+from xreset.files.storage import claim_folder, write_whole
 from xreset.live.engine import make_controller
 from xreset.live.faults import Faults, FaultyDriver
-from xreset.progress import unseen
+from xreset.resets.inputs import Data
 from xreset.runtime import OnnxActor, Runner
 
 SCHEMA = "xreset-rehearsal/1"

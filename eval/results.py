@@ -16,7 +16,10 @@ import numpy as np
 import pandas as pd
 
 from xreset.cameras.config import VisionConfig
-from xreset.checks import (
+from xreset.errors import FileFormatError, RunError
+from xreset.eval.stats import Interval, bootstrap_ci95, difference_ci95
+from xreset.eval.table import METRICS, table_text
+from xreset.files.checks import (
     Checked,
     NonNegativeFloat,
     NonNegativeInt,
@@ -28,12 +31,9 @@ from xreset.checks import (
     from_dict,
     frozen,
 )
-from xreset.errors import FileFormatError, RunError
-from xreset.eval.stats import Interval, bootstrap_ci95, difference_ci95
-from xreset.eval.table import METRICS, table_text
-from xreset.files import read_json, read_typed, write_json
-from xreset.records import POSITION, UNIT_TOLERANCE, Field, read_npz, write_npz
-from xreset.text import Brief
+from xreset.files.records import POSITION, UNIT_TOLERANCE, Field, read_npz, write_npz
+from xreset.files.storage import read_json, read_typed, write_json
+from xreset.files.text import Brief
 
 SCHEMA = "xreset-eval/1"
 EPISODES_SCHEMA = "xreset-episodes/1"

@@ -17,23 +17,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.checks import frozen
-from xreset.env import ManipulationEnv, make_scene
+from xreset.env.manipulation import ManipulationEnv, make_scene
 from xreset.errors import XResetError
 from xreset.eval.metrics import EpisodeMetrics, MetricPoints
 from xreset.eval.policy_spec import PolicySpec
 from xreset.eval.results import Episode, Rollouts, Trace
-from xreset.inputs import Data, load_inputs
+from xreset.files.checks import frozen
+from xreset.files.progress import Progress, unseen
 from xreset.physics import Backend, State
-from xreset.plugins import backend_class, device_for, make_backend
-from xreset.policy import Policy
-from xreset.progress import Progress, unseen
+from xreset.physics.plugins import backend_class, device_for, make_backend
+from xreset.policy.onnx_policy import Policy
 from xreset.resets.bank import ResetBank
 from xreset.resets.distribution import Reset, ResetDistribution
 from xreset.resets.goals import GoalSet
+from xreset.resets.inputs import Data, load_inputs
+from xreset.resets.schedule import schedule
 from xreset.resets.settle import settle_starts
 from xreset.retarget.file import Retargeted
-from xreset.schedule import schedule
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 from xreset.task.config import TaskConfig, evaluation_task, with_episodes_of
 from xreset.task.randomization import sample_friction

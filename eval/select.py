@@ -15,7 +15,7 @@ import numpy as np
 from xreset.eval.policy_spec import load_policy
 from xreset.eval.rollout import Engine, load_trial, roll_out
 from xreset.eval.setting import Setting
-from xreset.files import file_hash, write_whole
+from xreset.files.storage import file_hash, write_whole
 from xreset.learning.export import export_checkpoint
 from xreset.learning.run import (
     Candidate,

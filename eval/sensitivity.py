@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from xreset.checks import frozen
 from xreset.errors import XResetError
 from xreset.eval.stats import Interval, bootstrap_ci95, mean_of_known
+from xreset.files.checks import frozen
 from xreset.task.config import RandomizationConfig, TaskConfig
 
 if TYPE_CHECKING:  # a command checks names of properties before it loads torch

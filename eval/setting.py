@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from xreset.checks import Options, frozen
+from xreset.files.checks import Options, frozen
 
 
 @frozen

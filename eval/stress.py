@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import numpy as np
 
-from xreset.checks import frozen
 from xreset.errors import XResetError
 from xreset.eval.plots import COLORS, picture
 from xreset.eval.policy_spec import PolicySpec
@@ -23,9 +22,10 @@ from xreset.eval.results import Episode, check_name
 from xreset.eval.rollout import Engine, Trial, roll_out
 from xreset.eval.sensitivity import SWEEPS, Effect, Property, amount, nominal_task
 from xreset.eval.stats import Interval
-from xreset.files import claim_folder, read_typed, write_json
-from xreset.plugins import backend_class
-from xreset.progress import NamedProgress, unseen
+from xreset.files.checks import frozen
+from xreset.files.progress import NamedProgress, unseen
+from xreset.files.storage import claim_folder, read_typed, write_json
+from xreset.physics.plugins import backend_class
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,8 +11,8 @@ import sys
 from pathlib import Path
 
 import xreset
+from xreset.physics.plugins import robot_folder
 from xreset.pictures.render import write_png
-from xreset.plugins import robot_folder
 from xreset.robot_tools.check import check
 from xreset.robot_tools.picture import robot_picture
 

@@ -12,9 +12,9 @@ import onnxruntime
 import torch
 
 import xreset
-from xreset.checks import from_dict
-from xreset.inputs import load_inputs
-from xreset.policies import shipped
+from xreset.files.checks import from_dict
+from xreset.policy.shipped import shipped
+from xreset.resets.inputs import load_inputs
 from xreset.task.config import TaskConfig, evaluation_task
 
 

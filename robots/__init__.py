@@ -1,7 +1,7 @@
 """Robots: one folder each, a URDF and a ``robot.toml``; further ones come as plugins."""
 
-from xreset.description import load_robot
-from xreset.plugins import robot_names
+from xreset.geometry.description import load_robot
+from xreset.physics.plugins import robot_names
 
 load = load_robot
 

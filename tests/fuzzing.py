@@ -48,7 +48,6 @@ from xreset.backends.conformance import SCHEMA as CONFORMANCE
 from xreset.demos.dexycb import _read_extrinsics, _read_meta, _read_npz
 from xreset.demos.ho3d import _read_frame
 from xreset.demos.keypoints import read_keypoints, read_transform
-from xreset.description import load_robot, read_description
 from xreset.eval.engines.actions import Actions, read_actions, write_actions
 from xreset.eval.engines.page import page
 from xreset.eval.engines.page import read as read_page
@@ -63,8 +62,10 @@ from xreset.eval.results import (
 from xreset.eval.sensitivity import SWEEPS
 from xreset.eval.stress import Stress, curve, read_stress, write_card
 from xreset.eval.study.file import SHIPPED, read_study
-from xreset.files import read_json, write_json
+from xreset.files.records import Field
+from xreset.files.storage import read_json, write_json
 from xreset.geometry import urdf
+from xreset.geometry.description import load_robot, read_description
 from xreset.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from xreset.learning.clock import Lift, read_lift, write_lift
 from xreset.learning.run import RunInfo, read_run, write_run
@@ -74,8 +75,7 @@ from xreset.objects.meshes import read_mesh
 from xreset.objects.properties import properties_of
 from xreset.physics import State
 from xreset.pictures.view.load import load_view
-from xreset.policy import OnnxPolicy, policy_contract
-from xreset.records import Field
+from xreset.policy.onnx_policy import OnnxPolicy, policy_contract
 from xreset.robot_tools.sources import read_source
 from xreset.runtime import Controller, load_controller
 from xreset.spec import SceneSpec

@@ -5,7 +5,7 @@ from itertools import product
 
 import numpy as np
 
-from xreset.accounts import accounts, described
+from xreset.retarget.accounts import accounts, described
 
 
 class AccountsTest(unittest.TestCase):

@@ -35,7 +35,7 @@ from xreset.backends.mujoco_warp_step import (
     smooth_dynamics,
 )
 from xreset.errors import BackendUnavailableError, ObjectError, RobotError, XResetError
-from xreset.plugins import device_for, make_backend
+from xreset.physics.plugins import device_for, make_backend
 from xreset.spec import FingertipSpec, SceneSpec
 
 

@@ -13,11 +13,11 @@ from torch.testing import assert_close
 from tests.toy_bank import SOUP, toy_bank
 from tests.toy_robot import toy_robot
 from xreset.cameras.config import CameraConfig, DepthNoise, VisionConfig
-from xreset.env import make_env, make_scene
+from xreset.env.manipulation import make_env, make_scene
 from xreset.errors import RobotError, XResetError
 from xreset.objects.catalogue import load_objects
 from xreset.physics import State
-from xreset.plugins import make_backend
+from xreset.physics.plugins import make_backend
 from xreset.task.config import ObservationConfig, RandomizationConfig, TaskConfig, evaluation_task
 
 try:
@@ -196,7 +196,7 @@ class TestVisionInTheEnvironment(TestCase):
 
     def make(self, vision, **changes):
         task = replace(evaluation_task(TASK), vision=vision, **changes)
-        with mock.patch("xreset.env.make_backend", partial(make_backend, workers=0)):
+        with mock.patch("xreset.env.manipulation.make_backend", partial(make_backend, workers=0)):
             return self.enterContext(
                 make_env(self.robot, self.objects, self.bank, task, num_envs=2)
             )

@@ -17,7 +17,7 @@ from tests.command import xreset as run
 from tests.data import InFolder
 from xreset.cli import COMMANDS, _terminal
 from xreset.cli._options import checked
-from xreset.files import claim_folder
+from xreset.files.storage import claim_folder
 
 HEAVY = {
     "torch",
@@ -82,7 +82,7 @@ class LightnessTest(TestCase):
 
 class UsageTest(TestCase):
     def test_version(self):
-        from xreset.files import code_version
+        from xreset.files.storage import code_version
 
         self.assertEqual(run("--version"), (0, f"xreset {code_version()}\n", ""))
 

@@ -296,7 +296,7 @@ PLAIN = (
 class CommandTest(InFolder):
     def setUp(self):
         super().setUp()
-        self.enterContext(patch("xreset.description.load_robot", lambda _: ROBOT))
+        self.enterContext(patch("xreset.geometry.description.load_robot", lambda _: ROBOT))
         self.enterContext(in_this_process())
         self.enterContext(
             patch("xreset.objects.catalogue.load_objects", lambda *_: (toy_grasp.brick(),))

@@ -10,9 +10,9 @@ import numpy as np
 from tests.data import PYBULLET
 from tests.toy_robot import ROBOTS
 from xreset.backends.conformance import CHECKS, run
-from xreset.description import read_description
+from xreset.geometry.description import read_description
 from xreset.geometry.dynamics import drive_inertia
-from xreset.plugins import backend_status, make_backend
+from xreset.physics.plugins import backend_status, make_backend
 
 BACKENDS = ("mujoco", "mujoco-warp", "pybullet", "sapien")
 

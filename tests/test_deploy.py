@@ -26,7 +26,7 @@ from xreset.errors import PolicyError, XResetError
 from xreset.eval.rollout import engine, episode_starts, load_trial
 from xreset.live.deploy import deploy_contract, write_deployed
 from xreset.live.engine import EngineDriver
-from xreset.policy import policy_contract
+from xreset.policy.onnx_policy import policy_contract
 from xreset.runtime import (
     Controller,
     LiveError,

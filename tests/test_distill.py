@@ -22,8 +22,8 @@ from xreset.learning.recipes import student_config
 from xreset.learning.run import TEACHER, latest_checkpoint, read_run
 from xreset.learning.teacher import load_teacher
 from xreset.objects.catalogue import load_objects
-from xreset.policies import shipped
-from xreset.policy import OnnxPolicy, check_contract
+from xreset.policy.onnx_policy import OnnxPolicy, check_contract
+from xreset.policy.shipped import shipped
 from xreset.task.config import ObservationConfig, TaskConfig, evaluation_task
 
 try:
@@ -47,7 +47,9 @@ class DistillTest(WithBank):
     @classmethod
     def setUpClass(cls):
         super().setUpClass()
-        cls.enterClassContext(patch("xreset.env.make_backend", partial(make_backend, workers=0)))
+        cls.enterClassContext(
+            patch("xreset.env.manipulation.make_backend", partial(make_backend, workers=0))
+        )
         cls.teacher = cls.folder / "teacher"
         config = TrainConfig(
             task=TASK, model=SMALL, ppo=PpoConfig(horizon=8, mini_epochs=1), iterations=1

@@ -153,7 +153,7 @@ class HelpTest(TestCase):
     def test_a_data_class_of_an_interactive_session_keeps_its_own_words(self):
         cells = {"__name__": "__main__"}
         exec(
-            'from xreset.checks import frozen\n@frozen\nclass A:\n    """Words."""\n    x: int\n    """One."""\n',
+            'from xreset.files.checks import frozen\n@frozen\nclass A:\n    """Words."""\n    x: int\n    """One."""\n',
             cells,
         )
         self.assertEqual(inspect.getdoc(cells["A"]), "Words.")
@@ -198,7 +198,7 @@ class PageTest(TestCase):
         project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
         names = {re.split(r"\W", text)[0] for text in project["dependencies"]}
         imported = set()
-        for node in ast.walk(ast.parse((ROOT / "xreset/env.py").read_text())):
+        for node in ast.walk(ast.parse((ROOT / "xreset/env/manipulation.py").read_text())):
             if isinstance(node, ast.Import):
                 imported |= {alias.name for alias in node.names}
             elif isinstance(node, ast.ImportFrom):

@@ -20,7 +20,7 @@ from tests.data import InFolder
 from tests.toy_bank import SOUP, SPAM, toy_bank, toy_retargeted
 from tests.toy_robot import toy_robot
 from xreset import make_bank
-from xreset.env import ManipulationEnv, make_env, make_scene
+from xreset.env.manipulation import ManipulationEnv, make_env, make_scene
 from xreset.errors import CapabilityError, XResetError
 from xreset.eval.metrics import EpisodeMetrics, MetricPoints
 from xreset.eval.rollout import Engine, Trial, roll_out
@@ -28,8 +28,8 @@ from xreset.geometry.rotations import quat_rotate
 from xreset.learning.recipes import RECIPES
 from xreset.objects.catalogue import load_object, load_objects
 from xreset.physics import State
-from xreset.plugins import backend_status, make_backend
-from xreset.policy import ZeroPolicy
+from xreset.physics.plugins import backend_status, make_backend
+from xreset.policy.onnx_policy import ZeroPolicy
 from xreset.resets.distribution import ResetDistribution
 from xreset.task.config import (
     ActionConfig,

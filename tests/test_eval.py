@@ -21,7 +21,6 @@ from tests.data import InFolder
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_results import OBJECTS, toy_rollouts, toy_summary
 from xreset import evaluate, load_object, load_policy
-from xreset.checks import from_dict
 from xreset.errors import FileFormatError, PolicyError, XResetError
 from xreset.eval.metrics import EpisodeMetrics, MetricPoints
 from xreset.eval.report.groups import estimate
@@ -36,7 +35,8 @@ from xreset.eval.results import (
 from xreset.eval.rollout import chosen_engines, engine, load_trial, roll_out
 from xreset.eval.stats import bootstrap_ci95, mean_of_known
 from xreset.eval.table import result_rows
-from xreset.files import claim_folder
+from xreset.files.checks import from_dict
+from xreset.files.storage import claim_folder
 from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.objects.sampling import metric_points
 from xreset.physics import Contacts, Health, Links, State

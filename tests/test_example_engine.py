@@ -16,12 +16,12 @@ import torch
 
 from tests.data import InFolder
 from tests.engine_checks import with_drive
-from xreset import plugins
 from xreset.backends.conformance import CHECKS, run
 from xreset.backends.conformance.scene import scene
 from xreset.cli import main
 from xreset.errors import BackendUnavailableError, CapabilityError
-from xreset.plugins import backend_status, make_backend
+from xreset.physics import plugins
+from xreset.physics.plugins import backend_status, make_backend
 
 EXAMPLES = {"drake": "pydrake", "newton": "newton"}
 """What each example's engine is imported as."""

@@ -66,7 +66,7 @@ class ShelfTest(InFolder):
 
     def test_without_gymnasium_the_error_says_what_to_install(self):
         with mock.patch.dict(sys.modules, {"gymnasium": None}):
-            sys.modules.pop("xreset.vector_env", None)
+            sys.modules.pop("xreset.env.vector_env", None)
             vars(xreset).pop("VectorEnv", None)
             with self.assertRaisesRegex(
                 xreset.errors.XResetError, r"pip install 'xreset\[gymnasium\]'"

@@ -13,12 +13,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 import xreset
 from tests.command import succeeds
 from tests.toy_results import InFolder, toy_rollouts
-from xreset.description import load_robot
 from xreset.errors import FileFormatError, RunError, XResetError
 from xreset.eval.export.lerobot import write_lerobot
 from xreset.eval.export.recorded import read_recorded, write_arrays
 from xreset.eval.report.read import read_training, without_results
-from xreset.files import file_hash
+from xreset.files.storage import file_hash
+from xreset.geometry.description import load_robot
 
 PARQUET = find_spec("pyarrow") is not None
 FILMS = PARQUET and find_spec("imageio_ffmpeg") is not None

@@ -31,9 +31,10 @@ from xreset import (
     write_goals,
     write_retargeted,
 )
-from xreset.checks import from_dict
 from xreset.errors import FileFormatError, XResetError
-from xreset.files import (
+from xreset.files.checks import from_dict
+from xreset.files.records import Field, arrays_of, read_npz, write_npz
+from xreset.files.storage import (
     atomic_folder,
     atomic_write,
     claim,
@@ -43,7 +44,6 @@ from xreset.files import (
     read_toml,
     write_json,
 )
-from xreset.records import Field, arrays_of, read_npz, write_npz
 
 SCHEMA = {
     "points": Field(("F", 3), "f"),
@@ -157,7 +157,7 @@ class AtomicFolderTest(InFolder):
 
 class ClaimTest(InFolder):
     def test_one_writer_at_a_time(self):
-        program = "import sys\nfrom xreset.files import claim\nwith claim(sys.argv[1]):\n    print('mine', flush=True)\n    sys.stdin.read()\n"
+        program = "import sys\nfrom xreset.files.storage import claim\nwith claim(sys.argv[1]):\n    print('mine', flush=True)\n    sys.stdin.read()\n"
         for path in (self.folder, self.file):
             with self.subTest(path):
                 command = [sys.executable, "-c", program, str(path)]
@@ -351,7 +351,7 @@ class NpzTest(InFolder):
         self.write()
         for number, words in ((EACCES, "Permission denied"), (EMFILE, "Too many open")):
             wrong = OSError(number, os.strerror(number))
-            with patch("xreset.files.os.open", side_effect=wrong), self.refused(words):
+            with patch("xreset.files.storage.os.open", side_effect=wrong), self.refused(words):
                 self.read()
 
     def test_wrong_schema_and_version(self):

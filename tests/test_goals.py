@@ -12,11 +12,11 @@ from tests.toy_goals import toy_goals
 from xreset import GoalConfig, load_object, load_policy, load_robot
 from xreset.errors import DemoError, FileFormatError, GoalError
 from xreset.eval.rollout import engine, load_trial, roll_out
+from xreset.files.records import npz_schema
 from xreset.geometry.shapes import turn_of
-from xreset.inputs import load_inputs
 from xreset.objects.rest import rest_height
-from xreset.records import npz_schema
 from xreset.resets.goals import FAMILIES, SCHEMA, make_goals, read_goals, write_goals
+from xreset.resets.inputs import load_inputs
 
 BANANA = "011_banana"
 EXACT = GoalConfig(per_family=1, start_xy=0.0, start_yaw=0.0, goal_xy=0.0, goal_z=0.0, goal_yaw=0.0)

@@ -27,9 +27,9 @@ from xreset import (
     write_demos,
 )
 from xreset.errors import DemoError, FileFormatError, XResetError
-from xreset.files import file_hash
-from xreset.inputs import load_inputs
+from xreset.files.storage import file_hash
 from xreset.resets.bank import check_objects
+from xreset.resets.inputs import load_inputs
 
 
 class InputsTest(InOneFolder):

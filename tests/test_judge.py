@@ -77,8 +77,8 @@ class Judge(InFolder):
             judging.judge(bank(), robot(), ())
 
     def test_a_weak_grip_drops_in_the_command(self):
-        self.enterContext(mock.patch("xreset.inputs.load_robot", return_value=robot()))
-        self.enterContext(mock.patch("xreset.inputs.load_objects", return_value=(brick(),)))
+        self.enterContext(mock.patch("xreset.resets.inputs.load_robot", return_value=robot()))
+        self.enterContext(mock.patch("xreset.resets.inputs.load_objects", return_value=(brick(),)))
         write_bank(f"{self.folder}/bank.npz", bank())
         words = f"--robot gripper --engine mujoco --squeeze.force 0.2 --json {self.folder}/judge.json --picture {self.folder}/judge.png"
         with redirect_stdout(io.StringIO()) as output:

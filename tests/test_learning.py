@@ -19,8 +19,8 @@ from tests.data import InFolder
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_training import CONFIG
 from xreset import robots
-from xreset.checks import from_dict
 from xreset.errors import FileFormatError
+from xreset.files.checks import from_dict
 from xreset.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from xreset.learning.config import ModelConfig, PpoConfig, ScheduleConfig, TrainConfig
 from xreset.learning.distributed import Processes
@@ -28,7 +28,7 @@ from xreset.learning.export import exported
 from xreset.learning.model import PointNetLstmModel, ReturnCritic
 from xreset.learning.ppo import SequencePpo, first_steps, piece_states
 from xreset.learning.runner import TrainingRunner
-from xreset.policy import OnnxPolicy, policy_contract
+from xreset.policy.onnx_policy import OnnxPolicy, policy_contract
 from xreset.resets.distribution import ResetDistribution
 from xreset.task.config import (
     ObservationConfig,

@@ -6,7 +6,7 @@ import torch
 
 from tests.data import InFolder
 from xreset.errors import FileFormatError, XResetError
-from xreset.files import write_json
+from xreset.files.storage import write_json
 from xreset.learning.clock import FILE, Lift, read_lift, write_lift
 from xreset.learning.log import TrainingLog
 

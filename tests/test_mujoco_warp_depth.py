@@ -15,7 +15,7 @@ from xreset.backends import mujoco_warp_depth, mujoco_warp_step
 from xreset.backends.conformance.scene import scene
 from xreset.backends.mujoco_warp import MujocoWarpBackend
 from xreset.backends.mujoco_warp_setup import correct_engine, engine_step
-from xreset.torch_warp import quiet
+from xreset.physics.torch_warp import quiet
 
 WORLDS = 200
 

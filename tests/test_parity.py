@@ -41,7 +41,7 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.objects.rest import rest_height
 from xreset.physics import State
-from xreset.plugins import backend_status
+from xreset.physics.plugins import backend_status
 
 DT = 1 / 60
 BRISK = mock.patch.multiple(

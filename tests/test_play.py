@@ -15,8 +15,8 @@ from xreset.errors import XResetError
 from xreset.eval.play.record import write_film, write_trace
 from xreset.eval.play.session import AWAY, Session
 from xreset.eval.results import read_traces
-from xreset.plugins import backend_names, backend_status
-from xreset.tensors import one_thread
+from xreset.physics.plugins import backend_names, backend_status
+from xreset.physics.tensors import one_thread
 
 
 class Played(InFolder):

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.browser import Browser, find_chromium, wait_until
 from xreset.eval.play.session import Session
-from xreset.tensors import one_thread
+from xreset.physics.tensors import one_thread
 
 
 @unittest.skipUnless(find_spec("viser"), "viser is not installed")

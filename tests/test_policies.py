@@ -18,10 +18,11 @@ from tests.data import InOneFolder
 from tests.toy_bank import SOUP
 from tests.toy_policy import write_policy
 from tests.toy_results import toy_choice
-from xreset import load_policy, policies, robots, synthesize, write_demos
+from xreset import load_policy, robots, synthesize, write_demos
 from xreset.errors import PolicyError, XResetError
 from xreset.learning.run import write_choice
-from xreset.policy import OnnxPolicy, observation_shapes, policy_contract
+from xreset.policy import shipped
+from xreset.policy.onnx_policy import OnnxPolicy, observation_shapes, policy_contract
 from xreset.task.config import ObservationConfig, TaskConfig, TerminationConfig
 
 TASK = TaskConfig(
@@ -138,11 +139,11 @@ class ShippedTest(WithPolicy):
         ours = Path(here, "site")
         ours.mkdir()
         (ours / "skilled.onnx").write_bytes(self.file.read_bytes())
-        self.enterContext(mock.patch.object(policies, "FOLDER", ours))
+        self.enterContext(mock.patch.object(shipped, "FOLDER", ours))
         self.enterContext(mock.patch.dict(os.environ, {"COLUMNS": "200"}))
 
     def test_a_name_means_the_shipped_file(self):
-        self.assertEqual(list(policies.shipped()), ["skilled"])
+        self.assertEqual(list(shipped.shipped()), ["skilled"])
         subject = load_policy("skilled")
         self.assertEqual(
             (subject.name, subject.robot.name, subject.folder),
@@ -161,7 +162,7 @@ class ShippedTest(WithPolicy):
 
     def test_the_list_shows_the_cards(self):
         self.assertIn("the card of skilled.onnx", refused("policies", "list"))
-        card = policies.FOLDER / "skilled.toml"
+        card = shipped.FOLDER / "skilled.toml"
         text = (
             'schema = "xreset-policy-card/1"\nabout = "Lifts."\ndata = "four demonstrations"\nrecipe = "one minute"\nlicence = "MIT"\n'
             '[results.seen]\nmujoco = "90 %"\n[results.others]\nsapien = "70 %"\n'
@@ -197,7 +198,7 @@ class ShippedTest(WithPolicy):
             self.assertIn(
                 f"{expected}, skilled.", refused(*command, "skiled", "--demos", "x.npz", *options)
             )
-        next(policies.FOLDER.iterdir()).unlink()
+        next(shipped.FOLDER.iterdir()).unlink()
         self.assertRaisesRegex(PolicyError, f"{expected}[.]", load_policy, "skiled")
 
     @skipUnless(find_spec("mujoco"), "mujoco is not installed")

@@ -17,10 +17,10 @@ from xreset.eval.rehearse import Rehearsal, judge, page, rehearse
 from xreset.eval.rollout import engine, play_rounds
 from xreset.eval.sensitivity import REHEARSED
 from xreset.eval.stress import curve
-from xreset.files import read_json
+from xreset.files.storage import read_json
 from xreset.live.engine import EngineDriver
 from xreset.live.faults import Faults, FaultyDriver
-from xreset.policies import shipped
+from xreset.policy.shipped import shipped
 from xreset.task.config import TaskConfig, evaluation_task
 
 STEPS = 30

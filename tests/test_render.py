@@ -10,8 +10,8 @@ from PIL import Image
 
 from tests.data import InFolder
 from tests.toy_retarget import box_object
-from xreset.description import load_robot as load
 from xreset.errors import RobotError, XResetError
+from xreset.geometry.description import load_robot as load
 from xreset.geometry.kinematics import Kinematics
 from xreset.pictures import meshes, render
 from xreset.pictures.meshes import link_colors

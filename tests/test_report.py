@@ -41,7 +41,7 @@ from xreset.eval.results import TaskProgress, episode_table, recorded, write_res
 from xreset.eval.sensitivity import chosen
 from xreset.eval.stress import curve
 from xreset.eval.table import table_text
-from xreset.files import claim_folder, write_json
+from xreset.files.storage import claim_folder, write_json
 from xreset.geometry.shapes import pose_matrix
 from xreset.learning.run import write_choice
 

@@ -18,11 +18,11 @@ from tests.toy_robot import toy_motion, toy_robot
 from xreset import read_retargeted, robots, synthesize, write_retargeted
 from xreset.demos.archive import demo_objects, read_demos, write_demos
 from xreset.errors import DemoError, FileFormatError, RobotError, XResetError
+from xreset.files.records import arrays_of, stated_doubts, write_npz
 from xreset.geometry.collision import table_clearance
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_angle, quat_from_axis_angle, quat_to_matrix
 from xreset.geometry.surface import Surface
-from xreset.records import arrays_of, stated_doubts, write_npz
 from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmModel
 from xreset.retarget.arm.solve import track

@@ -14,12 +14,12 @@ from ci import build_robot
 from tests.command import refused, succeeds
 from tests.data import InFolder
 from xreset import TaskConfig, plugins
-from xreset.description import load_robot as load
 from xreset.errors import PolicyError, RobotError
+from xreset.geometry.description import load_robot as load
 from xreset.geometry.dynamics import mass_matrix
 from xreset.geometry.urdf import find_mesh, robot_tree
-from xreset.plugins import robot_folder, robot_names
-from xreset.policy import check_contract, policy_contract
+from xreset.physics.plugins import robot_folder, robot_names
+from xreset.policy.onnx_policy import check_contract, policy_contract
 from xreset.robot_tools.check import check
 
 BUILT_IN = {

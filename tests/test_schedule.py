@@ -5,7 +5,7 @@ import unittest
 import numpy as np
 from numpy.testing import assert_array_equal
 
-from xreset.schedule import schedule, shared_worlds
+from xreset.resets.schedule import schedule, shared_worlds
 
 CASES = {
     "one world": ([0, 0, 0], 1),

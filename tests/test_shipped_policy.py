@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from xreset import OnnxPolicy, evaluate, synthesize
 from xreset.eval.policy_spec import BASELINES, load_policy
 from xreset.objects.catalogue import object_names
-from xreset.policies import card, shipped
+from xreset.policy.shipped import card, shipped
 
 LARGEST = 5e6
 """What a policy may add to every download [bytes]."""
@@ -22,7 +22,7 @@ ACT = """
 import json, sys
 sys.modules.update(dict.fromkeys(sys.argv[1].split(",")))
 import torch
-from xreset.policy import OnnxPolicy, observation_shapes
+from xreset.policy.onnx_policy import OnnxPolicy, observation_shapes
 for file in sys.argv[2:]:
     policy = OnnxPolicy(file)
     shapes = observation_shapes(policy.contract, file)

@@ -15,7 +15,7 @@ try:
 except ImportError as error:
     raise unittest.SkipTest("stable-baselines3 is not installed") from error
 
-from xreset.stable_baselines import StableBaselinesEnv
+from xreset.env.stable_baselines import StableBaselinesEnv
 
 
 class StableBaselinesTest(WithEnv):

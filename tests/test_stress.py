@@ -14,7 +14,7 @@ from tests.toy_results import episodes, toy_card
 from xreset.errors import XResetError
 from xreset.eval.sensitivity import SWEEPS, chosen, nominal_task
 from xreset.eval.stress import curve, read_stress
-from xreset.files import claim, write_json
+from xreset.files.storage import claim, write_json
 from xreset.task.config import RandomizationConfig, TaskConfig, evaluation_task
 
 

@@ -33,7 +33,7 @@ from xreset.eval.study.plan import Plan, make_plan
 from xreset.eval.study.report import write_page
 from xreset.eval.study.steps import XRESET, Step, flags
 from xreset.eval.study.tables import fill
-from xreset.files import claim
+from xreset.files.storage import claim
 from xreset.learning.clock import read_lift, write_lift
 from xreset.learning.config import TrainConfig
 from xreset.learning.run import checkpoints, latest_checkpoint

@@ -19,9 +19,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_robot
 from xreset.cameras.config import FRONT, VisionConfig
-from xreset.checks import from_dict, merged
 from xreset.cli._terms import take_terms
 from xreset.errors import DemoError, FileFormatError, PolicyError, RunError, XResetError
+from xreset.files.checks import from_dict, merged
 from xreset.geometry.rotations import (
     quat_angle,
     quat_conjugate,
@@ -34,7 +34,13 @@ from xreset.geometry.rotations import (
 from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import RECIPES
 from xreset.physics import Contacts, Health, Links, State
-from xreset.policy import RandomPolicy, ZeroPolicy, check_contract, parsed_contract, policy_contract
+from xreset.policy.onnx_policy import (
+    RandomPolicy,
+    ZeroPolicy,
+    check_contract,
+    parsed_contract,
+    policy_contract,
+)
 from xreset.resets.distribution import ResetDistribution
 from xreset.spec import TableSpec
 from xreset.task import observations as obs

@@ -36,7 +36,7 @@ from xreset import (
 )
 from xreset.cli import main
 from xreset.errors import FileFormatError, PolicyError, RunError, XResetError
-from xreset.files import claim, file_hash
+from xreset.files.storage import claim, file_hash
 from xreset.learning.checkpoint import load_moments, read_checkpoint
 from xreset.learning.clock import read_lift
 from xreset.learning.config import ModelConfig, PpoConfig, ScheduleConfig, TrainConfig

@@ -350,8 +350,8 @@ class BankTest(InFolder):
     def test_the_viewer_names_them(self):
         write_bank(self.folder / "b.npz", self.found)
         with (
-            patch("xreset.inputs.load_robot", return_value=ROBOT),
-            patch("xreset.inputs.load_objects", return_value=OBJECTS),
+            patch("xreset.resets.inputs.load_robot", return_value=ROBOT),
+            patch("xreset.resets.inputs.load_objects", return_value=OBJECTS),
         ):
             view = load_view(self.folder / "b.npz")
         self.assertNotIn("grasp of another demonstration", view.text(2))
@@ -362,7 +362,7 @@ class BankTest(InFolder):
 class CommandTest(InFolder):
     def setUp(self):
         super().setUp()
-        self.enterContext(patch("xreset.description.load_robot", lambda _: ROBOT))
+        self.enterContext(patch("xreset.geometry.description.load_robot", lambda _: ROBOT))
         self.enterContext(in_this_process())
         self.enterContext(patch("xreset.objects.catalogue.load_objects", lambda *_: OBJECTS))
         self.motion = self.folder / "r.npz"

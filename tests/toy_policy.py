@@ -5,7 +5,7 @@ import json
 import numpy as np
 from onnx import TensorProto, helper, numpy_helper
 
-from xreset.policy import observation_shapes, parsed_contract
+from xreset.policy.onnx_policy import observation_shapes, parsed_contract
 
 
 def write_policy(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from xreset.description import read_description
+from xreset.geometry.description import read_description
 from xreset.geometry.rotations import quat_from_axis_angle
 
 ROBOTS = Path(__file__).with_name("robots")

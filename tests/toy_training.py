@@ -47,7 +47,9 @@ class WithBank(InOneFolder):
 @contextmanager
 def quickly():
     """Leave out what takes longer than all the rest: processes for the engine, and the export at the end. Yields what is printed."""
-    in_this_process = patch("xreset.env.make_backend", partial(make_backend, workers=0))
+    in_this_process = patch(
+        "xreset.env.manipulation.make_backend", partial(make_backend, workers=0)
+    )
     without_export = patch("xreset.learning.train.export_checkpoint")
     with in_this_process, without_export, redirect_stdout(io.StringIO()) as said:
         yield said

@@ -36,7 +36,7 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module 'xreset' has no attribute {name!r}")
     value = getattr(import_module(_HOMES[name]), name)
     if not isinstance(value, type):
-        from xreset.checks import names_wrong_arguments
+        from xreset.files.checks import names_wrong_arguments
 
         value = names_wrong_arguments(value)
         value.__module__ = __name__  # where pickle finds it

@@ -6,9 +6,10 @@ from xreset.demos.archive import merge_demos as merge_demos
 from xreset.demos.archive import read_demos as read_demos
 from xreset.demos.archive import write_demos as write_demos
 from xreset.demos.synth import synthesize as synthesize
-from xreset.description import load_robot as load_robot
-from xreset.env import ManipulationEnv as ManipulationEnv
-from xreset.env import make_env as make_env
+from xreset.env.manipulation import ManipulationEnv as ManipulationEnv
+from xreset.env.manipulation import make_env as make_env
+from xreset.env.stable_baselines import StableBaselinesEnv as StableBaselinesEnv
+from xreset.env.vector_env import VectorEnv as VectorEnv
 from xreset.errors import XResetError as XResetError
 from xreset.eval.evaluate import evaluate as evaluate
 from xreset.eval.export.deploy import export_deploy as export_deploy
@@ -26,6 +27,7 @@ from xreset.eval.report.read import read_training as read_training
 from xreset.eval.results import EvalResult as EvalResult
 from xreset.eval.results import Evaluation as Evaluation
 from xreset.eval.rollout import Engine as Engine
+from xreset.geometry.description import load_robot as load_robot
 from xreset.learning.config import TrainConfig as TrainConfig
 from xreset.learning.export import export_checkpoint as export_checkpoint
 from xreset.learning.train import distill as distill
@@ -33,8 +35,8 @@ from xreset.learning.train import resume as resume
 from xreset.learning.train import train as train
 from xreset.objects.catalogue import load_object as load_object
 from xreset.physics import Backend as Backend
-from xreset.plugins import make_backend as make_backend
-from xreset.policy import OnnxPolicy as OnnxPolicy
+from xreset.physics.plugins import make_backend as make_backend
+from xreset.policy.onnx_policy import OnnxPolicy as OnnxPolicy
 from xreset.resets.bank import ResetBank as ResetBank
 from xreset.resets.bank import read_bank as read_bank
 from xreset.resets.bank import write_bank as write_bank
@@ -59,8 +61,6 @@ from xreset.robot_tools.judge import judge as judge
 from xreset.spec import ObjectSpec as ObjectSpec
 from xreset.spec import RobotSpec as RobotSpec
 from xreset.spec import SceneSpec as SceneSpec
-from xreset.stable_baselines import StableBaselinesEnv as StableBaselinesEnv
 from xreset.task.config import TaskConfig as TaskConfig
-from xreset.vector_env import VectorEnv as VectorEnv
 
 __version__: str

@@ -14,7 +14,8 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from xreset.checks import (
+from xreset.errors import DemoError, FileFormatError, XResetError
+from xreset.files.checks import (
     Checked,
     NotNegative,
     Number,
@@ -25,8 +26,7 @@ from xreset.checks import (
     Text,
     frozen,
 )
-from xreset.errors import DemoError, FileFormatError, XResetError
-from xreset.text import Brief, shown
+from xreset.files.text import Brief, shown
 
 GRAVITY = 9.81
 """Magnitude of gravity in m/s^2; it points along -z."""

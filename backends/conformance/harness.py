@@ -20,7 +20,7 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_normalize
 from xreset.geometry.urdf import robot_tree
 from xreset.physics import Backend, Contacts, Links, Parameter, Parameters, State
-from xreset.plugins import backend_status, make_backend
+from xreset.physics.plugins import backend_status, make_backend
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 
 MakeBackend = Callable[..., Backend]

@@ -11,7 +11,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from xreset.description import read_description
+from xreset.geometry.description import read_description
 from xreset.geometry.shapes import mass_properties, mesh_arrays, surface_of, transform
 from xreset.spec import Geometry, ObjectSpec, PairFriction, RobotSpec, SceneSpec, Shape
 

@@ -18,8 +18,8 @@ from xreset.backends.conformance.harness import (
 )
 from xreset.backends.conformance.results import Measured, Skipped
 from xreset.physics import Parameter, State
+from xreset.physics.tensors import where
 from xreset.spec import GRAVITY
-from xreset.tensors import where
 
 
 def nothing_stays(bench: Bench) -> Measured:

@@ -8,7 +8,7 @@ policy, with the properties that ``measure`` finds); ``recording`` plays targets
 
     from xreset.eval.engines.agreement import compare
     from xreset.eval.rollout import engine
-    from xreset.inputs import load_inputs
+    from xreset.resets.inputs import load_inputs
     inputs = load_inputs(Path("retargeted.npz"))
     result = compare(inputs.robot, inputs.objects, inputs.motion(), [engine("pybullet"), engine("sapien")])
 """

@@ -14,19 +14,27 @@ from typing import Annotated
 import numpy as np
 import torch
 
-from xreset.checks import frozen
 from xreset.demos.archive import OneText
-from xreset.description import load_robot
 from xreset.errors import DemoError, FileFormatError
 from xreset.eval.engines.grasps import Grasps, closing_episode, find_grasps
 from xreset.eval.engines.recording import Recording
 from xreset.eval.results import TRACE_SCHEMA, Trace, read_result, read_traces
 from xreset.eval.rollout import nominal_scene
 from xreset.eval.setting import Place
-from xreset.inputs import load_inputs
+from xreset.files.checks import frozen
+from xreset.files.records import (
+    JOINT,
+    POSITION,
+    Field,
+    arrays_of,
+    npz_schema,
+    read_record,
+    write_npz,
+)
+from xreset.geometry.description import load_robot
 from xreset.objects.catalogue import load_object
 from xreset.physics import State
-from xreset.records import JOINT, POSITION, Field, arrays_of, npz_schema, read_record, write_npz
+from xreset.resets.inputs import load_inputs
 from xreset.retarget.file import JointNames
 from xreset.spec import ObjectSpec, PairFriction, RobotSpec, SceneSpec, check_robot
 from xreset.task.config import EVALUATION_TIMESTEP, TaskConfig

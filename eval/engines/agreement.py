@@ -15,7 +15,6 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from xreset.checks import frozen
 from xreset.eval.engines.grasps import (
     LIFT_HEIGHT,
     Grasps,
@@ -27,10 +26,11 @@ from xreset.eval.engines.grasps import (
 )
 from xreset.eval.engines.recording import Recording, play
 from xreset.eval.rollout import Engine, engine
+from xreset.files.checks import frozen
+from xreset.files.progress import NamedProgress, unseen
 from xreset.geometry.kinematics import Kinematics
 from xreset.objects.sampling import surface_points
 from xreset.physics import Backend, State
-from xreset.progress import NamedProgress, unseen
 from xreset.retarget.file import Retargeted
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 

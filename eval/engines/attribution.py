@@ -15,7 +15,6 @@ from typing import Any, Literal
 import numpy as np
 from rich.table import Table
 
-from xreset.checks import frozen
 from xreset.errors import XResetError
 from xreset.eval.engines.measure import measure
 from xreset.eval.policy_spec import PolicySpec
@@ -23,8 +22,9 @@ from xreset.eval.results import Episode
 from xreset.eval.rollout import Engine, Trial, nominal_scene, roll_out
 from xreset.eval.sensitivity import COMPARED, Effect, Property, nominal_task
 from xreset.eval.table import success_text
-from xreset.plugins import backend_class
-from xreset.progress import NamedProgress, unseen
+from xreset.files.checks import frozen
+from xreset.files.progress import NamedProgress, unseen
+from xreset.physics.plugins import backend_class
 from xreset.task.config import TaskConfig
 
 SCHEMA = "xreset-attribution/2"

@@ -18,17 +18,17 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from xreset.checks import frozen
 from xreset.errors import DemoError
+from xreset.files.checks import frozen
 from xreset.geometry.dynamics import drive_values
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_rotate_inverse
 from xreset.geometry.shapes import turn_of
 from xreset.geometry.surface import Surface
 from xreset.physics import State
+from xreset.physics.tensors import Tensors
 from xreset.retarget.file import Retargeted
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, lowest_point
-from xreset.tensors import Tensors
 
 REST_DISTANCE = 0.010
 """Largest distance from its start of an object that counts as at rest on the table [m]."""

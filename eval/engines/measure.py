@@ -18,9 +18,9 @@ from torch import Tensor
 
 from xreset.backends.conformance.harness import Worlds, free_place
 from xreset.backends.conformance.scene import shape, solid
-from xreset.checks import frozen
 from xreset.errors import XResetError
 from xreset.eval.rollout import Engine
+from xreset.files.checks import frozen
 from xreset.geometry.dynamics import drive_values, mass_matrix
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import hull, perpendicular, transformed

@@ -16,9 +16,9 @@ from xreset.backends.conformance.results import SCHEMA as CONFORMANCE
 from xreset.backends.conformance.results import share_of
 from xreset.errors import FileFormatError, XResetError
 from xreset.eval.pages import render
-from xreset.files import read_json
+from xreset.files.storage import read_json
+from xreset.files.text import shown
 from xreset.physics import Capability
-from xreset.text import shown
 
 Json = Mapping[str, Any]
 

@@ -10,7 +10,7 @@ from collections import defaultdict
 import torch
 from torch import Tensor
 
-from xreset.checks import frozen
+from xreset.files.checks import frozen
 from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
 from xreset.physics import Backend, State
 

@@ -19,11 +19,11 @@ from rich.table import Table
 from rich.text import Text
 from scipy.ndimage import binary_opening
 
-from xreset.checks import frozen
 from xreset.errors import XResetError
 from xreset.eval.engines.actions import Actions
 from xreset.eval.engines.recording import Recording, play
 from xreset.eval.rollout import Engine
+from xreset.files.checks import frozen
 from xreset.geometry.rotations import quat_angle
 from xreset.geometry.urdf import prismatic_joints
 from xreset.physics import State

@@ -21,10 +21,10 @@ from xreset.errors import XResetError, needs
 from xreset.eval.export.recorded import RecordedEpisodes, read_recorded
 from xreset.eval.report.clips import draw_state, draw_view, encode_mp4, policy_cameras
 from xreset.eval.results import Trace
-from xreset.files import atomic_folder, is_occupied, write_json
+from xreset.files.progress import unseen
+from xreset.files.storage import atomic_folder, is_occupied, write_json
 from xreset.objects.catalogue import load_object
 from xreset.pictures.render import Renderer, Size
-from xreset.progress import unseen
 from xreset.spec import RobotSpec, SceneSpec
 
 SCHEMA = "xreset-lerobot/1"

@@ -12,15 +12,15 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from xreset.checks import frozen
-from xreset.description import load_robot
 from xreset.errors import RunError
 from xreset.eval.report.read import results_in
 from xreset.eval.results import Table, Trace, read_evaluation, read_traces, recorded
-from xreset.files import file_hash
-from xreset.records import write_npz
+from xreset.files.checks import frozen
+from xreset.files.records import write_npz
+from xreset.files.storage import file_hash
+from xreset.files.text import short_name
+from xreset.geometry.description import load_robot
 from xreset.spec import RobotSpec
-from xreset.text import short_name
 
 SCHEMA = "xreset-rollouts/1"
 TASK = "Grasp the {object} and bring it to the goal pose."

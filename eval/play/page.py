@@ -15,12 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from xreset.checks import Seed
 from xreset.errors import XResetError
 from xreset.eval.play.record import draw_film, last_moments, write_trace
 from xreset.eval.play.session import Session
 from xreset.eval.plots import COLORS
 from xreset.eval.policy_spec import PolicySpec
+from xreset.files.checks import Seed
+from xreset.files.text import short_name
+from xreset.physics.plugins import backend_names, robot_names
+from xreset.physics.tensors import one_thread
 from xreset.pictures.meshes import GOAL_COLOR, OBJECT_COLOR, rgb
 from xreset.pictures.view.colors import TOUCH_COLOR
 from xreset.pictures.view.server import (
@@ -31,10 +34,7 @@ from xreset.pictures.view.server import (
     chosen,
     serve_until_interrupted,
 )
-from xreset.plugins import backend_names, robot_names
-from xreset.policies import shipped
-from xreset.tensors import one_thread
-from xreset.text import short_name
+from xreset.policy.shipped import shipped
 
 HELP = "Drag the **green shape**, and the robot brings the object there. Pull at the object or the robot to disturb it."
 NOBODY = "zero"

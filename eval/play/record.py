@@ -12,7 +12,7 @@ from xreset.errors import XResetError
 from xreset.eval.play.session import Moment, Session
 from xreset.eval.report.clips import encode_mp4
 from xreset.eval.results import Trace, write_traces
-from xreset.files import write_whole
+from xreset.files.storage import write_whole
 from xreset.pictures.render import Renderer
 from xreset.spec import SceneSpec
 

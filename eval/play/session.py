@@ -15,19 +15,19 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from xreset.checks import frozen
 from xreset.demos.synth import synthesize
-from xreset.env import ManipulationEnv
+from xreset.env.manipulation import ManipulationEnv
 from xreset.errors import XResetError
 from xreset.eval.policy_spec import PolicySpec, load_policy
+from xreset.files.checks import frozen
 from xreset.geometry.dynamics import drive_values
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_angle, quat_rotate, quat_rotate_inverse
-from xreset.inputs import Inputs, load_inputs
 from xreset.objects.catalogue import ALIASES, canonical_name, object_names
 from xreset.objects.rest import rest_height
 from xreset.physics import State
-from xreset.policy import Policy
+from xreset.policy.onnx_policy import Policy
+from xreset.resets.inputs import Inputs, load_inputs
 from xreset.spec import GRAVITY
 from xreset.task.observations import layout
 from xreset.task.terminations import out_of_bounds

@@ -11,18 +11,18 @@ import numpy as np
 import torch
 
 from xreset.cameras.config import VisionConfig
-from xreset.checks import frozen
-from xreset.description import load_robot
 from xreset.errors import RunError, XResetError, needs
 from xreset.eval.report.read import ReportData
 from xreset.eval.results import Table, Trace
-from xreset.files import write_whole
+from xreset.files.checks import frozen
+from xreset.files.storage import write_whole
+from xreset.files.text import short_name
+from xreset.geometry.description import load_robot
 from xreset.geometry.shapes import pose_matrix
 from xreset.objects.catalogue import load_object
 from xreset.physics import State
 from xreset.pictures.render import Camera, Renderer, add_caption
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
-from xreset.text import short_name
 
 if TYPE_CHECKING:
     from xreset.cameras.sensor import Cameras

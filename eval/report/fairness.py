@@ -10,7 +10,7 @@ import pandas as pd
 
 from xreset.eval.metrics import GOAL_DISTANCE
 from xreset.eval.results import Table
-from xreset.text import short_name
+from xreset.files.text import short_name
 
 if TYPE_CHECKING:
     from xreset.eval.report.read import Training

@@ -35,7 +35,7 @@ from xreset.eval.report.read import (
 from xreset.eval.results import Table, read_evaluation
 from xreset.eval.stress import by_property, read_stress
 from xreset.eval.table import FIGURES, caption
-from xreset.files import claim_folder, write_whole
+from xreset.files.storage import claim_folder, write_whole
 from xreset.learning.run import TEACHER, read_choice, read_run
 from xreset.pictures.render import encode_png
 

@@ -11,18 +11,18 @@ from typing import Any
 import pandas as pd
 
 from xreset.cameras.config import VisionConfig
-from xreset.checks import frozen, names_wrong_arguments, renamed
-from xreset.description import load_robot
 from xreset.errors import FileFormatError, RunError, WrongValueError, needs
 from xreset.eval.results import EvalResult, Table, read_evaluation, read_traces, recorded
 from xreset.eval.stress import Stress
-from xreset.files import read_json
+from xreset.files.checks import frozen, names_wrong_arguments, renamed
+from xreset.files.storage import read_json
+from xreset.files.text import Brief, short_name, shown
+from xreset.geometry.description import load_robot
 from xreset.learning.clock import Lift, read_lift
 from xreset.learning.run import SCHEMA as RUN_SCHEMA
 from xreset.learning.run import Choice, RunInfo
-from xreset.policies import run_folder
+from xreset.policy.shipped import run_folder
 from xreset.spec import RobotSpec
-from xreset.text import Brief, short_name, shown
 
 
 @frozen

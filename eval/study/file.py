@@ -36,11 +36,20 @@ from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from xreset.checks import Checked, PositiveFloat, PositiveInt, Rule, Seed, from_dict, frozen, merged
 from xreset.errors import FileFormatError, RunError
 from xreset.eval.study.paper import paper_tables
 from xreset.eval.table import METRICS
-from xreset.files import read_toml
+from xreset.files.checks import (
+    Checked,
+    PositiveFloat,
+    PositiveInt,
+    Rule,
+    Seed,
+    from_dict,
+    frozen,
+    merged,
+)
+from xreset.files.storage import read_toml
 
 SCHEMA = "xreset-study/1"
 SHIPPED = Path(__file__).parent.parent / "studies"

@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Literal
 
-from xreset.checks import from_dict, frozen
+from xreset.files.checks import from_dict, frozen
 
 FILE = Path(__file__).parent / "paper.toml"
 ALL = "all"

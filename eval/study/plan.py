@@ -7,18 +7,18 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
-from xreset.checks import from_dict, merged
 from xreset.demos.archive import read_demos
 from xreset.errors import FileFormatError, RunError
 from xreset.eval.study.file import Data, Study
 from xreset.eval.study.steps import Run, Step, Subset, bank_todo, eval_todo, train_todo
+from xreset.files.checks import from_dict, merged
+from xreset.files.text import short_name
 from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import from_home, starting_config
 from xreset.objects.catalogue import canonical_names, object_names
-from xreset.plugins import backend_status
-from xreset.schedule import shared_worlds
+from xreset.physics.plugins import backend_status
+from xreset.resets.schedule import shared_worlds
 from xreset.task.config import TaskConfig, with_episodes_of
-from xreset.text import short_name
 
 
 @dataclass(kw_only=True)

@@ -19,9 +19,9 @@ from xreset.eval.study.paper import TRAINING
 from xreset.eval.study.plan import Plan
 from xreset.eval.study.tables import FilledTable, draw, fill
 from xreset.eval.table import caption
-from xreset.files import write_whole
+from xreset.files.storage import write_whole
+from xreset.files.text import short_name
 from xreset.learning.clock import Lift, read_lift
-from xreset.text import short_name
 
 _ALIKE = 0.05
 """Trainings whose lengths differ by a smaller share are of equal length."""

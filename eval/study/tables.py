@@ -10,7 +10,6 @@ from typing import Any
 
 import pandas as pd
 
-from xreset.checks import frozen
 from xreset.eval.plots import picture
 from xreset.eval.report.figures import draw_bars
 from xreset.eval.report.groups import COUNTED, counted, estimate
@@ -20,8 +19,9 @@ from xreset.eval.study.file import TableSpec
 from xreset.eval.study.paper import ALL, PaperTable, paper_tables
 from xreset.eval.study.plan import Plan
 from xreset.eval.table import METRICS, Rows, estimate_text
+from xreset.files.checks import frozen
+from xreset.files.text import short_name
 from xreset.objects.catalogue import canonical_name
-from xreset.text import short_name
 
 _CELL = ["row", "column", "mean", "low", "high", "paper", "text"]
 

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from dataclasses import field
 from typing import Annotated, Literal
 
-from xreset.checks import (
+from xreset.errors import WrongValueError, XResetError
+from xreset.files.checks import (
     Checked,
     NonNegativeFloat,
     PositiveFloat,
@@ -16,7 +17,6 @@ from xreset.checks import (
     Share,
     frozen,
 )
-from xreset.errors import WrongValueError, XResetError
 
 Point = Annotated[
     tuple[float, float, float],

@@ -21,7 +21,7 @@ with needs("warp", "cameras"):
     import warp as wp
 
 from xreset.cameras.kernels import cast
-from xreset.torch_warp import TorchStream, quiet
+from xreset.physics.torch_warp import TorchStream, quiet
 
 
 class RayCaster:

@@ -22,8 +22,8 @@ from xreset.geometry.rotations import homogeneous, quat_from_axis_angle, quat_to
 from xreset.geometry.shapes import box, look_at, shape_mesh, transform, winding_number
 from xreset.geometry.urdf import link_meshes
 from xreset.physics import State
+from xreset.physics.tensors import where
 from xreset.spec import SceneSpec
-from xreset.tensors import where
 
 _GOAL_COLOR = (0.3, 1.0, 0.3)
 

@@ -61,7 +61,7 @@ def main(argv: list[str] | None = None) -> None:
             # characters that the terminal lacks are written as escapes
             stream.reconfigure(errors="backslashreplace")
     if argv[:1] == ["--version"]:
-        from xreset.files import code_version
+        from xreset.files.storage import code_version
 
         print(f"xreset {code_version()}")
         return
@@ -115,7 +115,7 @@ def _with_present_flags(argv: list[str]) -> list[str]:
 
 
 def _fail(argv: list[str], message: str) -> NoReturn:
-    from xreset.text import plain
+    from xreset.files.text import plain
 
     print(f"xreset {argv[0]}: {plain(message)}", file=sys.stderr)
     raise SystemExit(1) from None

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from xreset.accounts import Account, described
 from xreset.cli import INVOCATION
 from xreset.cli._terminal import console, show_table
 from xreset.errors import RunError
-from xreset.files import code_version, file_hash, write_json
-from xreset.plugins import backend_names, backend_status
+from xreset.files.storage import code_version, file_hash, write_json
+from xreset.physics.plugins import backend_names, backend_status
+from xreset.retarget.accounts import Account, described
 
 if TYPE_CHECKING:
     from xreset.eval import rollout

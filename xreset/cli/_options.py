@@ -15,10 +15,10 @@ from typing import Any, Union, get_args
 
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from xreset.checks import LARGEST_SEED, LAST_PORT, Options
 from xreset.errors import XResetError
-from xreset.files import check_suffix, claim
-from xreset.plugins import existing_device
+from xreset.files.checks import LARGEST_SEED, LAST_PORT, Options
+from xreset.files.storage import check_suffix, claim
+from xreset.physics.plugins import existing_device
 
 _COUNTS = {
     "num_envs", "iterations", "episodes", "states", "grasps", "per_object", "max_per_object", "perturbed",

@@ -7,8 +7,8 @@ from contextlib import suppress
 from dataclasses import asdict, fields
 from typing import Any
 
-from xreset.checks import from_dict, merged
 from xreset.errors import RunError
+from xreset.files.checks import from_dict, merged
 from xreset.learning.config import TrainConfig
 from xreset.task.config import GROUPS
 from xreset.task.legacy import ObservationOptions, RewardOptions

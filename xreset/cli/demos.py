@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from xreset.checks import Options, frozen
 from xreset.cli._common import Flat, Source, Sources
 from xreset.cli._terminal import Progress, console, show_notes, show_table
 from xreset.errors import DemoError
-from xreset.files import file_hash
+from xreset.files.checks import Options, frozen
+from xreset.files.storage import file_hash
 
 if TYPE_CHECKING:
     from xreset.demos.archive import Demos

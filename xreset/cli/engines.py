@@ -26,8 +26,8 @@ from xreset.cli._common import (
 from xreset.cli._terminal import Progress, console, show_table
 from xreset.errors import XResetError
 from xreset.eval.setting import Place, Setting
-from xreset.files import file_hash, write_json, write_whole
-from xreset.plugins import backend_class, backend_names, backend_status, make_backend
+from xreset.files.storage import file_hash, write_json, write_whole
+from xreset.physics.plugins import backend_class, backend_names, backend_status, make_backend
 from xreset.spec import SceneSpec
 
 if TYPE_CHECKING:
@@ -62,8 +62,8 @@ def check(
         json: File to write the results to.
         verbose: Show every measured number, not only the one nearest to its tolerance.
     """
-    from xreset import description
     from xreset.backends import conformance
+    from xreset.geometry import description
 
     spec = description.load_robot(robot) if robot else conformance.scene().robot
     runs = []
@@ -177,7 +177,7 @@ def compare(
         json: File to write the results to.
     """
     from xreset.eval.engines import agreement
-    from xreset.inputs import load_inputs
+    from xreset.resets.inputs import load_inputs
 
     engines = [each for each in quick_engines(engine, device) if each.name != agreement.REFERENCE]
     with Progress() as bar:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from xreset.cli._terminal import console, show_table
-from xreset.policies import card, shipped
+from xreset.policy.shipped import card, shipped
 
 
 def list_() -> None:
     """List the policies that ship with xreset. Every command with a policy argument accepts their names."""
-    from xreset import policy as policy_files
+    from xreset.policy import onnx_policy as policy_files
 
     for name, file in shipped().items():
         contract = policy_files.OnnxPolicy(file).contract

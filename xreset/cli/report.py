@@ -7,8 +7,8 @@ from pathlib import Path
 from xreset.cli._common import Robot, Source
 from xreset.cli._terminal import console, show_notes
 from xreset.eval import table
-from xreset.policies import run_folder
-from xreset.text import short_name
+from xreset.files.text import short_name
+from xreset.policy.shipped import run_folder
 
 
 def report(

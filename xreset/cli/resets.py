@@ -11,7 +11,7 @@ from tyro.conf import arg
 
 from xreset.cli._common import Device, Meshes, Several, Source, show_accounts
 from xreset.cli._terminal import Progress, console, show_notes
-from xreset.files import file_hash
+from xreset.files.storage import file_hash
 from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig, TransferConfig
 
 
@@ -47,9 +47,9 @@ def resets(
         settle: Let objects come to rest (in the first engine) before episodes begin at home. Default: the recorded
             poses, as in the paper, from which one object in eleven turns by more than 10 degrees.
     """
-    from xreset.description import load_robot
+    from xreset.files.records import stated_doubts
+    from xreset.geometry.description import load_robot
     from xreset.objects.catalogue import load_objects
-    from xreset.records import stated_doubts
     from xreset.resets.bank import write_bank
     from xreset.resets.filter import make_bank
     from xreset.resets.settle import settle_starts

@@ -9,7 +9,7 @@ import numpy as np
 
 from xreset.cli._common import Meshes, Source, show_accounts
 from xreset.cli._terminal import Progress, console, show_notes
-from xreset.files import file_hash
+from xreset.files.storage import file_hash
 from xreset.retarget.hand.config import Jaw
 
 
@@ -37,7 +37,7 @@ def retarget(
             from thumb tip to fingers.
     """
     from xreset.demos.archive import demo_objects, read_demos
-    from xreset.description import load_robot
+    from xreset.geometry.description import load_robot
     from xreset.retarget.file import write_retargeted
     from xreset.retarget.pipeline import RetargetConfig, retarget_demos
 

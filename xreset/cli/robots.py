@@ -22,7 +22,7 @@ from xreset.cli._common import (
 )
 from xreset.cli._terminal import Progress, console, show_table
 from xreset.errors import RobotError
-from xreset.plugins import robot_names
+from xreset.physics.plugins import robot_names
 from xreset.resets.config import JUDGE_SQUEEZE, SqueezeConfig
 from xreset.robot_tools import placement
 from xreset.robot_tools.placement import PlaceConfig
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 def list_robots() -> None:
     """List robots: built-in ones and those of installed packages."""
-    from xreset import description
+    from xreset.geometry import description
 
     table = [("robot", "joints (arm + hand)", "fingertips", "folder")]
     for name in robot_names():
@@ -57,7 +57,7 @@ def check(robot: RobotName, /, *, picture: Path | None = None) -> None:
     Args:
         picture: PNG to write: the robot at home, with the frames of its palm, fingertips and joints.
     """
-    from xreset import description
+    from xreset.geometry import description
     from xreset.pictures import render
     from xreset.robot_tools import check as checks
     from xreset.robot_tools import picture as pictures
@@ -108,7 +108,7 @@ def import_(
             turned so that the fingers point out of the arm, along its last joint's axis.
         thumb: A link or joint of the thumb, if the import chooses another finger.
     """
-    from xreset import description
+    from xreset.geometry import description
     from xreset.pictures import render
     from xreset.robot_tools import importer
     from xreset.robot_tools import picture as pictures
@@ -143,8 +143,8 @@ def place(
         write: Write the placement and its home into the robot's robot.toml.
         search: Ranges and effort of the search.
     """
-    from xreset import description
     from xreset.demos import archive
+    from xreset.geometry import description
     from xreset.retarget import pipeline
     from xreset.robot_tools import place as places
 
@@ -207,8 +207,8 @@ def judge(
         picture: PNG to write: the best state of each object at the start and after each phase.
         json: File to write the counts to.
     """
-    from xreset import inputs
     from xreset.pictures import render
+    from xreset.resets import inputs
     from xreset.robot_tools import judge as judging
 
     loaded = inputs.load_inputs(bank, robot=robot, meshes=meshes, accept=("bank",))

@@ -12,8 +12,8 @@ from xreset.cli import main
 from xreset.cli._common import Meshes, Several, Source, quick_engines
 from xreset.cli._terminal import console
 from xreset.errors import RunError
-from xreset.files import file_hash
-from xreset.records import read_npz
+from xreset.files.records import read_npz
+from xreset.files.storage import file_hash
 
 _RETARGET = 0.025
 _RESETS = 0.055
@@ -57,7 +57,7 @@ def run(
         episodes: Episodes of each demonstration in each engine.
     """
     from xreset.demos.archive import read_demos
-    from xreset.description import load_robot
+    from xreset.geometry.description import load_robot
     from xreset.resets import bank as bank_file
     from xreset.retarget import file
 

@@ -10,7 +10,7 @@ from rich.progress import track
 from xreset.cli._common import Host, Meshes, Port, Robot, Source
 from xreset.cli._terminal import console, show_notes
 from xreset.errors import XResetError
-from xreset.files import write_whole
+from xreset.files.storage import write_whole
 from xreset.pictures.view import data
 
 

@@ -15,12 +15,9 @@ from typing import Annotated, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xreset.checks import Seed, frozen, is_rigid, names_wrong_arguments
 from xreset.errors import DemoError, ObjectError
-from xreset.geometry.shapes import quat_of, turn_of
-from xreset.objects.catalogue import canonical_names, load_object, object_names, official_name
-from xreset.objects.rest import rest_height
-from xreset.records import (
+from xreset.files.checks import Seed, frozen, is_rigid, names_wrong_arguments
+from xreset.files.records import (
     POSITION,
     RATE,
     UNIT_TOLERANCE,
@@ -32,8 +29,11 @@ from xreset.records import (
     record_problem,
     write_record,
 )
+from xreset.files.text import Brief, shown
+from xreset.geometry.shapes import quat_of, turn_of
+from xreset.objects.catalogue import canonical_names, load_object, object_names, official_name
+from xreset.objects.rest import rest_height
 from xreset.spec import ObjectSpec
-from xreset.text import Brief, shown
 
 SCHEMA_NAME = "xreset-demos/1"
 SIDES = ("right", "left")
@@ -427,7 +427,7 @@ def write_demos(
     config: Mapping[str, Any] | None = None,
     inputs: Mapping[str, str] | None = None,
 ) -> None:
-    """Write an archive (see :func:`xreset.records.write_npz` for ``config`` and ``inputs``).
+    """Write an archive (see :func:`xreset.files.records.write_npz` for ``config`` and ``inputs``).
 
     Raises:
         DemoError: the demonstrations hold a value that the archive may not hold.

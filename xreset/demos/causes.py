@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from xreset.checks import frozen
+from xreset.files.checks import frozen
 from xreset.geometry.shapes import transformed
 from xreset.geometry.surface import Surface
 from xreset.spec import TableSpec

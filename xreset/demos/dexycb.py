@@ -21,14 +21,14 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from xreset.checks import is_rigid
 from xreset.demos.archive import SIDES, Demos, merge_demos, one_sequence
 from xreset.errors import DemoError, FileFormatError
+from xreset.files.checks import is_rigid
+from xreset.files.progress import Progress, unseen
+from xreset.files.records import Field, read_npz
+from xreset.files.text import shown
 from xreset.geometry.shapes import transformed
 from xreset.objects.ycb import NAME_OF_ID
-from xreset.progress import Progress, unseen
-from xreset.records import Field, read_npz
-from xreset.text import shown
 
 FPS = 30.0
 _MAX_YAML_BYTES = 1 << 20

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from xreset.checks import frozen
 from xreset.demos.archive import Demos, demo_objects, levelled
 from xreset.demos.causes import MOVED, Recording, length_text, likeliest_cause, unnoticed_cause
 from xreset.demos.hand import ORDERS, bone_lengths
 from xreset.errors import DemoError
+from xreset.files.checks import frozen
 from xreset.geometry.shapes import turn_of
 from xreset.geometry.surface import Surface, prepared_surface
 

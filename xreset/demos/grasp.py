@@ -15,8 +15,8 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from xreset.checks import frozen
 from xreset.demos import hand
+from xreset.files.checks import frozen
 from xreset.geometry.shapes import half_spaces, plane_heights
 from xreset.spec import ObjectSpec
 

@@ -19,8 +19,8 @@ from xreset.demos.archive import Demos, merge_demos
 from xreset.demos.keypoints import Convention, read_transform, sequence_of
 from xreset.demos.pickles import array_of, read_pickle
 from xreset.errors import DemoError
-from xreset.records import Arrays
-from xreset.text import shown
+from xreset.files.records import Arrays
+from xreset.files.text import shown
 
 _FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 """To the axes of the cameras of :class:`xreset.demos.keypoints.Convention`: x right, y down, z forward."""

@@ -19,17 +19,17 @@ import numpy as np
 from scipy.interpolate import interp1d
 from scipy.spatial.transform import Rotation, Slerp
 
-from xreset.checks import frozen, is_rigid
 from xreset.demos import hand
 from xreset.demos.archive import SIDES, Demos, merge_demos, one_sequence
 from xreset.demos.examine import examine, refuse_wrong, surfaces_of
 from xreset.demos.hand import ORDERS, Order
 from xreset.errors import DemoError
-from xreset.files import max_bytes
+from xreset.files.checks import frozen, is_rigid
+from xreset.files.records import RATE, UNIT_TOLERANCE, Arrays, Field, read_npz
+from xreset.files.storage import max_bytes
+from xreset.files.text import is_plain, shown
 from xreset.geometry.shapes import transformed
 from xreset.objects.catalogue import official_name
-from xreset.records import RATE, UNIT_TOLERANCE, Arrays, Field, read_npz
-from xreset.text import is_plain, shown
 
 Motion = tuple[np.ndarray, np.ndarray, Rotation]
 """Keypoints [F, 21, 3], object positions [F, 3] and F object orientations."""

@@ -16,9 +16,9 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from xreset.checks import frozen
 from xreset.demos.archive import Demos, levelled
 from xreset.errors import DemoError
+from xreset.files.checks import frozen
 from xreset.geometry.shapes import perpendicular, turn_of
 from xreset.spec import ObjectSpec, TableSpec
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from xreset.errors import DemoError
-from xreset.text import shown
+from xreset.files.text import shown
 
 _MAX_BYTES = 1 << 20
 """Largest file; a frame of HO-3D has a few kilobytes."""

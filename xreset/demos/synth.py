@@ -17,15 +17,15 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xreset.checks import Seed
 from xreset.demos import hand
 from xreset.demos.archive import Demos, merge_demos, one_sequence
 from xreset.demos.grasp import Contacts, Grasp, Solid, fit_hand, handedness, plan_contacts
 from xreset.errors import DemoError
+from xreset.files.checks import Seed
+from xreset.files.progress import unseen
 from xreset.geometry.shapes import turn_of
 from xreset.objects.catalogue import load_objects
 from xreset.objects.rest import rest_height, resting_orientation
-from xreset.progress import unseen
 from xreset.spec import ObjectSpec
 
 SUBJECT = "synthetic"

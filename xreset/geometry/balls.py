@@ -17,15 +17,15 @@ import torch
 from scipy.spatial import ConvexHull
 from torch import Tensor
 
-from xreset.checks import frozen
 from xreset.errors import RobotError
+from xreset.files.checks import frozen
 from xreset.geometry.collision import SelfCollision, bounding_ball, support_points
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import half_spaces, plane_heights, shape_mesh, surface_of, transformed
 from xreset.geometry.solids import link_field
+from xreset.physics.tensors import Tensors
 from xreset.spec import Geometry, Shape
-from xreset.tensors import Tensors
 
 SPACING = 4e-3
 """Balls need not be closer than this, however thin the shape [m]. From a radius of 2.8 mm on they leave no hole;

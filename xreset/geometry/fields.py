@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.checks import frozen
-from xreset.tensors import Tensors
+from xreset.files.checks import frozen
+from xreset.physics.tensors import Tensors
 
 
 @frozen

@@ -18,9 +18,9 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from xreset.errors import ObjectError
-from xreset.files import max_bytes
+from xreset.files.storage import max_bytes
+from xreset.files.text import shown
 from xreset.spec import Geometry, Shape
-from xreset.text import shown
 
 if TYPE_CHECKING:
     import trimesh

@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.shapes import half_spaces, plane_heights, shape_mesh, surface_of, turn_of
+from xreset.physics.tensors import one_thread
 from xreset.spec import ObjectSpec, Shape
-from xreset.tensors import one_thread
 
 _SAMPLE_SPACING = 0.003
 """Typical distance of the samples that narrow the search for the nearest triangle [m]."""

@@ -21,12 +21,12 @@ from xml.parsers import expat
 
 import numpy as np
 
-from xreset.checks import frozen
 from xreset.errors import ObjectError, RobotError
-from xreset.files import max_bytes
+from xreset.files.checks import frozen
+from xreset.files.storage import max_bytes
+from xreset.files.text import is_plain, shown
 from xreset.geometry.shapes import hull, load_mesh, refuse_pointer, shape_mesh, surface_of
 from xreset.spec import Geometry, MimicSpec, RobotSpec, Shape
-from xreset.text import is_plain, shown
 
 if TYPE_CHECKING:
     import trimesh

@@ -11,10 +11,10 @@ from typing import Annotated, Any
 
 import torch
 
-from xreset.checks import NonNegativeFloat, NonNegativeInt, Rule, from_dict, frozen
 from xreset.errors import FileFormatError, RunError
-from xreset.files import atomic_write
-from xreset.text import shown
+from xreset.files.checks import NonNegativeFloat, NonNegativeInt, Rule, from_dict, frozen
+from xreset.files.storage import atomic_write
+from xreset.files.text import shown
 
 
 def _are_tensors(values: Any) -> bool:

@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import asdict
 from pathlib import Path
 
-from xreset.checks import NonNegativeFloat, NonNegativeInt, Share, frozen
-from xreset.files import read_typed, write_json
+from xreset.files.checks import NonNegativeFloat, NonNegativeInt, Share, frozen
+from xreset.files.storage import read_typed, write_json
 
 SCHEMA = "xreset-lift/1"
 FILE = "lift.json"

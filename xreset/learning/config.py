@@ -9,8 +9,16 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
-from xreset.checks import Checked, NonNegativeFloat, PositiveFloat, PositiveInt, Rule, Share, frozen
 from xreset.errors import WrongValueError
+from xreset.files.checks import (
+    Checked,
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+    Rule,
+    Share,
+    frozen,
+)
 from xreset.task.config import (
     ActionConfig,
     ObservationConfig,

@@ -10,7 +10,7 @@ import os
 
 import torch
 
-from xreset.checks import frozen
+from xreset.files.checks import frozen
 
 SEED_STRIDE = 7919
 """Difference between the seeds of two processes, so that each simulates other episodes."""

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING
 import torch
 from tensordict import TensorDict
 
-from xreset.files import check_suffix, code_version, file_hash, must_exist, write_whole
+from xreset.files.storage import check_suffix, code_version, file_hash, must_exist, write_whole
 from xreset.learning.checkpoint import must_fit, read_checkpoint
 from xreset.learning.model import ExportedPolicy, PointNetLstmModel, make_actor
 from xreset.learning.run import read_run
-from xreset.policy import (
+from xreset.policy.onnx_policy import (
     CHECKPOINT_KEY,
     INPUTS,
     METADATA_KEY,
@@ -41,7 +41,7 @@ def exported(
 
     Args:
         actor: trained actor.
-        contract: what the policy needs to run: see :func:`xreset.policy.policy_contract`.
+        contract: what the policy needs to run: see :func:`xreset.policy.onnx_policy.policy_contract`.
         checkpoint: file with the actor's weights, of which the policy states the hash; None: there is none.
     """
     import onnx

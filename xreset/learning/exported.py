@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from xreset.errors import PolicyError
-from xreset.files import file_hash
+from xreset.files.storage import file_hash
 from xreset.learning.run import checkpoints, latest_checkpoint, read_choice
-from xreset.policies import shipped
-from xreset.policy import OnnxPolicy
+from xreset.policy.onnx_policy import OnnxPolicy
+from xreset.policy.shipped import shipped
 
 
 def read_policy(policy: str | Path, *, also: Sequence[str] = ()) -> OnnxPolicy:

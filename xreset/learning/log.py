@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from xreset.errors import needs
-from xreset.files import read_json
+from xreset.files.storage import read_json
 from xreset.learning.clock import Lift, read_lift, write_lift
 
 RECENT = 20

@@ -16,10 +16,10 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor
 
-from xreset.capture import GraphRunner
 from xreset.learning.config import TrainConfig
 from xreset.learning.distributed import Processes
 from xreset.learning.model import LstmState, ReturnCritic, make_actor, make_critic
+from xreset.physics.capture import GraphRunner
 
 BOUND = 1.1
 """Mean of an action beyond which ``bounds_loss`` pulls it back."""

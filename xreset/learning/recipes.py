@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from xreset.cameras.config import VisionConfig
-from xreset.checks import from_dict, frozen, merged
 from xreset.errors import RunError
+from xreset.files.checks import from_dict, frozen, merged
+from xreset.files.text import plain
 from xreset.learning.config import TrainConfig
 from xreset.learning.run import read_run
 from xreset.task.config import TaskConfig
-from xreset.text import plain
 
 
 @frozen

@@ -17,13 +17,13 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-from xreset.checks import Checked, NonNegativeInt, PositiveInt, Rule, Share, from_dict, frozen
 from xreset.errors import RunError, WrongValueError
-from xreset.files import read_json, read_typed, write_json
+from xreset.files.checks import Checked, NonNegativeInt, PositiveInt, Rule, Share, from_dict, frozen
+from xreset.files.storage import read_json, read_typed, write_json
+from xreset.files.text import shown
 from xreset.learning.config import TrainConfig
-from xreset.plugins import robot_names
+from xreset.physics.plugins import robot_names
 from xreset.task.contract import Contract
-from xreset.text import shown
 
 SCHEMA = "xreset-run/1"
 TEACHER = "teacher.onnx"
@@ -54,7 +54,7 @@ class RunInfo(Checked):
     seed: NonNegativeInt
     config: TrainConfig
     contract: Contract
-    """:func:`xreset.policy.policy_contract`."""
+    """:func:`xreset.policy.onnx_policy.policy_contract`."""
     weights: str | None = None
     """Path of the checkpoint whose networks the training started with; None: new networks."""
     weights_hash: str | None = None

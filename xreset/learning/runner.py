@@ -16,7 +16,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from xreset.env import ManipulationEnv
+from xreset.env.manipulation import ManipulationEnv
 from xreset.errors import RunError
 from xreset.learning.checkpoint import (
     Checkpoint,
@@ -39,7 +39,7 @@ FAULT_WINDOW = 200
 
 
 class TrainingRunner:
-    """Runs iterations of PPO, or of a distillation, on a :class:`~xreset.env.ManipulationEnv`.
+    """Runs iterations of PPO, or of a distillation, on a :class:`~xreset.env.manipulation.ManipulationEnv`.
 
     Attributes:
         iteration: number of iterations done.

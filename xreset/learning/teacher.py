@@ -14,7 +14,7 @@ from torch import Tensor
 from xreset.errors import PolicyError
 from xreset.learning.config import ModelConfig
 from xreset.learning.model import PointNetLstmModel
-from xreset.policy import OnnxPolicy, observation_shapes
+from xreset.policy.onnx_policy import OnnxPolicy, observation_shapes
 
 if TYPE_CHECKING:
     from onnx import GraphProto

@@ -21,11 +21,11 @@ from xreset.cameras.config import (
     VisionConfig,
     check_each_once,
 )
-from xreset.checks import Seed, names_wrong_arguments
-from xreset.env import make_env
+from xreset.env.manipulation import make_env
 from xreset.errors import PolicyError, RunError, XResetError
-from xreset.files import claim_folder, file_hash, write_whole
-from xreset.inputs import Inputs, load_inputs
+from xreset.files.checks import Seed, names_wrong_arguments
+from xreset.files.storage import claim_folder, file_hash, write_whole
+from xreset.files.text import shown
 from xreset.learning.config import TrainConfig
 from xreset.learning.distributed import Processes, leave
 from xreset.learning.export import export_checkpoint
@@ -46,13 +46,13 @@ from xreset.learning.run import (
     write_run,
 )
 from xreset.learning.runner import TrainingRunner
-from xreset.plugins import backend_class, device_for
-from xreset.policies import shipped
-from xreset.policy import OnnxPolicy, check_contract, policy_contract
+from xreset.physics.plugins import backend_class, device_for
+from xreset.policy.onnx_policy import OnnxPolicy, check_contract, policy_contract
+from xreset.policy.shipped import shipped
 from xreset.resets.bank import ResetBank, read_bank, write_bank
 from xreset.resets.goals import GoalSet, read_goals, with_goals, write_goals
+from xreset.resets.inputs import Inputs, load_inputs
 from xreset.task.rewards import RewardFunction
-from xreset.text import shown
 
 
 def train(

@@ -14,11 +14,11 @@ import numpy as np
 import torch
 
 from xreset.errors import PolicyError
-from xreset.files import atomic_folder, code_version, is_occupied, write_json
+from xreset.files.storage import atomic_folder, code_version, is_occupied, write_json
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import robot_tree
 from xreset.objects.sampling import center, surface_points
-from xreset.policy import policy_contract
+from xreset.policy.onnx_policy import policy_contract
 from xreset.runtime import check_contract
 from xreset.runtime import contract as files
 from xreset.spec import MimicSpec, ObjectSpec, RobotSpec

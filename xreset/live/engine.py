@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.env import ManipulationEnv
+from xreset.env.manipulation import ManipulationEnv
 from xreset.live.deploy import deploy_contract
 from xreset.runtime import Controller, Driver, Links, OnnxActor, Reading
 

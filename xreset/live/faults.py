@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from xreset.checks import Checked, NonNegativeFloat, Share, frozen
-from xreset.env import ManipulationEnv
+from xreset.env.manipulation import ManipulationEnv
+from xreset.files.checks import Checked, NonNegativeFloat, Share, frozen
 from xreset.geometry.shapes import turn_of
 from xreset.live.engine import EngineDriver
 from xreset.runtime import Reading

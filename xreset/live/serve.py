@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from xreset.checks import check_port
 from xreset.errors import XResetError, needs
+from xreset.files.checks import check_port
 from xreset.runtime import Controller, LiveError, OnnxActor, Reading
 from xreset.runtime.remote import LIVE_SCHEMA
 from xreset.runtime.rotations import is_unit

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from xreset.errors import FileFormatError, ObjectError, XResetError
+from xreset.files.records import POSITION, Field, read_npz, write_npz
 from xreset.geometry.shapes import hull
 from xreset.objects.decompose import Pieces, Settings, decompose
-from xreset.records import POSITION, Field, read_npz, write_npz
 
 if TYPE_CHECKING:
     import trimesh

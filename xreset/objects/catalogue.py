@@ -7,11 +7,11 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from xreset.errors import ObjectError
+from xreset.files.text import short_name, shown
 from xreset.objects.meshes import import_mesh
 from xreset.objects.standins import STAND_INS, stand_in
 from xreset.objects.ycb import ALIAS_OF
 from xreset.spec import ObjectSpec
-from xreset.text import short_name, shown
 
 ALIASES = {alias: name for name, alias in ALIAS_OF.items()}
 """The paper's names -> official names."""

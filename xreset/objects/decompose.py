@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
 
-from xreset.checks import frozen
 from xreset.errors import ObjectError, needs
+from xreset.files.checks import frozen
 from xreset.geometry.shapes import (
     MANY_POINTS,
     half_spaces,

@@ -13,16 +13,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import QhullError
 
-from xreset.checks import frozen
 from xreset.errors import ObjectError
-from xreset.files import file_hash, write_whole
+from xreset.files.checks import frozen
+from xreset.files.storage import file_hash, write_whole
+from xreset.files.text import shown
 from xreset.geometry.shapes import load_mesh, mesh_arrays, shell_properties
 from xreset.objects.cache import cached_pieces
 from xreset.objects.decompose import WALL, Pieces, Settings, openings
 from xreset.objects.properties import Properties, properties_of
 from xreset.objects.ycb import MASSES
 from xreset.spec import ObjectSpec
-from xreset.text import shown
 
 if TYPE_CHECKING:
     import trimesh

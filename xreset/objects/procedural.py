@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from xreset.errors import ObjectError, needs
-from xreset.files import atomic_folder
+from xreset.files.storage import atomic_folder
 from xreset.geometry.shapes import hull, loft, prism, section, shape_mesh
 from xreset.objects.properties import Properties
 from xreset.spec import Shape

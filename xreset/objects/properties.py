@@ -6,9 +6,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from xreset.checks import Checked, Rule, from_dict, frozen
 from xreset.errors import ObjectError, WrongValueError
-from xreset.files import read_toml
+from xreset.files.checks import Checked, Rule, from_dict, frozen
+from xreset.files.storage import read_toml
 
 
 def _within(low: float, high: float) -> Rule:

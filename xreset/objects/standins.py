@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from xreset.errors import ObjectError
-from xreset.files import read_toml
+from xreset.files.storage import read_toml
 from xreset.geometry.shapes import (
     box,
     cylinder,

@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from xreset.errors import ObjectError
-from xreset.files import read_toml
+from xreset.files.storage import read_toml
 
 _FACTS = read_toml(Path(__file__).with_name("ycb.toml"), error=ObjectError)
 

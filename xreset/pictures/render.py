@@ -17,9 +17,9 @@ import torch
 import trimesh
 from PIL import Image, ImageDraw, ImageFont
 
-from xreset.checks import frozen
 from xreset.errors import XResetError
-from xreset.files import write_whole
+from xreset.files.checks import frozen
+from xreset.files.storage import write_whole
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import look_at, pose_matrix
 from xreset.geometry.urdf import link_meshes

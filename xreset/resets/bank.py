@@ -15,8 +15,6 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from xreset.accounts import Account, accounts
-from xreset.checks import frozen
 from xreset.demos.archive import (
     ObjectMotions,
     OneText,
@@ -25,7 +23,8 @@ from xreset.demos.archive import (
     SequenceTexts,
 )
 from xreset.errors import FileFormatError, XResetError
-from xreset.records import (
+from xreset.files.checks import frozen
+from xreset.files.records import (
     JOINT,
     POSITION,
     Arrays,
@@ -35,9 +34,10 @@ from xreset.records import (
     unique_problem,
     write_record,
 )
+from xreset.files.text import Brief, shown
+from xreset.retarget.accounts import Account, accounts
 from xreset.retarget.file import JointNames, ReasonNames
 from xreset.spec import ObjectSpec, RobotSpec, check_joints, check_robot
-from xreset.text import Brief, shown
 
 SCHEMA = "xreset-resets/1"
 

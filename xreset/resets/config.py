@@ -4,7 +4,7 @@ The defaults are those of the headline results (docs/results.md)."""
 
 from __future__ import annotations
 
-from xreset.checks import (
+from xreset.files.checks import (
     Checked,
     Length,
     NonNegativeFloat,

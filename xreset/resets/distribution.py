@@ -15,15 +15,15 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from xreset.checks import frozen
 from xreset.errors import DemoError
+from xreset.files.checks import frozen
 from xreset.geometry.rotations import quat_from_axis_angle, quat_multiply, quat_rotate
 from xreset.geometry.urdf import joint_limits
 from xreset.objects.sampling import center
+from xreset.physics.tensors import Tensors, where
 from xreset.resets.bank import ResetBank
 from xreset.spec import GRAVITY, ObjectSpec, RobotSpec
 from xreset.task.config import ResetConfig, TaskConfig
-from xreset.tensors import Tensors, where
 
 
 @frozen

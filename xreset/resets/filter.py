@@ -13,10 +13,10 @@ from functools import partial
 import numpy as np
 import torch
 
-from xreset.checks import PositiveInt
 from xreset.errors import DemoError
+from xreset.files.checks import PositiveInt
+from xreset.files.progress import Progress, unseen
 from xreset.physics import State
-from xreset.progress import Progress, unseen
 from xreset.resets.bank import ResetBank, starts_and_goals
 from xreset.resets.closing import closing_states
 from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig, TransferConfig

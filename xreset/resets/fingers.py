@@ -12,7 +12,7 @@ import torch
 from scipy.optimize import nnls
 from torch import Tensor
 
-from xreset.checks import frozen
+from xreset.files.checks import frozen
 from xreset.geometry.balls import link_balls
 from xreset.geometry.dynamics import drive_values
 from xreset.geometry.fields import DistanceFields

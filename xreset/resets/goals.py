@@ -22,15 +22,15 @@ from typing import Annotated
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xreset.checks import frozen
 from xreset.demos.synth import LIFT, WORKSPACE
-from xreset.description import load_robot
 from xreset.errors import FileFormatError, GoalError
+from xreset.files.checks import frozen
+from xreset.files.progress import unseen
+from xreset.files.records import Field, read_record, schema_of, write_record
+from xreset.geometry.description import load_robot
 from xreset.geometry.shapes import quat_of, turn_of
 from xreset.objects.catalogue import load_objects
 from xreset.objects.rest import rest_height, resting_orientation
-from xreset.progress import unseen
-from xreset.records import Field, read_record, schema_of, write_record
 from xreset.resets.bank import ResetBank, bank_problem, check_objects, no_states
 from xreset.resets.config import GoalConfig
 from xreset.resets.reach import Reach
@@ -150,7 +150,7 @@ def make_goals(
 
 
 def write_goals(path: str | Path, goals: GoalSet, config: GoalConfig | None = None) -> None:
-    """Write a goal set; see :func:`xreset.records.write_record`."""
+    """Write a goal set; see :func:`xreset.files.records.write_record`."""
     made_with = asdict(config) if config else None
     write_record(GoalSet, path, SCHEMA, goals, check=bank_problem, config=made_with)
 

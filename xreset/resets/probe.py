@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from xreset.physics import Backend, State
-from xreset.plugins import device_for, make_backend
+from xreset.physics.plugins import device_for, make_backend
 from xreset.resets.config import FilterConfig
-from xreset.schedule import schedule
+from xreset.resets.schedule import schedule
 from xreset.spec import SceneSpec
 from xreset.task.terminations import out_of_bounds
 

@@ -13,12 +13,12 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from xreset.geometry.rotations import matrix_to_quat
+from xreset.physics.tensors import one_thread
 from xreset.retarget.arm.config import QUICK
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track
 from xreset.retarget.validity import Thresholds, classify
 from xreset.spec import RobotSpec
-from xreset.tensors import one_thread
 
 _TILTS = (0.0, 30.0, -30.0)
 """Angles by which a grasp's fingers point further down than at home [degrees]."""

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from xreset.files.progress import Progress, unseen
 from xreset.physics import Backend, State
-from xreset.progress import Progress, unseen
 from xreset.resets.bank import ResetBank
 from xreset.resets.config import FilterConfig
 from xreset.resets.probe import probe, rejection

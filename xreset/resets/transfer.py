@@ -18,12 +18,13 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from xreset.checks import PositiveInt, frozen
 from xreset.errors import DemoError
+from xreset.files.checks import PositiveInt, frozen
+from xreset.files.progress import unseen
 from xreset.geometry.rotations import matrix_to_quat, quat_angle
 from xreset.geometry.shapes import turn_of
 from xreset.physics import Backend, State
-from xreset.progress import unseen
+from xreset.physics.tensors import one_thread
 from xreset.resets.bank import ResetBank, check_states
 from xreset.resets.config import TransferConfig
 from xreset.resets.probe import probe
@@ -33,7 +34,6 @@ from xreset.retarget.arm.solve import track
 from xreset.retarget.file import Retargeted
 from xreset.retarget.validity import Thresholds, classify
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, checked_objects, objects_named
-from xreset.tensors import one_thread
 
 # These limits were measured together (docs/lab-book.md, "Grasps of other demonstrations"), and none was varied.
 _CARRIED = 0.02

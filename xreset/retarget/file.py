@@ -11,8 +11,6 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from xreset.accounts import Account, accounts
-from xreset.checks import frozen
 from xreset.demos.archive import (
     FrameFlags,
     FramePositions,
@@ -25,8 +23,8 @@ from xreset.demos.archive import (
     sequences_problem,
 )
 from xreset.errors import FileFormatError
-from xreset.geometry.urdf import joint_limits
-from xreset.records import (
+from xreset.files.checks import frozen
+from xreset.files.records import (
     JOINT,
     POSITION,
     RATE,
@@ -36,6 +34,8 @@ from xreset.records import (
     read_record,
     write_record,
 )
+from xreset.geometry.urdf import joint_limits
+from xreset.retarget.accounts import Account, accounts
 from xreset.spec import RobotSpec, check_robot
 
 SCHEMA = "xreset-retargeted/1"

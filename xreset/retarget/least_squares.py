@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from xreset.geometry.rotations import matvec
-from xreset.tensors import Tensors, where
+from xreset.physics.tensors import Tensors, where
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def minimize(
     """Take damped Gauss-Newton steps. A problem keeps a step if it lowers the cost, and is left out when it is done.
 
     Args:
-        x: first guess: a tensor, or a bundle of tensors (:class:`~xreset.tensors.Tensors`), of B rows.
+        x: first guess: a tensor, or a bundle of tensors (:class:`~xreset.physics.tensors.Tensors`), of B rows.
         evaluate: returns costs and their approximation, a bundle with ``cost`` [R], given x [R, ...] and the indices
             [R] of the problems.
         step: returns x after a damped step, given x, the approximation and the damping [R].

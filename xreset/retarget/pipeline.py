@@ -13,13 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.checks import Checked, frozen
 from xreset.demos.archive import Demos, grounded, levelled
 from xreset.demos.examine import examine, refuse_wrong
+from xreset.files.checks import Checked, frozen
+from xreset.files.progress import Progress, unseen
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.rotations import matrix_to_quat
 from xreset.geometry.surface import Surface, prepared_surface
-from xreset.progress import Progress, unseen
+from xreset.physics.tensors import one_thread
 from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track
@@ -30,7 +31,6 @@ from xreset.retarget.hand.model import HandModel, HandState, HandTargets
 from xreset.retarget.hand.solve import retarget_hand
 from xreset.retarget.validity import REASONS, Thresholds, classify
 from xreset.spec import ObjectSpec, RobotSpec, checked_objects, objects_named
-from xreset.tensors import one_thread
 
 _log = logging.getLogger(__name__)
 _SEQUENCES_PER_BATCH = 24

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from xreset.checks import frozen
+from xreset.files.checks import frozen
 
 REASONS = (
     "valid",

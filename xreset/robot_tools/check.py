@@ -11,13 +11,13 @@ from typing import Literal
 import numpy as np
 import torch
 
-from xreset.description import DESCRIPTION, load_robot
 from xreset.errors import RobotError, XResetError
 from xreset.geometry.collision import SelfCollision, table_clearance
+from xreset.geometry.description import DESCRIPTION, load_robot
 from xreset.geometry.dynamics import damping_ratio, drive_inertia
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import RobotTree, load_urdf, mismatches
-from xreset.plugins import robot_folder
+from xreset.physics.plugins import robot_folder
 from xreset.retarget.hand.model import HandModel, predicted_gigabytes
 from xreset.robot_tools.draft import link_places
 from xreset.robot_tools.opposition import opposition

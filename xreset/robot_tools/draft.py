@@ -10,7 +10,7 @@ import jinja2
 import numpy as np
 import torch
 
-from xreset.description import SCHEMA
+from xreset.geometry.description import SCHEMA
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import RobotTree
 from xreset.geometry.urdf_writer import urdf_text, write_meshes

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from xreset.checks import frozen
 from xreset.errors import RobotError
+from xreset.files.checks import frozen
 from xreset.geometry.collision import bounding_ball
 from xreset.geometry.shapes import surface_of, transform, transformed
 from xreset.geometry.urdf import RobotTree

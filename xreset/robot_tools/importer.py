@@ -14,11 +14,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xreset.checks import frozen
-from xreset.description import DESCRIPTION
 from xreset.errors import RobotError
-from xreset.files import atomic_folder, is_occupied
+from xreset.files.checks import frozen
+from xreset.files.storage import atomic_folder, is_occupied
+from xreset.files.text import listed
 from xreset.geometry.collision import SelfCollision
+from xreset.geometry.description import DESCRIPTION
 from xreset.geometry.dynamics import drive_inertia
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import roll_pitch_yaw, surface_of
@@ -37,7 +38,6 @@ from xreset.robot_tools.sources import (
     renamed,
 )
 from xreset.spec import RobotSpec, SceneSpec
-from xreset.text import listed
 
 _ROTOR = 1e-3
 """[kg m^2] Rotor inertia on the diagonal of moving hand links where none is stated: finger links alone are too light

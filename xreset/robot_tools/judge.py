@@ -18,8 +18,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.checks import PositiveInt, frozen
 from xreset.errors import RobotError
+from xreset.files.checks import PositiveInt, frozen
+from xreset.files.progress import unseen
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import (
     matrix_to_quat,
@@ -33,7 +34,6 @@ from xreset.geometry.rotations import (
 )
 from xreset.physics import Backend, State
 from xreset.pictures.render import Camera, Renderer, add_caption
-from xreset.progress import unseen
 from xreset.resets.bank import ResetBank, check_states
 from xreset.resets.config import JUDGE_SQUEEZE, SqueezeConfig
 from xreset.resets.fingers import Fingers, fingers_of, squeeze_targets

@@ -15,13 +15,13 @@ import mujoco
 import numpy as np
 
 from xreset.errors import ObjectError, RobotError
-from xreset.files import RAISE_LIMIT, max_bytes
+from xreset.files.storage import RAISE_LIMIT, max_bytes
+from xreset.files.text import listed
 from xreset.geometry.shapes import hull, refuse_pointer, transform
 from xreset.geometry.urdf import HULL_TOLERANCE, Joint, Link, RobotTree, check_tree
 from xreset.geometry.urdf_writer import fixed, frame
 from xreset.robot_tools.couplings import SLIDE, Couplings, Pull, joint_name
 from xreset.spec import Geometry, MimicSpec, Shape
-from xreset.text import listed
 
 _COMPILE = """
 import resource, sys

@@ -18,10 +18,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from xreset.errors import RobotError
+from xreset.files.progress import Progress, unseen
 from xreset.geometry.collision import table_clearance
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import quat_of, turn_of
-from xreset.progress import Progress, unseen
+from xreset.physics.tensors import one_thread
 from xreset.retarget.arm.config import QUICK
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track
@@ -29,7 +30,6 @@ from xreset.retarget.validity import Thresholds, classify
 from xreset.robot_tools.homes import hold_near
 from xreset.robot_tools.placement import Finalist, PlaceConfig
 from xreset.spec import RobotSpec, TableSpec
-from xreset.tensors import one_thread
 
 _POSITION = 0.005
 _ORIENTATION = np.radians(5.0)

@@ -9,9 +9,9 @@ from math import inf
 from pathlib import Path
 from typing import Annotated
 
-from xreset.checks import Checked, NonNegativeFloat, NonNegativeInt, PositiveInt, Rule, frozen
 from xreset.errors import RobotError
-from xreset.files import write_whole
+from xreset.files.checks import Checked, NonNegativeFloat, NonNegativeInt, PositiveInt, Rule, frozen
+from xreset.files.storage import write_whole
 from xreset.spec import RobotSpec
 
 Span = Annotated[

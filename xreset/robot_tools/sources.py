@@ -13,11 +13,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xreset.errors import RobotError, needs
+from xreset.files.text import listed
 from xreset.geometry.shapes import shape_mesh, surface_of
 from xreset.geometry.urdf import Joint, Link, RobotTree, load_urdf, parse_xml
 from xreset.geometry.urdf_writer import FRAME_INERTIA, FRAME_MASS, fixed
 from xreset.objects.decompose import mass_of_shapes
-from xreset.text import listed
 
 _DENSITY = 1000.0
 """[kg/m^3] Density of links whose mass is not stated."""

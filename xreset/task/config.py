@@ -12,7 +12,8 @@ from numbers import Real
 from typing import Annotated, Any, ClassVar, Literal
 
 from xreset.cameras.config import VisionConfig
-from xreset.checks import (
+from xreset.errors import WrongValueError, XResetError
+from xreset.files.checks import (
     Checked,
     NonNegativeFloat,
     PositiveFloat,
@@ -22,10 +23,9 @@ from xreset.checks import (
     Share,
     frozen,
 )
-from xreset.errors import WrongValueError, XResetError
+from xreset.files.text import shown
 from xreset.task.legacy import ObservationOptions, RewardOptions
 from xreset.task.terms import Named, OneTerm, Terms, Weighted
-from xreset.text import shown
 
 LONGEST_EPISODE = 1e6
 """Longest episode [s]: the largest time that a file of traces may hold."""

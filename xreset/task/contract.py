@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from xreset.checks import PositiveFloat, PositiveInt, frozen
+from xreset.files.checks import PositiveFloat, PositiveInt, frozen
 from xreset.task.config import TaskConfig
 
 SCHEMA = "xreset-policy/1"
@@ -30,4 +30,4 @@ class Contract:
     control_dt: PositiveFloat
     """Time between two actions [s]."""
     task: TaskConfig
-    """The task of the training; :func:`xreset.policy.check_contract` compares the parts of it that must agree."""
+    """The task of the training. ``check_contract`` compares the parts of it that must agree."""

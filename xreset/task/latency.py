@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
+from xreset.physics.tensors import where
 from xreset.task.worlds import Sample, Worlds
-from xreset.tensors import where
 
 
 class DelayLine:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import field
 from typing import Any, Literal
 
-from xreset.checks import (
+from xreset.files.checks import (
     Checked,
     FiniteFloat,
     NonNegativeFloat,

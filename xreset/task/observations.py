@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from xreset.cameras.config import VisionConfig
-from xreset.checks import NonNegativeFloat, PositiveFloat, PositiveInt, frozen
+from xreset.files.checks import NonNegativeFloat, PositiveFloat, PositiveInt, frozen
 from xreset.geometry.rotations import (
     quat_conjugate,
     quat_from_axis_angle,

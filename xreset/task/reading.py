@@ -8,7 +8,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from xreset.checks import frozen
+from xreset.files.checks import frozen
 from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
 from xreset.physics import Backend, Contacts, Health, Links, State
 from xreset.task.rewards import Reward

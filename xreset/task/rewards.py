@@ -20,8 +20,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from xreset.checks import FiniteFloat, NonNegativeFloat, PositiveFloat, frozen
 from xreset.errors import RunError
+from xreset.files.checks import FiniteFloat, NonNegativeFloat, PositiveFloat, frozen
 from xreset.geometry.rotations import quat_angle, quat_rotate
 from xreset.physics import State
 from xreset.task.config import RewardConfig

@@ -13,8 +13,8 @@ from importlib import import_module
 from math import isfinite
 from typing import Annotated, Any
 
-from xreset.checks import Rule, parsed_arguments
 from xreset.errors import RunError, WrongValueError
+from xreset.files.checks import Rule, parsed_arguments
 
 
 class Terms(dict[str, dict[str, Any]]):

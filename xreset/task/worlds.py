@@ -9,7 +9,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from xreset.tensors import Tensors, where
+from xreset.physics.tensors import Tensors, where
 
 Sample = Callable[[torch.Generator], Tensor]
 """Draws new values of a buffer, as many as it has."""

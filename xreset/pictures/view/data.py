@@ -9,9 +9,9 @@ from typing import Literal
 
 import numpy as np
 
-from xreset.checks import frozen
 from xreset.demos.hand import PARENTS
 from xreset.errors import XResetError
+from xreset.files.checks import frozen
 from xreset.spec import ObjectSpec, RobotSpec
 
 Kind = Literal["demonstrations", "robot trajectories", "reset states", "starts"]

@@ -12,13 +12,13 @@ import numpy as np
 from xreset.demos.archive import Demos, ObjectMotions, read_demos
 from xreset.demos.examine import examine
 from xreset.errors import XResetError
+from xreset.files.records import stated_doubts
 from xreset.geometry.surface import prepared_surface
-from xreset.inputs import Inputs, load_inputs
 from xreset.objects.catalogue import canonical_name
 from xreset.pictures.view.data import View
-from xreset.records import stated_doubts
 from xreset.resets.bank import ResetBank
 from xreset.resets.goals import GoalSet
+from xreset.resets.inputs import Inputs, load_inputs
 from xreset.retarget.file import Retargeted
 from xreset.retarget.pipeline import RetargetConfig, human_contacts, rest_on_table
 from xreset.spec import ObjectSpec, RobotSpec

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from xreset.description import load_robot
+from xreset.geometry.description import load_robot
+from xreset.physics.plugins import robot_names
 from xreset.pictures.render import Points, Renderer, Size
 from xreset.pictures.view.colors import HUMAN_COLOR, REACHED_COLOR, TOUCH_COLOR, reason_color
 from xreset.pictures.view.data import BONES, View
-from xreset.plugins import robot_names
 from xreset.spec import SceneSpec
 
 _BONE_DOTS = 6

@@ -15,15 +15,15 @@ from urllib.parse import urlsplit
 import numpy as np
 import torch
 
-from xreset.checks import check_port
 from xreset.errors import XResetError, needs
+from xreset.files.checks import check_port
+from xreset.files.text import plain
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matrix_to_quat
 from xreset.geometry.urdf import link_meshes
 from xreset.pictures.meshes import TABLE_COLORS, Color, link_colors, rgb, tint
 from xreset.pictures.render import Camera
 from xreset.spec import RobotSpec, TableSpec
-from xreset.text import plain
 
 _LOG = logging.getLogger("xreset")
 IDLE = 0.1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from xreset.checks import frozen
+from xreset.files.checks import frozen
 
 
 @frozen

@@ -11,16 +11,16 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from xreset.checks import frozen
 from xreset.errors import RobotError
+from xreset.files.checks import frozen
 from xreset.geometry.balls import bounding_balls, joined
 from xreset.geometry.collision import SelfCollision, height_above_table, table_points
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matrix_to_quat, matvec, quat_angle
+from xreset.physics.tensors import Tensors
 from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.validity import Measures, Thresholds, classify
 from xreset.spec import RobotSpec, TableSpec
-from xreset.tensors import Tensors
 
 _SEARCH = 0.02
 """Distances between shapes, and heights above the table, are measured up to this one [m]."""

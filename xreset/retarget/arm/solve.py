@@ -28,11 +28,11 @@ from xreset.geometry.rotations import (
     quat_multiply,
     quat_to_axis_angle,
 )
+from xreset.physics.tensors import Tensors
 from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmModel, ArmProblem, ArmTargets, arm_jump
 from xreset.retarget.least_squares import Quadratic, damped, free_to_move, minimize
 from xreset.retarget.validity import REASONS, Measures, Thresholds, classify
-from xreset.tensors import Tensors
 
 _CONVERGED = 1e-5
 """Steps smaller than this end the iteration [rad or m]."""

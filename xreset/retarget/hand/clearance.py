@@ -13,14 +13,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from xreset.checks import frozen
+from xreset.files.checks import frozen
 from xreset.geometry.balls import STAND_IN
 from xreset.geometry.collision import height_above_table
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import PointJacobian
 from xreset.geometry.rotations import matvec
+from xreset.physics.tensors import Tensors
 from xreset.retarget.hand.model import HandModel
-from xreset.tensors import Tensors
 
 
 @frozen

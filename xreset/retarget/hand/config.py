@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from xreset.checks import frozen
+from xreset.files.checks import frozen
 
 Jaw = Literal["fingertips", "analytic"]
 """What a parallel jaw follows. ``fingertips``: the human's fingertips, like every hand. ``analytic``: the published

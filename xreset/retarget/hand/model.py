@@ -15,15 +15,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.checks import frozen
 from xreset.errors import RobotError
+from xreset.files.checks import frozen
 from xreset.geometry.balls import hand_balls
 from xreset.geometry.collision import SelfCollision
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics, PointJacobian
 from xreset.geometry.rotations import homogeneous, matvec, quat_to_matrix
+from xreset.physics.tensors import Tensors
 from xreset.spec import FINGERS, KEYPOINTS, RobotSpec, TableSpec
-from xreset.tensors import Tensors
 
 _PAD_DEPTH = 1e-3
 """A finger's pad consists of its balls at most this far behind the foremost one, towards the other finger [m]."""

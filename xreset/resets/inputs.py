@@ -9,15 +9,16 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
-from xreset.checks import frozen
 from xreset.demos.archive import SCHEMA_NAME as DEMOS
 from xreset.demos.archive import Demos, demo_objects, read_demos
-from xreset.description import load_robot
 from xreset.errors import DemoError, FileFormatError, XResetError
-from xreset.files import file_hash
+from xreset.files.checks import frozen
+from xreset.files.progress import Progress, unseen
+from xreset.files.records import npz_schema
+from xreset.files.storage import file_hash
+from xreset.files.text import shown
+from xreset.geometry.description import load_robot
 from xreset.objects.catalogue import canonical_names, load_objects
-from xreset.progress import Progress, unseen
-from xreset.records import npz_schema
 from xreset.resets.bank import SCHEMA as BANK
 from xreset.resets.bank import ResetBank, check_objects, read_bank, starts_and_goals
 from xreset.resets.goals import SCHEMA as GOALS
@@ -26,7 +27,6 @@ from xreset.retarget.file import SCHEMA as MOTION
 from xreset.retarget.file import Retargeted, check_retargeted, read_retargeted
 from xreset.retarget.pipeline import rest_on_table, retarget_demos
 from xreset.spec import ObjectSpec, RobotSpec, check_robot
-from xreset.text import shown
 
 Kind = Literal["demos", "motion", "bank", "goals"]
 Data = Demos | Retargeted | ResetBank

@@ -16,11 +16,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from xreset.checks import parsed
 from xreset.errors import RobotError
-from xreset.files import read_toml
+from xreset.files.checks import parsed
+from xreset.files.storage import read_toml
 from xreset.geometry.urdf import mesh_files
-from xreset.plugins import robot_folder, robot_names
+from xreset.physics.plugins import robot_folder, robot_names
 from xreset.spec import RobotSpec
 
 DESCRIPTION = "robot.toml"

@@ -16,19 +16,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.checks import names_wrong_arguments, parsed
 from xreset.errors import PolicyError, WrongValueError, needs
-from xreset.files import max_bytes, parse_json
+from xreset.files.checks import names_wrong_arguments, parsed
+from xreset.files.storage import max_bytes, parse_json
+from xreset.files.text import shown
 from xreset.spec import RobotSpec
 from xreset.task.config import TaskConfig
 from xreset.task.contract import SCHEMA, Contract
 from xreset.task.observations import Observer, cloud_shape, layout
-from xreset.text import shown
 
 if TYPE_CHECKING:
     from tensordict import TensorDict
 
-    from xreset.env import ManipulationEnv
+    from xreset.env.manipulation import ManipulationEnv
 
 METADATA_KEY = "xreset"
 """Key of the ONNX metadata entry that holds the contract as JSON."""

@@ -19,9 +19,9 @@ from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
 
-from xreset.checks import marks_of
 from xreset.errors import FileFormatError, XResetError
-from xreset.files import (
+from xreset.files.checks import marks_of
+from xreset.files.storage import (
     RAISE_LIMIT,
     atomic_write,
     check_schema,
@@ -29,7 +29,7 @@ from xreset.files import (
     max_bytes,
     must_exist,
 )
-from xreset.text import is_plain, plain, shown
+from xreset.files.text import is_plain, plain, shown
 
 T = TypeVar("T")
 

@@ -19,7 +19,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from xreset.errors import BackendUnavailableError, RobotError, XResetError
-from xreset.text import shown
+from xreset.files.text import shown
 
 if TYPE_CHECKING:
     from xreset.physics import Backend

@@ -17,16 +17,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.capture import GraphRunner
-from xreset.checks import Seed, names_wrong_arguments
 from xreset.errors import XResetError
+from xreset.files.checks import Seed, names_wrong_arguments
+from xreset.files.text import shown
 from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
 from xreset.objects.sampling import center, metric_points, surface_points
 from xreset.physics import Backend, Parameters, State
-from xreset.plugins import make_backend
+from xreset.physics.capture import GraphRunner
+from xreset.physics.plugins import make_backend
+from xreset.physics.tensors import where
 from xreset.resets.bank import ResetBank, check_states
 from xreset.resets.distribution import Reset, ResetDistribution
-from xreset.schedule import shared_worlds
+from xreset.resets.schedule import shared_worlds
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, checked_objects
 from xreset.task import observations as obs
 from xreset.task.actions import ActionSpace
@@ -36,8 +38,6 @@ from xreset.task.rewards import Reward, RewardFunction, RewardInput
 from xreset.task.terminations import out_of_bounds
 from xreset.task.variation import Variation
 from xreset.task.worlds import Worlds
-from xreset.tensors import where
-from xreset.text import shown
 
 if TYPE_CHECKING:
     from tensordict import TensorDict

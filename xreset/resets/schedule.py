@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from xreset.checks import frozen
 from xreset.errors import XResetError
+from xreset.files.checks import frozen
 
 
 @frozen

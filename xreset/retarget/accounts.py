@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from xreset.checks import frozen
+from xreset.files.checks import frozen
 
 Phase = Literal["pre-contact", "post-contact", "both"]
 """Before the human hand first touches the object, and from then on."""

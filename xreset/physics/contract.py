@@ -13,11 +13,11 @@ from typing import Any, ClassVar, Literal, Self, get_args
 import torch
 from torch import Tensor
 
-from xreset.checks import frozen
 from xreset.errors import BackendUnavailableError, CapabilityError, WrongValueError, XResetError
+from xreset.files.checks import frozen
+from xreset.files.text import shown
+from xreset.physics.tensors import Tensors
 from xreset.spec import RobotSpec, SceneSpec, lowest_point
-from xreset.tensors import Tensors
-from xreset.text import shown
 
 Parameter = Literal[
     "friction",

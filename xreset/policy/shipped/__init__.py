@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from xreset.checks import from_dict, frozen
-from xreset.files import read_toml
+from xreset.files.checks import from_dict, frozen
+from xreset.files.storage import read_toml
 
 FOLDER = Path(__file__).parent
 """Folder of the policies and their cards."""

@@ -7,10 +7,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from xreset.checks import names_wrong_arguments
-from xreset.env import ManipulationEnv
-from xreset.errors import needs
-from xreset.vector_env import (
+from xreset.env.manipulation import ManipulationEnv
+from xreset.env.vector_env import (
     action_space,
     array,
     arrays,
@@ -18,6 +16,8 @@ from xreset.vector_env import (
     observation_space,
     with_sound_rows,
 )
+from xreset.errors import needs
+from xreset.files.checks import names_wrong_arguments
 
 with needs("stable_baselines3", "stable-baselines3"):
     from stable_baselines3.common.vec_env import VecEnv
@@ -31,7 +31,7 @@ class StableBaselinesEnv(VecEnv):
     is to be bootstrapped. An episode whose simulation fails is terminated, and ``infos[world]["faulty"]`` is True.
 
     Attributes:
-        log: as of :class:`~xreset.vector_env.VectorEnv`.
+        log: as of :class:`~xreset.env.vector_env.VectorEnv`.
     """
 
     @names_wrong_arguments

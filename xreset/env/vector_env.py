@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from xreset.checks import names_wrong_arguments
-from xreset.env import ManipulationEnv
+from xreset.env.manipulation import ManipulationEnv
 from xreset.errors import XResetError, needs
-from xreset.tensors import where
+from xreset.files.checks import names_wrong_arguments
+from xreset.physics.tensors import where
 
 with needs("gymnasium", "gymnasium"):
     import gymnasium

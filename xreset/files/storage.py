@@ -21,9 +21,9 @@ from pathlib import Path
 from typing import IO, Any, TypeVar
 
 from xreset import __version__
-from xreset.checks import from_dict
 from xreset.errors import FileFormatError, XResetError
-from xreset.text import is_plain, shown
+from xreset.files.checks import from_dict
+from xreset.files.text import is_plain, shown
 
 T = TypeVar("T")
 RAISE_LIMIT = "If it is what you expect, raise the limit: set XRESET_MAX_FILE_MB (default 1024)."
@@ -260,7 +260,7 @@ def code_version() -> str:
     ``.dirty`` is added if files of the checkout were changed. A package that was not installed from a repository has no
     commit.
     """
-    root = Path(__file__).parent.parent
+    root = Path(__file__).parent.parent.parent
     commit = ""
     if (root / ".git").exists():
         command = ["git", "--no-optional-locks", "-C", str(root), "describe", "--always"]

@@ -38,7 +38,7 @@ import numpy as np
 
 from xreset import __version__
 from xreset.errors import FileFormatError, WrongValueError, XResetError
-from xreset.text import Brief, shown
+from xreset.files.text import Brief, shown
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -1,0 +1,1 @@
+"""The environment, and its faces for Gymnasium and Stable-Baselines3."""

@@ -1,0 +1,1 @@
+"""Files and records: atomic writes, claims, checked formats, progress and texts."""

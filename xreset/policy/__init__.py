@@ -1,0 +1,1 @@
+"""Policies as files: the ONNX graph with its contract, and the policies that ship."""

@@ -51,6 +51,7 @@ from xreset.learning.run import (
     write_choice,
 )
 from xreset.learning.runner import TrainingRunner, _stop_on_interrupt
+from xreset.policy.onnx_policy import check_contract
 from xreset.task.config import RandomizationConfig, RewardConfig, TaskConfig
 
 try:
@@ -601,6 +602,22 @@ class TrainingTest(WithBank):
         write_bank(bank, empty)
         with self.assertRaisesRegex(RunError, "not the file that this run was started with"):
             self.resume(out)
+
+    def test_an_exported_policy_keeps_the_order_of_its_observations(self):
+        """A policy acts on columns: in another order it would see the goal where it was trained with the object."""
+        out = self.train("ordered", config=ONE)
+        trained = read_run(out).config.task
+        contract = OnnxPolicy(out / "policy.onnx").contract
+        terms = list(trained.observation.policy)
+        self.assertNotEqual(terms, sorted(terms))
+        for group in ("policy", "proprio", "perception", "privileged"):
+            expected = list(getattr(trained.observation, group))
+            self.assertEqual(list(getattr(contract.task.observation, group)), expected)
+        self.assertEqual(list(contract.observation_layout["policy"]), terms)
+        turned = dict(reversed(trained.observation.policy.items()))
+        other = replace(trained, observation=replace(trained.observation, policy=turned))
+        with self.assertRaisesRegex(PolicyError, "another order of observations"):
+            check_contract("p.onnx", contract, self.robot, other)
 
     def test_a_run_whose_observations_meant_something_else_is_not_resumed(self):
         out = self.train("older", config=ONE)

@@ -70,7 +70,7 @@ def exported(
     model = program.model_proto
     _drop_exporter_notes(model)
     entries = {
-        METADATA_KEY: json.dumps(asdict(contract), sort_keys=True),
+        METADATA_KEY: json.dumps(asdict(contract)),  # in order: that of the terms is the policy's
         VERSION_KEY: code_version(),
     }
     if checkpoint is not None:

@@ -107,6 +107,11 @@ def _meaning(contract: Contract) -> dict[str, dict[str, Any]]:
     """Return the entries that define what observations and actions mean, by part of the contract and name."""
     task = asdict(contract.task)
     observation = asdict(contract.task.observation.without_noise())
+    order = {
+        group: ", ".join(terms)
+        for group, terms in asdict(contract.task.observation).items()
+        if isinstance(terms, dict)
+    }
     widths = {}
     for group, terms in contract.observation_layout.items():
         widths |= {f"{group}.{term}": width for term, width in terms.items()}
@@ -117,6 +122,7 @@ def _meaning(contract: Contract) -> dict[str, dict[str, Any]]:
         "version of the robot": {"robot_fingerprint": contract.robot_fingerprint},
         "time between actions": {"control_dt": contract.control_dt},
         "observation layout": widths,
+        "order of observations": order,
         "action mapping": task["action"],
         "scale of observations": observation,
         "frame of objects": {"object_frame": task["object_frame"]},

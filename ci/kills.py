@@ -122,9 +122,18 @@ def commands(folder: Path) -> list[Command]:
             run / "stress" / "mujoco.json",
         ),
         Command(
-            "rehearse",
-            ["rehearse", run, "--demos", demos, "--engine", "mujoco", "--fault", "pose-delay"],
-            run / "rehearsal" / "mujoco.json",
+            "stress --faults",
+            [
+                "stress",
+                run,
+                "--demos",
+                demos,
+                "--property",
+                "pose-delay",
+                "--property",
+                "lost-frames",
+            ],
+            run / "faults" / "mujoco.json",
         ),
         Command(
             "distill",
@@ -143,7 +152,7 @@ def commands(folder: Path) -> list[Command]:
         Command(
             "study",
             ["study", "seconds", "--out", studies],
-            studies / "reports" / "seconds" / "study.md",
+            studies / "reports" / "seconds" / "index.html",
         ),
     ]
 

@@ -1,7 +1,7 @@
 """Evaluation of policies.
 
-Modules: ``evaluate`` (the whole), ``policy_spec`` (finds a policy, and has the baseline ``ik``), ``rollout`` (plays
-episodes in an engine), ``metrics`` (what success is), ``results`` (files and tables); ``stress`` and ``sensitivity``
-(sweeps of physical properties), ``select`` (checkpoints), ``rehearse`` (the loop of a robot); ``engines``, ``report``,
-``study``, ``export`` and ``play``.
+Modules: ``experiment`` (plays a policy under conditions, and writes what it did), ``policy_spec`` (finds a policy, and
+has the baseline ``ik``), ``rollout`` and ``robot_loop`` (play episodes in an engine, and through a robot's loop),
+``metrics`` (the numbers of an episode), ``conditions`` (what can be changed), ``results`` (files and tables),
+``effects`` (what changes cost), ``select`` (checkpoints); ``engines``, ``report``, ``study``, ``export`` and ``play``.
 """

@@ -1,4 +1,8 @@
-"""Metrics of both versions of the paper, updated at every control step of an episode in N worlds.
+"""Metrics of both versions of the paper: what they are called, and how they are computed.
+
+This is the one place of a metric. A field of :class:`Episode` with a title is a column of the table of episodes and of
+result files, a row of tables, and a column of the report's page and of its CSV file. :class:`EpisodeMetrics` has an
+attribute of the same name, updated at every control step of an episode in N worlds.
 
 The published paper (https://arxiv.org/abs/2609.35715, section V): an episode succeeds if the mean distance of 64
 surface points to the goal pose is at most 2 cm at any time, the start included, whether or not a hand holds the object.
@@ -12,13 +16,15 @@ of the goal at the episode's end). Task progress is 0, 0.33, 0.66 or 1 for the h
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Self
+from dataclasses import field, fields
+from math import isnan
+from typing import Any, Literal, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.files.checks import frozen
+from xreset.files.checks import NonNegativeFloat, NonNegativeInt, Share, frozen
 from xreset.geometry.rotations import quat_angle
 from xreset.objects.sampling import Frame, keypoints, metric_points
 from xreset.physics.tensors import Tensors
@@ -38,6 +44,87 @@ GOAL_DISTANCE = 0.02
 """Largest distance of the object's origin from the goal in the stage reorientation [m]."""
 GOAL_ANGLE = 0.2617993877991494
 """Largest angle between the object and the goal in this stage [rad]: 15 degrees."""
+
+
+@frozen
+class Metric:
+    """How tables show a field of :class:`Episode`."""
+
+    title: str
+    unit: Literal["%", "cm", "episodes"] = "%"
+    """Percent of a share, centimetres of a length, or the number of episodes."""
+    digits: int = 0
+    headline: bool = False
+    """Whether tables show the interval, too."""
+    fault: bool = False
+    """Whether every number but 0 makes the others doubtful."""
+
+    def text(self, mean: float, episodes: int) -> str:
+        """Return the mean over a number of episodes as text."""
+        if isnan(mean):
+            return "missing"
+        if self.unit == "episodes":
+            return str(round(mean * episodes))
+        return f"{100 * mean:.{self.digits}f}{'%' if self.unit == '%' else ' cm'}"
+
+    def interval_text(self, low: float, high: float) -> str:
+        """Return an interval of the mean as text."""
+        digits = 1 if self.unit == "cm" else 0
+        return f"{100 * low:.{digits}f}-{100 * high:.{digits}f}{'%' if self.unit == '%' else ' cm'}"
+
+
+def _shown(title: str, *, default: Any = ..., **how: Any) -> Any:
+    """Return a field that tables show."""
+    options = {} if default is ... else {"default": default}
+    return field(metadata={"metric": Metric(title=title, **how)}, **options)
+
+
+@frozen
+class Episode:
+    """Result of one episode. :class:`EpisodeMetrics` computes the metrics."""
+
+    sequence: NonNegativeInt
+    """Index of the demonstration."""
+    sequence_name: str
+    object: str
+    repetition: NonNegativeInt
+    """Number of the perturbation of the demonstration's start."""
+    task_progress: Share = _shown("task progress", digits=1, headline=True)
+    approach: bool = _shown("approach")
+    grasp: bool = _shown("grasp")
+    reorient: bool = _shown("reorient")
+    """Whether the object was at the goal at the end."""
+    reorient_once: bool = _shown("at the goal at any time")
+    """Whether the object was at the goal at any time."""
+    reorientation_progress: Share = _shown("reorientation progress", digits=1)
+    """1 - least / first distance to the goal, the largest of four keypoints of the object."""
+    published_success: bool | None = _shown(
+        "published success", default=None, digits=1, headline=True
+    )
+    """Whether ``least_distance`` is at most 2 cm: the success of the published paper. This field and those that follow
+    may be None in files of an earlier version, which did not measure them."""
+    least_distance: NonNegativeFloat | None = _shown(
+        "published distance", default=None, unit="cm", digits=1
+    )
+    """Least mean distance of 64 surface points to the goal over the episode [m]."""
+    final_distance: NonNegativeFloat | None = None
+    """This distance in the last reading, or the last before an early end [m]."""
+    final_position_error: NonNegativeFloat | None = None
+    """Distance of the object's origin, in the task's ``object_frame``, from the goal in the same reading [m]."""
+    final_angle: NonNegativeFloat | None = None
+    """Angle between the object and the goal in the same reading [rad]."""
+    nonfinite: bool = _shown("not finite", unit="episodes", fault=True)
+    """Whether a number was not finite: the engine broke down, or the policy's action was not finite."""
+    overflow: bool = _shown("overflow", unit="episodes", fault=True)
+    """Whether the engine dropped contacts or constraints."""
+    out_of_bounds: bool = _shown("left the scene", unit="episodes")
+    """Whether the object left the scene."""
+
+
+METRICS: dict[str, Metric] = {
+    f.name: f.metadata["metric"] for f in fields(Episode) if "metric" in f.metadata
+}
+"""Field of :class:`Episode` -> how it is shown, in the order of tables."""
 
 
 @frozen

@@ -7,9 +7,13 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from xreset.eval.table import cell, escape, markdown
 from xreset.files.storage import code_version
 from xreset.files.text import short_name
+
+
+def cell(text: str) -> str:
+    """Return Markdown for a cell of a table, in one line."""
+    return " ".join(text.replace("|", "\\|").split())
 
 
 def percent(share: float, digits: int = 0) -> str:
@@ -27,9 +31,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    made.filters |= {
-        "percent": percent, "short_name": short_name, "md": escape, "table": markdown, "cell": cell,
-    }  # fmt: skip
+    made.filters |= {"percent": percent, "short_name": short_name, "cell": cell}
     made.globals["version"] = code_version()
     return made
 

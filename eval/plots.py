@@ -1,6 +1,6 @@
 """Draw with matplotlib in the project's style, without windows and global state.
 
-Drawings become SVG with the page's text color, or pictures.
+Drawings become SVG with the page's text color.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from xreset.errors import needs
-from xreset.files.storage import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,17 +21,6 @@ COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a
 """Color of each engine: the palette of Okabe and Ito, for color-blind readers and for light and dark pages."""
 INK = "#010203"
 """Text color; in an SVG it is replaced by ``currentColor``."""
-
-
-@contextmanager
-def picture(path: Path, size: tuple[float, float]) -> Iterator[Figure]:
-    """Yield a figure that is written as PNG at the end of the block; size: width and height [inches]."""
-    with figure_style({}) as figure_class:
-        figure = figure_class(figsize=size, layout="constrained", facecolor="white")
-        yield figure
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=120)
-    write_whole(path, buffer.getbuffer())
 
 
 def svg(draw: Callable[[Figure], None], size: tuple[float, float], salt: str) -> str:

@@ -1,42 +1,49 @@
-"""Results of evaluations: their files, and a table with a row for each episode.
+"""Results of experiments: a table with a row for each episode, and its files.
 
-``ENGINE.json`` holds the summary of one engine, ``ENGINE.episodes.json`` its episodes and ``ENGINE.trace.npz`` recorded
-states.
+``ENGINE.json`` holds the episodes of one engine, under all conditions, and ``ENGINE.trace.npz`` recorded states.
 """
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, fields
+from collections.abc import Sequence
+from dataclasses import MISSING, asdict, field, fields, make_dataclass
+from functools import cache, cached_property
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, get_type_hints
 
 import numpy as np
 import pandas as pd
 
 from xreset.cameras.config import VisionConfig
 from xreset.errors import FileFormatError, RunError
-from xreset.eval.stats import Interval, bootstrap_ci95, difference_ci95
-from xreset.eval.table import METRICS, table_text
+from xreset.eval.metrics import METRICS, Episode
+from xreset.eval.stats import (
+    Interval,
+    crossed_bootstrap_ci95,
+    difference_ci95,
+    share_ci95,
+)
+from xreset.eval.table import table_text
 from xreset.files.checks import (
     Checked,
-    NonNegativeFloat,
     NonNegativeInt,
     PositiveFloat,
-    PositiveInt,
-    Range,
     Rule,
-    Share,
     from_dict,
     frozen,
+    renamed,
 )
 from xreset.files.records import POSITION, UNIT_TOLERANCE, Field, read_npz, write_npz
-from xreset.files.storage import read_json, read_typed, write_json
+from xreset.files.storage import check_schema, read_json, write_json
 from xreset.files.text import Brief
 
-SCHEMA = "xreset-eval/1"
-EPISODES_SCHEMA = "xreset-episodes/1"
+SCHEMA = "xreset-eval/2"
+EARLIER_SCHEMA = "xreset-eval/1"
+EARLIER_EPISODES = "xreset-episodes/1"
+"""Schemas of 0.1 to 0.3, which had a summary in ``ENGINE.json`` and its episodes in ``ENGINE.episodes.json``."""
 TRACE_SCHEMA = "xreset-trace/1"
 
 _TRACE_FIELDS = {
@@ -63,46 +70,13 @@ _LARGEST_STATE = 1e6
 """Largest number in a state [m, rad]. An object may fall and a joint may run away, but not beyond this."""
 
 
+_MAY_LACK = {"value", *(f.name for f in fields(Episode) if f.default is None)}
+"""Columns in which a file may have null."""
+
 if TYPE_CHECKING:
     Table = Any  # pandas' own types do not tell the rows of a table from one of its columns
 else:
     Table = pd.DataFrame
-
-
-@frozen
-class Episode:
-    """Result of one episode. :mod:`xreset.eval.metrics` defines the metrics."""
-
-    sequence: NonNegativeInt
-    """Index of the demonstration."""
-    sequence_name: str
-    object: str
-    repetition: NonNegativeInt
-    """Number of the perturbation of the demonstration's start."""
-    approach: bool
-    grasp: bool
-    reorient: bool
-    """Whether the object was at the goal at the end."""
-    reorient_once: bool
-    """Whether the object was at the goal at any time."""
-    reorientation_progress: Share
-    """1 - least / first distance to the goal, the largest of four keypoints of the object."""
-    task_progress: Share
-    out_of_bounds: bool
-    nonfinite: bool
-    overflow: bool
-    """Whether the engine dropped contacts or constraints."""
-    published_success: bool | None = None
-    """Whether ``least_distance`` is at most 2 cm: the success of the published paper. This field and those below are
-    None in files of an earlier version, which did not measure them."""
-    least_distance: NonNegativeFloat | None = None
-    """Least mean distance of 64 surface points to the goal over the episode [m]."""
-    final_distance: NonNegativeFloat | None = None
-    """This distance in the last reading, or the last before an early end [m]."""
-    final_position_error: NonNegativeFloat | None = None
-    """Distance of the object's origin, in the task's ``object_frame``, from the goal in the same reading [m]."""
-    final_angle: NonNegativeFloat | None = None
-    """Angle between the object and the goal in the same reading [rad]."""
 
 
 @frozen
@@ -169,50 +143,13 @@ class Rollouts:
     """The first episode of each demonstration."""
     control_steps_per_second: float
     """World steps per second of wall time, policy and observations included."""
-
-
-@frozen
-class TaskProgress(Checked):
-    """Mean score of the highest stage of the episodes."""
-
-    mean: Share
-    ci95: Range
-    """95 % bootstrap interval over demonstrations."""
-
-
-@frozen
-class DemoResult(Checked):
-    """Means over the episodes of one demonstration."""
-
-    sequence: str
-    object: str
-    episodes: PositiveInt
-    task_progress: Share
-    approach_rate: Share
-    grasp_rate: Share
-    reorient_rate: Share
-    reorientation_progress: Share
-    published_success_rate: Share | None = None
-    """None, as in the next field: an earlier version did not measure it."""
-    least_distance: NonNegativeFloat | None = None
-    """Mean of :attr:`Episode.least_distance` [m]."""
-
-
-@frozen
-class EpisodeFaults(Checked):
-    """Numbers of episodes with a fault."""
-
-    nonfinite: NonNegativeInt
-    """A number was not finite: the engine broke down, or the policy's action was not finite."""
-    overflow: NonNegativeInt
-    """The engine dropped contacts or constraints."""
-    out_of_bounds: NonNegativeInt
-    """The object left the scene."""
+    stopped: dict[str, int] = field(default_factory=dict)
+    """Reason why a robot's control loop stopped -> number of episodes."""
 
 
 @frozen
 class EvalResult(Brief, Checked):
-    """Contents of ``eval/ENGINE.json``: one policy in one engine."""
+    """Contents of ``ENGINE.json``: every episode of one policy in one engine, and what they were made with."""
 
     RENAMED: ClassVar = {
         "backend": "engine",
@@ -222,39 +159,65 @@ class EvalResult(Brief, Checked):
     engine: Annotated[str, Rule("an engine's name", lambda name: bool(name) and "/" not in name)]
     engine_version: str
     robot: str
-    objects: Annotated[tuple[str, ...], Rule("one object or more", bool)]
-    """Object names, sorted."""
-    meshes: str | None
-    """Folder of meshes; None: the stand-ins."""
     policy: str
-    episodes: PositiveInt
-    episodes_per_demo: PositiveInt
     seed: NonNegativeInt
-    task_progress: TaskProgress
-    approach_rate: Share
-    grasp_rate: Share
-    reorient_rate: Share
-    reorient_once_rate: Share
-    reorientation_progress: Share
-    per_demo: Annotated[tuple[DemoResult, ...], Rule("one demonstration or more", bool)]
-    health: EpisodeFaults
-    control_steps_per_second: PositiveFloat
+    """Seed of the starts."""
     inputs: dict[str, str]
     """SHA-256 of the policy and the demonstrations."""
+    meshes: str | None = None
+    """Folder of meshes; None: the stand-ins."""
+    control_steps_per_second: PositiveFloat
+    """World steps per second of wall time, policy and observations included."""
     unseen: tuple[str, ...] = ()
     """Objects that the policy was not trained with, sorted; empty for a baseline."""
     vision: VisionConfig | None = None
     """Cameras of the policy. None: it has none, or an earlier version did not state them."""
-    published_success_rate: Share | None = None
-    """Share of episodes that succeed in the sense of the published paper. None, as in the next two fields: an earlier
-    version did not measure it."""
-    published_success_ci95: Range | None = None
-    """95 % bootstrap interval over demonstrations."""
-    least_distance: NonNegativeFloat | None = None
-    """Mean of :attr:`Episode.least_distance` [m]."""
-
     episode_seconds: PositiveFloat | None = None
     """Length of an episode [s]. None: an earlier version did not state it; it was that of the policy's training."""
+    left_out: dict[str, str] = field(default_factory=dict)
+    """Property that was not changed -> reason."""
+    measured: dict[str, float] = field(default_factory=dict)
+    """Property -> what was measured of the engine, if it was compared with another one."""
+    stopped: dict[str, int] = field(default_factory=dict)
+    """Reason why a robot's control loop stopped -> number of episodes."""
+    episodes: Table = field(compare=False)
+    """A row for each episode: property (what was changed; empty: nothing), value, and the fields of
+    :class:`~xreset.eval.metrics.Episode`. A metric that an earlier version did not measure is NaN."""
+
+    @cached_property
+    def nominal(self) -> Table:
+        """The episodes in which nothing was changed."""
+        return self.episodes[self.episodes["property"] == ""]
+
+    @property
+    def changed(self) -> Table:
+        """The episodes with a changed property."""
+        return self.episodes[self.episodes["property"] != ""]
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Names of the objects, sorted."""
+        return tuple(sorted(self.nominal["object"].unique()))
+
+    @property
+    def episodes_per_demo(self) -> int:
+        """Episodes of each demonstration."""
+        return 1 + int(self.nominal["repetition"].max())
+
+    def mean(self, metric: str) -> float:
+        """Return the mean of a metric over the unchanged episodes; NaN if it was not measured in all of them."""
+        return mean(self.nominal, metric)
+
+    def ci95(self, metric: str) -> Interval:
+        """Return the 95 % interval of this mean over demonstrations."""
+        return ci95(self.nominal, metric)
+
+    def to_frame(self, run: str = "") -> Table:
+        """Return the episodes with columns that say whose they are: run (default: the policy), policy, engine, robot
+        and seed."""
+        about = {"run": run or self.policy}
+        about |= {name: getattr(self, name) for name in ("policy", "engine", "robot", "seed")}
+        return pd.concat([self.episodes.assign(**about)[list(about)], self.episodes], axis=1)
 
     def meshes_folder(self, given: Path | None) -> Path | None:
         """Return the given folder of meshes, or else that of the evaluation; None: the stand-ins."""
@@ -266,20 +229,19 @@ class EvalResult(Brief, Checked):
 class Evaluation(list[EvalResult]):
     """Results of one policy, one for each engine. It prints as a table; :meth:`to_frame` gives every episode."""
 
-    def __init__(self, results: Iterable[EvalResult], episodes: Sequence[Table]) -> None:
-        """Join the tables of the engines."""
-        super().__init__(results)
-        self._episodes = pd.concat(episodes, ignore_index=True) if episodes else pd.DataFrame()
+    folder: Path | None = None
+    """Folder of the files."""
 
-    def to_frame(self) -> Table:
-        """Return the table of episodes; see :func:`episode_table`."""
-        return self._episodes
+    def to_frame(self, run: str = "") -> Table:
+        """Return the table of all episodes; see :meth:`EvalResult.to_frame`."""
+        tables = [result.to_frame(run) for result in self]
+        return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
     def minus(self, other: Evaluation) -> Table:
         """Return how much better this policy is than another one that played the same episodes.
 
-        Columns: engine, object (or ``all``), metric (a column of :func:`episode_table`), and mean, low and high: the
-        difference, and its 95 % interval. The interval is a bootstrap that draws the same demonstrations for both.
+        Columns: engine, object (or ``all``), metric, and mean, low and high: the difference, and its 95 % interval. The
+        interval is a bootstrap that draws the same demonstrations for both.
 
         Raises:
             RunError: no engine is in both, or the starts, their seed, the meshes or the length of episodes differ.
@@ -293,9 +255,9 @@ class Evaluation(list[EvalResult]):
                 continue
             tables = []
             played = []
-            for whole, own in ((other, theirs[engine]), (self, result)):
-                table = whole.to_frame()
-                tables.append(table[table["engine"] == engine])
+            for own in (theirs[engine], result):
+                table = own.to_frame()
+                tables.append(table[table["property"] == ""])
                 episodes = tables[-1][starts].to_numpy().tolist()
                 played.append((episodes, own.seed, own.meshes, own.episode_seconds))
             if played[0] != played[1]:
@@ -316,38 +278,35 @@ class Evaluation(list[EvalResult]):
         return table_text(self)
 
 
-# Episodes as a table --------------------------------------------------------------------------------------------------
+# Tables of episodes ---------------------------------------------------------------------------------------------------
 
 
-def episode_table(result: EvalResult, episodes: Sequence[Episode], run: str = "") -> Table:
-    """Return a table with one row for each episode.
-
-    Columns: run, policy, engine, robot and seed, then the fields of :class:`Episode`: sequence
-    (index of the demonstration), sequence_name, object, repetition, approach, grasp, reorient (at the goal at the end),
-    reorient_once, reorientation_progress, task_progress, out_of_bounds, nonfinite, overflow, published_success,
-    least_distance, final_distance, final_position_error [m], final_angle [rad]. A metric that an earlier version did
-    not measure is NaN.
-    """
-    about = {
-        "run": run or result.policy,
-        "policy": result.policy,
-        "engine": result.engine,
-        "robot": result.robot,
-        "seed": result.seed,
-    }
-    return _table(episodes, about)
+def episode_table(
+    episodes: Sequence[Episode], changed: str = "", value: float | None = None
+) -> Table:
+    """Return a row for each episode; ``changed``: name of the property that had a value, empty if nothing was
+    changed."""
+    columns = ["property", "value", *(f.name for f in fields(Episode))]
+    about = {"property": changed, "value": value}
+    return _with_nan(pd.DataFrame([about | vars(e) for e in episodes], columns=columns))
 
 
-def _table(episodes: Sequence[Episode], about: dict[str, Any]) -> Table:
-    """Return a row for each episode, after the columns ``about``; a metric that was not measured is NaN."""
-    columns = [*about, *(f.name for f in fields(Episode))]
-    table: Table = pd.DataFrame([about | asdict(e) for e in episodes], columns=columns)
-    return table.astype({name: float for name in table if table[name].isna().any()})
+def _with_nan(table: Table) -> Table:
+    """Return a table with NaN in place of None."""
+    unknown = {name: float for name in table if table[name].isna().any()}
+    return table.astype(unknown | {"value": float})
 
 
 def mean(episodes: Table, metric: str) -> float:
     """Return the mean of one metric over episodes, rounded to six digits; NaN if it was not measured in all of them."""
     return round(float(episodes[metric].to_numpy(float).mean()), 6)
+
+
+def ci95(episodes: Table, metric: str) -> Interval:
+    """Return the 95 % interval of the mean over demonstrations; and over trainings, if the table is of several
+    (:func:`xreset.eval.stats.share_ci95`)."""
+    interval = share_ci95 if METRICS[metric].unit == "%" else crossed_bootstrap_ci95
+    return interval(*crossed(episodes, metric))
 
 
 def difference(one: Table, other: Table, metric: str) -> tuple[float, float, float]:
@@ -357,84 +316,41 @@ def difference(one: Table, other: Table, metric: str) -> tuple[float, float, flo
     return mean(other, metric) - mean(one, metric), *interval
 
 
-def crossed(episodes: Table, metric: str) -> list[np.ndarray]:
+def crossed(episodes: Table, metric: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the metric, the index of the training and the demonstration of each episode, [E] each."""
-    runs = pd.factorize(episodes["run"])[0]
-    return [episodes[metric].to_numpy(float), runs, episodes["sequence"].to_numpy()]
-
-
-def measured(episodes: Table, metric: str) -> float | None:
-    """Return :func:`mean`, or None if the metric was not measured in all of the episodes."""
-    value = mean(episodes, metric)
-    return None if np.isnan(value) else value
-
-
-def summarize(rollouts: Rollouts, **about: Any) -> EvalResult:
-    """Return the means, intervals and faults of the episodes of one engine.
-
-    Args:
-        about: the fields of the result that do not follow from the episodes, such as ``engine`` and ``seed``.
-    """
-    episodes = _table(rollouts.episodes, {})
-    rates = _rates(episodes)
-    is_measured = rates["published_success_rate"] is not None
-    per_demo = []
-    for _, own in episodes.groupby("sequence", sort=False):
-        first = own.iloc[0]
-        per_demo.append(
-            DemoResult(
-                sequence=first["sequence_name"],
-                object=first["object"],
-                episodes=len(own),
-                task_progress=mean(own, "task_progress"),
-                **_rates(own),
-            )
-        )
-    return EvalResult(
-        objects=tuple(sorted(episodes["object"].unique())),
-        episodes=len(episodes),
-        episodes_per_demo=1 + int(episodes["repetition"].max()),
-        task_progress=TaskProgress(
-            mean=mean(episodes, "task_progress"), ci95=_ci95(episodes, "task_progress")
-        ),
-        published_success_ci95=_ci95(episodes, "published_success") if is_measured else None,
-        reorient_once_rate=mean(episodes, "reorient_once"),
-        per_demo=tuple(per_demo),
-        health=EpisodeFaults(
-            **{f.name: int(episodes[f.name].sum()) for f in fields(EpisodeFaults)}
-        ),
-        control_steps_per_second=round(rollouts.control_steps_per_second, 1),
-        **rates,
-        **about,
-    )
-
-
-def _ci95(episodes: Table, metric: str) -> Interval:
-    low, high = bootstrap_ci95(episodes[metric].to_numpy(float), episodes["sequence"].to_numpy())
-    return round(low, 6), round(high, 6)
-
-
-def _rates(episodes: Table) -> dict[str, Any]:
-    """Return the means that a result and each of its demonstrations state, by field."""
-    stages = ("approach", "grasp", "reorient", "published_success")
-    rates = {f"{stage}_rate": measured(episodes, stage) for stage in stages}
-    return rates | {
-        name: measured(episodes, name) for name in ("reorientation_progress", "least_distance")
-    }
+    runs = np.zeros(len(episodes), int)
+    if "run" in episodes:
+        runs = pd.factorize(episodes["run"])[0]
+    return episodes[metric].to_numpy(float), runs, episodes["sequence"].to_numpy()
 
 
 # Files ----------------------------------------------------------------------------------------------------------------
 
 
-def write_results(
-    folder: Path, summary: EvalResult, rollouts: Rollouts, joint_names: tuple[str, ...]
+def write_result(
+    folder: Path, result: EvalResult, traces: Sequence[Trace], joint_names: tuple[str, ...]
 ) -> None:
-    """Write ``ENGINE.json``, ``ENGINE.episodes.json`` and ``ENGINE.trace.npz``."""
-    name = summary.engine
-    episodes = [asdict(e) for e in rollouts.episodes]
-    write_json(folder / f"{name}.episodes.json", {"schema": EPISODES_SCHEMA, "episodes": episodes})
-    write_traces(folder / f"{name}.trace.npz", rollouts.traces, joint_names)
-    write_json(folder / f"{name}.json", {"schema": SCHEMA} | asdict(summary))
+    """Write ``ENGINE.json``, and the recorded episodes, if there are any, as ``ENGINE.trace.npz``."""
+    name = result.engine
+    header = {f.name: getattr(result, f.name) for f in fields(result)}
+    if result.vision is not None:
+        header["vision"] = asdict(result.vision)
+    columns = {}
+    for column, values in result.episodes.items():
+        columns[column] = values.tolist()
+        if column in _MAY_LACK:
+            columns[column] = [None if x != x else x for x in columns[column]]
+    content = {"schema": SCHEMA} | header | {"episodes": columns}
+    json.dumps(
+        columns, allow_nan=False
+    )  # refuses a number that is not finite before anything is written
+    trace = folder / f"{name}.trace.npz"
+    if traces:
+        write_traces(trace, traces, joint_names)
+    else:
+        trace.unlink(missing_ok=True)
+    write_json(folder / f"{name}.json", content)
+    (folder / f"{name}.episodes.json").unlink(missing_ok=True)  # of an earlier version
 
 
 def write_traces(
@@ -447,73 +363,96 @@ def write_traces(
         "object_name": np.array([t.object for t in traces]),
         "sequence_index": np.array([t.sequence for t in traces]),
     }
-    for field, key in _STACKED.items():
-        arrays[key] = np.stack([getattr(t, field) for t in traces])
+    for name, key in _STACKED.items():
+        arrays[key] = np.stack([getattr(t, name) for t in traces])
     targets = [t.joint_target for t in traces if t.joint_target is not None]
     if len(targets) == len(traces):
         arrays["joint_target"] = np.stack(targets)
     write_npz(path, TRACE_SCHEMA, arrays | others)
 
 
-def read_evaluation(folder: Path, run: str = "") -> Evaluation:
-    """Read the results of every engine in an ``eval`` folder, in order of name, and their episodes.
-
-    Args:
-        run: name of the run in the table of episodes; default: the policy's name in the results.
+def read_evaluation(folder: Path) -> Evaluation:
+    """Read the results of every engine in a folder, in order of name; none if the folder does not exist.
 
     Raises:
         FileFormatError: a file is damaged, or the files are of different evaluations.
     """
-    results = []
-    tables = []
+    files = []
     if os.path.isdir(folder):
         files = [f for f in folder.glob("*.json") if not f.name.endswith(".episodes.json")]
-        for file in sorted(files, key=lambda f: f.stem):
-            result = read_result(file)
-            check_name(file, result.engine)
-            results.append(result)
-    for result in results:
-        episodes = read_episodes(folder, result.engine)
-        if len(episodes) != result.episodes:
-            raise FileFormatError(
-                f"{folder / result.engine}.json states {result.episodes} episodes, {result.engine}.episodes.json "
-                f"holds {len(episodes)}. The files are of different evaluations; evaluate again."
-            )
-        tables.append(episode_table(result, episodes, run))
-    return Evaluation(results, tables)
+    found = Evaluation(map(read_result, sorted(files, key=lambda f: f.stem)))
+    found.folder = folder
+    return found
 
 
-def check_name(path: Path, engine: str) -> None:
-    """Refuse, with ``FileFormatError``, results of an engine in a file of another name, because copies count twice."""
-    if path.stem != engine:
-        raise FileFormatError(
-            f"{path} has the results of {engine}, expected in {engine}.json. If it is a copy, move it out of the "
-            "folder."
-        )
+def has_results(folder: Path) -> bool:
+    """Return whether a folder has results of an engine."""
+    return any(folder.glob("*.json"))
 
 
 def read_result(path: Path) -> EvalResult:
-    """Read the result of one engine.
+    """Read the results of one engine.
 
     Raises:
-        FileFormatError: the file is damaged, or lacks an entry; the message names the entry.
+        FileFormatError: the file is damaged, has the results of another engine, or lacks an entry.
     """
-    return read_typed(EvalResult, path, SCHEMA)
+    data = read_json(path)
+    version = data.pop("xreset", None)
+    schema = data.pop("schema", None)
+    if schema == EARLIER_SCHEMA:
+        data = _of_earlier_version(path, data)
+    else:
+        check_schema(path, schema, SCHEMA)
+    columns = from_dict(_columns(), data.get("episodes"), f"{path}: episodes", version)
+    every = {name: values for name, values in vars(columns).items() if values}
+    lengths = {len(values) for values in every.values()}
+    if len(lengths) != 1:
+        raise FileFormatError(
+            f"{path}: the columns of episodes have {sorted(lengths)} entries, expected the same number, one or more, "
+            "in each. Evaluate again."
+        )
+    names = ["property", "value", *(f.name for f in fields(Episode))]
+    table = _with_nan(pd.DataFrame({name: every.get(name) for name in names}))
+    if not (table["property"] == "").any():
+        raise FileFormatError(f"{path} has no unchanged episode. Evaluate again.")
+    result = from_dict(EvalResult, data | {"episodes": table}, str(path), version)
+    if path.stem != result.engine:
+        raise FileFormatError(
+            f"{path} has the results of {result.engine}, expected in {result.engine}.json. If it is a copy, move it "
+            "out of the folder."
+        )
+    return result
 
 
-def read_episodes(folder: Path, engine: str) -> tuple[Episode, ...]:
-    """Read the episodes of one engine.
+@cache
+def _columns() -> type:
+    """Return a dataclass of the columns of episodes in a file, to check them."""
+    hints = get_type_hints(Episode, include_extras=True)
+    columns: list[Any] = [("property", tuple[str, ...]), ("value", tuple[float | None, ...])]
+    for f in fields(Episode):
+        default = () if f.default is MISSING else (field(default=()),)
+        columns.append((f.name, tuple[hints[f.name], ...], *default))
+    return make_dataclass("Episodes", columns, kw_only=True)
 
-    Raises:
-        FileFormatError: the file is damaged, or a value is impossible.
-    """
-    path = folder / f"{engine}.episodes.json"
-    episodes = read_json(path, EPISODES_SCHEMA).get("episodes")
-    if not isinstance(episodes, list):
-        raise FileFormatError(f"{path} has no list 'episodes'. Evaluate again.")
-    return tuple(
-        from_dict(Episode, episode, f"{path}: episodes[{i}]") for i, episode in enumerate(episodes)
-    )
+
+def _of_earlier_version(path: Path, data: dict[str, Any]) -> dict[str, Any]:
+    """Return the entries of today from a summary of 0.1 to 0.3 and the file of its episodes."""
+    file = path.with_name(f"{path.stem}.episodes.json")
+    rows = read_json(file, EARLIER_EPISODES).get("episodes")
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise FileFormatError(f"{file} has no list 'episodes'. Evaluate again.")
+    if len(rows) != data.get("episodes"):
+        raise FileFormatError(
+            f"{path} states {data.get('episodes')} episodes, {file.name} holds {len(rows)}. The files are of different "
+            "evaluations; evaluate again."
+        )
+    names = dict.fromkeys(chain.from_iterable(rows))
+    columns: dict[str, list[Any]] = {"property": [""] * len(rows), "value": [None] * len(rows)}
+    for name in names:
+        columns[name] = [row.get(name) for row in rows]
+    kept = {f.name for f in fields(EvalResult)}
+    header = {name: x for name, x in renamed(EvalResult, data).items() if name in kept}
+    return header | {"episodes": columns}
 
 
 def read_traces(
@@ -541,7 +480,7 @@ def read_traces(
             object=str(name),
             time=arrays["time"],
             joint_target=arrays["joint_target"][i] if "joint_target" in arrays else None,
-            **{field: arrays[key][i] for field, key in _STACKED.items()},
+            **{name: arrays[key][i] for name, key in _STACKED.items()},
         )
         traces.append(trace)
     return tuple(traces)
@@ -558,7 +497,8 @@ def recorded(episodes: Table, engine: str, traces: Sequence[Trace]) -> Table:
     Raises:
         FileFormatError: a trace shows a demonstration without an episode.
     """
-    own = episodes[episodes["engine"] == engine].sort_values("repetition", kind="stable")
+    is_own = (episodes["engine"] == engine) & (episodes["property"] == "")
+    own = episodes[is_own].sort_values("repetition", kind="stable")
     own = own.drop_duplicates("sequence").set_index("sequence", drop=False)
     for trace in traces:
         if trace.sequence not in own.index:

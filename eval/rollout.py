@@ -19,9 +19,9 @@ from torch import Tensor
 
 from xreset.env.manipulation import ManipulationEnv, make_scene
 from xreset.errors import XResetError
-from xreset.eval.metrics import EpisodeMetrics, MetricPoints
+from xreset.eval.metrics import Episode, EpisodeMetrics, MetricPoints
 from xreset.eval.policy_spec import PolicySpec
-from xreset.eval.results import Episode, Rollouts, Trace
+from xreset.eval.results import Rollouts, Trace
 from xreset.files.checks import frozen
 from xreset.files.progress import Progress, unseen
 from xreset.physics import Backend, State

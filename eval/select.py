@@ -12,8 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
+from xreset.eval.conditions import Condition
+from xreset.eval.experiment import play
 from xreset.eval.policy_spec import load_policy
-from xreset.eval.rollout import Engine, load_trial, roll_out
+from xreset.eval.rollout import Engine, load_trial
 from xreset.eval.setting import Setting
 from xreset.files.storage import file_hash, write_whole
 from xreset.learning.export import export_checkpoint
@@ -84,8 +86,9 @@ def select(
             scores: dict[str, float] = {}
             score_to_beat = best.worst if best else -1.0
             for engine in order:
-                rollouts = roll_out(policy.start(None), engine, trial, episodes=episodes)
-                scores[engine.name] = float(np.mean([e.task_progress for e in rollouts.episodes]))
+                nominal = [Condition(task=trial.task)]
+                result, _ = play(policy, trial, engine, nominal, episodes=episodes)
+                scores[engine.name] = result.mean("task_progress")
                 progress(path.name, engine.name, scores[engine.name])
                 if scores[engine.name] <= score_to_beat:  # the newer of two equal ones wins
                     break

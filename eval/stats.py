@@ -6,17 +6,28 @@ from collections.abc import Sequence
 
 import numpy as np
 
-
-def mean_of_known(values: Sequence[float | None]) -> float | None:
-    """Return the mean, or None if one of the values was not measured."""
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if len(known) == len(values) else None
-
-
 Interval = tuple[float, float]
 """Lower and upper end of a 95 % interval."""
 DRAWS = 2000
 """Resamples of a bootstrap."""
+_Z = 1.959963984540054
+"""Half width of a 95 % interval of the normal distribution, in standard deviations."""
+
+
+def share_ci95(values: np.ndarray, runs: np.ndarray, groups: np.ndarray) -> Interval:
+    """Return a 95 % interval of the mean of values in [0, 1]: :func:`crossed_bootstrap_ci95`, which is a point where
+    all groups have the same mean. Wilson's interval for as many trials as there are groups takes its place there, so
+    that four successes of four do not look certain.
+    """
+    low, high = crossed_bootstrap_ci95(values, runs, groups)
+    if high - low > 1e-9 or not 0 <= low <= high <= 1:
+        return low, high
+    count = len(np.unique(groups)) if len(np.unique(groups)) > 1 else len(values)
+    share = min((low + high) / 2, 1.0)
+    shrunk = 1 + _Z**2 / count
+    center = (share + _Z**2 / (2 * count)) / shrunk
+    half = _Z / shrunk * np.sqrt(share * (1 - share) / count + _Z**2 / (4 * count**2))
+    return max(0.0, float(center - half)), min(1.0, float(center + half))
 
 
 def bootstrap_ci95(values: np.ndarray, groups: np.ndarray | None = None) -> Interval:

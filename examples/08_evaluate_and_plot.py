@@ -18,12 +18,13 @@ def main(out: Path, engines: tuple[str, ...] = ("mujoco", "sapien")) -> None:
     results = xreset.evaluate(policy, unseen, engines, episodes=1, num_envs=1, out=out / "eval")
 
     figure, axes = pyplot.subplots(figsize=(5, 3), layout="constrained")
-    parts = ("approach_rate", "grasp_rate", "reorient_rate", "reorientation_progress")
+    parts = ("approach", "grasp", "reorient", "reorientation_progress")
     for number, result in enumerate(results):
-        means = [getattr(result, part) for part in parts]
+        means = [result.mean(part) for part in parts]
         places = [i + 0.4 * number for i in range(len(parts))]
         axes.bar(places, means, width=0.38, label=f"{result.engine} {result.engine_version}")
-        progress = f"task progress {result.task_progress.mean:.0%} in {result.episodes} episodes"
+        mean = result.mean("task_progress")
+        progress = f"task progress {mean:.0%} in {len(result.episodes)} episodes"
         print(f"{result.policy} in {result.engine}: {progress}")
     axes.set_xticks(
         [i + 0.2 for i in range(len(parts))], [part.replace("_", "\n") for part in parts]

@@ -27,7 +27,7 @@ from tests.test_view import toy_demos, toy_retargeted
 from tests.toy_bank import SOUP, toy_bank
 from tests.toy_goals import toy_goals
 from tests.toy_policy import write_policy
-from tests.toy_results import toy_rollouts, toy_summary
+from tests.toy_results import toy_result, toy_rollouts
 from tests.toy_robot import toy_hand_arm
 from xreset import (
     TrainConfig,
@@ -48,19 +48,12 @@ from xreset.backends.conformance import SCHEMA as CONFORMANCE
 from xreset.demos.dexycb import _read_extrinsics, _read_meta, _read_npz
 from xreset.demos.ho3d import _read_frame
 from xreset.demos.keypoints import read_keypoints, read_transform
+from xreset.eval.effects import curves, verdict
 from xreset.eval.engines.actions import Actions, read_actions, write_actions
 from xreset.eval.engines.page import page
 from xreset.eval.engines.page import read as read_page
 from xreset.eval.report.read import read_curves, run_facts
-from xreset.eval.results import (
-    read_episodes,
-    read_evaluation,
-    read_result,
-    read_traces,
-    write_results,
-)
-from xreset.eval.sensitivity import SWEEPS
-from xreset.eval.stress import Stress, curve, read_stress, write_card
+from xreset.eval.results import read_result, read_traces, write_result
 from xreset.eval.study.file import SHIPPED, read_study
 from xreset.files.records import Field
 from xreset.files.storage import read_json, write_json
@@ -187,32 +180,34 @@ def add_actions(every):
     write_actions(every.add("actions", "actions.npz", read, "npz"), actions)
 
 
-def write_evaluation(folder):
-    rollouts = toy_rollouts()
-    write_results(folder, toy_summary(rollouts=rollouts), rollouts, JOINTS)
-
-
 def add_evaluation(every):
-    write_evaluation(every.folder)
-    every.add("result", "mujoco.json", read_result, "json")
-    path = every.add("stress", "stress/mujoco.json", lambda p: read_stress(p.parent), "json")
-    path.parent.mkdir()
-    nominal = toy_rollouts().episodes
-    mass = next(prop for prop in SWEEPS if prop.option == "object-mass")
-    swept = curve(mass, nominal, {2.0: nominal})
-    card = Stress(
-        engine="mujoco", engine_version="4", episodes=len(nominal), task_progress=0.5, ci95=(0.4, 0.6),
-        curves=(swept,), left_out=("arm-stiffness",),
-    )  # fmt: skip
-    write_card(path.parent, card)
+    rollouts = toy_rollouts()
+    sweep = {("object-mass", 2.0): rollouts.episodes}
+    result = toy_result(sweep=sweep, left_out={"arm-stiffness": "why"})
+    write_result(every.folder, result, rollouts.traces, JOINTS)
 
-    def episodes(path):
-        return read_episodes(path.parent, "mujoco")
+    def evaluated(path):
+        found = read_result(path)
+        return curves(found), verdict([found])
+
+    every.add("result", "mujoco.json", evaluated, "json")
 
     def traces(path):
         return read_traces(path.parent, "mujoco", JOINTS)
 
-    every.add("episodes", "mujoco.episodes.json", episodes, "json")
+    # the two files of 0.1 to 0.3
+    (every.folder / "both").mkdir()
+    summary = every.add("earlier result", "both/mujoco.json", read_result, "json")
+    path = every.add(
+        "earlier episodes", "both/mujoco.episodes.json", lambda _: read_result(summary), "json"
+    )
+    header = {
+        name: getattr(result, name) for name in ("engine", "engine_version", "robot", "policy")
+    }
+    header |= {"seed": 3, "inputs": {"demos": "ab"}, "meshes": None, "control_steps_per_second": 9}
+    write_json(summary, {"schema": "xreset-eval/1", "episodes": 4} | header)
+    rows = [vars(episode) for episode in rollouts.episodes]
+    write_json(path, {"schema": "xreset-episodes/1", "episodes": rows})
     may = ("joint_pos", "object_pos", "object_quat", "joint_target")
     every.add("trace", "mujoco.trace.npz", traces, "npz", may)
 
@@ -429,14 +424,6 @@ def add_pairs(every):
     may = (*may, "human_keypoints")
     path = every.add("motion and archive", "seen.npz", viewed, "npz", may, slow=True)
     write_retargeted(path, toy_retargeted(every.openarm))
-
-    def evaluation(path):
-        read_evaluation(path.parent)
-
-    (every.folder / "both").mkdir()
-    write_evaluation(every.folder / "both")
-    every.add("result and episodes", "both/mujoco.json", evaluation, "json")
-    every.add("episodes and result", "both/mujoco.episodes.json", evaluation, "json")
 
 
 def add_mesh_of_urdf(every):

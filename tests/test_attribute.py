@@ -1,6 +1,5 @@
 """What costs a skill: measurements of altered engines, changes of the task, and engines whose one mistake is named."""
 
-import json
 import math
 from dataclasses import fields, replace
 from unittest import TestCase
@@ -11,11 +10,12 @@ import torch
 from tests import toy_grasp
 from tests.command import printed, refused, succeeds
 from tests.data import InFolder
-from tests.toy_results import episodes
+from tests.toy_results import swept
 from xreset import XResetError, synthesize, write_demos
+from xreset.eval.conditions import COMPARED, nominal_task
 from xreset.eval.engines.attribution import (
+    ALL,
     Attribution,
-    Row,
     attribute,
     change_towards,
     not_tried,
@@ -23,8 +23,8 @@ from xreset.eval.engines.attribution import (
     verdict,
 )
 from xreset.eval.engines.measure import Measured, measure
+from xreset.eval.results import read_evaluation
 from xreset.eval.rollout import engine
-from xreset.eval.sensitivity import COMPARED, Effect, nominal_task
 from xreset.task.config import RandomizationConfig, TaskConfig, TerminationConfig
 from xreset.task.randomization import pair_friction
 
@@ -118,11 +118,10 @@ class ProbesTest(TestCase):
 class ChangeTest(TestCase):
     TASK = nominal_task(TASK)
 
-    def change(self, name, b, a=None, engine="mujoco"):
+    def change(self, name, b, a=None):
         prop = COMPARED[name]
-        return change_towards(
-            prop, getattr(STATED, prop.measured) if a is None else a, b, self.TASK, engine
-        )
+        known = getattr(STATED, prop.measured) if a is None else a
+        return change_towards(prop, known, b, self.TASK, mujoco())
 
     def drawn(self, name, b, a=None):
         found = self.change(name, b, a)
@@ -164,7 +163,7 @@ class ChangeTest(TestCase):
                 self.assertIn(why, str(self.change(name, b, a)))
 
 
-class AttributeTest(TestCase):
+class AttributeTest(InFolder):
     """A grasp that just holds, and engines with one deliberate mistake each."""
 
     def attribute(self, b, **options):
@@ -173,22 +172,23 @@ class AttributeTest(TestCase):
             mujoco(),
             b,
             toy_grasp.trial(TASK, num_envs=3),
+            self.folder,
             episodes=1,
             **options,
         )
 
     def test_half_the_friction_is_what_costs_the_grasp(self):
         found = self.attribute(altered(mujoco(), friction=0.55))
-        self.assertEqual((found.rows[0].mean("grasp"), found.rows[-1].mean("grasp")), (1.0, 0.0))
+        self.assertEqual((found.a.mean("grasp"), found.b.mean("grasp")), (1.0, 0.0))
         self.assertEqual([row.name for row in found.rows], ["mujoco", "tip friction", "other"])
         worst = found.costs()
         self.assertEqual((worst.name, found.share(worst)), ("tip friction", 1.0))
         self.assertIn("'tip friction' alone brings about 100% of it", verdict(found))
-        data = json.loads(json.dumps(found.as_dict(), allow_nan=False))
-        self.assertEqual(
-            (data["schema"], data["costs_most"]), ("xreset-attribution/2", "tip friction")
-        )
-        self.assertLess(data["rows"][1]["difference"], -0.1)
+        a, b = read_evaluation(self.folder)
+        again = Attribution(a=a, b=b)
+        self.assertEqual(verdict(again), verdict(found), "read from the files")
+        self.assertEqual(again.costs().name, "tip friction")
+        self.assertLess(again.rows[1].effect.difference, -0.1)
         text = printed(rich_table(found, "title"))
         self.assertRegex(text, r"tip friction.* 0.\d+ -> 0.4\d+ .*100%")
 
@@ -218,66 +218,52 @@ class AttributeTest(TestCase):
             self.attribute(mujoco(), only=["colour"])
 
 
-def row(kind, name, *scores):
-    """A run of two episodes of each demonstration; in A as it is, every score is 0.66."""
-    effect = Effect.of(episodes(list(scores)), episodes([0.66] * len(scores)))
-    return Row(kind=kind, name=name, episodes=episodes(list(scores)), effect=effect)  # pyright: ignore[reportArgumentType]
-
-
-A = row("as it is", "mujoco", *[0.66] * 8)
-B = row("other", "sapien", *[0.33] * 8)
-
-
-def outcome(*rows):
-    return Attribution(
-        a="mujoco", b="sapien", measured={"arm stiffness": (1.0, 0.8)}, rows=rows, skipped={}
-    )
+def outcome(sweep, b=(0.33,) * 8):
+    """An attribution; in A as it is, every score is 0.66."""
+    conditions = {(name, 0.8): scores for name, scores in sweep.items()}
+    measured = {"arm-stiffness": 1.0}
+    a = swept([0.66] * 8, conditions, measured=measured, left_out={"timestep": "why"})
+    return Attribution(a=a, b=swept(list(b), {}, "sapien", measured={"arm-stiffness": 0.8}))
 
 
 class OutcomeTest(TestCase):
     def test_shares_of_the_gap(self):
-        found = outcome(
-            A,
-            row("towards", "tip friction", *[0.33] * 4, *[0.66] * 4),
-            row("towards", "arm stiffness", *[0.33] * 6, *[0.66] * 2),
-            row("towards", "timestep", *[0.99] * 8),
-            B,
-        )
+        sweep = {
+            "tip-friction": [0.33] * 4 + [0.66] * 4,
+            "arm-stiffness": [0.33] * 6 + [0.66] * 2,
+            "timestep": [0.99] * 8,
+            ALL: [0.33] * 8,
+        }
+        found = outcome(sweep)
+        names = ["mujoco", "tip friction", "arm stiffness", "timestep", "all 3 at once", "sapien"]
+        self.assertEqual([row.name for row in found.rows], names)
         self.assertAlmostEqual(found.share(found.rows[1]), 0.5)
         self.assertAlmostEqual(found.share(found.rows[3]), -1.0)
-        self.assertEqual(found.costs(), found.rows[2])
+        self.assertEqual(found.costs().name, "arm stiffness")
+        self.assertIn("of it, all 3 at once 100%", verdict(found))
+        unknown = "not tried: timestep (unknown in mujoco, unknown in sapien): why"
+        self.assertEqual(list(not_tried(found)), [unknown])
         # one demonstration among many
-        found = outcome(A, row("other", "sapien", 0.33, 0.33, *[0.66] * 6))
-        self.assertIsNone(found.as_dict()["rows"][-1]["share_of_gap"])
+        found = outcome({}, [0.33, 0.33] + [0.66] * 6)
+        self.assertTrue(math.isnan(found.share(found.rows[-1])))
         self.assertIsNone(found.costs())
 
 
 class CommandTest(InFolder):
-    def test_the_command_writes_what_was_found(self):
+    def test_the_command_says_what_was_found(self):
         demos = self.folder / "demos.npz"
         write_demos(demos, synthesize(["soup"], 1, seed=0))
-        found = outcome(A, row("towards", "arm stiffness", *[0.33] * 8), B)
-        options = (
-            "--robot",
-            "openarm",
-            "--demos",
-            demos,
-            "--towards",
-            "sapien",
-            "--out",
-            self.folder,
-        )
-        options += ("--episodes", 3, "--seed", 4, "--only", "arm stiffness")
+        found = outcome({"arm-stiffness": [0.33] * 8})
+        options = ("--robot", "openarm", "--demos", demos, "--towards", "sapien")
+        options += ("--out", self.folder / "made", "--episodes", 3, "--seed", 4)
+        options += ("--only", "arm stiffness")
         with patch("xreset.eval.engines.attribution.attribute", return_value=found) as attribute:
             said = succeeds("engines", "attribute", "zero", *options)
-        spec, a, b, trial = attribute.call_args.args
+        spec, a, b, trial, out = attribute.call_args.args
         self.assertEqual((spec.name, a.name, b.name, trial.seed), ("zero", "mujoco", "sapien", 4))
         given = attribute.call_args.kwargs
         self.assertEqual((given["episodes"], [*given["only"]]), (3, ["arm stiffness"]))
-        content = json.loads((self.folder / "attribution.json").read_text())
-        self.assertEqual(content["costs_most"], "arm stiffness")
-        self.assertEqual((content["robot"], content["demonstrations"]), ("openarm", 1))
-        self.assertIn("demos", content["inputs"])
+        self.assertEqual(out, self.folder / "made")
         self.assertIn("'arm stiffness' alone brings about 100% of it", " ".join(said.split()))
 
     def test_bad_input(self):

@@ -68,7 +68,7 @@ class LightnessTest(TestCase):
 
     def test_a_misspelt_fault_or_property_is_refused_before_anything_heavy_is_loaded(self):
         for words in (
-            "rehearse soup-can --fault pose-dely",
+            "stress soup-can --faults --property pose-dely",
             "stress soup-can --demos x.npz --property pose-dely",
         ):
             code = (
@@ -118,8 +118,8 @@ class UsageTest(TestCase):
             (r"--mp4 is x, expected a name that ends in \.mp4", "view d.npz --mp4 x"),
             (r"--picture is x\.jpg, expected", "robots check openarm --picture x.jpg"),
             (
-                r"Unknown property 'pose-dely'\. Choose from: tracker-interval, pose-delay",
-                "rehearse soup-can --fault pose-dely",
+                r"Unknown property 'pose-dely'\. Choose from: .*tracker-interval, pose-delay",
+                "stress soup-can --property pose-dely",
             ),
             (r"Nothing was overwritten", "retarget d.npz --robot openarm --out ./d.npz"),
         ):
@@ -232,7 +232,9 @@ class UsageTest(TestCase):
             argv = ["eval", "zero", "--robot", "openarm", "--demos", "x.npz"]
             for name in given:
                 argv += ["--engine", name]
-            with patch("xreset.eval.evaluate.evaluate", side_effect=KeyboardInterrupt) as evaluate:
+            with patch(
+                "xreset.eval.experiment.evaluate", side_effect=KeyboardInterrupt
+            ) as evaluate:
                 self.assertEqual(run(*argv)[0], 130)
             self.assertEqual(list(evaluate.call_args.args[2]), expected)
 

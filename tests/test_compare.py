@@ -1,8 +1,9 @@
-"""Several trainings side by side: what is read, what is taken together, what is unfair, and what is written."""
+"""Several runs in one report: what is read, what is taken together, what is unfair, and what is written."""
 
 import re
 import shutil
 from dataclasses import replace
+from html import unescape
 from pathlib import Path
 from unittest import mock
 
@@ -17,11 +18,12 @@ from tests.toy_bank import SOUP, SPAM
 from tests.toy_results import ENGINES, InFolder, rollouts_with, toy_rollouts
 from xreset import TrainConfig
 from xreset.errors import FileFormatError, RunError, XResetError
+from xreset.eval.metrics import METRICS
 from xreset.eval.plots import COLORS, figure_style
 from xreset.eval.report.curves import amounts, line
-from xreset.eval.report.figures import draw_lines, draw_scores
+from xreset.eval.report.figures import draw_lines
 from xreset.eval.report.groups import grouped, scores
-from xreset.eval.report.make import compare
+from xreset.eval.report.make import collect, make_report, page
 from xreset.eval.report.read import read_curves, read_training, read_trainings
 from xreset.eval.results import read_evaluation
 from xreset.eval.stats import bootstrap_ci95, crossed_bootstrap_ci95, difference_ci95
@@ -49,6 +51,13 @@ def curves_of(seconds, success, first=1):
     return pd.DataFrame(columns, index=range(first, first + len(seconds)))
 
 
+def text_of(html):
+    """The text of a page, in one line; cells of tables end with a bar."""
+    body = re.sub(r"(?s)<(style|script).*?</\1>", "", html)
+    body = re.sub(r"</t[dh]>", " | ", body)
+    return " ".join(unescape(re.sub(r"<[^>]+>", " ", body)).split())
+
+
 class Compared(InFolder):
     def write_curves(self, name, curves):
         with SummaryWriter(log_dir=str(self.folder / name)) as writer:
@@ -68,10 +77,16 @@ class Compared(InFolder):
         return name
 
     def compare(self, *names, **options):
-        """The page, without escapes, of a comparison without the picture, which takes a second."""
-        with mock.patch("xreset.eval.report.make.write_picture"):
-            page = compare([str(self.folder / n) for n in names], self.folder / "out", **options)
-        return re.sub(r"\\(.)", r"\1", page.read_text())
+        """The text of a page without curves and films, whose cells end with a bar; ``self.report`` is what it shows."""
+        trainings = read_trainings([str(self.folder / name) for name in names])
+        with mock.patch("xreset.eval.report.make.draw_training", return_value=""):
+            self.report = collect(trainings, **options)
+        return text_of(page(self.report))
+
+    def notes(self, *names):
+        """The notes of the page, one a line."""
+        self.compare(*names)
+        return "\n".join(self.report.notes)
 
 
 class ReadTest(Compared):
@@ -87,7 +102,7 @@ class ReadTest(Compared):
         bare = self.write_run("bare")
         without = "neither learning curves .* nor evaluation results.*xreset eval .*/bare"
         for runs, message in (
-            ([], "nothing to compare"),
+            ([], "nothing to report"),
             ([str(a), str(other)], f"(?s)both be called 'a'.*a-1={a} a-2=.*other/a"),
             ([f"={a}"], "a name is missing"),
             (["x="], "a folder is missing"),
@@ -105,7 +120,7 @@ class ReadTest(Compared):
             ("lift.json", "}", "", "lift.json is not valid JSON"),
             ("run.json", "}", "", "run.json is not valid JSON"),
             ("run.json", '"config"', '"other"', "run.json lacks config"),
-            ("eval/mujoco.json", '"episodes": 4', '"episodes": 5', "states 5 episodes, .* holds 4"),
+            ("eval/mujoco.json", '"policy"', '"other"', "missing: policy"),
         ):
             whole = (a / name).read_text()
             (a / name).write_text(whole.replace(old, new))
@@ -232,9 +247,9 @@ class LiftTest(Compared):
             ("iterations", "60, 70", "85, >100", ">120, >100"),
         ):
             text = self.compare("x-s0", "x-s1", "other", "old", x=x)
-            row = "| x | 2 | 100% (34-100); {} | 50% (9-91); {} | 0% (0-66); {} |"
+            row = " x | 2 | 100% (34-100); {} | 50% (9-91); {} | 0% (0-66); {} |"
             self.assertIn(row.format(*times), text)
-        self.assertIn("| other | 1 |" + " 0% (0-79); >80 |" * 3, text)
+        self.assertIn(" other | 1 |" + " 0% (0-79); >80 |" * 3, text)
 
 
 class GroupTest(Compared):
@@ -296,22 +311,22 @@ class ScoreTest(Compared):
         for i, values in enumerate(progress):
             results = {"rollouts": rollouts_with(*values), "engines": engines}
             trainings.append(self.training(self.run_and_results(f"s-{i}", results, seed=i)))
-        return scores(grouped(trainings)[0]).set_index(["engine", "metric"])
+        found = scores(grouped(trainings)[0])
+        return found[found["object"] == "all"].set_index(["engine", "metric"])
 
     def test_one_training_has_the_figures_of_its_evaluation(self):
         ours = self.scored((1.0, 0.33, 0.66, 0.0), engines=ENGINES).loc["pybullet"]
-        summary = self.training("s-0").results["pybullet"]
+        result = self.training("s-0").results["pybullet"]
         progress = ours.loc["task_progress"]
-        self.assertEqual(progress["mean"], summary.task_progress.mean)
-        ci95 = summary.task_progress.ci95
+        ci95 = result.ci95("task_progress")
         assert_allclose(progress[["low", "high"]].astype(float), ci95, atol=1e-6)
-        for metric in ("approach", "grasp", "reorient", "reorient_once", "published_success"):
-            self.assertEqual(ours.loc[metric, "mean"], getattr(summary, f"{metric}_rate"), metric)
+        for metric in METRICS:
+            self.assertEqual(ours.loc[metric, "mean"], result.mean(metric), metric)
 
     def test_seeds_widen_the_interval(self):
         # one of the two seeds only is drawn in half of the resamples
         for progress, *expected in (
-            (((0.4, 0.6, 0.4, 0.6), (0.4, 0.6, 0.4, 0.6)), 0.5, 0.5, 0.5),
+            (((0.4, 0.6, 0.2, 0.4), (0.4, 0.6, 0.2, 0.4)), 0.4, 0.3, 0.5),
             (((0.0, 0.2, 0.0, 0.2), (0.8, 1.0, 0.8, 1.0)), 0.5, 0.1, 0.9),
         ):
             found = self.scored(*progress).loc["mujoco", "task_progress"]
@@ -384,7 +399,7 @@ class ScoreTest(Compared):
             self.write_run(name, reset_config(demo_probability=share))
             self.write_results(name, inputs={"demos": "ab", "policy": name})
         self.compare("a", "b")
-        figures = pd.read_csv(self.folder / "out" / "compare.csv")
+        figures = self.report.scores
         found = figures[figures["metric"] == "published_success minus a"]
         self.assertEqual(found[["group", "mean", "low", "high"]].values.tolist(), [["b", 0, 0, 0]])
 
@@ -397,7 +412,7 @@ class FairnessTest(Compared):
         text = self.compare("a", "b")
         self.assertNotIn("comparable", text)
         note = "Of 4 episodes of a in mujoco, 1 stopped being finite and 1 dropped contacts"
-        self.assertIn(f"Note:** {note}", text)
+        self.assertIn(note, text)
 
     def test_the_page_names_what_makes_results_incomparable(self):
         self.write_results("a", engines=("mujoco", "sapien"))
@@ -420,8 +435,8 @@ class FairnessTest(Compared):
             with self.subTest(what):
                 rollouts = replace(base, episodes=tuple(episodes) or base.episodes)
                 self.write_results(what, rollouts, ("mujoco", "sapien"), **changes)
-                note = r"\*\*Note:\*\* These results are (perhaps )?not comparable: not the same"
-                self.assertRegex(self.compare("a", what), rf"(?m)^> {note} {expected}")
+                note = "These results are (perhaps )?not comparable: not the same"
+                self.assertRegex(self.notes("a", what), rf"(?m)^{note} {expected}")
         with self.subTest("the same meshes, named from here and in full"):
             for name, folder in (("here", "meshes"), ("full", str(Path("meshes").resolve()))):
                 self.write_results(name, meshes=folder)
@@ -454,7 +469,8 @@ class FairnessTest(Compared):
                 text = self.compare("earlier", name)
                 self.assertRegex(text, words or "earlier")
                 self.assertEqual("not comparable" in text, bool(words))
-                self.assertEqual("task progress minus earlier" in text, not words)
+                is_compared = self.report.scores["metric"].str.endswith("minus earlier").any()
+                self.assertEqual(is_compared, not words)
         self.write_results("usual", engines=("sapien",), episode_seconds=12.0)
         self.assertRegex(self.compare("usual"), r"\(5: usual in mujoco; 12: usual in sapien\)")
 
@@ -464,7 +480,7 @@ class FairnessTest(Compared):
         self.run_and_results("onwards", weights=file, weights_hash="ab" * 32)
         text = self.compare("new", "onwards")
         self.assertIn(f"onwards began with the networks of another training ({file}): ", text)
-        self.assertIn(f"| weights | new | {file} |", text)
+        self.assertIn(f" weights | new | {file} |", text)
 
 
 class WrittenTest(Compared):
@@ -483,42 +499,41 @@ class WrittenTest(Compared):
     def test_the_page(self):
         names = self.write_three()
         text = self.compare(*names)
+        interval = r"\d+-\d+%"
         for row in (
-            "|  |  | mujoco 4.0.0 | sapien 4.0.0 |",
-            "| x | episodes / demonstrations / seeds | 8 / 2 / 2 | 8 / 2 / 2 |",
-            "| ik | episodes / demonstrations / seeds | 4 / 2 / 1 | - |",
-            r"|  | task progress | 32\.2 \(\d+-\d+\) | 32\.2 \(\d+-\d+\) |",
-            r"|  | reorient | 25\.0 \(.*\) | - |",
-            r"|  | published success | 25\.0 \(.*\) | 25\.0 \(.*\) |",
-            r"|  | published distance \[cm\] | 7\.8 \(5\.5-10\.0\) | - |",
-            r"|  | task progress minus x | -5\.0 \([-+.\d]+ to [-+.\d]+\) | -5\.0 \(.*\) |",
-            "| seed | 0; 1 | 0 |",
-            "| task.reset.random_gravity | True | False |",
-            "| minutes of training | 2.0 | 2.0 |",
-            "| iterations of training | 2 | 2 |",
+            rf"x \| mujoco 4\.0\.0 8 / 2 / 2 \| 32\.2% {interval} \|",
+            rf"\| \| sapien 4\.0\.0 8 / 2 / 2 \| 32\.2% {interval} \|",
+            r"ik \| mujoco 4\.0\.0 4 / 2 / 1 \| 49\.8% 33-66% \| 75% ",
+            r"fixed \| mujoco .* 7\.8 cm 5\.5-10\.0 cm .* \| -5\.0 \([-+.\d]+ to [-+.\d]+\) \|",
+            r"seed \| 0; 1 \| 0 \|",
+            r"task\.reset\.random_gravity \| True \| False \|",
+            r"minutes of training \| 2\.0 \| 2\.0 \|",
+            r"iterations of training \| 2 \| 2 \|",
+            r"tomato soup can \| \d+% \|",
         ):
-            self.assertRegex(text, f"(?m)^{row.replace('|', chr(92) + '|')}$")
+            self.assertRegex(text, row)
         self.assertNotIn("num_envs", text, "the same in all")
         self.assertIn("x is 2 trainings that differ in the seed only (x-s0, x-s1)", text)
-        self.assertIn("![Learning curves and task progress](compare.png)", text)
-        self.assertIn("# Comparison: x-s0, x-s1, fixed, ik\n", self.compare(*names, apart=True))
+        self.compare(*names, apart=True)
+        self.assertEqual(self.report.title, "x-s0, x-s1, fixed, ik")
 
-    def test_the_picture_is_higher_with_curves(self):
+    def test_curves(self):
         names = self.write_three()
-        heights = []
-        every = ("task/success", "task/success_from_home", *SPEED)
-        for chosen, curves in ((names[3:], ()), (names, every)):
-            runs = [str(self.folder / name) for name in chosen]
-            page = compare(runs, self.folder / "drawn", curves=curves)
-            content = page.with_name("compare.png").read_bytes()
-            width, height = (int.from_bytes(content[i : i + 4], "big") for i in (16, 20))
-            self.assertEqual((content[:4], width), (b"\x89PNG", 1200))
-            heights.append(height)
-        self.assertLess(heights[0], heights[1])
+        runs = read_trainings([str(self.folder / name) for name in names])
+        self.assertEqual(collect(runs[3:]).curves, "")
+        default = collect(runs)
+        self.assertEqual(default.x, "minutes")
+        self.assertIn("at the goal, from home", default.curves)
+        self.assertIn("minutes of training", default.curves)
+        chosen = collect(runs, curves=["speed/learn_seconds"], x="iterations").curves
+        self.assertIn("speed/learn_seconds", chosen)
+        self.assertIn("iterations of training", chosen)
 
     def test_curves_only(self):
         self.write_curves("a", curves_of((60.0, 60.0), (0.0, 0.5)))
-        self.assertNotIn("## Evaluation", self.compare("a"))
+        text = self.compare("a")
+        self.assertNotIn("side by side", text)
+        self.assertIn("a has no results. Make them first: xreset eval POLICY", text)
         self.write_results("ik")
         for name, curve, words in (
             ("a", "task/sucess", r"speed/.*task/success, task/success_from_home\.$"),
@@ -533,12 +548,9 @@ class WrittenTest(Compared):
         a = self.write_results("a")
         blocked = self.folder / "file"
         blocked.write_text("")
-        with self.assertRaisesRegex(XResetError, "cannot write"):
-            compare([str(a)], blocked / "out")
+        with self.assertRaisesRegex(XResetError, "cannot make the folder"):
+            make_report([str(a)], blocked / "out")
         self.assertEqual(blocked.read_text(), "")
-
-
-SPEED = ("speed/collect_seconds", "speed/learn_seconds")
 
 
 class DrawTest(Compared):
@@ -564,35 +576,30 @@ class DrawTest(Compared):
         words = (ax.get_xlabel(), ax.get_title(loc="left"))
         self.assertEqual(words, ("million environment steps", "at the goal"))
 
-    def test_bars_are_as_long_as_the_results(self):
-        self.write_results("a", rollouts_with(1.0, 0.5, 0.5, 0.0), ("mujoco", "sapien"))
-        self.write_results("b", rollouts_with(0.2, 0.2, 0.2, 0.2), ("sapien",))
-        table = scores(grouped([self.training(n) for n in "ab"])[0])
-        ax = self.draw(draw_scores, table, ["a", "b"])
-        assert_allclose([bar.get_height() for bar in ax.patches], [50, 50, np.nan, 20])
-        self.assertEqual([label.get_text() for label in ax.get_xticklabels()], ["mujoco", "sapien"])
-
 
 class CommandTest(Compared):
-    def test_from_folders_to_picture_and_page(self):
+    def test_from_folders_to_page_and_figures(self):
         for name, seed in (("a", 3), ("b", 4)):
             self.run_and_results(name, {"engines": ENGINES, "seed": seed}, num_envs=64 + seed)
         out = self.folder / "made"
         runs = (f"[one]={self.folder}/a", self.folder / "b")
         printed = succeeds("compare", *runs, "--out", out)
-        for expected in (*ENGINES, "[one]", "49.8", "num_envs", "These results are", "compare.md"):
+        for expected in (*ENGINES, "49.8", "These results are", "compare is now report"):
             self.assertIn(expected, printed)
-        written = {f.name for f in out.iterdir()}
-        self.assertEqual(written, {"compare.csv", "compare.md", "compare.png"})
-        figures = pd.read_csv(out / "compare.csv")
-        self.assertEqual([*figures], ["group", "engine", "metric", "mean", "low", "high"])
+        self.assertEqual({f.name for f in out.iterdir()}, {"index.html", "results.csv"})
+        text = text_of((out / "index.html").read_text())
+        self.assertIn("num_envs | 67 | 68 |", text)
+        figures = pd.read_csv(out / "results.csv")
+        columns = ["group", "engine", "object", "metric", "mean", "low", "high"]
+        self.assertEqual([*figures], columns)
         first = figures.iloc[0]
-        self.assertEqual(first[["group", "metric"]].tolist(), ["[one]", "task_progress"])
+        expected = ["[one]", "mujoco", "all", "task_progress"]
+        self.assertEqual(first[columns[:4]].tolist(), expected)
         self.assertAlmostEqual(first["mean"], 0.4975)
         self.assertLess(first["low"], first["mean"])
 
     def test_mistakes_are_one_line(self):
         self.assertRegex(
-            refused("compare", f"{self.folder}/x").strip(),
-            "^xreset compare: The folder [^\n]* does not exist[^\n]*$",
+            refused("report", f"{self.folder}/x").strip(),
+            "^xreset report: The folder [^\n]* does not exist[^\n]*$",
         )

@@ -1,41 +1,34 @@
 """Metrics on constructed trajectories, confidence intervals, result files."""
 
-import contextlib
-import io
 import json
 import math
 import re
-from dataclasses import asdict, replace
+from dataclasses import replace
+from typing import Any
 from unittest import TestCase
 from unittest.mock import patch
 
 import numpy as np
+import pandas as pd
 import torch
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
+from pandas.testing import assert_frame_equal
 from scipy.spatial.transform import Rotation
 from torch import tensor
 
 from tests import toy_grasp
 from tests.data import InFolder
 from tests.toy_bank import SOUP, SPAM, toy_bank
-from tests.toy_results import OBJECTS, toy_rollouts, toy_summary
+from tests.toy_results import OBJECTS, toy_result, toy_rollouts
 from xreset import evaluate, load_object, load_policy
 from xreset.errors import FileFormatError, PolicyError, XResetError
-from xreset.eval.metrics import EpisodeMetrics, MetricPoints
+from xreset.eval.metrics import METRICS, EpisodeMetrics, MetricPoints
 from xreset.eval.report.groups import estimate
-from xreset.eval.results import (
-    Episode,
-    EvalResult,
-    Evaluation,
-    read_evaluation,
-    read_traces,
-    write_results,
-)
+from xreset.eval.results import Evaluation, read_evaluation, read_traces, write_result
 from xreset.eval.rollout import chosen_engines, engine, load_trial, roll_out
-from xreset.eval.stats import bootstrap_ci95, mean_of_known
+from xreset.eval.stats import bootstrap_ci95, share_ci95
 from xreset.eval.table import result_rows
-from xreset.files.checks import from_dict
 from xreset.files.storage import claim_folder
 from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.objects.sampling import metric_points
@@ -348,9 +341,16 @@ class BootstrapTest(TestCase):
         alone = bootstrap_ci95(np.array([1.0, 0, 1, 0]), np.zeros(4))
         self.assertTrue(0 <= alone[0] < 0.5 < alone[1] <= 1)
 
-    def test_a_mean_of_what_was_not_always_measured_is_unknown(self):
-        self.assertEqual(mean_of_known([1.0, 4.0]), 2.5)
-        self.assertIsNone(mean_of_known([1.0, None]))
+    def test_four_of_four_are_not_certain(self):
+        groups = np.arange(4)
+        runs = np.zeros(4)
+        low, high = share_ci95(np.ones(4), runs, groups)
+        self.assertAlmostEqual(low, 4 / (4 + 1.959964**2), places=6)  # Wilson's interval
+        self.assertEqual(high, 1.0)
+        self.assertEqual(share_ci95(np.zeros(4), runs, groups)[0], 0.0)
+        mixed = np.array([1.0, 1.0, 1.0, 0.0])
+        self.assertEqual(share_ci95(mixed, runs, groups), bootstrap_ci95(mixed, groups))
+        self.assertTrue(np.isnan(share_ci95(np.full(4, np.nan), runs, groups)).all())
 
 
 JOINTS = ("a", "b", "c")
@@ -363,16 +363,15 @@ class ResultsTest(InFolder):
         super().setUp()
         self.rollouts = toy_rollouts()
         for name in ("sapien", "mujoco"):
-            write_results(self.folder, toy_summary(name), self.rollouts, JOINTS)
+            write_result(self.folder, toy_result(name), self.rollouts.traces, JOINTS)
         self.policy = replace(toy_grasp.policy(), folder=self.folder)
 
     def test_the_table_tells_trained_objects_from_unseen_ones(self):
-        summary = toy_summary(unseen=(OBJECTS[1],))
-        table = {row[0].strip(): row[1] for row in reversed(result_rows([summary]))}
+        result = toy_result(unseen=(OBJECTS[1],))
+        table = {row[0].strip(): row[1] for row in reversed(result_rows([result]))}
         self.assertEqual((table["trained objects"], table["unseen objects"]), ("66.5%", "33.0%"))
-        for same in (toy_summary(), toy_summary(unseen=OBJECTS)):
+        for same in (toy_result(), toy_result(unseen=OBJECTS)):
             self.assertNotIn("unseen objects", {row[0].strip() for row in result_rows([same])})
-        self.assertEqual(from_dict(EvalResult, json.loads(json.dumps(asdict(summary)))), summary)
 
     def test_an_evaluation_shows_its_table(self):
         evaluation = read_evaluation(self.folder)
@@ -380,84 +379,84 @@ class ResultsTest(InFolder):
         self.assertEqual(len(table), 8)
         means = table.groupby("engine")["task_progress"].mean().round(6).to_dict()
         self.assertEqual(means, dict.fromkeys(("mujoco", "sapien"), 0.4975))
-        first = table.iloc[0][["policy", "robot", "seed", "sequence_name"]]
-        self.assertEqual(first.tolist(), ["zero", "toy", 3, "demo_0"])
+        first = table.iloc[0][["policy", "robot", "seed", "property", "sequence_name"]]
+        self.assertEqual(first.tolist(), ["zero", "toy", 3, "", "demo_0"])
         self.assertEqual(repr(evaluation), str(evaluation))
         for expected in ("mujoco", "sapien", "49.8%", "episodes: 4, demonstrations: 2, seed: 3"):
             self.assertIn(expected, str(evaluation))
-        self.assertIn("task progress", str(Evaluation([toy_summary()], [])))
 
-    def test_summary(self):
-        s = toy_summary()
-        self.assertEqual((s.objects, s.episodes, s.task_progress.mean), ((SOUP, SPAM), 4, 0.4975))
-        self.assertEqual(
-            s.task_progress.ci95,
-            (0.33, 0.665),
-            "two demonstrations: the interval spans their means",
-        )
-        self.assertEqual((s.approach_rate, s.grasp_rate, s.reorient_rate), (0.75, 0.5, 0.25))
-        self.assertEqual(s.reorientation_progress, 0.375)
-        self.assertEqual(vars(s.health), {"nonfinite": 1, "overflow": 1, "out_of_bounds": 1})
-        self.assertEqual(
-            [(d.sequence, d.task_progress) for d in s.per_demo],
-            [("demo_0", 0.665), ("demo_1", 0.33)],
-        )
-        self.assertEqual(
-            (s.per_demo[1].grasp_rate, s.per_demo[1].object, s.per_demo[1].episodes), (0.5, SPAM, 2)
-        )
+    def test_means_and_intervals(self):
+        found = toy_result()
+        self.assertEqual((found.objects, found.episodes_per_demo), ((SOUP, SPAM), 2))
+        means = {name: found.mean(name) for name in METRICS}
+        expected = {"task_progress": 0.4975, "approach": 0.75, "grasp": 0.5, "reorient": 0.25}
+        expected |= {"reorientation_progress": 0.375, "nonfinite": 0.25, "out_of_bounds": 0.25}
+        self.assertEqual({name: means[name] for name in expected}, expected)
+        self.assertEqual(found.ci95("task_progress"), (0.33, 0.665), "the two demonstrations")
 
     def test_impossible_values_are_refused(self):
-        episode = asdict(self.rollouts.episodes[0])
-        health = {"nonfinite": "<script>alert(1)</script>", "overflow": 0, "out_of_bounds": 0}
-        wide = {"mean": 7, "ci95": [0, 1]}
-        short = {"mean": 0.5, "ci95": [0]}
-        for file, words, changes in (
-            ("mujoco.json", "missing: grasp_rate", {}),
-            ("mujoco.json", "unknown: later", {"later": 1}),
-            ("mujoco.json", "unknown(.|\n)*by xreset '9.9'", {"later": 1, "xreset": "9.9"}),
-            ("mujoco.json", "policy is 5, expected str", {"policy": 5}),
-            ("mujoco.json", "mean is 7, expected a number from 0 to 1", {"task_progress": wide}),
-            ("mujoco.json", "ci95 has 1 entries", {"task_progress": short}),
-            ("mujoco.json", "nonfinite is '<script>alert", {"health": health}),
-            ("mujoco.json", "inputs.demos is 3", {"inputs": {"demos": 3}}),
-            ("mujoco.json", r"per_demo is \[\], expected one demonstration", {"per_demo": []}),
-            ("mujoco.json", "schema version 'xreset-eval/0'", {"schema": "xreset-eval/0"}),
-            ("mujoco.episodes.json", "task_progress is 1e.308, expected", {"task_progress": 1e308}),
-            ("mujoco.episodes.json", "progress is -7, expected", {"reorientation_progress": -7}),
-            ("mujoco.episodes.json", "sequence is -1, expected", {"sequence": -1}),
+        path = self.folder / "mujoco.json"
+        whole = json.loads(path.read_text())
+        for words, changes in (
+            ("missing: robot", {"robot": ...}),
+            ("unknown: later", {"later": 1}),
+            ("unknown(.|\n)*by xreset '9.9'", {"later": 1, "xreset": "9.9"}),
+            ("policy is 5, expected str", {"policy": 5}),
+            ("inputs.demos is 3", {"inputs": {"demos": 3}}),
+            ("schema version 'xreset-eval/0'", {"schema": "xreset-eval/0"}),
+            ("'<script>alert", {"engine_version": ["<script>alert(1)</script>"]}),
+            ("episodes is None, expected an object", {"episodes": ...}),
         ):
-            path = self.folder / file
-            whole = path.read_text()
-            content = json.loads(whole)
-            if "episodes" in file:
-                content["episodes"] = [episode | changes] * 4
-            elif changes:
-                content |= changes
-            else:
-                del content["grasp_rate"]
+            content = {name: x for name, x in (whole | changes).items() if x is not ...}
             path.write_text(json.dumps(content))
             with self.subTest(changes), self.assertRaisesRegex(FileFormatError, words):
                 read_evaluation(self.folder)
-            path.write_text(whole)
+        for words, column, values in (
+            (
+                r"task_progress\[0\] is 1e.308, expected a number from 0 to 1",
+                "task_progress",
+                1e308,
+            ),
+            (r"progress\[0\] is -7, expected", "reorientation_progress", -7),
+            (r"sequence\[0\] is -1, expected", "sequence", -1),
+            ("missing: grasp", "grasp", ...),
+            ("unknown: colour", "colour", 1),
+            (r"the columns of episodes have \[3, 4\] entries", "grasp", [True] * 3),
+            ("no unchanged episode", "property", "object-mass"),
+        ):
+            columns = dict(whole["episodes"])
+            columns[column] = values if isinstance(values, list) else [values] * 4
+            if values is ...:
+                del columns[column]
+            path.write_text(json.dumps(whole | {"episodes": columns}))
+            with self.subTest(column), self.assertRaisesRegex(FileFormatError, words):
+                read_evaluation(self.folder)
+
+    def write_as_earlier(self, engine, *unmeasured):
+        """Replace a result by the two files of 0.1 to 0.3: a summary, and a list of episodes without some metrics."""
+        path = self.folder / f"{engine}.json"
+        content = json.loads(path.read_text())
+        columns = content.pop("episodes")
+        names = columns.keys() - {"property", "value", *unmeasured}
+        rows = pd.DataFrame({name: columns[name] for name in names}).to_dict("records")
+        earlier = {"schema": "xreset-episodes/1", "episodes": rows}
+        path.with_name(f"{engine}.episodes.json").write_text(json.dumps(earlier))
+        for name in ("left_out", "measured", "stopped"):
+            del content[name]
+        content["backend"] = content.pop("engine")
+        content["backend_version"] = content.pop("engine_version")
+        content |= {"schema": "xreset-eval/1", "episodes": 4, "episodes_per_demo": 2}
+        content |= {"task_progress": {"mean": 0.4975, "ci95": [0.33, 0.665]}, "grasp_rate": 0.5}
+        path.write_text(json.dumps(content))
+        return path, content
 
     def test_an_earlier_version_did_not_measure_the_published_success(self):
         """Its files load and say so; the rest of the table is as it was, also next to results of today."""
         today = read_evaluation(self.folder)
         self.assertEqual(today.to_frame()["published_success"].dtype, bool)
         self.assertRegex(str(today), r"published success *│ *25.0% │ *25.0%")
-        for file, fields in (
-            ("mujoco.json", ("published_success_rate", "published_success_ci95", "least_distance")),
-            (
-                "mujoco.episodes.json",
-                ("published_success", "least_distance", "final_distance", "final_angle"),
-            ),
-        ):
-            content = json.loads((self.folder / file).read_text())
-            rows = content["episodes"] if "episodes" in file else content["per_demo"]
-            for entry in (content, *rows):
-                for name in fields:
-                    entry.pop(name, None)
-            (self.folder / file).write_text(json.dumps(content))
+        unmeasured = ("published_success", "least_distance", "final_distance", "final_angle")
+        path, content = self.write_as_earlier("mujoco", *unmeasured)
         evaluation = read_evaluation(self.folder)
         self.assertRegex(str(evaluation), r"published success *│ *missing │ *25.0%")
         self.assertRegex(str(evaluation), r"task progress *│ *49.8% │ *49.8%")
@@ -469,17 +468,25 @@ class ResultsTest(InFolder):
             found, low, _ = estimate(table[table["engine"] == name], "least_distance")
             assert_allclose(found, expected)
             self.assertEqual(np.isnan(low), np.isnan(expected))
+        path.write_text(json.dumps(content | {"episodes": 5}))
+        words = "states 5 episodes, .* holds 4"
+        self.assertRaisesRegex(FileFormatError, words, read_evaluation, self.folder)
+        # new results replace both files
+        write_result(self.folder, toy_result("mujoco"), self.rollouts.traces, JOINTS)
+        self.assertFalse(path.with_name("mujoco.episodes.json").exists())
 
     def test_files(self):
+        sweep = {("object-mass", 0.5): self.rollouts.episodes}
+        write_result(self.folder, toy_result(sweep=sweep), self.rollouts.traces, JOINTS)
         found = read_evaluation(self.folder)
-        self.assertEqual([s.engine for s in found], ["mujoco", "sapien"])
-        self.assertEqual(found[0], toy_summary("mujoco"))
+        self.assertEqual([r.engine for r in found], ["mujoco", "sapien"])
+        self.assertEqual(found[0], toy_result(sweep=sweep))
+        assert_frame_equal(found[0].episodes, toy_result(sweep=sweep).episodes)
+        self.assertEqual((len(found[0].nominal), len(found[0].changed)), (4, 4))
         traces = read_traces(self.folder, "mujoco", JOINTS)
         for read, made in zip(traces, self.rollouts.traces, strict=True):
             for name, value in vars(made).items():
                 assert_array_equal(getattr(read, name), value, name)
-        episodes = json.loads((self.folder / "mujoco.episodes.json").read_text())["episodes"]
-        self.assertEqual(Episode(**episodes[2]), self.rollouts.episodes[2])
         with self.assertRaisesRegex(FileFormatError, "joints a, b, c.*robot has a, c, b"):
             read_traces(self.folder, "mujoco", ("a", "c", "b"))
         trace = self.folder / "mujoco.trace.npz"
@@ -512,8 +519,8 @@ class ResultsTest(InFolder):
 
     def test_two_evaluations_are_not_written_into_one_folder(self):
         with (
-            patch("xreset.eval.evaluate.load_trial"),
-            patch("xreset.eval.evaluate.chosen_engines", return_value=[]),
+            patch("xreset.eval.experiment.load_trial"),
+            patch("xreset.eval.experiment.chosen_engines", return_value=[]),
         ):
             with claim_folder(self.folder), self.assertRaisesRegex(XResetError, "writing"):
                 evaluate(self.policy, "demos.npz")
@@ -545,7 +552,7 @@ class ResultsTest(InFolder):
             )
             self.assertEqual(result.episode_seconds, seconds)
             self.assertIn(
-                f"episodes: 3 of {seconds} s, demonstrations: 3", repr(Evaluation([result], []))
+                f"episodes: 3 of {seconds} s, demonstrations: 3", repr(Evaluation([result]))
             )
             self.assertEqual(read_evaluation(self.folder)[0], result)
             found[seconds] = read_traces(self.folder, "mujoco", policy.robot.joint_names)
@@ -564,34 +571,31 @@ class ResultsTest(InFolder):
     def test_results_of_another_length_are_named_before_they_are_replaced(self):
         policy = load_policy("zero", robot="ur7e-sharpa")
         bank = toy_bank(policy.robot)
+        options: dict[str, Any] = {"episodes": 1, "out": self.folder / "new"}
         for seconds, told in ((0.1, ""), (0.1, ""), (0.2, "results of episodes of another length")):
-            errors = io.StringIO()
-            with self.subTest(seconds), contextlib.redirect_stderr(errors):
+            logged = self.assertLogs if told else self.assertNoLogs
+            with self.subTest(seconds), logged("xreset.eval.experiment") as logs:
                 evaluate(
-                    policy,
-                    bank,
-                    [engine("mujoco", workers=0)],
-                    episodes=1,
-                    episode_seconds=seconds,
-                    out=self.folder / "new",
+                    policy, bank, engine("mujoco", workers=0), episode_seconds=seconds, **options
                 )
-            self.assertIn(told, errors.getvalue())
-            self.assertEqual(bool(told), bool(errors.getvalue()))
+            if told:
+                self.assertIn(told, logs.output[0])
 
     def test_results_of_other_demonstrations_are_named_before_they_are_replaced(self):
         before = (self.folder / "mujoco.json").read_bytes()
         for demos, told in (("ab", ""), ("cd", f"{self.folder / 'mujoco.json'}: results of other")):
-            errors = io.StringIO()
+            logged = self.assertLogs if told else self.assertNoLogs
             with (
                 self.subTest(demos),
-                patch("xreset.eval.evaluate.load_trial") as load_trial,
-                patch("xreset.eval.evaluate.roll_out", side_effect=KeyboardInterrupt),
-                contextlib.redirect_stderr(errors),
+                patch("xreset.eval.experiment.load_trial") as load_trial,
+                patch("xreset.eval.experiment.play", side_effect=KeyboardInterrupt),
+                logged("xreset.eval.experiment") as logs,
                 self.assertRaises(KeyboardInterrupt),
             ):
                 load_trial.return_value.inputs = {"demos": demos}
                 evaluate(self.policy, "demos.npz", "mujoco")
-            self.assertEqual(errors.getvalue()[: len(told) or None], told)
+            if told:
+                self.assertIn(told, logs.output[0])
         self.assertEqual((self.folder / "mujoco.json").read_bytes(), before)
 
     def test_a_result_that_is_not_a_number_is_not_written(self):
@@ -599,5 +603,5 @@ class ResultsTest(InFolder):
         broken = replace(self.rollouts, episodes=(bad,))
         new = self.folder / "new"
         with self.assertRaises(ValueError):
-            write_results(new, toy_summary(rollouts=broken), broken, JOINTS)
+            write_result(new, toy_result(rollouts=broken), broken.traces, JOINTS)
         self.assertFalse(new.exists())

@@ -18,9 +18,9 @@ from xreset import (
     make_env,
     make_goals,
     merge_demos,
-    rehearse,
     retarget_demos,
     robots,
+    stress,
     synthesize,
     train,
     write_bank,
@@ -118,7 +118,7 @@ class InputsTest(InOneFolder):
             (make_env, {"bank": bank} | scene, {"seed": np.random.default_rng()}, seeds),
             (merge_demos, {}, {"parts": ["demos.npz"]}, "Sequence[Demos]"),
             (evaluate, playing, {"engines": 5}, "str | Engine | Sequence[str | Engine]"),
-            (rehearse, {"policy": "soup-can", "demos": bank}, {"episodes": 0}, counts),
+            (stress, {"policy": "soup-can", "demos": bank}, {"episodes": 0}, counts),
             (retarget_demos, {"demos": self.demos} | scene, {"config": {"arm": 1}}, "RetargetConfig | None"),
             (make_bank, {"retargeted": motion} | scene, {"limits": {"steps": 1}}, "FilterConfig | None"),
             (make_env, {"bank": bank} | scene, {"task": {"timestep": 1}}, "TaskConfig | None"),
@@ -147,5 +147,5 @@ class InputsTest(InOneFolder):
             self.assertIs(pickle.loads(pickle.dumps(function)), function)
 
     def test_errors_of_right_arguments_are_not_changed(self):
-        with patch("xreset.eval.evaluate.load_policy", side_effect=TypeError("defect")):
+        with patch("xreset.eval.experiment.load_policy", side_effect=TypeError("defect")):
             self.assertRaisesRegex(TypeError, "defect", evaluate, "zero", self.demos)

@@ -10,7 +10,7 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
 from tests import toy_grasp
-from xreset.eval.rehearse import SimulatedRunner
+from xreset.eval.robot_loop import SimulatedRunner
 from xreset.eval.rollout import engine, episode_starts
 from xreset.learning.recipes import RECIPES
 from xreset.live.engine import EngineDriver, make_controller

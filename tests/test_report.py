@@ -2,10 +2,10 @@
 
 import re
 import subprocess
-from dataclasses import asdict, replace
+from dataclasses import replace
 from html.parser import HTMLParser
 from importlib.util import find_spec
-from unittest import TestCase, mock, skipUnless
+from unittest import mock, skipUnless
 
 import numpy as np
 import pandas as pd
@@ -16,17 +16,16 @@ from tests.toy_bank import SOUP, SPAM
 from tests.toy_results import (
     ENGINES,
     InFolder,
-    episodes,
-    toy_card,
+    rollouts_with,
+    swept,
     toy_choice,
+    toy_result,
     toy_rollouts,
-    toy_summary,
 )
 from tests.toy_robot import toy_hand_arm
 from xreset import TrainConfig, load_object, robots
 from xreset.cameras.config import FRONT, VisionConfig
 from xreset.errors import FileFormatError, RunError
-from xreset.eval.report import figures
 from xreset.eval.report.clips import (
     Clip,
     best_everywhere,
@@ -36,12 +35,13 @@ from xreset.eval.report.clips import (
     make_film,
     worst_episodes,
 )
+from xreset.eval.report.figures import draw_training
+from xreset.eval.report.groups import singles
 from xreset.eval.report.make import collect, count_failures, headline, make_report, page
-from xreset.eval.results import TaskProgress, episode_table, recorded, write_results
-from xreset.eval.sensitivity import chosen
-from xreset.eval.stress import curve
+from xreset.eval.report.read import read_trainings
+from xreset.eval.results import read_evaluation, recorded, write_result
 from xreset.eval.table import table_text
-from xreset.files.storage import claim_folder, write_json
+from xreset.files.storage import claim_folder
 from xreset.geometry.shapes import pose_matrix
 from xreset.learning.run import write_choice
 
@@ -66,7 +66,7 @@ class Reported(InFolder):
 
 
 def table_of(*episodes, engine="mujoco"):
-    return episode_table(toy_summary(engine), episodes)
+    return toy_result(engine, replace(toy_rollouts(), episodes=episodes)).to_frame()
 
 
 def row_of(index):
@@ -102,34 +102,44 @@ class Outline(HTMLParser):
 
 
 class CollectTest(Reported):
+    def read(self, folder=None):
+        return read_trainings([str(folder or self.folder)])
+
+    def collect(self):
+        return collect(self.read())
+
     def test_a_run_a_baseline_and_a_bare_folder(self):
         self.write()
-        self.assertIsNone(collect(self.folder).run)
-        self.assertEqual(collect(self.folder / "eval").training.label, "soup")
+        self.assertIsNone(self.read()[0].run)
+        self.assertEqual(self.read(self.folder / "eval")[0].label, "soup")
         self.write_soup()
-        data = collect(self.folder)
-        self.assertEqual((data.training.label, data.run.num_envs, data.notes), ("soup", 4096, ()))
-        self.assertEqual(tuple(data.training.results), ENGINES)
+        (training,) = self.read()
+        self.assertEqual((training.label, training.run.num_envs), ("soup", 4096))
+        self.assertEqual(self.collect().notes, ())
+        self.assertEqual(tuple(training.results), ENGINES)
 
     def test_a_policy_that_sees_needs_no_run(self):
         self.write(vision=SEEING)
-        self.assertEqual(collect(self.folder).vision, SEEING)
-        self.assertEqual(collect(self.folder).notes, ())
-        write_results(self.folder / "teacher", toy_summary(), toy_rollouts(), ("a", "b", "c"))
-        [note] = collect(self.folder).notes
+        self.assertEqual(self.read()[0].vision, SEEING)
+        self.assertEqual(self.collect().notes, ())
+        self.write_teacher()
+        [note] = self.collect().notes
         words = "Of 1 episodes that the teacher ends at the goal, the student misses 0."
         self.assertEqual(note, words)
         self.write_soup()
-        self.assertIsNone(collect(self.folder).vision, "the run's configuration has no camera")
+        self.assertIsNone(self.read()[0].vision, "the run's configuration has no camera")
+
+    def write_teacher(self, engine="mujoco"):
+        traces = toy_rollouts().traces
+        write_result(self.folder / "teacher", toy_result(engine), traces, ("a", "b", "c"))
 
     def test_a_teacher_that_played_other_episodes_is_not_compared(self):
         self.write(("mujoco",))
         self.write_run("", teacher="soup-can")
         for engine in (None, "sapien", "mujoco"):
             if engine is not None:
-                summary = toy_summary(engine)
-                write_results(self.folder / "teacher", summary, toy_rollouts(), ("a", "b", "c"))
-            [note] = collect(self.folder).notes
+                self.write_teacher(engine)
+            [note] = self.collect().notes
             with self.subTest(engine):
                 self.assertEqual(
                     note.startswith("The teacher was not evaluated from the same starts. Make"),
@@ -139,20 +149,20 @@ class CollectTest(Reported):
     def test_nothing_to_report(self):
         self.folder.mkdir()
         words = f"nor evaluation results.*xreset eval POLICY.*--out {self.folder}"
-        self.assertRaisesRegex(RunError, words, collect, self.folder)
+        self.assertRaisesRegex(RunError, words, self.read)
         self.write_soup()
         (self.folder / "lift.json").write_text('{"schema": "xreset-lift/1", "iteration": 1}')
-        words = f"no evaluation results.*xreset eval {self.folder} --demos"
-        self.assertRaisesRegex(RunError, words, collect, self.folder)
+        [note] = self.collect().notes
+        self.assertRegex(note, f"soup has no results.*xreset eval {self.folder} --demos")
 
     def test_results_outlive_the_description_of_their_training(self):
         self.write()
         self.write_soup()
         file = self.folder / "run.json"
         file.write_text(file.read_text().replace('"iterations"', '"cycles"'))
-        data = collect(self.folder)
-        self.assertIsNone(data.run)
-        self.assertRegex(data.notes[0], "training is not described here: .*unknown: cycles")
+        self.assertIsNone(self.read()[0].run)
+        words = "training is not described here: .*unknown: cycles"
+        self.assertRegex(self.collect().notes[0], words)
 
     def test_engines_that_were_not_evaluated_alike_are_pointed_out(self):
         self.write(("mujoco",))
@@ -162,26 +172,41 @@ class CollectTest(Reported):
             ("demonstrations", {"inputs": {"demos": "cd"}}),
         ):
             self.write(("sapien",), **change)
-            (note,) = collect(self.folder).notes
+            (note,) = self.collect().notes
             words = f"not comparable: not the same {what} .*: soup in mujoco; .*: soup in sapien"
             self.assertRegex(note, words)
 
     def test_the_page_has_tolerances_and_the_choice_of_the_checkpoint(self):
         policy = {"policy": "ab12"}
         self.write(inputs=policy)
-        (prop,) = chosen(["force-gain=2"])
-        scattered = curve(prop, episodes([0.8] * 4), {2.0: episodes([0.2, 0.2, 1.0, 1.0])})
-        card = toy_card(curves=(scattered,), inputs=policy)
-        write_json(f"{self.folder}/stress/mujoco.json", asdict(card))
+        sweep = {("force-gain", 2.0): [0.2, 0.2, 1.0, 1.0]}
+        lost = {("pose-delay", 0.2): [0.1] * 4}
+        stopped = {"The pose is old.": 2}
+        for name, conditions in (("stress", sweep), ("faults", lost)):
+            found = swept([0.8] * 4, conditions, inputs=policy, stopped=stopped)
+            write_result(self.folder / name, found, (), ())
+        # cards of 0.1 to 0.3 had no episodes
+        (self.folder / "stress" / "sapien.json").write_text('{"schema": "xreset-stress/1"}')
         choice = toy_choice()
         write_choice(self.folder, choice)
-        text = Outline(page(collect(self.folder), [])).text
-        for words in ("What it tolerates", "x 1.5, or chance", choice.sentence()):
+        html = page(self.collect())
+        text = Outline(html).text
+        for words in (
+            "What it tolerates",
+            "x 1.5, or chance",
+            "Not ready for a robot.",
+            "pose delay 0.2 s costs 70.0 points",
+            "The pose is old.",
+            "not tried on hardware",
+            "sapien.json is of an earlier version, without episodes",
+            choice.sentence(),
+        ):
             self.assertIn(words, text)
+        self.assertEqual(html.count("<svg"), 2)
         write_choice(self.folder, replace(choice, policy_hash="another"))
         self.write(inputs={"policy": "retrained"})
-        data = collect(self.folder)
-        self.assertEqual((data.choice, data.stress), (None, ()))
+        (training,) = self.read()
+        self.assertEqual((training.choice, training.sweeps), (None, ()))
 
 
 class ClipTest(Reported):
@@ -279,11 +304,11 @@ class ClipTest(Reported):
             mock.patch("xreset.eval.report.clips.encode_mp4") as encode,
         ):
             encode.return_value = b"film"
-            data = collect(self.folder)
-            objects = make_film(data, self.folder / "film.mp4")
+            (training,) = read_trainings([str(self.folder)])
+            objects = make_film([training], self.folder / "film.mp4")
         frames, fps = encode.call_args.args
         names = tuple(sorted({trace.object for trace in rollouts.traces}))
-        self.assertEqual((set(data.training.results), objects), (set(ENGINES), names))
+        self.assertEqual((set(training.results), objects), (set(ENGINES), names))
         self.assertEqual((len(frames), *frames.shape[2:]), (3, len(names) * 200, 3))
         self.assertEqual(round(fps), 10)
         self.assertEqual(frames.shape[1] % 4, 0)
@@ -328,16 +353,20 @@ class FailureTest(Reported):
         self.assertEqual(list(counts.values()), [1, 2, 1, 1])
 
 
-class PlotTest(TestCase):
+class PlotTest(Reported):
     def test_a_drawing_takes_the_pages_colour_and_size(self):
-        drawing = figures.draw_training(CURVES)
+        self.write(("mujoco",))
+        (training,) = read_trainings([str(self.folder)])
+        groups = singles([replace(training, curves=CURVES)])
+        drawing = draw_training(groups, ["episode/return"], "iterations")
         self.assertTrue(drawing.startswith("<svg") and drawing.endswith("</svg>"))
         opening = drawing[: drawing.index(">")]
         self.assertIn("viewBox", opening)
         self.assertNotRegex(opening, r"\b(width|height)=")
         self.assertIn("currentColor", drawing)
         self.assertNotIn("#010203", drawing)
-        self.assertEqual(drawing, figures.draw_training(CURVES))
+        again = draw_training(groups, ["episode/return"], "iterations")
+        self.assertEqual(drawing, again)
 
 
 CURVES = pd.DataFrame({"episode/return": [0.5, 2.0]}, index=[1, 50])
@@ -354,17 +383,22 @@ class PageTest(Reported):
             cls.clips.append(Clip(episode=episode, finite=name != "sapien", **shown))
         cls.strips = [Clip(episode=row_of(2)._replace(engine=""), finite=True, **shown)]
 
-    def data(self, **changes):
+    def report(self, **changes):
+        """The report of the folder, with films; ``changes`` replace its fields."""
+        report = collect(read_trainings([str(self.folder)]))
+        return replace(report, clips=self.clips, strips=self.strips, **changes)
+
+    def whole(self):
+        """The report of a run with results and learning curves."""
         self.write()
         self.write_soup()
-        data = collect(self.folder)
-        return replace(data, training=replace(data.training, curves=CURVES), **changes)
+        (training,) = read_trainings([str(self.folder)])
+        report = collect([replace(training, curves=CURVES)])
+        return replace(report, clips=self.clips, strips=self.strips)
 
     def test_the_page(self):
-        text = page(self.data(), self.clips, self.strips)
-        self.assertEqual(
-            text, page(self.data(), self.clips, self.strips), "the same results give the same page"
-        )
+        text = page(self.whole())
+        self.assertEqual(text, page(self.whole()), "the same results give the same page")
         outline = Outline(text)
         with self.subTest("well formed, with unique identifiers"):
             self.assertEqual(outline.open, [])
@@ -403,7 +437,7 @@ class PageTest(Reported):
             self.assertEqual(outline.of("html")[0]["lang"], "en")
             self.assertEqual(len(outline.of("caption")), 3)
         for expected in (
-            "zero on toy", "mujoco-warp 4.0.0 on cuda, 4,096 worlds", "50 of 500 iterations, seed 7", "49.8%", "33.0 to 66.5%", "37.5%",
+            "zero on toy", "mujoco-warp 4.0.0 on cuda, 4,096 worlds", "50 of 500 iterations, seed 7", "49.8%", "33-66%", "37.5%",
             "tomato soup can", "demo_1", "4 in each engine: 2 demonstrations, 2 starts each", "trained here",
             "Of 4 episodes in mujoco: 1 never near the object; 1 near it, but no grasp; 1 grasped, never at the goal.",
         ):  # fmt: skip
@@ -412,21 +446,24 @@ class PageTest(Reported):
 
     def test_the_page_tells_what_the_cameras_see(self):
         words = "the depth that the cameras see"
-        self.assertNotIn(words, page(self.data(), self.clips))
+        self.assertNotIn(words, page(self.whole()))
         self.write(vision=SEEING)
         (self.folder / "run.json").unlink()
-        self.assertIn(words, page(collect(self.folder), self.clips))
+        self.assertIn(words, page(self.report()))
+
+    def without_films(self):
+        return collect(read_trainings([str(self.folder)]))
 
     def test_without_clips_curves_and_run(self):
         self.write(engines=("pybullet",), episode_seconds=12.0)
-        text = page(collect(self.folder), [])
+        text = page(self.without_films())
         self.assertIn("4 of 12 s in each engine: 2 demonstrations", Outline(text).text)
         self.write(engines=("mujoco",), episode_seconds=5.0)
-        both = Outline(page(collect(self.folder), [])).text
+        both = Outline(page(self.without_films())).text
         self.assertIn(
             "4 in each engine, of 5 s in mujoco, of 12 s in pybullet: 2 demonstrations", both
         )
-        table = table_text(list(collect(self.folder).training.results.values()))
+        table = table_text(read_evaluation(self.folder / "eval"))
         self.assertRegex(table, r"episodes: 4, demonstrations: 2")
         self.assertRegex(table, r"episode length +│ +5 s │ +12 s")
         self.assertEqual(text.count('<td class="bad">1</td>'), 2, "faults of an engine stand out")
@@ -435,26 +472,47 @@ class PageTest(Reported):
 
     def test_names_cannot_inject_anything(self):
         hostile = '<script>alert("x")</script>'
-        data = self.data(notes=(hostile,))
-        text = page(replace(data, training=replace(data.training, label=hostile)), self.clips)
+        report = self.whole()
+        (training,) = report.trainings
+        named = (replace(training, label=hostile),)
+        text = page(replace(report, trainings=named, notes=(hostile,)))
         self.assertNotIn("<script>alert", text)
         self.write(policy=hostile)
-        text = page(collect(self.folder), [])
+        text = page(self.without_films())
         self.assertNotIn("<script>alert", text)
         self.assertIn(hostile, Outline(text).text)
 
     def test_the_headline_begins_with_the_best(self):
-        data = self.data()
-        results = {}
         means = {"mujoco": 0.4, "mujoco-warp": 0.9, "pybullet": 0.1, "sapien": 0.5}
         for engine, mean in means.items():
-            progress = TaskProgress(mean=mean, ci95=(mean, mean))
-            results[engine] = replace(data.training.results[engine], task_progress=progress)
+            self.write((engine,), rollouts_with(*[mean] * 4))
+        self.write_soup()
         self.assertEqual(
-            headline(replace(data, training=replace(data.training, results=results))),
+            headline(read_trainings([str(self.folder)])),
             "Task progress is 90% in mujoco-warp, 50% in sapien, 40% in mujoco, 10% in pybullet. "
             "The policy was trained in mujoco-warp.",
         )
+
+
+class SeveralTest(Reported):
+    def test_films_of_several_runs_are_of_one_episode_in_one_engine(self):
+        robot = robots.load("openarm")
+        for name in ("a", "b"):
+            self.write_results(
+                name,
+                toy_rollouts(robot.home),
+                ("mujoco", "sapien"),
+                joints=robot.joint_names,
+                robot="openarm",
+            )
+        runs = [str(self.folder / name) for name in ("a", "b")]
+        html, report = make_report(runs, self.folder / "both")
+        self.assertEqual([clip.episode.run for clip in report.clips], ["a", "b"])
+        self.assertEqual({clip.episode.engine for clip in report.clips}, {"mujoco"})
+        self.assertEqual(html.read_text().count("<video"), 2)
+        self.write_results("b", robot="openarm", inputs={"demos": "cd"})
+        _, report = make_report(runs, self.folder / "both")
+        self.assertIn("no films: the runs were evaluated with different", report.notes[-1])
 
 
 class CommandTest(Reported):
@@ -475,12 +533,12 @@ class CommandTest(Reported):
 
     def test_numbers_are_reported_even_where_no_clip_can_be_drawn(self):
         self.write(("mujoco",), robot="a-robot-that-is-not-installed")
-        html, data = make_report(self.folder, self.folder / "elsewhere")
+        html, report = make_report([str(self.folder)], self.folder / "elsewhere")
         self.assertRegex(
-            " ".join(data.notes), "no clips: Unknown robot 'a-robot-that-is-not-installed'"
+            " ".join(report.notes), "no films: Unknown robot 'a-robot-that-is-not-installed'"
         )
         self.assertEqual(html, self.folder / "elsewhere" / "index.html")
-        self.assertIn("There are no clips", html.read_text())
+        self.assertIn("There are no films", html.read_text())
 
     def test_two_reports_are_not_written_into_one_folder(self):
         self.write(("mujoco",))

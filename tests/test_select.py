@@ -8,12 +8,11 @@ from unittest.mock import Mock, patch
 from tests import toy_grasp, toy_results
 from tests.command import refused, xreset
 from tests.data import InFolder
-from xreset import evaluate
+from xreset import TaskConfig, evaluate, stress
 from xreset.errors import FileFormatError, PolicyError, RunError
 from xreset.eval.engines.attribution import attribute
 from xreset.eval.select import candidates_in, select
 from xreset.eval.setting import Setting
-from xreset.eval.stress import stress
 from xreset.learning.run import read_choice
 
 SEED = 1_000_003
@@ -41,20 +40,19 @@ class SelectTest(InFolder):
             return SimpleNamespace(start=lambda motion: f"{path.stem}.pt")
 
         def load_trial(policy, demos, seed, **_):
-            return SimpleNamespace(seed=seed)
+            return SimpleNamespace(seed=seed, task=TaskConfig())
 
-        def rolled(policy, engine, trial, *, episodes):
-            self.played.append((policy, engine.name, trial.seed))
-            return SimpleNamespace(
-                episodes=toy_results.episodes([SCORES[policy][engine.name]] * episodes)
-            )
+        def play(policy, trial, engine, conditions, *, episodes):
+            name = policy.start(None)
+            self.played.append((name, engine.name, trial.seed))
+            return toy_results.swept([SCORES[name][engine.name]] * episodes, {}), ()
 
         def export(checkpoint, file):
             file.write_bytes(checkpoint.read_bytes())
 
         engines = [SimpleNamespace(name=name, version="1") for name in "abc"]
         run = SimpleNamespace(meshes=None, robot="my/robot")
-        patches = {"load_policy": load_policy, "load_trial": load_trial, "roll_out": rolled}
+        patches = {"load_policy": load_policy, "load_trial": load_trial, "play": play}
         patches |= {"export_checkpoint": export, "read_run": lambda folder: run}
         with patch.multiple("xreset.eval.select", **patches):
             return select(self.folder, engines, self.demos, Setting(seed=SEED), **options)  # pyright: ignore[reportArgumentType]
@@ -87,8 +85,8 @@ class SelectTest(InFolder):
         trial = Mock(seed=SEED)
         for measure in (
             lambda: evaluate(policy, self.demos, [], seed=SEED),
-            lambda: stress(policy, trial, [], self.folder),
-            lambda: attribute(policy, Mock(), Mock(), trial, episodes=1),
+            lambda: stress(policy, self.demos, [], seed=SEED),
+            lambda: attribute(policy, Mock(), Mock(), trial, self.folder, episodes=1),
         ):
             self.assertRaisesRegex(PolicyError, f"Seed {SEED} chose this checkpoint", measure)
         policy.check_seed(0)

@@ -20,12 +20,12 @@ import numpy as np
 from tests.command import succeeds
 from tests.data import InFolder, InOneFolder
 from tests.toy_bank import SOUP
-from tests.toy_results import toy_rollouts, toy_summary
+from tests.toy_results import toy_result, toy_rollouts
 from tests.toy_study import shell_step
 from xreset import synthesize, write_demos
 from xreset.cli import main
 from xreset.errors import FileFormatError, ObjectError, RunError, XResetError
-from xreset.eval.results import write_results
+from xreset.eval.results import write_result
 from xreset.eval.study.file import SHIPPED, read_study, study_path
 from xreset.eval.study.launch import launch
 from xreset.eval.study.paper import paper_tables
@@ -394,8 +394,8 @@ class TablesTest(Studied):
         own = toy.episodes[first : first + len(progress)]
         episodes = tuple(replace(e, task_progress=p) for e, p in zip(own, progress, strict=True))
         rollouts = replace(toy, episodes=episodes)
-        summary = toy_summary("mujoco", rollouts, robot="openarm", seed=0, **changes)
-        write_results(self.out / name / "eval", summary, rollouts, ("a", "b", "c"))
+        result = toy_result("mujoco", rollouts, robot="openarm", seed=0, **changes)
+        write_result(self.out / name / "eval", result, rollouts.traces, ("a", "b", "c"))
 
     def test_our_figures_are_next_to_the_papers(self):
         self.write("ours-seed0", 1.0, 1.0, 0.33, 0.33)
@@ -422,22 +422,20 @@ class TablesTest(Studied):
         self.assertEqual(grasps.as_rows("mujoco")[1][0], "X-RESET")
         page, notes = write_page(plan, self.folder / "page")
         text = page.read_text()
-        self.assertIn("![Table I", text)
-        self.assertRegex(text, r"\| published success \| 25.0 \(0-50\) \| - \| 25.0 \(0-50\) \|")
-        self.assertRegex(text, r"\| published distance \\\[cm\\\] \| 7.8 \(5.5-10.0\) \|")
+        self.assertIn("<h2>Table I", text)
+        self.assertIn("83.0 (66-100), paper 90.8", text)
         self.assertIn("Episodes / demonstrations / seeds: ik 4 / 2 / 1, ours 8 / 2 / 2.", text)
-        self.assertIn("The paper's figures follow", text)
+        self.assertIn("The paper&#39;s figures follow", text)
+        self.assertIn("Runs side by side", text)
         for note in (
             "The training ours-seed0 is not finished: not begun",
             "Not evaluated yet: eval x-sim-seed0, eval x-sim-seed1",
             "10,000 iterations",
         ):
             self.assertTrue(any(note in n for n in notes), note)
-        self.assertTrue((self.folder / "page" / "table-1.png").read_bytes().startswith(b"\x89PNG"))
-        lines = (self.folder / "page" / "table-1.csv").read_text().splitlines()
-        self.assertTrue(lines[0].startswith("engine,row,column,mean,low,high,paper,"), lines[0])
-        (soup,) = [line for line in lines if line.startswith("mujoco,tomato soup can,Ours,")]
-        self.assertEqual([float(text) for text in soup.split(",")[3:7]], [0.83, 0.66, 1.0, 90.8])
+        lines = (self.folder / "page" / "results.csv").read_text().splitlines()
+        (soup,) = [x for x in lines if x.startswith(f"ours-seed1,mujoco,{SOUP},task_progress,")]
+        self.assertEqual(float(soup.split(",")[4]), 0.66)
 
     def test_a_mean_over_some_objects_is_not_shown_as_one_over_all(self):
         self.write("ours-tomato_soup_can-seed0", 1.0, 0.33)
@@ -450,7 +448,7 @@ class TablesTest(Studied):
         self.write("ours-tomato_soup_can-seed1", 1.0, 0.33)
         self.write("ours-potted_meat_can-seed1", 0.66, 0.0, first=2)
         rows = fill(plan, plan.study.tables[0]).as_rows("mujoco")
-        self.assertRegex(rows[1][3], r"^66\.5 \(66-66\)", "the same demonstration in both seeds")
+        self.assertRegex(rows[1][3], r"^66\.5 \(24-92\)", "one demonstration is little")
         self.assertRegex(rows[3][3], r"^49\.8 ", "seed 1 alone")
         _, notes = write_page(plan, self.folder / "page")
         self.assertFalse(
@@ -473,7 +471,7 @@ class TablesTest(Studied):
         plan = self.plan(self.TEXT.replace("[runs.ours]\n", later))
         self.assertEqual(fill(plan, plan.study.tables[1]).engines, {})
         page, _ = write_page(plan, self.folder / "page")
-        self.assertIn("Nothing is evaluated yet", page.read_text())
+        self.assertIn("nothing is evaluated yet", page.read_text())
 
     def test_results_of_other_episodes_do_not_count(self):
         self.write("ik", 0.33, 0.33, 0.33, 0.33)
@@ -529,20 +527,16 @@ class WholeTest(InOneFolder):
         self.assertRegex(
             self.said, r"(?s)data .*: done.*train x-reset-seed0: done.*eval x-reset-seed0: done"
         )
-        text = (self.out / "reports" / "seconds" / "study.md").read_text()
-        self.assertRegex(text, r"\| tomato soup can \| \d.* paper 33\.0 .* \| \d.* paper 90\.8 ")
+        text = (self.out / "reports" / "seconds" / "index.html").read_text()
+        self.assertRegex(text, r"tomato soup can</th><td>\d.* paper 33\.0 .*<td>\d.* paper 90\.8 ")
         self.assertIn("one seed only of x-reset", text)
-        for unit in ("minutes of training", "million environment steps"):
-            _, _, after = text.partition(f"## First success from home, in {unit}\n")
-            self.assertIn("| x-reset | 1 | 0% (0-79); \\>0.0 |", after)
-        self.assertTrue(
-            (self.out / "reports" / "seconds" / "compare-tomato_soup_can" / "compare.png").is_file()
-        )
+        _, _, after = text.partition("First success from home</h2>")
+        self.assertRegex(after, r"x-reset-seed0</th><td>1</td><td>0% \(0-79\); &gt;0\.0</td>")
+        self.assertIn("<svg", text)
 
     def test_what_is_done_is_not_done_again(self):
         before = {f: f.stat().st_mtime_ns for f in self.out.glob("*-seed0/**/*") if f.is_file()}
-        with patch("xreset.eval.study.report.compare"):
-            said = succeeds("study", "seconds", "--out", self.out)
+        said = succeeds("study", "seconds", "--out", self.out)
         self.assertNotIn("begun", said)
         self.assertEqual({f: f.stat().st_mtime_ns for f in before}, before)
         self.assertEqual({s.name for s in self.plan().steps.values() if s.left()}, set())

@@ -4,12 +4,13 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from tests import data
 from tests.toy_bank import SOUP, SPAM
 from xreset import TrainConfig
-from xreset.eval.results import Episode, Rollouts, Trace, summarize, write_results
-from xreset.eval.stress import Stress
+from xreset.eval.metrics import Episode
+from xreset.eval.results import EvalResult, Rollouts, Trace, episode_table, write_result
 from xreset.learning.run import Candidate, Choice, RunInfo, write_run
 from xreset.task.config import TaskConfig
 from xreset.task.contract import Contract
@@ -97,8 +98,15 @@ def rollouts_with(*progress):
     return replace(rollouts, episodes=tuple(replace(e, task_progress=p) for e, p in both))
 
 
-def toy_summary(engine="mujoco", rollouts=None, **changes):
-    """Return ``ENGINE.json`` of the rollouts; ``changes`` replace arguments of :func:`xreset.eval.results.summarize`."""
+def toy_result(engine="mujoco", rollouts=None, sweep=None, **changes):
+    """Return the result of the rollouts in an engine; ``changes`` replace its fields.
+
+    Args:
+        engine: name of the engine.
+        rollouts: unchanged episodes; default: the toy's.
+        sweep: (property, value) -> episodes, of conditions.
+    """
+    rollouts = rollouts or toy_rollouts()
     arguments: dict[str, Any] = {
         "engine_version": "4.0.0",
         "robot": "toy",
@@ -106,15 +114,20 @@ def toy_summary(engine="mujoco", rollouts=None, **changes):
         "seed": 3,
         "inputs": {"demos": "ab"},
         "meshes": None,
+        "control_steps_per_second": round(rollouts.control_steps_per_second, 1),
     }
-    return summarize(rollouts or toy_rollouts(), engine=engine, **(arguments | changes))
+    tables = [episode_table(rollouts.episodes)]
+    for (name, value), own in (sweep or {}).items():
+        tables.append(episode_table(own, name, value))
+    episodes = pd.concat(tables, ignore_index=True)
+    return EvalResult(engine=engine, episodes=episodes, **(arguments | changes))
 
 
-def toy_card(card_type=Stress, **changes):
-    """Return a card of a sweep without curves; ``changes`` replace its fields."""
-    fields = {"engine": "mujoco", "engine_version": "4", "episodes": 4, "task_progress": 0.8}
-    fields |= {"ci95": (0.7, 0.9), "curves": (), "left_out": ()}
-    return card_type(**(fields | changes))
+def swept(base, sweep, engine="mujoco", **changes):
+    """Return the result of a sweep: episodes with these task progresses, unchanged and for each (property, value)."""
+    rollouts = Rollouts(episodes=episodes(base), traces=(), control_steps_per_second=1.0)
+    own = {condition: episodes(scores) for condition, scores in sweep.items()}
+    return toy_result(engine, rollouts, own, **changes)
 
 
 def toy_choice(**changes):
@@ -134,8 +147,8 @@ class InFolder(data.InFolder):
     ):
         rollouts = rollouts or toy_rollouts()
         for engine in engines:
-            summary = toy_summary(engine, rollouts, **changes)
-            write_results(self.folder / name / "eval", summary, rollouts, joints)
+            result = toy_result(engine, rollouts, **changes)
+            write_result(self.folder / name / "eval", result, rollouts.traces, joints)
         return self.folder / name
 
     def write_run(self, name, config=None, **changes):

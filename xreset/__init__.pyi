@@ -11,7 +11,8 @@ from xreset.env.manipulation import make_env as make_env
 from xreset.env.stable_baselines import StableBaselinesEnv as StableBaselinesEnv
 from xreset.env.vector_env import VectorEnv as VectorEnv
 from xreset.errors import XResetError as XResetError
-from xreset.eval.evaluate import evaluate as evaluate
+from xreset.eval.experiment import evaluate as evaluate
+from xreset.eval.experiment import stress as stress
 from xreset.eval.export.deploy import export_deploy as export_deploy
 from xreset.eval.export.deploy import serve as serve
 from xreset.eval.export.lerobot import export_lerobot as export_lerobot
@@ -20,8 +21,6 @@ from xreset.eval.film import film as film
 from xreset.eval.play.page import play as play
 from xreset.eval.policy_spec import PolicySpec as PolicySpec
 from xreset.eval.policy_spec import load_policy as load_policy
-from xreset.eval.rehearse import Rehearsal as Rehearsal
-from xreset.eval.rehearse import rehearse as rehearse
 from xreset.eval.report.read import Training as Training
 from xreset.eval.report.read import read_training as read_training
 from xreset.eval.results import EvalResult as EvalResult

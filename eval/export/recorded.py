@@ -47,7 +47,7 @@ class RecordedEpisodes:
     fps: float
     """Frames per second."""
     episodes: Table
-    """One row for each recorded episode (:func:`xreset.eval.results.episode_table`), with further columns: ``task`` in
+    """One row for each recorded episode (:meth:`xreset.EvalResult.to_frame`), with further columns: ``task`` in
     words; ``trace``, its states [T]; ``action`` [T, J], joint targets: the last target before the next frame, of
     the last frame its own; ``meshes``, folder of the object's mesh or None: a stand-in. Joint positions in rad
     (prismatic: m), poses in the world frame (z up, table top at z = 0), quaternions (w, x, y, z)."""

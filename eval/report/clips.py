@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 import torch
 
 from xreset.cameras.config import VisionConfig
 from xreset.errors import RunError, XResetError, needs
-from xreset.eval.report.read import ReportData
+from xreset.eval.report.read import Training
 from xreset.eval.results import Table, Trace
 from xreset.files.checks import frozen
 from xreset.files.storage import write_whole
@@ -34,6 +36,8 @@ STRIP_SIZE = (240, 180)
 """Width and height of one picture of a strip [pixels]."""
 FAILURES = 4
 """Largest number of failures that a report shows."""
+MOST_FILMS = 8
+"""Largest number of runs that a report shows films of."""
 MOMENTS = 6
 """Pictures in a strip, evenly spread over the episode from its first to its last state."""
 
@@ -58,17 +62,17 @@ class Clip:
 
 
 def best_everywhere(shown: Table) -> Table:
-    """Return the episodes, one for each engine, of the demonstration that went best; empty if none was recorded in
-    every engine.
+    """Return the episodes, one for each run and engine, of the demonstration that went best; empty if none was recorded
+    everywhere.
 
-    Best is the highest mean task progress over all engines, then the highest mean reorientation progress, then the
+    Best is the highest mean task progress over all of these, then the highest mean reorientation progress, then the
     lowest index.
 
     Args:
         shown: :func:`xreset.eval.results.recorded`.
     """
-    engines = shown["engine"].nunique()
-    everywhere = shown.groupby("sequence").filter(lambda own: len(own) == engines)
+    places = len(shown.drop_duplicates(["run", "engine"]))
+    everywhere = shown.groupby("sequence").filter(lambda own: len(own) == places)
     metrics = ["task_progress", "reorientation_progress"]
     quality = (
         everywhere.groupby("sequence")[metrics]
@@ -211,41 +215,74 @@ def draw_clips(
     return clips
 
 
-def draw_report(data: ReportData) -> tuple[list[Clip], list[Clip]]:
-    """Draw one episode in every engine, and failures in the first engine as strips.
+def draw_report(
+    trainings: Sequence[Training], robot: str | None, meshes: Path | None
+) -> tuple[list[Clip], list[Clip]]:
+    """Draw one episode: of one run in every engine; of several runs in the first engine that all were evaluated in. And
+    draw failures of a single run in its first engine as strips.
+
+    Args:
+        trainings: the evaluated runs.
+        robot: name or folder of the robot; default: as the results name it.
+        meshes: folder of meshes; default: as the results name it.
 
     Raises:
-        XResetError: no demonstration was recorded in every engine, or the robot or an object cannot be loaded.
+        XResetError: no demonstration was recorded everywhere, or the robot or an object cannot be loaded.
     """
-    spec = load_robot(data.robot)
-    shown = data.training.recorded(spec)
-    clips = draw_clips(best_everywhere(shown), spec, data.meshes, data.vision)
+    shown = recorded_in(trainings, robot)
+    if len(trainings) > 1:
+        engines = [set(training.results) for training in trainings]
+        shared = sorted(set.intersection(*engines))
+        shown = shown[shown["engine"] == (shared[0] if shared else "")]
+        shown = shown[shown["run"].isin([t.label for t in trainings[:MOST_FILMS]])]
+    first = trainings[0]
+    spec = load_robot(robot or first.robot)
+    folder = first.first.meshes_folder(meshes)
+    clips = draw_clips(best_everywhere(shown), spec, folder, first.vision)
     if not clips:
         raise XResetError(
-            "no demonstration was recorded in every engine. Evaluate all engines in one command."
+            "no demonstration was recorded everywhere. Evaluate all engines in one command, and all runs with the same "
+            "demonstrations."
         )
-    worst = worst_episodes(shown[shown["engine"] == data.training.first.engine], FAILURES)
-    return clips, draw_clips(worst, spec, data.meshes, data.vision, strips=True)
+    if len(trainings) > 1:
+        return clips, []
+    worst = worst_episodes(shown[shown["engine"] == first.first.engine], FAILURES)
+    return clips, draw_clips(worst, spec, folder, first.vision, strips=True)
 
 
-def make_film(data: ReportData, out: Path) -> tuple[str, ...]:
-    """Write an mp4 with the best episode of each object in every engine (:func:`best_everywhere`), at its own speed.
+def recorded_in(trainings: Sequence[Training], robot: str | None) -> Table:
+    """Return the recorded episodes of runs (:meth:`~xreset.eval.report.read.Training.recorded`)."""
+    parts = [t.recorded(load_robot(robot or t.robot)) for t in trainings]
+    return pd.concat(parts, ignore_index=True)
+
+
+def make_film(
+    trainings: Sequence[Training],
+    out: Path,
+    *,
+    robot: str | None = None,
+    meshes: Path | None = None,
+) -> tuple[str, ...]:
+    """Write an mp4 with the best episode of each object in every run and engine (:func:`best_everywhere`), at its own
+    speed.
 
     Returns:
-        The objects, from the left; the engines are in the order of the results, from above.
+        The objects, from the left; from above are the runs, each in its engines.
 
     Raises:
-        RunError: no object was recorded in every engine.
+        RunError: no object was recorded everywhere.
         XResetError: the film cannot be encoded or written.
     """
-    spec = load_robot(data.robot)
+    first = trainings[0]
+    spec = load_robot(robot or first.robot)
+    folder = first.first.meshes_folder(meshes)
     columns = {}
-    for name, own in data.training.recorded(spec).groupby("object"):
-        if clips := draw_clips(best_everywhere(own), spec, data.meshes, data.vision):
+    for name, own in recorded_in(trainings, robot).groupby("object"):
+        if clips := draw_clips(best_everywhere(own), spec, folder, first.vision):
             columns[str(name)] = clips
     if not columns:
         raise RunError(
-            f"no demonstration in {data.training.results_folder} was recorded in every engine. "
+            f"no demonstration in {first.results_folder} was recorded in every engine. "
             "Evaluate all engines in one command."
         )
     every = list(chain(*columns.values()))
@@ -256,7 +293,8 @@ def make_film(data: ReportData, out: Path) -> tuple[str, ...]:
         for clip in clips:
             shown = np.minimum(np.arange(length), len(clip.frames) - 1)  # ends with a still
             half = clip.frames[shown, ::2, ::2]
-            label = f"{short_name(name)}, {clip.episode.engine}"
+            run = f"{clip.episode.run}, " if len(trainings) > 1 else ""
+            label = f"{short_name(name)}, {run}{clip.episode.engine}"
             column.append(np.stack([add_caption(picture, [label], 1) for picture in half]))
         films.append(np.concatenate(column, axis=1))
     write_whole(out, encode_mp4(np.concatenate(films, axis=2), every[-1].fps))

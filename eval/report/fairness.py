@@ -65,7 +65,7 @@ def _condition_table(trainings: Sequence[Training]) -> Table:
                 "sequences": tuple(
                     sorted(set(episodes["object"] + "/" + episodes["sequence_name"]))
                 ),
-                "number of episodes": result.episodes,
+                "number of episodes": len(result.nominal),
                 "seed of the evaluation": result.seed,
             }
             for name, text in training.facts.items():

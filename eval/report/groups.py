@@ -1,4 +1,4 @@
-"""Group trainings that differ only in their seed, and score each group in each engine."""
+"""Group runs that differ only in their seed, and score each group in each engine."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ from typing import Any
 
 import pandas as pd
 
+from xreset.eval.metrics import METRICS
 from xreset.eval.report.fairness import uneven
 from xreset.eval.report.read import Training
-from xreset.eval.results import Table, crossed, difference, mean
-from xreset.eval.stats import crossed_bootstrap_ci95
-from xreset.eval.table import METRICS
+from xreset.eval.results import Table, ci95, difference, mean
 
 Groups = dict[str, Sequence[Training]]
 """Label -> one training, or several that differ only in their seed. A group is a line of the picture."""
@@ -73,20 +72,24 @@ def _label(members: Sequence[Training]) -> str:
     return re.sub(r"[-_. ]+(seed|s)?[-_. ]*$", "", common) or _whole_label(members)
 
 
-COLUMNS = ("group", "engine", "metric", "mean", "low", "high")
+COLUMNS = ("group", "engine", "object", "metric", "mean", "low", "high")
+EVERY = "all"
+"""Name that stands for all objects in tables of scores."""
 
 
 def scores(groups: Groups) -> Table:
-    """Return a row for each group, engine and metric of :data:`~xreset.eval.table.METRICS`.
+    """Return a row for each group, engine, object and metric of :data:`~xreset.eval.metrics.METRICS`.
 
-    Columns: group (its label), engine, metric, and mean, low and high (:func:`estimate`), which are NaN where an
-    earlier version did not measure the metric.
+    Columns: group (its label), engine, object (or ``all``), metric, and mean, low and high (:func:`estimate`), which
+    are NaN where an earlier version did not measure the metric.
     """
     rows = []
     for label, members in groups.items():
-        for engine, own in by_engine(members):
-            for metric in METRICS:
-                rows.append((label, engine, metric, *estimate(own, metric)))
+        for engine, every in by_engine(members):
+            for name in (EVERY, *sorted(every["object"].unique())):
+                own = every if name == EVERY else every[every["object"] == name]
+                for metric in METRICS:
+                    rows.append((label, engine, name, metric, *estimate(own, metric)))
     return pd.DataFrame(rows, columns=COLUMNS)
 
 
@@ -110,11 +113,11 @@ def estimate(episodes: Table, metric: str) -> tuple[float, float, float]:
     the lower and upper end of its 95 % interval; NaN without episodes.
 
     The interval is a bootstrap over demonstrations, as in ``xreset eval``, and for several trainings over trainings,
-    too (:func:`xreset.eval.stats.crossed_bootstrap_ci95`).
+    too (:func:`xreset.eval.results.ci95`).
     """
     if episodes.empty:
         return nan, nan, nan
-    return mean(episodes, metric), *crossed_bootstrap_ci95(*crossed(episodes, metric))
+    return mean(episodes, metric), *ci95(episodes, metric)
 
 
 def differences(groups: Groups) -> Table:
@@ -122,6 +125,8 @@ def differences(groups: Groups) -> Table:
     group's mean is above the first group's. Columns as of :func:`scores`; the metric is named ``METRIC minus FIRST``.
     """
     rows = []
+    if not groups:
+        return pd.DataFrame(rows, columns=COLUMNS)
     first, *others = groups
     reference = dict(by_engine(groups[first]))
     for label in others:
@@ -130,5 +135,5 @@ def differences(groups: Groups) -> Table:
         for engine, own in by_engine(groups[label]):
             for metric in METRICS if engine in reference else ():
                 values = difference(reference[engine], own, metric)
-                rows.append((label, engine, f"{metric} minus {first}", *values))
+                rows.append((label, engine, EVERY, f"{metric} minus {first}", *values))
     return pd.DataFrame(rows, columns=COLUMNS)

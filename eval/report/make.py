@@ -1,163 +1,294 @@
-"""Make the report of a run, and the comparison of several runs.
-
-A report is one HTML page that needs no network and no other files.
-"""
+"""Make the report of one run or of several: one HTML page that needs no network and no other files, and its figures as
+CSV."""
 
 from __future__ import annotations
 
 import base64
 import hashlib
-from collections.abc import Sequence
-from dataclasses import replace
-from functools import partial
+from collections.abc import Iterator, Sequence
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from xreset.errors import FileFormatError, RunError, XResetError
+from xreset.errors import RunError, XResetError
+from xreset.eval import effects
+from xreset.eval.metrics import METRICS
 from xreset.eval.pages import percent, render
-from xreset.eval.plots import COLORS
+from xreset.eval.plots import COLORS, svg
 from xreset.eval.report import fairness, tables
 from xreset.eval.report.clips import Clip, draw_report, encode_mp4
-from xreset.eval.report.curves import AXES, X
-from xreset.eval.report.figures import draw_training, write_picture
-from xreset.eval.report.groups import by_engine, differences, grouped, scores, singles
-from xreset.eval.report.read import (
-    ReportData,
-    Training,
-    read_training,
-    read_trainings,
-    versions,
-    without_results,
+from xreset.eval.report.curves import AXES, X, amounts
+from xreset.eval.report.figures import DEFAULT_CURVES, draw_training
+from xreset.eval.report.groups import (
+    COUNTED,
+    Groups,
+    by_engine,
+    differences,
+    grouped,
+    scores,
+    singles,
 )
-from xreset.eval.results import Table, read_evaluation
-from xreset.eval.stress import by_property, read_stress
-from xreset.eval.table import FIGURES, caption
+from xreset.eval.report.read import Training, how_to_evaluate, read_trainings
+from xreset.eval.results import Evaluation, Table
+from xreset.eval.table import Rows, caption
+from xreset.files.checks import frozen
 from xreset.files.storage import claim_folder, write_whole
-from xreset.learning.run import TEACHER, read_choice, read_run
+from xreset.files.text import Brief
 from xreset.pictures.render import encode_png
 
-DEFAULT_CURVES = ("task/success", "task/success_from_home")
-"""Curves that a comparison draws by default."""
+
+@frozen
+class PageTable:
+    """A table of a report that its caller made."""
+
+    title: str
+    rows: Rows
+    """The first row is the head."""
+    note: str
+
+
+@frozen
+class Report(Brief):
+    """What a page shows."""
+
+    title: str
+    trainings: tuple[Training, ...]
+    groups: Groups
+    notes: tuple[str, ...]
+    """Sentences about unfair comparisons and missing results."""
+    scores: Table
+    """:func:`xreset.eval.report.groups.scores`, and the differences to the first group."""
+    curves: str
+    """Drawing of the learning curves; empty if there are none."""
+    x: X
+    clips: Sequence[Clip] = ()
+    strips: Sequence[Clip] = ()
+    """Failures."""
+    tables: Sequence[PageTable] = field(default_factory=tuple)
+
+    @property
+    def evaluated(self) -> list[Training]:
+        """The runs with results."""
+        return [training for training in self.trainings if training.results]
 
 
 def make_report(
-    folder: Path, out: Path | None = None, *, robot: str | None = None, meshes: Path | None = None
-) -> tuple[Path, ReportData]:
-    """Write ``index.html``; return its path, and what it shows.
+    runs: Sequence[str],
+    out: Path | None = None,
+    *,
+    robot: str | None = None,
+    meshes: Path | None = None,
+    x: X | None = None,
+    curves: Sequence[str] = (),
+    apart: bool = False,
+) -> tuple[Path, Report]:
+    """Write ``index.html`` and ``results.csv`` of one run, or of several side by side; return the page's path, and what
+    it shows.
 
     Args:
-        folder: a run folder, or a folder of results.
-        out: folder of the report; default: ``report`` in the folder.
-        robot: name or folder of the robot, for the clips; default: as the run and the results name it.
-        meshes: folder of meshes, for the clips; default: as the results name it.
+        runs: run folders, folders of results or names of shipped policies, as ``FOLDER`` or ``LABEL=FOLDER``.
+        out: folder of the report; default: ``report`` in the folder of a single run, ``runs/report`` for several.
+        robot: name or folder of the robot, for the films; default: as the run and the results name it.
+        meshes: folder of meshes, for the films; default: as the results name it.
+        x: horizontal axis of the learning curves; default: minutes, if all runs logged their speed, or else iterations.
+        curves: names of curves as in TensorBoard; default: :data:`~xreset.eval.report.figures.DEFAULT_CURVES`.
+        apart: show runs that differ only in their seed separately, not as a group.
 
     Raises:
-        RunError: there are no results.
-        FileFormatError: a file of the results is damaged.
+        RunError: there is nothing to report, labels are not unique, or a curve is unknown.
+        FileFormatError: a file is damaged.
         XResetError: the page cannot be written, another command is writing it, or a package for plots is missing.
     """
-    out = folder / "report" if out is None else out
-    data = collect(folder, robot, meshes)
+    trainings = read_trainings(runs)
+    if out is None:
+        out = trainings[0].folder / "report" if len(trainings) == 1 else Path("runs/report")
     with claim_folder(out):
-        clips = []
-        strips = []
-        try:
-            clips, strips = draw_report(data)
-        except XResetError as error:
-            # the page has the numbers all the same, and says why films are missing
-            data = replace(data, notes=(*data.notes, f"There are no clips: {error}"))
-        write_whole(out / "index.html", page(data, clips, strips))
-    return out / "index.html", data
+        report = collect(trainings, x=x, curves=curves, apart=apart)
+        return write_report(report, out, robot=robot, meshes=meshes)
 
 
-def collect(folder: Path, robot: str | None = None, meshes: Path | None = None) -> ReportData:
-    """Read everything that a report shows.
+def collect(
+    trainings: Sequence[Training],
+    *,
+    x: X | None = None,
+    curves: Sequence[str] = (),
+    apart: bool = False,
+    title: str = "",
+    notes: Sequence[str] | None = None,
+    page_tables: Sequence[PageTable] = (),
+) -> Report:
+    """Return what a page of runs shows, without films.
 
     Args:
-        folder: a run folder, or a folder that holds ``ENGINE.json`` files, itself or in ``eval/``.
-        robot: name or folder of the robot; default: as the run and the results name it.
-        meshes: folder of meshes; default: as the results name it.
+        trainings: the runs.
+        x: as of :func:`make_report`.
+        curves: as of :func:`make_report`.
+        apart: as of :func:`make_report`.
+        title: title of the page; default: the policy, or the runs.
+        notes: sentences about what is unfair; None: they are found here.
+        page_tables: tables to show first.
+    """
+    groups, reasons = (singles(trainings), []) if apart else grouped(trainings)
+    found = scores(groups)
+    if notes is None:
+        notes = [*reasons, *fairness.uneven(trainings)]
+        for label, members in groups.items():
+            notes += fairness.health(label, by_engine(members)) if len(trainings) > 1 else []
+    notes = [*notes, *fairness.begun(trainings)]
+    for training in trainings:
+        notes += training.notes
+        if not training.results:
+            notes.append(f"{training.label} has no results. {how_to_evaluate(training.folder)}")
+    if not title and len(trainings) == 1 and trainings[0].results:
+        first = trainings[0].first
+        title = f"{first.policy} on {first.robot}"
+    tags = choose_curves(trainings, curves)
+    x = x or _axis(trainings)
+    return Report(
+        title=title or ", ".join(groups),
+        trainings=tuple(trainings),
+        groups=groups,
+        notes=tuple(dict.fromkeys(notes)),  # each sentence once
+        scores=pd.concat([found, differences(groups)], ignore_index=True),
+        curves=draw_training(groups, tags, x),
+        x=x,
+        tables=page_tables,
+    )
+
+
+def write_report(
+    report: Report, out: Path, *, robot: str | None = None, meshes: Path | None = None
+) -> tuple[Path, Report]:
+    """Draw the films and write the page and its figures; return the page's path, and what it shows."""
+    evaluated = report.evaluated
+    if evaluated:
+        try:
+            if len({t.first.inputs.get("demos") for t in evaluated}) > 1:
+                raise XResetError("the runs were evaluated with different demonstrations.")
+            clips, strips = draw_report(evaluated, robot, meshes)
+            report = replace(report, clips=clips, strips=strips)
+        except XResetError as error:
+            # the page has the numbers all the same, and says why films are missing
+            report = replace(report, notes=(*report.notes, f"There are no films: {error}"))
+    write_whole(out / "results.csv", report.scores.to_csv(index=False))
+    write_whole(out / "index.html", page(report))
+    return out / "index.html", report
+
+
+def _axis(trainings: Sequence[Training]) -> X:
+    try:
+        for training in trainings:
+            if len(training.curves):
+                amounts(training, "minutes")
+    except RunError:
+        return "iterations"
+    return "minutes"
+
+
+def choose_curves(trainings: Sequence[Training], wanted: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the curves to draw: the wanted ones, or else those of
+    :data:`~xreset.eval.report.figures.DEFAULT_CURVES` that a training has, each once.
 
     Raises:
-        RunError: the folder does not exist or holds no results.
-        FileFormatError: a file is damaged or of another version.
+        RunError: no training has one of the wanted curves.
     """
-    training = read_training(folder)
-    if not training.results:
-        raise without_results(folder)
-    run = None
-    not_described = []
-    if training.facts:
-        try:
-            run = read_run(folder)
-        except FileFormatError as error:
-            # results are shown even if an older configuration is unreadable
-            not_described.append(f"The training is not described here: {error}")
-    policy_folder = training.results_folder.parent
-    choice = read_choice(policy_folder)
-    policies = {result.inputs.get("policy") for result in training.results.values()}
-    if choice is not None and choice.policy_hash not in policies:
-        choice = None
-    stress = read_stress(policy_folder / "stress", training.first.inputs.get("policy"))
-    taught = read_evaluation(folder / "teacher")
-    notes = fairness.uneven([training]) + not_described
-    missed = ""
-    if taught:
-        missed = fairness.missed_by_student(training.episodes, taught.to_frame())
-    if missed:
-        notes.append(missed)
-    elif run is not None and run.teacher is not None:
-        notes.append(
-            "The teacher was not evaluated from the same starts. Make its results first: "
-            f"xreset eval {folder / TEACHER} --out {folder / 'teacher'} --demos DEMOS"
+    known = sorted(set().union(*(t.curves for t in trainings)))
+    if unknown := set(wanted) - set(known):
+        raise RunError(
+            f"Unknown curve {', '.join(sorted(unknown))}. Choose with --curve from: {', '.join(known) or 'none'}."
         )
-    return ReportData(
-        training=training,
-        run=run,
-        choice=choice,
-        stress=stress,
-        notes=tuple(notes),
-        robot=robot or (run or training.first).robot,
-        meshes=training.first.meshes_folder(meshes),
-    )
+    return tuple(dict.fromkeys(wanted)) or tuple(tag for tag in DEFAULT_CURVES if tag in known)
 
 
-def page(data: ReportData, clips: Sequence[Clip], strips: Sequence[Clip] = ()) -> str:
-    """Return the whole page; clips, and strips of failures, may be empty. The page allows no script but its own."""
+# The page -------------------------------------------------------------------------------------------------------------
+
+
+def page(report: Report) -> str:
+    """Return the whole page. It allows no script but its own."""
     script = render("report.js")
-    episodes = data.training.episodes
-    first = episodes[episodes["engine"] == data.training.first.engine]
-    results = list(data.training.results.values())
-    demonstrations: dict[str, list[Any]] = {}
-    for i, result in enumerate(results):
-        for row in result.per_demo:
-            demonstrations.setdefault(row.sequence, [None] * len(results))[i] = row
-    objects = episodes.pivot_table(index="object", columns="engine", values="task_progress")
+    groups = report.groups
+    evaluated = report.evaluated
+    places = list(_places(evaluated))
+    failures = []
+    for training in evaluated:
+        own = training.episodes[training.episodes["engine"] == training.first.engine]
+        counts = {what: count for what, count in count_failures(own).items() if count}
+        if counts:
+            failures.append((training, len(own), counts))
+    clocks = {}
+    for label, members in groups.items():
+        clocks[label] = [member.lift for member in members]
+    above = report.scores[report.scores["metric"].str.contains(" minus ", regex=False)]
     return render(
         "report.html.j2",
-        data=data,
-        results=results,
-        engines=list(data.training.results),
-        figures=FIGURES,
-        versions=caption(result.policy for result in results),
-        headline=headline(data),
+        report=report,
+        trainings=report.trainings,
+        evaluated=evaluated,
+        groups=groups,
+        single=len(report.trainings) == 1,
+        metrics=METRICS,
+        counted=COUNTED,
+        rows=tables.results(groups, report.scores, above),
+        versions=caption(t.first.policy for t in evaluated),
+        headline=headline(evaluated),
         colors=COLORS,
+        engines=sorted(set().union(*(t.results for t in evaluated))),
         script=script,
         script_hash=_base64(hashlib.sha256(script.encode()).digest()),
-        clips=clips,
-        strips=strips,
         mp4=lambda clip: _base64(encode_mp4(clip.frames, clip.fps)),
         png=lambda strip: _base64(encode_png(np.hstack(strip.frames))),
-        failed=len(first),
-        failures={what: count for what, count in count_failures(first).items() if count},
-        objects=objects,
-        curves=draw_training(data.training.curves),
-        stressed=by_property(data.stress),
-        demonstrations=demonstrations,
+        failures=failures,
+        sweeps=list(_sweeps(evaluated)),
+        costly=effects.COSTLY,
+        places=places,
+        objects=_by(places, ["object"]),
+        demonstrations=_by(places, ["sequence_name", "object"]),
+        lifted=tables.lifted(clocks, report.x),
+        x=AXES[report.x][0],
+        different=tables.different(groups) if len(report.trainings) > 1 else (),
     )
+
+
+def _places(trainings: Sequence[Training]) -> Iterator[tuple[str, Table]]:
+    """Yield the name and the episodes of each run in each engine."""
+    for training in trainings:
+        for engine in training.results:
+            name = engine if len(trainings) == 1 else f"{training.label} in {engine}"
+            yield name, training.episodes[training.episodes["engine"] == engine]
+
+
+def _by(places: Sequence[tuple[str, Table]], keys: list[str]) -> list[tuple[Any, list[Any]]]:
+    """Return the means of the metrics of each object or demonstration in each place; None where it was not played."""
+    found: dict[Any, list[Any]] = {}
+    for i, (_, episodes) in enumerate(places):
+        for key, own in episodes.groupby(keys, sort=keys == ["object"]):
+            cells = found.setdefault(key, [None] * len(places))
+            cells[i] = {name: own[name].mean() for name in METRICS}
+    return list(found.items())
+
+
+def _sweeps(trainings: Sequence[Training]) -> Iterator[dict[str, Any]]:
+    """Yield what the page shows of each sweep."""
+    for training in trainings:
+        for i, sweep in enumerate(training.sweeps):
+            sentence, reasons = effects.verdict(sweep)
+            yield {
+                "label": training.label,
+                "results": sweep,
+                "properties": effects.by_property(sweep),
+                "verdict": sentence,
+                "reasons": reasons,
+                "picture": draw_sweep(sweep, f"{training.label} {i}"),
+            }
+
+
+def draw_sweep(results: Evaluation, salt: str) -> str:
+    """Return the picture of the effects of each property as SVG."""
+    size = effects.plot_size(len(effects.by_property(results)))
+    return svg(lambda figure: effects.draw_curves(figure, results), size, f"sweep {salt}")
 
 
 def _base64(content: bytes) -> str:
@@ -175,84 +306,15 @@ def count_failures(episodes: Table) -> dict[str, int]:
     return {what: int(rows.sum()) for what, rows in missed.items()}
 
 
-def headline(data: ReportData) -> str:
-    """Return the result in one or two sentences."""
-    ranked = sorted(data.training.results.values(), key=lambda s: -s.task_progress.mean)
-    text = f"Task progress is {', '.join(f'{percent(s.task_progress.mean)} in {s.engine}' for s in ranked)}."
-    if data.run is not None and len(ranked) > 1:
-        text += f" The policy was trained in {data.run.engine}."
+def headline(trainings: Sequence[Training]) -> str:
+    """Return the result of a single run in one or two sentences; empty for several."""
+    if len(trainings) != 1:
+        return ""
+    training = trainings[0]
+    progress = {name: r.mean("task_progress") for name, r in training.results.items()}
+    ranked = sorted(progress, key=lambda name: -progress[name])
+    listing = ", ".join(f"{percent(progress[name])} in {name}" for name in ranked)
+    text = f"Task progress is {listing}."
+    if training.run is not None and len(ranked) > 1:
+        text += f" The policy was trained in {training.run.engine}."
     return text
-
-
-# Comparisons ----------------------------------------------------------------------------------------------------------
-
-
-def compare(
-    runs: Sequence[str],
-    out: Path,
-    *,
-    x: X = "minutes",
-    curves: Sequence[str] = (),
-    apart: bool = False,
-) -> Path:
-    """Write ``compare.png``, ``compare.csv`` (shares, or metres) and ``compare.md``, and return the path of the latter.
-
-    Args:
-        runs: folders, as ``FOLDER`` or ``LABEL=FOLDER``.
-        out: folder to write into.
-        x: horizontal axis of the learning curves.
-        curves: names of curves as in TensorBoard; default: :data:`DEFAULT_CURVES`.
-        apart: show trainings that differ only in their seed separately, not as a group.
-
-    Raises:
-        RunError: there is nothing to compare, labels are not unique, or a curve is unknown.
-        FileFormatError: a file is damaged.
-        XResetError: the files cannot be written, or a package for curves or plots is missing.
-    """
-    trainings = read_trainings(runs)
-    groups, reasons = (singles(trainings), []) if apart else grouped(trainings)
-    tags = choose_curves(trainings, curves)
-    found = scores(groups)
-    above = differences(groups)
-    notes = [*reasons, *fairness.uneven(trainings), *fairness.begun(trainings)]
-    notes = list(dict.fromkeys(notes))  # each sentence once
-    policies = []
-    clocks = {}
-    for label, members in groups.items():
-        clocks[label] = [member.lift for member in members]
-        notes += fairness.health(label, by_engine(members))
-        policies += [result.policy for result in members[0].results.values()]
-    content = render(
-        "compare.md.j2",
-        groups=groups,
-        notes=notes,
-        versions=caption(policies),
-        engines=sorted(found["engine"].unique()),
-        engine_versions=partial(versions, trainings),
-        results=tables.results(groups, found, above),
-        x=AXES[x][0],
-        lifted=tables.lifted(clocks, x),
-        different=tables.different(groups),
-    )
-    write_picture(out / "compare.png", groups, tags, found, x)
-    write_whole(out / "compare.csv", pd.concat([found, above]).to_csv(index=False))
-    write_whole(out / "compare.md", content)
-    return out / "compare.md"
-
-
-def choose_curves(trainings: Sequence[Training], wanted: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of the curves to draw: the wanted ones, or else :data:`DEFAULT_CURVES`, each once; none if no
-    training has curves.
-
-    Raises:
-        RunError: no training has one of the wanted curves.
-    """
-    known = sorted(set().union(*(t.curves for t in trainings)))
-    if not known and not wanted:
-        return ()
-    chosen = tuple(dict.fromkeys(wanted or DEFAULT_CURVES))
-    if unknown := set(chosen) - set(known):
-        raise RunError(
-            f"Unknown curve {', '.join(sorted(unknown))}. Choose with --curve from: {', '.join(known) or 'none'}."
-        )
-    return chosen

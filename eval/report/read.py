@@ -4,6 +4,7 @@ results."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -12,15 +13,25 @@ import pandas as pd
 
 from xreset.cameras.config import VisionConfig
 from xreset.errors import FileFormatError, RunError, WrongValueError, needs
-from xreset.eval.results import EvalResult, Table, read_evaluation, read_traces, recorded
-from xreset.eval.stress import Stress
+from xreset.eval.report import fairness
+from xreset.eval.results import (
+    EARLIER_SCHEMA,
+    SCHEMA,
+    EvalResult,
+    Evaluation,
+    Table,
+    read_evaluation,
+    read_result,
+    read_traces,
+    recorded,
+)
 from xreset.files.checks import frozen, names_wrong_arguments, renamed
 from xreset.files.storage import read_json
 from xreset.files.text import Brief, short_name, shown
 from xreset.geometry.description import load_robot
 from xreset.learning.clock import Lift, read_lift
 from xreset.learning.run import SCHEMA as RUN_SCHEMA
-from xreset.learning.run import Choice, RunInfo
+from xreset.learning.run import TEACHER, Choice, RunInfo, read_choice, read_run
 from xreset.policy.shipped import run_folder
 from xreset.spec import RobotSpec
 
@@ -30,6 +41,8 @@ class Training(Brief):
     """Learning curves and evaluations of a training or a baseline."""
 
     label: str
+    folder: Path
+    """Run folder, or folder of results."""
     results_folder: Path
     """Folder of the evaluations."""
     facts: dict[str, str]
@@ -40,21 +53,42 @@ class Training(Brief):
     results: dict[str, EvalResult]
     """Engine -> result."""
     episodes: Table
-    """Episodes in all engines (:func:`xreset.eval.results.episode_table`), where ``run`` is the label."""
+    """Episodes in all engines (:meth:`xreset.EvalResult.to_frame`), where ``run`` is the label."""
     lift: Lift
     """When the training first succeeded from home; empty without ``lift.json``."""
+    run: RunInfo | None = None
+    """The training's configuration; None for baselines, and where this version cannot read ``run.json``."""
+    choice: Choice | None = None
+    """How the evaluated policy was chosen among the run's checkpoints."""
+    sweeps: tuple[Evaluation, ...] = ()
+    """Results of ``xreset stress`` of the same policy."""
+    notes: tuple[str, ...] = ()
+    """Sentences about missing results."""
 
     @property
     def first(self) -> EvalResult:
         """The result of the first engine."""
         return next(iter(self.results.values()))
 
+    @property
+    def robot(self) -> str:
+        """Name or folder of the robot."""
+        return (self.run or self.first).robot
+
+    @property
+    def vision(self) -> VisionConfig | None:
+        """Cameras of the policy; None: it has none, or the results do not state them."""
+        if self.run is None:
+            return self.first.vision
+        vision = self.run.config.task.vision
+        return vision if vision.cameras else None
+
     @names_wrong_arguments
     def recorded(self, robot: str | Path | RobotSpec | None = None) -> Table:
         """Return the recorded episodes in all engines: the first of each demonstration.
 
-        A row holds the figures of the episode (:func:`xreset.eval.results.episode_table`) and in the column ``trace``
-        its arrays over time, a :class:`xreset.eval.results.Trace`.
+        A row holds the figures of the episode (:meth:`xreset.EvalResult.to_frame`) and in the column ``trace`` its
+        arrays over time, a :class:`xreset.eval.results.Trace`.
 
         Args:
             robot: the robot, its name or its folder; default: whatever robot was recorded.
@@ -77,34 +111,6 @@ def versions(trainings: Iterable[Training], engine: str) -> str:
     """Return the engine's versions in which trainings were evaluated."""
     found = {t.results[engine].engine_version for t in trainings if engine in t.results}
     return ", ".join(sorted(found))
-
-
-@frozen
-class ReportData:
-    """Results of one policy in several engines, and how it was trained."""
-
-    training: Training
-    """The policy's results, named after the run or the folder."""
-    run: RunInfo | None
-    """The training's configuration; None for baselines, and where ``run.json`` cannot be read."""
-    choice: Choice | None = None
-    """How the evaluated policy was chosen among the run's checkpoints."""
-    stress: tuple[Stress, ...] = ()
-    """Robustness of the policy in every engine in which it was measured."""
-    notes: tuple[str, ...]
-    """Sentences about unfair comparisons and missing results."""
-    robot: str
-    """Name or folder of the robot."""
-    meshes: Path | None
-    """Folder of object meshes; None: the stand-ins."""
-
-    @property
-    def vision(self) -> VisionConfig | None:
-        """Cameras of the policy; None: it has none, or the results do not state them."""
-        if self.run is None:
-            return self.training.first.vision
-        vision = self.run.config.task.vision
-        return vision if vision.cameras else None
 
 
 def results_in(folder: Path) -> Path:
@@ -192,11 +198,11 @@ def _scalars(file: Path) -> Iterator[tuple[str, int, float]]:
                 yield value.tag, event.step, value.simple_value
 
 
-# Trainings to compare -------------------------------------------------------------------------------------------------
+# Runs ----------------------------------------------------------------------------------------------------------------
 
 
 def read_trainings(runs: Sequence[str]) -> tuple[Training, ...]:
-    """Read the trainings to compare.
+    """Read the runs of a report.
 
     Args:
         runs: ``FOLDER`` or ``LABEL=FOLDER``: run folders, folders of results, or names of shipped policies (their
@@ -208,7 +214,7 @@ def read_trainings(runs: Sequence[str]) -> tuple[Training, ...]:
     """
     if not runs:
         raise RunError(
-            "there is nothing to compare. Give run folders, or folders that xreset eval wrote results into."
+            "there is nothing to report. Give run folders, or folders that xreset eval wrote results into."
         )
     folders: dict[str, Path] = {}
     for text in runs:
@@ -251,27 +257,97 @@ def read_training(
     folder = run_folder(folder)
     label = label or name_of(folder)
     results = Path(results) if results else results_in(folder)
-    evaluation = read_evaluation(results, label)
+    evaluation = read_evaluation(results)
     curves = read_curves(folder)
     lift = read_lift(folder)
-    run = None
-    file = folder / "run.json"
-    if file.is_file():
-        run = read_json(file, RUN_SCHEMA, keep_version=True)
     if not evaluation and curves.empty and not lift.iteration:
         raise RunError(
             f"{folder} holds neither learning curves (events.out.tfevents.*) nor evaluation results. "
             + how_to_evaluate(folder)
         )
-    return Training(
+    episodes = evaluation.to_frame(label)
+    if len(episodes):
+        episodes = episodes[episodes["property"] == ""].reset_index(drop=True)
+    found = Training(
         label=label,
+        folder=folder,
         results_folder=results,
-        facts={} if run is None else run_facts(run, file),
+        facts={},
         curves=curves,
-        results={s.engine: s for s in evaluation},
-        episodes=evaluation.to_frame(),
+        results={result.engine: result for result in evaluation},
+        episodes=episodes,
         lift=lift,
     )
+    return _with_run(found)
+
+
+def _with_run(training: Training) -> Training:
+    """Add what is known of a training besides its curves and evaluations."""
+    folder = training.folder
+    facts: dict[str, str] = {}
+    run = None
+    notes = []
+    file = folder / "run.json"
+    if file.is_file():
+        facts = run_facts(read_json(file, RUN_SCHEMA, keep_version=True), file)
+        try:
+            run = read_run(folder)
+        except FileFormatError as error:
+            # results are shown even if an older configuration is unreadable
+            notes.append(f"The training is not described here: {error}")
+    choice = None
+    sweeps = []
+    if training.results:
+        policies = {result.inputs.get("policy") for result in training.results.values()}
+        own = training.results_folder.parent
+        choice = read_choice(own)
+        if choice is not None and choice.policy_hash not in policies:
+            choice = None
+        places = [training.results_folder, own / "stress", own / "faults"]
+        for place in {place.resolve(): place for place in places}.values():
+            if sweep := _sweep(place, policies, notes):
+                sweeps.append(sweep)
+        notes += _about_teacher(training, run)
+    return replace(
+        training, facts=facts, run=run, choice=choice, sweeps=tuple(sweeps), notes=tuple(notes)
+    )
+
+
+def _sweep(folder: Path, policies: set[str | None], notes: list[str]) -> Evaluation:
+    """Return the results of ``xreset stress`` in a folder that are of the same policy. Those of 0.1 to 0.3, which had
+    no episodes, are left out, with a note."""
+    found = Evaluation()
+    for file in sorted(folder.glob("*.json")):
+        if file.name.endswith(".episodes.json"):
+            continue
+        schema = read_json(file).get("schema")
+        if schema not in (SCHEMA, EARLIER_SCHEMA):
+            notes.append(
+                f"{file} is of an earlier version, without episodes. Run xreset stress again."
+            )
+        if schema != SCHEMA:
+            continue
+        result = read_result(file)
+        if len(result.changed) and result.inputs.get("policy") in policies:
+            found.append(result)
+    return found
+
+
+def _about_teacher(training: Training, run: RunInfo | None) -> list[str]:
+    """Return what a student misses of its teacher's episodes, or how to make the teacher's results."""
+    folder = training.folder
+    taught = read_evaluation(folder / "teacher")
+    missed = ""
+    if taught:
+        missed = fairness.missed_by_student(training.episodes, taught.to_frame())
+    if missed:
+        return [missed]
+    if run is None or run.teacher is None:
+        return []
+    return [
+        "The teacher was not evaluated from the same starts. Make its results first: "
+        f"xreset eval {folder / TEACHER} --out {folder / 'teacher'} --demos DEMOS"
+    ]
 
 
 def without_results(folder: Path) -> RunError:

@@ -1,45 +1,94 @@
-"""The tables of a comparison."""
+"""The tables of a report."""
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from math import isnan
 
 from scipy.stats import binomtest
 
 from xreset.errors import RunError
+from xreset.eval.metrics import METRICS
 from xreset.eval.report.curves import AXES, X, amounts
-from xreset.eval.report.groups import COUNTED, Groups, by_engine, counted
-from xreset.eval.report.read import Training
+from xreset.eval.report.groups import EVERY, Groups, by_engine, counted
+from xreset.eval.report.read import Training, versions
 from xreset.eval.results import Table
-from xreset.eval.table import METRICS, Rows, estimate_text
+from xreset.eval.table import Rows
+from xreset.files.checks import frozen
 from xreset.learning.clock import SHARES, Lift
 
 
-def results(groups: Groups, found: Table, above: Table) -> dict[str, dict[str, dict[str, str]]]:
-    """Return group -> name of a row -> engine -> text. The rows are the numbers of episodes, every metric, and the
-    difference to the first group where both were evaluated alike.
+@frozen
+class Cell:
+    """One number of the table of results."""
+
+    text: str
+    within: str
+    """Its 95 % interval; empty: none."""
+    share: float | None
+    """Length of a bar; None: no bar."""
+    bad: bool
+
+
+@frozen
+class Row:
+    """A group in one engine."""
+
+    label: str
+    engine: str
+    version: str
+    trained: bool
+    """Whether it was trained in this engine."""
+    counts: str
+    """:func:`xreset.eval.report.groups.counted`"""
+    cells: tuple[Cell, ...]
+    """A number for each of :data:`xreset.eval.metrics.METRICS`."""
+    difference: str
+    """Points of task progress above the first group; empty: not comparable."""
+
+
+def results(groups: Groups, found: Table, above: Table) -> list[Row]:
+    """Return a row for each group and engine.
 
     Args:
         groups: the groups.
         found: :func:`xreset.eval.report.groups.scores`.
         above: :func:`xreset.eval.report.groups.differences`.
     """
-    progress = f"task_progress minus {next(iter(groups))}"
-    texts = {}
+    rows = []
+    progress = f"task_progress minus {next(iter(groups), None)}"
+    every = found[found["object"] == EVERY].set_index(["group", "engine", "metric"])
+    more = above[above["metric"] == progress].set_index(["group", "engine"])
     for label, members in groups.items():
-        own = defaultdict(dict)
-        texts[label] = own
         for engine, episodes in by_engine(members):
-            own[COUNTED][engine] = counted(episodes)
-            scored = found[(found["group"] == label) & (found["engine"] == engine)]
-            for _, _, metric, *values in scored.itertuples(index=False):
-                own[METRICS[metric]][engine] = estimate_text(metric, *values)
-        for _, engine, metric, *values in above[above["group"] == label].itertuples(index=False):
-            if metric == progress:
-                value, low, high = (f"{100 * share:+.1f}" for share in values)
-                own[metric.replace("_", " ", 1)][engine] = f"{value} ({low} to {high})"
-    return texts
+            cells = []
+            for name, metric in METRICS.items():
+                mean, low, high = every.loc[(label, engine, name), ["mean", "low", "high"]]
+                text = metric.text(mean, len(episodes))
+                within = "" if isnan(low) else metric.interval_text(low, high)
+                cells.append(
+                    Cell(
+                        text=text,
+                        within=within if metric.unit != "episodes" else "",
+                        share=mean if metric.headline and not isnan(mean) else None,
+                        bad=metric.fault and mean > 0,
+                    )
+                )
+            difference = ""
+            if (label, engine) in more.index:
+                mean, low, high = more.loc[(label, engine), ["mean", "low", "high"]]
+                difference = f"{100 * mean:+.1f} ({100 * low:+.1f} to {100 * high:+.1f})"
+            row = Row(
+                label=label,
+                engine=engine,
+                version=versions(members, engine),
+                trained=any(m.run is not None and m.run.engine == engine for m in members),
+                counts=counted(episodes),
+                cells=tuple(cells),
+                difference=difference,
+            )
+            rows.append(row)
+    return rows
 
 
 def lifted(clocks: Mapping[str, Sequence[Lift]], x: X) -> Rows:

@@ -9,7 +9,7 @@
     demos = "dexycb_right_9x20.npz"
     meshes = "ycb"
 
-    [evaluations.eval]                 # results go to RUN/eval, where xreset compare and xreset report look
+    [evaluations.eval]                 # results go to RUN/eval, where xreset report looks
     episodes = 5
 
     [defaults]                         # of every run; `resets`: of all data
@@ -38,7 +38,6 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from xreset.errors import FileFormatError, RunError
 from xreset.eval.study.paper import paper_tables
-from xreset.eval.table import METRICS
 from xreset.files.checks import (
     Checked,
     PositiveFloat,
@@ -267,6 +266,8 @@ def _check_names(study: Study) -> None:
         _expect(f"runs.{name}.evaluations", study.evaluations, *run.evaluations)
         if run.policy is None:
             trained.append(name)
+    from xreset.eval.metrics import METRICS  # imports torch
+
     papers = paper_tables()
     for i, table in enumerate(study.tables):
         where = f"tables[{i}]"

@@ -24,7 +24,7 @@ Axis = Literal["object", "method", "metric"]
 class PaperTable:
     """A table of the paper; or a table of a study, which has no figures.
 
-    Objects have their official names, metrics those of :data:`xreset.eval.table.METRICS`.
+    Objects have their official names, metrics those of :data:`xreset.eval.metrics.METRICS`.
     """
 
     title: str

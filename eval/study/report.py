@@ -7,64 +7,68 @@ from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 
-import pandas as pd
-
-from xreset.eval.pages import render
 from xreset.eval.report import fairness
-from xreset.eval.report.curves import AXES
-from xreset.eval.report.make import compare
-from xreset.eval.report.tables import lifted
-from xreset.eval.study.file import TableSpec
+from xreset.eval.report.make import PageTable, collect, write_report
+from xreset.eval.report.read import Training, read_training
+from xreset.eval.results import has_results
 from xreset.eval.study.paper import TRAINING
 from xreset.eval.study.plan import Plan
-from xreset.eval.study.tables import FilledTable, draw, fill
-from xreset.eval.table import caption
-from xreset.files.storage import write_whole
-from xreset.files.text import short_name
-from xreset.learning.clock import Lift, read_lift
+from xreset.eval.study.tables import FilledTable, fill
+from xreset.learning.clock import read_lift
 
 _ALIKE = 0.05
 """Trainings whose lengths differ by a smaller share are of equal length."""
 
 
 def write_page(plan: Plan, out: Path) -> tuple[Path, list[str]]:
-    """Write ``study.md``, its tables as pictures and CSV, and comparisons of the trainings of each object.
+    """Write the report of a study's runs, with the study's tables first.
 
     Returns:
         The page, and its notes: what makes figures incomparable, doubtful or incomplete.
     """
-    tables = [fill(plan, table) for table in plan.study.tables]
-    metrics: list[TableSpec] = []
-    for table in plan.study.tables:
-        title = f"Every metric, {table.evaluation}"
-        spec = TableSpec(runs=table.runs, title=title, evaluation=table.evaluation, rows="metric")
-        if spec not in metrics:
-            metrics.append(spec)
-    notes = dict.fromkeys(_incomplete(plan))
-    for i, table in enumerate(tables, 1):
-        if table.engines:
-            notes |= dict.fromkeys(f"{table.title}: {note}" for note in _unfair(plan, table))
-            draw(out / f"table-{i}.png", table)
-            every = pd.concat(
-                {e: t.stack("column", future_stack=True) for e, t in table.engines.items()}
-            )
-            write_whole(
-                out / f"table-{i}.csv", every.to_csv(index_label=["engine", "row", "column"])
-            )
-    content = render(
-        "study.md.j2",
-        plan=plan,
-        tables=tables,
-        metrics=[fill(plan, spec) for spec in metrics],
+    notes = list(_incomplete(plan))
+    page_tables = []
+    for spec in plan.study.tables:
+        table = fill(plan, spec)
+        if not table.engines:
+            notes.append(f"{table.title}: nothing is evaluated yet.")
+            continue
+        notes += [f"{table.title}: {note}" for note in _unfair(plan, table)]
+        for engine in table.engines:
+            title = f"{table.title}: {engine} {table.versions(engine)}"
+            shown = PageTable(title=title, rows=table.as_rows(engine), note=_note(table, engine))
+            page_tables.append(shown)
+    report = collect(
+        list(_trainings(plan)),
+        title=f"Study {plan.name}: {plan.study.about}",
         notes=notes,
-        compared=_compare(plan, out),
-        lifted={
-            label: lifted(_clocks(plan), x) for x, (label, *_) in AXES.items() if x != "iterations"
-        },
-        versions=caption(run.spec.policy or "" for run in plan.runs),
+        page_tables=page_tables,
     )
-    write_whole(out / "study.md", content)
-    return out / "study.md", list(notes)
+    page, report = write_report(report, out)
+    return page, list(report.notes)
+
+
+def _note(table: FilledTable, engine: str) -> str:
+    """Return what the figures of a table are, and of how many episodes."""
+    text = (
+        f"{'Centimetres' if table.unit == 'cm' else 'Percent'}, mean and in brackets the 95 % interval: a bootstrap "
+        "over demonstrations and, where there are several, over seeds, too; over two or three seeds it is too narrow."
+    )
+    if table.paper:
+        text += " The paper's figures follow, with their standard error where it states one."
+    text += " All of them: the mean over all episodes, left out while an object is missing."
+    return f"{text} {table.counts(engine)}"
+
+
+def _trainings(plan: Plan) -> Iterator[Training]:
+    """Yield the runs that have begun to learn or were evaluated."""
+    for run in plan.runs:
+        has_curves = any(run.folder.glob("events.out.tfevents.*"))
+        evaluations = [name for group, name in plan.played if group == run.group]
+        evaluated = [run.folder / name for name in evaluations if has_results(run.folder / name)]
+        if has_curves or evaluated:
+            results = next(iter(evaluated), run.folder / "eval")
+            yield read_training(run.folder, run.folder.name, results)
 
 
 def _incomplete(plan: Plan) -> Iterator[str]:
@@ -110,32 +114,4 @@ def _unfair(plan: Plan, table: FilledTable) -> Iterator[str]:
         listing = ", ".join(f"{name} {steps:.3g}" for name, steps in lengths.items())
         yield f"not of equal length (million environment steps: {listing})."
     if table.paper:
-        yield f"the paper's policies took {TRAINING}; ours as in the comparisons below."
-
-
-def _clocks(plan: Plan) -> dict[str, list[Lift]]:
-    """Return the lift clocks of each run's trainings; where a run trains objects alone, also those of each object."""
-    clocks: defaultdict[str, list[Lift]] = defaultdict(list)
-    for run in plan.runs:
-        if run.config is not None:
-            labels = [run.group]
-            if run.spec.alone:
-                labels.append(f"{run.group}: {short_name(run.objects[0])}")
-            for label in labels:
-                clocks[label].append(read_lift(run.folder))
-    return clocks
-
-
-def _compare(plan: Plan, out: Path) -> list[str]:
-    """Compare the trainings of the same objects, one folder for each set of objects; return the folders' names."""
-    by_objects = defaultdict(list)
-    for run in plan.runs:
-        has_curves = any(run.folder.glob("events.out.tfevents.*"))
-        if run.config is not None and (has_curves or any(run.folder.glob("eval/*.episodes.json"))):
-            by_objects[run.objects].append(f"{run.label}={run.folder}")
-    names = []
-    for objects, runs in by_objects.items():
-        what = short_name(objects[0], "_") if len(objects) == 1 else f"{len(objects)}-objects"
-        names.append(f"compare-{what}")
-        compare(runs, out / names[-1])
-    return names
+        yield f"the paper's policies took {TRAINING}; ours as in the table of what differs."

@@ -5,20 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import chain, product
 from math import nan
-from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from xreset.eval.plots import picture
-from xreset.eval.report.figures import draw_bars
+from xreset.eval.metrics import METRICS
 from xreset.eval.report.groups import COUNTED, counted, estimate
 from xreset.eval.report.read import Training, read_training, versions
-from xreset.eval.results import Table
+from xreset.eval.results import Table, has_results
 from xreset.eval.study.file import TableSpec
 from xreset.eval.study.paper import ALL, PaperTable, paper_tables
 from xreset.eval.study.plan import Plan
-from xreset.eval.table import METRICS, Rows, estimate_text
+from xreset.eval.table import Rows, estimate_text
 from xreset.files.checks import frozen
 from xreset.files.text import short_name
 from xreset.objects.catalogue import canonical_name
@@ -101,7 +99,7 @@ def fill(plan: Plan, table: TableSpec) -> FilledTable:
             engines[engine] = found.set_index(["row", "column"]).unstack(sort=False)
     return FilledTable(
         title=table.title or layout.title,
-        unit="cm" if fixed["metric"] == "least_distance" else "%",
+        unit=METRICS[fixed["metric"]].unit,
         engines=engines,
         trainings=trainings,
         episodes=episodes,
@@ -117,7 +115,7 @@ def _layout(table: TableSpec, known: list[str]) -> tuple[PaperTable, dict[str, l
     """
     names = {
         "method": list(table.runs.values()),
-        "metric": list(METRICS),
+        "metric": [name for name, metric in METRICS.items() if metric.unit != "episodes"],
         "object": [*known, ALL] if table.paper or len(known) > 1 else known,
     }
     if table.paper:
@@ -127,7 +125,7 @@ def _layout(table: TableSpec, known: list[str]) -> tuple[PaperTable, dict[str, l
     rows = "method" if table.rows == "run" else table.rows
     columns = "object" if table.rows == "run" else "method"
     layout = PaperTable(
-        title=METRICS[table.metric],
+        title=METRICS[table.metric].title,
         rows=rows,
         columns=columns,
         names=tuple(names[columns]),
@@ -143,7 +141,7 @@ def trainings_of(plan: Plan, group: str, evaluation: str) -> list[Training]:
     found = []
     for run in plan.runs:
         folder = run.folder / evaluation
-        if run.group == group and any(folder.glob("*.episodes.json")):
+        if run.group == group and has_results(folder):
             found.append(read_training(run.folder, run.label, folder))
     return found
 
@@ -171,29 +169,4 @@ def _episodes_with(episodes: Table, engine: str, objects: set[str]) -> Table:
 def _shown(axis: str, name: str) -> str:
     if axis == "object":
         return "all of them" if name == ALL else short_name(name)
-    return METRICS[name] if axis == "metric" else name
-
-
-def draw(path: Path, table: FilledTable) -> None:
-    """Draw bars with intervals, a panel for each engine; the paper's figures are black lines across them."""
-    count = len(table.engines)
-    rows = max(len(own) for own in table.engines.values())
-    size = (max(7.0, 1.1 * rows + 2), 2.6 * count + 0.4)
-    with picture(path, size) as figure:
-        panels = figure.subplots(count, 1, squeeze=False)[:, 0]
-        for ax, (engine, own) in zip(panels, table.engines.items(), strict=True):
-            draw_bars(ax, own["mean"], own["low"], own["high"])
-            for bar, value in zip(ax.patches, own["paper"].to_numpy().T.ravel(), strict=True):
-                ax.hlines(
-                    value, bar.get_x(), bar.get_x() + bar.get_width(), color="black", linewidth=2
-                )
-            ax.set_ylabel(table.unit)
-            if table.unit == "%":
-                ax.set_ylim(0, 104)
-            ax.set_title(engine, fontsize="medium", loc="left")
-        if table.paper:
-            panels[-1].plot([], [], color="black", linewidth=2, label=" the paper")
-        handles, labels = panels[-1].get_legend_handles_labels()
-        figure.legend(
-            handles, labels, loc="outside upper center", ncols=min(len(labels), 5), frameon=False
-        )
+    return METRICS[name].title if axis == "metric" else name

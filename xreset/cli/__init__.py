@@ -29,14 +29,12 @@ COMMANDS = {
     "distill": "Train a policy that sees, by imitating one that is told the object's pose.",
     "policies": "List the policies that ship with xreset.",
     "eval": "Evaluate a policy or a baseline in one or several engines.",
-    "stress": "Measure robustness: change stiffness, latency, friction and more, one at a time.",
-    "rehearse": "Rehearse a policy for a robot: late poses and actions, lost frames, pushes, in every engine.",
+    "stress": "Measure robustness: change stiffness, latency, friction or a robot's faults, one at a time.",
     "serve": "Serve a policy to a robot's computer over the network.",
     "select": "Choose the checkpoint that is best in its worst engine.",
-    "compare": "Compare trainings: learning curves, results in every engine, and configurations.",
     "study": "Run a study: trainings by object and seed, evaluations, and tables next to the paper's.",
     "export": "Write a policy for a robot, or recorded episodes as a LeRobot data set or as plain arrays.",
-    "report": "Make an HTML page of a run's evaluations.",
+    "report": "Make an HTML page of a run, or of several side by side.",
 }
 """Command -> one line of help.
 
@@ -89,14 +87,25 @@ _RENAMED = {
     "--objects": "--meshes",
     "--like": "--recipe",
     "--hand.jaw": "--jaw",
+    "--fault": "--property",
 }
 """Flag of earlier versions -> its present name."""
+_MOVED = {"rehearse": ["stress", "--faults"], "compare": ["report"]}
+"""Command of earlier versions -> its present words."""
 _NAME_OBJECTS = (["demos", "synth"], ["demos", "select"], ["demos", "split"])
 """Commands whose ``--objects`` are names of objects, and always were."""
 
 
 def _with_present_flags(argv: list[str]) -> list[str]:
-    """Return the arguments with the present names of flags, and print what was renamed."""
+    """Return the arguments with the present names of commands and flags, and print what was renamed."""
+    if argv and argv[0] in _MOVED:
+        earlier = argv[0]
+        present = _MOVED[earlier]
+        print(
+            f"xreset: {earlier} is now {' '.join(present)}. The next release removes {earlier}.",
+            file=sys.stderr,
+        )
+        argv = [*present, *argv[1:]]
     changed = dict(_RENAMED)
     if argv[:2] in _NAME_OBJECTS:
         del changed["--objects"]

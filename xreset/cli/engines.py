@@ -301,7 +301,7 @@ def attribute(
         only: Property to change; give it again for more. Default: all in which the engines differ.
         episodes: Episodes of each demonstration.
         setting: Robot, meshes, seed of the perturbations of the starts, device and worlds.
-        out: Folder for attribution.json; default: attribute/ next to the policy's results.
+        out: Folder for the results, one file for each engine; default: attribute/ next to the policy's results.
     """
     from xreset.eval import policy_spec, rollout
     from xreset.eval.engines import attribution
@@ -314,24 +314,15 @@ def attribute(
         spec, demos, meshes=setting.meshes, seed=setting.seed, num_envs=setting.num_envs
     )
     out = out or spec.folder.parent / "attribute"
-    folder = played.meshes
     with Progress() as bar:
         found = attribution.attribute(
-            spec, a, b, played, episodes=episodes, only=only, progress=bar.stages()
+            spec, a, b, played, out, episodes=episodes, only=only, progress=bar.stages()
         )
     demonstrations = len(played.bank.sequence_name)
-    counts = f"episodes: {len(found.rows[0].episodes)}, demonstrations: {demonstrations}, seed: {setting.seed}"
+    counts = (
+        f"episodes: {len(found.a.nominal)}, demonstrations: {demonstrations}, seed: {setting.seed}"
+    )
     title = f"{spec.name} on {spec.robot.name}: what costs the skill between {engine} and {towards}\n{counts}"
-    content = found.as_dict() | {
-        "policy": spec.name,
-        "robot": spec.robot.name,
-        "seed": setting.seed,
-        "demonstrations": demonstrations,
-        "versions": {a.name: a.version, b.name: b.version},
-        "meshes": str(folder) if folder else None,
-        "inputs": played.inputs,
-    }
-    write_json(out / "attribution.json", content)
     console.print(attribution.rich_table(found, title))
     for line in attribution.not_tried(found):
         console.print(line, style="dim")

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from xreset.cli._common import Engines, Flat, PolicyOrBaseline
 from xreset.cli._terminal import Progress, console
-from xreset.eval import table
 from xreset.eval.setting import Setting
 
 
@@ -37,12 +36,11 @@ def evaluate(
         out: Folder for the results; default: eval/ in the run folder or next to the policy, runs/NAME/eval for a policy
             that ships with xreset, runs/BASELINE-ROBOT/eval for a baseline.
     """
-    from xreset.eval import evaluate as evaluation
-    from xreset.eval import policy_spec
+    from xreset.eval import experiment, policy_spec, table
 
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
     with Progress() as bar:
-        summaries = evaluation.evaluate(
+        results = experiment.evaluate(
             spec,
             demos,
             tuple(dict.fromkeys(engine or ("mujoco",))),
@@ -53,8 +51,8 @@ def evaluate(
             progress=bar.stages(),
             **vars(setting),
         )
-    console.print(table.results_table(summaries))
-    if unseen := summaries[0].unseen:
+    console.print(table.results_table(results))
+    if unseen := results[0].unseen:
         console.print(f"not in the policy's training: {', '.join(unseen)}")
     console.print(f"results in {out or spec.folder}")
 

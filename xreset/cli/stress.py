@@ -10,84 +10,89 @@ from xreset.cli._terminal import Progress, console, show_table
 from xreset.eval.setting import Setting
 
 if TYPE_CHECKING:
-    from xreset.eval import stress as sweeps
+    from xreset.eval import effects
 
 
 def stress(
     policy: PolicyOrBaseline,
     *,
-    demos: Path,
+    demos: Path | None = None,
     engine: Engines = (),
     property: Several = (),
+    faults: bool = False,
     episodes: int = 2,
+    real_time: bool = False,
     setting: Flat[Setting] = Setting(),
     out: Path | None = None,
 ) -> None:
     """Measure robustness: the same episodes with changed stiffness, latency, friction, mass and more, one at a time.
 
+    With faults, a robot's control loop plays: late and wrong poses, late actions, lost frames, pushes. The result says
+    whether the policy may be tried on a robot. xreset report draws every curve.
+
     Args:
-        demos: Demonstrations whose starts and goals are played.
-        property: Property to change, or NAME=VALUE,VALUE... for values of your own (factors, latencies in control
-            steps; the table shows each unit); give it again for more. Default: all.
+        demos: Demonstrations whose starts and goals are played. Default: two synthetic demonstrations of each of the
+            policy's objects.
+        property: Property or fault to change, or NAME=VALUE,VALUE... for values of your own (factors, s, m, rad; the
+            table shows each unit); give it again for more. Default: all physical properties.
+        faults: Try all faults of a robot by default.
         episodes: Episodes of each demonstration, the same for every value.
+        real_time: Let the control loop of the faults wait for the wall clock.
         setting: Robot, meshes, seed, device and worlds.
-        out: Folder for the results; default: stress/ in the run folder or next to the policy.
+        out: Folder for the results; default: stress/ in the run folder or next to the policy, faults/ if there are
+            faults.
     """
-    from xreset.eval import sensitivity
+    from xreset.eval import conditions
 
-    properties = sensitivity.chosen(property)  # refuses wrong ones before torch is loaded
-    from xreset.eval import policy_spec, rollout
-    from xreset.eval import stress as sweeps
+    conditions.chosen(property)  # refuses wrong ones before torch is loaded
+    from xreset.eval import effects, experiment, policy_spec
 
-    engines = rollout.chosen_engines(engine or "mujoco", setting.device)
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
-    folder = out or spec.folder.parent / "stress"
-    played = rollout.load_trial(
-        spec, demos, meshes=setting.meshes, seed=setting.seed, num_envs=setting.num_envs
-    )
     with Progress() as bar:
-        found = sweeps.stress(
+        found = experiment.stress(
             spec,
-            played,
-            engines,
-            folder,
-            sweeps=properties,
+            demos,
+            tuple(dict.fromkeys(engine or ("mujoco",))),
+            properties=property,
+            faults=faults,
             episodes=episodes,
+            real_time=real_time,
+            out=out,
             progress=bar.stages(),
+            **vars(setting),
         )
-    sweeps.write_plot(folder / "stress.png", found, f"{spec.name}: robustness")
-    table = [("property", "value", *(result.engine for result in found))]
-    swept = sweeps.by_property(found)
-    tried = set(swept).union(*(result.left_out for result in found))
-    for prop in properties:
-        if prop.option not in tried:  # a property of cameras, and the policy has none
-            continue
-        for i, value in enumerate(sorted({*prop.values, prop.nominal})):
+    rows = [("property", "value", *(result.engine for result in found))]
+    for name, curves in effects.by_property(found).items():
+        known = next(filter(None, curves))
+        for i, point in enumerate(known.points):
             cells = []
-            for curve in swept.get(prop.option, [None] * len(found)):
-                text = _cell(curve.points[i], value == prop.nominal) if curve else "cannot be set"
-                cells.append(text)
-            table.append((prop.option, f"{value:g} {prop.unit}", *cells))
-    show_table(
-        table,
-        title=f"{spec.name}: task progress, and its difference to the same episodes in points (95 %)\n"
-        f"{found[0].episodes} episodes, seed {setting.seed}",
-    )
+            for curve in curves:
+                cells.append(_cell(curve, i) if curve else "cannot be set")
+            rows.append((name, known.property.amount(point.value), *cells))
+        limits = [curve.costs() if curve else "" for curve in curves]
+        rows.append(("", "costs ten points", *limits))
+    title = f"{spec.name}: task progress, and its difference to the same episodes in points (95 %)"
+    show_table(rows, title=f"{title}\n{len(found[0].nominal)} episodes, seed {setting.seed}")
     for result in found:
         if result.left_out:
             console.print(
                 f"left out in {result.engine}, which cannot set them: {', '.join(result.left_out)}"
             )
-    console.print(f"results and picture in {folder}")
+    sentence, reasons = effects.verdict(found)
+    if sentence:
+        console.print(sentence, style="bold")
+    for reason in reasons:
+        console.print(reason)
+    console.print(f"results in {found.folder}; page with every curve: xreset report {found.folder}")
 
 
-def _cell(point: sweeps.Point, nominal: bool) -> str:
+def _cell(curve: effects.Curve, index: int) -> str:
     """Return task progress as text; at other than the nominal value, with the difference to it and its interval."""
+    point = curve.points[index]
     text = f"{100 * point.task_progress:.1f} %"
-    if nominal:
+    if point.value == curve.property.nominal:
         return text
-    low, high = point.difference_ci95
-    return f"{text} ({100 * point.difference:+.1f}; {100 * low:+.1f} to {100 * high:+.1f})"
+    return f"{text}, {point.difference_text()}"
 
 
 COMMAND = stress

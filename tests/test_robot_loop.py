@@ -2,22 +2,24 @@
 
 from dataclasses import replace
 from importlib.util import find_spec
-from unittest import TestCase, mock, skipUnless
+from unittest import TestCase, skipUnless
+from unittest.mock import patch
 
 import numpy as np
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
 from tests import toy_grasp
-from tests.command import refused, succeeds
+from tests.command import succeeds, xreset
 from tests.data import InFolder
 from tests.toy_bank import SOUP
-from tests.toy_results import episodes, toy_card
-from xreset.eval.rehearse import Rehearsal, judge, page, rehearse
+from tests.toy_results import swept
+from xreset import stress
+from xreset.errors import PolicyError
+from xreset.eval.conditions import FAULTS
+from xreset.eval.effects import verdict
+from xreset.eval.results import read_evaluation
 from xreset.eval.rollout import engine, play_rounds
-from xreset.eval.sensitivity import REHEARSED
-from xreset.eval.stress import curve
-from xreset.files.storage import read_json
 from xreset.live.engine import EngineDriver
 from xreset.live.faults import Faults, FaultyDriver
 from xreset.policy.shipped import shipped
@@ -125,86 +127,62 @@ class FrameTest(TestCase):
 
 
 class VerdictTest(TestCase):
-    def card(self, engine="mujoco", **losses):
-        """A card; ``action_delay_67=0.2`` is a loss of 20 points in every episode."""
-        curves = []
-        for prop in REHEARSED:
+    def result(self, engine="mujoco", progress=0.8, only=None, **losses):
+        """The result of a sweep; ``action_delay_0=0.2`` is a loss of 20 points at the first value in every episode."""
+        sweep = {}
+        for prop in FAULTS[:only]:
             name = prop.option.replace("-", "_")
-            swept = {}
-            for value in prop.values:
-                swept[value] = episodes([0.8 - losses.get(f"{name}_{value:g}", 0.0)] * 5)
-            curves.append(curve(prop, episodes([0.8] * 5), swept))
-        stopped = {"The pose is old.": 2}
-        return toy_card(Rehearsal, engine=engine, curves=tuple(curves), stopped=stopped)
+            for i, value in enumerate(prop.values):
+                loss = losses.get(f"{name}_{i}", 0.0)
+                sweep[prop.option, value] = [progress - loss] * 5
+        return swept([progress] * 5, sweep, engine)
 
     def test_verdicts(self):
-        self.assertEqual(judge([self.card()]), ("Ready for a first, careful trial on a robot.", []))
-        sentence, reasons = judge([self.card(), self.card("sapien", action_delay_67=0.2)])
+        ready = ("Ready for a first, careful trial on a robot.", [])
+        self.assertEqual(verdict([self.result()]), ready)
+        found = [self.result(), self.result("sapien", action_delay_2=0.2)]
+        sentence, reasons = verdict(found)
         self.assertEqual(sentence, "Not ready for a robot.")
-        self.assertRegex(
-            reasons[0], "sapien: action delay 67 ms costs 20.0 points .95 %: 20 to 20.. At most 4"
-        )
-        card = self.card(action_delay_67=0.2)
-        curves = []
-        for each in card.curves:
-            points = tuple(replace(point, difference_ci95=(-0.2, 1e-6)) for point in each.points)
-            curves.append(replace(each, points=points))
-        self.assertRegex(judge([replace(card, curves=tuple(curves))])[1][0], "95 %: 0 to 20.")
-        _, reasons = judge([replace(self.card(), task_progress=0.3)])
+        words = "sapien: action delay 0.067 s costs 20.0 points .95 %: 20 to 20.. At most 4"
+        self.assertRegex(reasons[0], words)
+        scattered = {("pose-delay", 0.2): [0.4, 0.4, 0.9, 0.9, 0.9]}
+        sentence, reasons = verdict([swept([0.8] * 5, scattered)])
+        self.assertIn("Not shown to be ready", sentence)
+        self.assertRegex(reasons[0], r"costs 10.0 points .95 %: -\d+ to \d+.")
+        _, reasons = verdict([self.result(progress=0.3)])
         self.assertIn("only 30 % without any fault", reasons[0])
-        self.assertIn("No verdict", judge([replace(self.card(), curves=self.card().curves[:3])])[0])
-
-    def test_the_page_has_every_fault(self):
-        text = page([self.card(), self.card("sapien", action_delay_67=0.2, action_delay_133=0.4)])
-        for expected in (
-            "Not ready",
-            "50 ms",
-            "none that was tried",
-            "not tried on hardware",
-            "The pose is old",
-            "<svg",
-        ):
-            self.assertIn(expected, text)
-        for prop in REHEARSED:
-            self.assertIn(prop.option.replace("-", " "), text)
+        self.assertIn("No verdict", verdict([self.result(only=6)])[0])
+        self.assertEqual(verdict([swept([0.8] * 5, {("object-mass", 2.0): [0.8] * 5})]), ("", []))
 
 
 @skipUnless(find_spec("mujoco"), "mujoco is not installed")
 class CommandTest(InFolder):
-    def test_a_page_from_the_command_line(self):
+    def test_a_verdict_from_the_command_line(self):
         demos = self.folder / "demos.npz"
         succeeds("demos", "synth", "--objects", SOUP, "--per-object", 1, "--out", demos)
-        options = ("--demos", demos, "--engine", "mujoco", "--out", self.folder)
-        out = succeeds(
-            "rehearse",
-            shipped()["soup-can"],
-            *options,
-            "--fault",
-            "published-faults=0.5",
-            "--fault",
-            "lost-frames=1.2",
-        )
+        policy = shipped()["soup-can"]
+        options = ("--demos", demos, "--engine", "mujoco", "--episodes", 1, "--out", self.folder)
+        faults = ("--property", "published-faults=0.5", "--property", "lost-frames=1.2")
+        out = succeeds("stress", policy, *options, *faults)
         self.assertIn("No verdict: not every fault that decides was tried.", out)
-        found = read_json(f"{self.folder}/mujoco.json", "xreset-rehearsal/1")
-        self.assertEqual(
-            [c["property"] for c in found["curves"]], ["published-faults", "lost-frames"]
-        )
-        self.assertEqual(list(found["stopped"].values()), [1])
-        self.assertIn("pose of the object is ... s old", next(iter(found["stopped"])))
-        self.assertTrue((self.folder / "index.html").is_file())
-        self.assertFalse((self.folder / "mujoco.partial").exists())
+        (found,) = read_evaluation(self.folder)
+        names = found.changed["property"].tolist()
+        self.assertEqual(names, ["published-faults", "lost-frames"])
+        self.assertEqual(list(found.stopped.values()), [1])
+        self.assertIn("pose of the object is ... s old", next(iter(found.stopped)))
         before = (self.folder / "mujoco.json").read_bytes()
-        played = [episodes([0.8] * 5)] * 2
-        with (
-            mock.patch("xreset.eval.rehearse._play", side_effect=[*played, KeyboardInterrupt]),
-            self.assertRaises(KeyboardInterrupt),
-        ):
-            rehearse("soup-can", demos, faults=("pose-delay=1", "lost-frames"), out=self.folder)
+        rolled = "xreset.eval.robot_loop.roll_out_on_robot"
+        with patch(rolled, side_effect=KeyboardInterrupt), self.assertRaises(KeyboardInterrupt):
+            stress("soup-can", demos, properties="pose-delay=1", out=self.folder)
         after = (self.folder / "mujoco.json").read_bytes()
-        self.assertEqual(after, before, "results of a whole rehearsal stay")
-        partial = read_json(self.folder / "mujoco.partial", "xreset-rehearsal/1")
-        self.assertEqual([c["property"] for c in partial["curves"]], ["pose-delay"])
-        err = refused(
-            "rehearse", shipped()["soup-can"], *options, "--fault", "missed-deadlines=150"
-        )
-        self.assertIn("missed-deadlines 150 % of the steps cannot be tried", err)
+        self.assertEqual(after, before, "results of a whole sweep stay")
+        earlier = xreset("rehearse", policy, *options, "--fault", "pose-delay=200")
+        self.assertEqual(earlier[0], 1)
+        for words in (
+            "rehearse is now stress --faults",
+            "--fault is now --property",
+            "200 is too much. Give s, at most 2",
+        ):
+            self.assertIn(words, earlier[2])
+        with self.assertRaisesRegex(PolicyError, "not an exported policy"):
+            stress("zero", demos, robot="openarm", faults=True)

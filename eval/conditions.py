@@ -1,7 +1,7 @@
-"""The physical properties of the world that can be changed, and the effect of a change on a policy's score.
+"""Conditions of an experiment: a physical property with a value, a fault between policy and robot, or nothing.
 
-Sweeps (:mod:`xreset.eval.stress`), rehearsals (:mod:`xreset.eval.rehearse`) and the attribution to differences of
-engines (:mod:`xreset.eval.engines.attribution`) share both.
+``properties.toml`` lists what can be changed. Sweeps (``xreset stress``) and the attribution to differences of engines
+(:mod:`xreset.eval.engines.attribution`) share it.
 """
 
 from __future__ import annotations
@@ -13,74 +13,59 @@ from dataclasses import field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from xreset.errors import XResetError
-from xreset.eval.stats import Interval, bootstrap_ci95, mean_of_known
 from xreset.files.checks import frozen
 from xreset.task.config import RandomizationConfig, TaskConfig
 
 if TYPE_CHECKING:  # a command checks names of properties before it loads torch
-    from xreset.eval.results import Episode
+    from xreset.live.faults import Faults
     from xreset.physics import Capability
 
 
 @frozen
-class Effect:
-    """Task progress of some episodes, and its difference to the same episodes unchanged; intervals of 95 %."""
+class Condition:
+    """What differs from an evaluation."""
 
-    task_progress: float
-    ci95: Interval
-    difference: float
-    difference_ci95: Interval
-    published_success: float | None = None
-    """Share of the episodes that succeed in the sense of the published paper; None: an earlier version did not measure
-    it."""
-
-    @classmethod
-    def of(cls, episodes: Sequence[Episode], nominal: Sequence[Episode]) -> Effect:
-        """Compare episodes one by one. The intervals are bootstraps over demonstrations."""
-        score = np.array([e.task_progress for e in episodes])
-        difference = score - np.array([e.task_progress for e in nominal])
-        groups = np.array([e.sequence for e in episodes])
-        return cls(
-            task_progress=float(score.mean()),
-            ci95=bootstrap_ci95(score, groups),
-            difference=float(difference.mean()),
-            difference_ci95=bootstrap_ci95(difference, groups),
-            published_success=mean_of_known([e.published_success for e in episodes]),
-        )
-
-    @property
-    def is_certain(self) -> bool:
-        """Whether the interval of the difference excludes zero."""
-        low, high = self.difference_ci95
-        return low > 0 or high < 0
+    task: TaskConfig
+    """The task that is played."""
+    property: str = ""
+    """Name of the property as in options; empty: nothing is changed."""
+    value: float | None = None
+    faults: Faults | None = None
+    """Faults between policy and robot."""
 
 
 @frozen
 class Property:
-    """One physical property, or a fault of a rehearsal. The fields are explained in ``properties.toml``."""
+    """One physical property, or one fault. The fields are explained in ``properties.toml``."""
 
     name: str
     task_field: str = ""
     values: tuple[float, ...] = ()
     nominal: float = 1.0
     unit: str = "x"
+    most: float = math.inf
     needs: Capability | None = None
+    in_steps: bool = False
     measured: str = ""
     """Field of :class:`~xreset.eval.engines.measure.Measured`."""
     resolution: float = 0.0
     absolute: bool = False
     shown_unit: str = ""
     of_cameras: bool = False
+    on_robot: bool = False
     scaled: dict[str, float] = field(default_factory=dict)
     fixed: dict[str, Any] = field(default_factory=dict)
 
     @property
     def option(self) -> str:
-        """Name of the property in options and in files of sweeps."""
+        """Name of the property in options and in files."""
         return self.name.replace(" ", "-")
+
+    @property
+    def is_fault(self) -> bool:
+        """Whether it is a fault, which only the control loop of a robot can have."""
+        return bool(self.scaled)
 
     @property
     def changed_field(self) -> str:
@@ -92,72 +77,78 @@ class Property:
         scale = 1e3 if self.shown_unit in ("mm", "ms") else 1.0
         return f"{value * scale:.3g} {self.shown_unit}".rstrip()
 
+    def amount(self, value: float) -> str:
+        """Return a value with its unit, such as ``0.033 s`` or ``x 0.7``."""
+        number = f"{float(f'{value:.3g}'):g}"
+        return f"x {number}" if self.unit == "x" else f"{number} {self.unit}".rstrip()
+
     def set_in(self, task: TaskConfig, value: float) -> TaskConfig:
         """Return the task with the property at one value.
 
         Raises:
             XResetError: the property cannot have the value.
         """
-        drawn = value
-        if self.unit == "ms":
-            drawn /= 1000 * task.control_dt  # the task counts control steps
+        drawn = value / task.control_dt if self.in_steps else value
         try:
             changed = replace(task.randomization, **{self.changed_field: (drawn, drawn)})
             return replace(task, randomization=changed)
         except ValueError as error:
-            raise self.impossible(value, error) from None
+            raise self._impossible(value, error) from None
 
-    def impossible(self, value: float, error: ValueError) -> XResetError:
-        """Return the error that the property cannot have a value."""
-        return XResetError(f"{self.option} {amount(self.unit, value)} cannot be tried: {error}.")
+    def at(self, value: float, task: TaskConfig) -> Condition:
+        """Return the condition that the property has a value and everything else is as in a task.
+
+        Raises:
+            XResetError: the property cannot have the value.
+        """
+        if not self.is_fault:
+            return Condition(task=self.set_in(task, value), property=self.option, value=value)
+        from xreset.live.faults import Faults
+
+        sizes: dict[str, Any] = {name: factor * value for name, factor in self.scaled.items()}
+        try:
+            faults = Faults(**self.fixed, **sizes)
+        except ValueError as error:
+            raise self._impossible(value, error) from None
+        return Condition(task=task, property=self.option, value=value, faults=faults)
+
+    def _impossible(self, value: float, error: ValueError) -> XResetError:
+        return XResetError(f"{self.option} {self.amount(value)} cannot be tried: {error}.")
 
 
-def amount(unit: str, value: float) -> str:
-    """Return a value with its unit, such as ``33 ms`` or ``x 0.7``."""
-    number = f"{float(f'{value:.3g}'):g}"
-    return f"x {number}" if unit == "x" else f"{number} {unit}"
-
-
-TABLE = tomllib.loads(Path(__file__).with_name("properties.toml").read_text())
-"""The tables ``properties`` and ``faults``, by name of the row."""
-
-
-def _rows(table: str) -> tuple[Property, ...]:
-    """Return the rows of a table, in its order."""
+def _properties() -> tuple[Property, ...]:
+    table = tomllib.loads(Path(__file__).with_name("properties.toml").read_text())
     rows = []
-    for name, row in TABLE[table].items():
+    for name, row in table["properties"].items():
         values = tuple(row.get("values", ()))
         rows.append(Property(**row | {"name": name, "values": values}))
     return tuple(rows)
 
 
-PROPERTIES = _rows("properties")
-FAULTS = _rows("faults")
-"""Faults between a policy and a robot."""
-SWEEPS = tuple(p for p in PROPERTIES if p.values)
-"""The properties that can be swept."""
+PROPERTIES = _properties()
+SWEPT = tuple(p for p in PROPERTIES if p.values and not p.is_fault)
+"""Physical properties that can be swept."""
+FAULTS = tuple(p for p in PROPERTIES if p.is_fault or p.on_robot)
+"""Faults between a policy and a robot, and physical properties that are tried with them."""
 COMPARED = {p.name: p for p in PROPERTIES if p.measured}
 """The properties in which engines are compared, by name."""
-_PHYSICAL = {prop.name: prop for prop in SWEEPS}
-REHEARSED: tuple[Property, ...] = (
-    *FAULTS,
-    _PHYSICAL["object mass"],
-    _PHYSICAL["object friction"],
-    replace(_PHYSICAL["force gain"], values=(0.0, 0.5, 2.0)),
-)
-"""Faults and physical properties of a rehearsal, in the order of its page. A force gain of 0 is a robot that does not
-measure forces."""
+_BY_OPTION = {p.option: p for p in PROPERTIES}
+
+
+def property_of(option: str) -> Property:
+    """Return the property of a name in files; one that this version does not know has no unit."""
+    return _BY_OPTION.get(option) or Property(name=option.replace("-", " "), unit="")
 
 
 def chosen(
-    wanted: str | Sequence[str], properties: Sequence[Property] = SWEEPS
+    wanted: str | Sequence[str], default: Sequence[Property] = SWEPT
 ) -> tuple[Property, ...]:
-    """Return the wanted properties, given as ``NAME`` or ``NAME=VALUE,VALUE...``; all if ``wanted`` is empty.
+    """Return the wanted properties, given as ``NAME`` or ``NAME=VALUE,VALUE...``; ``default`` if ``wanted`` is empty.
 
     Raises:
         XResetError: a property is unknown, or a value is impossible.
     """
-    known = {prop.option: prop for prop in properties}
+    known = {prop.option: prop for prop in PROPERTIES if prop.values}
     found = []
     for text in (wanted,) if isinstance(wanted, str) else wanted:
         name, _, values = text.partition("=")
@@ -168,7 +159,7 @@ def chosen(
         if values:
             prop = replace(prop, values=_values(text, values, prop))
         found.append(prop)
-    return tuple(found or properties)
+    return tuple(found or default)
 
 
 def _values(text: str, values: str, prop: Property) -> tuple[float, ...]:
@@ -181,6 +172,10 @@ def _values(text: str, values: str, prop: Property) -> tuple[float, ...]:
     if not numbers or not all(0 <= v < math.inf for v in numbers):
         raise XResetError(
             f"{text!r}: expected finite values of at least 0, other than the nominal {prop.nominal:g}."
+        )
+    if numbers[-1] > prop.most:
+        raise XResetError(
+            f"{text!r}: {numbers[-1]:g} is too much. Give {prop.unit}, at most {prop.most:g}."
         )
     return tuple(numbers)
 

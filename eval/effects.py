@@ -1,0 +1,233 @@
+"""Effects of conditions on a policy: group-bys of a table of episodes, the verdict about a robot, and their picture."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from itertools import chain, pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from xreset.eval.conditions import Property, property_of
+from xreset.eval.plots import COLORS
+from xreset.eval.results import EvalResult, Table, ci95, mean
+from xreset.eval.stats import Interval, bootstrap_ci95
+from xreset.files.checks import frozen
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COSTLY = 0.10
+"""Loss of task progress that ends the range in which a policy counts as robust."""
+CRITERIA = (
+    ("pose-delay", 0.2, 0.03),
+    ("action-delay", 0.067, 0.04),
+    ("action-delay", 0.133, 0.10),
+    ("published-faults", 1.0, 0.10),
+)
+"""Fault, its value, and the largest acceptable loss of task progress. The values are those of the published training;
+the losses are this project's choice."""
+LEAST = 0.5
+"""Least task progress without faults of a policy that may be tried on a robot."""
+
+
+@frozen
+class Effect:
+    """Task progress of some episodes, and its difference to the same episodes unchanged; intervals of 95 %."""
+
+    value: float = math.nan
+    """Value of the changed property; NaN where it is not one property that is changed."""
+    task_progress: float
+    ci95: Interval
+    difference: float
+    difference_ci95: Interval
+    published_success: float
+    """Share of the episodes that succeed in the sense of the published paper; NaN if it was not measured."""
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether the interval of the difference excludes zero."""
+        low, high = self.difference_ci95
+        return low > 0 or high < 0
+
+    def difference_text(self) -> str:
+        """Return the difference in points, and its interval."""
+        low, high = self.difference_ci95
+        return f"{100 * self.difference:+.1f} ({100 * low:+.1f} to {100 * high:+.1f})"
+
+
+def effect(episodes: Table, nominal: Table, value: float = math.nan) -> Effect:
+    """Compare episodes one by one with the same episodes unchanged. Intervals are bootstraps over demonstrations."""
+    difference = episodes["task_progress"].to_numpy() - nominal["task_progress"].to_numpy()
+    return Effect(
+        value=value,
+        task_progress=mean(episodes, "task_progress"),
+        ci95=ci95(episodes, "task_progress"),
+        difference=float(difference.mean()),
+        difference_ci95=bootstrap_ci95(difference, episodes["sequence"].to_numpy()),
+        published_success=mean(episodes, "published_success"),
+    )
+
+
+@frozen
+class Curve:
+    """Task progress against one property in one engine."""
+
+    property: Property
+    points: tuple[Effect, ...]
+    """In ascending order of the value, the nominal one included."""
+    lower: float | None
+    """Value below the nominal one at which ten points are lost, interpolated; None: no tried value loses them."""
+    upper: float | None
+    """The same above the nominal value."""
+
+    def costs(self) -> str:
+        """Return the values nearest to the nominal one that cost ten points, as text."""
+        values = [value for value in (self.lower, self.upper) if value is not None]
+        if not values:
+            return "no tested value"
+        chance = "" if all(self.loses_beyond(value) for value in values) else ", or chance"
+        amounts = [self.property.amount(float(f"{value:.2g}")) for value in values]
+        return " and ".join(amounts) + chance
+
+    def loses_beyond(self, limit: float) -> bool:
+        """Whether the loss at the first value beyond a limit is more than chance."""
+        if limit < self.property.nominal:
+            beyond = [p for p in self.points if p.value <= limit]
+        else:
+            beyond = [p for p in self.points if p.value >= limit]
+        nearest = min(beyond, key=lambda p: abs(p.value - limit))
+        return nearest.difference_ci95[1] < 0
+
+
+def curves(result: EvalResult) -> list[Curve]:
+    """Return the curve of each property that an experiment changed in one engine, in the order of the episodes."""
+    found = []
+    for name, own in result.changed.groupby("property", sort=False):
+        prop = property_of(str(name))
+        points = [effect(result.nominal, result.nominal, prop.nominal)]
+        for value, episodes in own.groupby("value"):
+            points.append(effect(episodes, result.nominal, float(value)))  # pyright: ignore[reportArgumentType]
+        points.sort(key=lambda point: point.value)
+        curve = Curve(
+            property=prop,
+            points=tuple(points),
+            lower=_limit([p for p in reversed(points) if p.value <= prop.nominal]),
+            upper=_limit([p for p in points if p.value >= prop.nominal]),
+        )
+        found.append(curve)
+    return found
+
+
+def _limit(outwards: Sequence[Effect]) -> float | None:
+    """Return the value at which ten points are lost, interpolated; None if none of the points loses as much. The points
+    are in order from the nominal value outwards."""
+    for near, far in pairwise(outwards):
+        if far.difference <= -COSTLY < near.difference:
+            share = (near.difference + COSTLY) / (near.difference - far.difference)
+            return near.value + share * (far.value - near.value)
+    return None
+
+
+def by_property(results: Sequence[EvalResult]) -> dict[str, list[Curve | None]]:
+    """Return the curve of each property in each engine; None where the engine cannot set it."""
+    found: dict[str, list[Curve | None]] = {}
+    for i, result in enumerate(results):
+        for curve in curves(result):
+            found.setdefault(curve.property.option, [None] * len(results))[i] = curve
+    return found
+
+
+# The verdict about a robot --------------------------------------------------------------------------------------------
+
+
+def verdict(results: Sequence[EvalResult]) -> tuple[str, list[str]]:
+    """Return a sentence that says whether the policy may be tried on a robot, and the reasons against it; nothing if no
+    fault that decides was tried at any value.
+
+    It may if every engine shows at least :data:`LEAST` without faults, and no loss beyond :data:`CRITERIA`.
+    """
+    against = []
+    unsure = []
+    tried = 0
+    for result in results:
+        progress = result.mean("task_progress")
+        if progress < LEAST:
+            against.append(f"{result.engine}: only {100 * progress:.0f} % without any fault.")
+        for curve, point, most in _deciding_points(result):
+            tried += 1
+            if -point.difference <= most:
+                continue
+            low, high = (-100 * bound for bound in reversed(point.difference_ci95))
+            text = (
+                f"{result.engine}: {curve.property.name} {curve.property.amount(point.value)} costs "
+                f"{-100 * point.difference:.1f} points (95 %: {round(low)} to {round(high)}). "
+                f"At most {100 * most:.0f} are wanted."
+            )
+            reasons = against if low > 100 * most else unsure
+            reasons.append(text)
+    changed = set(chain.from_iterable(result.changed["property"].unique() for result in results))
+    if not changed & {option for option, _, _ in CRITERIA}:
+        return "", []
+    sentence = "Ready for a first, careful trial on a robot."
+    if against:
+        sentence = "Not ready for a robot."
+    elif unsure:
+        sentence = "Not shown to be ready: some losses may be too large. Play more episodes."
+    elif tried < len(CRITERIA) * len(results):
+        sentence = "No verdict: not every fault that decides was tried."
+    return sentence, [*against, *unsure]
+
+
+def _deciding_points(result: EvalResult) -> Iterator[tuple[Curve, Effect, float]]:
+    """Yield the curve, the point and the largest acceptable loss of each of the :data:`CRITERIA` that was tried."""
+    found = {curve.property.option: curve for curve in curves(result)}
+    for option, value, most in CRITERIA:
+        for point in found[option].points if option in found else ():
+            if point.value == value:
+                yield found[option], point, most
+
+
+# The picture ----------------------------------------------------------------------------------------------------------
+
+_COLUMNS = 4
+
+
+def plot_size(count: int) -> tuple[float, float]:
+    """Return the size of the drawing of a number of properties [inches]."""
+    width = max(2.9 * min(_COLUMNS, count), 5.0)
+    height = 0.8 + 2.3 * math.ceil(count / _COLUMNS)
+    return width, height
+
+
+def draw_curves(figure: Figure, results: Sequence[EvalResult]) -> None:
+    """Draw task progress against each property that was changed, a line for each engine."""
+    found = by_property(results)
+    columns = min(_COLUMNS, len(found))
+    axes = figure.subplots(math.ceil(len(found) / columns), columns, squeeze=False, sharey=True)
+    for ax in axes.flat[len(found) :]:
+        ax.set_visible(False)
+    for ax, (name, of_engines) in zip(axes.flat, found.items(), strict=False):
+        ax.set_title(name)
+        ax.set_ylim(0, 100)
+        for result, curve, color in zip(results, of_engines, COLORS, strict=False):
+            nominal = result.mean("task_progress")
+            ax.axhline(100 * (nominal - COSTLY), color=color, linewidth=0.7, linestyle="--")
+            if curve is not None:
+                _draw(ax, result.engine, nominal, curve, color)
+    axes[0, 0].legend(loc="lower left", fontsize=8)
+    for row in axes:
+        row[0].set_ylabel("task progress [%]")
+
+
+def _draw(ax: Axes, engine: str, nominal: float, curve: Curve, color: str) -> None:
+    x = [p.value for p in curve.points]
+    ends = np.array([p.difference_ci95 for p in curve.points]).T
+    progress = [100 * p.task_progress for p in curve.points]
+    ax.fill_between(x, *(100 * (nominal + ends)), color=color, alpha=0.15, linewidth=0)
+    ax.plot(x, progress, color=color, marker="o", markersize=3, label=engine)
+    ax.axvline(curve.property.nominal, color="grey", linewidth=0.7, linestyle=":")
+    ax.set_xlabel("factor" if curve.property.unit == "x" else curve.property.unit)
+    ax.locator_params(axis="x", nbins=5)

@@ -1,0 +1,77 @@
+"""Play a policy through the control loop of a real robot, with faults between the loop and the robot.
+
+The loop is :mod:`xreset.runtime`, an engine takes the place of the robot's driver (:mod:`xreset.live.engine`), and
+:mod:`xreset.live.faults` has the faults.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections import Counter
+
+from xreset.eval.results import Rollouts
+from xreset.eval.rollout import Engine, Round, Trial, play_rounds
+from xreset.files.progress import Progress, unseen
+from xreset.live.engine import make_controller
+from xreset.live.faults import Faults, FaultyDriver
+from xreset.runtime import OnnxActor, Runner
+
+
+class SimulatedRunner(Runner):
+    """Runs simulated robots: Ctrl-C is raised, because an episode that it cuts short must not count."""
+
+    def _interrupted(self) -> None:
+        raise KeyboardInterrupt
+
+
+def roll_out_on_robot(
+    actor: OnnxActor,
+    engine: Engine,
+    trial: Trial,
+    faults: Faults,
+    *,
+    episodes: int,
+    real_time: bool = False,
+    progress: Progress = unseen,
+) -> Rollouts:
+    """Play demonstrations ``episodes`` times each through the loop. Nothing is recorded.
+
+    Args:
+        actor: the policy.
+        engine: the engine.
+        trial: what is played.
+        faults: faults of every robot.
+        episodes: episodes of each demonstration.
+        real_time: whether the simulation waits for the wall clock.
+        progress: called with (rounds done, rounds in all).
+    """
+    stopped: Counter[str] = Counter()
+    steps = 0
+    began = time.perf_counter()
+
+    def play(played: Round) -> None:
+        nonlocal steps
+        env = played.env
+        controller = make_controller(env, actor)
+        seeds = [
+            (trial.seed, int(sequence), int(repetition))
+            for sequence, repetition in zip(played.sequence, played.repetition, strict=True)
+        ]
+        driver = FaultyDriver(
+            env, faults, seeds, lambda: played.update_metrics(env.reading()), real_time=real_time
+        )
+        outcome = SimulatedRunner(controller, driver).run(env.max_episode_length * controller.dt)
+        for world in played.fresh:
+            reason = outcome.reasons[world]
+            if reason is not None:
+                stopped[re.sub(r"-?\d+\.\d+", "...", reason)] += 1
+        steps += env.max_episode_length * env.num_envs
+        progress(played.number + 1, played.total)
+
+    return Rollouts(
+        episodes=play_rounds(engine, trial, episodes, play),
+        traces=(),
+        control_steps_per_second=steps / (time.perf_counter() - began),
+        stopped=dict(stopped),
+    )

@@ -1,4 +1,4 @@
-"""Studies: the file, the plan, the launcher, and the tables; and one whole study of seconds."""
+"""Studies: the file, the plan, running its steps, and the tables; and one whole study of seconds."""
 
 import io
 import json
@@ -31,7 +31,7 @@ from xreset.eval.study.launch import launch
 from xreset.eval.study.paper import paper_tables
 from xreset.eval.study.plan import Plan, make_plan
 from xreset.eval.study.report import write_page
-from xreset.eval.study.steps import XRESET, Step, flags
+from xreset.eval.study.steps import XRESET, flags
 from xreset.eval.study.tables import fill
 from xreset.files.storage import claim
 from xreset.learning.clock import read_lift, write_lift
@@ -287,37 +287,36 @@ class PlanTest(Studied):
 
 
 class LaunchTest(Studied):
-    def launch(self, *steps, gpus=()):
+    def launch(self, *steps):
         plan = Mock(spec=Plan, out=self.out, steps={s.name: s for s in steps})
         said: list[str] = []
-        with (
-            patch("xreset.eval.study.launch.visible_gpus", return_value=gpus),
-            patch("xreset.eval.study.launch._POLL", 0.02),
-        ):
-            return launch(plan, steps, say=said.append), said
+        return launch(plan, steps, say=said.append), said
 
-    def step(self, name, command, *needs, gpu=False):
-        return shell_step(name, self.folder / name, command, *needs, gpu=gpu)
+    def step(self, name, command, *needs):
+        return shell_step(name, self.folder / name, command, *needs)
 
     def test_steps_are_done_in_their_order_and_failures_are_named(self):
-        problems, said = self.launch(
-            self.step("b", "test -e ../a/done && touch done", "a"),
-            self.step("a", "touch done"),
-            self.step("c", "echo it is broken; exit 3"),
-            self.step("d", "touch done", "c"),
-            self.step("e", "touch done", gpu=True),
-            self.step("f", "true"),
-        )
+        taken = self.step("e", "touch done")
+        with claim(taken.folder / "resets.npz"):
+            problems, said = self.launch(
+                self.step("a", "touch done"),
+                self.step("b", "test -e ../a/done && touch done", "a"),
+                self.step("c", "echo it is broken; exit 3"),
+                self.step("d", "touch done", "c"),
+                taken,
+                self.step("f", "true"),
+            )
         self.assertTrue((self.folder / "b" / "done").exists())
         self.assertLess(said.index("a: done"), said.index("b: done"))
         expected = (
             r"c: it is broken\. Its output: .*c\.log",
             "d cannot start: c is not done.*",
-            "e cannot start: it needs a GPU, this machine has none.*",
+            "e is in progress in another process.*",
             "f: it ended before it was done.*",
         )
         self.assertRegex("\n".join(sorted(problems)), "\n".join(expected))
         self.assertEqual(len(problems), 4)
+        self.assertFalse(taken.busy())
 
     def test_a_step_imports_nothing_from_the_current_folder(self):
         for name in ("tyro", "xreset", "queue"):
@@ -326,43 +325,6 @@ class LaunchTest(Studied):
         (command,) = step.todo()[1]
         subprocess.run([*command, "--help"], cwd=self.folder, check=True, capture_output=True)
         self.assertFalse((self.folder / "imported").exists())
-
-    def test_each_step_sees_its_own_gpu_and_a_waiting_one_is_not_asked_again_and_again(self):
-        say = "echo $CUDA_VISIBLE_DEVICES > gpus; sleep 0.3; touch done"
-        waits = self.step("d", say, gpu=True)
-        todo = Mock(side_effect=waits.todo)
-        steps = [self.step("c", say), self.step("a", say, gpu=True), self.step("b", say, gpu=True)]
-        problems, said = self.launch(*steps, replace(waits, todo=todo), gpus=("2", "5"))
-        self.assertEqual(problems, [])
-        a, b, c, d = ((self.folder / name / "gpus").read_text().strip() for name in "abcd")
-        self.assertEqual((sorted((a, b)), c), (["2", "5"], ""))
-        self.assertIn(f"d: begun on GPU {d}", said)
-        self.assertEqual(
-            todo.call_count,
-            2,
-            "before its turn and at its end: a training reads its checkpoint for it",
-        )
-
-    def test_a_step_that_another_process_runs_is_waited_for(self):
-        """The other process begins between the question and the start, and ends later."""
-        step = self.step("a", "echo another command is writing it; exit 1")
-        answers = iter((False, True, True))
-
-        def busy(_):
-            if (answer := next(answers, None)) is None:
-                (step.folder / "done").touch()
-            return bool(answer)
-
-        with patch.object(Step, "busy", busy):
-            problems, said = self.launch(step)
-        self.assertEqual(problems, [])
-        self.assertEqual(
-            said, ["a: begun", "a: in progress in another process; waiting for its end"]
-        )
-        for claimed in (step.folder, step.folder / "resets.npz"):
-            with claim(claimed):
-                self.assertTrue(step.busy())
-        self.assertFalse(step.busy())
 
     def test_ctrl_c_asks_the_command_to_end(self):
         step = self.step(
@@ -608,6 +570,6 @@ class WholeTest(InOneFolder):
         said = succeeds("study", "seconds", "--out", f"{self.folder}/none", "--dry-run")
         self.assertRegex(
             said,
-            r"(?s)train x-reset-seed0: not begun \(no GPU, after data .*\n    xreset train --out .*/none/x-reset-seed0 --iterations 2",
+            r"(?s)train x-reset-seed0: not begun \(after data .*\n    xreset train --out .*/none/x-reset-seed0 --iterations 2",
         )
         self.assertFalse((self.folder / "none").exists())

@@ -3,7 +3,7 @@
 from xreset.eval.study.steps import Step
 
 
-def shell_step(name, writes, command, *needs, gpu=False):
+def shell_step(name, writes, command, *needs):
     """Return a step that is done when its folder holds ``done``."""
 
     def todo():
@@ -11,4 +11,4 @@ def shell_step(name, writes, command, *needs, gpu=False):
             return "", []
         return "to do", [["sh", "-c", f"mkdir -p {writes} && cd {writes} && {command}"]]
 
-    return Step(name=name, kind="data", folder=writes, todo=todo, needs=needs, gpu=gpu)
+    return Step(name=name, kind="data", folder=writes, todo=todo, needs=needs)

@@ -90,8 +90,7 @@ class Plan:
         if earlier in self.steps:
             needs.append(earlier)
         name = f"train {run.folder.name}"
-        gpu = run.spec.device == "cuda"
-        self.add(Step(name, "train", run.folder, partial(train_todo, run), needs, gpu))
+        self.add(Step(name, "train", run.folder, partial(train_todo, run), needs))
 
     def evaluate(self, run: Run, key: str) -> None:
         """Add the step of an evaluation, if the run can play some of its objects and an engine is installed."""

@@ -55,7 +55,6 @@ class Step:
     todo: Callable[[], Todo]
     needs: Sequence[str] = ()
     """Names of the steps before it."""
-    gpu: bool = False
 
     def left(self) -> str:
         """Return what is left to do, in words; empty if the step is done."""

@@ -22,7 +22,7 @@ from xreset.physics.plugins import existing_device
 
 _COUNTS = {
     "num_envs", "iterations", "episodes", "states", "grasps", "per_object", "max_per_object", "perturbed",
-    "per_gpu", "most", "processes",
+    "most", "processes",
 }  # fmt: skip
 """Whole numbers from 1."""
 _INDICES = {"seed", "episode", "repetition", "sequence", "frame", "port"}

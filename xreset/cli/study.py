@@ -21,7 +21,6 @@ def study(
     out: Path = Path("runs/studies"),
     run: Several = (),
     only: Literal["all", "data", "train", "eval", "tables"] = "all",
-    per_gpu: int = 1,
     dry_run: bool = False,
 ) -> None:
     """Run the missing steps of a study: reset banks, trainings, evaluations, and tables next to the paper's.
@@ -35,7 +34,6 @@ def study(
         out: Folder for all output.
         run: Only these runs of the study; give it again for more. Default: all.
         only: Kind of steps to run: reset banks, trainings, evaluations or tables.
-        per_gpu: Number of simultaneous trainings on each GPU of this machine.
         dry_run: Print the plan and its commands, and run nothing.
     """
     from xreset.eval.study import launch, plan, report
@@ -51,8 +49,8 @@ def study(
         for step in wanted:
             left, commands = step.todo()
             after = [need for need in step.needs if todo.steps[need].left()]
-            waits = f", after {', '.join(after)}" if after else ""
-            console.print(f"{step.name}: {left or 'done'} ({'a' if step.gpu else 'no'} GPU{waits})")
+            waits = f" (after {', '.join(after)})" if after else ""
+            console.print(f"{step.name}: {left or 'done'}{waits}")
             for command in commands:
                 console.print(f"    {launch.shown_command(command)}")
         return
@@ -61,7 +59,7 @@ def study(
         for subset in todo.subsets():
             subset.make()
         undone = [step for step in wanted if step.left()]
-        problems = launch.launch(todo, undone, per_gpu=per_gpu, say=console.print)
+        problems = launch.launch(todo, undone, say=console.print)
     if only in ("all", "tables"):
         page, notes = report.write_page(planned(), out / "reports" / todo.name)
         show_notes(notes)

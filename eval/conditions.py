@@ -44,7 +44,7 @@ class Property:
     values: tuple[float, ...] = ()
     nominal: float = 1.0
     unit: str = "x"
-    most: float = math.inf
+    most: float = 1000.0
     needs: Capability | None = None
     in_steps: bool = False
     measured: str = ""

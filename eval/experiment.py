@@ -115,7 +115,6 @@ def stress(
     meshes: str | Path | None = None,
     num_envs: PositiveInt = 64,
     device: str = "cpu",
-    real_time: bool = False,
     out: str | Path | None = None,
     progress: NamedProgress = unseen,
 ) -> Evaluation:
@@ -138,7 +137,6 @@ def stress(
         meshes: folder of object meshes; default: the folder of the policy's training.
         num_envs: worlds that run at the same time.
         device: where GPU engines run: cpu or cuda.
-        real_time: whether a robot's control loop waits for the wall clock.
         out: folder for the results; default: ``stress`` next to the policy's evaluations, or ``faults`` if there are
             faults.
         progress: called with (engine, conditions done, conditions in all).
@@ -191,7 +189,6 @@ def stress(
                 usable,
                 episodes=episodes,
                 on_robot=on_robot,
-                real_time=real_time,
                 progress=partial(progress, each.name),
             )
             result = replace(result, left_out=left_out)
@@ -224,7 +221,6 @@ def play(
     *,
     episodes: int,
     on_robot: bool = False,
-    real_time: bool = False,
     progress: Progress = unseen,
 ) -> tuple[EvalResult, tuple[Trace, ...]]:
     """Play every demonstration under every condition in one engine.
@@ -236,7 +232,6 @@ def play(
         conditions: the first one is recorded.
         episodes: episodes of each demonstration, each with another perturbation, the same under every condition.
         on_robot: whether a robot's control loop plays, as faults need.
-        real_time: whether this loop waits for the wall clock.
         progress: called with what is done and what is to be done in all; for one condition control steps, else
             conditions.
 
@@ -271,7 +266,6 @@ def play(
                 changed,
                 condition.faults or Faults(),
                 episodes=episodes,
-                real_time=real_time,
             )
         if i == 0:
             traces = rollouts.traces

@@ -32,7 +32,6 @@ def roll_out_on_robot(
     faults: Faults,
     *,
     episodes: int,
-    real_time: bool = False,
     progress: Progress = unseen,
 ) -> Rollouts:
     """Play demonstrations ``episodes`` times each through the loop. Nothing is recorded.
@@ -43,7 +42,6 @@ def roll_out_on_robot(
         trial: what is played.
         faults: faults of every robot.
         episodes: episodes of each demonstration.
-        real_time: whether the simulation waits for the wall clock.
         progress: called with (rounds done, rounds in all).
     """
     stopped: Counter[str] = Counter()
@@ -58,9 +56,7 @@ def roll_out_on_robot(
             (trial.seed, int(sequence), int(repetition))
             for sequence, repetition in zip(played.sequence, played.repetition, strict=True)
         ]
-        driver = FaultyDriver(
-            env, faults, seeds, lambda: played.update_metrics(env.reading()), real_time=real_time
-        )
+        driver = FaultyDriver(env, faults, seeds, lambda: played.update_metrics(env.reading()))
         outcome = SimulatedRunner(controller, driver).run(env.max_episode_length * controller.dt)
         for world in played.fresh:
             reason = outcome.reasons[world]

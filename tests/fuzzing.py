@@ -188,7 +188,8 @@ def add_evaluation(every):
 
     def evaluated(path):
         found = read_result(path)
-        return curves(found), verdict([found])
+        curves(found)
+        return verdict([found])
 
     every.add("result", "mujoco.json", evaluated, "json")
 

@@ -21,7 +21,6 @@ def stress(
     property: Several = (),
     faults: bool = False,
     episodes: int = 2,
-    real_time: bool = False,
     setting: Flat[Setting] = Setting(),
     out: Path | None = None,
 ) -> None:
@@ -35,9 +34,8 @@ def stress(
             policy's objects.
         property: Property or fault to change, or NAME=VALUE,VALUE... for values of your own (factors, s, m, rad; the
             table shows each unit); give it again for more. Default: all physical properties.
-        faults: Try all faults of a robot by default.
+        faults: Change the faults of a robot by default, in place of physics.
         episodes: Episodes of each demonstration, the same for every value.
-        real_time: Let the control loop of the faults wait for the wall clock.
         setting: Robot, meshes, seed, device and worlds.
         out: Folder for the results; default: stress/ in the run folder or next to the policy, faults/ if there are
             faults.
@@ -56,7 +54,6 @@ def stress(
             properties=property,
             faults=faults,
             episodes=episodes,
-            real_time=real_time,
             out=out,
             progress=bar.stages(),
             **vars(setting),

@@ -605,9 +605,8 @@ class TrainingTest(WithBank):
 
     def test_an_exported_policy_keeps_the_order_of_its_observations(self):
         """A policy acts on columns: in another order it would see the goal where it was trained with the object."""
-        out = self.train("ordered", config=ONE)
-        trained = read_run(out).config.task
-        contract = OnnxPolicy(out / "policy.onnx").contract
+        trained = read_run(self.out).config.task
+        contract = OnnxPolicy(self.out / "policy.onnx").contract
         terms = list(trained.observation.policy)
         self.assertNotEqual(terms, sorted(terms))
         for group in ("policy", "proprio", "perception", "privileged"):

@@ -959,6 +959,36 @@ class ResetTest(TestCase):
             self.assertEqual("aten.lt.Scalar" in done.names, share > 0)
             self.assertIn("aten.lt.Tensor", done.names)
 
+    def test_crossed_goals_have_the_place_lift_and_turn_of_another_demonstration(self):
+        """The soup can's demonstrations are 0 and 2; a goal of either is drawn for each of them, from home and bank."""
+        turns = [
+            Rotation.from_quat(quat, scalar_first=True)
+            for quat in (self.bank.start_quat_wxyz, self.bank.goal_quat_wxyz)
+        ]
+        start, goal = turns
+        for share, p in ((1.0, 0.0), (0.5, 1.0)):
+            config = {"crossed_goals": share, "demo_probability": p}
+            reset = self.sample(**config)
+            found = {}
+            for own, other in product((0, 2), (0, 2)):
+                place = self.bank.goal_pos[other].copy()
+                lift = place[2] - self.bank.start_pos[other, 2]
+                place[2] = self.bank.start_pos[own, 2] + lift
+                turn = goal[other] * start[other].inv() * start[own]
+                quat = torch.as_tensor(turn.as_quat(scalar_first=True), dtype=torch.float32)
+                angle = quat_angle(reset.goal_quat, quat.expand(len(reset.goal_quat), 4))
+                far = (reset.goal_pos - torch.as_tensor(place)).norm(dim=1)
+                here = (far < 1e-5) & (angle < 1e-2) & (reset.sequence == own)
+                found[own, other] = here.float().mean()
+            own_share = 0.5 - share / 4
+            for (own, other), observed in found.items():
+                expected = own_share if own == other else share / 4
+                with self.subTest(share=share, own=own, other=other):
+                    self.assertAlmostEqual(observed, expected, delta=0.03)
+            plain = self.sample(**config | {"crossed_goals": 0.0})
+            assert_close(plain.joint_pos, reset.joint_pos)
+            assert_close(plain.object_pos, reset.object_pos)
+
     def test_a_demonstration_without_states_is_drawn_at_home_only(self):
         bank = self.bank.with_states(self.bank.sequence_index != 2)
         reset = self.sample(bank=bank, demo_probability=1.0, adaptive_share=1.0)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 import torch
@@ -17,7 +17,12 @@ from torch.nn.functional import pad
 
 from xreset.errors import DemoError
 from xreset.files.checks import frozen
-from xreset.geometry.rotations import quat_from_axis_angle, quat_multiply, quat_rotate
+from xreset.geometry.rotations import (
+    quat_conjugate,
+    quat_from_axis_angle,
+    quat_multiply,
+    quat_rotate,
+)
 from xreset.geometry.urdf import joint_limits
 from xreset.objects.sampling import center
 from xreset.physics.tensors import Tensors, where
@@ -218,8 +223,6 @@ class ResetDistribution:
             object_index: [M] object of each world.
             generator: random numbers, on this distribution's device.
         """
-        # One of the six numbers is not used. It is drawn so that a seed gives the episodes that it gave in earlier
-        # versions.
         uniform = torch.rand(len(object_index), 6, generator=generator, device=generator.device)
         sequence = self._sequences_of_object.draw(object_index, uniform[:, 2])
         adaptive = self.config.adaptive_share
@@ -227,6 +230,25 @@ class ResetDistribution:
             failure = (1.0 - self.success_rate).clamp_min(_LEAST_FAILURE)
             weak = self._sequences_of_object.draw_by_weight(object_index, uniform[:, 2], failure)
             sequence = torch.where(uniform[:, 4] < adaptive, weak, sequence)
+        reset = self._home_or_bank(object_index, sequence, uniform, generator)
+        crossed = self.config.crossed_goals
+        if not crossed:
+            return reset
+        others = self._sequences_of_object.draw(object_index, uniform[:, 5] / crossed)
+        goal_pos, goal_quat = self._crossed_goal(reset.sequence, others)
+        with_other = replace(reset, goal_pos=goal_pos, goal_quat=goal_quat)
+        return where(uniform[:, 5] < crossed, with_other, reset)
+
+    def _home_or_bank(
+        self,
+        object_index: Tensor,
+        sequence: Tensor,
+        uniform: Tensor,
+        generator: torch.Generator,
+    ) -> Reset:
+        """Return a reset of each world from home, for given demonstrations [M], or from the bank; by the uniform
+        numbers [M, 6] of :meth:`sample`."""
+        adaptive = self.config.adaptive_share
         home = self.home(sequence, generator)
         states = self._states_of_object
         if not len(states.rows):
@@ -285,6 +307,25 @@ class ResetDistribution:
             state=torch.full((m,), -1, device=device),
             sequence=sequence,
         )
+
+    def _crossed_goal(self, sequence: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
+        """Return goals [M, 3], [M, 4] of demonstrations [M], with the place, lift and turn of others [M]."""
+        own_start = self._pivot_at(sequence, "start")
+        other_start = self._pivot_at(other, "start")
+        place = self._pivot_at(other, "goal")
+        lift = (place - other_start)[:, 2].clamp_min(0.0)
+        place[:, 2] = own_start[:, 2] + lift
+        demos = self._demos[other]
+        turn = quat_multiply(demos.goal_quat, quat_conjugate(demos.start_quat))
+        quat = quat_multiply(turn, self._demos.start_quat[sequence])
+        return place - quat_rotate(quat, self._demos.pivot[sequence]), quat
+
+    def _pivot_at(self, sequence: Tensor, time: Literal["start", "goal"]) -> Tensor:
+        """Return the places [M, 3] of the objects' pivots at the start or goal of demonstrations [M]."""
+        demos = self._demos[sequence]
+        pos = demos.start_pos if time == "start" else demos.goal_pos
+        quat = demos.start_quat if time == "start" else demos.goal_quat
+        return pos + quat_rotate(quat, demos.pivot)
 
     def _moved_goal(
         self, demos: _Demonstrations, generator: torch.Generator

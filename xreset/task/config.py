@@ -237,6 +237,9 @@ class ResetConfig(Checked):
     """Home resets: the goal is moved by U(-z, z) upwards [m], but not below the height at which the object starts."""
     goal_yaw: NonNegativeFloat = 0.0
     """Home resets: the goal is turned about the vertical by U(-y, y) [rad]."""
+    crossed_goals: Share = 0.0
+    """Trainings: share of episodes whose goal is another demonstration's of the same object: the same place over the
+    table, lift and turn, from the start of the episode's own demonstration."""
     object_share: Annotated[
         dict[str, float], Rule("names of objects and numbers above 0", _are_shares)
     ] = field(default_factory=dict)

@@ -113,6 +113,8 @@ class Episode:
     """Distance of the object's origin, in the task's ``object_frame``, from the goal in the same reading [m]."""
     final_angle: NonNegativeFloat | None = None
     """Angle between the object and the goal in the same reading [rad]."""
+    turn: NonNegativeFloat | None = None
+    """Angle between the object and the goal at the start [rad]: by how much the object must turn."""
     nonfinite: bool = _shown("not finite", unit="episodes", fault=True)
     """Whether a number was not finite: the engine broke down, or the policy's action was not finite."""
     overflow: bool = _shown("overflow", unit="episodes", fault=True)
@@ -170,6 +172,8 @@ class EpisodeMetrics:
         self._start_keypoint_distance = self._distances(start, points.keypoints).amax(dim=-1)
         self._least_keypoint_distance = self._start_keypoint_distance
         infinite = torch.full_like(self._least_keypoint_distance, torch.inf)
+        self.turn = quat_angle(start.task_state.object_quat, goal_quat)
+        """[N] angle between the object and the goal at the start [rad]."""
         self.least_distance = infinite
         """[N] least mean distance of the surface points to the goal [m]."""
         self.final_distance = infinite

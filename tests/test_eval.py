@@ -239,10 +239,13 @@ class MetricsTest(TestCase):
             lost = tensor([step == lost_at for lost_at in losses])
             together.update(joined(places, turned(5)), lost)
         self.assertEqual(together.grasp.tolist(), [True, True, False])
+        for world, quat in enumerate(quats):
+            angle = 2 * math.acos(abs(float(quat[0])))  # starts are not turned
+            self.assertAlmostEqual(float(together.turn[world]), angle, delta=1e-3)
         for name in (
             "approach", "grasp", "reorient", "reorient_once", "out_of_bounds", "published_success",
             "least_distance", "final_distance", "final_position_error", "final_angle",
-            "reorientation_progress", "task_progress",
+            "reorientation_progress", "task_progress", "turn",
         ):  # fmt: skip
             found = getattr(together, name)
             torch.testing.assert_close(found, torch.cat([getattr(m, name) for m in alone]))

@@ -118,6 +118,22 @@ class CollectTest(Reported):
         self.assertEqual(self.collect().notes, ())
         self.assertEqual(tuple(training.results), ENGINES)
 
+    def test_progress_by_the_angle_that_the_object_must_turn(self):
+        """Demonstration 0 turns its object by 10 degrees, 1 by 100; results of before state no angle."""
+        self.write()
+        self.assertNotIn("must turn", page(self.collect()))
+        rollouts = toy_rollouts()
+        turned = []
+        for episode in rollouts.episodes:
+            turned.append(replace(episode, turn=np.radians((10.0, 100.0)[episode.sequence])))
+        self.write(rollouts=replace(rollouts, episodes=tuple(turned)))
+        text = Outline(page(self.collect())).text
+        progress = pd.DataFrame(turned).groupby("sequence")["task_progress"].mean()
+        for sequence, name in enumerate(("under 20°", "90 to 120°")):
+            one_demonstration = f"{100 * progress[sequence]:.0f}%1"
+            self.assertIn(name + one_demonstration * len(ENGINES), text)
+        self.assertNotIn("45 to 90°", text)
+
     def test_a_policy_that_sees_needs_no_run(self):
         self.write(vision=SEEING)
         self.assertEqual(self.read()[0].vision, SEEING)

@@ -245,6 +245,7 @@ def page(report: Report) -> str:
         costly=effects.COSTLY,
         places=places,
         objects=_by(places, ["object"]),
+        turns=_by_turn(places),
         demonstrations=_by(places, ["sequence_name", "object"]),
         lifted=tables.lifted(clocks, report.x),
         x=AXES[report.x][0],
@@ -267,7 +268,24 @@ def _by(places: Sequence[tuple[str, Table]], keys: list[str]) -> list[tuple[Any,
         for key, own in episodes.groupby(keys, sort=keys == ["object"]):
             cells = found.setdefault(key, [None] * len(places))
             cells[i] = {name: own[name].mean() for name in METRICS}
+            cells[i]["demonstrations"] = own["sequence_name"].nunique()
     return list(found.items())
+
+
+TURNS = {20: "under 20°", 45: "20 to 45°", 90: "45 to 90°", 120: "90 to 120°", 181: "over 120°"}
+"""Upper limit of a class of turns [degrees] -> its name."""
+
+
+def _by_turn(places: Sequence[tuple[str, Table]]) -> list[tuple[Any, list[Any]]]:
+    """Return the means of the metrics, and the number of demonstrations, of each class of :data:`TURNS` in each place,
+    without classes that no place has; empty for files of earlier versions, which do not state the turn."""
+    classed = []
+    for name, episodes in places:
+        degrees = np.degrees(episodes["turn"].astype(float))
+        turn = pd.cut(degrees, [0, *TURNS], labels=list(TURNS.values()), right=False)
+        classed.append((name, episodes.assign(turn=turn.astype(object)).dropna(subset="turn")))
+    found = dict(_by(classed, ["turn"]))
+    return [((name,), found[(name,)]) for name in TURNS.values() if (name,) in found]
 
 
 def _sweeps(trainings: Sequence[Training]) -> Iterator[dict[str, Any]]:

@@ -250,18 +250,23 @@ class OutputTest(InFolder):
 
 
 class InstallationTest(InFolder):
-    def test_an_editable_installation_works_in_the_parent_folder_of_a_clone(self):
-        """Python takes a folder "xreset" of the current folder for a package unless the path has one as well."""
+    def installed(self, build):
+        """Build a wheel with a function of setuptools, and return the folder that it is unpacked to."""
         clone = self.folder / "xreset"
         clone.mkdir()
         repository = Path(__file__).parents[1]
         for name in ("pyproject.toml", "README.md", "LICENSE", "xreset"):
             (clone / name).symlink_to(repository / name)
-        build = "from setuptools.build_meta import build_editable; build_editable('..')"
-        subprocess.run([sys.executable, "-c", build], cwd=clone, check=True, capture_output=True)
+        call = f"from setuptools.build_meta import {build}; {build}('..')"
+        subprocess.run([sys.executable, "-c", call], cwd=clone, check=True, capture_output=True)
         (wheel,) = self.folder.glob("*.whl")
         site = self.folder / "site-packages"
         zipfile.ZipFile(wheel).extractall(site)
+        return site
+
+    def test_an_editable_installation_works_in_the_parent_folder_of_a_clone(self):
+        """Python takes a folder "xreset" of the current folder for a package unless the path has one as well."""
+        site = self.installed("build_editable")
         use = (
             f"import site; site.addsitedir('{site}')\n"
             "import runpy, sys, xreset; xreset.load_robot('openarm'); sys.argv = ['xreset', '--version']\n"
@@ -273,3 +278,43 @@ class InstallationTest(InFolder):
             command, cwd=self.folder, env=environment, capture_output=True, text=True
         )
         self.assertRegex(done.stdout + done.stderr, r"^xreset \d")
+
+    def test_a_wheel_has_policies_robots_and_templates_without_a_clone(self):
+        site = self.installed("build_wheel")
+        use = (
+            "import xreset\n"
+            f"assert xreset.__file__.startswith({str(site)!r}), xreset.__file__\n"
+            "policy = xreset.load_policy('many-objects')\n"
+            "print(policy.robot.name, len(xreset.load_robot('openarm').joints))\n"
+            "from xreset.eval import pages\n"
+            "assert 'report.html.j2' in pages._environment().list_templates()\n"
+        )
+        environment = os.environ | {"PYTHONPATH": str(site)}
+        done = subprocess.run(
+            [sys.executable, "-c", use],
+            cwd=self.folder,
+            env=environment,
+            capture_output=True,
+            text=True,
+        )
+        self.assertEqual((done.returncode, done.stdout), (0, "ur7e-sharpa 8\n"), done.stderr)
+
+    def test_a_missing_package_is_named_with_the_extra_that_brings_it(self):
+        from xreset import cli
+
+        found = ["numpy>=1.26", "pandas>=2.2; extra == 'eval'", "pandas>=2.2; extra == 'all'"]
+        with patch("importlib.metadata.requires", return_value=found):
+            self.assertEqual(cli._extra_with("pandas"), "eval")
+            self.assertIsNone(cli._extra_with("numpy"))
+        missing = ModuleNotFoundError("No module named 'pandas'", name="pandas")
+        with (
+            patch("importlib.metadata.requires", return_value=found),
+            patch.object(cli, "_run", side_effect=missing),
+            self.assertRaises(SystemExit),
+            redirect_stderr(io.StringIO()) as text,
+        ):
+            cli.main(["report", "x"])
+        self.assertEqual(
+            text.getvalue(),
+            "xreset report: pandas is not installed. Install it with: pip install 'xreset[eval]'\n",
+        )

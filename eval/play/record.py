@@ -10,8 +10,6 @@ import numpy as np
 
 from xreset.errors import XResetError
 from xreset.eval.play.session import Moment, Session
-from xreset.eval.report.clips import encode_mp4
-from xreset.eval.results import Trace, write_traces
 from xreset.files.storage import write_whole
 from xreset.pictures.render import Renderer
 from xreset.spec import SceneSpec
@@ -32,6 +30,8 @@ def write_trace(path: str | Path, session: Session) -> None:
     Raises:
         XResetError: nothing has happened yet.
     """
+    from xreset.eval.results import Trace, write_traces  # pandas, which playing does not need
+
     moments = last_moments(session, None)
     arrays = {}
     for each in fields(Moment):
@@ -74,6 +74,8 @@ def write_film(path: str | Path, session: Session, *, seconds: float = 10.0) -> 
 
 def draw_film(scene: SceneSpec, moments: Sequence[Moment]) -> bytes:
     """Draw moments as an mp4, :data:`FRAMES_PER_SECOND` of them for each second."""
+    from xreset.eval.report.clips import encode_mp4  # pandas, which playing does not need
+
     renderer = Renderer(scene, size=SIZE)
     every = max(1, round(1.0 / (FRAMES_PER_SECOND * scene.control_dt)))
     frames = []

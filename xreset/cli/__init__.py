@@ -9,6 +9,7 @@ configurations and errors; their functions import the rest.
 
 from __future__ import annotations
 
+import re
 import sys
 from importlib import import_module
 from io import TextIOWrapper
@@ -68,6 +69,12 @@ def main(argv: list[str] | None = None) -> None:
         _run(argv)
     except XResetError as error:
         _fail(argv, str(error))
+    except ModuleNotFoundError as error:
+        extra = _extra_with(error.name or "")
+        if extra is None:
+            raise
+        install = f"pip install 'xreset[{extra}]'"
+        _fail(argv, f"{error.name} is not installed. Install it with: {install}")
     except KeyboardInterrupt:
         print("\nstopped.", file=sys.stderr)
         raise SystemExit(130) from None
@@ -121,6 +128,17 @@ def _with_present_flags(argv: list[str]) -> list[str]:
             f"xreset: {earlier} is now {flag}. The next release removes {earlier}.", file=sys.stderr
         )
     return words
+
+
+def _extra_with(package: str) -> str | None:
+    """Return an extra of xreset that brings a package; None: no extra does."""
+    from importlib import metadata
+
+    for line in metadata.requires("xreset") or ():
+        requirement, _, extra = line.partition("; extra == ")
+        if re.split(r"[^\w-]", requirement)[0].replace("-", "_") == package and extra:
+            return extra.strip("\"'")
+    return None
 
 
 def _fail(argv: list[str], message: str) -> NoReturn:

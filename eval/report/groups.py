@@ -78,7 +78,8 @@ EVERY = "all"
 
 
 def scores(groups: Groups) -> Table:
-    """Return a row for each group, engine, object and metric of :data:`~xreset.eval.metrics.METRICS`.
+    """Return a row for each group, engine, object and metric of :data:`~xreset.eval.metrics.METRICS`. Faults have only
+    the row of all objects.
 
     Columns: group (its label), engine, object (or ``all``), metric, and mean, low and high (:func:`estimate`), which
     are NaN where an earlier version did not measure the metric.
@@ -88,8 +89,9 @@ def scores(groups: Groups) -> Table:
         for engine, every in by_engine(members):
             for name in (EVERY, *sorted(every["object"].unique())):
                 own = every if name == EVERY else every[every["object"] == name]
-                for metric in METRICS:
-                    rows.append((label, engine, name, metric, *estimate(own, metric)))
+                for metric, how in METRICS.items():
+                    if name == EVERY or how.unit != "episodes":
+                        rows.append((label, engine, name, metric, *estimate(own, metric)))
     return pd.DataFrame(rows, columns=COLUMNS)
 
 

@@ -168,11 +168,10 @@ class PaperTest(TestCase):
             self.assertAlmostEqual(sum(each) / 9, average, delta=0.06)
             self.assertEqual(average, two[0])
         for table in tables.values():
-            self.assertTrue(all(0 <= value <= 100 for value, _ in table.figures().values()))
-        self.assertEqual(
-            nine.figures()["Ours", SOUP, "task_progress"],
-            (90.8, ", paper 90.8 \N{PLUS-MINUS SIGN} 1.5"),
-        )
+            for row in table.values.values():
+                self.assertTrue(all(0 <= value <= 100 for value in row))
+        figure = nine.figures()["Ours", SOUP, "task_progress"]
+        self.assertEqual(figure, ", paper 90.8 \N{PLUS-MINUS SIGN} 1.5")
 
 
 class PlanTest(Studied):
@@ -365,7 +364,7 @@ class TablesTest(Studied):
         self.write("ik", 0.33, 0.33, 0.33, 0.33)
         plan = self.plan(self.TEXT)
         table, grasps = (fill(plan, t) for t in plan.study.tables)
-        rows = table.as_rows("mujoco")
+        rows = table.engines["mujoco"]
         self.assertEqual(rows[0], ("%", "IK Oracle", "X-Sim", "Ours"))
         self.assertEqual(
             [r[0] for r in rows[1:]], ["tomato soup can", "potted meat can", "all of them"]
@@ -381,7 +380,7 @@ class TablesTest(Studied):
             everything["Ours"], r"^58\.0 \(33-100\)$", "the paper's mean is over nine objects"
         )
         self.assertEqual(len(paper_tables()["II"].objects), 9)
-        self.assertEqual(grasps.as_rows("mujoco")[1][0], "X-RESET")
+        self.assertEqual(grasps.engines["mujoco"][1][0], "X-RESET")
         page, notes = write_page(plan, self.folder / "page")
         text = page.read_text()
         self.assertIn("<h2>Table I", text)
@@ -403,13 +402,13 @@ class TablesTest(Studied):
         self.write("ours-tomato_soup_can-seed0", 1.0, 0.33)
         text = self.TEXT.replace("[runs.ours]\n", "[runs.ours]\nalone = true\n")
         plan = self.plan(text)
-        rows = fill(plan, plan.study.tables[0]).as_rows("mujoco")
+        rows = fill(plan, plan.study.tables[0]).engines["mujoco"]
         self.assertRegex(rows[1][3], r"^66\.5 ")
         self.assertEqual([r[3][0] for r in rows[2:]], ["-", "-"])
         # now seed 0 lacks an object, seed 1 does not
         self.write("ours-tomato_soup_can-seed1", 1.0, 0.33)
         self.write("ours-potted_meat_can-seed1", 0.66, 0.0, first=2)
-        rows = fill(plan, plan.study.tables[0]).as_rows("mujoco")
+        rows = fill(plan, plan.study.tables[0]).engines["mujoco"]
         self.assertRegex(rows[1][3], r"^66\.5 \(24-92\)", "one demonstration is little")
         self.assertRegex(rows[3][3], r"^49\.8 ", "seed 1 alone")
         _, notes = write_page(plan, self.folder / "page")
@@ -422,7 +421,7 @@ class TablesTest(Studied):
         missing = Mock(reason="not installed")
         with patch("xreset.eval.study.plan.backend_status", return_value=missing):
             plan = self.plan(self.TEXT)
-        rows = fill(plan, plan.study.tables[1]).as_rows("mujoco")
+        rows = fill(plan, plan.study.tables[1]).engines["mujoco"]
         self.assertEqual(rows[0][1:], ("tomato soup can", "potted meat can", "all of them"))
         _, notes = write_page(plan, self.folder / "page")
         self.assertIn("Not evaluated in mujoco on this machine: not installed", notes)

@@ -49,8 +49,8 @@ class PaperTable:
             return paper_tables()["I"].objects
         return {*(self.values if self.rows == "object" else self.names)} - {ALL}
 
-    def figures(self) -> dict[tuple[str, str, str], tuple[float, str]]:
-        """Return method, object and metric -> figure, percent, and its text with the standard error if it is stated."""
+    def figures(self) -> dict[tuple[str, str, str], str]:
+        """Return method, object and metric -> figure, percent, as text with the standard error if it is stated."""
         found = {}
         fixed = {"object": self.object, "metric": self.metric}
         for row, values in self.values.items():
@@ -60,7 +60,7 @@ class PaperTable:
                 text = f", paper {value:.1f}"
                 if error is not None:
                     text += f" \N{PLUS-MINUS SIGN} {error:.1f}"
-                found[key["method"], key["object"], key["metric"]] = (value, text)
+                found[key["method"], key["object"], key["metric"]] = text
         return found
 
 

@@ -36,7 +36,7 @@ def write_page(plan: Plan, out: Path) -> tuple[Path, list[str]]:
         notes += [f"{table.title}: {note}" for note in _unfair(plan, table)]
         for engine in table.engines:
             title = f"{table.title}: {engine} {table.versions(engine)}"
-            shown = PageTable(title=title, rows=table.as_rows(engine), note=_note(table, engine))
+            shown = PageTable(title=title, rows=table.engines[engine], note=_note(table, engine))
             page_tables.append(shown)
     report = collect(
         list(_trainings(plan)),

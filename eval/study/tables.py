@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import chain, product
-from math import nan
-from typing import Any
+from itertools import chain
 
 import pandas as pd
 
@@ -21,8 +19,6 @@ from xreset.files.checks import frozen
 from xreset.files.text import short_name
 from xreset.objects.catalogue import canonical_name
 
-_CELL = ["row", "column", "mean", "low", "high", "paper", "text"]
-
 
 @frozen
 class FilledTable:
@@ -31,20 +27,14 @@ class FilledTable:
     title: str
     unit: str
     """Unit of the figures, where their column does not state one."""
-    engines: dict[str, Table]
-    """Engine -> rows by columns, for each of mean, low and high (95 % interval; shares, or m; NaN if it was not
-    evaluated or measured), paper (the paper's figure, percent) and text."""
+    engines: dict[str, Rows]
+    """Engine -> rows of text; ``-`` where a run was not evaluated."""
     trainings: dict[str, list[Training]]
     """Run of the study -> its evaluated trainings."""
     episodes: dict[str, Table]
     """Run of the study -> all episodes. Trainings of one seed have the same name, also if each trained one object."""
     paper: bool
     """Whether the table has figures of the paper."""
-
-    def as_rows(self, engine: str) -> Rows:
-        """Return the table of one engine."""
-        text = self.engines[engine]["text"]
-        return [(self.unit, *text.columns), *text.itertuples(name=None)]
 
     def counts(self, engine: str) -> str:
         """Return the numbers of episodes, demonstrations and seeds of each run in an engine, as text."""
@@ -78,8 +68,8 @@ def fill(plan: Plan, table: TableSpec) -> FilledTable:
         name: _episodes(found, plan.study.runs[name].alone) for name, found in trainings.items()
     }
 
-    def cell(engine: str, row: str, column: str) -> tuple[Any, ...]:
-        """Return the values of :data:`_CELL`."""
+    def cell(engine: str, row: str, column: str) -> str:
+        """Return the estimate with its interval, and the paper's figure."""
         key = fixed | {layout.rows: row, layout.columns: column}
         run = run_of[key["method"]]
         wanted = objects[run] if key["object"] == ALL else {key["object"]}
@@ -87,19 +77,20 @@ def fill(plan: Plan, table: TableSpec) -> FilledTable:
         theirs = (key["method"], key["object"], key["metric"])
         if key["object"] == ALL and wanted != layout.objects:
             theirs = ("", "", "")  # the paper's mean is over other objects
-        figure, text = stated.get(theirs, (nan, ""))
-        text = estimate_text(key["metric"], *values) + text
-        return _shown(layout.rows, row), _shown(layout.columns, column), *values, figure, text
+        return estimate_text(key["metric"], *values) + stated.get(theirs, "")
 
     engines = {}
+    unit = METRICS[fixed["metric"]].unit
     for engine in sorted(set().union(*(t.results for t in chain(*trainings.values())))):
-        cells = [cell(engine, row, column) for row, column in product(rows, columns)]
-        if cells:  # empty if no planned run plays the objects of the results
-            found = pd.DataFrame(cells, columns=_CELL)
-            engines[engine] = found.set_index(["row", "column"]).unstack(sort=False)
+        lines = [(unit, *(_shown(layout.columns, column) for column in columns))]
+        for row in rows:
+            cells = [cell(engine, row, column) for column in columns]
+            lines.append((_shown(layout.rows, row), *cells))
+        if rows and columns:  # empty if no planned run plays the objects of the results
+            engines[engine] = lines
     return FilledTable(
         title=table.title or layout.title,
-        unit=METRICS[fixed["metric"]].unit,
+        unit=unit,
         engines=engines,
         trainings=trainings,
         episodes=episodes,

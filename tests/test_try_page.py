@@ -1,0 +1,224 @@
+"""The page that plays a policy without an install: its physics next to MuJoCo's, and the page in a headless browser."""
+
+import functools
+import http.server
+import threading
+import time
+import unittest
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import torch
+
+from ci import try_page
+from tests.browser import Browser, find_chromium, wait_until
+from tests.wasm_engine import WasmBackend, ask, installed
+from xreset.backends.mjcf import compile_scene
+from xreset.eval.play.session import Session
+from xreset.geometry.description import load_robot
+from xreset.objects.catalogue import load_object
+from xreset.physics.tensors import one_thread
+from xreset.spec import SceneSpec
+
+CAN = "005_tomato_soup_can"
+DRILL = "035_power_drill"
+STEPS = 75
+"""Control steps of a grasp."""
+FREE = 20
+"""Of these, the first ones, in which the robot touches nothing."""
+
+
+class PhysicsTest(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        installed()
+        cls.enterClassContext(one_thread())
+
+    def grasp(self, name):
+        """Let a policy grasp an object in MuJoCo, and give the same targets to WebAssembly.
+
+        Returns for each control step the largest difference of the joints [rad] and of the object's position [m].
+        """
+        session = Session("many-objects", object_name=name)
+        self.addCleanup(session.close)
+        env = session.env
+        start = env.backend.state().clone()
+        high = start.object_pos[0].numpy() + np.array((0.0, 0.0, 0.2))
+        session.move_goal(high, start.object_quat[0].numpy())
+        moments = [session.step() for _ in range(STEPS)]
+        lift = moments[-1].object_pos[2] - moments[0].object_pos[2]
+        self.assertGreater(lift, 0.02, "the object was not lifted")
+        backend = WasmBackend(env.backend.scene, 1, workers=0)
+        self.addCleanup(backend.close)
+        backend.set_friction(env.variation.parameters["friction"])
+        backend.set_state(start)
+        rows = []
+        for moment in moments:
+            backend.set_joint_targets(torch.as_tensor(moment.joint_target)[None])
+            backend.step()
+            state = backend.state()
+            joints = np.abs(state.joint_pos[0].numpy() - moment.joint_pos).max()
+            moved = np.abs(state.object_pos[0].numpy() - moment.object_pos).max()
+            rows.append((joints, moved))
+        return np.array(rows)
+
+    def test_a_grasp_is_nearly_the_same_as_in_mujoco(self):
+        for name in (CAN, DRILL):
+            with self.subTest(name):
+                rows = self.grasp(name)
+                joints, moved = rows[:FREE].max(axis=0)
+                self.assertLess(joints, 1e-6)  # states are read in single precision
+                self.assertLess(moved, 5e-5)
+                # MuJoCo 3.14 and 4.0 differ in contacts of hulls and of round shapes
+                joints, moved = rows.max(axis=0)
+                self.assertLess(joints, 0.1)
+                self.assertLess(moved, 0.01)
+
+    def test_every_number_of_the_model_is_the_engines_own(self):
+        robot = load_robot("ur7e-sharpa")
+        scene = SceneSpec(robot=robot, objects=(load_object(DRILL),))
+        model = compile_scene(scene, 0, sensors=True).model
+        numbers = {}
+        for name in dir(model):
+            value = getattr(model, name)
+            if isinstance(value, np.ndarray) and value.dtype.kind in "fi" and name[0] != "_":
+                numbers[name] = value
+        world = ask(do="build", scene=try_page.physics_part(scene, 0))
+        there = ask(do="arrays", world=world, names=list(numbers))
+        compared = 0
+        for name, found in zip(numbers, there, strict=True):
+            if found is not None:  # this version of MuJoCo has it
+                np.testing.assert_array_equal(found, numbers[name].ravel(), err_msg=name)
+                compared += numbers[name].size > 0
+        self.assertGreater(compared, 100)
+
+
+class PolicyTest(unittest.TestCase):
+    def test_its_targets_are_those_of_xreset_play(self):
+        installed()
+        self.enterContext(one_thread())
+        session = Session("many-objects", object_name=CAN)
+        self.addCleanup(session.close)
+        env = session.env
+        folder = Path(self.enterContext(TemporaryDirectory()))
+        try_page.write_policy(folder)
+        obj = env.backend.scene.objects[0]
+        ask(do="load", folder=str(folder), object=try_page.object_part(obj, 64))
+        for _ in range(45):
+            reading = env.reading()
+            links = {name: value.flatten().tolist() for name, value in vars(reading.links).items()}
+            state = reading.state
+            target = ask(
+                do="act",
+                reading={
+                    "jointPos": state.joint_pos[0].tolist(),
+                    "jointVel": state.joint_vel[0].tolist(),
+                    "objectPos": state.object_pos[0].tolist(),
+                    "objectQuat": state.object_quat[0].tolist(),
+                    "tipForce": reading.contacts.tip_force.flatten().tolist(),
+                    "links": links,
+                },
+                target=env.joint_target[0].tolist(),
+                goalPos=env.goal_pos[0].tolist(),
+                goalQuat=env.goal_quat[0].tolist(),
+            )
+            moment = session.step()
+            np.testing.assert_allclose(target, moment.joint_target, rtol=0, atol=1e-5)
+
+
+class Files(http.server.SimpleHTTPRequestHandler):
+    """Files of a folder, without a log."""
+
+    def log_message(self, *_):
+        pass
+
+
+class PageTest(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        program = find_chromium()
+        installed()
+        folder = Path(cls.enterClassContext(TemporaryDirectory()))
+        try_page.build(folder, (CAN, DRILL))
+        cls.folder = folder
+        handler = functools.partial(Files, directory=str(folder))
+        server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        cls.addClassCleanup(server.server_close)
+        cls.addClassCleanup(server.shutdown)
+        cls.url = f"http://127.0.0.1:{server.server_port}/index.html"
+        cls.browser = Browser(program)
+        cls.addClassCleanup(cls.browser.close)
+
+    def setUp(self):
+        self.open(480, 360)
+        self.addCleanup(self.browser.open, "about:blank")
+
+    def open(self, width, height, *, phone=False):
+        self.browser.problems.clear()
+        self.browser.resize(width, height, phone=phone)
+        self.browser.open(self.url)
+        self.until("xreset.times.ready")
+        self.until("xreset.session.time > 0.1")
+
+    def until(self, condition):
+        """Wait for a condition in JavaScript; long, because frames drawn without a GPU can take seconds."""
+        script = f"Boolean(window.xreset && ({condition}))"
+        wait_until(lambda: self.browser.evaluate(script), condition, seconds=300)
+
+    def test_the_object_follows_the_goal_that_is_dragged(self):
+        self.until("xreset.session.distance < 0.03")
+        start = self.browser.evaluate("xreset.view.ballOnPage")
+        before = np.array(self.browser.evaluate("xreset.session.goalPos"))
+        self.assertFalse(self.browser.evaluate("document.getElementById('hint').hidden"))
+        self.browser.drag(start, (start[0] - 50, start[1] - 30))
+        after = np.array(self.browser.evaluate("xreset.session.goalPos"))
+        self.assertGreater(np.linalg.norm(after - before), 0.05)
+        self.assertTrue(self.browser.evaluate("document.getElementById('hint').hidden"))
+        self.until("xreset.session.distance < 0.03")
+        self.assertEqual(self.browser.problems, [])
+
+    def test_pause_stops_time_and_another_object_can_be_chosen(self):
+        self.browser.click("document.getElementById('pause')")
+        time.sleep(1.0)
+        before = self.browser.evaluate("xreset.session.time")
+        time.sleep(1.0)
+        self.assertEqual(self.browser.evaluate("xreset.session.time"), before)
+        self.assertIn("Paused", self.browser.text())
+        self.browser.click("document.getElementById('pause')")
+        self.browser.click(f"document.querySelector('[data-name=\"{DRILL}\"]')")
+        self.until("xreset.session.scene.object.mass > 0.8 && xreset.session.time > 0.1")
+        self.assertEqual(self.browser.problems, [])
+
+    def test_a_pull_at_the_robot_moves_it_and_lets_go(self):
+        self.browser.evaluate("document.getElementById('restart').click()")
+        part = "xreset.view.parts[xreset.view.parts.length - 1]"
+        start = self.browser.evaluate(f"xreset.view.onPage({part}.position)")
+        self.browser.drag(start, (start[0] + 40, start[1]), steps=2)
+        self.assertIsNone(self.browser.evaluate("xreset.session.hand"))
+        self.assertEqual(self.browser.problems, [])
+
+    def test_everything_fits_on_a_phone(self):
+        self.open(360, 740, phone=True)
+        width = self.browser.evaluate("document.documentElement.scrollWidth")
+        self.assertLessEqual(width, 360)
+        boxes = self.browser.evaluate(
+            "['header', '#status', '#pause', '#restart', '#objects'].map(name => "
+            "{ const box = document.querySelector(name).getBoundingClientRect();"
+            " return [box.left, box.top, box.right, box.bottom]; })"
+        )
+        for left, top, right, bottom in boxes:
+            self.assertGreaterEqual(min(left, top), 0)
+            self.assertLessEqual(right, 360)
+            self.assertLessEqual(bottom, 740)
+        x, y = self.browser.evaluate("xreset.view.ballOnPage")
+        self.assertTrue(0 < x < 360 and boxes[0][3] < y < boxes[1][1], "the goal is covered")
+
+    def test_nothing_is_loaded_from_elsewhere(self):
+        names = self.browser.evaluate("performance.getEntriesByType('resource').map(e => e.name)")
+        self.assertGreater(len(names), 10)
+        address = self.url.rpartition("/")[0]
+        self.assertEqual([name for name in names if not name.startswith(address)], [])
+        size = sum(file.stat().st_size for file in self.folder.rglob("*") if file.is_file())
+        self.assertLess(size, 32e6)

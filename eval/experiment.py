@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -28,7 +28,7 @@ from xreset.eval.results import (
 )
 from xreset.eval.rollout import Engine, Trial, chosen_engines, load_trial, roll_out
 from xreset.files.checks import PositiveInt, Seed
-from xreset.files.progress import NamedProgress, Progress, unseen
+from xreset.files.progress import Progress, unseen
 from xreset.files.storage import claim_folder
 from xreset.physics.plugins import backend_class
 from xreset.resets.inputs import Data
@@ -48,7 +48,7 @@ def evaluate(
     settle: bool = False,
     episode_seconds: float | None = None,
     out: str | Path | None = None,
-    progress: NamedProgress = unseen,
+    progress: Callable[[str, float, int], None] = unseen,
 ) -> Evaluation:
     """Play every demonstration in every engine, from the same starts, and write the results.
 
@@ -116,7 +116,7 @@ def stress(
     num_envs: PositiveInt = 64,
     device: str = "cpu",
     out: str | Path | None = None,
-    progress: NamedProgress = unseen,
+    progress: Callable[[str, float, int], None] = unseen,
 ) -> Evaluation:
     """Play the same episodes with one property of the world, or one fault of a robot, changed at a time, and write the
     results.

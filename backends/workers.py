@@ -421,7 +421,9 @@ def serve(pipe: int, memory: int) -> None:
         pipe: file descriptor of the pipe to the parent.
         memory: file descriptor of the shared arrays.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # A scheduler may send signals to all processes of a job. They are for the parent, which then closes the pipe.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
     connection = Connection(pipe)
     worlds = None
     with contextlib.suppress(EOFError, OSError):  # the parent is gone, or done with this worker

@@ -42,14 +42,8 @@ class Command:
     """A file that exists when the command has ended."""
     checkpoints: Path | None = None
     """Folder of a training's checkpoints. No kill may make them fewer."""
-    resume: list | None = None
-    """The arguments that continue a training once it has a checkpoint."""
     once: bool = False
     """Whether the command refuses to make its result again, so that it is removed first."""
-
-    def now(self) -> list:
-        """Return the arguments for the files that there are."""
-        return self.resume if self.resume and self.saved() else self.arguments
 
     def saved(self) -> int:
         """Return how many checkpoints there are."""
@@ -105,7 +99,6 @@ def commands(folder: Path) -> list[Command]:
             ],
             run / "policy.onnx",
             run / "checkpoints",
-            resume,
         ),
         Command(
             "train --resume",
@@ -140,7 +133,6 @@ def commands(folder: Path) -> list[Command]:
             ["distill", run, *watch, *where],
             eyes / "policy.onnx",
             eyes / "checkpoints",
-            ["distill", "--out", eyes, "--resume"],
         ),
         Command("report", ["report", run], run / "report" / "index.html"),
         Command(
@@ -206,7 +198,7 @@ def kill(command: Command, wanted: int, chance: random.Random) -> tuple[int, boo
     good = True
     while killed < wanted and ended < 3:
         remove_if_once(command)
-        if attempt(command.now(), chance.uniform(0.2, seconds)) is None:
+        if attempt(command.arguments, chance.uniform(0.2, seconds)) is None:
             killed += 1
         else:
             ended += 1
@@ -214,7 +206,7 @@ def kill(command: Command, wanted: int, chance: random.Random) -> tuple[int, boo
         good &= command.saved() >= saved
         saved = command.saved()
     remove_if_once(command)
-    return killed, good and attempt(command.now(), None) == 0
+    return killed, good and attempt(command.arguments, None) == 0
 
 
 def remove_if_once(command: Command) -> None:

@@ -1,16 +1,22 @@
 """Two processes train together on the CPU, as ``torchrun`` starts them; and what a process finds out about itself."""
 
 import os
+import re
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
+from textwrap import dedent
 from unittest import SkipTest, TestCase, mock
 
 import torch
 from torch.testing import assert_close
 
 from tests.toy_training import WithBank
+from xreset.learning.checkpoint import read_checkpoint
 from xreset.learning.distributed import Processes
+from xreset.learning.recipes import starting_config
 from xreset.learning.run import checkpoints
 
 try:
@@ -90,6 +96,99 @@ class TwoProcesses(WithBank):
         self.assertEqual(len([name for name in self.made if name.startswith("events.out")]), 1)
         self.assertTrue((self.out / "policy.onnx").is_file())
         self.assertEqual(self.output.count("continuing after iteration 2"), 1)
+
+
+SCRIPTS = ROOT / "examples" / "cluster"
+TOOLS = {
+    "xreset": f'#!/bin/bash\nexec {sys.executable} -m xreset "$@"\n',
+    "torchrun": f'#!/bin/bash\nexec {sys.executable} -m torch.distributed.run "$@"\n',
+    "scontrol": '#!/bin/bash\n[ "$1" = show ] && echo localhost || echo "$*" >> "$REQUEUED"\n',
+    # two nodes; like the original, it passes SIGTERM on
+    "srun": """#!/bin/bash
+        trap 'kill -TERM $nodes' TERM
+        for node in 1 2; do "$@" & nodes="$nodes $!"; done
+        code=0
+        for node in $nodes; do
+          while kill -0 "$node" 2> /dev/null; do wait "$node" || code=$?; done
+        done
+        exit $code
+    """,
+}
+"""What a cluster has, on one machine."""
+
+
+class ScriptsTest(WithBank):
+    """The job scripts, with stand-ins of Slurm's commands."""
+
+    def setUp(self):
+        super().setUp()
+        self.requeued = self.folder / "requeued"
+        self.requeued.unlink(missing_ok=True)
+        tools = self.folder / "bin"
+        tools.mkdir(exist_ok=True)
+        for name, text in TOOLS.items():
+            (tools / name).write_text(dedent(text))
+            (tools / name).chmod(0o755)
+        self.tools = tools
+        own = {"SLURM_JOB_ID": str(os.getpid()), "SLURM_NNODES": "2", "SLURM_GPUS_ON_NODE": "1"}
+        own |= {"SLURM_JOB_NODELIST": "a,b", "REQUEUED": str(self.requeued), "OMP_NUM_THREADS": "1"}
+        self.environment = os.environ | own | {"PATH": f"{tools}:{os.environ['PATH']}"}
+        self.environment["PYTHONPATH"] = str(ROOT)
+
+    def start(self, script, *arguments):
+        return subprocess.Popen(
+            ["bash", SCRIPTS / script, *map(str, arguments)], cwd=ROOT, env=self.environment,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        )  # fmt: skip
+
+    def test_two_nodes_train_together_stop_in_time_and_go_on(self):
+        out = self.folder / "nodes"
+        options = f"--resets {self.bank} --engine mujoco --device cpu --num-envs 4 --iterations 40 {SMALL}"
+        job = self.start("train_many.slurm", out, *options.split())
+        while len(checkpoints(out)) < 2 and job.poll() is None:
+            time.sleep(0.05)
+        job.send_signal(signal.SIGTERM)
+        said = job.communicate()[0]
+        self.assertNotEqual(job.returncode, 0, said)
+        self.assertEqual(self.requeued.read_text(), f"requeue {os.getpid()}\n", said)
+        done = int(checkpoints(out)[-1].stem)
+        self.assertLess(done, 40)
+        self.requeued.unlink()
+        job = self.start("train_many.slurm", out, *options.split())
+        said = job.communicate()[0]
+        self.assertEqual(job.returncode, 0, said)
+        self.assertIn(f"continuing after iteration {done}\n", said)
+        self.assertEqual(checkpoints(out)[-1].name, "000040.pt")
+        self.assertFalse(self.requeued.exists())
+        content = read_checkpoint(checkpoints(out)[-1])
+        self.assertEqual(
+            content.env_steps, 40 * 2 * 8 * 4
+        )  # iterations x processes x horizon x worlds
+
+    def test_a_training_that_was_stopped_is_queued_again_and_a_failed_one_is_not(self):
+        (self.tools / "srun").write_text('#!/bin/bash\necho "$*"\nexit "$CODE"\n')
+        for code, queued in ((0, False), (1, False), (137, False), (143, True)):
+            self.environment["CODE"] = str(code)
+            self.requeued.unlink(missing_ok=True)
+            job = self.start("train.slurm", "runs/soup", "--resets", "a b.npz")
+            said = job.communicate()[0]
+            with self.subTest(code):
+                self.assertEqual(said, "xreset train --out runs/soup --resets a b.npz\n")
+                self.assertEqual((job.returncode, self.requeued.exists()), (code, queued))
+
+    def test_the_container_has_the_versions_of_the_lock(self):
+        container = (SCRIPTS / "Dockerfile").read_text()
+        setup = (ROOT / "ci" / "_venv.sh").read_text()
+        [torch_version] = set(re.findall(r"torch==[0-9.]+[0-9]", container))
+        self.assertIn(f"install {torch_version}\n", setup)
+        self.assertIn("--no-deps --require-hashes -r", container)
+        [version] = re.findall(r"FROM python:3\.([0-9]+)-", container)
+        self.assertIn(f"COPY ci/locks/py3{version}.txt", container)
+        self.assertTrue((ROOT / "ci" / "locks" / f"py3{version}.txt").is_file())
+
+    def test_the_recipe_of_the_example_is_one(self):
+        config = starting_config(str(SCRIPTS / "mine.toml"))
+        self.assertEqual((config.save_interval, config.model.lstm), (200, 512))
 
 
 class Environment(TestCase):

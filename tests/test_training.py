@@ -4,9 +4,12 @@ import io
 import json
 import math
 import os
+import pty
 import shutil
 import signal
+import subprocess
 import sys
+import textwrap
 import threading
 import time
 from contextlib import redirect_stderr, suppress
@@ -35,13 +38,13 @@ from xreset import (
     write_goals,
 )
 from xreset.cli import main
-from xreset.errors import FileFormatError, PolicyError, RunError, XResetError
+from xreset.errors import FileFormatError, PolicyError, RunError, Stopped, XResetError
 from xreset.files.storage import claim, file_hash
 from xreset.learning.checkpoint import load_moments, read_checkpoint
 from xreset.learning.clock import read_lift
 from xreset.learning.config import ModelConfig, PpoConfig, ScheduleConfig, TrainConfig
 from xreset.learning.exported import read_policy
-from xreset.learning.recipes import RECIPES, own_terms_flags
+from xreset.learning.recipes import RECIPES, own_terms_flags, starting_config
 from xreset.learning.run import (
     Candidate,
     Choice,
@@ -214,7 +217,7 @@ class TrainingTest(WithBank):
             self.assertEqual(len(stop), 2)
             written.assert_called_once()
             self.assertIn(b"stopping after this iteration", written.call_args.args[1])
-            stop[0] -= 60.0
+            stop[0] = stop[0]._replace(time=stop[0].time - 60.0)
             with self.assertRaises(KeyboardInterrupt):
                 os.kill(os.getpid(), signal.SIGINT)
                 time.sleep(1.0)
@@ -231,7 +234,9 @@ class TrainingTest(WithBank):
 
         threading.Thread(target=interrupt, daemon=True).start()
         endless = replace(CONFIG, iterations=100000, save_interval=100000)
-        self.train("stopped", config=endless)
+        with self.assertRaises(Stopped) as raised:
+            self.train("stopped", config=endless)
+        self.assertEqual(raised.exception.number, signal.SIGINT)
         stopped = newest(out).iteration
         self.assertGreater(stopped, 0)
         self.assertEqual(latest_checkpoint(out).name, f"{stopped:06d}.pt")
@@ -241,6 +246,138 @@ class TrainingTest(WithBank):
         self.assertGreater(done, stopped)
         self.resume(out, iterations=done + 1)
         self.assertEqual(newest(out).iteration, done + 1)
+
+    def test_the_same_call_goes_on_and_another_one_is_refused(self):
+        out = self.folder / "job-again"
+
+        def again(**changes):
+            options = OPTIONS | {"bank": self.bank, "config": ONE} | changes
+            with quickly() as said:
+                train(out=out, **options)
+            return said.getvalue()
+
+        again()
+        first = latest_checkpoint(out).read_bytes()
+        self.assertIn("continuing after iteration 1, the last one", again())
+        self.assertIn("continuing after iteration 1\n", again(config=CONFIG))
+        self.assertEqual([c.name for c in checkpoints(out)], ["000001.pt", "000002.pt"])
+        self.assertEqual((out / "checkpoints" / "000001.pt").read_bytes(), first)
+        self.assertIn("iteration 2, the last one", again(iterations=2))
+        other = self.folder / "other_bank.npz"
+        write_bank(other, toy_bank(self.robot))
+        slower = replace(ONE, ppo=replace(ONE.ppo, learning_rate=1e-5))
+        for changes, problem in (
+            ({"seed": 4}, "seed is 3 there and 4 here"),
+            ({"num_envs": 5}, "num_envs is 4 there and 5 here"),
+            ({"bank": other}, "hash of the reset bank is"),
+            ({"weights": self.out}, "hash of the weights is None there"),
+            ({"config": slower}, "ppo.learning_rate is .* there and 1e-05 here"),
+        ):
+            message = (
+                f"job-again holds another training: {problem}.*Choose another folder, or .*--resume"
+            )
+            with self.subTest(problem), self.assertRaisesRegex(RunError, message):
+                again(**changes)
+        self.assertEqual(len(checkpoints(out)), 2)
+
+    def test_the_same_call_goes_on_with_a_bank_that_has_no_file(self):
+        out = self.folder / "in-memory"
+        for _ in range(2):
+            self.train("in-memory", bank=self.states, config=ONE)
+        self.assertEqual(read_run(out).resets, str(out / "resets.npz"))
+        with self.assertRaisesRegex(RunError, "hash of the reset bank"):
+            self.train("in-memory", bank=toy_bank(self.robot), config=ONE)
+
+    def test_a_command_that_is_stopped_exits_with_its_signal_and_the_same_one_finishes(self):
+        out = self.folder / "job"
+        recipe = self.folder / "small.toml"
+        recipe.write_text(
+            """
+            about = "seconds on a CPU"
+            iterations = 60
+            save_interval = 1
+            task = { distance_points = 64, observation = { cloud_points = 16 } }
+            model = { pointnet = [8, 6], lstm = 12, mlp = [16] }
+            ppo = { horizon = 8, mini_epochs = 2, minibatch_size = 16 }
+            """
+        )
+        command = (
+            f"-m xreset train --out {out} --resets {self.bank} --engine mujoco --device cpu --num-envs 4"
+            f" --recipe {recipe}"
+        )
+        words = [sys.executable, *command.split()]
+        process = subprocess.Popen(
+            words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+        while len(checkpoints(out)) < 2 and process.poll() is None:
+            time.sleep(0.05)
+        process.send_signal(signal.SIGTERM)
+        said = process.communicate()[0]
+        self.assertEqual(process.returncode, 128 + signal.SIGTERM, said)
+        self.assertLess(newest(out).iteration, 60)
+        self.assertIn("a checkpoint is written", said)
+        self.assertTrue((out / "policy.onnx").is_file())
+        done = subprocess.run([*words, "--iterations", "61"], capture_output=True, text=True)
+        self.assertEqual(done.returncode, 0, done.stderr)
+        self.assertRegex(done.stdout, "continuing after iteration [0-9]+\n")
+        self.assertEqual(newest(out).iteration, 61)
+
+    def test_a_training_outlives_its_terminal(self):
+        """The terminal closes: SIGHUP comes, and writing fails. With nohup it does not come."""
+        program = """
+            import signal, sys, time
+            from pathlib import Path
+            from xreset.learning.runner import _stop_on_interrupt
+            if sys.argv[2] == "nohup":
+                signal.signal(signal.SIGHUP, signal.SIG_IGN)
+            with _stop_on_interrupt(say=True) as requests:
+                print("a line of progress", flush=True)
+                Path(sys.argv[1]).write_text("ready")
+                for _ in range(100):
+                    time.sleep(0.02)
+                    if requests:
+                        break
+                if sys.argv[2] != "nohup":
+                    print("a line of progress", flush=True)
+            Path(sys.argv[1]).write_text(str(len(requests)))
+        """
+        for name, requests in (("closed", "1"), ("nohup", "0")):
+            file = self.folder / name
+            words = [sys.executable, "-c", textwrap.dedent(program), str(file), name]
+            process, terminal = pty.fork()
+            if process == 0:
+                os.execv(sys.executable, words)
+            while not file.exists() or file.read_text() != "ready":
+                time.sleep(0.05)
+            os.close(terminal)
+            _, status = os.waitpid(process, 0)
+            with self.subTest(name):
+                self.assertEqual(
+                    (os.waitstatus_to_exitcode(status), file.read_text()), (0, requests)
+                )
+
+    def test_a_recipe_may_be_a_file_of_the_users_own(self):
+        path = self.folder / "mine.toml"
+        path.write_text('extends = "robust"\niterations = 7\nmodel.lstm = 64\n')
+        robust = RECIPES["robust"].config
+        expected = replace(robust, iterations=7, model=replace(robust.model, lstm=64))
+        self.assertEqual(starting_config(str(path)), expected)
+        for text, problem in (
+            ('extends = "nothing"', "extends is 'nothing'. Choose from: default"),
+            ('replaces = ["task.nothing"]', "expected a list of names of tables"),
+            ("replaces = 3", "expected a list of names of tables"),
+            ("ppo.entropyy = 1.0", "mine.toml.ppo does not fit.*entropy"),
+            ("ppo = 3", "mine.toml.ppo is 3, expected"),
+            ('iterations = "many"', "iterations is 'many', expected"),
+            ("x =", "is not valid TOML"),
+        ):
+            path.write_text(text)
+            with self.subTest(text), self.assertRaisesRegex(XResetError, problem):
+                starting_config(str(path))
+        path.write_text('task.reward.terms."no_such_module:term".weight = 1.0')
+        with redirect_stderr(io.StringIO()) as said:
+            self.assertEqual(starting_config(str(path)).task.reward.own, {})
+        self.assertIn("--config.task.reward.terms.no_such_module:term.weight=1.0", said.getvalue())
 
     def test_a_run_ends_at_its_target(self):
         shares = (0.0, 0.09, 0.2, 0.3)
@@ -323,7 +460,7 @@ class TrainingTest(WithBank):
         for arguments, problem in (
             (
                 ("--recipe", "nothing"),
-                "no recipe and no run folder 'nothing'. Recipes: default, .*; paper, the paper's tables",
+                "no recipe, no file and no run folder 'nothing'. Recipes: default, .*; paper, the paper's tables",
             ),
             (("--recipe", str(self.folder)), "is not a run folder"),
             (("--recipe", "minutes", "--resume"), "Omit --recipe"),
@@ -595,7 +732,6 @@ class TrainingTest(WithBank):
         ):
             self.train("refused", bank=toy_bank(self.robot))
         self.assertEqual([f for f in (self.folder / "refused").rglob("*") if f.is_file()], [])
-        self.assertRaisesRegex(RunError, "holds a run already.*--resume", self.train, "run")
         bank = self.folder / "changing.npz"
         write_bank(bank, toy_bank(self.robot))
         out = self.train("changed", bank=bank, config=ONE)

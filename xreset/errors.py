@@ -52,6 +52,18 @@ class RunError(XResetError):
     """A training run or its folder does not allow what was asked."""
 
 
+class Stopped(KeyboardInterrupt):
+    """A training was asked to stop by a signal and did: its checkpoint and its policy are written.
+
+    Attributes:
+        number: the signal, such as ``signal.SIGTERM``.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(f"the training was stopped by signal {number}")
+        self.number = number
+
+
 @contextmanager
 def needs(package: str, extra: str, error: type[XResetError] = XResetError) -> Iterator[None]:
     """Around the import of a package that not every installation has: where it fails, says which extra of xreset brings

@@ -31,7 +31,7 @@ from xreset.files.text import Brief, short_name, shown
 from xreset.geometry.description import load_robot
 from xreset.learning.clock import Lift, read_lift
 from xreset.learning.run import SCHEMA as RUN_SCHEMA
-from xreset.learning.run import TEACHER, Choice, RunInfo, read_choice, read_run
+from xreset.learning.run import TEACHER, Choice, RunInfo, flat, read_choice, read_run
 from xreset.policy.shipped import run_folder
 from xreset.spec import RobotSpec
 
@@ -406,12 +406,3 @@ def run_facts(run: dict[str, Any], file: Path) -> dict[str, str]:
         "xreset": str(run.get("xreset")).partition("+")[0],
         **{name: f"{x:.6g}" if isinstance(x, float) else str(x) for name, x in flat(run["config"])},
     }
-
-
-def flat(data: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the entries of nested dictionaries: names, joined by dots, and values."""
-    for name, value in data.items():
-        if isinstance(value, dict):
-            yield from flat(value, f"{prefix}{name}.")
-        else:
-            yield prefix + name, value

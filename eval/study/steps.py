@@ -24,7 +24,6 @@ import numpy as np
 from xreset.demos.archive import read_demos, write_demos
 from xreset.demos.synth import synthesize
 from xreset.errors import RunError
-from xreset.eval.report.read import flat
 from xreset.eval.results import read_result
 from xreset.eval.study.file import Data, Evaluation, Runs
 from xreset.files.checks import frozen
@@ -32,7 +31,7 @@ from xreset.files.storage import file_hash, is_claimed, read_json, write_json
 from xreset.files.text import shown
 from xreset.learning.clock import read_lift
 from xreset.learning.config import TrainConfig
-from xreset.learning.run import checkpoints, read_run
+from xreset.learning.run import checkpoints, flat, read_run
 
 SUBSET_SCHEMA = "xreset-subset/1"
 XRESET = (sys.executable, "-P", "-m", "xreset")

@@ -47,12 +47,13 @@ INVOCATION: list[str] = []
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the command line. It exits with 1 after an error, 2 after wrong usage, 130 after Ctrl-C.
+    """Run the command line. It exits with 1 after an error, 2 after wrong usage, and 128 + N after signal N: 130 after
+    Ctrl-C, 143 after SIGTERM.
 
     Args:
         argv: arguments, without the program; default: those of this process.
     """
-    from xreset.errors import XResetError
+    from xreset.errors import Stopped, XResetError
 
     argv = _with_present_flags(sys.argv[1:] if argv is None else argv)
     for stream in (sys.stdout, sys.stderr):
@@ -75,6 +76,8 @@ def main(argv: list[str] | None = None) -> None:
             raise
         install = f"pip install 'xreset[{extra}]'"
         _fail(argv, f"{error.name} is not installed. Install it with: {install}")
+    except Stopped as stop:  # it has said so
+        raise SystemExit(128 + stop.number) from None
     except KeyboardInterrupt:
         print("\nstopped.", file=sys.stderr)
         raise SystemExit(130) from None

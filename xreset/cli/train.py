@@ -41,6 +41,9 @@ def train(
 ) -> None:
     """Train a policy.
 
+    The same command continues a training that was stopped or killed. After a signal, it writes a checkpoint and exits
+    with 128 and the signal's number: 130 after Ctrl-C, 143 after SIGTERM.
+
     Args:
         out: Run folder to make, or to continue.
         robot: Name or folder of the robot; default: that of the bank or of the goal set.
@@ -51,18 +54,20 @@ def train(
         device: cpu or cuda; default: cuda where there is a GPU and the engine can use it.
         num_envs: Worlds to simulate (per GPU).
         iterations: Total number of iterations; default: the configuration's.
-        minutes: Longest time to train now. Then the run stops as with Ctrl-C, and --resume continues it. Compiling
-            kernels is not counted.
+        minutes: Longest time to train now. Then the run stops with a checkpoint, and the same command continues it.
+            Compiling kernels is not counted.
         seed: Seed of every random number.
-        resume: Continue the run in --out from its newest checkpoint. Name reward terms of your own again.
-        recipe: Where the configuration starts from: a recipe (default, robust, live, paper, published) or another run's
-            folder. Options --config.* change it; see them with xreset train --help-config [PART]. Reward terms of your
-            own are not taken from a run; name them again. Default: the recipe of the headline results; with --weights
-            and --goals, the run of --weights.
+        resume: Continue the run in --out as it was started: its other options need not be given. Name reward terms of
+            your own again.
+        recipe: Where the configuration starts from: a recipe (default, robust, live, paper, published), a TOML file of
+            your own with the tables that it changes (docs/clusters.md), or another run's folder. Options --config.*
+            change it; see them with xreset train --help-config [PART]. Reward terms of your own are not taken from a
+            file or a run; name them again. Default: the recipe of the headline results; with --weights and --goals, the
+            run of --weights.
         weights: Another run's folder: start with the networks of its newest checkpoint, including the standard
             deviation of the actions and, if it adapts, the learning rate.
         wandb: Project of Weights & Biases to which learning curves are sent as well. Needs the package wandb, and a
-            login.
+            login. Its variables, such as WANDB_RUN_GROUP and WANDB_MODE=offline, say the rest.
         config: Task, model and algorithm. The defaults shown are those of --recipe. Terms of rewards and observations:
             --config.task.reward.terms.reach.width 0.4.
     """

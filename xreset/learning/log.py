@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections import deque
 from pathlib import Path
@@ -54,10 +55,9 @@ class TrainingLog:
                 from wandb import init  # pyright: ignore[reportMissingImports]
             self._online = init(
                 project=wandb,
-                name=folder.name,
+                name=os.environ.get("WANDB_NAME", folder.name),
                 dir=str(folder),
                 config=read_json(folder / "run.json"),
-                reinit=True,
             )
         self._folder = folder
         self.lift = read_lift(folder).up_to(done) if done else Lift()

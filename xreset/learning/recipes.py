@@ -1,4 +1,4 @@
-"""Named starting points for a training's configuration: ``recipes.toml``."""
+"""Named starting points for a training's configuration, ``recipes.toml``, and those of the user's own files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from typing import Any
 from xreset.cameras.config import VisionConfig
 from xreset.errors import RunError
 from xreset.files.checks import from_dict, frozen, merged
-from xreset.files.text import plain
+from xreset.files.storage import read_toml
+from xreset.files.text import plain, shown
 from xreset.learning.config import TrainConfig
 from xreset.learning.run import read_run
 from xreset.task.config import TaskConfig
@@ -32,14 +33,46 @@ def _read_recipes() -> dict[str, Recipe]:
     recipes: dict[str, Recipe] = {}
     for name, changes in tomllib.loads(_FILE.read_text()).items():
         about = changes.pop("about")
-        base = changes.pop("extends", None)
-        config = asdict(recipes[base].config if base else TrainConfig())
-        for table in changes.pop("replaces", ()):
-            reduce(dict.__getitem__, table.split("."), config).clear()
-        changed = merged(config, _with_none(changes))
-        config = from_dict(TrainConfig, changed, f"{_FILE}: {name}")
-        recipes[name] = Recipe(config=config, about=about)
+        recipes[name] = Recipe(config=_changed(changes, recipes, f"{_FILE}: {name}"), about=about)
     return recipes
+
+
+def _changed(changes: dict[str, Any], recipes: Mapping[str, Recipe], where: str) -> TrainConfig:
+    """Return the configuration of a recipe as it is written, which may extend one of ``recipes``."""
+    base = changes.pop("extends", None)
+    config = asdict(recipes[base].config if base else TrainConfig())
+    for table in changes.pop("replaces", ()):
+        reduce(dict.__getitem__, table.split("."), config).clear()
+    return from_dict(TrainConfig, merged(config, _with_none(changes)), where)
+
+
+def read_recipe(path: Path) -> TrainConfig:
+    """Read a recipe of the user's own: a TOML file like a table of ``recipes.toml``.
+
+    Raises:
+        FileFormatError: the file is damaged, or has an entry or a value that a configuration cannot have.
+        RunError: it extends or replaces something that does not exist.
+    """
+    changes = read_toml(path)
+    changes.pop("about", None)
+    base = changes.get("extends")
+    if base is not None and (not isinstance(base, str) or base not in RECIPES):
+        raise RunError(
+            f"{path}: extends is {shown(base)}. Choose from: {', '.join(RECIPES)}; or omit it for the default."
+        )
+    replaced = changes.get("replaces", [])
+    if not isinstance(replaced, list) or any(_is_no_table(name) for name in replaced):
+        raise RunError(
+            f"{path}: replaces is {shown(replaced)}, expected a list of names of tables, such as task.reward.terms."
+        )
+    return _changed(changes, RECIPES, str(path))
+
+
+def _is_no_table(name: Any) -> bool:
+    table: Any = asdict(TrainConfig())
+    for part in str(name).split("."):
+        table = table.get(part) if isinstance(table, dict) else None
+    return not isinstance(table, dict)
 
 
 def _with_none(changes: dict[str, Any]) -> dict[str, Any]:
@@ -73,29 +106,32 @@ def default_config(bank: Any, goals: Any, weights: str | Path | None) -> tuple[s
 
 
 def starting_config(recipe: str) -> TrainConfig:
-    """Return the configuration of a recipe, or of a run without the reward terms that its user added.
+    """Return the configuration of a recipe, of a file, or of a run, without reward terms that a user added.
 
     Such a term names code to import. A file must not decide that, so the user has to name the terms again. A note on
     standard error says so.
 
     Args:
-        recipe: name of a recipe, or a run folder.
+        recipe: name of a recipe, a file of the user's own (``.toml``), or a run folder.
 
     Raises:
-        RunError: it is neither.
+        RunError: it is none of them.
+        FileFormatError: the file or the run is damaged.
     """
     if recipe in RECIPES:
         return RECIPES[recipe].config
     if not Path(recipe).exists():
         known = "; ".join(f"{name}, {each.about}" for name, each in RECIPES.items())
-        raise RunError(f"There is no recipe and no run folder {recipe!r}. Recipes: {known}.")
-    config = read_run(recipe).config
+        raise RunError(
+            f"There is no recipe, no file and no run folder {recipe!r}. Recipes: {known}."
+        )
+    config = read_recipe(Path(recipe)) if recipe.endswith(".toml") else read_run(recipe).config
     reward = config.task.reward
     if reward.own:
         flags = own_terms_flags(reward.own)
         print(
-            f"{recipe} was trained with reward terms of your own. They are off unless you name them again, because a "
-            "run folder must not decide which code is imported. If you trust this code, add "
+            f"{recipe} has reward terms of your own. They are off unless you name them again, because a file must not "
+            "decide which code is imported. If you trust this code, add "
             f"{flags}.",
             file=sys.stderr,
         )

@@ -13,9 +13,10 @@ RUN/eval/, RUN/report/       made by ``xreset eval`` and ``xreset report``
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 from xreset.errors import RunError, WrongValueError
 from xreset.files.checks import Checked, NonNegativeInt, PositiveInt, Rule, Share, from_dict, frozen
@@ -99,6 +100,15 @@ def read_run(folder: str | Path, *, as_stated: bool = False) -> RunInfo:
             places = (above / path for above in folder.resolve().parents)
             found[name] = str(next(filter(os.path.exists, places), path))
     return replace(info, **found)
+
+
+def flat(data: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the entries of nested dictionaries: names, joined by dots, and values."""
+    for name, value in data.items():
+        if isinstance(value, dict):
+            yield from flat(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, value
 
 
 def checkpoints(folder: Path) -> list[Path]:

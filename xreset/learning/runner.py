@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import os
 import signal
+import stat
 import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict
@@ -92,15 +93,19 @@ class TrainingRunner:
         self._fault_totals = deque([[0, 0]], maxlen=FAULT_WINDOW)
         self._resume_command = resume_command(folder, config.task.reward.own)
 
-    def learn(self, total: int, *, seconds: float = math.inf) -> None:
+    def learn(self, total: int, *, seconds: float = math.inf) -> int | None:
         """Train until a number of iterations is done in all, and write a checkpoint.
 
-        The configuration's ``target_success`` ends the training earlier, and so does Ctrl-C, after an iteration. The
-        first episodes start at random times, so that the worlds do not end them together.
+        The configuration's ``target_success`` ends the training earlier, and so does a signal (Ctrl-C, SIGTERM or
+        SIGHUP), after an iteration. The first episodes start at random times, so that the worlds do not end them
+        together.
 
         Args:
             total: iterations in all, those of a resumed run included.
             seconds: most time to spend here; the present iteration is completed.
+
+        Returns:
+            The signal that ended the training before its last iteration; None: it ended by itself.
         """
         env = self.env
         env.episode_length_buf = torch.randint_like(
@@ -148,6 +153,9 @@ class TrainingRunner:
                     "stopped after the current iteration; a checkpoint is written. To continue: "
                     + self._resume_command
                 )
+        if not requests or self.iteration >= total:
+            return None
+        return requests[0].number
 
     def _agreed(self, stop: bool) -> bool:
         """Whether any process is to stop: then all do, after the same iteration."""
@@ -321,25 +329,39 @@ _STOPPING = (
 """What standard error says after the first request."""
 
 
+class _Request(NamedTuple):
+    """A signal that asks to stop."""
+
+    number: int
+    time: float
+    """Of the monotonic clock [s]."""
+
+
 @contextmanager
-def _stop_on_interrupt(*, say: bool = False) -> Iterator[list[float]]:
-    """Yield the times of requests to stop (Ctrl-C or SIGTERM). A second request interrupts at once.
+def _stop_on_interrupt(*, say: bool = False) -> Iterator[list[_Request]]:
+    """Yield the requests to stop: Ctrl-C, SIGTERM, or SIGHUP, which comes when the terminal closes. A second request
+    interrupts at once.
 
     Args:
         say: whether the first request is answered on standard error, because an iteration may take minutes.
     """
-    requests = []
+    requests: list[_Request] = []
 
-    def ask(_number: int, _frame: Any) -> None:
-        if requests and time.monotonic() - requests[0] > _SAME_REQUEST:
+    def ask(number: int, _frame: Any) -> None:
+        if number == signal.SIGHUP:
+            _leave_terminal()
+        if requests and time.monotonic() - requests[0].time > _SAME_REQUEST:
             raise KeyboardInterrupt
         if say and not requests:
             with suppress(OSError):  # print may be what the signal has interrupted
                 os.write(2, _STOPPING)
-        requests.append(time.monotonic())
+        requests.append(_Request(number, time.monotonic()))
 
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # as nohup sets it
+        numbers.append(signal.SIGHUP)
     try:
-        before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+        before = {number: signal.signal(number, ask) for number in numbers}
     except ValueError:  # not in the main thread: signals go elsewhere
         yield requests
         return
@@ -348,3 +370,13 @@ def _stop_on_interrupt(*, say: bool = False) -> Iterator[list[float]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _leave_terminal() -> None:
+    """Send what is printed from now on nowhere if it went to a terminal, because writing to a closed one fails."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):
+        with suppress(OSError):
+            if stat.S_ISCHR(os.fstat(stream).st_mode):
+                os.dup2(nowhere, stream)
+    os.close(nowhere)

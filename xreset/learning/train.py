@@ -7,9 +7,10 @@ import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -22,7 +23,7 @@ from xreset.cameras.config import (
     check_each_once,
 )
 from xreset.env.manipulation import make_env
-from xreset.errors import PolicyError, RunError, XResetError
+from xreset.errors import PolicyError, RunError, Stopped, XResetError
 from xreset.files.checks import Seed, names_wrong_arguments
 from xreset.files.storage import claim_folder, file_hash, write_whole
 from xreset.files.text import shown
@@ -41,6 +42,7 @@ from xreset.learning.run import (
     TEACHER,
     RunInfo,
     checkpoints,
+    flat,
     latest_checkpoint,
     read_run,
     write_run,
@@ -74,18 +76,22 @@ def train(
     teacher: str | Path | None = None,
     wandb: str | None = None,
 ) -> Path:
-    """Train a new policy, and export it as ``policy.onnx`` in the run folder.
+    """Train a policy, and export it as ``policy.onnx`` in the run folder.
+
+    If the folder holds this very training already, stopped or killed, the training goes on from its newest checkpoint;
+    if it is finished, nothing is trained. So a job may give the same command, or call, again and again.
 
     With ``torchrun``, every process simulates ``num_envs`` worlds of its own, each on its own GPU, or all on the CPU.
 
     Args:
         bank: reset bank, or its file. A bank without a file is written to ``resets.npz`` in the run folder. None: there
             are no demonstrated states, and every episode begins at home.
-        out: run folder to make.
+        out: run folder to make, or to continue.
         goals: goal set, or its file. With a bank, its starts and goals are added to the demonstrated ones.
-        recipe: where the configuration comes from: a recipe such as ``paper``, or another run's folder. Reward terms of
-            the user's own are not taken from a run: name them in ``config``. Default: the recipe of the headline
-            results; with ``weights`` and ``goals``, the run of ``weights``.
+        recipe: where the configuration comes from: a recipe such as ``paper``, a TOML file of the user's own, or
+            another run's folder. Reward terms of the user's own are not taken from a file or a run: name them in
+            ``config``. Default: the recipe of the headline results; with ``weights`` and ``goals``, the run of
+            ``weights``.
         config: the whole configuration, instead of a recipe.
         robot: name or folder of the robot; default: the robot that the bank names.
         meshes: folder of object meshes; default: the built-in stand-ins.
@@ -93,7 +99,7 @@ def train(
         device: cpu or cuda; default: cuda if there is a GPU that the engine can use.
         num_envs: number of worlds, in each process.
         iterations: number of iterations; default: as configured.
-        minutes: most time to train now; ``xreset.resume`` continues the run.
+        minutes: most time to train now; the same call continues the run.
         seed: seed of every random number.
         weights: another run's folder, whose networks are the start; default: new networks.
         teacher: policy whose actions the new one learns instead of learning from rewards; see :func:`distill`.
@@ -104,8 +110,9 @@ def train(
         The run folder, which ``xreset.load_policy`` reads.
 
     Raises:
-        RunError: the folder holds a run already, there is no state to reset to, a schedule asks for states that goals
-            do not have, ``weights`` has no checkpoint of networks like these, or there is too little memory.
+        Stopped: a signal ended the training early; a checkpoint and the policy are written.
+        RunError: the folder holds another training, there is no state to reset to, a schedule asks for states that
+            goals do not have, ``weights`` has no checkpoint of networks like these, or there is too little memory.
         PolicyError: ``weights`` is of another robot, or its policy observes something else.
         XResetError: bank, robot, objects and configuration do not fit together.
     """
@@ -119,10 +126,6 @@ def train(
     if iterations is not None:
         config = replace(config, iterations=iterations)
     device = device or device_for(engine, "cuda" if torch.cuda.is_available() else "cpu")
-    if checkpoints(out):
-        raise RunError(
-            f"{out} holds a run already. Continue it (xreset.resume or --resume), or choose another folder."
-        )
     if num_envs < 1:
         raise RunError(f"num_envs is {num_envs}, expected at least 1.")
     _check_minutes(minutes)
@@ -143,37 +146,85 @@ def train(
     teacher_policy = None if teacher is None else read_policy(teacher)
     if teacher_policy is not None:
         _check_teacher(teacher_policy, inputs, config)
+    info = RunInfo(
+        robot=str(inputs.robot_name),
+        resets=str(inputs.path),
+        resets_hash=str(inputs.hash),
+        meshes=str(inputs.meshes) if inputs.meshes else None,
+        engine=engine,
+        engine_version=version,
+        device=device,
+        num_envs=num_envs,
+        seed=seed,
+        config=config,
+        contract=policy_contract(inputs.robot, config.task, tuple(o.name for o in inputs.objects)),
+        weights=str(start) if start else None,
+        weights_hash=file_hash(start) if start else None,
+        teacher=str(teacher) if teacher else None,
+    )
+    if checkpoints(out):
+        if not isinstance(data, str | Path):
+            info = replace(info, resets_hash=_hash_of(data))
+        _refuse_another_training(out, info, teacher_policy)
+        own = config.task.reward.own
+        return resume(out, iterations=config.iterations, minutes=minutes, own=own, wandb=wandb)
     with _new_run(out):
         if teacher_policy is not None:
             write_whole(out / TEACHER, teacher_policy.content)
         # the training reads its own file, so that it has the same data as a resumed one, and values are checked
-        if isinstance(data, GoalSet):
-            write_goals(out / "goals.npz", data)
-            inputs = load(out / "goals.npz")
-        elif isinstance(data, ResetBank):
-            write_bank(out / "resets.npz", data)
-            inputs = load(out / "resets.npz")
-        info = RunInfo(
-            robot=str(inputs.robot_name),
-            resets=str(inputs.path),
-            resets_hash=str(inputs.hash),
-            meshes=str(inputs.meshes) if inputs.meshes else None,
-            engine=engine,
-            engine_version=version,
-            device=device,
-            num_envs=num_envs,
-            seed=seed,
-            config=config,
-            contract=policy_contract(
-                inputs.robot, config.task, tuple(o.name for o in inputs.objects)
-            ),
-            weights=str(start) if start else None,
-            weights_hash=file_hash(start) if start else None,
-            teacher=str(teacher) if teacher else None,
-        )
+        if not isinstance(data, str | Path):
+            path = out / ("goals.npz" if isinstance(data, GoalSet) else "resets.npz")
+            _write_data(path, data)
+            inputs = load(path)
+            info = replace(info, resets=str(inputs.path), resets_hash=str(inputs.hash))
         with _cleanly(out, info):
             _train(out, info, inputs, minutes=minutes, resumed=False, wandb=wandb)
     return out
+
+
+def _write_data(path: Path, data: ResetBank | GoalSet) -> None:
+    if isinstance(data, GoalSet):
+        write_goals(path, data)
+    else:
+        write_bank(path, data)
+
+
+def _hash_of(data: ResetBank | GoalSet) -> str:
+    """Return the hash that the file of a bank or a goal set has in a run folder."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "data.npz")
+        _write_data(path, data)
+        return file_hash(path)
+
+
+def _refuse_another_training(out: Path, wanted: RunInfo, teacher: OnnxPolicy | None) -> None:
+    """Refuse to continue the run in a folder as a training that it is not. The number of iterations may differ."""
+    present = read_run(out)
+    before = _identity(present, file_hash(out / TEACHER) if present.teacher else None)
+    now = _identity(wanted, teacher.hash if teacher else None)
+    for name, value in before.items():
+        if now.get(name) != value:
+            raise RunError(
+                f"{out} holds another training: {name} is {shown(value)} there and {shown(now.get(name))} here. Choose "
+                "another folder, or continue it as it was started (xreset.resume or --resume)."
+            )
+
+
+def _identity(info: RunInfo, teacher: str | None) -> dict[str, Any]:
+    """Return what makes a training the same one, by name; ``teacher`` is the hash of its teacher's policy."""
+    config = dict(flat(asdict(info.config)))
+    del config["iterations"]
+    return {
+        "robot": str(Path(info.robot).resolve()),
+        "hash of the reset bank": info.resets_hash,
+        "meshes": str(Path(info.meshes).resolve()) if info.meshes else None,
+        "engine": info.engine,
+        "device": info.device,
+        "num_envs": info.num_envs,
+        "seed": info.seed,
+        "hash of the weights": info.weights_hash,
+        "hash of the teacher": teacher,
+    } | config
 
 
 def resume(
@@ -195,6 +246,7 @@ def resume(
         wandb: as for :func:`train`.
 
     Raises:
+        Stopped: as for :func:`train`.
         RunError: the run has other reward terms of the user's own, the bank is not the run's, the newest checkpoint
             does not fit, another process is training here, or there is too little memory.
         PolicyError: the robot has changed, or the policy observed something else in an earlier version of xreset.
@@ -463,11 +515,13 @@ def _train(
             runner.load_networks(Path(info.weights))
         if processes.is_main:
             _write_start(out, info, runner.iteration, is_new=newest is None, resumed=resumed)
-        runner.learn(info.config.iterations, seconds=60 * minutes)
+        stopped_by = runner.learn(info.config.iterations, seconds=60 * minutes)
     if processes.is_main:
         policy = out / "policy.onnx"
         export_checkpoint(latest_checkpoint(out), policy)
         print(f"policy after {runner.iteration} iterations in {policy}", flush=True)
+    if stopped_by is not None:
+        raise Stopped(stopped_by)
 
 
 def _write_start(out: Path, info: RunInfo, iteration: int, *, is_new: bool, resumed: bool) -> None:

@@ -134,6 +134,29 @@ class CollectTest(Reported):
             self.assertIn(name + one_demonstration * len(ENGINES), text)
         self.assertNotIn("45 to 90°", text)
 
+    def test_the_page_says_where_nothing_is_to_be_expected(self):
+        self.write(policy="ik")
+        [note] = collect(self.folder).notes
+        self.assertRegex(note, "^ik is a baseline without a policy: it plays the robot motion")
+        self.write()
+        self.write_soup()
+        for passed, expected in (((), True), ((0.01,), False)):
+            passings = [
+                {"share": share, "iteration": 9, "env_steps": 90, "minutes": 0.5}
+                for share in passed
+            ]
+            write_json(
+                self.folder / "lift.json",
+                {"schema": "xreset-lift/1", "iteration": 10, "minutes": 0.6, "passed": passings},
+            )
+            notes = collect(self.folder).notes
+            with self.subTest(passed):
+                self.assertEqual(len(notes), int(expected))
+                if expected:
+                    self.assertRegex(
+                        notes[0], r"^0 % is expected here: in 10 iterations \(0.6 minutes\)"
+                    )
+
     def test_a_policy_that_sees_needs_no_run(self):
         self.write(vision=SEEING)
         self.assertEqual(self.read()[0].vision, SEEING)

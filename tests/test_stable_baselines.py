@@ -78,6 +78,20 @@ class StableBaselinesTest(WithEnv):
         for get in (env.get_attr, env.env_method):
             self.assertRaisesRegex(AttributeError, "num_action", get, "num_action")
 
+    def test_no_network_gets_what_is_for_critics(self):
+        env = self.wrapped(0.1)
+        still = np.zeros((N, env.env.num_actions), np.float32)
+        groups = {"policy", "proprio", "perception"}
+        self.assertLessEqual(groups, set(env.observation_space))
+        self.assertIn("privileged", env.env.get_observations())
+        seen = [env.reset()]
+        while len(seen) < 3:
+            observations, _, done, infos = env.step(still)
+            if done.any():
+                seen += [observations, infos[0]["terminal_observation"]]
+        for each in seen:
+            self.assertEqual(set(each), set(env.observation_space) - {"privileged"})
+
     def test_a_learner_takes_steps(self):
         env = self.wrapped(0.2)
         learner = PPO(

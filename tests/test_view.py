@@ -274,6 +274,25 @@ class Served(WithFiles):
                 own = scene._robot._colors[name]
                 assert_array_equal(link.color, rgb(tint(own, color) if color else own))
 
+    def test_the_page_opens_where_a_hand_is_and_says_what_is_green(self):
+        demos = toy_demos()
+        keypoints = demos.hand_keypoints.copy()
+        keypoints[:2] = np.nan
+        valid = demos.hand_valid.copy()
+        valid[:2] = False
+        path = self.folder / "late.npz"
+        write_demos(path, replace(demos, hand_keypoints=keypoints, hand_valid=valid))
+        page = self.page(path)
+        self.assertEqual(page.row, 2)
+        self.assertTrue(page._scene._keypoints.visible)
+        self.assertEqual(self.page(path, frame=1).row, 1)
+        client = mock.Mock()
+        for aspect, moves in ((0.5, True), (1.5, False)):
+            client.camera = mock.Mock(aspect=aspect, look_at=None)
+            page._make_room(client)
+            with self.subTest(aspect):
+                self.assertEqual(client.camera.look_at is not None, moves)
+
     def test_frames_of_one_reason_are_picked(self):
         page = self.page(self.retargeted)
         page._sequence.value = "all"

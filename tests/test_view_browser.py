@@ -77,6 +77,7 @@ class InTheBrowser(WithFiles):
     def test_scrubbing_and_changing_the_sequence(self):
         page = self.open(self.retargeted, demos=self.demos)
         self.assertEqual(page.row, 0)
+        self.assertIn("Green: the object at its goal.", self.browser.text())
         can = page._scene._objects[0]
         np.testing.assert_allclose(can.position, page.view.object_pos[0])
         self.browser.evaluate(f"{SLIDER.format(label='frame')}.focus()")

@@ -144,7 +144,6 @@ class Page(WebPage):
         camera = self._server.initial_camera
         camera.position = NEAR * np.subtract(camera.position, LOOK_AT) + LOOK_AT
         camera.look_at = LOOK_AT
-        self._server.on_client_connect(self._on_connect)
         self._server.on_client_disconnect(self._on_disconnect)
         self._draw()
 
@@ -217,12 +216,6 @@ class Page(WebPage):
             self._show_choices()
 
     # Visitors ---------------------------------------------------------------------------------------------------------
-
-    def _on_connect(self, client: Any) -> None:
-        if client.camera.aspect < 1.0:  # a phone: its controls cover the lower part
-            below = LOOK_AT - (0.0, 0.0, 0.3)
-            client.camera.position = below + 1.4 * (self._server.initial_camera.position - LOOK_AT)
-            client.camera.look_at = below
 
     def _on_disconnect(self, client: Any) -> None:
         if self._holder == client.client_id:

@@ -23,6 +23,28 @@ _LENGTH = "task.termination.episode_seconds"
 _SAME_NAMES = " Their sequences have the same names: if one was made from the other, as for ik, they are comparable."
 
 
+_BASELINES = {
+    "ik": "ik is a baseline without a policy: it plays the robot motion that was retargeted from the demonstration,"
+    " without looking where the object is.",
+    "zero": "zero is a baseline: the robot holds its home position.",
+    "random": "random is a baseline: actions are drawn at random.",
+}
+
+
+def expected(training: Training) -> list[str]:
+    """Return what a reader should expect of the results: those of a baseline, and of a training that was too short."""
+    found = []
+    if training.first.policy in _BASELINES:
+        found.append(_BASELINES[training.first.policy])
+    lift = training.lift
+    if lift.iteration and not lift.passed:
+        found.append(
+            f"0 % is expected here: in {lift.iteration:,} iterations ({lift.minutes:.2g} minutes), the training has not"
+            " once brought an object to its goal from home. Most trainings need minutes on a GPU for that."
+        )
+    return found
+
+
 def uneven(trainings: Sequence[Training]) -> list[str]:
     """Return a sentence for each condition in which the evaluations of trainings differ. For a single training, the
     policy is one of the conditions, because all engines must have played the same one."""

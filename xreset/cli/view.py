@@ -29,15 +29,15 @@ def view(
 ) -> None:
     """Show demonstrations, robot motion, a reset bank or a goal set in a browser, or write pictures of them.
 
-    In an invalid frame, the robot has the color of the reason. The object's goal is translucent. Human keypoints are
+    In an invalid frame, the robot has the color of the reason. The object's goal is green. Human keypoints are
     pink, keypoints in contact are yellow, the robot's fingertips are blue.
 
     Args:
         file: Demonstrations, or a file of `xreset retarget`, `xreset resets` or `xreset goals`.
         demos: Demonstrations that the file was made from, to show the human hand with the robot.
         sequence: Index of the sequence, from 0. Default: the first; in a bank, all sequences.
-        frame: Index of the frame in the sequence (or of the state in the bank). Default: the first; for --png the
-            middle one.
+        frame: Index of the frame in the sequence (or of the state in the bank). Default: the first one with a hand;
+            for --png the middle one.
         png: Picture to write, instead of a page.
         mp4: Film of the sequence to write, instead of a page.
     """
@@ -46,7 +46,7 @@ def view(
     shown = load.load_view(file, demos=demos, robot=robot, meshes=meshes)
     show_notes(shown.notes)
     if png is None and mp4 is None:
-        _serve(shown, host, port, sequence, frame or 0)
+        _serve(shown, host, port, sequence, frame)
         return
     rows = shown.choose(sequence=sequence if sequence is not None or not shown.is_motion else 0)
     if png is not None:
@@ -55,7 +55,7 @@ def view(
         _write_mp4(mp4, shown, rows)
 
 
-def _serve(shown: data.View, host: str, port: int, sequence: int | None, frame: int) -> None:
+def _serve(shown: data.View, host: str, port: int, sequence: int | None, frame: int | None) -> None:
     from xreset.pictures.view import page, server
 
     opened = page.Page(shown, host=host, port=port, sequence=sequence, frame=frame)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from tensordict import TensorDict
 
 from xreset.env.manipulation import ManipulationEnv
 from xreset.env.vector_env import (
@@ -26,6 +27,8 @@ with needs("stable_baselines3", "stable-baselines3"):
 class StableBaselinesEnv(VecEnv):
     """N worlds of the task in any engine, for learners of Stable-Baselines3 with a ``MultiInputPolicy``.
 
+    Its networks share their observations, so ``privileged``, which a critic alone may have, is left out.
+
     A world is reset in the step that ends its episode, as Stable-Baselines3 expects. The last observation of the
     episode is ``infos[world]["terminal_observation"]``; ``infos[world]["TimeLimit.truncated"]`` says whether its value
     is to be bootstrapped. An episode whose simulation fails is terminated, and ``infos[world]["faulty"]`` is True.
@@ -44,7 +47,9 @@ class StableBaselinesEnv(VecEnv):
         self.env = env
         self.log: dict[str, torch.Tensor] = {}
         self._action = torch.zeros(env.num_envs, env.num_actions, device=env.device)
-        super().__init__(env.num_envs, observation_space(env), action_space(env))
+        spaces = observation_space(env)
+        spaces.spaces.pop("privileged", None)
+        super().__init__(env.num_envs, spaces, action_space(env))
 
     def reset(self) -> dict[str, np.ndarray]:
         """Begin an episode in every world and return the observations [N, ...] by group."""
@@ -52,7 +57,7 @@ class StableBaselinesEnv(VecEnv):
             self.env.generator.manual_seed(self._seeds[0])
         self._reset_seeds()
         self.env.reset()
-        return arrays(self.env.get_observations())
+        return _of_an_actor(self.env.get_observations())
 
     def step_async(self, actions: np.ndarray) -> None:
         """Take the actions [N, J] of the next step.
@@ -76,7 +81,7 @@ class StableBaselinesEnv(VecEnv):
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         ended = done.nonzero().squeeze(-1)
         if len(ended):
-            last = arrays(observations)
+            last = _of_an_actor(observations)
             for world in ended.tolist():
                 infos[world] = {
                     "terminal_observation": {name: value[world] for name, value in last.items()},
@@ -85,7 +90,7 @@ class StableBaselinesEnv(VecEnv):
                 }
             self.env.reset(ended)
             observations = self.env.get_observations()
-        return arrays(observations), array(reward), array(done.bool()), infos
+        return _of_an_actor(observations), array(reward), array(done.bool()), infos
 
     def close(self) -> None:
         """Close the engine."""
@@ -111,3 +116,8 @@ class StableBaselinesEnv(VecEnv):
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
         """Return False for each world: the worlds have no wrappers."""
         return [False for _ in self._get_indices(indices)]
+
+
+def _of_an_actor(observations: TensorDict) -> dict[str, np.ndarray]:
+    """Return what an actor may observe, by group."""
+    return arrays(observations.exclude("privileged"))

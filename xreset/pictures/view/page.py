@@ -28,7 +28,7 @@ class Page(WebPage):
         host: str = "127.0.0.1",
         port: int = 8080,
         sequence: int | None = None,
-        frame: int = 0,
+        frame: int | None = None,
     ) -> None:
         """Start the server.
 
@@ -36,7 +36,7 @@ class Page(WebPage):
             host: address to listen at; 0.0.0.0 for every address of the machine.
             port: port to listen at; the next free one if it is taken.
             sequence: first sequence to show; None: all of a bank, the first of another file.
-            frame: first row to show, within the sequence.
+            frame: first row to show, within the sequence; None: the first one with a hand.
 
         Raises:
             XResetError: viser is not installed, the server does not start, or the sequence or frame is unknown.
@@ -45,6 +45,8 @@ class Page(WebPage):
         if sequence is None and view.is_motion:
             sequence = 0
         self._rows = view.choose(sequence=sequence)
+        if frame is None:
+            frame = int(np.argmax(view.has_hand[self._rows])) if len(self._rows) else 0
         if not 0 <= frame < len(self._rows):
             raise XResetError(
                 f"There is no frame {frame}: the sequence has {len(self._rows)}, counted from 0."
@@ -100,6 +102,12 @@ class Page(WebPage):
         self._play = gui.add_checkbox("play", False)
         self._speed = gui.add_slider("speed", 0.1, 2.0, 0.1, 1.0)
         self._text = gui.add_html("")
+        legend = ["Green: the object at its goal."]
+        if view.human_keypoints is not None:
+            legend.append("Pink: the human hand; yellow where it touches.")
+        if view.fingertips is not None:
+            legend.append("Blue: the robot's fingertips.")
+        gui.add_html(as_html("Colors", *legend))
         for control in (self._sequence, self._reason):
             control.on_update(lambda _: self._choose())
         self._frame.on_update(lambda _: self.show())

@@ -30,6 +30,10 @@ IDLE = 0.1
 """Time between two looks at the controls [s]."""
 
 
+_ROOM = np.array((0.0, 0.0, 0.3))
+"""How far above the middle of a phone's picture the scene is [m]."""
+
+
 class WebPage:
     """A page at :attr:`url` until :meth:`close`. It shows the table, and answers its own visitors only."""
 
@@ -69,7 +73,17 @@ class WebPage:
         server.scene.add_box(
             "/table", rgb(TABLE_COLORS[0]), size, position=(*table.center, -table.half_size[2])
         )
+        server.on_client_connect(self._make_room)
         self._server = server
+
+    def _make_room(self, client: Any) -> None:
+        """Move the scene of a phone up, because the controls cover its lower part."""
+        if client.camera.aspect < 1.0:
+            camera = self._server.initial_camera
+            look_at = np.asarray(camera.look_at)
+            below = look_at - _ROOM
+            client.camera.position = below + 1.4 * (np.asarray(camera.position) - look_at)
+            client.camera.look_at = below
 
     @property
     def url(self) -> str:

@@ -17,6 +17,7 @@ from tests.command import xreset as run
 from tests.data import InFolder
 from xreset.cli import COMMANDS, _terminal
 from xreset.cli._options import checked
+from xreset.errors import XResetError
 from xreset.files.storage import claim_folder
 
 HEAVY = {
@@ -186,6 +187,39 @@ class UsageTest(TestCase):
         err = refused("eval", "\x1b[31mred\x1b]0;title\x07", "--demos", "none.npz")
         self.assertIn("red", err)
         self.assertNotIn("\x1b", err)
+
+    def test_a_table_that_is_too_wide_for_a_terminal_is_a_list(self):
+        rows = [("object", "mass, kg"), ("tomato_soup_can", "0.349"), ("=[red]", "")]
+        for width, expected in (
+            (
+                20,
+                [
+                    "object: tomato_soup_can",
+                    "mass, kg: 0.349",
+                    "",
+                    "object: =[red]",
+                    "mass, kg: ",
+                    "",
+                    "two objects",
+                ],
+            ),
+            (40, None),
+        ):
+            narrow = _terminal.Console(file=io.StringIO(), width=width)
+            with patch.object(_terminal, "console", narrow):
+                _terminal.show_table(rows, caption="two objects")
+            lines = narrow.file.getvalue().splitlines()
+            if expected is None:
+                self.assertIn("tomato_soup_can", lines[3])
+            else:
+                self.assertEqual(lines, expected)
+
+    def test_a_message_repeats_no_endless_name(self):
+        self.assertEqual(str(XResetError("a joint is missing")), "a joint is missing")
+        said = str(XResetError(f"Unknown joint '{'j' * 50_000}'. Choose from: a, b."))
+        self.assertRegex(said, r"^Unknown joint 'j+\.\.\.j+'\. Choose from: a, b\.$")
+        self.assertLess(len(said), 300)
+        self.assertLess(len(str(XResetError("a b " * 50_000))), 10_000)
 
     def test_without_a_terminal_progress_is_a_line_a_minute(self):
         with (

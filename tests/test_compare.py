@@ -578,6 +578,14 @@ class DrawTest(Compared):
 
 
 class CommandTest(Compared):
+    def test_no_name_is_a_formula_in_a_spreadsheet(self):
+        for name in ("@sum(1)", "b"):
+            self.run_and_results(name, {"inputs": {"demos": "ab", "policy": name}})
+        out = self.folder / "made"
+        succeeds("report", self.folder / "@sum(1)", self.folder / "b", "--out", out)
+        figures = pd.read_csv(out / "results.csv")
+        self.assertEqual(set(figures["group"]), {"'@sum(1)", "b"})
+
     def test_from_folders_to_page_and_figures(self):
         for name, seed in (("a", 3), ("b", 4)):
             self.run_and_results(name, {"engines": ENGINES, "seed": seed}, num_envs=64 + seed)

@@ -6,6 +6,7 @@ from dataclasses import replace
 from unittest.mock import patch
 
 import numpy as np
+import trimesh
 
 from tests.data import InOneFolder
 from tests.toy_bank import SOUP, SPAM, toy_bank, toy_retargeted
@@ -28,7 +29,7 @@ from xreset import (
 )
 from xreset.errors import DemoError, FileFormatError, XResetError
 from xreset.files.storage import file_hash
-from xreset.resets.bank import check_objects
+from xreset.resets.bank import check_objects, starts_and_goals
 from xreset.resets.inputs import load_inputs
 
 
@@ -95,6 +96,51 @@ class InputsTest(InOneFolder):
             FileFormatError, "an imported mesh of .*, but the given one is another mesh. Give the"
         ):
             check_objects("bank.npz", other, changed)
+
+    def test_another_mesh_is_refused_before_it_is_cut(self):
+        meshes = self.folder / "meshes"
+        meshes.mkdir()
+        for name in (SOUP, SPAM):
+            trimesh.creation.box((0.05, 0.06, 0.07)).export(meshes / f"{name}.obj")
+        with (
+            patch("xreset.objects.catalogue.import_mesh") as cut,
+            self.assertRaisesRegex(
+                FileFormatError, "resets.npz was made with the built-in stand-in of"
+            ),
+        ):
+            load_inputs(self.bank_file, meshes=meshes)
+        cut.assert_not_called()
+
+    def test_a_bank_is_for_objects_of_about_its_mass_and_friction(self):
+        heavy = {"object_mass": np.array([40.0, 0.0]), "object_friction": np.array([0.0, 0.0])}
+        with self.assertRaisesRegex(
+            FileFormatError,
+            "made with a mass of 40 kg of 005_tomato_soup_can, but it is 0.349 kg now. Make",
+        ):
+            load_inputs(toy_bank(self.robot, **heavy))
+        soup = load_object(SOUP)
+        spam = load_object(SPAM)
+        bank = starts_and_goals(
+            toy_retargeted(self.robot, [SOUP], [0, 2]), self.robot, [replace(soup, friction=0.4)]
+        )
+        np.testing.assert_array_equal(
+            (bank.object_mass, bank.object_friction), ([soup.mass], [0.4])
+        )
+        for changes, problem in (
+            ({"friction": 0.4}, None),
+            ({"friction": 0.43}, None),
+            ({"friction": None}, None),
+            ({"friction": 0.8}, "a friction of 0.4 of .*, but it is 0.8 now"),
+            ({"mass": 1.05 * soup.mass}, None),
+            ({"mass": 1.2 * soup.mass}, "a mass of 0.349 kg of .*, but it is 0.419 kg now"),
+        ):
+            objects = (replace(soup, **changes), spam)
+            with self.subTest(changes):
+                if problem is None:
+                    check_objects("bank.npz", bank, objects)
+                else:
+                    with self.assertRaisesRegex(FileFormatError, problem):
+                        check_objects("bank.npz", bank, objects)
 
     def test_arguments_of_another_type_are_named(self):
         """Python's own errors come from deep inside."""

@@ -136,7 +136,7 @@ class CollectTest(Reported):
 
     def test_the_page_says_where_nothing_is_to_be_expected(self):
         self.write(policy="ik")
-        [note] = collect(self.folder).notes
+        [note] = self.collect().notes
         self.assertRegex(note, "^ik is a baseline without a policy: it plays the robot motion")
         self.write()
         self.write_soup()
@@ -149,7 +149,7 @@ class CollectTest(Reported):
                 self.folder / "lift.json",
                 {"schema": "xreset-lift/1", "iteration": 10, "minutes": 0.6, "passed": passings},
             )
-            notes = collect(self.folder).notes
+            notes = self.collect().notes
             with self.subTest(passed):
                 self.assertEqual(len(notes), int(expected))
                 if expected:

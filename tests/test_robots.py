@@ -13,7 +13,7 @@ import trimesh
 from ci import build_robot
 from tests.command import refused, succeeds
 from tests.data import InFolder
-from xreset import TaskConfig, plugins
+from xreset import TaskConfig, plugins, spec
 from xreset.errors import PolicyError, RobotError
 from xreset.geometry.description import load_robot as load
 from xreset.geometry.dynamics import mass_matrix
@@ -21,6 +21,7 @@ from xreset.geometry.urdf import find_mesh, robot_tree
 from xreset.physics.plugins import robot_folder, robot_names
 from xreset.policy.onnx_policy import check_contract, policy_contract
 from xreset.robot_tools.check import check
+from xreset.spec import DriveSpec
 
 BUILT_IN = {
     "ur7e-sharpa": "503f290c651dbc9d645a3113d96b9f9c51eecfe382a87fadbeaec8c8896e08d2",
@@ -58,6 +59,31 @@ class BuiltIn(TestCase):
     def test_fingerprints_are_those_of_earlier_files(self):
         for name, fingerprint in BUILT_IN.items():
             self.assertEqual(load(name).fingerprint, fingerprint, name)
+
+    def test_a_fingerprint_is_of_values_and_not_of_how_python_holds_them(self):
+        robot = load("openarm")
+        first = robot.joints[0]
+        same = replace(
+            first,
+            home=np.float64(first.home),
+            drive=replace(first.drive, kp=np.float32(first.drive.kp)),
+        )
+        self.assertEqual(
+            replace(robot, joints=(same, *robot.joints[1:])).fingerprint, robot.fingerprint
+        )
+        other = replace(first, drive=replace(first.drive, kp=first.drive.kp + 1))
+        self.assertNotEqual(
+            replace(robot, joints=(other, *robot.joints[1:])).fingerprint, robot.fingerprint
+        )
+        # as if armature and friction_loss had been added today
+        with mock.patch.dict(spec._DESCRIBED, {DriveSpec: ("kp", "kd", "effort")}):
+            self.assertEqual(
+                spec._description(DriveSpec(1, 2, 3)), "DriveSpec(kp=1, kd=2, effort=3)"
+            )
+            self.assertEqual(
+                spec._description(DriveSpec(1, 2, 3, armature=0.5)),
+                "DriveSpec(kp=1, kd=2, effort=3, armature=0.5)",
+            )
 
     def test_one_line_says_what_a_robot_is(self):
         robot = load("ur7e-robotiq")

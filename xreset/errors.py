@@ -4,12 +4,20 @@ The command line prints these without a traceback; any other exception is a defe
 A message says what was found, what was expected, and what to do.
 """
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+_LONG_WORD = re.compile(r"\S{1000,}")
+_LONGEST = 8000
+
 
 class XResetError(Exception):
-    """Base of every error that a user can fix."""
+    """Base of every error that a user can fix. A message that repeats a very long name of a file is shortened."""
+
+    def __str__(self) -> str:
+        text = _LONG_WORD.sub(lambda word: f"{word[0][:160]}...{word[0][-30:]}", super().__str__())
+        return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ... {text[-1000:]}"
 
 
 class WrongValueError(XResetError, ValueError):

@@ -215,14 +215,8 @@ class RobotSpec:
     @property
     def fingerprint(self) -> str:
         """SHA-256 over the description, the URDF and its meshes: equal where the robot is the same, wherever its files
-        are.
-
-        Files hold it, so the text that is hashed must not change: a new field of a spec gets ``repr=False``, and enters
-        the hash only where it differs from its default.
-        """
-        spec = replace(self, urdf=Path(self.urdf.name))
-        values = [f"{f.name}={getattr(spec, f.name)!r}" for f in fields(spec) if f.repr]
-        description = f"RobotSpec({', '.join(values)})"
+        are. Files hold it, so the text of the description must not change (:data:`_DESCRIBED`)."""
+        description = _description(replace(self, urdf=Path(self.urdf.name)))
         digest = hashlib.sha256(description.encode() + self.urdf.read_bytes())
         for mesh in self.meshes:
             digest.update(mesh.read_bytes())
@@ -231,6 +225,40 @@ class RobotSpec:
     def has_fingerprint(self, fingerprint: str) -> bool:
         """Return whether a file's fingerprint is this robot's. Files of xreset 0.1.0 do not know its meshes."""
         return fingerprint in (self.fingerprint, replace(self, meshes=()).fingerprint)
+
+
+_DESCRIBED: dict[type, tuple[str, ...]] = {
+    DriveSpec: ("kp", "kd", "effort", "armature", "friction_loss"),
+    JointSpec: ("name", "group", "drive", "home"),
+    MimicSpec: ("joint", "source", "multiplier", "offset"),
+    FingertipSpec: ("name", "link", "contact_links", "keypoint"),
+    KeypointSpec: ("keypoint", "link"),
+    RobotSpec: (
+        "name", "urdf", "joints", "mimics", "base_pos", "base_quat", "palm", "fingertips", "keypoints", "hand_root",
+        "self_collision_links", "collision_exclude", "table_exclude", "gravity_compensated", "home_std",
+    ),
+}  # fmt: skip
+"""The fields that a robot's fingerprint is made of, in the order of the text. A field that is added to a class enters
+the text only where it differs from its default, so that the fingerprints of earlier files stay."""
+
+
+def _description(value: Any) -> str:
+    """Return a value as the text that a fingerprint is made of: Python's notation, with numpy's numbers as Python's."""
+    if type(value) in _DESCRIBED:
+        known = _DESCRIBED[type(value)]
+        names = [*known]
+        for each in fields(value):
+            is_told = each.repr and each.name not in known
+            if is_told and getattr(value, each.name) != each.default:
+                names.append(each.name)
+        inside = [f"{name}={_description(getattr(value, name))}" for name in names]
+        return f"{type(value).__name__}({', '.join(inside)})"
+    if isinstance(value, tuple | list):
+        inside = [_description(each) for each in value]
+        return f"({', '.join(inside)}{',' * (len(inside) == 1)})"
+    if isinstance(value, Path):
+        return f"PosixPath({value.as_posix()!r})"
+    return repr(value.item() if isinstance(value, np.generic) else value)
 
 
 @frozen

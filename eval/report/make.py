@@ -142,6 +142,8 @@ def collect(
         notes += training.notes
         if not training.results:
             notes.append(f"{training.label} has no results. {how_to_evaluate(training.folder)}")
+        elif len(trainings) == 1:
+            notes += fairness.expected(training)
     if not title and len(trainings) == 1 and trainings[0].results:
         first = trainings[0].first
         title = f"{first.policy} on {first.robot}"
@@ -173,7 +175,7 @@ def write_report(
         except XResetError as error:
             # the page has the numbers all the same, and says why films are missing
             report = replace(report, notes=(*report.notes, f"There are no films: {error}"))
-    write_whole(out / "results.csv", report.scores.to_csv(index=False))
+    write_whole(out / "results.csv", report.scores.map(_without_formula).to_csv(index=False))
     write_whole(out / "index.html", page(report))
     return out / "index.html", report
 
@@ -186,6 +188,12 @@ def _axis(trainings: Sequence[Training]) -> X:
     except RunError:
         return "iterations"
     return "minutes"
+
+
+def _without_formula(cell: Any) -> Any:
+    """Return a cell that a spreadsheet does not take for a formula: names come from files."""
+    is_formula = isinstance(cell, str) and cell.startswith(("=", "+", "-", "@", "\t", "\r"))
+    return f"'{cell}" if is_formula else cell
 
 
 def choose_curves(trainings: Sequence[Training], wanted: Sequence[str]) -> tuple[str, ...]:

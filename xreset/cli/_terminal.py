@@ -10,6 +10,7 @@ from time import monotonic
 from typing import Any
 
 import rich.console
+import rich.measure
 import rich.progress
 from rich.table import Table
 from rich.text import Text
@@ -85,7 +86,8 @@ def show_notes(notes: Iterable[str]) -> None:
 
 
 def show_table(rows: Sequence[Sequence[str | Text]], **options: Any) -> None:
-    """Print a table whose first row is its head. Columns of numbers are aligned to the right.
+    """Print a table whose first row is its head. Columns of numbers are aligned to the right. In a terminal that is too
+    narrow for it, each row is a list.
 
     Args:
         rows: texts of the cells.
@@ -97,4 +99,13 @@ def show_table(rows: Sequence[Sequence[str | Text]], **options: Any) -> None:
         table.add_column(name, justify="right" if figures else "left")
     for row in rows[1:]:
         table.add_row(*row)
-    console.print(table)
+    unlimited = console.options.update(max_width=10_000)
+    if rich.measure.Measurement.get(console, unlimited, table).minimum <= console.width:
+        console.print(table)
+        return
+    for row in rows[1:]:
+        for name, cell in zip(rows[0], row, strict=True):
+            console.print(f"{name}: {cell}" if name else str(cell))
+        console.print()
+    if options.get("caption"):
+        console.print(str(options["caption"]))

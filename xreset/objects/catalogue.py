@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from xreset.errors import ObjectError
+from xreset.files.storage import file_hash
 from xreset.files.text import short_name, shown
 from xreset.objects.meshes import import_mesh
 from xreset.objects.standins import STAND_INS, stand_in
@@ -115,6 +116,20 @@ def load_object(name: str, meshes: str | Path | None = None) -> ObjectSpec:
     """
     if meshes is None:
         return stand_in(canonical_name(name))
+    path, own = _mesh_of(name, meshes)
+    return import_mesh(path, own)
+
+
+def object_source(name: str, meshes: str | Path | None = None) -> str:
+    """Return where the geometry of an object comes from, as :func:`load_object` states it, without cutting its
+    mesh."""
+    if meshes is None:
+        return stand_in(canonical_name(name)).source
+    return file_hash(_mesh_of(name, meshes)[0])
+
+
+def _mesh_of(name: str, meshes: str | Path) -> tuple[Path, str]:
+    """Return the mesh file of an object in a folder, and the name of the object that it makes."""
     files = mesh_files(meshes)
     try:
         full = canonical_name(name, files)
@@ -122,7 +137,7 @@ def load_object(name: str, meshes: str | Path | None = None) -> ObjectSpec:
         raise ObjectError(
             f"{error} These are the meshes in {meshes}; omit the folder for the built-in objects."
         ) from None
-    return import_mesh(files[full], name if name in STAND_INS else full)
+    return files[full], name if name in STAND_INS else full
 
 
 def load_objects(

@@ -100,6 +100,10 @@ class ResetBank(Brief):
     reason_names: ReasonNames
 
     # What files of earlier versions do not have
+    object_mass: Annotated[np.ndarray, Field(("O",), "f", within=(0.0, inf))] | None = None
+    """[O] mass of each object [kg]; 0: not known."""
+    object_friction: Annotated[np.ndarray, Field(("O",), "f", within=(0.0, inf))] | None = None
+    """[O] friction of each object's material; 0: it has none of its own."""
     joint_target: StateJoints | None = None
     """[L, J] drive targets; None: the joints' positions (:attr:`targets`)."""
     frame_part: Annotated[np.ndarray, Field(("L",), "f", within=(0.0, 1.0))] | None = None
@@ -181,6 +185,8 @@ def starts_and_goals(
     start_pos, start_quat = motions.start_pose
     goal_pos, goal_quat = motions.goal_pose
     sources = {o.name: o.source for o in objects}
+    masses = {o.name: o.mass for o in objects}
+    frictions = {o.name: o.friction or 0.0 for o in objects}
     return ResetBank(
         **no_states(robot),
         sequence_name=motions.sequence_name,
@@ -191,6 +197,8 @@ def starts_and_goals(
         goal_quat_wxyz=goal_quat.astype(np.float32),
         object_names=motions.object_names,
         object_sources=tuple(sources.get(name, "") for name in motions.object_names),
+        object_mass=np.array([masses.get(name, 0.0) for name in motions.object_names]),
+        object_friction=np.array([frictions.get(name, 0.0) for name in motions.object_names]),
     )
 
 
@@ -230,9 +238,39 @@ def check_states(bank: ResetBank, robot: RobotSpec, objects: tuple[ObjectSpec, .
         check_objects("The reset bank", bank, objects)
 
 
+_SAME = 0.1
+"""Relative difference of masses or frictions that counts as the same object: what a scale and a table of materials
+give."""
+
+
 def check_objects(path: str | Path, bank: ResetBank, objects: tuple[ObjectSpec, ...]) -> None:
-    """Refuse objects whose geometry is not what the bank was made with; ``FileFormatError``."""
-    given = {o.name: o.source for o in objects}
+    """Refuse objects whose geometry, mass or friction is not what the bank was made with; ``FileFormatError``."""
+    check_sources(path, bank, {o.name: o.source for o in objects})
+    for obj in objects:
+        if obj.name not in bank.object_names:
+            continue
+        index = bank.object_names.index(obj.name)
+        for what, unit, made, now in (
+            ("mass", " kg", bank.object_mass, obj.mass),
+            ("friction", "", bank.object_friction, obj.friction),
+        ):
+            if made is None or now is None or not made[index] > 0:  # files of 0.3 do not state it
+                continue
+            if abs(now / made[index] - 1) > _SAME:
+                raise FileFormatError(
+                    f"{path} was made with a {what} of {made[index]:.3g}{unit} of {obj.name}, but it is {now:.3g}{unit}"
+                    " now. Make the file again, or restore the value in the mesh's NAME.toml."
+                )
+
+
+def check_sources(path: str | Path, bank: ResetBank, given: Mapping[str, str]) -> None:
+    """Refuse objects whose geometry is not what the bank was made with; ``FileFormatError``.
+
+    Args:
+        path: file of the bank, for messages.
+        bank: the bank.
+        given: name of an object -> its ``source``.
+    """
     for name, source in zip(bank.object_names, bank.object_sources, strict=True):
         given_source = given.get(name, source)
         if given_source == source:

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -177,14 +177,29 @@ def with_goals(bank: ResetBank, goals: GoalSet) -> ResetBank:
             raise FileFormatError(
                 f"The bank and the goal set were made with different meshes of {name}. Make one again."
             )
-    joined = {}
+    names = tuple(sorted(sources))
+    joined: dict[str, Any] = {
+        "object_mass": _of_both(bank, goals, "object_mass", names),
+        "object_friction": _of_both(bank, goals, "object_friction", names),
+    }
     for name, field in schema_of(ResetBank).items():
         if field.shape[:1] == ("S",):
             joined[name] = np.concatenate((getattr(bank, name), getattr(goals, name)))
-    names = tuple(sorted(sources))
     return replace(
         bank, **joined, object_names=names, object_sources=tuple(sources[name] for name in names)
     )
+
+
+def _of_both(
+    bank: ResetBank, goals: GoalSet, field: str, names: tuple[str, ...]
+) -> np.ndarray | None:
+    """Return a number of each object from a bank, or else from a goal set; None: neither states it."""
+    found: dict[str, float] = {}
+    for data in (goals, bank):
+        values = getattr(data, field)
+        if values is not None:
+            found |= dict(zip(data.object_names, values.tolist(), strict=True))
+    return np.array([found.get(name, 0.0) for name in names]) if found else None
 
 
 def checked_goals(
@@ -369,8 +384,8 @@ def _reached(reach: Reach, drawn: Sequence[_Episode]) -> list[_Episode]:
 
 def _goal_set(robot: RobotSpec, episodes: Sequence[_Episode]) -> GoalSet:
     """Return the episodes as a goal set, with the poses of mesh frames."""
-    sources = {e.obj.name: e.obj.source for e in episodes}
-    names = tuple(sorted(sources))
+    objects = {e.obj.name: e.obj for e in episodes}
+    names = tuple(sorted(objects))
     return GoalSet(
         **no_states(robot),
         sequence_name=np.array([f"{e.obj.name}/{e.family}_{e.number:03d}" for e in episodes]),
@@ -381,5 +396,7 @@ def _goal_set(robot: RobotSpec, episodes: Sequence[_Episode]) -> GoalSet:
         goal_pos=np.array([e.goal - e.goal_turn.apply(e.obj.com) for e in episodes], np.float32),
         goal_quat_wxyz=np.array([quat_of(e.goal_turn) for e in episodes], np.float32),
         object_names=names,
-        object_sources=tuple(sources[name] for name in names),
+        object_sources=tuple(objects[name].source for name in names),
+        object_mass=np.array([objects[name].mass for name in names]),
+        object_friction=np.array([objects[name].friction or 0.0 for name in names]),
     )

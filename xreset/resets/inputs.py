@@ -18,9 +18,15 @@ from xreset.files.records import npz_schema
 from xreset.files.storage import file_hash
 from xreset.files.text import shown
 from xreset.geometry.description import load_robot
-from xreset.objects.catalogue import canonical_names, load_objects
+from xreset.objects.catalogue import canonical_names, load_objects, object_source
 from xreset.resets.bank import SCHEMA as BANK
-from xreset.resets.bank import ResetBank, check_objects, read_bank, starts_and_goals
+from xreset.resets.bank import (
+    ResetBank,
+    check_objects,
+    check_sources,
+    read_bank,
+    starts_and_goals,
+)
 from xreset.resets.goals import SCHEMA as GOALS
 from xreset.resets.goals import GoalSet, checked_goals, read_goals
 from xreset.retarget.file import SCHEMA as MOTION
@@ -147,6 +153,10 @@ def load_inputs(
         by_name = demo_objects(data, folder)
         loaded = tuple(by_name[name] for name in names)
     else:
+        if isinstance(data, ResetBank):
+            # before meshes are cut, which takes minutes
+            sources = {name: object_source(name, folder) for name in names}
+            check_sources(str(path or "the data"), data, sources)
         loaded = load_objects(names, folder)
         robot = robot or data.robot
     robot_name = None

@@ -61,6 +61,7 @@ from xreset.geometry import urdf
 from xreset.geometry.description import load_robot, read_description
 from xreset.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from xreset.learning.clock import Lift, read_lift, write_lift
+from xreset.learning.recipes import read_recipe
 from xreset.learning.run import RunInfo, read_run, write_run
 from xreset.live.deploy import deploy_contract, write_deployed
 from xreset.live.serve import _Episode
@@ -74,6 +75,7 @@ from xreset.runtime import Controller, load_controller
 from xreset.spec import SceneSpec
 from xreset.task.config import ObservationConfig, TaskConfig
 
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 SECONDS = 20.0
 """Most time of a processor that a reader may take over a file."""
 HAND_MAY = ("hand_keypoints", "wrist_quat_wxyz")
@@ -226,6 +228,8 @@ def add_run(every):
     path.write_bytes(run.read_bytes())
     every.add("lift.json", "lift.json", lambda p: read_lift(p.parent), "json")
     write_lift(every.folder, Lift().after(0.2, iteration=10, env_steps=1000, seconds=60.0))
+    recipe = every.add("recipe", "mine.toml", read_recipe, "text")
+    recipe.write_bytes((EXAMPLES / "cluster" / "mine.toml").read_bytes())
 
 
 def add_curves(every):

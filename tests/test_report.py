@@ -41,7 +41,7 @@ from xreset.eval.report.make import collect, count_failures, headline, make_repo
 from xreset.eval.report.read import read_trainings
 from xreset.eval.results import read_evaluation, recorded, write_result
 from xreset.eval.table import table_text
-from xreset.files.storage import claim_folder
+from xreset.files.storage import claim_folder, write_json
 from xreset.geometry.shapes import pose_matrix
 from xreset.learning.run import write_choice
 

@@ -13,11 +13,12 @@ import trimesh
 from ci import build_robot
 from tests.command import refused, succeeds
 from tests.data import InFolder
-from xreset import TaskConfig, plugins, spec
+from xreset import TaskConfig, spec
 from xreset.errors import PolicyError, RobotError
 from xreset.geometry.description import load_robot as load
 from xreset.geometry.dynamics import mass_matrix
 from xreset.geometry.urdf import find_mesh, robot_tree
+from xreset.physics import plugins
 from xreset.physics.plugins import robot_folder, robot_names
 from xreset.policy.onnx_policy import check_contract, policy_contract
 from xreset.robot_tools.check import check

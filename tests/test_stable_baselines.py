@@ -83,7 +83,7 @@ class StableBaselinesTest(WithEnv):
         still = np.zeros((N, env.env.num_actions), np.float32)
         groups = {"policy", "proprio", "perception"}
         self.assertLessEqual(groups, set(env.observation_space))
-        self.assertIn("privileged", env.env.get_observations())
+        self.assertIn("privileged", env.env.get_observations().keys())
         seen = [env.reset()]
         while len(seen) < 3:
             observations, _, done, infos = env.step(still)

@@ -79,10 +79,11 @@ class BuiltIn(TestCase):
         # as if armature and friction_loss had been added today
         with mock.patch.dict(spec._DESCRIBED, {DriveSpec: ("kp", "kd", "effort")}):
             self.assertEqual(
-                spec._description(DriveSpec(1, 2, 3)), "DriveSpec(kp=1, kd=2, effort=3)"
+                spec._description(DriveSpec(kp=1, kd=2, effort=3)),
+                "DriveSpec(kp=1, kd=2, effort=3)",
             )
             self.assertEqual(
-                spec._description(DriveSpec(1, 2, 3, armature=0.5)),
+                spec._description(DriveSpec(kp=1, kd=2, effort=3, armature=0.5)),
                 "DriveSpec(kp=1, kd=2, effort=3, armature=0.5)",
             )
 

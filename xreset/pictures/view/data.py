@@ -83,7 +83,7 @@ class View:
     def has_hand(self) -> np.ndarray:
         """[N] bool: whether a row shows a human hand; where the file has none, whether the robot's state is good."""
         if self.human_keypoints is not None:
-            return np.isfinite(self.human_keypoints).all(axis=(1, 2))
+            return np.asarray(np.isfinite(self.human_keypoints).all(axis=(1, 2)))
         return np.array([not reason for reason in self.reason], dtype=bool)
 
     def choose(self, *, sequence: int | None = None, reason: str | None = None) -> np.ndarray:

@@ -130,7 +130,7 @@ def commands(folder: Path) -> list[Command]:
         ),
         Command(
             "distill",
-            ["distill", run, *watch, *where],
+            ["train", "--teacher", run, *watch, *where],
             eyes / "policy.onnx",
             eyes / "checkpoints",
         ),

@@ -27,13 +27,14 @@ from xreset.eval.results import (
     write_result,
 )
 from xreset.eval.rollout import Engine, Trial, chosen_engines, load_trial, roll_out
-from xreset.files.checks import PositiveInt, Seed
+from xreset.files.checks import PositiveInt, Seed, obeys_rules
 from xreset.files.progress import Progress, unseen
 from xreset.files.storage import claim_folder
 from xreset.physics.plugins import backend_class
 from xreset.resets.inputs import Data
 
 
+@obeys_rules
 def evaluate(
     policy: str | Path | PolicySpec,
     demos: str | Path | Data,
@@ -102,6 +103,7 @@ def evaluate(
     return found
 
 
+@obeys_rules
 def stress(
     policy: str | Path | PolicySpec,
     demos: str | Path | Data | None = None,

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from xreset.env.manipulation import ManipulationEnv, make_env
 from xreset.errors import PolicyError
-from xreset.files.checks import Checked, Seed, frozen, names_wrong_arguments
+from xreset.files.checks import Checked, Seed, frozen, obeys_rules
 from xreset.files.text import Brief, shown
 from xreset.geometry.description import load_robot
 from xreset.learning.exported import read_policy
@@ -87,7 +87,7 @@ class PolicySpec(Brief, Checked):
         names = object_names(folder)
         return tuple(name for name in names if name in (self.objects or ())) or names
 
-    @names_wrong_arguments
+    @obeys_rules
     def make_env(
         self,
         objects: Sequence[ObjectSpec],
@@ -119,7 +119,6 @@ class PolicySpec(Brief, Checked):
             seed=seed,
         )
 
-    @names_wrong_arguments
     def begin(self, env: ManipulationEnv) -> Policy:
         """Return the policy, ready to act in an environment whose episodes have just begun.
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from xreset.files.checks import Options, frozen
+from xreset.files.checks import Options, PositiveInt, Seed, frozen
+from xreset.physics.plugins import Device
 
 
 @frozen
@@ -15,9 +16,9 @@ class Place(Options):
     """Name or folder of the robot; default: the policy's, or the file's."""
     meshes: Path | None = None
     """Folder of real meshes; default: what the policy was trained with, else the stand-ins."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of everything that is drawn; draws are the same in every engine."""
-    device: str = "cpu"
+    device: Device = "cpu"
     """Where GPU engines run: cpu or cuda."""
 
 
@@ -25,5 +26,5 @@ class Place(Options):
 class Setting(Place):
     """Robot, meshes, seed, device and worlds."""
 
-    num_envs: int = 64
+    num_envs: PositiveInt = 64
     """Worlds that run at the same time."""

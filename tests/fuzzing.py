@@ -5,7 +5,6 @@ A reader may read several files, of which one is damaged and contradicts the oth
 
 import json
 import logging
-import pickle
 import tempfile
 import time
 from collections.abc import Callable
@@ -46,7 +45,6 @@ from xreset import (
 )
 from xreset.backends.conformance import SCHEMA as CONFORMANCE
 from xreset.demos.dexycb import _read_extrinsics, _read_meta, _read_npz
-from xreset.demos.ho3d import _read_frame
 from xreset.demos.keypoints import read_keypoints, read_transform
 from xreset.eval.effects import curves, verdict
 from xreset.eval.engines.actions import Actions, read_actions, write_actions
@@ -122,7 +120,6 @@ def readers():
             add_dexycb,
             add_keypoints,
             add_meshes,
-            add_ho3d,
             add_pairs,
             add_mesh_of_urdf,
         ):
@@ -226,8 +223,10 @@ def add_run(every):
         "run.json, compared", "compared.json", lambda p: run_facts(read_json(p), p), "json"
     )
     path.write_bytes(run.read_bytes())
-    every.add("lift.json", "lift.json", lambda p: read_lift(p.parent), "json")
-    write_lift(every.folder, Lift().after(0.2, iteration=10, env_steps=1000, seconds=60.0))
+    path = every.add("lift", "lift/run.json", lambda p: read_lift(p.parent), "json")
+    path.parent.mkdir()
+    path.write_bytes(run.read_bytes())
+    write_lift(path.parent, Lift().after(0.2, iteration=10, env_steps=1000, seconds=60.0))
     recipe = every.add("recipe", "mine.toml", read_recipe, "text")
     recipe.write_bytes((EXAMPLES / "cluster" / "mine.toml").read_bytes())
 
@@ -392,20 +391,6 @@ def add_meshes(every):
         "properties", "box.toml", lambda p: properties_of(p.with_suffix(".obj")), "text"
     )
     path.write_text("mass = 0.1\ntolerance = 0.002\n")
-
-
-def add_ho3d(every):
-    def read(path):
-        return dict(zip(("joints", "pose"), _read_frame(path)))
-
-    frame = {
-        "handJoints3D": None,
-        "objRot": np.zeros((3, 1)),
-        "objTrans": np.zeros(3),
-        "objName": SOUP,
-    }
-    path = every.add("pickle", "0000.pkl", read, "bytes", ("joints", "pose"))
-    path.write_bytes(pickle.dumps(frame, protocol=2))
 
 
 # Several files that contradict each other ------------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ import tyro
 from tests.test_view import toy_demos
 from xreset import write_demos
 from xreset.cli import COMMANDS, main
-from xreset.cli._options import _WRITTEN, checked
+from xreset.cli._options import checked
 
 SECONDS = 20.0
 """Most processor time of a command."""
@@ -43,6 +43,8 @@ VALUES = (
     "True", "None", "\r\n", "\u202e", "x=1", "x=nan,inf", "cuda:99999999999", "[]", "{}", "a" * 5000, *NUMBERS, *NAMES,
 )  # fmt: skip
 """Values of any option."""
+WRITTEN = ("out", "rest", "png", "mp4", "picture", "json", "film", "page")
+"""Options that name a file or folder that a command writes."""
 WAIT_OR_WORK = {"engines check"}
 """Commands that need no file and work for minutes."""
 FIRST = {"play": ["no-policy"], "demos synth": ["--objects", "no-object"]}
@@ -118,7 +120,7 @@ def outcome_of_command(line):
         outputs = [
             (work / value).resolve()
             for flag, value in pairwise(line)
-            if flag.lstrip("-") in _WRITTEN
+            if flag.lstrip("-") in WRITTEN
         ]
         stray = []
         for path in sorted(written):

@@ -15,6 +15,7 @@ from unittest.mock import patch
 from tests.command import refused
 from tests.command import xreset as run
 from tests.data import InFolder
+from xreset.cameras.config import WRIST
 from xreset.cli import COMMANDS, _terminal
 from xreset.cli._options import checked
 from xreset.errors import XResetError
@@ -47,21 +48,26 @@ def modules_after(code):
     return set(json.loads(output_of(code).strip().splitlines()[-1]))
 
 
+def commands():
+    """Words of every command, and of every group of commands."""
+    found = []
+    for name in COMMANDS:
+        found.append([name])
+        group = getattr(import_module(f"xreset.cli.{name}"), "COMMAND", None)
+        if isinstance(group, dict):
+            found += [[name, *verb.split()] for verb in group]
+    return found
+
+
 class LightnessTest(TestCase):
     def test_import_and_help_load_nothing_heavy(self):
         code = "import xreset; from xreset.cli import main; main(['--help'])"
         self.assertFalse(modules_after(code) & (HEAVY | {"tyro", "numpy"}))
 
     def test_help_of_every_command_loads_nothing_heavy(self):
-        commands = []
-        for name in COMMANDS:
-            commands.append([name])
-            group = getattr(import_module(f"xreset.cli.{name}"), "COMMAND", None)
-            if isinstance(group, dict):
-                commands += [[name, *verb.split()] for verb in group]
         code = (
             "from xreset.cli import main\n"
-            f"for words in {commands}:\n"
+            f"for words in {commands()}:\n"
             "  try: main([*words, '--help'])\n"
             "  except SystemExit as end: assert not end.code, words\n"
         )
@@ -107,7 +113,7 @@ class UsageTest(TestCase):
                 r"--port is 87990, expected a whole number from 0 to 65535",
                 "view none.npz --port 87990",
             ),
-            (r"--num-envs is 0, expected a whole number from 1", "train --out x --num-envs 0"),
+            (r"--num-envs is 0, expected a whole number above 0", "train --out x --num-envs 0"),
             (
                 r"episode_seconds is -1.0, expected a number from 0.0167, which is one control step",
                 "eval zero --robot openarm --demos none.npz --episode-seconds -1",
@@ -160,16 +166,37 @@ class UsageTest(TestCase):
         refusal = run("train", "--help-config", "tusk")[2]
         self.assertIn("no part 'tusk'. Choose from: all, task, task.action", refusal)
 
-    def test_a_student_has_the_robot_of_the_bank(self):
-        self.assertIn("default: that of the bank", run("distill", "--help")[1])
+    def test_help_of_every_command_fits_a_terminal(self):
+        with patch.dict(os.environ, COLUMNS="80"):
+            for words in commands():
+                lines = run(*words, "--help")[1].splitlines()
+                # the first line of a group lists its verbs
+                self.assertLessEqual(max(map(len, lines[1:])), 80, words)
+
+    def test_a_student_has_the_task_of_its_teacher_and_no_recipe(self):
+        student = "train --teacher many-objects --out x --resets x.npz"
+        for words, told in (
+            ("--recipe paper", "follows from its teacher. Omit --recipe"),
+            ("--weights x", "Omit --weights"),
+            ("--camera rear", "Unknown camera 'rear'"),
+        ):
+            self.assertIn(told, refused(*student.split(), *words.split()))
+        with patch("xreset.learning.train.distill") as started:
+            for flag in ("--config.task.vision.width", "--vision.width"):
+                run(*student.split(), "--camera", "wrist", flag, "32")
+                vision = started.call_args.kwargs["config"].task.vision
+                self.assertEqual((vision.width, vision.cameras), (32, (WRIST,)))
+                self.assertEqual(started.call_args.kwargs["num_envs"], 1024)
+            run("distill", *student.split()[2:])
+        self.assertEqual(started.call_args.args, ("many-objects", Path("x.npz")))
 
     def test_a_wrong_value_of_a_verb_names_the_option_and_the_help(self):
         code, out, err = run(
-            "robots", "place", "openarm", "--demos", "d.npz", "--search.elite", "0"
+            "robots", "place", "openarm", "--demos", "d.npz", "--search.clear", "-1"
         )
         self.assertEqual(code, 2)
         self.assertRegex(
-            err + out, r"parsing search: elite is 0, expected[\s\S]*xreset robots place --help"
+            err + out, r"parsing search: clear is -1.0, expected[\s\S]*xreset robots place --help"
         )
 
     def test_a_gpu_that_is_not_there(self):

@@ -117,7 +117,12 @@ class ReadTest(Compared):
         self.write_run("a")
         write_lift(a, Lift())
         for name, old, new, message in (
-            ("lift.json", "}", "", "lift.json is not valid JSON"),
+            (
+                "run.json",
+                '"lift": {',
+                '"lift": 3, "other": {',
+                "run.json: lift is 3, expected an object",
+            ),
             ("run.json", "}", "", "run.json is not valid JSON"),
             ("run.json", '"config"', '"other"', "run.json lacks config"),
             ("eval/mujoco.json", '"policy"', '"other"', "missing: policy"),
@@ -227,7 +232,7 @@ class ProgressTest(Compared):
 
 class LiftTest(Compared):
     def lifted(self, name, end, *passed, **changes):
-        """A run with ``lift.json``: minutes until its end and until each share that it passed."""
+        """A run with a lift clock: minutes until its end and until each share that it passed."""
 
         def at(minutes):
             iteration = round(10 * minutes)

@@ -38,7 +38,7 @@ TASK = TaskConfig(
     ),
     distance_points=64,
 )
-SMALL = replace(CONFIG.model, conv=(4, 4), initial_std=0.1)
+SMALL = replace(CONFIG.model, initial_std=0.1)
 IMAGES = VisionConfig(cameras=(FRONT, WRIST), width=16, height=12)
 POINTS = replace(IMAGES, view="points", points=8, goal_image=True)
 
@@ -176,7 +176,7 @@ class DistillTest(WithBank):
             with self.subTest(words), quickly(), self.assertRaisesRegex(error, words):
                 distill(**(two | options))
             self.assertFalse((self.folder / "refused").exists(), words)
-        with self.assertRaisesRegex(XResetError, r"no critic.* xreset train .*--resume"):
+        with self.assertRaisesRegex(XResetError, r"no critic.* another run .--weights.*--resume"):
             train(
                 self.bank,
                 out=self.folder / "refused",
@@ -197,15 +197,15 @@ class DistillTest(WithBank):
 
     def test_a_student_is_resumed_as_it_was_started(self):
         for options, problem in (
-            (f"{self.teacher} --resets {self.bank}", ""),
-            ("--camera front", "the run's own cameras. Omit --camera and --vision"),
-            ("--vision.view points", "Omit --camera and --vision"),
+            (f"--teacher {self.teacher} --resets {self.bank}", ""),
+            ("--camera front", "the run's own networks and configuration. Omit --camera"),
+            ("--config.task.vision.view points", "Omit --config"),
             # the default, which is not what the run was started with
             ("--num-envs 1024", "--num-envs is 1024, but .* was started with"),
-            ("many-objects", "TEACHER is many-objects, but .* was started with"),
+            ("--teacher many-objects", "--teacher is many-objects, but .* was started with"),
         ):
             with self.subTest(options):
-                self.assert_resumed(f"distill --resume --out {self.run_folder} {options}", problem)
+                self.assert_resumed(f"train --resume --out {self.run_folder} {options}", problem)
 
     def test_what_the_teacher_does_better(self):
         common = {

@@ -1,15 +1,12 @@
 """The page of the engines: what it says of given results."""
 
-import contextlib
 import copy
-import io
 import json
 from pathlib import Path
 from typing import Any
 
 from tests.data import InFolder
 from xreset.backends.conformance import SCHEMA
-from xreset.cli import main
 from xreset.errors import FileFormatError, XResetError
 from xreset.eval.engines.page import page, read
 
@@ -35,11 +32,10 @@ class PageTest(InFolder):
         line = next(line for line in text.splitlines() if line.startswith(f"| {start}"))
         return [cell.strip() for cell in line.strip("|").split(" | ")]
 
-    def test_the_command_makes_the_stored_page(self):
-        out = self.folder / "engines.md"
-        with contextlib.redirect_stdout(io.StringIO()):
-            main(["engines", "page", "--from", str(STORED / "conformance.json"), "--out", str(out)])
-        self.assertEqual(out.read_text(), (STORED / "page.md").read_text())
+    def test_it_is_the_stored_page(self):
+        self.assertEqual(
+            page(read([STORED / "conformance.json"])), (STORED / "page.md").read_text()
+        )
 
     def test_devices_of_an_engine_are_neighbouring_columns(self):
         slower = self.changed(engine="mujoco-warp", device="cuda", capabilities=["friction"])

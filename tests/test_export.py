@@ -88,8 +88,6 @@ class Episodes(Case):
         file.write_text("")
         with self.assertRaisesRegex(RunError, "a.txt is not a folder. Give a run folder"):
             read_training(file)
-        with self.assertRaisesRegex(XResetError, "^label is 3, expected str . None. Look at help"):
-            xreset.read_training(self.folder, label=3)
         empty = self.folder / "run"
         (empty / "eval").mkdir(parents=True)
         (empty / "run.json").write_text("{}")

@@ -75,8 +75,8 @@ class CommandLines(TestCase):
         for line in (
             ("eval", "x", "--demos", "y", "--device", "1" * 5000),
             ("engines", "page", "--from", "x" * 5000),
-            ("demos", "mirror", "demos.npz", "--out", "null.npz"),
-            ("demos", "merge", "demos.npz", "--out", "null.npz"),
+            ("demos", "select", "demos.npz", "--mirror", "--out", "null.npz"),
+            ("demos", "select", "demos.npz", "--out", "null.npz"),
             ("demos", "info", "\udcff\n.npz"),
         ):
             with self.subTest(line[:4]):

@@ -1,6 +1,7 @@
 """Goal sets: starts at rest, goals of each family within reach, and what is refused."""
 
 from unittest import mock
+from unittest.mock import patch
 
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
@@ -19,7 +20,6 @@ from xreset.resets.goals import FAMILIES, SCHEMA, make_goals, read_goals, write_
 from xreset.resets.inputs import load_inputs
 
 BANANA = "011_banana"
-EXACT = GoalConfig(per_family=1, start_xy=0.0, start_yaw=0.0, goal_xy=0.0, goal_z=0.0, goal_yaw=0.0)
 
 
 class MadeTest(InOneFolder):
@@ -29,7 +29,9 @@ class MadeTest(InOneFolder):
         cls.enterClassContext(in_this_process())
         cls.robot = load_robot("ur7e-sharpa")
         cls.banana = load_object(BANANA)
-        cls.exact = make_goals(["banana"], robot=cls.robot, config=EXACT)
+        zeros = {"START_OFFSET": np.zeros(3), "GOAL_OFFSET": np.zeros(4)}
+        with patch.multiple("xreset.resets.goals", **zeros):
+            cls.exact = make_goals(["banana"], robot=cls.robot, config=GoalConfig(per_family=1))
 
     def centers(self, goals, which):
         """[S, 3] centres of mass."""

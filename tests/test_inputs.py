@@ -1,7 +1,6 @@
 """Loading of demonstrations, motion and banks, with the robot and the objects that they need."""
 
 import pickle
-import re
 from dataclasses import replace
 from unittest.mock import patch
 
@@ -12,20 +11,18 @@ from tests.data import InOneFolder
 from tests.toy_bank import SOUP, SPAM, toy_bank, toy_retargeted
 from xreset import (
     Retargeted,
-    distill,
     evaluate,
     load_object,
     make_bank,
     make_env,
     make_goals,
-    merge_demos,
-    retarget_demos,
     robots,
     stress,
     synthesize,
     train,
     write_bank,
     write_demos,
+    write_retargeted,
 )
 from xreset.errors import DemoError, FileFormatError, XResetError
 from xreset.files.storage import file_hash
@@ -77,6 +74,28 @@ class InputsTest(InOneFolder):
         )
         with self.assertRaisesRegex(DemoError, "resets.npz is a reset bank, which holds no motion"):
             inputs.motion()
+
+    def test_the_meshes_that_a_file_was_made_with_are_taken_or_asked_for(self):
+        folder = self.folder / "project"
+        (folder / "meshes").mkdir(parents=True)
+        trimesh.creation.box((0.06, 0.06, 0.1)).export(folder / "meshes" / f"{SOUP}.obj")
+        block = load_object(SOUP, folder / "meshes")
+        motion = toy_retargeted(self.robot, [SOUP], [0, 2])
+        inputs = {f"object {SOUP}": block.source}
+        file = folder / "motion.npz"
+        write_retargeted(file, motion, config={"meshes": "meshes"}, inputs=inputs)
+        found = load_inputs(file)
+        self.assertEqual((found.meshes, found.objects[0].source), (folder / "meshes", block.source))
+        other = folder / "other"
+        other.mkdir()
+        trimesh.creation.box((0.06, 0.06, 0.12)).export(other / f"{SOUP}.obj")
+        words = f"made with an imported mesh of {SOUP}, but the given one is another mesh.*--meshes"
+        with self.assertRaisesRegex(FileFormatError, words):
+            load_inputs(file, meshes=other)
+        for wrong in (None, "gone", "a\0b", 3):
+            write_retargeted(file, motion, config={"meshes": wrong}, inputs=inputs)
+            with self.subTest(wrong), self.assertRaisesRegex(XResetError, "--meshes"):
+                load_inputs(file)
 
     def test_what_does_not_fit_is_refused(self):
         with self.assertRaisesRegex(FileFormatError, "for the robot 'ur7e-sharpa'"):
@@ -142,8 +161,7 @@ class InputsTest(InOneFolder):
                     with self.assertRaisesRegex(FileFormatError, problem):
                         check_objects("bank.npz", bank, objects)
 
-    def test_arguments_of_another_type_are_named(self):
-        """Python's own errors come from deep inside."""
+    def test_numbers_without_sense_are_refused(self):
         bank = toy_bank(self.robot)
         motion = toy_retargeted(self.robot, [SOUP], [0, 2])
         objects = [load_object(name) for name in (SOUP, SPAM)]
@@ -153,8 +171,6 @@ class InputsTest(InOneFolder):
         seeds = "a whole number from 0 to 4294967295"
         counts = "a whole number above 0"
         for call, given, wrong, expected in (
-            (train, run, {"minutes": "1"}, "float"),
-            (train, run, {"config": {"iterations": 5}}, "TrainConfig | None"),
             (train, run, {"seed": "3"}, seeds),
             (train, run, {"seed": -1}, seeds),
             (evaluate, playing, {"episodes": "5"}, counts),
@@ -162,22 +178,16 @@ class InputsTest(InOneFolder):
             (make_bank, {"retargeted": motion} | scene, {"num_envs": 0}, counts),
             (evaluate, playing, {"seed": 2**32}, seeds),
             (make_env, {"bank": bank} | scene, {"seed": np.random.default_rng()}, seeds),
-            (merge_demos, {}, {"parts": ["demos.npz"]}, "Sequence[Demos]"),
-            (evaluate, playing, {"engines": 5}, "str | Engine | Sequence[str | Engine]"),
             (stress, {"policy": "soup-can", "demos": bank}, {"episodes": 0}, counts),
-            (retarget_demos, {"demos": self.demos} | scene, {"config": {"arm": 1}}, "RetargetConfig | None"),
-            (make_bank, {"retargeted": motion} | scene, {"limits": {"steps": 1}}, "FilterConfig | None"),
-            (make_env, {"bank": bank} | scene, {"task": {"timestep": 1}}, "TaskConfig | None"),
-        ):  # fmt: skip
-            words = f"is .*, expected {re.escape(expected)}. Look at help.xreset.{call.__name__}"
+        ):
             with (
                 self.subTest(call.__name__, **wrong),
-                self.assertRaisesRegex(XResetError, f"^{next(iter(wrong))} {words}"),
+                self.assertRaisesRegex(
+                    XResetError, f"^{next(iter(wrong))} is .*, expected {expected}"
+                ),
             ):
                 call(**given | wrong)
         self.assertFalse((self.folder / "run").exists())
-        with self.assertRaisesRegex(XResetError, "^num_envs is '3', expected int"):
-            distill("many-objects", self.bank_file, out=self.folder / "run", num_envs="3")
 
     def test_an_empty_selection_is_not_everything(self):
         for call in (

@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict, replace
 from types import SimpleNamespace
 from unittest import TestCase, skipUnless
-from unittest.mock import Mock, patch
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -26,8 +26,7 @@ from xreset.learning.config import ModelConfig, PpoConfig, ScheduleConfig, Train
 from xreset.learning.distributed import Processes
 from xreset.learning.export import exported
 from xreset.learning.model import PointNetLstmModel, ReturnCritic
-from xreset.learning.ppo import SequencePpo, first_steps, piece_states
-from xreset.learning.runner import TrainingRunner
+from xreset.learning.ppo import CLIP, SequencePpo, first_steps, piece_states
 from xreset.policy.onnx_policy import OnnxPolicy, policy_contract
 from xreset.resets.distribution import ResetDistribution
 from xreset.task.config import (
@@ -216,13 +215,8 @@ class StorageTest(TestCase):
     )
     def test_a_captured_update_learns_what_a_plain_one_does(self):
         # Adam moves a weight by about the rate whatever its gradient's size, so that one whose sign hangs on the last bits of a kernel may
-        # end 60 steps x 3e-4 away: 0.018. An adaptive rate multiplies that: a step more or less of it is a factor of 1.5.
-        fixed = {"schedule": "fixed", "learning_rate": 3e-4}
-        for tolerance, options in (
-            (1e-2, fixed),
-            (1e-2, fixed | {"normalize_returns": True}),
-            (5e-2, {}),
-        ):
+        # end 60 steps x 3e-4 away: 0.018. The adaptive rate multiplies that: a step more or less of it is a factor of 1.5.
+        for options in ({}, {"normalize_returns": True}):
             (one, before, plain), (two, _, captured) = (
                 self.bandit(iterations=3, device="cuda", capture=on, **options)
                 for on in (False, True)
@@ -230,7 +224,7 @@ class StorageTest(TestCase):
             self.assertFalse(one._graphs._graphs)
             self.assertTrue(two._graphs._graphs)
             self.assertGreater((plain - before).abs().mean(), 0.05)
-            assert_close(captured, plain, rtol=0.0, atol=tolerance)
+            assert_close(captured, plain, rtol=0.0, atol=5e-2)
 
     def test_a_bounds_loss_pulls_means_back_from_beyond_the_limits(self):
         _, _, free = self.bandit(iterations=5, bias=3.0, target=3.0)
@@ -246,12 +240,15 @@ class UpdateTest(TestCase):
     FIRST = ((2, 1), (3, 0), (6, 0), (6, 2))
     """Steps and worlds that begin an episode. The step before (2, 1) ends at its time limit; that before (3, 0) fails."""
 
-    def algorithm(self, normalize_returns=False, **ppo):
+    def algorithm(self, normalize_returns=False, *, adaptive=False, **ppo):
+        """A learner; the rate stays as it is unless it is to be adaptive."""
         torch.manual_seed(0)
         model = replace(SMALL, initial_std=0.5, normalize_returns=normalize_returns)
         options = {"horizon": T, "sequence_length": L, "minibatch_size": 10**6, "mini_epochs": 1}
-        config = TrainConfig(model=model, ppo=PpoConfig(**(options | {"schedule": "fixed"} | ppo)))
+        config = TrainConfig(model=model, ppo=PpoConfig(**(options | ppo)))
         alg = SequencePpo(observations(self.WORLDS), A, config, "cpu", Processes())
+        if not adaptive:
+            self.enterContext(patch.object(alg, "_adapt_rate"))
         # some means lie beyond the bounds, on both sides
         alg.actor.mlp[-1].bias.data += torch.linspace(-2.0, 2.0, A)
         return alg
@@ -281,7 +278,8 @@ class UpdateTest(TestCase):
         """Sums of discounted errors until the episode's end; the value of a time limit's state is bootstrapped."""
         discount = 0.9
         decay = 0.7
-        alg = self.algorithm(discount=discount, gae_lambda=decay)
+        with patch("xreset.learning.ppo.GAE_LAMBDA", decay):
+            alg = self.algorithm(discount=discount)
         rewards, ends, last = self.roll_out(alg)
         values = torch.cat((alg.storage.values[..., 0], last.T)).double().numpy()
         rewards = rewards.double().numpy()
@@ -359,9 +357,9 @@ class UpdateTest(TestCase):
         for limit in (1e3, 0.01):
             weights = {"value_loss": 0.7, "entropy": 0.02, "bounds_loss": 0.3}
             with patch("xreset.learning.ppo.GRAD_NORM", limit):
-                alg = self.algorithm(clip=0.15, learning_rate=1e-3, **weights)
+                alg = self.algorithm(learning_rate=1e-3, **weights)
             models = self.perturbed(alg, 0)
-            losses = self.expected(models, alg.storage, 0.15, 1.0)
+            losses = self.expected(models, alg.storage, CLIP, 1.0)
             signs = {"value": 0.7, "surrogate": 1.0, "entropy": -0.02, "bounds": 0.3}
             sum(weight * losses[name] for name, weight in signs.items()).backward()
             flat = alg.storage.observations.flatten(0, 1)
@@ -385,7 +383,7 @@ class UpdateTest(TestCase):
     def test_losses_are_means_over_epochs_and_minibatches(self):
         """Also of later updates, and in units of the returns' deviation."""
         for normalize in (False, True):
-            options = {"mini_epochs": 2, "minibatch_size": 16, "clip": 0.15}
+            options = {"mini_epochs": 2, "minibatch_size": 16}
             alg = self.algorithm(normalize, learning_rate=1e-9, **options)
             self.assertEqual(alg.num_mini_batches, 2)
             seen = []
@@ -394,7 +392,7 @@ class UpdateTest(TestCase):
                 seen.append(alg.storage.returns.clone())
                 unit = torch.cat(seen).std(unbiased=False) if normalize else 1.0
                 with torch.no_grad():
-                    expected = self.expected(models, alg.storage, 0.15, unit)
+                    expected = self.expected(models, alg.storage, CLIP, unit)
                 found = alg.update()
                 expected = {name: float(value) for name, value in expected.items()}
                 assert_close(found, expected, rtol=1e-4, atol=1e-5)
@@ -411,7 +409,7 @@ class UpdateTest(TestCase):
             (2.05, 1.2e-5, 1e-5),
             (0.45, 9e-3, 1e-2),
         ):
-            alg = self.algorithm(schedule="adaptive", desired_kl=desired)
+            alg = self.algorithm(adaptive=True, desired_kl=desired)
             for processes in (1, 2):
                 alg.learning_rate = rate
                 alg.is_multi_gpu = processes > 1
@@ -428,15 +426,6 @@ class UpdateTest(TestCase):
                     alg.update()
                     self.assertAlmostEqual(alg.learning_rate, expected, delta=1e-9)
                     self.assertEqual(alg.optimizer.param_groups[0]["lr"], alg.learning_rate)
-
-    def test_a_fixed_rate_is_the_one_that_was_set_last(self):
-        alg = self.algorithm()
-        alg.learning_rate = 7e-4
-        self.roll_out(alg)
-        mean, _ = alg.storage.distribution_params
-        mean += 1.0
-        alg.update()
-        self.assertEqual((alg.learning_rate, alg.optimizer.param_groups[0]["lr"]), (7e-4, 7e-4))
 
 
 class ReturnCriticTest(TestCase):
@@ -522,7 +511,7 @@ class ConfigTest(TestCase):
             ),
             (PpoConfig, {"discount": 1.01}, "discount is 1.01, expected a number from 0 to 1"),
             (PpoConfig, {"entropy": float("nan")}, "entropy is nan"),
-            (PpoConfig, {"clip": float("inf")}, "clip is inf, expected .* finite"),
+            (PpoConfig, {"desired_kl": float("inf")}, "desired_kl is inf, expected .* finite"),
             (ModelConfig, {"initial_std": 0.0}, "initial_std is 0.0, expected a number above 0"),
             (
                 TrainConfig,
@@ -574,6 +563,11 @@ class ConfigTest(TestCase):
         data["task"]["randomization"]["friction_buckets"] = 250
         data["ppo"] |= {"clip_values": True, "grad_norm": 1.0}
         data["random_episode_start"] = True
+        data["schedule"] |= {"faults": [], "demo_probability": [], "success_position": []}
+        data["ppo"] |= {"clip": 0.2, "gae_lambda": 0.95, "schedule": "adaptive"}
+        data["model"]["conv"] = [16, 32, 32]
+        data["task"]["reset"]["home_noise"] = True
+        data["target_success"] = None
         self.assertEqual(from_dict(TrainConfig, data), config)
         data["task"]["reset"]["frontier"] = 0.75
         data["model"]["synergy_std"] = 0.4
@@ -604,46 +598,12 @@ class ChangingSettings(TestCase):
                 self.subTest(points=points),
                 self.assertRaisesRegex(ValueError, "each share greater than the one before"),
             ):
-                ScheduleConfig(faults=points)
-        with self.assertRaisesRegex(ValueError, "success_position is .*, expected values above 0"):
-            ScheduleConfig(success_position=((0.0, 0.05), (1.0, 0.0)))
-
-    def test_a_training_moves_its_limit_of_success_its_faults_and_its_starts(self):
-        """On straight lines between the points."""
-        env = Mock(success_position=torch.zeros(()))
-        env.worlds.fault_scale = torch.zeros(())
-        env.resets.demo_probability = torch.zeros(())
-        schedule = ScheduleConfig(
-            success_position=((0.2, 0.05), (1.0, 0.01)),
-            faults=((0.0, 0.0), (0.5, 1.0)),
-            demo_probability=((0.0, 1.0), (1.0, 0.0)),
-        )
-        runner = Mock(env=env, config=TrainConfig(schedule=schedule))
-        for progress, limit, scale in (
-            (0.1, 0.05, 0.2),
-            (0.25, 0.0475, 0.5),
-            (0.6, 0.03, 1.0),
-            (1.5, 0.01, 1.0),
-        ):
-            TrainingRunner._follow_schedule(runner, progress)
-            self.assertAlmostEqual(float(env.success_position), limit)
-            self.assertAlmostEqual(float(env.worlds.fault_scale), scale)
-            share = float(env.resets.demo_probability)
-            self.assertAlmostEqual(share, max(0.0, 1 - progress), places=6)
-
-    def test_states_are_needed_where_episodes_ever_begin_in_one(self):
-        home = TaskConfig(reset=ResetConfig(demo_probability=0.0))
-        later = ScheduleConfig(demo_probability=((0.0, 0.0), (1.0, 0.5)))
-        never = ScheduleConfig(demo_probability=((0.0, 0.0),))
-        self.assertTrue(TrainConfig().uses_states)
-        self.assertFalse(TrainConfig(task=home).uses_states)
-        self.assertTrue(TrainConfig(task=home, schedule=later).uses_states)
-        self.assertFalse(TrainConfig(schedule=never).uses_states)
+                ScheduleConfig(teacher=points)
 
     def test_resets_follow_the_share_of_demonstrated_states(self):
         robot = robots.load("openarm")
-        resets = ResetDistribution(toy_bank(robot), robot, (SOUP, SPAM), ResetConfig())
         for share in (1.0, 0.0):
-            resets.demo_probability.fill_(share)
+            config = ResetConfig(demo_probability=share)
+            resets = ResetDistribution(toy_bank(robot), robot, (SOUP, SPAM), config)
             drawn = resets.sample(torch.zeros(50, dtype=torch.long), torch.Generator())
             self.assertEqual(drawn.from_bank.float().mean(), share)

@@ -7,7 +7,7 @@ import torch
 from tests.data import InFolder
 from xreset.errors import FileFormatError, XResetError
 from xreset.files.storage import write_json
-from xreset.learning.clock import FILE, Lift, read_lift, write_lift
+from xreset.learning.clock import Lift, read_lift, write_lift
 from xreset.learning.log import TrainingLog
 
 
@@ -18,6 +18,7 @@ class LiftTest(InFolder):
         return lift
 
     def test_the_first_passing_of_each_mark_is_kept(self):
+        write_json(self.folder / "run.json", {"seed": 3})
         write_lift(self.folder, self.after(Lift(), [0.0, 0.009, 0.2, 0.05, 0.11, 0.6, 0.3]))
         lift = read_lift(self.folder)
         self.assertEqual([(p.share, p.iteration, p.env_steps, p.minutes) for p in lift.passed],
@@ -44,9 +45,18 @@ class LiftTest(InFolder):
             ("iteration is -5, expected a", {"iteration": -5}),
             ("share is 1e.308, expected a", {"passed": [passing]}),
         ):
-            write_json(self.folder / FILE, {"schema": "xreset-lift/1"} | changes)
+            write_json(self.folder / "lift.json", {"schema": "xreset-lift/1"} | changes)
             with self.subTest(words), self.assertRaisesRegex(FileFormatError, words):
                 read_lift(self.folder)
+            write_json(self.folder / "run.json", {"lift": changes})
+            with (
+                self.subTest(words),
+                self.assertRaisesRegex(FileFormatError, f"run.json: .*{words}"),
+            ):
+                read_lift(self.folder)
+            (self.folder / "run.json").unlink()
+        write_json(self.folder / "lift.json", {"schema": "xreset-lift/1", "iteration": 4})
+        self.assertEqual(read_lift(self.folder).iteration, 4)
 
 
 class CurvesTest(InFolder):
@@ -59,8 +69,8 @@ class CurvesTest(InFolder):
         }
         folder = self.folder
         with mock.patch.dict("sys.modules", {"wandb": online}):
-            write_json(f"{folder}/run.json", {"a": 1})
             for project in (None, "project"):
+                write_json(f"{folder}/run.json", {"a": 1})
                 curves = TrainingLog(folder, 2, "cpu", 5, project)
                 curves.add(torch.ones(2), torch.zeros(2), log)
                 curves.write(3, 10, 1.0, {"speed/env_steps_per_second": 2.0})

@@ -28,7 +28,7 @@ class MirrorTest(InOneFolder):
         cls.demos = synthesize(["mustard"], 1, 0, side="left")
         cls.object = load_object("mustard")
         cls.symmetries = {cls.object.name: symmetry(cls.object)}
-        cls.found = mirrored(cls.demos, cls.symmetries, tolerance=0.004)
+        cls.found = mirrored(cls.demos, cls.symmetries)
 
     def test_finds_the_plane_of_a_body_with_one(self):
         """An L has one plane of symmetry only, here z = 0.01; a third arm out of the plane leaves none."""
@@ -63,12 +63,12 @@ class MirrorTest(InOneFolder):
     def test_an_object_that_is_not_symmetric_is_refused(self):
         crooked = dataclasses.replace(self.symmetries[self.object.name], deviation=0.02)
         with self.assertRaisesRegex(DemoError, r"mustard_bottle 20\.0 mm"):
-            mirrored(self.demos, {self.object.name: crooked}, tolerance=0.004)
+            mirrored(self.demos, {self.object.name: crooked})
 
     def test_the_command_mirrors_the_left_hands_of_an_archive(self):
         files = [self.folder / name for name in ("demos.npz", "mirrored.npz")]
         write_demos(files[0], merge_demos([self.demos, synthesize(["soup"], 1, 0)]))
-        said = succeeds("demos", "mirror", files[0], "--out", files[1])
+        said = succeeds("demos", "select", files[0], "--mirror", "--out", files[1])
         self.assertRegex(said, r"mustard_bottle: \d\.\d mm from its reflection, mirrored")
         found = read_demos(files[1])
         self.assertEqual(found.object_name.tolist(), ["006_mustard_bottle"])

@@ -43,6 +43,7 @@ from xreset.eval.results import read_evaluation, recorded, write_result
 from xreset.eval.table import table_text
 from xreset.files.storage import claim_folder, write_json
 from xreset.geometry.shapes import pose_matrix
+from xreset.learning.clock import Lift, write_lift
 from xreset.learning.run import write_choice
 
 VOID = {"meta", "br", "link", "img", "input", "hr"}
@@ -190,7 +191,7 @@ class CollectTest(Reported):
         words = f"nor evaluation results.*xreset eval POLICY.*--out {self.folder}"
         self.assertRaisesRegex(RunError, words, self.read)
         self.write_soup()
-        (self.folder / "lift.json").write_text('{"schema": "xreset-lift/1", "iteration": 1}')
+        write_lift(self.folder, Lift(iteration=1))
         [note] = self.collect().notes
         self.assertRegex(note, f"soup has no results.*xreset eval {self.folder} --demos")
 

@@ -3,13 +3,15 @@
 from unittest import TestCase
 from unittest.mock import patch
 
+import xreset
 from tests.command import refused
 from tests.data import InFolder
-from xreset.cli import main
+from xreset.cli import perform
 from xreset.cli import run as command
 from xreset.demos.archive import write_demos
 from xreset.demos.synth import synthesize
 from xreset.errors import RunError
+from xreset.retarget.file import read_retargeted, write_retargeted
 
 
 class Run(InFolder, TestCase):
@@ -20,10 +22,10 @@ class Run(InFolder, TestCase):
         def step(words):
             verbs.append(words[0])
             if words[0] in ("retarget", "resets"):
-                main(words)
+                perform(words)
 
-        with patch.object(command, "main", step):
-            command.run(self.folder / demos, robot="ur7e-sharpa", out=self.folder / "v0.1")
+        with patch.object(command, "perform", step):
+            xreset.run(f"{self.folder}/{demos}", robot="ur7e-sharpa", out=f"{self.folder}/v0.1")
         return verbs
 
     def test_steps_that_are_done_are_left_out(self):
@@ -35,6 +37,10 @@ class Run(InFolder, TestCase):
         self.assertEqual(self.run_it(), ["resets", "train", "eval", "report"])
         with self.assertRaisesRegex(RunError, "another archive of demonstrations"):
             self.run_it("other.npz")
+        motion = self.folder / "v0.1/motion.npz"
+        write_retargeted(motion, read_retargeted(motion))  # states no inputs
+        with self.assertRaisesRegex(RunError, "motion.npz was made with another archive"):
+            self.run_it()
 
     def test_nothing_is_made_for_an_unknown_robot(self):
         demos = self.folder / "soup.npz"

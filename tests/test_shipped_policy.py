@@ -68,4 +68,4 @@ class ShippedPolicyTest(unittest.TestCase):
                     (result,) = evaluate(name, demos, num_envs=2, out=folder, episodes=1)
                 self.assertEqual(list(result.inputs), ["policy"])
                 self.assertEqual(result.episodes, 2)
-                self.assertGreaterEqual(result.task_progress.mean, FLOOR)
+                self.assertGreaterEqual(result.mean("task_progress"), FLOOR)

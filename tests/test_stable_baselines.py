@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from tests.test_env import TASK, BreakableBackend, N, WithEnv
-from xreset.errors import XResetError
 from xreset.task.config import TerminationConfig
 
 try:
@@ -24,10 +23,6 @@ class StableBaselinesTest(WithEnv):
         env = StableBaselinesEnv(self.make(task, **options))
         self.addCleanup(env.close)
         return env
-
-    def test_what_is_not_an_environment_is_refused(self):
-        words = "^env is None, expected ManipulationEnv"
-        self.assertRaisesRegex(XResetError, words, StableBaselinesEnv, None)
 
     def test_the_last_observation_of_a_truncated_episode_is_given(self):
         env = self.wrapped(0.1)

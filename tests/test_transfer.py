@@ -168,14 +168,19 @@ class TransferTest(TestCase):
         self.assertEqual(set(new.targets[:, JAW].tolist()), {float(jaw) for jaw in grasps})
 
     def test_poses_and_grasps_are_drawn_by_number_and_seed(self):
-        self.assertEqual(tried(self.bank, self.data, poses=1)[0].frame_index[3:].tolist(), [1, 1])
-        two, _ = tried(self.bank, self.data, poses=2, per_pose=1)
-        self.assertEqual(two.frame_index[3:].tolist(), [1, 3])
-        self.assertEqual(tried(self.bank, self.data, poses=10**15)[0].num_states, 9)
+        for poses, per_pose, frames in (
+            (1, 8, [1, 1]),
+            (2, 1, [1, 3]),
+            (99, 8, [1, 1, 2, 2, 3, 3]),
+        ):
+            with patch("xreset.resets.transfer._POSES", poses):
+                found, _ = tried(self.bank, self.data, per_pose=per_pose)
+            self.assertEqual(found.frame_index[3:].tolist(), frames)
         base = bank(self.data, (0.0, 0.002, 0.003))
         jaws = set()
         for seed in range(8):
-            once, again = (tried(base, self.data, candidates=1, seed=seed)[0] for _ in range(2))
+            with patch.multiple("xreset.resets.transfer", _CANDIDATES=1, _SEED=seed):
+                once, again = (tried(base, self.data)[0] for _ in range(2))
             self.assertEqual(once.num_states, 6)
             assert_array_equal(once.joint_target, again.joint_target)
             jaws.add(tuple(once.targets[3:, JAW].tolist()))
@@ -243,8 +248,8 @@ class TransferTest(TestCase):
             add_transfers(self.data, self.bank, ROBOT, OBJECTS)
         with self.assertRaisesRegex(FileFormatError, "whose joints are not those"):
             add_transfers(replace(self.bank, joint_names=tuple("abcde")), self.data, ROBOT, OBJECTS)
-        with self.assertRaisesRegex(ValueError, "poses is 0, expected a whole number above 0"):
-            TransferConfig(poses=0)
+        with self.assertRaisesRegex(ValueError, "per_pose is -1, expected a whole number"):
+            TransferConfig(per_pose=-1)
 
     def test_none_are_added_without_a_grasp_in_the_air_that_presses(self):
         low = motion(first=(0.0, 0.019, 0.01))
@@ -362,9 +367,9 @@ class BankTest(InFolder):
 class CommandTest(InFolder):
     def setUp(self):
         super().setUp()
-        self.enterContext(patch("xreset.geometry.description.load_robot", lambda _: ROBOT))
+        self.enterContext(patch("xreset.resets.inputs.load_robot", lambda _: ROBOT))
         self.enterContext(in_this_process())
-        self.enterContext(patch("xreset.objects.catalogue.load_objects", lambda *_: OBJECTS))
+        self.enterContext(patch("xreset.resets.inputs.load_objects", lambda *_: OBJECTS))
         self.motion = self.folder / "r.npz"
         write_retargeted(self.motion, motion())
 
@@ -379,10 +384,9 @@ class CommandTest(InFolder):
         press = ("--closing.spacing", "None", "--squeeze.force", "2.5", "--squeeze.weight", "0")
         plain, config, out = self.resets(*press, "--transfer.per-pose", "0")
         self.assertNotIn("grasps of other", out)
-        bank, config, out = self.resets(*press, "--transfer.per-pose", "1", "--transfer.poses", "2")
-        self.assertEqual(
-            config["transfer"], {"per_pose": 1, "poses": 2, "candidates": 40, "seed": 0}
-        )
+        self.enterContext(patch("xreset.resets.transfer._POSES", 2))
+        bank, config, out = self.resets(*press, "--transfer.per-pose", "1")
+        self.assertEqual(config["transfer"], {"per_pose": 1})
         for words in (
             "3 states of 3 kept",
             "2 states in grasps of other demonstrations added, to 1 of 3 demonstrations",
@@ -400,16 +404,16 @@ class CommandTest(InFolder):
             OBJECTS,
             closing=None,
             squeeze=SqueezeConfig(force=2.5, weight=0.0),
-            transfer=TransferConfig(per_pose=1, poses=2),
+            transfer=TransferConfig(per_pose=1),
         )
         assert_array_equal(again.joint_pos, bank.joint_pos)
 
     def test_the_defaults_are_those_of_the_headline_results(self):
         bank, config, _ = self.resets()
-        self.assertEqual(config["closing"], {"spacing": 0.005, "within": 0.1})
+        self.assertEqual(config["closing"], {"spacing": 0.005})
         pressing = {"force": 5.0, "weight": 1.0, "balanced": True, "reach": 0.005}
         self.assertEqual(config["squeeze"], pressing)
-        transfer = {"per_pose": 8, "poses": 4, "candidates": 40, "seed": 0}
+        transfer = {"per_pose": 8}
         self.assertEqual(config["transfer"], transfer)
         again = make_bank(read_retargeted(self.motion), ROBOT, OBJECTS)
         for name, values in vars(bank).items():

@@ -22,10 +22,8 @@ FRICTION = PairFriction(tip=0.9, link=0.5, table=0.6, torsional=0.002)
 OPEN = 0.0201
 CLOSED = 0.0141
 """Positions and targets [m] of a jaw: each finger then presses with 2.5 N, and 0.9 of that, twice, is 1.8 times the brick's weight."""
-AT_HOME = ResetConfig(
-    demo_probability=0.0, home_gravity_std=0.0, spawn_xy=0.0, spawn_yaw=0.0, home_noise=False
-)
-"""Every episode begins at home, with nothing at random."""
+AT_HOME = ResetConfig(demo_probability=0.0, home_gravity_std=0.0, spawn_xy=0.0, spawn_yaw=0.0)
+"""Every episode begins at home, with nothing at random. The robot has no spread at home."""
 RAISED = 0.04
 """How far the lift goes [m]."""
 
@@ -36,6 +34,7 @@ def robot():
     return replace(
         spec,
         joints=tuple(replace(j, home=OPEN) if j.name == "jaw_a_slide" else j for j in spec.joints),
+        home_std=(0.0, 0.0),
     )
 
 

@@ -35,11 +35,6 @@ def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'xreset' has no attribute {name!r}")
     value = getattr(import_module(_HOMES[name]), name)
-    if not isinstance(value, type):
-        from xreset.files.checks import names_wrong_arguments
-
-        value = names_wrong_arguments(value)
-        value.__module__ = __name__  # where pickle finds it
     globals()[name] = value
     return value
 

@@ -1,6 +1,7 @@
 # The names of `import xreset`, for editors and type checkers; __init__.py imports each from here when it is first used.
 from xreset.cameras.config import CameraConfig as CameraConfig
 from xreset.cameras.config import VisionConfig as VisionConfig
+from xreset.cli.run import run as run
 from xreset.demos.archive import Demos as Demos
 from xreset.demos.archive import merge_demos as merge_demos
 from xreset.demos.archive import read_demos as read_demos

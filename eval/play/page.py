@@ -20,7 +20,7 @@ from xreset.eval.play.record import draw_film, last_moments, write_trace
 from xreset.eval.play.session import Session
 from xreset.eval.plots import COLORS
 from xreset.eval.policy_spec import PolicySpec
-from xreset.files.checks import Seed
+from xreset.files.checks import Seed, obeys_rules
 from xreset.files.text import short_name
 from xreset.physics.plugins import backend_names, robot_names
 from xreset.physics.tensors import one_thread
@@ -62,6 +62,7 @@ GROWTH = 1.03
 """Size of the goal next to the object, so that a pointer meets the goal first where both are in one place."""
 
 
+@obeys_rules
 def play(
     policy: str | Path | PolicySpec = "many-objects",
     *,

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from xreset.eval.report.read import Training
 
 _CONDITIONS = ("objects", "robot", "object meshes", "number of episodes", "seed of the evaluation")
-_PLAYED_TASK = ("task.termination.", "task.reset.spawn_", "task.reset.home_noise", "task.timestep")
+_PLAYED_TASK = ("task.termination.", "task.reset.spawn_", "task.timestep")
 """Fields of a training's task that make its evaluation easier or harder, because the evaluation keeps them
 (:func:`xreset.task.config.evaluation_task`). An evaluation may only change the length of episodes."""
 _LENGTH = "task.termination.episode_seconds"

@@ -25,7 +25,7 @@ from xreset.eval.results import (
     read_traces,
     recorded,
 )
-from xreset.files.checks import frozen, names_wrong_arguments, renamed
+from xreset.files.checks import frozen, renamed
 from xreset.files.storage import read_json
 from xreset.files.text import Brief, short_name, shown
 from xreset.geometry.description import load_robot
@@ -55,7 +55,7 @@ class Training(Brief):
     episodes: Table
     """Episodes in all engines (:meth:`xreset.EvalResult.to_frame`), where ``run`` is the label."""
     lift: Lift
-    """When the training first succeeded from home; empty without ``lift.json``."""
+    """When the training first succeeded from home; empty for runs that have no clock."""
     run: RunInfo | None = None
     """The training's configuration; None for baselines, and where this version cannot read ``run.json``."""
     choice: Choice | None = None
@@ -83,7 +83,6 @@ class Training(Brief):
         vision = self.run.config.task.vision
         return vision if vision.cameras else None
 
-    @names_wrong_arguments
     def recorded(self, robot: str | Path | RobotSpec | None = None) -> Table:
         """Return the recorded episodes in all engines: the first of each demonstration.
 

@@ -77,12 +77,11 @@ def _options(*allowed: str) -> Rule:
 
 @frozen
 class Data(Checked):
-    """Demonstrations, and the options with which reset states are made of them; or goals of objects."""
+    """Demonstrations, and the options with which reset states are made of them."""
 
     demos: str | None = None
     """An archive (``xreset demos``), relative to ``--data``. None: synthetic ones of the stand-ins."""
     synthetic_per_object: PositiveInt = 4
-    synthetic_seed: Seed = 0
     meshes: str | None = None
     """Folder of meshes, relative to ``--data``; None: the stand-ins."""
     retarget: Annotated[tuple[str, ...], _options("--jaw", "--hand.jaw", "--device")] = ()
@@ -102,14 +101,6 @@ class Data(Checked):
         ),
     ] = ()
     """Further options of ``xreset resets``."""
-    goals: Annotated[tuple[str, ...], _options("--family", "--draw.")] | None = None
-    """Options of ``xreset goals``; may be empty. The data are then starts and goals of the meshes, without
-    demonstrations, and trainings begin every episode at home."""
-
-    @property
-    def states(self) -> Literal["resets", "goals"]:
-        """Kind of the file that trainings begin with: a reset bank, or a goal set."""
-        return "resets" if self.goals is None else "goals"
 
 
 @frozen
@@ -120,8 +111,6 @@ class Evaluation(Checked):
     """Data with the starts and goals; None: the data of the policy's training."""
     objects: tuple[str, ...] = ()
     """Only these objects, where a run has them; empty: all objects of the run."""
-    unseen: bool = False
-    """Whether every run plays the objects, also a run that was not trained with them."""
     per_object: PositiveInt | None = None
     """Largest number of demonstrations of each object; None: all (of the run's own data: as many as in training)."""
     episodes: PositiveInt = 5
@@ -138,7 +127,6 @@ class Evaluation(Checked):
 class Runs(Checked):
     """Trainings that differ in seed (and, with ``alone``, object), or a baseline."""
 
-    REMOVED: ClassVar = {"gpus": 1}
     RENAMED: ClassVar = {"backend": "engine"}
     data: str
     robot: Robot = "ur7e-sharpa"
@@ -167,8 +155,6 @@ class Runs(Checked):
     engine: str = "mujoco-warp"
     device: Literal["cuda", "cpu"] = "cuda"
     num_envs: PositiveInt = 4096
-    evaluations: tuple[str, ...] = ()
-    """Names of the evaluations; empty: all."""
 
 
 @frozen
@@ -256,14 +242,10 @@ def _check_names(study: Study) -> None:
                 f"the evaluation {name!r} is a folder in every run: call it 'eval', or begin its name with 'eval-'."
             )
         _expect(f"evaluations.{name}.data", study.data, evaluation.data)
-    for name, data in study.data.items():
-        if data.goals is not None and data.demos is not None:
-            raise ValueError(f"data.{name} has both demos and goals. Give one of them.")
     trained: list[str] = []
     for name, run in study.runs.items():
         _expect(f"runs.{name}.data", study.data, run.data)
         _expect(f"runs.{name}.weights", trained, run.weights)
-        _expect(f"runs.{name}.evaluations", study.evaluations, *run.evaluations)
         if run.policy is None:
             trained.append(name)
     from xreset.eval.metrics import METRICS  # imports torch

@@ -14,7 +14,7 @@ from xreset.eval.study.steps import Run, Step, Subset, bank_todo, eval_todo, tra
 from xreset.files.checks import from_dict, merged
 from xreset.files.text import short_name
 from xreset.learning.config import TrainConfig
-from xreset.learning.recipes import from_home, starting_config
+from xreset.learning.recipes import starting_config
 from xreset.objects.catalogue import canonical_names, object_names
 from xreset.physics.plugins import backend_status
 from xreset.resets.schedule import shared_worlds
@@ -59,13 +59,10 @@ class Plan:
         return [part for part in self.parts.values() if isinstance(part, Subset)]
 
     def subset(self, name: str, objects: Iterable[str], per_object: int | None) -> Subset:
-        """Return the demonstrations, or goals, of some objects of the data."""
+        """Return the demonstrations of some objects of the data."""
         data = self.study.data[name]
         chosen = tuple(sorted(objects))
-        if data.goals is not None:
-            per_object = None
-        given = data.demos is not None or data.goals is not None
-        if given and chosen == self.objects[name]:
+        if data.demos is not None and chosen == self.objects[name]:
             chosen = ()
         shown = "+".join(short_name(each, "_") for each in chosen).replace("/", "_")
         parts = filter(None, [name, shown, str(per_object or "")])
@@ -77,7 +74,7 @@ class Plan:
         return made
 
     def bank(self, subset: Subset, robot: str) -> str:
-        """Add the step to a reset bank or goal set, and return its name."""
+        """Add the step to a reset bank, and return its name."""
         folder = subset.robot(robot)
         self.own(folder, robot)
         name = f"data {subset.folder.name} {folder.name}"
@@ -98,10 +95,7 @@ class Plan:
         data = spec.data or run.spec.data
         known = self.objects[data]
         wanted = canonical_names(spec.objects, known) or known
-        objects = [name for name in wanted if spec.unseen or name in run.objects]
-        has_goals = self.study.data[data].goals is not None
-        if has_goals and run.spec.policy == "ik":  # goals have no motion to follow
-            return
+        objects = [name for name in wanted if name in run.objects]
         engines = [engine for engine in spec.engines if engine not in self.unavailable]
         if not objects:
             return
@@ -116,7 +110,7 @@ class Plan:
             per_object = run.spec.per_object
         subset = self.subset(data, objects, per_object)
         needs = [] if run.spec.policy else [f"train {run.folder.name}"]
-        if has_goals or run.spec.policy == "ik":
+        if run.spec.policy == "ik":
             needs.append(self.bank(subset, run.spec.robot))
         name = f"{key} {run.folder.name}"
         folder = run.folder / key
@@ -155,7 +149,7 @@ def make_plan(study: Study, name: str, *, given: Path, out: Path, only: Iterable
         out=out,
         objects={key: _objects_of(data, given) for key, data in study.data.items()},
         unavailable=unavailable,
-        parts={out / folder: None for folder in ("data", "logs", "reports")},
+        parts={out / folder: None for folder in ("data", "reports")},
     )
     for group in study.runs:
         if not only or group in only:
@@ -166,7 +160,7 @@ def make_plan(study: Study, name: str, *, given: Path, out: Path, only: Iterable
         if run.config is not None:
             plan.train(run)
     for run in plan.runs:
-        for key in run.spec.evaluations or study.evaluations:
+        for key in study.evaluations:
             plan.evaluate(run, key)
     for subset in plan.subsets():
         subset.is_made()
@@ -175,8 +169,6 @@ def make_plan(study: Study, name: str, *, given: Path, out: Path, only: Iterable
 
 def _objects_of(data: Data, given: Path) -> tuple[str, ...]:
     """Return the names of the objects of the data."""
-    if data.goals is not None:
-        return object_names(given / data.meshes if data.meshes else None)
     if data.demos is None:
         return object_names()
     if not (given / data.demos).is_file():
@@ -198,8 +190,6 @@ def _runs(plan: Plan, group: str) -> Iterator[Run]:
         return
     changed = merged(asdict(starting_config(spec.recipe)), spec.config)
     config = from_dict(TrainConfig, changed, f"runs.{group}.config")
-    if plan.study.data[spec.data].goals is not None:
-        config = from_home(config)
     if own := ", ".join(config.task.reward.own):
         raise RunError(
             f"runs.{group}.config.task.reward.terms names code ({own}), which a study may not. Use xreset train."

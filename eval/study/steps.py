@@ -1,8 +1,7 @@
 """The steps of a study that are left to do, and the commands of ``xreset`` that do them.
 
-    OUT/data/SUBSET/demos.npz               demonstrations of a subset of the data, and its definition (subset.json)
+    OUT/data/SUBSET/demos.npz               demonstrations of a subset of the data, which states its definition
     OUT/data/SUBSET/ROBOT/resets.npz        reset bank, made by xreset retarget and xreset resets
-    OUT/data/SUBSET/ROBOT/goals.npz         or goal set, made by xreset goals
     OUT/RUN/                                run folder of xreset train
     OUT/RUN/EVALUATION/                     results of xreset eval
 
@@ -12,7 +11,7 @@ Studies with the same OUT share its content: a run of the same name and configur
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from itertools import chain
@@ -27,13 +26,13 @@ from xreset.errors import RunError
 from xreset.eval.results import read_result
 from xreset.eval.study.file import Data, Evaluation, Runs
 from xreset.files.checks import frozen
-from xreset.files.storage import file_hash, is_claimed, read_json, write_json
+from xreset.files.records import read_meta
+from xreset.files.storage import file_hash
 from xreset.files.text import shown
-from xreset.learning.clock import read_lift
+from xreset.learning.clock import Lift, read_lift
 from xreset.learning.config import TrainConfig
 from xreset.learning.run import checkpoints, flat, read_run
 
-SUBSET_SCHEMA = "xreset-subset/1"
 XRESET = (sys.executable, "-P", "-m", "xreset")
 """Command line of ``xreset``. ``-P``: Python files in the current folder, which may be a download, are not imported."""
 _ENOUGH = 0.97
@@ -59,14 +58,10 @@ class Step:
         """Return what is left to do, in words; empty if the step is done."""
         return self.todo()[0]
 
-    def busy(self) -> bool:
-        """Return whether another process is writing this step's folder, or a file in it."""
-        return any(map(is_claimed, (self.folder, *self.folder.glob(".*.lock"))))
-
 
 @frozen
 class Subset:
-    """Demonstrations, or goals, of some objects of a study's data."""
+    """Demonstrations of some objects of a study's data."""
 
     folder: Path
     data: Data
@@ -91,29 +86,18 @@ class Subset:
         return self.folder / Path(name).name
 
     def bank(self, robot: str) -> Path:
-        """Return the reset bank or goal set of a robot."""
-        return self.robot(robot) / f"{self.data.states}.npz"
-
-    def starts(self, robot: str) -> Path:
-        """Return the file with starts and goals that a robot's policies play."""
-        return self.demos if self.data.goals is None else self.bank(robot)
+        """Return the reset bank of a robot."""
+        return self.robot(robot) / "resets.npz"
 
     @cached_property
     def definition(self) -> dict[str, Any]:
-        """Everything that the subset's files depend on."""
+        """Everything that the archive and the banks depend on."""
         data = self.data
-        if data.goals is not None:
-            return {
-                "goals": list(data.goals),
-                "objects": list(self.objects),
-                "meshes": data.meshes,
-            }
         if data.demos:
             source: dict[str, Any] = {"demos": file_hash(self.given / data.demos)}
         else:
             source = {
                 "synthetic_per_object": data.synthetic_per_object,
-                "synthetic_seed": data.synthetic_seed,
             }
         return source | {
             "retarget": list(data.retarget),
@@ -125,26 +109,24 @@ class Subset:
 
     def is_made(self) -> bool:
         """Return whether the archive exists; refuse one of another definition."""
-        file = self.folder / "subset.json"
-        if file.is_file():
-            made = read_json(file, SUBSET_SCHEMA)
+        if self.demos.is_file():
+            made = read_meta(self.demos).get("config")
+            made = made if isinstance(made, dict) else {}
             _refuse_other(f"{self.folder} was made otherwise", "data", made, self.definition)
-        return file.is_file() and (self.data.goals is not None or self.demos.is_file())
+        return self.demos.is_file()
 
     def make(self) -> None:
-        """Write the archive, unless it exists. Goals have no archive; ``xreset goals`` writes the goal set."""
+        """Write the archive, unless it exists."""
         if self.is_made():
             return
         data = self.data
         objects = self.objects or None
-        if data.goals is None:
-            if data.demos:
-                demos = read_demos(self.given / data.demos)
-            else:
-                demos = synthesize(objects, data.synthetic_per_object, data.synthetic_seed)
-            chosen = demos.select(objects=objects, max_per_object=self.per_object)
-            write_demos(self.demos, chosen, config=self.definition)
-        write_json(self.folder / "subset.json", {"schema": SUBSET_SCHEMA} | self.definition)
+        if data.demos:
+            demos = read_demos(self.given / data.demos)
+        else:
+            demos = synthesize(objects, data.synthetic_per_object)
+        chosen = demos.select(objects=objects, max_per_object=self.per_object)
+        write_demos(self.demos, chosen, config=self.definition)
 
 
 @frozen
@@ -169,7 +151,7 @@ class Run:
 
     @property
     def bank(self) -> Path:
-        """The run's reset bank or goal set."""
+        """The run's reset bank."""
         return self.subset.bank(self.spec.robot)
 
     def check(self) -> None:
@@ -216,15 +198,12 @@ def _refuse_other(problem: str, what: str, found: dict[str, Any], wanted: dict[s
 
 
 def bank_todo(subset: Subset, robot: str) -> Todo:
-    """Return what is left to do for a robot's reset bank, or for its goal set."""
+    """Return what is left to do for a robot's reset bank."""
     folder = subset.robot(robot)
     motion = folder / "retargeted.npz"
     bank = subset.bank(robot)
     if bank.is_file():
         return "", []
-    if subset.data.goals is not None:
-        goals = _xreset("goals", *subset.objects, robot=robot, out=bank, meshes=subset.meshes)
-        return "to do", [[*goals, *subset.data.goals]]
     commands = []
     if not motion.is_file():
         retarget = _xreset("retarget", subset.demos, robot=robot, out=motion, meshes=subset.meshes)
@@ -234,29 +213,33 @@ def bank_todo(subset: Subset, robot: str) -> Todo:
     return "to do", [*commands, [*resets, *subset.data.resets]]
 
 
+def is_trained(done: Lift, iterations: int, minutes: float | None) -> bool:
+    """Return whether a training has done its iterations, or nearly all of its minutes where they are limited."""
+    is_over = minutes is not None and done.minutes >= _ENOUGH * minutes
+    return is_over or done.iteration >= iterations
+
+
 def train_todo(run: Run) -> Todo:
     """Return what is left to do of a training: start it, or continue from its newest checkpoint."""
     spec = run.spec
     now = read_lift(run.folder)
     assert run.config is not None
     iterations = run.config.iterations
+    if is_trained(now, iterations, spec.minutes):
+        return "", []
     left = f"{now.iteration} of {iterations} iterations" if now.iteration else "not begun"
     length = {"out": run.folder, "iterations": iterations}
-    is_enough = now.iteration >= iterations or now.reaches(run.config.target_success)
     if spec.minutes is not None:
-        is_enough = is_enough or now.minutes >= _ENOUGH * spec.minutes
         length["minutes"] = f"{spec.minutes - now.minutes:.4g}"
         if now.iteration:
             left += f", {now.minutes:.1f} of {spec.minutes:g} minutes"
-    if is_enough:
-        return "", []
     if checkpoints(run.folder):
         return left, [_xreset("train", **length, resume=True)]
     command = _xreset(
         "train",
         **length,
         robot=spec.robot,
-        **{run.subset.data.states: run.bank},
+        resets=run.bank,
         engine=spec.engine,
         device=spec.device,
         num_envs=spec.num_envs,
@@ -272,7 +255,7 @@ def train_todo(run: Run) -> Todo:
 def eval_todo(run: Run, folder: Path, spec: Evaluation, subset: Subset, engines: list[str]) -> Todo:
     """Return the engines in which an evaluation has no result, or a result of other episodes or files."""
     policy = run.spec.policy
-    demos = subset.starts(run.spec.robot)
+    demos = subset.demos
     if policy == "ik":
         demos = subset.robot(run.spec.robot) / "retargeted.npz"
     command = _xreset(
@@ -290,20 +273,48 @@ def eval_todo(run: Run, folder: Path, spec: Evaluation, subset: Subset, engines:
     files = {"demos": demos}
     if policy is None:
         files["policy"] = run.folder / "policy.onnx"
-    hashes = {name: file_hash(file) for name, file in files.items() if file.is_file()}
     trained = (run.config or TrainConfig()).task.termination.episode_seconds
-    wanted = (spec.seed, spec.episodes, spec.episode_seconds or trained)
     missing = []
     for engine in engines:
-        file = folder / f"{engine}.json"
-        if file.is_file():
-            result = read_result(file)
-            played = (result.seed, result.episodes_per_demo, result.episode_seconds or trained)
-            if played == wanted and hashes.items() <= result.inputs.items():
-                continue
-        missing.append(engine)
-        command += ["--engine", engine]
+        if not is_evaluated(
+            folder / f"{engine}.json",
+            files,
+            seed=spec.seed,
+            episodes=spec.episodes,
+            seconds=spec.episode_seconds or trained,
+            trained=trained,
+        ):
+            missing.append(engine)
+            command += ["--engine", engine]
     return (f"in {', '.join(missing)}", [command]) if missing else ("", [])
+
+
+def is_evaluated(
+    result: Path,
+    files: Mapping[str, Path],
+    *,
+    seed: int,
+    episodes: int,
+    seconds: float | None = None,
+    trained: float | None = None,
+) -> bool:
+    """Return whether an engine's results are those of certain episodes and files.
+
+    Args:
+        result: file of the engine's results.
+        files: the files as they are now, by their name in the results; those that do not exist are not compared.
+        seed: seed of the starts.
+        episodes: episodes of each demonstration.
+        seconds: length of an episode [s]; None: as in the policy's training.
+        trained: length of an episode in the policy's training [s], for results that do not state a length.
+    """
+    if not result.is_file():
+        return False
+    found = read_result(result)
+    hashes = {name: file_hash(file) for name, file in files.items() if file.is_file()}
+    played = (found.seed, found.episodes_per_demo, found.episode_seconds or trained)
+    is_same = played == (seed, episodes, seconds)
+    return is_same and hashes.items() <= found.inputs.items()
 
 
 def _with_tables(changes: dict[str, Any], config: Any) -> dict[str, Any]:

@@ -11,23 +11,25 @@ from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Callable
 from importlib import import_module
 from io import TextIOWrapper
-from typing import Any, NoReturn
+from shutil import get_terminal_size
+from textwrap import fill
+from typing import NoReturn
 
 COMMANDS = {
     "run": "Take demonstrations to a trained, evaluated policy: all steps with one command.",
-    "demos": "Import, synthesize, select, merge and describe human demonstrations.",
-    "objects": "List objects, import meshes, and make random shapes.",
-    "robots": "List, check, import, place and judge robots.",
-    "engines": "List, check and compare physics engines, and trace where they diverge.",
+    "demos": "Import, synthesize, select and describe human demonstrations.",
+    "objects": "Import meshes, and make random shapes.",
+    "robots": "Check, import, place and judge robots.",
+    "engines": "Check and compare physics engines, and trace where they diverge.",
     "retarget": "Turn human demonstrations into robot motion.",
     "resets": "Test robot states in physics and keep the stable ones.",
     "goals": "Give any object goals, without demonstrations.",
     "view": "Show demonstrations, robot motion, resets or goals in a browser, or as pictures.",
     "play": "Play with a policy in a browser: drag the goal, push the robot, change the engine.",
-    "train": "Train a policy.",
-    "distill": "Train a policy that sees, by imitating one that is told the object's pose.",
+    "train": "Train a policy by its rewards, or a student that sees, from a teacher.",
     "policies": "List the policies that ship with xreset.",
     "eval": "Evaluate a policy or a baseline in one or several engines.",
     "stress": "Measure robustness: change stiffness, latency, friction or a robot's faults, one at a time.",
@@ -39,8 +41,9 @@ COMMANDS = {
 }
 """Command -> one line of help.
 
-The module ``xreset.cli.NAME`` has ``COMMAND``, a function or a dictionary of sub-commands. If defaults depend on the
-arguments, it has ``command_for`` instead, which returns the function for some arguments."""
+The module ``xreset.cli.NAME`` has ``COMMAND``, a function or a dictionary of sub-commands; the one without a name runs
+if no verb is given. If defaults depend on the arguments, it has ``command_for`` instead, which returns the function for
+some arguments."""
 
 INVOCATION: list[str] = []
 """Arguments of the command that is running."""
@@ -65,9 +68,8 @@ def main(argv: list[str] | None = None) -> None:
 
         print(f"xreset {code_version()}")
         return
-    INVOCATION[:] = argv
     try:
-        _run(argv)
+        perform(argv)
     except XResetError as error:
         _fail(argv, str(error))
     except ModuleNotFoundError as error:
@@ -100,9 +102,13 @@ _RENAMED = {
     "--fault": "--property",
 }
 """Flag of earlier versions -> its present name."""
-_MOVED = {"rehearse": ["stress", "--faults"], "compare": ["report"]}
+_MOVED = {
+    "rehearse": ["stress", "--faults"],
+    "compare": ["report"],
+    "distill": ["train", "--teacher"],
+}
 """Command of earlier versions -> its present words."""
-_NAME_OBJECTS = (["demos", "synth"], ["demos", "select"], ["demos", "split"])
+_NAME_OBJECTS = (["demos", "synth"], ["demos", "select"])
 """Commands whose ``--objects`` are names of objects, and always were."""
 
 
@@ -115,6 +121,8 @@ def _with_present_flags(argv: list[str]) -> list[str]:
             f"xreset: {earlier} is now {' '.join(present)}. The next release removes {earlier}.",
             file=sys.stderr,
         )
+        if earlier == "distill" and argv[1:2] and argv[1].startswith("-"):
+            present = ["train"]  # continues a run, and names no teacher
         argv = [*present, *argv[1:]]
     changed = dict(_RENAMED)
     if argv[:2] in _NAME_OBJECTS:
@@ -125,6 +133,8 @@ def _with_present_flags(argv: list[str]) -> list[str]:
         flag, equals, value = word.partition("=")
         if flag in changed:
             used[flag] = changed[flag]
+        if flag.startswith("--vision."):
+            changed[flag] = f"--config.task.{flag[2:]}"
         words.append(changed.get(flag, flag) + equals + value)
     for earlier, flag in used.items():
         print(
@@ -151,9 +161,10 @@ def _fail(argv: list[str], message: str) -> NoReturn:
     raise SystemExit(1) from None
 
 
-def _run(argv: list[str]) -> None:
-    """Run the command that the first argument names."""
-    if not argv or argv[0] in ("-h", "--help"):
+def perform(argv: list[str]) -> None:
+    """Run the command that the first argument names. Its errors are raised."""
+    INVOCATION[:] = argv
+    if not argv or asks_for_help(argv[:1]):
         print(_usage())
         return
     name = argv[0]
@@ -164,32 +175,53 @@ def _run(argv: list[str]) -> None:
     module = import_module(f"xreset.cli.{name}")
     import tyro
 
-    from xreset.cli._options import OPTIONAL, checked
+    from xreset.cli._options import RULES, checked, description, fitted
+
+    def call(function: Callable[..., None], words: list[str], *verb: str) -> None:
+        tyro.cli(
+            checked(function),
+            args=words,
+            prog=" ".join(("xreset", name, *verb)),
+            description=description(function),
+            registry=RULES,
+        )
 
     command = module.command_for(arguments) if hasattr(module, "command_for") else module.COMMAND
-    how: dict[str, Any] = {
-        "prog": f"xreset {name}",
-        "description": COMMANDS[name],
-        "registry": OPTIONAL,
-    }
+    if arguments[:1] == ["list"]:  # as in earlier versions
+        arguments = arguments[1:]
     if not isinstance(command, dict):
-        tyro.cli(checked(command), args=arguments, **how)
+        call(command, arguments)
         return
-    for words in (2, 1):  # a verb may have two words
-        verb = " ".join(arguments[:words])
-        if verb in command:
-            tyro.cli(
-                checked(command[verb]),
-                args=arguments[words:],
-                prog=f"xreset {name} {verb}",
-                registry=OPTIONAL,
-            )
+    text = COMMANDS[name]
+    if "" in command:
+        if not arguments or (arguments[0].startswith("-") and not asks_for_help(arguments[:1])):
+            call(command[""], arguments)
             return
-    verbs = {verb: checked(function) for verb, function in command.items()}
-    tyro.extras.subcommand_cli_from_dict(verbs, args=arguments, **how)
+        text += f"\n\nxreset {name} without a verb: {description(command[''])}"
+    for count in (2, 1):  # a verb may have two words
+        verb = " ".join(arguments[:count])
+        if verb in command:
+            call(command[verb], arguments[count:], verb)
+            return
+    tyro.extras.subcommand_cli_from_dict(
+        {verb: checked(function) for verb, function in command.items() if verb},
+        args=arguments,
+        prog=f"xreset {name}",
+        description=fitted(text),
+        registry=RULES,
+    )
+
+
+def asks_for_help(arguments: list[str]) -> bool:
+    """Return whether help is among the arguments."""
+    return not {"-h", "--help"}.isdisjoint(arguments)
 
 
 def _usage() -> str:
     width = max(map(len, COMMANDS))
-    lines = "\n".join(f"  {name:<{width}}  {text}" for name, text in COMMANDS.items())
+    columns = get_terminal_size().columns
+    lines = "\n".join(
+        fill(f"  {name:<{width}}  {text}", columns, subsequent_indent=" " * (width + 4))
+        for name, text in COMMANDS.items()
+    )
     return f"usage: xreset COMMAND ...\n\n{lines}\n\nxreset COMMAND --help shows the options of one command."

@@ -12,7 +12,9 @@ from tyro.conf import Positional, UseAppendAction, arg
 from xreset.cli import INVOCATION
 from xreset.cli._terminal import console, show_table
 from xreset.errors import RunError
+from xreset.files import checks
 from xreset.files.storage import code_version, file_hash, write_json
+from xreset.physics.plugins import Device as DeviceName
 from xreset.physics.plugins import backend_names, backend_status
 from xreset.retarget.accounts import Account, described
 
@@ -36,7 +38,7 @@ Flat = Annotated[_T, arg(name="")]
 
 # Options that several commands share, with their help -----------------------------------------------------------------
 
-_POLICY = "Run folder, exported policy (.onnx), or name of a policy that ships with xreset (xreset policies list)"
+_POLICY = "Run folder, exported policy (.onnx), or name of a policy that ships with xreset (xreset policies)"
 Policy = Annotated[Name, arg(help=f"{_POLICY}.")]
 PolicyOrBaseline = Annotated[
     Name, arg(help=f"{_POLICY}; or a baseline: zero, random, ik (open-loop kinematic retargeting).")
@@ -46,6 +48,10 @@ Robot = Annotated[
     str | None, arg(help="Name or folder of the robot; default: the policy's, or the file's.")
 ]
 Meshes = Annotated[Path | None, arg(help="Folder of real meshes; default: the built-in stand-ins.")]
+MotionMeshes = Annotated[
+    Path | None,
+    arg(help="Folder of real meshes; default: that of the motion, else the stand-ins."),
+]
 TrainedMeshes = Annotated[
     Path | None,
     arg(help="Folder of real meshes; default: that of the training, else the stand-ins."),
@@ -56,11 +62,11 @@ AllEngines = Annotated[
     arg(help="Physics engine; give it again for more. Default: all that can be used here."),
 ]
 Device = Annotated[
-    str,
+    DeviceName,
     arg(help="Where engines run that can use a GPU: cpu or cuda; the others run on the CPU."),
 ]
 Host = Annotated[str, arg(help="Address to serve at; 0.0.0.0 allows other machines.")]
-Port = Annotated[int, arg(help="Port to serve at; if it is taken, the next free one.")]
+Port = Annotated[checks.Port, arg(help="Port to serve at; if it is taken, the next free one.")]
 
 
 def usable_engines() -> list[str]:
@@ -91,8 +97,7 @@ def refuse_changes(out: Path, **options: Any) -> None:
 
     Args:
         out: the run's folder.
-        options: values by name of the option. ``resets`` and ``goals`` are files; ``teacher`` is empty if it was not
-            given.
+        options: values by name of the option. ``resets`` and ``goals`` are files.
 
     Raises:
         RunError: an option differs; the message names the first.
@@ -105,9 +110,8 @@ def refuse_changes(out: Path, **options: Any) -> None:
     is_joined = Path(info.resets).resolve().parent == out.resolve()
     joined = is_joined and None not in [options.get(name) for name in files]
     for name, value in options.items():
-        flag = "TEACHER" if name == "teacher" else f"--{name.replace('_', '-')}"
-        is_given = bool(value) if name == "teacher" else flag in given_flags()
-        if not is_given or (joined and name in files):
+        flag = f"--{name.replace('_', '-')}"
+        if flag not in given_flags() or (joined and name in files):
             continue
         if name in files:
             found = info.resets
@@ -123,20 +127,25 @@ def refuse_changes(out: Path, **options: Any) -> None:
             )
 
 
+def measured(content: dict[str, Any]) -> dict[str, Any]:
+    """Return results with the version and the command that measured them."""
+    return content | {"xreset_version": code_version(), "command": this_command()}
+
+
 def write_measured(path: Path | None, content: dict[str, Any]) -> None:
     """Write results with the version and the command that measured them; path None: write nothing."""
     if path is not None:
-        made_by = {"xreset_version": code_version(), "command": this_command()}
-        write_json(path, content | made_by)
+        write_json(path, measured(content))
         console.print(f"wrote {path}")
 
 
 def this_command() -> str:
-    """Return the running command as text, without the folders of files and without ``--json FILE``."""
+    """Return the running command as text, without the folders of files and the files of the results."""
     words = list(INVOCATION)
-    if "--json" in words:
-        i = words.index("--json")
-        del words[i : i + 2]
+    for flag in ("--json", "--page"):
+        if flag in words:
+            i = words.index(flag)
+            del words[i : i + 2]
     names = [Path(word).name if Path(word).exists() else word for word in words]
     return shlex.join(["xreset", *names])
 

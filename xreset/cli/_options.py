@@ -1,40 +1,68 @@
-"""Check the options of a command, by their names, before the command begins, and show them."""
+"""Commands as functions: what their signatures say about their options is checked before they begin, and shown."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import replace
-from functools import partial, wraps
-from inspect import signature
+from dataclasses import dataclass, is_dataclass, replace
+from functools import partial
+from inspect import cleandoc, signature
 from pathlib import Path
+from shutil import get_terminal_size
+from textwrap import fill
 from types import NoneType, UnionType
-from typing import Any, Union, get_args
+from typing import Annotated, Any, Union, get_args, get_type_hints
 
-from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+from tyro.conf import arg
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+    StructConstructorSpec,
+    StructTypeInfo,
+)
 
 from xreset.errors import XResetError
-from xreset.files.checks import LARGEST_SEED, LAST_PORT, Options
+from xreset.files.checks import Options, check_value, marks_in, marks_of
 from xreset.files.storage import check_suffix, claim
-from xreset.physics.plugins import existing_device
 
-_COUNTS = {
-    "num_envs", "iterations", "episodes", "states", "grasps", "per_object", "max_per_object", "perturbed",
-    "most", "processes",
-}  # fmt: skip
-"""Whole numbers from 1."""
-_INDICES = {"seed", "episode", "repetition", "sequence", "frame", "port"}
-"""Whole numbers from 0."""
-_WRITTEN = ("out", "rest", "png", "mp4", "picture", "json")
-"""Files or folders that a command writes."""
-_SUFFIXES = {"png": ".png", "mp4": ".mp4", "picture": ".png"}
-"""How the name of a file ends that can be written in one format only."""
-_IN_PLACE = {"policy"}
-"""Options that may name the same file as the output."""
 _LONGEST = 1000
 """Largest number of characters of a text or a file name, because messages repeat them."""
+
+
+@dataclass(frozen=True)
+class Written:
+    """Marks the path of a file or folder that a command writes, in its annotation."""
+
+    suffix: str = ""
+    """How the name of a file must end; empty: any way."""
+
+
+Output = Annotated[Path, Written()]
+"""File or folder that a command writes. It is claimed, and is no other path that the command gets."""
+Png = Annotated[Path, Written(".png")]
+Mp4 = Annotated[Path, Written(".mp4")]
+
+
+@dataclass(frozen=True)
+class _Option:
+    """An option of a command, as it was given."""
+
+    name: str
+    value: Any
+    marks: list[Any]
+
+    @property
+    def flag(self) -> str:
+        return f"--{self.name.replace('_', '-')}"
+
+    @property
+    def written(self) -> Written | None:
+        """The mark of a path that is written; None for other options, and if there is no path."""
+        found = [mark for mark in self.marks if isinstance(mark, Written)]
+        return found[0] if found and isinstance(self.value, Path) else None
 
 
 def checked(command: Callable[..., None]) -> Callable[..., None]:
@@ -42,44 +70,93 @@ def checked(command: Callable[..., None]) -> Callable[..., None]:
     if isinstance(command, partial):
         return partial(checked(command.func), **command.keywords)
 
-    @wraps(command)
+    hints = get_type_hints(command, include_extras=True)
+
     def run(*positional: Any, **named: Any) -> None:
-        options: dict[str, Any] = {}
-        for name, value in signature(command).bind(*positional, **named).arguments.items():
-            options |= vars(value) if isinstance(value, Options) else {name: value}
-        _check(options)
+        given = signature(command).bind(*positional, **named).arguments
+        options = list(_options_of(given, hints))
+        for option in options:
+            _check(option)
+        _check_overwriting(options)
         with ExitStack() as claims:
-            for name in _WRITTEN:
-                path = options.get(name)
+            for option in options:
                 # the function that writes into a folder claims it; its name may have a dot as well
-                if not isinstance(path, Path) or not path.suffix or path.is_dir():
-                    continue
-                if path.parent.is_dir():
+                path = option.value
+                is_file = option.written and path.suffix and not path.is_dir()
+                if is_file and path.parent.is_dir():
                     claims.enter_context(claim(path))
             command(*positional, **named)
 
-    run.__doc__ = _reflowed(command.__doc__ or "")
+    run.__doc__ = _shortened(command.__doc__ or "")
+    run.__annotations__ = {**hints}
+    for each in signature(command).parameters.values():
+        if each.default is None:  # the text says what happens then
+            run.__annotations__[each.name] = Annotated[hints[each.name], arg(help_behavior_hint="")]
+    vars(run)["__signature__"] = signature(command)
     return run
 
 
-def _reflowed(docstring: str) -> str:
-    """Return a docstring with each paragraph and each argument's text on one line, because the terminal's width decides
-    where lines end."""
-    lines: list[str] = []
-    for line in docstring.splitlines():
-        begins = not line.strip() or re.match(r"    (Args:|    \w+: )", line)
-        if begins or not lines or not lines[-1].strip() or lines[-1].endswith("Args:"):
-            lines.append(line)
-        else:
-            lines[-1] += f" {line.strip()}"
-    return "\n".join(lines)
+def description(command: Callable[..., None]) -> str:
+    """Return what a command does."""
+    if isinstance(command, partial):
+        return description(command.func)
+    return fitted(cleandoc(command.__doc__ or "").partition("\nArgs:\n")[0].strip())
 
 
-OPTIONAL = ConstructorRegistry()
-"""How options that may be left out are read and shown: as ``PATH``, and not as ``{None}|PATH``."""
+def fitted(text: str) -> str:
+    """Return paragraphs in lines that end where the terminal ends."""
+    width = get_terminal_size().columns
+    # tyro joins lines, except to one that begins with a space
+    lines = [
+        fill(" ".join(each.split()), width, subsequent_indent=" ") for each in text.split("\n\n")
+    ]
+    return "\n\n".join(lines)
 
 
-@OPTIONAL.primitive_rule
+def _shortened(docstring: str) -> str:
+    """Return the first sentence of a docstring, for lists of commands, and its arguments, each in one line."""
+    text, _, arguments = cleandoc(docstring).partition("\nArgs:\n")
+    first = " ".join(text.partition("\n\n")[0].split())
+    entries = re.sub(r"\n {5,}", " ", arguments)
+    return f"{first}\n\nArgs:\n{entries}" if entries else first
+
+
+RULES = ConstructorRegistry()
+"""How options are read and shown, where it is not as tyro does: ``PATH`` in place of ``{None}|PATH``."""
+
+
+_ASKED: list[StructTypeInfo] = []
+"""Groups of options that tyro's own rule is describing."""
+
+
+@RULES.struct_rule
+def _group(info: StructTypeInfo) -> StructConstructorSpec | None:
+    """Describe the options of a dataclass as tyro does, each in one line."""
+    if not is_dataclass(info.type) or any(info is asked for asked in _ASKED):
+        return None
+    _ASKED.append(info)
+    spec = ConstructorRegistry.get_struct_spec(info)
+    _ASKED.pop()
+    if not isinstance(spec, StructConstructorSpec):
+        return None
+    fields = []
+    for field in spec.fields:
+        text = field.helptext() if callable(field.helptext) else field.helptext
+        fields.append(replace(field, helptext=" ".join(text.split()) if text else None))
+    return replace(spec, fields=tuple(fields))
+
+
+@RULES.primitive_rule
+def _path(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """Read what may be a text or a path as a path."""
+    if {*get_args(info.type)} - {NoneType} != {str, Path}:
+        return None
+    kind = Path | None if NoneType in get_args(info.type) else Path
+    spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(kind, info.markers))
+    return spec if isinstance(spec, PrimitiveConstructorSpec) else None
+
+
+@RULES.primitive_rule
 def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
     parts = get_args(info.type)
     if info.type_origin not in (Union, UnionType) or len(parts) != 2 or parts[1] is not NoneType:
@@ -97,40 +174,39 @@ def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
     )
 
 
-def _check(options: dict[str, Any]) -> None:
-    for name, value in options.items():
-        flag = f"--{name.replace('_', '-')}"
-        if isinstance(value, bool) or value is None:
-            continue
-        if name in _COUNTS or name in _INDICES:
-            low = 1 if name in _COUNTS else 0
-            high = LAST_PORT if name == "port" else LARGEST_SEED
-            if not low <= value <= high:
-                raise XResetError(
-                    f"{flag} is {value}, expected a whole number from {low} to {high}."
-                )
-        if name in _SUFFIXES:
-            check_suffix(flag, value, _SUFFIXES[name])
-        for text in value if isinstance(value, tuple) else (value,):
-            if isinstance(text, str | Path) and len(str(text)) > _LONGEST:
-                raise XResetError(
-                    f"{flag} has {len(str(text))} characters, expected at most {_LONGEST}."
-                )
-        if isinstance(value, float) and math.isnan(value):
-            raise XResetError(f"{flag} is not a number.")
-        if name == "device" and isinstance(value, str):
-            existing_device(value)
-    _check_overwriting(options)
+def _options_of(given: Mapping[str, Any], hints: Mapping[str, Any]) -> Iterator[_Option]:
+    """Yield the options of a command; those of a group of options one by one."""
+    for name, value in given.items():
+        if isinstance(value, Options):
+            for field, marks in marks_of(type(value)).items():
+                yield _Option(field, getattr(value, field), marks)
+        else:
+            yield _Option(name, value, marks_in(hints[name]))
 
 
-def _check_overwriting(options: dict[str, Any]) -> None:
-    given = {name: value for name, value in options.items() if isinstance(value, Path)}
-    for name in _WRITTEN:
-        if name not in given or given[name].is_dir():
+def _check(option: _Option) -> None:
+    """Refuse a value that is against the rules of the option's type."""
+    check_value(option.flag, option.value, option.marks)
+    if option.written and option.written.suffix:
+        check_suffix(option.flag, option.value, option.written.suffix)
+    for text in option.value if isinstance(option.value, tuple) else (option.value,):
+        if isinstance(text, str | Path) and len(str(text)) > _LONGEST:
+            raise XResetError(
+                f"{option.flag} has {len(str(text))} characters, expected at most {_LONGEST}."
+            )
+    if isinstance(option.value, float) and math.isnan(option.value):
+        raise XResetError(f"{option.flag} is not a number.")
+
+
+def _check_overwriting(options: list[_Option]) -> None:
+    """Refuse an output file that is another file of the command."""
+    paths = [option for option in options if isinstance(option.value, Path)]
+    for option in paths:
+        if not option.written or option.value.is_dir():
             continue
-        for other, path in given.items():
-            if other not in (name, *_IN_PLACE) and path.resolve() == given[name].resolve():
+        for other in paths:
+            if other is not option and other.value.resolve() == option.value.resolve():
                 raise XResetError(
-                    f"--{name} is {path}, which is also the {other.replace('_', ' ')}. "
+                    f"{option.flag} is {option.value}, which is also the {other.name.replace('_', ' ')}. "
                     "Nothing was overwritten; choose another file."
                 )

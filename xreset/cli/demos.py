@@ -1,4 +1,4 @@
-"""``xreset demos``: import, synth, select, split, merge, mirror, noise, info."""
+"""``xreset demos``: import, synth, select, info."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from xreset.cli._common import Flat, Source, Sources
+from xreset.cli._common import Flat, Meshes, Source, Sources
+from xreset.cli._options import Output
 from xreset.cli._terminal import Progress, console, show_notes, show_table
 from xreset.errors import DemoError
-from xreset.files.checks import Options, frozen
+from xreset.files.checks import Options, PositiveInt, Seed, Share, frozen
 from xreset.files.storage import file_hash
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 Side = Literal["right", "left", "both"]
 
 
-def import_dexycb(folder: Source, *, out: Path) -> None:
+def import_dexycb(folder: Source, *, out: Output) -> None:
     """Read DexYCB in its own layout and write an archive of demonstrations.
 
     Args:
@@ -34,30 +35,10 @@ def import_dexycb(folder: Source, *, out: Path) -> None:
     _save(demos, out, {"dataset": "dexycb"})
 
 
-def import_ho3d(folder: Source, *, out: Path, fps: float, cameras: Path) -> None:
-    """Read HO-3D (versions 2 and 3) in its own layout and write an archive of demonstrations. This was not yet tried on
-    the original files.
-
-    Args:
-        folder: The folder that holds `train`.
-        out: Archive to write.
-        fps: Frames per second; the files do not state it.
-        cameras: File with the camera's pose in the table frame (4x4, metres, as text; x right, y down, z
-            forward) for all sequences; or a folder with SEQUENCE.txt, where sequences without one are left out.
-    """
-    from xreset.demos.ho3d import read_ho3d
-
-    demos = read_ho3d(folder, fps=fps, cameras=cameras)
-    _save(demos, out, {"dataset": "ho3d", "fps": fps})
-    every = {path.parent.name for path in folder.glob("train/*/meta")}
-    if without := sorted(every.difference(demos.sequence_name)):
-        show_notes([f"left out, because {cameras} has no camera's pose: {', '.join(without)}"])
-
-
 def import_keypoints(
     path: Source,
     *,
-    out: Path,
+    out: Output,
     order: Literal["mano", "mediapipe", "openpose"],
     units: Literal["m", "mm"],
     coordinates: Literal["table", "camera"],
@@ -113,10 +94,10 @@ def import_keypoints(
 
 def synth(
     *,
-    out: Path,
+    out: Output,
     objects: tuple[str, ...] = (),
-    per_object: int = 4,
-    seed: int = 0,
+    per_object: PositiveInt = 4,
+    seed: Seed = 0,
     fps: float = 30.0,
     side: Side = "right",
     meshes: Path | None = None,
@@ -171,13 +152,13 @@ class Selection(Options):
     """Only sequences that these persons demonstrated."""
     side: Side = "both"
     """Only sequences of this hand."""
-    per_object: int | None = None
+    per_object: PositiveInt | None = None
     """Keep at most this many sequences of each object."""
-    share: float = 1.0
+    share: Share = 1.0
     """Keep this share of each object's sequences, at least one: a number from 0 to 1."""
     pick: Literal["first", "spread", "random"] = "first"
     """Which sequences --per-object and --share keep: the first, sequences spread over the archive, or random ones."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of --pick random."""
 
     def conditions(self) -> dict[str, Any]:
@@ -198,100 +179,50 @@ class Selection(Options):
         }
 
 
-def select(file: Source, *, out: Path, selection: Flat[Selection] = Selection()) -> None:
-    """Take some sequences out of an archive.
+def select(
+    files: Sources,
+    *,
+    out: Output,
+    rest: Output | None = None,
+    selection: Flat[Selection] = Selection(),
+    mirror: bool = False,
+    meshes: Meshes = None,
+) -> None:
+    """Take sequences out of one or several archives, which have the same frame rate; without conditions, all of them.
 
     Args:
-        file: Archive of demonstrations.
+        files: Archives of demonstrations, whose sequences have different names.
         out: Archive to write.
+        rest: Archive to write: the sequences that do not meet the conditions, such as those of a test.
         selection: Conditions.
-    """
-    _save(
-        _read(file).select(**selection.conditions()), out, {"select": asdict(selection)}, demos=file
-    )
-
-
-def split(file: Source, *, out: Path, rest: Path, selection: Flat[Selection] = Selection()) -> None:
-    """Split an archive into two, for training and test: what the options select, and the rest.
-
-    Args:
-        file: Archive of demonstrations.
-        out: Archive to write: the sequences that meet the conditions.
-        rest: Archive to write: all other sequences.
-        selection: Conditions.
-    """
-    kept, others = _read(file).split(**selection.conditions())
-    _save(kept, out, {"select": asdict(selection)}, demos=file)
-    _save(others, rest, {"select_others": asdict(selection)}, demos=file)
-
-
-def merge(files: Sources, *, out: Path) -> None:
-    """Merge archives of one frame rate, whose sequences have different names.
-
-    Args:
-        files: Archives of demonstrations.
-        out: Archive to write.
+        mirror: Take left hands only, and mirror them, so that a right-handed robot can train on them. Objects that are
+            not their own mirror image are listed and left out.
+        meshes: Folder of real meshes, whose symmetry --mirror needs; default: the built-in stand-ins.
     """
     from xreset.demos.archive import merge_demos
 
     inputs = {f"demos {i}": file for i, file in enumerate(files)}
-    _save(merge_demos([*map(_read, files)]), out, {"merge": len(files)}, **inputs)
+    demos = merge_demos([*map(_read, files)])
+    if rest is None:
+        kept = demos.select(**selection.conditions())
+    else:
+        kept, others = demos.split(**selection.conditions())
+        _save(others, rest, {"select_others": asdict(selection)}, **inputs)
+    if mirror:
+        kept = _mirrored(kept.select(sides=["left"]), meshes)
+    _save(kept, out, {"select": asdict(selection), "mirrored": mirror}, **inputs)
 
 
-def reflect(
-    file: Source,
-    *,
-    out: Path,
-    meshes: Path | None = None,
-    tolerance: float = 0.004,
-) -> None:
-    """Mirror demonstrations of left hands, so that a right-handed robot can train on them.
-
-    Only objects that are their own mirror image within the tolerance can be mirrored; the others are
-    listed.
-
-    Args:
-        file: Archive with left hands.
-        out: Archive to write.
-        meshes: Folder of real meshes; default: the built-in stand-ins.
-        tolerance: Largest distance between an object's surface and its reflection, over 95 % of it [m].
-    """
+def _mirrored(demos: Demos, meshes: Path | None) -> Demos:
+    """Mirror demonstrations, and print how symmetric the objects are."""
     from xreset.demos.archive import demo_objects
-    from xreset.demos.mirror import mirrored, symmetry
+    from xreset.demos.mirror import TOLERANCE, mirrored, symmetry
 
-    demos = _read(file).select(sides=["left"])
     symmetries = {name: symmetry(spec) for name, spec in demo_objects(demos, meshes).items()}
     for name, found in sorted(symmetries.items()):
-        verdict = "mirrored" if found.deviation <= tolerance else "left out: not symmetric enough"
+        verdict = "mirrored" if found.deviation <= TOLERANCE else "left out: not symmetric enough"
         console.print(f"{name}: {1e3 * found.deviation:.1f} mm from its reflection, {verdict}")
-    _save(
-        mirrored(demos, symmetries, tolerance=tolerance),
-        out,
-        {"mirrored": True, "tolerance": tolerance},
-        demos=file,
-    )
-
-
-def add_noise(
-    file: Source, *, out: Path, tier: Literal["low", "medium", "high"] = "medium", seed: int = 0
-) -> None:
-    """Add the errors of a worse hand tracker to demonstrations: the published paper's tiers.
-
-    Args:
-        file: Archive of demonstrations.
-        out: Archive to write.
-        tier: The hand is off by at most 10, 20 or 40 mm along each axis, and each keypoint of its fingers by 3, 6 or
-            12 mm, before the bones get their lengths back.
-        seed: Seed of the errors.
-    """
-    from xreset.demos.noise import TIERS, with_noise
-
-    _save(
-        with_noise(_read(file), **TIERS[tier], seed=seed),
-        out,
-        {"noise": tier, "seed": seed},
-        demos=file,
-    )
+    return mirrored(demos, symmetries)
 
 
 def describe(file: Source, *, meshes: Path | None = None) -> None:
@@ -358,13 +289,8 @@ def _print_summary(demos: Demos, path: Path, meshes: Path | None) -> None:
 
 COMMAND = {
     "import dexycb": import_dexycb,
-    "import ho3d": import_ho3d,
     "import keypoints": import_keypoints,
     "synth": synth,
     "select": select,
-    "split": split,
-    "merge": merge,
-    "mirror": reflect,
-    "noise": add_noise,
     "info": describe,
 }

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from rich.text import Text
-from tyro.conf import UseAppendAction, arg
+from tyro.conf import arg
 
 from xreset.cli._common import (
     AllEngines,
@@ -19,13 +19,16 @@ from xreset.cli._common import (
     Robot,
     Several,
     Source,
+    measured,
     quick_engines,
     usable_engines,
     write_measured,
 )
+from xreset.cli._options import Output
 from xreset.cli._terminal import Progress, console, show_table
 from xreset.errors import XResetError
 from xreset.eval.setting import Place, Setting
+from xreset.files.checks import NonNegativeInt, PositiveInt
 from xreset.files.storage import file_hash, write_json, write_whole
 from xreset.physics.plugins import backend_class, backend_names, backend_status, make_backend
 from xreset.spec import SceneSpec
@@ -51,7 +54,8 @@ def check(
     robot: str | None = None,
     device: Device = "cpu",
     only: Annotated[Several, arg(name="check")] = (),
-    json: Path | None = None,
+    json: Output | None = None,
+    page: Output | None = None,
     verbose: bool = False,
 ) -> None:
     """Test whether physics engines keep their contract. Exits with 1 if one does not.
@@ -60,9 +64,11 @@ def check(
         robot: Name or folder of the robot to test with. Default: a gripper, with which every check can run.
         only: Check to run; give it again for more. Default: all.
         json: File to write the results to.
+        page: Markdown page to write, with a table of the results.
         verbose: Show every measured number, not only the one nearest to its tolerance.
     """
     from xreset.backends import conformance
+    from xreset.eval.engines import page as pages
     from xreset.geometry import description
 
     spec = description.load_robot(robot) if robot else conformance.scene().robot
@@ -89,7 +95,11 @@ def check(
             }
         )
         failed += sum(result.verdict == "failed" for result in results)
-    write_measured(json, {"schema": conformance.SCHEMA, "runs": runs})
+    found = measured({"schema": conformance.SCHEMA, "runs": runs})
+    write_measured(json, found)
+    if page is not None:
+        write_whole(page, pages.page([found]))
+        console.print(f"wrote {page}")
     if failed:
         console.print(f"{failed} checks failed", style="bold red")
         raise SystemExit(1)
@@ -160,9 +170,9 @@ def compare(
     meshes: Meshes = None,
     only: Several = (),
     engine: AllEngines = (),
-    grasps: int = 48,
+    grasps: PositiveInt = 48,
     device: Device = "cpu",
-    json: Path | None = None,
+    json: Output | None = None,
 ) -> None:
     """Measure how far physics engines agree with MuJoCo on grasps. Exits with 1 if one misses a target.
 
@@ -240,9 +250,9 @@ def trace(
     engine: Several = (),
     reference: str = "mujoco",
     object: str | None = None,
-    episode: int = 0,
+    episode: NonNegativeInt = 0,
     place: Flat[Place] = Place(),
-    out: Path = Path("runs/trace"),
+    out: Output = Path("runs/trace"),
 ) -> None:
     """Replay the same actions from the same state in several engines, and show when and by how much they diverge.
 
@@ -283,9 +293,9 @@ def attribute(
     towards: str,
     engine: str = "mujoco",
     only: Several = (),
-    episodes: int = 1,
+    episodes: PositiveInt = 1,
     setting: Flat[Setting] = Setting(),
-    out: Path | None = None,
+    out: Output | None = None,
 ) -> None:
     """Find the physical difference between two engines that costs a policy its skill.
 
@@ -330,33 +340,10 @@ def attribute(
     console.print(f"results in {out}")
 
 
-def page(
-    *,
-    source: Annotated[tuple[Path, ...], arg(name="from"), UseAppendAction],
-    out: Path | None = None,
-) -> None:
-    """Make a Markdown page of the checks of engines.
-
-    Args:
-        source: File of `xreset engines check --json`; give it again for more. If two files have the same check of the
-            same engine, device and robot, the later file counts.
-        out: File to write; default: print it.
-    """
-    from xreset.eval.engines import page as matrix
-
-    text = matrix.page(matrix.read(source))
-    if out is None:
-        print(text, end="")
-        return
-    write_whole(out, text)
-    print(f"wrote {out}")
-
-
 COMMAND = {
-    "list": list_,
+    "": list_,
     "check": check,
     "compare": compare,
     "trace": trace,
     "attribute": attribute,
-    "page": page,
 }

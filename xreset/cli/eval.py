@@ -5,8 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from xreset.cli._common import Engines, Flat, PolicyOrBaseline
+from xreset.cli._options import Output
 from xreset.cli._terminal import Progress, console
 from xreset.eval.setting import Setting
+from xreset.files.checks import PositiveInt
 
 
 def evaluate(
@@ -14,11 +16,11 @@ def evaluate(
     *,
     engine: Engines = (),
     demos: Path,
-    episodes: int = 5,
+    episodes: PositiveInt = 5,
     settle: bool = False,
     episode_seconds: float | None = None,
     setting: Flat[Setting] = Setting(),
-    out: Path | None = None,
+    out: Output | None = None,
 ) -> None:
     """Evaluate a policy or a baseline in one or several engines.
 

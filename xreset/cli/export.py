@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from xreset import runtime
 from xreset.cli._common import Policy, Robot, Several, Sources, TrainedMeshes
+from xreset.cli._options import Output
 from xreset.cli._terminal import Progress, console
 
 if TYPE_CHECKING:
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 def lerobot(
     folders: Sources,
     *,
-    out: Path,
+    out: Output,
     engine: Several = (),
     robot: Robot = None,
     meshes: Path | None = None,
@@ -55,7 +56,7 @@ def lerobot(
 def npz(
     folders: Sources,
     *,
-    out: Path,
+    out: Output,
     engine: Several = (),
     robot: Robot = None,
     task: str | None = None,
@@ -78,7 +79,7 @@ def npz(
 def deploy(
     policy: Policy,
     *,
-    out: Path,
+    out: Output,
     robot: Robot = None,
     meshes: TrainedMeshes = None,
     object: Several = (),

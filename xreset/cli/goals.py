@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import UseAppendAction
 
 from xreset.cli._common import Meshes, Names, Several
+from xreset.cli._options import Output
 from xreset.cli._terminal import Progress, console
 from xreset.resets.config import GoalConfig
 
@@ -19,7 +19,7 @@ def goals(
     names: Names = (),
     *,
     robot: str,
-    out: Path,
+    out: Output,
     meshes: Meshes = None,
     family: Several = (),
     pose: Annotated[tuple[Pose, ...], UseAppendAction] = (),
@@ -45,7 +45,7 @@ def goals(
             names or None, robot=robot, meshes=meshes, families=family or None, poses=pose, config=draw,
             progress=bar.count("goals within reach"),
         )  # fmt: skip
-    goal_sets.write_goals(out, made, draw)
+    goal_sets.write_goals(out, made, draw, meshes=meshes)
     counts = Counter(made.family.tolist())
     listing = ", ".join(f"{count} {kind}" for kind, count in counts.items())
     console.print(

@@ -7,14 +7,16 @@ from pathlib import Path
 from rich.text import Text
 
 from xreset.cli._common import Source
+from xreset.cli._options import Output, Png
 from xreset.cli._terminal import console, show_table
 from xreset.errors import ObjectError
+from xreset.files.checks import PositiveInt, Seed
 from xreset.objects.properties import Properties
 from xreset.spec import ObjectSpec
 
 
 def list_(*, meshes: Path | None = None) -> None:
-    """List the built-in objects, or the objects of a folder of meshes.
+    """List the built-in objects, or the objects of a folder of meshes (--meshes FOLDER).
 
     Args:
         meshes: Folder of real meshes; default: the built-in stand-ins.
@@ -30,14 +32,14 @@ def list_(*, meshes: Path | None = None) -> None:
 def import_(
     path: Source,
     *,
-    out: Path | None = None,
+    out: Output | None = None,
     name: str | None = None,
     scale: float = 1.0,
     mass: float | None = None,
     density: float | None = None,
     friction: float | None = None,
     tolerance: float | None = None,
-    png: Path | None = None,
+    png: Png | None = None,
 ) -> None:
     """Cut a mesh, or every mesh of a folder, into convex pieces, and keep them for later runs.
 
@@ -118,7 +120,7 @@ def _cells(obj: ObjectSpec) -> tuple[str, ...]:
     )
 
 
-def make(*, out: Path, count: int = 40, seed: int = 0) -> None:
+def make(*, out: Output, count: PositiveInt = 40, seed: Seed = 0) -> None:
     """Make random shapes to train with: boxes, cans, cups, eggs, wedges, bottles, hammers and bananas.
 
     Demonstrations of them: xreset demos synth --meshes FOLDER.
@@ -134,4 +136,4 @@ def make(*, out: Path, count: int = 40, seed: int = 0) -> None:
     console.print(f"{out}: {len(written)} shapes")
 
 
-COMMAND = {"list": list_, "import": import_, "make": make}
+COMMAND = {"": list_, "import": import_, "make": make}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from xreset.cli._common import Host, Policy, Port, Robot, TrainedMeshes
+from xreset.files.checks import Seed
 
 
 def play(
@@ -15,7 +16,7 @@ def play(
     robot: Robot = None,
     demos: Path | None = None,
     meshes: TrainedMeshes = None,
-    seed: int = 0,
+    seed: Seed = 0,
     host: Host = "127.0.0.1",
     port: Port = 8080,
 ) -> None:

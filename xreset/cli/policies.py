@@ -6,7 +6,7 @@ from xreset.cli._terminal import console, show_table
 from xreset.policy.shipped import card, shipped
 
 
-def list_() -> None:
+def policies() -> None:
     """List the policies that ship with xreset. Every command with a policy argument accepts their names."""
     from xreset.policy import onnx_policy as policy_files
 
@@ -41,4 +41,4 @@ def _objects(trained: tuple[str, ...]) -> str:
     return ", ".join([*known, f"{others} other shapes"] if others else known)
 
 
-COMMAND = {"list": list_}
+COMMAND = policies

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from xreset.cli._common import Names, Robot, Several
+from xreset.cli._options import Mp4, Output
 from xreset.cli._terminal import console, show_notes
 from xreset.files.text import short_name
 
@@ -13,13 +14,13 @@ from xreset.files.text import short_name
 def report(
     runs: Names,
     *,
-    out: Path | None = None,
+    out: Output | None = None,
     robot: Robot = None,
     meshes: Path | None = None,
     x: Literal["minutes", "steps", "iterations"] | None = None,
     curve: Several = (),
     apart: bool = False,
-    film: Path | None = None,
+    film: Mp4 | None = None,
 ) -> None:
     """Make a self-contained HTML page of a run's evaluations, or of several runs side by side.
 

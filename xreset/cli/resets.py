@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 from tyro.conf import arg
 
-from xreset.cli._common import Device, Meshes, Several, Source, show_accounts
+from xreset.cli._common import Device, MotionMeshes, Several, Source, show_accounts
+from xreset.cli._options import Output
 from xreset.cli._terminal import Progress, console, show_notes
-from xreset.files.storage import file_hash
+from xreset.files.checks import PositiveInt
 from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig, TransferConfig
 
 
 def resets(
     retargeted: Source,
     *,
-    out: Path,
+    out: Output,
     engine: Several = (),
     robot: str | None = None,
-    meshes: Meshes = None,
-    num_envs: int = 64,
+    meshes: MotionMeshes = None,
+    num_envs: PositiveInt = 64,
     device: Device = "cpu",
     limits: Annotated[FilterConfig, arg(name="filter")] = FilterConfig(),
     closing: ClosingConfig = ClosingConfig(),
@@ -48,27 +48,18 @@ def resets(
             poses, as in the paper, from which one object in eleven turns by more than 10 degrees.
     """
     from xreset.files.records import stated_doubts
-    from xreset.geometry.description import load_robot
-    from xreset.objects.catalogue import load_objects
     from xreset.resets.bank import write_bank
     from xreset.resets.filter import make_bank
+    from xreset.resets.inputs import load_inputs
     from xreset.resets.settle import settle_starts
     from xreset.resets.transfer import add_transfers
-    from xreset.retarget.file import check_retargeted, object_sources, read_retargeted
 
     engines = list(dict.fromkeys(engine)) or ["mujoco"]
-    motion = read_retargeted(retargeted)
-    stated = object_sources(retargeted)
+    inputs = load_inputs(retargeted, robot=robot, meshes=meshes, accept=("motion",))
+    motion = inputs.motion()
     doubts = stated_doubts(retargeted)
     show_notes(doubts)
-    made_from = {"retargeted": file_hash(retargeted)}
-    spec = load_robot(robot or motion.robot)
-    check_retargeted(retargeted, motion, spec)
-    loaded = load_objects(motion.object_names, meshes)
-    scene = (spec, loaded)
-    if changed := [o.name for o in loaded if stated.get(o.name, o.source) != o.source]:
-        warning = f"{retargeted} was made with other meshes of {', '.join(changed)}"
-        show_notes([f"{warning}. Give the same --meshes folder."])
+    scene = (inputs.robot, inputs.objects)
     where = {"num_envs": num_envs, "device": device}
     title = f"states stable in {', '.join(engines)}"
     with Progress() as bar:
@@ -99,9 +90,10 @@ def resets(
         "squeeze": asdict(squeeze),
         "transfer": asdict(transfer),
         "settle": settle,
+        "meshes": str(inputs.meshes) if inputs.meshes else None,
         "doubts": doubts,
     }
-    write_bank(out, bank, config=config, inputs=made_from)
+    write_bank(out, bank, config=config, inputs={"retargeted": str(inputs.hash)})
     accounts = bank.accounts()
     show_accounts(accounts, f"{bank.robot}: {title}")
     if squeeze.presses:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from pathlib import Path
 
 import numpy as np
 
 from xreset.cli._common import Meshes, Source, show_accounts
+from xreset.cli._options import Output
 from xreset.cli._terminal import Progress, console, show_notes
 from xreset.files.storage import file_hash
+from xreset.physics.plugins import Device
 from xreset.retarget.hand.config import Jaw
 
 
@@ -17,11 +18,10 @@ def retarget(
     demos: Source,
     *,
     robot: str,
-    out: Path,
+    out: Output,
     meshes: Meshes = None,
-    max_per_object: int | None = None,
     trust_recordings: bool = False,
-    device: str = "cpu",
+    device: Device = "cpu",
     jaw: Jaw = "fingertips",
 ) -> None:
     """Turn human demonstrations into robot motion.
@@ -30,7 +30,6 @@ def retarget(
         demos: Archive of demonstrations (`xreset demos`).
         robot: Name of a robot, or the folder of its description.
         out: File to write.
-        max_per_object: Use only the first sequences of each object, at most this many.
         trust_recordings: Use demonstrations that are certainly wrong all the same.
         device: Where hand retargeting runs: cpu or cuda. The arm runs on the CPU.
         jaw: What a parallel jaw follows: the human's fingertips, like every hand, or the published paper's analytic map
@@ -43,12 +42,10 @@ def retarget(
 
     spec = load_robot(robot)
     chosen = read_demos(demos)
-    if max_per_object is not None:
-        chosen = chosen.select(max_per_object=max_per_object)
     if left := np.count_nonzero(chosen.hand_side == "left"):
         show_notes(
             [
-                f"{left} of {len(chosen)} sequences are of left hands. For a right hand: xreset demos mirror"
+                f"{left} of {len(chosen)} sequences are of left hands. For a right hand: xreset demos select --mirror"
             ]
         )
     specs = demo_objects(chosen, meshes)
@@ -76,7 +73,7 @@ def retarget(
         config={
             "retarget": asdict(config),
             "robot": robot,
-            "max_per_object": max_per_object,
+            "meshes": str(meshes) if meshes else None,
             "doubts": doubts,
         },
         inputs={"demos": file_hash(demos), "robot": spec.fingerprint}

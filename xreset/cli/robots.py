@@ -20,8 +20,10 @@ from xreset.cli._common import (
     usable_engines,
     write_measured,
 )
+from xreset.cli._options import Output, Png
 from xreset.cli._terminal import Progress, console, show_table
 from xreset.errors import RobotError
+from xreset.files.checks import PositiveInt
 from xreset.physics.plugins import robot_names
 from xreset.resets.config import JUDGE_SQUEEZE, SqueezeConfig
 from xreset.robot_tools import placement
@@ -29,6 +31,10 @@ from xreset.robot_tools.placement import PlaceConfig
 
 if TYPE_CHECKING:
     from xreset.robot_tools.check import Finding
+
+
+_PER_OBJECT = 2
+"""Sequences of each object that a search for a placement tries, spread over the archive."""
 
 
 def list_robots() -> None:
@@ -49,7 +55,7 @@ def list_robots() -> None:
     show_table(table)
 
 
-def check(robot: RobotName, /, *, picture: Path | None = None) -> None:
+def check(robot: RobotName, /, *, picture: Png | None = None) -> None:
     """Check a robot, and print all errors and warnings. Exits with 1 after an error.
 
     `xreset engines check --robot ROBOT` tries it in the physics engines.
@@ -84,7 +90,7 @@ def import_(
     *,
     arm: Path | None = None,
     hand: Path,
-    out: Path,
+    out: Output,
     name: str | None = None,
     flange: str | None = None,
     offset: tuple[float, float, float] | None = None,
@@ -131,7 +137,6 @@ def place(
     *,
     demos: Path,
     meshes: Meshes = None,
-    max_per_object: int = 2,
     write: bool = False,
     search: PlaceConfig = PlaceConfig(),
 ) -> None:
@@ -139,7 +144,6 @@ def place(
 
     Args:
         demos: Archive of demonstrations (`xreset demos`).
-        max_per_object: Number of sequences of each object, spread over the archive.
         write: Write the placement and its home into the robot's robot.toml.
         search: Ranges and effort of the search.
     """
@@ -150,7 +154,7 @@ def place(
 
     spec = description.load_robot(robot)
     every = archive.read_demos(demos)
-    chosen = every.select(max_per_object=max_per_object, spread=True)
+    chosen = every.select(max_per_object=_PER_OBJECT, spread=True)
     specs = list(archive.demo_objects(chosen, meshes).values())
     with Progress() as bar:
         paths = pipeline.wrist_paths(chosen, spec, specs, progress=bar.count("hand retargeting"))
@@ -186,12 +190,12 @@ def judge(
     robot: Robot = None,
     meshes: Meshes = None,
     engine: AllEngines = (),
-    states: int = 8,
+    states: PositiveInt = 8,
     squeeze: SqueezeConfig = JUDGE_SQUEEZE,
-    num_envs: int = 32,
+    num_envs: PositiveInt = 32,
     device: Device = "cpu",
-    picture: Path | None = None,
-    json: Path | None = None,
+    picture: Png | None = None,
+    json: Output | None = None,
 ) -> None:
     """Judge a robot without training: which objects it holds for a second at full gravity, lifts and turns.
 
@@ -247,4 +251,4 @@ def _digits(values: Iterable[float]) -> str:
     return ", ".join(f"{value:.4f}" for value in values)
 
 
-COMMAND = {"list": list_robots, "check": check, "import": import_, "place": place, "judge": judge}
+COMMAND = {"": list_robots, "check": check, "import": import_, "place": place, "judge": judge}

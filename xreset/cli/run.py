@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shlex
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
-from xreset.cli import main
-from xreset.cli._common import Meshes, Several, Source, quick_engines
+from tyro.conf import Positional
+
+from xreset.cli import perform
+from xreset.cli._common import Device, Several, quick_engines
 from xreset.cli._terminal import console
 from xreset.errors import RunError
-from xreset.files.records import read_npz
+from xreset.files.checks import PositiveInt, Seed
+from xreset.files.records import stated_inputs
 from xreset.files.storage import file_hash
 
 _RETARGET = 0.025
@@ -23,19 +25,19 @@ episode of 5 s in one engine (UR7e + Sharpa, nine YCB objects)."""
 
 
 def run(
-    demos: Source,
+    demos: Annotated[str | Path, Positional],
     *,
-    robot: str,
-    out: Path,
-    meshes: Meshes = None,
+    robot: str | Path,
+    out: str | Path,
+    meshes: str | Path | None = None,
     engine: Several = (),
     recipe: str = "default",
-    device: str | None = None,
-    num_envs: int = 4096,
+    device: Device | None = None,
+    num_envs: PositiveInt = 4096,
     minutes: float = 25.0,
-    iterations: int | None = None,
-    seed: int = 0,
-    episodes: int = 5,
+    iterations: PositiveInt | None = None,
+    seed: Seed = 0,
+    episodes: PositiveInt = 5,
 ) -> None:
     """Take demonstrations to a trained policy: retarget, make the bank, train, evaluate in several engines, report.
 
@@ -47,6 +49,7 @@ def run(
         demos: Archive of demonstrations (`xreset demos`).
         robot: Name of a robot, or the folder of its description.
         out: Run folder to make, or to continue.
+        meshes: Folder of real meshes; default: the built-in stand-ins.
         engine: Physics engine to evaluate in; give it again for more. Default: all that can be used here.
         recipe: Recipe of the training, or another run's folder.
         device: Where to train: cpu or cuda; default: cuda where there is a GPU.
@@ -55,12 +58,17 @@ def run(
         iterations: Most iterations of the training; default: the recipe's.
         seed: Seed of the training and of the evaluations' starts.
         episodes: Episodes of each demonstration in each engine.
+
+    Raises:
+        XResetError: a step fails, or a file in the folder was made from others.
     """
     from xreset.demos.archive import read_demos
+    from xreset.eval.study import steps
     from xreset.geometry.description import load_robot
-    from xreset.resets import bank as bank_file
-    from xreset.retarget import file
+    from xreset.learning.run import checkpoints
 
+    demos = Path(demos)
+    out = Path(out)
     archive = read_demos(demos)
     spec = load_robot(robot)
     engines = [each.name for each in quick_engines(engine, "cpu")]
@@ -68,24 +76,33 @@ def run(
     motion = out / "motion.npz"
     bank = out / "resets.npz"
     out.mkdir(parents=True, exist_ok=True)
-    if not _made_from(motion, file.SCHEMA, demos=file_hash(demos), robot=spec.fingerprint):
+    if not _made_from(motion, demos=file_hash(demos), robot=spec.fingerprint):
         _step("retarget", demos, robot=robot, out=motion, meshes=meshes)
-    if not _made_from(bank, bank_file.SCHEMA, retargeted=file_hash(motion)):
+    if not _made_from(bank, retargeted=file_hash(motion)):
         own = robot if os.path.isdir(robot) else None
         _step("resets", motion, out=bank, robot=own, meshes=meshes)
-    _train(
-        out,
-        minutes,
-        iterations,
-        robot=robot,
-        resets=bank,
-        meshes=meshes,
-        recipe=recipe,
-        device=device,
-        num_envs=num_envs,
-        seed=seed,
-    )
-    missing = [name for name in engines if not _is_evaluated(out, name, demos, seed, episodes)]
+    if checkpoints(out):
+        _continue_training(out, bank, minutes, iterations)
+    else:
+        _step(
+            "train",
+            out=out,
+            resets=bank,
+            robot=robot,
+            meshes=meshes,
+            recipe=recipe,
+            device=device,
+            num_envs=num_envs,
+            minutes=minutes,
+            iterations=iterations,
+            seed=seed,
+        )
+    files = {"demos": demos, "policy": out / "policy.onnx"}
+    missing = []
+    for name in engines:
+        result = out / "eval" / f"{name}.json"
+        if not steps.is_evaluated(result, files, seed=seed, episodes=episodes):
+            missing.append(name)
     if missing:
         _step("eval", out, demos=demos, episodes=episodes, seed=seed, meshes=meshes, engine=missing)
     _step("report", out, meshes=meshes)
@@ -110,17 +127,17 @@ def _show_times(
     )
 
 
-def _made_from(path: Path, schema: str, **sources: str) -> bool:
+def _made_from(path: Path, **sources: str) -> bool:
     """Return whether a file exists that was made from these sources: name -> hash.
 
     Raises:
-        RunError: it was made from others.
+        RunError: it was made from others, or does not state what from.
     """
     if not path.is_file():
         return False
-    meta = json.loads(str(read_npz(path, schema, {}, what="a file of xreset run")["meta"]))
+    stated = stated_inputs(path)
     for name, wanted in sources.items():
-        if meta["inputs"].get(name) != wanted:
+        if stated.get(name) != wanted:
             raise RunError(
                 f"{path} was made with another {_NAMES[name]}. Choose another --out, or remove the file."
             )
@@ -131,44 +148,20 @@ def _made_from(path: Path, schema: str, **sources: str) -> bool:
 _NAMES = {"demos": "archive of demonstrations", "robot": "robot", "retargeted": "motion"}
 
 
-def _train(
-    out: Path, minutes: float, iterations: int | None, *, resets: Path, **options: Any
-) -> None:
-    """Start the training, or continue it for what is left of its minutes and iterations."""
-    from xreset.learning.clock import read_lift
-    from xreset.learning.run import checkpoints, read_run
+def _continue_training(out: Path, bank: Path, minutes: float, iterations: int | None) -> None:
+    """Continue a training for what is left of its minutes and iterations."""
+    from xreset.eval.study.steps import is_trained
+    from xreset.learning.run import read_run
 
-    if not checkpoints(out):
-        _step("train", out=out, minutes=minutes, iterations=iterations, resets=resets, **options)
-        return
     info = read_run(out)
-    if info.resets_hash != file_hash(resets):
+    if info.resets_hash != file_hash(bank):
         raise RunError(f"The run in {out} was made with another bank. Choose another --out.")
-    done = read_lift(out)
-    most = iterations or info.config.iterations
-    left = minutes - done.minutes
-    if done.iteration >= most or left < _LEAST * minutes:
+    done = info.lift
+    if is_trained(done, iterations or info.config.iterations, minutes):
         console.print(f"{out} is trained: {done.iteration} iterations, {done.minutes:.1f} minutes")
         return
-    _step("train", out=out, resume=True, minutes=round(left, 2), iterations=iterations)
-
-
-_LEAST = 0.03
-"""Share of the minutes for which a training is not started again: compiling takes longer."""
-
-
-def _is_evaluated(out: Path, engine: str, demos: Path, seed: int, episodes: int) -> bool:
-    """Return whether the policy has played these episodes in an engine."""
-    from xreset.eval.results import read_result
-
-    file = out / "eval" / f"{engine}.json"
-    if not file.is_file():
-        return False
-    result = read_result(file)
-    files = {"demos": demos, "policy": out / "policy.onnx"}
-    hashes = {name: file_hash(path) for name, path in files.items()}
-    is_same = (result.seed, result.episodes_per_demo) == (seed, episodes)
-    return is_same and hashes.items() <= result.inputs.items()
+    left = round(minutes - done.minutes, 2)
+    _step("train", out=out, resume=True, minutes=left, iterations=iterations)
 
 
 def _step(verb: str, *words: object, **options: object) -> None:
@@ -184,7 +177,7 @@ def _step(verb: str, *words: object, **options: object) -> None:
         elif value is not None:
             command += [flag, str(value)]
     console.print(f"\n+ xreset {shlex.join(command)}", style="bold")
-    main(command)
+    perform(command)
 
 
 COMMAND = run

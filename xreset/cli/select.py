@@ -7,6 +7,7 @@ from pathlib import Path
 from xreset.cli._common import Flat, Several, Source, quick_engines
 from xreset.cli._terminal import console, show_table
 from xreset.eval.setting import Setting
+from xreset.files.checks import PositiveInt
 
 
 def select(
@@ -14,8 +15,8 @@ def select(
     *,
     demos: Path,
     engine: Several = (),
-    most: int = 8,
-    episodes: int = 2,
+    most: PositiveInt = 8,
+    episodes: PositiveInt = 2,
     setting: Flat[Setting] = Setting(seed=1_000_003),
 ) -> None:
     """Choose the checkpoint of a training that is best in its worst engine.

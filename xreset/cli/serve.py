@@ -5,13 +5,14 @@ from __future__ import annotations
 import logging
 
 from xreset.cli._common import Policy, Robot, Several, TrainedMeshes
+from xreset.files.checks import Port
 
 
 def serve(
     policy: Policy,
     *,
     host: str = "127.0.0.1",
-    port: int = 8765,
+    port: Port = 8765,
     robot: Robot = None,
     meshes: TrainedMeshes = None,
     object: Several = (),

@@ -6,8 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from xreset.cli._common import Engines, Flat, PolicyOrBaseline, Several
+from xreset.cli._options import Output
 from xreset.cli._terminal import Progress, console, show_table
 from xreset.eval.setting import Setting
+from xreset.files.checks import PositiveInt
 
 if TYPE_CHECKING:
     from xreset.eval import effects
@@ -20,9 +22,9 @@ def stress(
     engine: Engines = (),
     property: Several = (),
     faults: bool = False,
-    episodes: int = 2,
+    episodes: PositiveInt = 2,
     setting: Flat[Setting] = Setting(),
-    out: Path | None = None,
+    out: Output | None = None,
 ) -> None:
     """Measure robustness: the same episodes with changed stiffness, latency, friction, mass and more, one at a time.
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from xreset.cli._common import Name, Several
+from xreset.cli._options import Output
 from xreset.cli._terminal import console, show_notes
 from xreset.errors import RunError
 from xreset.eval.study import file as files
@@ -18,15 +19,15 @@ def study(
     file: Name,
     *,
     data: Path = Path("data"),
-    out: Path = Path("runs/studies"),
+    out: Output = Path("runs/studies"),
     run: Several = (),
     only: Literal["all", "data", "train", "eval", "tables"] = "all",
     dry_run: bool = False,
 ) -> None:
     """Run the missing steps of a study: reset banks, trainings, evaluations, and tables next to the paper's.
 
-    After a stop, the same command continues; finished steps are not repeated. Studies with the same --out share their
-    runs, and several may run at the same time, also as jobs of a cluster.
+    Steps run one after another. After a stop, the same command continues; finished steps are not repeated. Studies with
+    the same --out share their runs.
 
     Args:
         file: Study file, or name of a study that ships with xreset.
@@ -59,7 +60,7 @@ def study(
         for subset in todo.subsets():
             subset.make()
         undone = [step for step in wanted if step.left()]
-        problems = launch.launch(todo, undone, say=console.print)
+        problems = launch.launch(todo, undone, console.print)
     if only in ("all", "tables"):
         page, notes = report.write_page(planned(), out / "reports" / todo.name)
         show_notes(notes)

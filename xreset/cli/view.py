@@ -8,8 +8,10 @@ import numpy as np
 from rich.progress import track
 
 from xreset.cli._common import Host, Meshes, Port, Robot, Source
+from xreset.cli._options import Mp4, Png
 from xreset.cli._terminal import console, show_notes
 from xreset.errors import XResetError
+from xreset.files.checks import NonNegativeInt
 from xreset.files.storage import write_whole
 from xreset.pictures.view import data
 
@@ -20,12 +22,12 @@ def view(
     demos: Path | None = None,
     meshes: Meshes = None,
     robot: Robot = None,
-    sequence: int | None = None,
-    frame: int | None = None,
+    sequence: NonNegativeInt | None = None,
+    frame: NonNegativeInt | None = None,
     host: Host = "127.0.0.1",
     port: Port = 8080,
-    png: Path | None = None,
-    mp4: Path | None = None,
+    png: Png | None = None,
+    mp4: Mp4 | None = None,
 ) -> None:
     """Show demonstrations, robot motion, a reset bank or a goal set in a browser, or write pictures of them.
 

@@ -1,4 +1,4 @@
-"""Human hand-object demonstrations: the archive, DexYCB, HO-3D, other trackers, and synthetic ones.
+"""Human hand-object demonstrations: the archive, DexYCB, other trackers, and synthetic ones.
 
 .. code-block:: python
 

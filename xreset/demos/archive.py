@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xreset.errors import DemoError, ObjectError
-from xreset.files.checks import Seed, frozen, is_rigid, names_wrong_arguments
+from xreset.files.checks import Seed, frozen, is_rigid, obeys_rules
 from xreset.files.records import (
     POSITION,
     RATE,
@@ -142,7 +142,7 @@ class Demos(ObjectMotions):
     def __len__(self) -> int:
         return self.num_sequences
 
-    @names_wrong_arguments
+    @obeys_rules
     def select(
         self,
         *,

@@ -431,7 +431,7 @@ def _of_motion(r: Recording) -> Iterator[Finding]:
             "jumps",
             f"The object jumps from frame to frame, first in frame {np.argmax(jumps)}.",
             "Poses that were not seen may be written as numbers. Repair these frames, or leave the sequence out"
-            " (xreset demos split).",
+            " (xreset demos select --rest).",
         )
     if r.moved.any() and (r.turn * r.turn[0].inv()).magnitude().max() < _NEVER_TURNS:
         yield _doubt(

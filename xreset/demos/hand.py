@@ -22,7 +22,7 @@ ORDERS: Mapping[Order, tuple[int, ...]] = {
 }
 """Index of each of :data:`xreset.spec.KEYPOINTS` in another order. MANO: the 16 joints of the model (wrist, index,
 middle, little, ring, thumb, base to end), then the tips of thumb, index, middle, ring and little finger (Romero et al.
-2017; HO-3D's order too)."""
+2017)."""
 
 PARENTS = np.array([0, 1, 2, 3, 0, 5, 6, 7, 0, 9, 10, 11, 0, 13, 14, 15, 0, 17, 18, 19])
 """[20] the keypoint before each of the keypoints 1 to 20: the other end of its bone."""

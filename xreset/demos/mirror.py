@@ -24,6 +24,8 @@ from xreset.spec import ObjectSpec, TableSpec
 
 _SAMPLES = 600
 """Points of a surface that measure its symmetry."""
+TOLERANCE = 0.004
+"""Largest deviation of an object from its mirror image [m]; those of the twenty DexYCB objects are up to 2.3 mm."""
 _ACROSS = np.array([-1.0, 1.0, 1.0])
 
 
@@ -68,26 +70,25 @@ def symmetry(obj: ObjectSpec) -> Symmetry:
     return Symmetry(normal=normal, offset=offset, deviation=float(deviation))
 
 
-def mirrored(demos: Demos, symmetries: Mapping[str, Symmetry], *, tolerance: float) -> Demos:
+def mirrored(demos: Demos, symmetries: Mapping[str, Symmetry]) -> Demos:
     """Reflect demonstrations: left hands become right hands and vice versa; names end in ``-mirrored``.
 
     Args:
         demos: demonstrations; they are levelled first.
-        symmetries: of each object, by name.
-        tolerance: largest deviation from symmetry of an object [m]; sequences of other objects are omitted.
+        symmetries: of each object, by name. Sequences of objects that deviate by more than :data:`TOLERANCE` are
+            omitted.
 
     Raises:
         DemoError: no object is symmetric enough; the message lists the deviations.
     """
     measured = {name: symmetries[name].deviation for name in demos.object_names}
-    kept = [name for name, deviation in measured.items() if deviation <= tolerance]
+    kept = [name for name, deviation in measured.items() if deviation <= TOLERANCE]
     if not kept:
         listed = ", ".join(
             f"{name} {1e3 * deviation:.1f} mm" for name, deviation in measured.items()
         )
         raise DemoError(
-            f"No object is its own mirror image within {1e3 * tolerance:g} mm: {listed}. Raise --tolerance or"
-            " omit xreset demos mirror."
+            f"No object is its own mirror image within {1e3 * TOLERANCE:g} mm: {listed}. Omit --mirror."
         )
     demos = levelled(demos).select(objects=kept)
     shift = np.array([2.0 * TableSpec().center[0], 0.0, 0.0])

@@ -21,7 +21,7 @@ from xreset.demos import hand
 from xreset.demos.archive import Demos, merge_demos, one_sequence
 from xreset.demos.grasp import Contacts, Grasp, Solid, fit_hand, handedness, plan_contacts
 from xreset.errors import DemoError
-from xreset.files.checks import Seed
+from xreset.files.checks import Seed, obeys_rules
 from xreset.files.progress import unseen
 from xreset.geometry.shapes import turn_of
 from xreset.objects.catalogue import load_objects
@@ -61,6 +61,7 @@ _OPENING = np.array([0.0, 0.4, 0.2] * 4 + [-0.15, -0.1, 0.0, 0.3, 0.3])
 """[17] joint angles by which a hand opens before a grasp [rad]."""
 
 
+@obeys_rules
 def synthesize(
     names: Iterable[str] | None = None,
     per_object: int = 4,

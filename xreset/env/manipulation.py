@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from xreset.errors import XResetError
-from xreset.files.checks import Seed, names_wrong_arguments
+from xreset.files.checks import Seed, obeys_rules
 from xreset.files.text import shown
 from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
 from xreset.objects.sampling import center, metric_points, surface_points
@@ -58,6 +58,7 @@ def make_scene(robot: RobotSpec, objects: tuple[ObjectSpec, ...], task: TaskConf
     return SceneSpec(robot=robot, objects=objects, timestep=task.timestep, substeps=task.substeps)
 
 
+@obeys_rules
 def make_env(
     robot: RobotSpec,
     objects: Sequence[ObjectSpec],
@@ -77,7 +78,7 @@ def make_env(
             ``task.reset.object_share`` gives some objects more worlds.
         bank: where episodes begin, and their goals.
         task: observations, rewards and ends of episodes; None: the paper's task.
-        engine: name of the engine, as ``xreset engines list`` prints it.
+        engine: name of the engine, as ``xreset engines`` prints it.
         num_envs: N.
         device: where the engine and all tensors live.
         seed: seed of every random number that the environment draws.
@@ -118,7 +119,6 @@ class ManipulationEnv:
         sequence: [N] demonstration of each world.
         bank_state: [N] bank state that each world's episode began with, -1 for home.
         gravity_fraction: [N] share of the object's weight that acts.
-        success_position: [] limit of success [m]; a schedule may overwrite ``task.reward.success_position`` here.
         nonfinite_count: [] number of episodes that ended because a number was not finite.
         overflow_count: [] number of episodes that ended because the engine dropped contacts.
         worlds: everything that lasts from step to step, in addition to the engine's state.
@@ -126,7 +126,6 @@ class ManipulationEnv:
         vision: the cameras; None: the task has none.
     """
 
-    @names_wrong_arguments
     def __init__(
         self, backend: Backend, task: TaskConfig, resets: ResetDistribution, *, seed: int = 0
     ) -> None:
@@ -267,7 +266,6 @@ class ManipulationEnv:
         """Observations of the present state, by group."""
         return self._observations.clone()
 
-    @names_wrong_arguments
     def step(
         self, action: Tensor, begin: Tensor | None = None
     ) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
@@ -310,7 +308,6 @@ class ManipulationEnv:
 
     # Stepping and resetting
 
-    @names_wrong_arguments
     def advance(self, action: Tensor, push: Tensor | None = None) -> tuple[Reading, Reward]:
         """Take one control step without any reset. Evaluations end episodes themselves.
 
@@ -330,7 +327,6 @@ class ManipulationEnv:
         self._compute_observations()
         return reading, reward
 
-    @names_wrong_arguments
     def reset(self, worlds: Tensor | None = None, start: Reset | None = None) -> None:
         """Start new episodes. The other worlds and their observations stay as they are.
 
@@ -378,7 +374,6 @@ class ManipulationEnv:
         """[N, 3] goal position of the object's origin in the task (``TaskConfig.object_frame``)."""
         return self._task_origin(self.goal_pos, self.goal_quat)
 
-    @names_wrong_arguments
     def render(self, world: int = 0, size: tuple[int, int] = (640, 480)) -> np.ndarray:
         """Return a picture of one world, [H, W, 3] uint8, with the goal as a translucent object.
 
@@ -409,7 +404,6 @@ class ManipulationEnv:
         values = self.worlds.buffers | vars(self.backend.state())
         return {name: value.to("cpu", copy=True) for name, value in values.items()}
 
-    @names_wrong_arguments
     def restore(self, snapshot: dict[str, Tensor]) -> None:
         """Continue from a snapshot of the same task with as many worlds.
 

@@ -18,7 +18,6 @@ from xreset.env.vector_env import (
     with_sound_rows,
 )
 from xreset.errors import needs
-from xreset.files.checks import names_wrong_arguments
 
 with needs("stable_baselines3", "stable-baselines3"):
     from stable_baselines3.common.vec_env import VecEnv
@@ -37,7 +36,6 @@ class StableBaselinesEnv(VecEnv):
         log: as of :class:`~xreset.env.vector_env.VectorEnv`.
     """
 
-    @names_wrong_arguments
     def __init__(self, env: ManipulationEnv) -> None:
         """Wrap an environment, such as ``xreset.make_env`` makes. It belongs to this object from then on.
 

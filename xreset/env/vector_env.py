@@ -9,7 +9,6 @@ import torch
 
 from xreset.env.manipulation import ManipulationEnv
 from xreset.errors import XResetError, needs
-from xreset.files.checks import names_wrong_arguments
 from xreset.physics.tensors import where
 
 with needs("gymnasium", "gymnasium"):
@@ -41,7 +40,6 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": []}  # noqa: RUF012
 
-    @names_wrong_arguments
     def __init__(self, env: ManipulationEnv) -> None:
         """Wrap an environment, such as ``xreset.make_env`` makes, and reset it. :meth:`close` closes it.
 

@@ -6,19 +6,16 @@ when a configuration is made, instead of turning into NaN some minutes later.
 
 from __future__ import annotations
 
-import ast
 import re
-import sys
 import types
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import MISSING, dataclass, fields, is_dataclass, make_dataclass
 from difflib import get_close_matches
 from functools import cache, wraps
-from inspect import Parameter, cleandoc, getsource, signature
-from itertools import pairwise
+from inspect import Parameter, signature
 from math import inf, isfinite
-from numbers import Integral, Real
+from numbers import Integral
 from types import SimpleNamespace
 from typing import (
     Annotated,
@@ -37,7 +34,8 @@ from typing import (
 import numpy as np
 
 from xreset import __version__
-from xreset.errors import FileFormatError, WrongValueError, XResetError
+from xreset.errors import FileFormatError, WrongValueError
+from xreset.files.legacy import REMOVED
 from xreset.files.text import Brief, shown
 
 P = ParamSpec("P")
@@ -46,43 +44,8 @@ T = TypeVar("T")
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 def frozen(cls: type[T]) -> type[T]:
-    """Make a data class whose objects do not change, and whose fields are named where one is made; ``help`` explains
-    them."""
-    made = dataclass(frozen=True, kw_only=True, repr=not issubclass(cls, Brief))(cls)
-    type.__setattr__(made, "__doc__", _WithFields(made.__doc__ or ""))
-    return made
-
-
-class _WithFields:
-    """In place of a data class's docstring: the same, and those below its fields, which Python does not keep."""
-
-    def __init__(self, summary: str) -> None:
-        self._summary = cleandoc(summary)
-
-    def __get__(self, instance: Any, cls: type) -> str:
-        return _with_fields(self._summary, cls)
-
-
-@cache
-def _classes_of(module: str) -> dict[str, ast.ClassDef]:
-    """Name -> class of a module; none if it has no source, as an interactive session."""
-    try:
-        nodes = ast.parse(getsource(sys.modules[module])).body
-    except (OSError, TypeError):
-        return {}
-    return {node.name: node for node in nodes if isinstance(node, ast.ClassDef)}
-
-
-@cache
-def _with_fields(summary: str, cls: type) -> str:
-    """Return a class's docstring, and after it each field with the string that stands below it in the source."""
-    known = _classes_of(cls.__module__).get(cls.__name__)
-    texts = []
-    for field, below in pairwise(known.body if known else ()):
-        match field, below:
-            case ast.AnnAssign(target=ast.Name(name)), ast.Expr(ast.Constant(str() as text)):
-                texts.append(f"\n    {name}: " + cleandoc(text).replace("\n", "\n        "))
-    return f"{summary}\n\nAttributes:{''.join(texts)}" if texts else summary
+    """Make a data class whose objects do not change, and whose fields are named where one is made."""
+    return dataclass(frozen=True, kw_only=True, repr=not issubclass(cls, Brief))(cls)
 
 
 @dataclass(frozen=True)
@@ -97,6 +60,13 @@ def _is_whole(value: Any) -> bool:
     return isinstance(value, Integral)
 
 
+@dataclass(frozen=True)
+class Check:
+    """A function that refuses wrong values with ``XResetError``, in the annotation of an argument."""
+
+    refuse: Callable[[Any], Any]
+
+
 Positive = Annotated[T, Rule("a number above 0 and finite", lambda x: 0 < x < inf)]
 """JSON, and so a run's configuration, has no infinity."""
 NotNegative = Annotated[T, Rule("a number from 0 to 1e15", lambda x: 0 <= x <= 1e15)]
@@ -104,7 +74,9 @@ NotNegative = Annotated[T, Rule("a number from 0 to 1e15", lambda x: 0 <= x <= 1
 PositiveFloat = Positive[float]
 Length = Annotated[float, Rule("a number from 1e-5 to 1e5", lambda x: 1e-5 <= x <= 1e5)]
 """A length [m] that others are divided by: its square is finite, too."""
-PositiveInt = Annotated[int, Rule("a whole number above 0", lambda x: _is_whole(x) and x > 0)]
+PositiveInt = Annotated[
+    int, Rule("a whole number above 0", lambda x: _is_whole(x) and 0 < x <= 1e15)
+]
 NonNegativeFloat = NotNegative[float]
 NonNegativeInt = Annotated[
     int, Rule("a whole number from 0 to 1e15", lambda x: _is_whole(x) and 0 <= x <= 1e15)
@@ -124,6 +96,7 @@ Seed = Annotated[
         lambda x: _is_whole(x) and 0 <= x <= LARGEST_SEED,
     ),
 ]
+Port = Annotated[int, Rule("a whole number from 0 to 65535", lambda x: 0 <= x <= 65535)]
 Text = Annotated[str, Rule("a text", lambda text: bool(text.strip()) and text.isprintable())]
 Number = Annotated[float, Rule("a finite number of at most 1e9", lambda x: abs(x) <= 1e9)]
 """A number of a robot's description: stiffnesses reach 1e5, everything else is far smaller."""
@@ -158,10 +131,11 @@ class Options:
 def marks_of(cls: type) -> dict[str, list[Any]]:
     """Field name -> what its annotation holds in addition to the type."""
     hints = get_type_hints(cls, include_extras=True)
-    return {name: _marks(hint) for name, hint in hints.items()}
+    return {name: marks_in(hint) for name, hint in hints.items()}
 
 
-def _marks(hint: Any) -> list[Any]:
+def marks_in(hint: Any) -> list[Any]:
+    """Return what an annotation holds in addition to the type."""
     marks = []
     for part in _parts(hint):
         marks += getattr(part, "__metadata__", ())
@@ -223,69 +197,37 @@ def is_rigid(T: np.ndarray) -> bool:
     return bool(is_orthogonal and np.array_equal(T[3], (0, 0, 0, 1)) and np.linalg.det(R) > 0)
 
 
-LAST_PORT = 65535
+def check_value(name: str, value: Any, marks: Iterable[Any]) -> None:
+    """Refuse, with ``XResetError``, an argument that breaks a rule of its annotation. None breaks none.
+
+    Args:
+        name: name of the argument in messages.
+        value: its value.
+        marks: what its annotation holds in addition to the type: :func:`marks_in`.
+    """
+    for rule in _broken_rules(marks, value):
+        raise WrongValueError(f"{name} is {shown(value)}, expected {rule.expected}.")
+    for mark in marks:
+        if isinstance(mark, Check) and value is not None:
+            mark.refuse(value)
 
 
 def check_port(port: int) -> None:
     """Refuse, with ``XResetError``, a port that no machine has."""
-    if not 0 <= port <= LAST_PORT:
-        raise XResetError(f"port is {port}, expected a whole number from 0 to {LAST_PORT}.")
+    check_value("port", port, marks_in(Port))
 
 
-def names_wrong_arguments(function: Callable[P, T]) -> Callable[P, T]:
-    """Return a function that raises ``XResetError`` if an argument breaks a rule of its annotation, or in place of
-    Python's own errors if an argument is of another type than its annotation says."""
+def obeys_rules(function: Callable[P, T]) -> Callable[P, T]:
+    """Return a function that raises ``WrongValueError`` if an argument breaks a rule of its annotation."""
 
     @wraps(function)
     def call(*positional: P.args, **named: P.kwargs) -> T:
-        rules = _rules_of(function)
-        if rules:  # methods without rules, such as step, are called often
-            for name, value in _by_name(function, positional, named).items():
-                for rule in _broken_rules(rules.get(name, ()), value):
-                    raise WrongValueError(_message(function, name, value, rule.expected))
-        try:
-            return function(*positional, **named)
-        except (AttributeError, RuntimeError, TypeError, ValueError) as error:
-            known = _by_name(function, positional, named)
-            if isinstance(error, TypeError) and named and not known:
-                given = ", ".join(name for name in signature(function).parameters if name != "self")
-                error.add_note(f"Its arguments are: {given}.")
-            with suppress(TypeError):  # isinstance does not take every type
-                for name, value in known.items():
-                    if not _is_of(_hint_of(function, name), value):
-                        expected = function.__annotations__[name]
-                        raise XResetError(_message(function, name, value, expected)) from error
-            raise
+        given = signature(function).bind(*positional, **named).arguments
+        for name, value in given.items():
+            check_value(name, value, marks_in(_hint_of(function, name)))
+        return function(*positional, **named)
 
     return call
-
-
-def _by_name(
-    function: Callable[..., Any], positional: Sequence[Any], named: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Return the arguments of a call by name; none if one is unknown or missing."""
-    try:
-        return signature(function).bind(*positional, **named).arguments
-    except TypeError:
-        return {}
-
-
-def _message(function: Callable[..., Any], name: str, value: Any, expected: str) -> str:
-    """Return the message about an argument of a public function."""
-    return f"{name} is {shown(value)}, expected {expected}. Look at help(xreset.{function.__qualname__})."
-
-
-@cache
-def _rules_of(function: Callable[..., Any]) -> dict[str, list[Any]]:
-    """Name of an argument -> what its annotation holds in addition to the type, where that is anything."""
-    annotations = getattr(function, "__annotations__", ())
-    marks = {name: _marks(_hint_of(function, name)) for name in annotations}
-    return {name: found for name, found in marks.items() if found}
-
-
-_WIDER: dict[Any, Any] = {
-    bool: (bool, np.bool_), int: Integral, float: Real, Sequence: Iterable, tuple: Iterable,
-}  # fmt: skip
 
 
 def _hint_of(function: Callable[..., Any], name: str) -> Any:
@@ -298,20 +240,16 @@ def _hint_of(function: Callable[..., Any], name: str) -> Any:
 
 
 def _is_of(hint: Any, value: Any) -> bool:
-    """Whether a value and the items of a sequence are of an annotated type."""
+    """Return whether a value and the items of a tuple are of a type of :func:`_choices_of`."""
     if _is_union(hint):
         return any(_is_of(part, value) for part in get_args(hint))
     kind = get_origin(hint) or hint
-    if kind is Any:
-        return True
     if kind is Literal:
         return value in get_args(hint)
-    if kind is Annotated:
-        return _is_of(hint.__origin__, value) and not _broken_rules(hint.__metadata__, value)
-    is_one = isinstance(value, _WIDER.get(kind, kind))
-    if is_one and (kind in (Sequence, Iterable) or Ellipsis in get_args(hint)):
-        return all(_is_of(get_args(hint)[0], item) for item in value)
-    return is_one
+    if kind is tuple:
+        is_list = isinstance(value, tuple | list)
+        return is_list and all(_is_of(get_args(hint)[0], item) for item in value)
+    return isinstance(value, (bool, np.bool_) if kind is bool else kind)
 
 
 # Reading from JSON and TOML -------------------------------------------------------------------------------------------
@@ -348,10 +286,10 @@ def from_dict(cls: type[T], data: Any, where: str = "configuration", version: An
     """Build a dataclass from nested dictionaries, as :func:`dataclasses.asdict` and JSON make them.
 
     A missing entry takes its default, so files stay readable when a field is added: its default must be what was done
-    before. A class may list the fields that it no longer has, with the values that mean what is done now: ``REMOVED:
-    ClassVar[dict[str, Any]]``. Entries with these values are ignored. It may also list the earlier names of fields:
-    ``RENAMED: ClassVar[dict[str, str]]``, earlier name -> present name. ``EARLIER: ClassVar`` is a dataclass of the
-    fields of earlier versions; its method ``entries`` returns what they are called today.
+    before. Entries that :data:`xreset.files.legacy.REMOVED` lists are ignored if they have the value that is listed. A
+    class may list the earlier names of fields: ``RENAMED: ClassVar[dict[str, str]]``, earlier name -> present name.
+    ``EARLIER`` is a dataclass of the fields of earlier versions; its method ``entries`` returns what they are called
+    today.
 
     Args:
         cls: the dataclass.
@@ -406,7 +344,7 @@ def _parsed_record(cls: type, data: Any, where: str, problems: list[str]) -> Any
         return None
     count = len(problems)
     data = renamed(cls, data)
-    removed = getattr(cls, "REMOVED", {})
+    removed = REMOVED.get(cls.__name__, {})
     for name in sorted(data.keys() & removed.keys()):
         if data[name] != removed[name]:
             problems.append(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -388,13 +389,34 @@ def read_meta(path: str | Path) -> dict[str, Any]:
     return meta if isinstance(meta, dict) else {}
 
 
+def stated_inputs(path: str | Path) -> dict[str, str]:
+    """Return the inputs that a file was made from, name -> SHA-256; empty if it does not state them."""
+    inputs = read_meta(path).get("inputs")
+    return inputs if isinstance(inputs, dict) else {}
+
+
 def stated_doubts(path: str | Path) -> list[str]:
     """Return the doubts about demonstrations that a file made from them states in its configuration."""
-    config = read_meta(path).get("config")
-    doubts = config.get("doubts") if isinstance(config, dict) else None
+    doubts = _stated(path, "doubts")
     if not isinstance(doubts, list):
         return []
     return [plain(text) for text in doubts if isinstance(text, str)]
+
+
+def stated_meshes(path: str | Path) -> Path | None:
+    """Return the folder of meshes that a file was made with, if the file states one that is still there. The folder may
+    be relative to one of the folders above the file."""
+    folder = _stated(path, "meshes")
+    if not folder or not isinstance(folder, str):
+        return None
+    places = [Path(), *Path(path).resolve().parents]
+    return next((place / folder for place in places if os.path.isdir(place / folder)), None)
+
+
+def _stated(path: str | Path, name: str) -> Any:
+    """Return an entry of the configuration that a file states; None if there is none."""
+    config = read_meta(path).get("config")
+    return config.get(name) if isinstance(config, dict) else None
 
 
 def record_problem(cls: type, arrays: Arrays, check: Callable[[Arrays], str | None]) -> str | None:

@@ -200,21 +200,8 @@ def claim_folder(path: str | Path) -> Iterator[None]:
         yield
 
 
-def is_claimed(folder: Path) -> bool:
-    """Return whether a command is writing into a folder."""
-    try:
-        descriptor = _lock(folder)
-    except FileNotFoundError:
-        return False
-    if descriptor is None:
-        return True
-    os.close(descriptor)
-    return False
-
-
 def _patient_lock(path: Path) -> int | None:
-    """Lock a folder, or a file that is made for this; try for a quarter of a second, because :func:`is_claimed` locks
-    for a moment."""
+    """Lock a folder, or a file that is made for this; try for a quarter of a second, because a command may just end."""
     for _ in range(5):
         path.parent.mkdir(parents=True, exist_ok=True)
         if not path.is_dir():

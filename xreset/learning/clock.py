@@ -9,12 +9,11 @@ from __future__ import annotations
 from dataclasses import asdict
 from pathlib import Path
 
-from xreset.files.checks import NonNegativeFloat, NonNegativeInt, Share, frozen
-from xreset.files.storage import read_typed, write_json
+from xreset.files.checks import NonNegativeFloat, NonNegativeInt, Share, from_dict, frozen
+from xreset.files.storage import read_json, read_typed, write_json
 
-SCHEMA = "xreset-lift/1"
-FILE = "lift.json"
-"""File next to ``run.json``."""
+EARLIER = ("lift.json", "xreset-lift/1")
+"""File of earlier versions in the run folder, and its schema."""
 SHARES = (0.01, 0.1, 0.5)
 """Shares of success from home whose first passing is recorded."""
 
@@ -33,7 +32,7 @@ class Passing:
 
 @frozen
 class Lift:
-    """Contents of ``lift.json``."""
+    """The entry ``lift`` of ``run.json``."""
 
     passed: tuple[Passing, ...] = ()
     """In the order of :data:`SHARES`."""
@@ -43,10 +42,6 @@ class Lift:
     minutes: NonNegativeFloat = 0.0
     success_from_home: Share = 0.0
     """Share in the last iteration."""
-
-    def reaches(self, target: float | None) -> bool:
-        """Return whether success from home in the last iteration reaches a target; without one it never does."""
-        return target is not None and self.success_from_home >= target
 
     def up_to(self, iteration: int) -> Lift:
         """Return the contents without what came after an iteration."""
@@ -61,15 +56,24 @@ class Lift:
 
 
 def write_lift(folder: Path, lift: Lift) -> None:
-    """Write a run's ``lift.json``."""
-    write_json(folder / FILE, {"schema": SCHEMA} | asdict(lift))
+    """Write the entry ``lift`` of ``run.json``."""
+    path = folder / "run.json"
+    stated = read_json(path) if path.is_file() else {}
+    write_json(path, stated | {"lift": asdict(lift)})
 
 
 def read_lift(folder: Path) -> Lift:
-    """Read a run's ``lift.json``; an empty one for runs of earlier versions, which have none.
+    """Read the entry ``lift`` of ``run.json``; an empty one for a run that has none.
 
     Raises:
         FileFormatError: the file is damaged.
     """
-    path = folder / FILE
-    return read_typed(Lift, path, SCHEMA) if path.is_file() else Lift()
+    file, schema = EARLIER
+    path = folder / "run.json"
+    if path.is_file():
+        entry = read_json(path).get("lift")
+        if entry is not None:
+            return from_dict(Lift, entry, f"{path}: lift")
+    if (folder / file).is_file():
+        return read_typed(Lift, folder / file, schema)
+    return Lift()

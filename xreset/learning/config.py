@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from itertools import pairwise
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -39,18 +39,8 @@ Widths = Annotated[
 class ModelConfig(Checked):
     """Actor and critic: PointNet per cloud frame, LSTM with layer norm on its output, MLP."""
 
-    REMOVED: ClassVar = {
-        "initial_hand_std": None,
-        "synergy_std": None,
-        "activation": "elu",
-        "normalize_observations": True,
-    }
-
     pointnet: Widths = (64, 128, 64)
     """Widths of the per-point MLP 3 -> 64 -> 128 -> 64; the maximum over points is the frame's embedding."""
-    conv: Widths = (16, 32, 32)
-    """Channels of the convolutions for depth images, each of which halves the image; the last width of ``pointnet`` is
-    the images' embedding."""
     lstm: PositiveInt = 512
     """Units of the LSTM."""
     mlp: Widths = (512, 256, 128)
@@ -74,8 +64,6 @@ class ModelConfig(Checked):
 class PpoConfig(Checked):
     """Proximal policy optimization."""
 
-    REMOVED: ClassVar = {"critic_learning_rate": None, "clip_values": True, "grad_norm": 1.0}
-
     horizon: Annotated[int, Rule("a number above 1", lambda steps: steps > 1)] = 16
     """Control steps per world and iteration. Not 1: rsl-rl stores LSTM states from a run's second step on."""
     sequence_length: PositiveInt = 4
@@ -85,14 +73,10 @@ class PpoConfig(Checked):
     """Transitions per minibatch. With fewer transitions per iteration than two of these, an iteration is one
     minibatch."""
     discount: Share = 0.99
-    gae_lambda: Share = 0.95
     learning_rate: PositiveFloat = 1e-3
-    """Learning rate of actor and critic; with an adaptive schedule the initial one."""
-    schedule: Literal["adaptive", "fixed"] = "adaptive"
-    """``adaptive``: the rate is divided (multiplied) by 1.5 where the policy moved more than twice (less than half)
-    ``desired_kl``."""
+    """Initial learning rate of actor and critic. It is divided (multiplied) by 1.5 where the policy moved more than
+    twice (less than half) ``desired_kl``."""
     desired_kl: PositiveFloat = 0.01
-    clip: PositiveFloat = 0.2
     entropy: NonNegativeFloat = 0.005
     bounds_loss: NonNegativeFloat = 0.0
     """Weight of the squared excess of the actions' means over +-1.1, summed over actions: beyond the limit, noise
@@ -144,9 +128,6 @@ ShareSchedule = Annotated[
         is_schedule,
     ),
 ]
-PositiveSchedule = Annotated[
-    ShareSchedule, Rule("values above 0", lambda points: all(value > 0 for _, value in points))
-]
 
 
 @frozen
@@ -161,16 +142,6 @@ class ScheduleConfig(Checked):
 
     teacher: ShareSchedule = ()
     """Share of the worlds in which the teacher acts during a distillation. Empty: none."""
-    demo_probability: ShareSchedule = ()
-    """Replaces ``task.reset.demo_probability``, such as ``0 0.5 1 0.25``: demonstrated states teach the first grasp,
-    and starts from home are what is evaluated."""
-    success_position: PositiveSchedule = ()
-    """Replaces ``task.reward.success_position`` [m], such as ``0 0.05 1 0.01``: what counts as success becomes
-    stricter. Evaluations keep their own limits."""
-    faults: ShareSchedule = ()
-    """Factor on the faults of a real loop, such as ``0 0 0.5 1``: all delays, lost actions, errors and losses of the
-    tracker (not its interval), and the probability of pushes of ``task.randomization``. An episode keeps the delays,
-    the biases and the probabilities that it began with."""
 
 
 def value_at(points: Points, progress: float) -> float:
@@ -275,8 +246,6 @@ class TrainConfig(Checked):
     The defaults are the recipe of the headline results. Those of its parts, such as ``TaskConfig()``, are the paper's.
     """
 
-    REMOVED: ClassVar = {"random_episode_start": True}
-
     task: TaskConfig = TASK
     model: ModelConfig = MODEL
     ppo: PpoConfig = PPO
@@ -285,16 +254,3 @@ class TrainConfig(Checked):
     """Number of iterations; 2,600 with 4,096 worlds are 170 M steps, or 25 minutes of one H100."""
     save_interval: PositiveInt = 50
     """Iterations between checkpoints."""
-    target_success: (
-        Annotated[float, Rule("a number above 0 and at most 1", lambda x: 0 < x <= 1)] | None
-    ) = None
-    """The training ends when success from home reaches this share, such as 0.1, in one iteration. It is the share of
-    the steps with the object at its goal, among the steps of worlds that started at home. None: no such end."""
-
-    @property
-    def uses_states(self) -> bool:
-        """Whether episodes ever begin in states of the bank."""
-        schedule = self.schedule.demo_probability
-        if not schedule:
-            return self.task.reset.demo_probability > 0
-        return any(value > 0 for _, value in schedule)

@@ -130,7 +130,7 @@ class TrainingLog:
         self._steps.clear()
 
     def write_lift(self) -> None:
-        """Write the lift clock's file."""
+        """Write the lift clock."""
         write_lift(self._folder, self.lift)
 
     def close(self) -> None:

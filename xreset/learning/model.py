@@ -25,6 +25,8 @@ with needs("rsl-rl-lib", "train"):
     from rsl_rl.modules import CNN, EmpiricalNormalization, HiddenState
     from rsl_rl.modules.distribution import GaussianDistribution
 
+CONV = (16, 32, 32)
+"""Channels of the convolutions for depth images, each of which halves the image."""
 LstmState = tuple[Tensor, Tensor]
 """Hidden and cell state of the LSTM, each [1, N, lstm]."""
 
@@ -374,7 +376,7 @@ class ExportedPolicy(nn.Module):
 def make_actor(obs: TensorDict, num_actions: int, config: TrainConfig) -> PointNetLstmModel:
     """Return a new actor; ``obs`` is an example of the observations."""
     vision = config.task.vision
-    conv = config.model.conv if vision.cameras and vision.view == "depth" else ()
+    conv = CONV if vision.cameras and vision.view == "depth" else ()
     actor = PointNetLstmModel(
         obs, config.task.policy_groups, num_actions, config.model, conv=conv, stochastic=True
     )

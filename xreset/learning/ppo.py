@@ -23,11 +23,15 @@ from xreset.physics.capture import GraphRunner
 
 BOUND = 1.1
 """Mean of an action beyond which ``bounds_loss`` pulls it back."""
+CLIP = 0.2
+"""Clip range of the policy's ratio and of the values (Table VIII)."""
+GAE_LAMBDA = 0.95
+"""Decay of the advantages' estimator (Table VIII)."""
 GRAD_NORM = 1.0
 """Largest norm of a network's gradient (Table VIII); a longer one is shortened to it."""
 SLOWEST = 1e-5
 FASTEST = 1e-2
-"""Limits of an adaptive learning rate (rsl-rl's)."""
+"""Limits of the learning rate (rsl-rl's)."""
 
 
 def first_steps(storage: RolloutStorage, worlds: Tensor) -> Tensor:
@@ -74,14 +78,14 @@ class SequencePpo(PPO):
             RolloutStorage("rl", len(obs), p.horizon, obs, [num_actions], device),
             num_learning_epochs=p.mini_epochs,
             num_mini_batches=p.minibatches(len(obs)),
-            clip_param=p.clip,
+            clip_param=CLIP,
             gamma=p.discount,
-            lam=p.gae_lambda,
+            lam=GAE_LAMBDA,
             value_loss_coef=p.value_loss,
             entropy_coef=p.entropy,
             learning_rate=p.learning_rate,
             max_grad_norm=GRAD_NORM,
-            schedule=p.schedule,
+            schedule="adaptive",
             desired_kl=p.desired_kl,
             device=device,
             multi_gpu_cfg=processes.ranks,
@@ -167,9 +171,8 @@ class SequencePpo(PPO):
         log_prob = self.actor.get_output_log_prob(storage.actions[:, worlds])
         values = self.critic(observations, masks=first, hidden_state=critic_state)
         entropy = self.actor.output_entropy.mean()
-        if self.schedule == "adaptive":
-            self._adapt_rate(tuple(p[:, worlds] for p in storage.distribution_params or ()))
-            self._use_rate()
+        self._adapt_rate(tuple(p[:, worlds] for p in storage.distribution_params or ()))
+        self._use_rate()
         advantages = storage.advantages[:, worlds, 0]
         ratio = torch.exp(log_prob - storage.actions_log_prob[:, worlds, 0])
         clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)

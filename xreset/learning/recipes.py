@@ -91,18 +91,14 @@ RECIPES = _read_recipes()
 """Name -> recipe."""
 
 
-def default_config(bank: Any, goals: Any, weights: str | Path | None) -> tuple[str, TrainConfig]:
+def default_config(goals: Any, weights: str | Path | None) -> tuple[str, TrainConfig]:
     """Return where the configuration comes from if nothing is said, and the configuration.
 
-    With goals and the weights of a run, it is that run's configuration. If there is no bank then, the schedule of
-    demonstrated states is left out. In all other cases it is the recipe ``default``.
+    With goals and the weights of a run, it is that run's configuration. Otherwise it is the recipe ``default``.
     """
     if goals is None or weights is None or not (Path(weights) / "run.json").is_file():
         return "default", TrainConfig()
-    config = starting_config(str(weights))
-    if bank is None:
-        config = replace(config, schedule=replace(config.schedule, demo_probability=()))
-    return str(weights), config
+    return str(weights), starting_config(str(weights))
 
 
 def starting_config(recipe: str) -> TrainConfig:
@@ -139,19 +135,9 @@ def starting_config(recipe: str) -> TrainConfig:
 
 
 def from_home(config: TrainConfig) -> TrainConfig:
-    """Return the configuration for goals without demonstrated states: every episode begins at home.
-
-    Raises:
-        RunError: a schedule asks for demonstrated states.
-    """
+    """Return the configuration for goals without demonstrated states: every episode begins at home."""
     reset = replace(config.task.reset, demo_probability=0.0)
-    config = replace(config, task=replace(config.task, reset=reset))
-    if config.uses_states:
-        raise RunError(
-            "schedule.demo_probability asks for demonstrated states, and a goal set has none. Add a reset bank "
-            "(--resets), or leave the schedule empty: --config.schedule.demo-probability"
-        )
-    return config
+    return replace(config, task=replace(config.task, reset=reset))
 
 
 def own_terms_flags(own: Mapping[str, Mapping[str, Any]]) -> str:

@@ -2,7 +2,6 @@
 
 RUN/run.json                 everything that the training was started with
 RUN/checkpoints/000050.pt    model, optimizer and counters after 50 iterations
-RUN/lift.json                when success from home passed 1, 10 and 50 %
 RUN/policy.onnx              the policy, with its contract
 RUN/teacher.onnx             the policy that a distillation learned from
 RUN/choice.json              the checkpoint whose policy this is, if ``xreset select`` chose one
@@ -22,6 +21,7 @@ from xreset.errors import RunError, WrongValueError
 from xreset.files.checks import Checked, NonNegativeInt, PositiveInt, Rule, Share, from_dict, frozen
 from xreset.files.storage import read_json, read_typed, write_json
 from xreset.files.text import shown
+from xreset.learning.clock import Lift
 from xreset.learning.config import TrainConfig
 from xreset.physics.plugins import robot_names
 from xreset.task.contract import Contract
@@ -62,6 +62,8 @@ class RunInfo(Checked):
     """SHA-256 of the checkpoint."""
     teacher: str | None = None
     """Name of the policy that a distillation learns from; it is copied to ``teacher.onnx``. None: the rewards teach."""
+    lift: Lift = Lift()
+    """When success from home passed its marks, and how far the training has come."""
 
 
 def write_run(folder: Path, info: RunInfo) -> None:

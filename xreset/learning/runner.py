@@ -96,9 +96,8 @@ class TrainingRunner:
     def learn(self, total: int, *, seconds: float = math.inf) -> int | None:
         """Train until a number of iterations is done in all, and write a checkpoint.
 
-        The configuration's ``target_success`` ends the training earlier, and so does a signal (Ctrl-C, SIGTERM or
-        SIGHUP), after an iteration. The first episodes start at random times, so that the worlds do not end them
-        together.
+        A signal (Ctrl-C, SIGTERM or SIGHUP) ends the training earlier, after an iteration. The first episodes start at
+        random times, so that the worlds do not end them together.
 
         Args:
             total: iterations in all, those of a resumed run included.
@@ -123,17 +122,14 @@ class TrainingRunner:
         saved_at = self.iteration
         earlier = self.elapsed
         begin = time.perf_counter()
-        reached = False
         with _stop_on_interrupt(say=self.processes.is_main) as requests:
             while self.iteration < total:
                 over = time.perf_counter() - begin > seconds
-                if self._agreed(bool(requests) or reached or over):
+                if self._agreed(bool(requests) or over):
                     break
                 share_of_time = (earlier + time.perf_counter() - begin) / (earlier + seconds)
                 self._follow_schedule(max(self.iteration / total, share_of_time))
                 obs = self._iterate(obs, log)
-                if log is not None:
-                    reached = log.lift.reaches(self.config.target_success)
                 if self.iteration % self.config.save_interval == 0:
                     self.save_checkpoint()
                     saved_at = self.iteration
@@ -143,12 +139,7 @@ class TrainingRunner:
             self.save_checkpoint()
         if log is not None:
             log.close()
-            if reached:
-                print(
-                    f"success from home is {log.lift.success_from_home:.1%} and reaches its target: the training ends, "
-                    "and a checkpoint is written"
-                )
-            elif self.iteration < total:
+            if self.iteration < total:
                 print(
                     "stopped after the current iteration; a checkpoint is written. To continue: "
                     + self._resume_command
@@ -164,13 +155,6 @@ class TrainingRunner:
     def _follow_schedule(self, progress: float) -> None:
         """Give the settings that have a schedule their values at a share of the run."""
         schedule = self.config.schedule
-        if schedule.demo_probability:
-            share = value_at(schedule.demo_probability, progress)
-            self.env.resets.demo_probability.fill_(share)
-        if schedule.success_position:
-            self.env.success_position.fill_(value_at(schedule.success_position, progress))
-        if schedule.faults:
-            self.env.worlds.fault_scale.fill_(value_at(schedule.faults, progress))
         if schedule.teacher and isinstance(self.alg, SequenceDistillation):
             self.alg.teacher_share = value_at(schedule.teacher, progress)
 
@@ -303,12 +287,11 @@ class TrainingRunner:
     def load_networks(self, path: Path) -> None:
         """Start with the actor and the critic of another run's checkpoint, with normalization and standard deviation.
 
-        An adaptive learning rate starts where the other run's rate was: a new run's rate would undo in one step what
-        the networks have learned.
+        The learning rate starts where the other run's rate was: a new run's rate would undo in one step what the
+        networks have learned.
         """
         content = self._load(path)
-        if self.config.ppo.schedule == "adaptive":
-            self.alg.learning_rate = content.learning_rate
+        self.alg.learning_rate = content.learning_rate
 
     def _load(self, path: Path) -> Checkpoint:
         """Read a checkpoint, and load its networks."""

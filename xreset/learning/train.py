@@ -24,7 +24,7 @@ from xreset.cameras.config import (
 )
 from xreset.env.manipulation import make_env
 from xreset.errors import PolicyError, RunError, Stopped, XResetError
-from xreset.files.checks import Seed, names_wrong_arguments
+from xreset.files.checks import Seed, obeys_rules
 from xreset.files.storage import claim_folder, file_hash, write_whole
 from xreset.files.text import shown
 from xreset.learning.config import TrainConfig
@@ -57,6 +57,7 @@ from xreset.resets.inputs import Inputs, load_inputs
 from xreset.task.rewards import RewardFunction
 
 
+@obeys_rules
 def train(
     bank: str | Path | ResetBank | None = None,
     *,
@@ -111,8 +112,8 @@ def train(
 
     Raises:
         Stopped: a signal ended the training early; a checkpoint and the policy are written.
-        RunError: the folder holds another training, there is no state to reset to, a schedule asks for states that
-            goals do not have, ``weights`` has no checkpoint of networks like these, or there is too little memory.
+        RunError: the folder holds another training, there is no state to reset to, ``weights`` has no checkpoint of
+            networks like these, or there is too little memory.
         PolicyError: ``weights`` is of another robot, or its policy observes something else.
         XResetError: bank, robot, objects and configuration do not fit together.
     """
@@ -122,7 +123,7 @@ def train(
     if recipe is not None:
         config = starting_config(recipe)
     elif config is None:
-        _, config = default_config(bank, goals, weights)
+        _, config = default_config(goals, weights)
     if iterations is not None:
         config = replace(config, iterations=iterations)
     device = device or device_for(engine, "cuda" if torch.cuda.is_available() else "cpu")
@@ -309,24 +310,30 @@ def distill(
             have fewer pixels than points, or the renderer cannot start.
     """
     if config is None:
-        wanted = [cameras] if isinstance(cameras, str | CameraConfig) else cameras
-        chosen = tuple(_camera(each) for each in wanted)
-        teacher_task = read_policy(teacher).contract.task
-        try:
-            vision = replace(vision or STUDENT_VISION, cameras=chosen)
-        except ValueError as error:
-            raise XResetError(
-                f"vision.{error}. Give fewer points, or a larger width and height."
-            ) from None
-        config = student_config(teacher_task, vision)
+        config = config_of_student(teacher, cameras, vision)
     if not config.task.vision.cameras:
         raise XResetError(
             "A student needs a camera. Give one or two of: " + ", ".join(CAMERAS) + "."
         )
     check_each_once(config.task.vision.cameras)
-    # names an option of a wrong type, as xreset.train does
-    public_train = names_wrong_arguments(train)
-    return public_train(bank, out=out, config=config, teacher=teacher, **options)
+    return train(bank, out=out, config=config, teacher=teacher, **options)
+
+
+def config_of_student(
+    teacher: str | Path,
+    cameras: str | CameraConfig | Sequence[str | CameraConfig] = "front",
+    vision: VisionConfig | None = None,
+) -> TrainConfig:
+    """Return the configuration of a distillation; arguments and errors as of :func:`distill`."""
+    wanted = [cameras] if isinstance(cameras, str | CameraConfig) else cameras
+    chosen = tuple(_camera(each) for each in wanted)
+    try:
+        vision = replace(vision or STUDENT_VISION, cameras=chosen)
+    except ValueError as error:
+        raise XResetError(
+            f"vision.{error}. Give fewer points, or a larger width and height."
+        ) from None
+    return student_config(read_policy(teacher).contract.task, vision)
 
 
 def _bank_or_goals(
@@ -353,15 +360,10 @@ def _check_config(config: TrainConfig, inputs: Inputs, *, has_teacher: bool) -> 
     RewardFunction(config.task.reward)
     if config.schedule.teacher and not has_teacher:
         raise RunError(
-            "schedule.teacher is for xreset distill, and this training has no teacher. Leave it empty: "
+            "schedule.teacher is for students (--teacher), and this training has no teacher. Leave it empty: "
             "--config.schedule.teacher without a value"
         )
-    if config.schedule.faults and not config.task.randomization.has_faults:
-        raise RunError(
-            "schedule.faults scales the faults of a real loop, and task.randomization has none. Set some, "
-            "or omit the schedule."
-        )
-    if config.uses_states and not inputs.bank.num_states:
+    if config.task.reset.demo_probability > 0 and not inputs.bank.num_states:
         raise RunError(
             f"There is no state to reset to in {inputs.name}: every candidate was rejected. Look at its reasons "
             "(xreset resets), or train without it: --config.task.reset.demo-probability 0"
@@ -377,8 +379,8 @@ def _checkpoint_to_start_from(run: Path, inputs: Inputs, config: TrainConfig) ->
     other = read_run(run)
     if other.teacher is not None:
         raise RunError(
-            f"{run} is a run of xreset distill and has no critic, so no training can start from it. Give a run of "
-            f"xreset train (--weights), or continue the distillation: --out {run} --resume"
+            f"{run} is the run of a student (--teacher) and has no critic, so no training can start from it. Give "
+            f"another run (--weights), or continue the student: --out {run} --resume"
         )
     start = f"Start from its configuration, with recipe=... or --recipe {run}"
     try:

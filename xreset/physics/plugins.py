@@ -16,9 +16,10 @@ from importlib.metadata import EntryPoint, entry_points
 from inspect import Parameter, signature
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from xreset.errors import BackendUnavailableError, RobotError, XResetError
+from xreset.files.checks import Check
 from xreset.files.text import shown
 
 if TYPE_CHECKING:
@@ -172,6 +173,10 @@ def existing_device(device: str) -> str:
             f"The device is {device}, but torch can use {count} GPUs. Check nvidia-smi, or use cpu."
         )
     return f"cuda:{index}"
+
+
+Device = Annotated[str, Check(existing_device)]
+"""Name of a device that this machine has: ``cpu``, ``cuda`` or one of several GPUs, such as ``cuda:1``."""
 
 
 def _kind(device: str) -> str:

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from xreset.errors import PolicyError, WrongValueError, needs
-from xreset.files.checks import names_wrong_arguments, parsed
+from xreset.files.checks import parsed
 from xreset.files.storage import max_bytes, parse_json
 from xreset.files.text import shown
 from xreset.spec import RobotSpec
@@ -181,7 +181,6 @@ class OnnxPolicy:
         checkpoint: SHA-256 of the checkpoint that it was exported from; None: it states none.
     """
 
-    @names_wrong_arguments
     def __init__(self, path: str | Path, content: bytes | None = None) -> None:
         """Load the file.
 

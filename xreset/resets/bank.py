@@ -245,7 +245,7 @@ give."""
 
 def check_objects(path: str | Path, bank: ResetBank, objects: tuple[ObjectSpec, ...]) -> None:
     """Refuse objects whose geometry, mass or friction is not what the bank was made with; ``FileFormatError``."""
-    check_sources(path, bank, {o.name: o.source for o in objects})
+    check_sources(path, stated_sources(bank), {o.name: o.source for o in objects})
     for obj in objects:
         if obj.name not in bank.object_names:
             continue
@@ -263,15 +263,20 @@ def check_objects(path: str | Path, bank: ResetBank, objects: tuple[ObjectSpec, 
                 )
 
 
-def check_sources(path: str | Path, bank: ResetBank, given: Mapping[str, str]) -> None:
-    """Refuse objects whose geometry is not what the bank was made with; ``FileFormatError``.
+def stated_sources(bank: ResetBank) -> dict[str, str]:
+    """Return the name of each object of a bank -> its ``source``."""
+    return dict(zip(bank.object_names, bank.object_sources, strict=True))
+
+
+def check_sources(path: str | Path, stated: Mapping[str, str], given: Mapping[str, str]) -> None:
+    """Refuse objects whose geometry is not what a file states; ``FileFormatError``.
 
     Args:
-        path: file of the bank, for messages.
-        bank: the bank.
-        given: name of an object -> its ``source``.
+        path: the file, for messages.
+        stated: name of an object -> its ``source``, as the file states it.
+        given: the same of the objects as they are.
     """
-    for name, source in zip(bank.object_names, bank.object_sources, strict=True):
+    for name, source in stated.items():
         given_source = given.get(name, source)
         if given_source == source:
             continue
@@ -280,8 +285,8 @@ def check_sources(path: str | Path, bank: ResetBank, given: Mapping[str, str]) -
         if found == used:
             found = "another mesh"
         raise FileFormatError(
-            f"{path} was made with {used} of {name}, but the given one is {found}. Give the same folder of meshes, or "
-            "make it again."
+            f"{path} was made with {used} of {name}, but the given one is {found}. Give the same folder of meshes "
+            "(--meshes), or make it again."
         )
 
 

@@ -21,6 +21,8 @@ from xreset.spec import ObjectSpec, RobotSpec
 
 TOUCH = 0.002
 """A finger nearer to the object than this touches it [m]; retargeting keeps 0.5 mm between them."""
+WITHIN = 0.10
+"""States are added between two frames if a finger is nearer than this to the object in one of them [m]."""
 MOVED = 0.01
 """An object has been moved once its origin is farther than this from where it started [m]."""
 
@@ -44,7 +46,7 @@ def closing_states(
         object_name = retargeted.object_name[retargeted.sequence_of_frame]
         poses = (retargeted.joint_pos, retargeted.object_pos, retargeted.object_quat_wxyz)
         fingers = fingers_of(robot, objects, object_name, *poses)
-        followed = _frames_to_follow(retargeted, fingers, config.within)
+        followed = _frames_to_follow(retargeted, fingers)
         step = retargeted.fingertip_pos[followed + 1] - retargeted.fingertip_pos[followed]
         travel = np.linalg.norm(step, axis=-1).max(axis=-1)
         count[followed] = np.maximum(np.ceil(travel / config.spacing).astype(int), 1)
@@ -57,7 +59,7 @@ def closing_states(
     return frame, part, (joint_pos, object_pos, object_quat)
 
 
-def _frames_to_follow(retargeted: Retargeted, fingers: Fingers, within: float) -> np.ndarray:
+def _frames_to_follow(retargeted: Retargeted, fingers: Fingers) -> np.ndarray:
     """Return the frames after which states are added, on the way to the next frame."""
     owner = retargeted.sequence_of_frame
     start = retargeted.frame_offsets[:-1][owner]
@@ -69,7 +71,7 @@ def _frames_to_follow(retargeted: Retargeted, fingers: Fingers, within: float) -
     # in this frame, or in an earlier one of the same sequence
     has_ended = num_ends > before_sequence
     gap = fingers.gap.amin(dim=-1).numpy()
-    near = np.minimum(gap[:-1], gap[1:]) < within
+    near = np.minimum(gap[:-1], gap[1:]) < WITHIN
     same_sequence = owner[:-1] == owner[1:]
     return np.flatnonzero(
         same_sequence & retargeted.valid[:-1] & retargeted.valid[1:] & ~has_ended[:-1] & near

@@ -35,8 +35,6 @@ class ClosingConfig(Checked):
 
     spacing: Length | None = 0.005
     """Farthest that any fingertip moves from one state to the next [m]. None: no states are added."""
-    within: PositiveFloat = 0.10
-    """States are added between two frames if a finger is nearer than this to the object in one of them [m]."""
 
 
 @frozen
@@ -70,36 +68,14 @@ class TransferConfig(Checked):
 
     per_pose: NonNegativeInt = 8
     """Most states at each pose. 0: no states are added."""
-    poses: PositiveInt = 4
-    """Most poses of each demonstration: evenly from the first frame in which the object is raised by 3 cm to the last,
-    usually the goal. 1: the first only."""
-    candidates: PositiveInt = 40
-    """Most grasps that are tried at each pose."""
-    seed: NonNegativeInt = 0
-    """The same seed draws the same grasps."""
 
 
 @frozen
 class GoalConfig(Checked):
-    """How a goal set is drawn (:mod:`xreset.resets.goals`). Offsets are those of the published paper's evaluation of
-    objects without demonstrations (its table A3); the height of a lift is not in the paper."""
+    """How a goal set is drawn (:mod:`xreset.resets.goals`)."""
 
     per_family: PositiveInt = 20
     """Goals of each object and family."""
-    lift: PositiveFloat = 0.20
-    """Height of the goal above the start [m]."""
-    angle: NonNegativeFloat = 60.0
-    """Angle of the families ``yaw``, ``tilt-x`` and ``tilt-y`` [degrees]."""
-    start_xy: NonNegativeFloat = 0.02
-    """Starts are moved by U(-x, x) in both directions [m]."""
-    start_yaw: NonNegativeFloat = 25.0
-    """Starts are turned about the vertical by U(-y, y) [degrees]."""
-    goal_xy: NonNegativeFloat = 0.03
-    """Goals are moved by U(-x, x) in both directions [m]."""
-    goal_z: NonNegativeFloat = 0.05
-    """Goals are moved up or down by U(-z, z) [m]."""
-    goal_yaw: NonNegativeFloat = 30.0
-    """Goals are turned about the vertical by U(-y, y) [degrees]."""
     upright: bool = False
     """Whether objects start in the resting pose in which their mesh's z axis points up. Otherwise they start in any of
     their resting poses, on a broad face more often than on a narrow one."""

@@ -137,7 +137,6 @@ class ResetDistribution:
     it.
 
     Attributes:
-        demo_probability: [] share of resets from the bank: the configured one, until another is filled in.
         success_rate: [S] share of the last episodes from home that succeeded, for each demonstration of the bank
             (:meth:`record`).
     """
@@ -166,7 +165,6 @@ class ResetDistribution:
             DemoError: an object of the scene has no demonstration in the bank.
         """
         self.config = config
-        self.demo_probability = torch.tensor(float(config.demo_probability), device=device)
         missing = [name for name in object_names if name not in bank.sequence_object]
         if missing:
             raise DemoError(
@@ -253,7 +251,9 @@ class ResetDistribution:
         states = self._states_of_object
         if not len(states.rows):
             return home
-        from_bank = (uniform[:, 0] < self.demo_probability) & (states.count[object_index] > 0)
+        from_bank = (uniform[:, 0] < self.config.demo_probability) & (
+            states.count[object_index] > 0
+        )
         row = states.draw(object_index, uniform[:, 1])
         if adaptive:
             own = self._states_of_sequence
@@ -284,7 +284,7 @@ class ResetDistribution:
         c = self.config
         device = generator.device
         noise = torch.randn(m, len(self._home), generator=generator, device=device)
-        noise = noise * self._home_std * c.home_noise
+        noise = noise * self._home_std
         joint_pos = (self._home + noise).clamp(self._lower, self._upper)
         shift = 2.0 * torch.rand(m, 3, generator=generator, device=device) - 1.0
         spawn_xy = c.spawn_xy if c.training_xy is None else c.training_xy

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from xreset.errors import DemoError
-from xreset.files.checks import PositiveInt
+from xreset.files.checks import PositiveInt, obeys_rules
 from xreset.files.progress import Progress, unseen
 from xreset.physics import State
 from xreset.resets.bank import ResetBank, starts_and_goals
@@ -34,6 +34,7 @@ from xreset.spec import (
 )
 
 
+@obeys_rules
 def make_bank(
     retargeted: Retargeted,
     robot: RobotSpec,

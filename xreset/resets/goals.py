@@ -44,6 +44,15 @@ FAMILIES = ("lift", "yaw", "tilt-x", "tilt-y", "random")
 _MIDDLE = tuple(sum(span) / 2 for span in WORKSPACE)
 _Z = (0.0, 0.0, 1.0)
 _TURN_AXES = {"yaw": _Z, "tilt-x": (1.0, 0.0, 0.0), "tilt-y": (0.0, 1.0, 0.0)}
+LIFT_HEIGHT = 0.20
+"""Height of the goals of most families above the start [m]; not in the paper."""
+ANGLE = 60.0
+"""Angle of the families ``yaw``, ``tilt-x`` and ``tilt-y`` [degrees]."""
+START_OFFSET = np.array([0.02, 0.02, np.radians(25.0)])
+"""Starts are moved by U(-1, 1) times this: x and y [m], turn about the vertical [rad]. These offsets and the next are
+those of the published paper's evaluation of objects without demonstrations (its table A3)."""
+GOAL_OFFSET = np.array([0.03, 0.03, 0.05, np.radians(30.0)])
+"""Goals are moved by U(-1, 1) times this: x, y and z [m], turn about the vertical [rad]."""
 _START_SEED = 42
 _GOAL_SEED = 71
 """The published paper's seed bases of its start and goal offsets."""
@@ -142,16 +151,23 @@ def make_goals(
         ]:
             raise GoalError(
                 f"{robot.name} cannot reach {len(missing)} of {len(wanted)} goals of {obj.name}, such as {missing[0]}: "
-                "no grasp holds the object both at its start and there. Lower the lift or the angle, leave out the "
+                "no grasp holds the object both at its start and there. Leave out the "
                 "family, or move the goal."
             )
         episodes += [found[item] for item in wanted]
     return _goal_set(robot, episodes)
 
 
-def write_goals(path: str | Path, goals: GoalSet, config: GoalConfig | None = None) -> None:
-    """Write a goal set; see :func:`xreset.files.records.write_record`."""
-    made_with = asdict(config) if config else None
+def write_goals(
+    path: str | Path,
+    goals: GoalSet,
+    config: GoalConfig | None = None,
+    *,
+    meshes: str | Path | None = None,
+) -> None:
+    """Write a goal set, how it was drawn, and the folder of the objects' meshes; see
+    :func:`xreset.files.records.write_record`."""
+    made_with = (asdict(config) if config else {}) | {"meshes": str(meshes) if meshes else None}
     write_record(GoalSet, path, SCHEMA, goals, check=bank_problem, config=made_with)
 
 
@@ -334,30 +350,30 @@ def _draw(
     (x, y), (goal_x, goal_y) = random.uniform(*np.transpose(WORKSPACE), size=(2, 2))
     center = np.array([x, y, height])
     resting = _about_z(random.uniform(0.0, 2.0 * np.pi)) * resting
-    start_offset = np.random.default_rng([_START_SEED, *key]).uniform(-1.0, 1.0, 3)  # x, y, yaw
-    goal_offset = np.random.default_rng([_GOAL_SEED, *key]).uniform(-1.0, 1.0, 4)  # x, y, z, yaw
+    start_offset = START_OFFSET * np.random.default_rng([_START_SEED, *key]).uniform(-1.0, 1.0, 3)
+    goal_offset = GOAL_OFFSET * np.random.default_rng([_GOAL_SEED, *key]).uniform(-1.0, 1.0, 4)
     if family == OWN:
         pos, quat = own[number]
         goal_turn = turn_of(quat)
         goal = pos + goal_turn.apply(obj.com)
     else:
-        goal = center + np.array([0.0, 0.0, config.lift])
+        goal = center + np.array([0.0, 0.0, LIFT_HEIGHT])
         turn = Rotation.identity()
         if family == "random":
             goal = np.array([goal_x, goal_y, height + random.uniform(*LIFT)])
             axis = random.normal(size=3)
             turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * random.uniform(0.0, np.pi))
         elif family in _TURN_AXES:
-            angle = random.choice((-1.0, 1.0)) * np.radians(config.angle)
+            angle = random.choice((-1.0, 1.0)) * np.radians(ANGLE)
             turn = Rotation.from_rotvec(angle * np.array(_TURN_AXES[family]))
-        goal += np.array([config.goal_xy, config.goal_xy, config.goal_z]) * goal_offset[:3]
-        goal_turn = _about_z(np.radians(config.goal_yaw) * goal_offset[3]) * turn * resting
+        goal += goal_offset[:3]
+        goal_turn = _about_z(goal_offset[3]) * turn * resting
     return _Episode(
         obj=obj,
         family=family,
         number=number,
-        start=center + np.array([config.start_xy, config.start_xy, 0.0]) * start_offset,
-        start_turn=_about_z(np.radians(config.start_yaw) * start_offset[2]) * resting,
+        start=center + np.array([*start_offset[:2], 0.0]),
+        start_turn=_about_z(start_offset[2]) * resting,
         goal=goal,
         goal_turn=goal_turn,
     )

@@ -14,7 +14,7 @@ from xreset.demos.archive import Demos, demo_objects, read_demos
 from xreset.errors import DemoError, FileFormatError, XResetError
 from xreset.files.checks import frozen
 from xreset.files.progress import Progress, unseen
-from xreset.files.records import npz_schema
+from xreset.files.records import npz_schema, stated_meshes
 from xreset.files.storage import file_hash
 from xreset.files.text import shown
 from xreset.geometry.description import load_robot
@@ -26,11 +26,12 @@ from xreset.resets.bank import (
     check_sources,
     read_bank,
     starts_and_goals,
+    stated_sources,
 )
 from xreset.resets.goals import SCHEMA as GOALS
 from xreset.resets.goals import GoalSet, checked_goals, read_goals
 from xreset.retarget.file import SCHEMA as MOTION
-from xreset.retarget.file import Retargeted, check_retargeted, read_retargeted
+from xreset.retarget.file import Retargeted, check_retargeted, object_sources, read_retargeted
 from xreset.retarget.pipeline import rest_on_table, retarget_demos
 from xreset.spec import ObjectSpec, RobotSpec, check_robot
 
@@ -124,7 +125,7 @@ def load_inputs(
     Args:
         source: file of ``xreset demos``, ``xreset retarget``, ``xreset resets`` or ``xreset goals``, or its content.
         robot: the robot, its name or its folder; default: the robot that the file names. Demonstrations name none.
-        meshes: folder of object meshes; default: the built-in stand-ins.
+        meshes: folder of object meshes; default: the folder that the file states, else the built-in stand-ins.
         only: names of the objects to load; demonstrations of other objects are left out. Default: all objects.
         accept: the kinds of data that the caller can use.
 
@@ -144,6 +145,8 @@ def load_inputs(
             f"Found {shown(data)}, expected Demos, Retargeted, a ResetBank or their file."
         )
     folder = Path(meshes) if meshes else None
+    if folder is None and path is not None:
+        folder = stated_meshes(path)
     names = data.object_names
     if only:
         names = tuple(dict.fromkeys(canonical_names(only, names)))
@@ -153,10 +156,14 @@ def load_inputs(
         by_name = demo_objects(data, folder)
         loaded = tuple(by_name[name] for name in names)
     else:
+        stated = {}
         if isinstance(data, ResetBank):
-            # before meshes are cut, which takes minutes
-            sources = {name: object_source(name, folder) for name in names}
-            check_sources(str(path or "the data"), data, sources)
+            stated = stated_sources(data)
+        elif path is not None:
+            stated = object_sources(path)
+        # before meshes are cut, which takes minutes
+        sources = {name: object_source(name, folder) for name in names if name in stated}
+        check_sources(str(path or "the data"), stated, sources)
         loaded = load_objects(names, folder)
         robot = robot or data.robot
     robot_name = None

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from xreset.errors import DemoError
-from xreset.files.checks import PositiveInt, frozen
+from xreset.files.checks import PositiveInt, frozen, obeys_rules
 from xreset.files.progress import unseen
 from xreset.geometry.rotations import matrix_to_quat, quat_angle
 from xreset.geometry.shapes import turn_of
@@ -49,6 +49,13 @@ _MOVED = 0.02
 """Farthest that a held object may move in this time [m]."""
 _TURNED = float(np.radians(15.0))
 """Farthest that a held object may turn in this time [rad]."""
+_POSES = 4
+"""Most poses of each demonstration: evenly from the first frame in which the object is raised to the last, usually the
+goal."""
+_CANDIDATES = 40
+"""Most grasps that are tried at each pose."""
+_SEED = 0
+"""Seed of the grasps that are drawn."""
 _BATCH = 512
 """Candidates whose inverse kinematics is solved at a time; limits the memory that this takes."""
 
@@ -67,6 +74,7 @@ class _Poses:
     """[W, 4]"""
 
 
+@obeys_rules
 def add_transfers(
     bank: ResetBank,
     retargeted: Retargeted,
@@ -108,8 +116,8 @@ def add_transfers(
     grasps = _grasps(bank, retargeted, robot)
     if not len(grasps):
         return bank
-    poses = _raised_poses(retargeted, config.poses)
-    pose, grasp = _candidates(bank, grasps, poses, config)
+    poses = _raised_poses(retargeted, _POSES)
+    pose, grasp = _candidates(bank, grasps, poses)
     used = objects_named(objects, bank.object_name[grasp])
     scene = SceneSpec(robot=robot, objects=tuple(used.values()))
     count = len(pose)
@@ -185,16 +193,16 @@ def _raised_poses(retargeted: Retargeted, count: int) -> _Poses:
 
 
 def _candidates(
-    bank: ResetBank, grasps: np.ndarray, poses: _Poses, config: TransferConfig
+    bank: ResetBank, grasps: np.ndarray, poses: _Poses
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw grasps of other demonstrations for each pose: pose [M], ascending, and state of the bank [M]."""
-    random = np.random.default_rng(config.seed)
+    random = np.random.default_rng(_SEED)
     pose = []
     grasp = []
     for number, sequence in enumerate(poses.sequence):
         same_object = bank.object_name[grasps] == bank.sequence_object[sequence]
         others = grasps[same_object & (bank.sequence_index[grasps] != sequence)]
-        drawn = random.permutation(others)[: config.candidates]
+        drawn = random.permutation(others)[:_CANDIDATES]
         pose += [number] * len(drawn)
         grasp += drawn.tolist()
     return np.array(pose, dtype=int), np.array(grasp, dtype=int)

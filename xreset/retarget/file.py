@@ -30,8 +30,8 @@ from xreset.files.records import (
     RATE,
     Arrays,
     Field,
-    read_meta,
     read_record,
+    stated_inputs,
     write_record,
 )
 from xreset.geometry.urdf import joint_limits
@@ -146,9 +146,7 @@ def check_retargeted(path: str | Path, data: Retargeted, robot: RobotSpec) -> No
 def object_sources(path: str | Path) -> dict[str, str]:
     """Return object name -> :attr:`~xreset.spec.ObjectSpec.source` of the objects that the file was made with; empty if
     it does not state them."""
-    inputs = read_meta(path).get("inputs")
-    if not isinstance(inputs, dict):
-        return {}
+    inputs = stated_inputs(path)
     objects = [name for name in inputs if name.startswith("object ")]
     return {name.removeprefix("object "): inputs[name] for name in objects}
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -35,6 +35,10 @@ from xreset.spec import ObjectSpec, RobotSpec, checked_objects, objects_named
 _log = logging.getLogger(__name__)
 _SEQUENCES_PER_BATCH = 24
 """Enough to use the processor well; few enough to keep memory below about 1 GB and to show progress."""
+CONTACT_DISTANCE = 0.020
+"""A human keypoint nearer than this to the object's surface touches it [m]."""
+_THRESHOLDS = Thresholds()
+"""Limits of a valid frame."""
 _THUMB = slice(1, 5)
 """Keypoints of the thumb."""
 _FINGERS = slice(5, None)
@@ -48,9 +52,6 @@ class RetargetConfig(Checked):
     jaw: Jaw = "fingertips"
     hand: HandWeights = HandWeights()
     arm: ArmSearch = ArmSearch()
-    thresholds: Thresholds = field(default_factory=Thresholds)
-    contact_distance: float = 0.020
-    """A human keypoint nearer than this to the object's surface touches it [m]."""
 
 
 def retarget_demos(
@@ -99,9 +100,9 @@ def retarget_demos(
     for rows, is_frame, targets, motion in hands.batches(progress):
         path = _arm_targets(hands.model, arm, targets, motion)
         with one_thread():
-            joints, measures = track(arm, path, config.thresholds, config.arm)
+            joints, measures = track(arm, path, _THRESHOLDS, config.arm)
         joint_pos[rows] = arm.full(joints, path.hand_joints)[is_frame]
-        reason[rows] = classify(measures, config.thresholds)[is_frame]
+        reason[rows] = classify(measures, _THRESHOLDS)[is_frame]
         hand_error[rows] = path.hand_error[is_frame]
         wrist_error[rows] = measures.wrist_position[is_frame]
     hand_error[~demos.hand_valid] = np.inf
@@ -189,9 +190,7 @@ class HandMotions:
         _, self._object_index = np.unique(demos.object_name, return_inverse=True)
         self._fields = DistanceFields.join([surface.field for surface in surfaces.values()])
         self.demos = demos = rest_on_table(demos, objects)
-        self._contact_points, self.touching = human_contacts(
-            demos, surfaces, config.contact_distance
-        )
+        self._contact_points, self.touching = human_contacts(demos, surfaces, CONTACT_DISTANCE)
         """Contact points [F, 21, 3] of the human keypoints, and whether each keypoint [F, 21] touches the object."""
         self._keypoints = np.where(demos.hand_valid[:, None, None], demos.hand_keypoints, 0.0)
 

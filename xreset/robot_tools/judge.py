@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from xreset.errors import RobotError
-from xreset.files.checks import PositiveInt, frozen
+from xreset.files.checks import PositiveInt, frozen, obeys_rules
 from xreset.files.progress import unseen
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import (
@@ -114,6 +114,7 @@ class Judgement:
         }
 
 
+@obeys_rules
 def judge(
     bank: ResetBank,
     robot: RobotSpec,

@@ -34,6 +34,15 @@ from xreset.spec import RobotSpec, TableSpec
 _POSITION = 0.005
 _ORIENTATION = np.radians(5.0)
 """[m], [rad] Largest distance and angle of a reached hand root from its target."""
+_FRAMES = 100
+"""Frames that each candidate is tried on, each on its own."""
+_ELITE = 5
+"""Best candidates: the next round is drawn around them, and in the end they and the description's own placement are the
+finalists."""
+_CANDIDATES = 40
+"""Candidates of each round."""
+_SEED = 0
+"""Seed of the frames and of the candidates."""
 _FINAL_FRAMES = 600
 """Frames on which the finalists are tried."""
 _LENGTH = 0.10
@@ -78,18 +87,18 @@ def place(
         raise RobotError(
             f"robot {robot.name!r}: there is no frame to reach; hand retargeting followed none within its threshold."
         )
-    random = np.random.default_rng(config.seed)
+    random = np.random.default_rng(_SEED)
     order = torch.as_tensor(random.permutation(count))
-    tried = wrists[order[: config.frames]]
-    kept = wrists[order[config.frames :][:_FINAL_FRAMES]]
+    tried = wrists[order[:_FRAMES]]
+    kept = wrists[order[_FRAMES:][:_FINAL_FRAMES]]
     if not len(kept.annotated):
         kept = tried
     found = [(reach(robot, tried), robot)]
     done = 0
-    total = config.rounds * config.candidates + config.elite + 1
+    total = config.rounds * _CANDIDATES + _ELITE + 1
     for number in range(config.rounds):
-        elite = found[: config.elite]
-        least = _rank(elite[-1][0])[0] if len(elite) == config.elite else 0
+        elite = found[:_ELITE]
+        least = _rank(elite[-1][0])[0] if len(elite) == _ELITE else 0
         for candidate in _candidates(
             robot, avoid, config, random, number, [candidate for _, candidate in elite]
         ):
@@ -99,7 +108,7 @@ def place(
         found.sort(key=lambda pair: _rank(pair[0]), reverse=True)
     chosen = [robot]
     if config.rounds:
-        chosen += [candidate for _, candidate in found[: config.elite] if candidate is not robot]
+        chosen += [candidate for _, candidate in found[:_ELITE] if candidate is not robot]
     finalists = []
     for candidate in chosen:
         finalists.append(_finalist(candidate, robot, kept, paths))
@@ -188,7 +197,7 @@ def _candidates(
     centers = [_parameters(candidate) for candidate in elite]
     bounded = [0, 1, 2, 4]  # all but the angles that go round
     candidates = []
-    for _ in range(config.candidates):
+    for _ in range(_CANDIDATES):
         for _ in range(_DRAWS):
             if number == 0:
                 drawn = random.uniform(low, high)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated
 
 from xreset.errors import RobotError
-from xreset.files.checks import Checked, NonNegativeFloat, NonNegativeInt, PositiveInt, Rule, frozen
+from xreset.files.checks import Checked, NonNegativeFloat, NonNegativeInt, Rule, frozen
 from xreset.files.storage import write_whole
 from xreset.spec import RobotSpec
 
@@ -33,16 +33,8 @@ class PlaceConfig(Checked):
     clear: NonNegativeFloat = 0.30
     """Least distance [m] from the base's origin to every wrist and object of the demonstrations; what is below an
     upright base keeps the same distance."""
-    frames: PositiveInt = 100
-    """Frames that each candidate is tried on, each on its own."""
-    candidates: PositiveInt = 40
-    """Candidates of each round."""
     rounds: NonNegativeInt = 5
     """Rounds of candidates; 0 measures only the description's own placement."""
-    elite: PositiveInt = 5
-    """Best candidates: the next round is drawn around them, and in the end they and the description's own placement are
-    the finalists."""
-    seed: NonNegativeInt = 0
 
 
 @frozen

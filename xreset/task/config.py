@@ -9,7 +9,7 @@ from copy import deepcopy
 from dataclasses import field, replace
 from math import isfinite
 from numbers import Real
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from xreset.cameras.config import VisionConfig
 from xreset.errors import WrongValueError, XResetError
@@ -45,8 +45,6 @@ class ActionConfig(Checked):
 
     In the paper, arm commands are relative and hand targets absolute (Table VIII).
     """
-
-    REMOVED: ClassVar = {"hand_smoothing": 1.0}
 
     arm_step: PositiveFloat = 0.03
     """Largest change of an arm joint's target per control step [rad]: 1.8 rad/s at 60 Hz. Not in the paper."""
@@ -84,7 +82,7 @@ class ObservationConfig(Checked):
     (appendix C), not by how much.
     """
 
-    EARLIER: ClassVar = ObservationOptions
+    EARLIER = ObservationOptions
 
     cloud_points: Annotated[
         PositiveInt, Rule("at most 100,000 points", lambda points: points <= 100_000)
@@ -152,15 +150,7 @@ GROUPS = ("policy", "proprio", "perception", "privileged", "goal")
 class RewardConfig(Checked):
     """The reward: named terms with weights (``xreset/task/rewards.py``). Defaults are appendix D.d of the paper."""
 
-    REMOVED: ClassVar = {
-        "tracking": "presence",
-        "progress": 8.0,
-        "progress_width": 0.15,
-        "rotation_shape": "tanh",
-        "rotation_near": 0.0,
-        "rotation_near_width": 0.3,
-    }
-    EARLIER: ClassVar = RewardOptions
+    EARLIER = RewardOptions
 
     terms: Weighted = _terms(
         reach={"function": "best_reach", "weight": 1.0, "width": 0.1},  # m
@@ -197,8 +187,6 @@ class RewardConfig(Checked):
 class TerminationConfig(Checked):
     """When an episode ends. xreset/task/terminations.py has the bounds of the scene."""
 
-    REMOVED: ClassVar = {"object_low": -0.05, "object_high": 1.0, "margin": 0.10}
-
     episode_seconds: float = 5.0
     """Time limit [s], from one control step to 1,000,000 s. Its end is not a failure: the value is bootstrapped."""
 
@@ -206,14 +194,6 @@ class TerminationConfig(Checked):
 @frozen
 class ResetConfig(Checked):
     """The reset mixture (sections IV-B, appendix D.c, D.e, Table IX)."""
-
-    REMOVED: ClassVar = {
-        "frontier": 0.0,
-        "frontier_over": "bank",
-        "frontier_power": 1.0,
-        "frontier_rate": 0.1,
-        "home_gravity_clip": 0.3,
-    }
 
     demo_probability: Share = 0.5
     """p: share of resets from the bank; 0 is X-Sim."""
@@ -227,8 +207,6 @@ class ResetConfig(Checked):
     """Home resets: the object is moved by U(-x, x) in both directions [m]."""
     spawn_yaw: NonNegativeFloat = 0.4363323129985824
     """Home resets: the object is turned about the vertical by U(-y, y) [rad], 25 degrees."""
-    home_noise: bool = True
-    """Home resets: joints start around home with the robot's ``home_std``."""
     training_xy: NonNegativeFloat | None = None
     """Replaces ``spawn_xy`` in trainings, so that starts vary more than in evaluations [m]; None: ``spawn_xy``."""
     goal_xy: NonNegativeFloat = 0.0
@@ -324,8 +302,6 @@ class RandomizationConfig(Checked):
     off by default; docs/sim-to-sim.md has their effect on policies.
     """
 
-    REMOVED: ClassVar = {"friction_buckets": 250}
-
     enabled: bool = True
     friction: Range = (0.5, 1.0)
     """Range of the object material's coefficient."""
@@ -399,20 +375,6 @@ class RandomizationConfig(Checked):
         """Return the largest delay of a range [control steps]; 0: there is none."""
         limits = getattr(self, name)
         return limits[1] if self.enabled and limits else 0.0
-
-    @property
-    def has_faults(self) -> bool:
-        """Whether there are faults of a real control loop: delays, losses, errors of poses, or pushes."""
-        late = ("action_latency", "hand_latency", "observation_latency", "proprio_latency")
-        tracker = self.tracker
-        push = self.push
-        return self.enabled and (
-            any(self.longest(name) > 0 for name in (*late, "lost_actions"))
-            or tracker.has_errors
-            or tracker.loss > 0
-            or push.moves_object
-            or push.arm_torque > 0
-        )
 
     @property
     def scales_drives(self) -> bool:
@@ -505,6 +467,7 @@ def evaluation_task(task: TaskConfig) -> TaskConfig:
             goal_z=0.0,
             goal_yaw=0.0,
             object_share={},
+            crossed_goals=0.0,
             adaptive_share=0.0,
         ),
         randomization=replace(task.randomization, enabled=False),

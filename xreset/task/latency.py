@@ -26,7 +26,6 @@ class DelayLine:
         sample: Sample,
         *,
         by_column: bool = False,
-        is_fault: bool = True,
     ) -> None:
         """Allocate.
 
@@ -37,7 +36,6 @@ class DelayLine:
             longest: largest delay [steps].
             sample: draws the delays [steps].
             by_column: whether each of the D numbers has a delay of its own.
-            is_fault: see :meth:`Worlds.keep`.
         """
         self.longest = longest
         if longest:
@@ -45,7 +43,7 @@ class DelayLine:
             self.values = worlds.keep(f"{name}.values", worlds.zeros(steps, width))
             """[N, K, D]"""
             delays = worlds.zeros(width if by_column else 1)
-            self.delay = worlds.keep(f"{name}.delay", delays, sample, is_fault=is_fault)
+            self.delay = worlds.keep(f"{name}.delay", delays, sample)
             """[N, 1] steps, or [N, D]."""
 
     def fill(self, fresh: Tensor, value: Tensor) -> None:

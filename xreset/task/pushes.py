@@ -41,7 +41,6 @@ class Pushes:
             "pushes.probability",
             worlds.zeros(),
             lambda generator: sample_range(worlds.num_worlds, (low, high), generator).exp(),
-            is_fault=True,
         )
         """[N] probability of a push in a control step."""
         self.force = worlds.zeros(3)

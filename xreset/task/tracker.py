@@ -21,7 +21,6 @@ class Tracker:
         """Allocate, and register what is drawn at each reset."""
         c = config.tracker if config.enabled else TrackerConfig()
         self._config = c
-        self._fault_scale = worlds.fault_scale
         delay = partial(sample_range, worlds.num_worlds, config.observation_latency)
         longest = config.longest("observation_latency")
         self._delays = DelayLine(worlds, "poses", 7, longest, delay)
@@ -35,7 +34,6 @@ class Tracker:
                 "tracker.bias",
                 worlds.zeros(6),
                 lambda generator: bias * symmetric(shape, generator),
-                is_fault=True,
             )
         if c.skips_steps:
             self._wait = worlds.keep("tracker.wait", worlds.zeros())
@@ -53,7 +51,7 @@ class Tracker:
             generator: random numbers.
         """
         if self._config.has_errors:
-            noise = self._fault_scale * self._noise * symmetric(self._bias.shape, generator)
+            noise = self._noise * symmetric(self._bias.shape, generator)
             error = self._bias + noise
             pos = pos + error[:, :3]
             quat = quat_multiply(quat_from_axis_angle(error[:, 3:]), quat)
@@ -70,7 +68,7 @@ class Tracker:
         arrives = fresh | (self._wait <= 0)
         pose = torch.where(arrives[:, None], pose, self._last)
         self._last.copy_(pose)
-        lost = uniform(self._wait.shape, generator) < c.loss * self._fault_scale
+        lost = uniform(self._wait.shape, generator) < c.loss
         pause = sample_range(len(pose), c.loss_steps, generator).round()
         until_next = sample_range(len(pose), c.interval, generator).round()
         until_next = until_next + torch.where(lost, pause, 0.0)
@@ -88,8 +86,7 @@ class Tracker:
         self._delays.fill(fresh, pose)
         delay = self._delays.delay
         if self._config.jitter:
-            largest = self._fault_scale * self._config.jitter
-            delay = delay + largest * symmetric(delay.shape, generator)
+            delay = delay + self._config.jitter * symmetric(delay.shape, generator)
             delay = delay.clamp(0.0, self._delays.longest)
         pos, quat = self._delays.push(pose, delay).split((3, 4), dim=-1)
         return pos, torch.nn.functional.normalize(quat, dim=-1)

@@ -80,7 +80,7 @@ class Variation:
         self._lost_actions: Tensor | None = None
         if c.draws("lost_actions"):
             share = partial(sample_range, n, c.lost_actions)
-            self._lost_actions = worlds.keep("lost_actions", worlds.zeros(1), share, is_fault=True)
+            self._lost_actions = worlds.keep("lost_actions", worlds.zeros(1), share)
         self.pushes = Pushes(worlds, backend, c.push, is_arm) if c.draws("push") else None
 
     def _check_capabilities(self, backend: Backend) -> None:

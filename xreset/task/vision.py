@@ -56,7 +56,7 @@ class Vision:
 
         width = cameras.view[0].numel()
         longest = round(vision.latency + c.longest("camera_latency"))
-        self._delay = DelayLine(worlds, "delayed_views", width, longest, age, is_fault=False)
+        self._delay = DelayLine(worlds, "delayed_views", width, longest, age)
 
     def aim(self, state: State, goal_pos: Tensor, goal_quat: Tensor, episode_step: Tensor) -> None:
         """Move the renderer's bodies and cameras to the present state.

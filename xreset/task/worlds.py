@@ -21,7 +21,6 @@ class Worlds:
 
     Attributes:
         buffers: all buffers [N, ...] by name.
-        fault_scale: [] factor on the drawn faults of a real control loop.
     """
 
     def __init__(self, num_worlds: int, device: torch.device) -> None:
@@ -29,28 +28,24 @@ class Worlds:
         self.num_worlds = num_worlds
         self.device = device
         self.buffers: dict[str, Tensor] = {}
-        self.fault_scale = torch.ones((), device=device)
-        self._samples: list[tuple[Sample, Tensor, bool]] = []
+        self._samples: list[tuple[Sample, Tensor]] = []
 
     def zeros(self, *shape: int) -> Tensor:
         """[N, ...] zeros that do not last."""
         return torch.zeros(self.num_worlds, *shape, device=self.device)
 
-    def keep(
-        self, name: str, buffer: Tensor, sample: Sample | None = None, *, is_fault: bool = False
-    ) -> Tensor:
+    def keep(self, name: str, buffer: Tensor, sample: Sample | None = None) -> Tensor:
         """Add a buffer [N, ...], and return it.
 
         Args:
             name: the buffer's name, which no other has.
             buffer: [N, ...] its first values.
             sample: draws its values; None: it is not drawn.
-            is_fault: whether drawn values are multiplied by :attr:`fault_scale`.
         """
         assert name not in self.buffers, f"two buffers are called {name}"
         self.buffers[name] = buffer
         if sample is not None:
-            self._samples.append((sample, buffer, is_fault))
+            self._samples.append((sample, buffer))
         return buffer
 
     def keep_bundle(self, name: str, bundle: _Bundle) -> _Bundle:
@@ -61,10 +56,8 @@ class Worlds:
 
     def draw(self, fresh: Tensor, generator: torch.Generator) -> None:
         """Draw new values for the worlds of a mask [N]. All worlds draw, so that no GPU waits for a count."""
-        for sample, buffer, is_fault in self._samples:
+        for sample, buffer in self._samples:
             values = sample(generator).view_as(buffer)
-            if is_fault:
-                values = values * self.fault_scale
             buffer.copy_(where(fresh, values, buffer))
 
     def clone(self) -> dict[str, Tensor]:

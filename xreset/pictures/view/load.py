@@ -20,7 +20,7 @@ from xreset.resets.bank import ResetBank
 from xreset.resets.goals import GoalSet
 from xreset.resets.inputs import Inputs, load_inputs
 from xreset.retarget.file import Retargeted
-from xreset.retarget.pipeline import RetargetConfig, human_contacts, rest_on_table
+from xreset.retarget.pipeline import CONTACT_DISTANCE, human_contacts, rest_on_table
 from xreset.spec import ObjectSpec, RobotSpec
 
 _BANK_RATE = 5.0
@@ -170,7 +170,7 @@ def _human(demos: Demos, objects: Sequence[ObjectSpec]) -> tuple[Demos, dict[str
     surfaces = {
         spec.name: prepared_surface(spec) for spec in objects if spec.name in demos.object_name
     }
-    _, touching = human_contacts(demos, surfaces, RetargetConfig().contact_distance)
+    _, touching = human_contacts(demos, surfaces, CONTACT_DISTANCE)
     return demos, {"human_keypoints": keypoints, "human_touching": touching}
 
 

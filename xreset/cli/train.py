@@ -82,7 +82,7 @@ def train(
     """
     from xreset.learning import train as training
 
-    started = {
+    started: dict[str, Any] = {
         "robot": robot,
         "meshes": meshes,
         "engine": engine,
@@ -90,7 +90,7 @@ def train(
         "num_envs": num_envs,
         "seed": seed,
     }
-    length = {"iterations": iterations, "minutes": minutes, "wandb": wandb}
+    length: dict[str, Any] = {"iterations": iterations, "minutes": minutes, "wandb": wandb}
     if resume:
         _refuse_new_start(out)
         refuse_changes(out, resets=resets, goals=goals, teacher=teacher, **started)
@@ -100,7 +100,7 @@ def train(
         raise RunError(
             "A new run needs --resets or --goals. To continue the run in --out, add --resume."
         )
-    options = {"out": out, "goals": goals, "config": config, **started, **length}
+    options: dict[str, Any] = {"out": out, "goals": goals, "config": config, **started, **length}
     if teacher is None:
         training.train(resets, **options | {"num_envs": num_envs or 4096, "weights": weights})
     else:

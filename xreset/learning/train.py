@@ -279,7 +279,7 @@ def resume(
 
 def distill(
     teacher: str | Path,
-    bank: str | Path | ResetBank,
+    bank: str | Path | ResetBank | None,
     *,
     out: str | Path,
     cameras: str | CameraConfig | Sequence[str | CameraConfig] = "front",
@@ -293,7 +293,7 @@ def distill(
 
     Args:
         teacher: run folder, exported policy (.onnx) or name of a policy that ships with xreset.
-        bank: reset bank, or its file.
+        bank: reset bank, or its file; None: with ``goals``, as for :func:`train`.
         out: run folder to make.
         cameras: name of one of :data:`xreset.cameras.config.CAMERAS`, or a camera; or several.
         vision: images, their timing and what the student gets of them; its cameras are replaced by ``cameras``.

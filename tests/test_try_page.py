@@ -191,12 +191,44 @@ class PageTest(unittest.TestCase):
         self.until("xreset.session.scene.object.mass > 0.8 && xreset.session.time > 0.1")
         self.assertEqual(self.browser.problems, [])
 
-    def test_a_pull_at_the_robot_moves_it_and_lets_go(self):
-        self.browser.evaluate("document.getElementById('restart').click()")
-        part = "xreset.view.parts[xreset.view.parts.length - 1]"
-        start = self.browser.evaluate(f"xreset.view.onPage({part}.position)")
-        self.browser.drag(start, (start[0] + 40, start[1]), steps=2)
+    def test_a_pull_at_the_robot_acts_until_it_is_let_go(self):
+        part = "xreset.view.parts[6]"
+        x, y = self.browser.evaluate(f"xreset.view.onPage({part}.position)")
+        mouse = {"button": "left", "buttons": 1, "clickCount": 1}
+        self.browser.send("Input.dispatchMouseEvent", type="mousePressed", x=x, y=y, **mouse)
+        self.browser.send("Input.dispatchMouseEvent", type="mouseMoved", x=x - 60, y=y, **mouse)
+        self.assertIsInstance(self.browser.evaluate("xreset.session.hand.body"), int)
+        before = self.browser.evaluate("xreset.session.time")
+        self.until(f"xreset.session.time > {before} + 0.1")
+        ahead = (
+            "xreset.session.physics.data.ctrl.reduce((most, target, j) => "
+            "Math.max(most, Math.abs(target - xreset.session.target[j])), 0)"
+        )
+        self.assertGreater(self.browser.evaluate(ahead), 0.01)
+        self.browser.send("Input.dispatchMouseEvent", type="mouseReleased", x=x - 60, y=y, **mouse)
         self.assertIsNone(self.browser.evaluate("xreset.session.hand"))
+        self.assertEqual(self.browser.problems, [])
+
+    def test_a_ring_turns_the_goal_and_the_shape_between_the_rings_moves_it(self):
+        self.browser.click("document.getElementById('pause')")
+        goal = np.array(self.browser.evaluate("xreset.view.onPage(xreset.view.goal.position)"))
+        place = "[...xreset.session.goalPos, ...xreset.session.goalQuat]"
+        start = np.array(self.browser.evaluate(place))
+        self.browser.drag(goal, goal + np.array((40, 0)), steps=2)
+        moved = np.array(self.browser.evaluate(place))
+        self.assertGreater(np.linalg.norm(moved[:3] - start[:3]), 0.02)
+        np.testing.assert_allclose(moved[3:], start[3:], atol=1e-6)
+        x, y = self.browser.evaluate("xreset.view.onPage(xreset.view.goal.position)")
+        for distance in range(8, 80, 2):
+            self.browser.send(
+                "Input.dispatchMouseEvent", type="mouseMoved", x=x + distance, y=y + distance / 4
+            )
+            if self.browser.evaluate("Boolean(xreset.view.rings.axis)"):
+                break
+        at = np.array((x + distance, y + distance / 4))
+        self.browser.drag(at, at + np.array((5, -40)), steps=2)
+        turned = np.array(self.browser.evaluate(place))
+        self.assertGreater(np.abs(turned[3:] - moved[3:]).max(), 0.05)
         self.assertEqual(self.browser.problems, [])
 
     def test_everything_fits_on_a_phone(self):

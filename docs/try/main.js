@@ -222,7 +222,8 @@ function notify(text) {
 
 function tell(error) {
   console.error(error);
-  status.textContent = `This page does not work here: ${error.message ?? error}`;
+  status.classList.remove("good");
+  status.textContent = `This page does not work here: ${String(error.message ?? error).slice(0, 160)}`;
 }
 
 begin().catch(tell);

@@ -92,10 +92,10 @@ export class Physics {
   /** Return the joint torques [J] of a force at a point of a body, both in the world. */
   torques(body, point, force) {
     const { mujoco, model, data } = this;
-    const jacobian = new mujoco.DoubleBuffer(new Array(3 * model.nv).fill(0));
-    const turning = new mujoco.DoubleBuffer(new Array(3 * model.nv).fill(0));
+    const jacobian = new mujoco.DoubleBuffer(3 * model.nv);
+    const turning = new mujoco.DoubleBuffer(3 * model.nv);
     mujoco.mj_jac(model, data, jacobian, turning, point, body);
-    const rows = jacobian.getView();
+    const rows = jacobian.GetView();
     const torque = this.scene.addresses.dof.map((dof) => {
       return [0, 1, 2].reduce((sum, axis) => sum + rows[axis * model.nv + dof] * force[axis], 0);
     });

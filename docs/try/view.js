@@ -70,7 +70,8 @@ export class View {
     this.rings = new TransformControls(this.camera, this.canvas);
     this.rings.setMode("rotate");
     this.rings.setSize(0.55);
-    this.rings.showE = false; // three rings are enough
+    this.rings.showE = false; // three rings are enough; between them, the goal is dragged
+    this.rings.showXYZE = false;
     this.rings.attach(this.turned);
     this.rings.addEventListener("objectChange", () => this.#turn());
     this.rings.addEventListener("dragging-changed", ({ value }) => {

@@ -5,8 +5,8 @@ import { OrbitControls } from "./lib/OrbitControls.js";
 import { TransformControls } from "./lib/TransformControls.js";
 import { decoded } from "./physics.js";
 
-const LOOK_AT = new THREE.Vector3(0.5, 0.22, 0.24);
-const EYE = new THREE.Vector3(1.22, -0.47, 0.74);
+const LOOK_AT = new THREE.Vector3(0.5, 0.22, 0.29);
+const EYE = new THREE.Vector3(1.22, -0.47, 0.77);
 const RIGHT = new THREE.Vector3(0.79, 0.61, 0);
 const GROWTH = 1.03; // the pointer meets the goal first where object and goal are in one place
 const FIELD = 42; // vertical field of view [degrees]

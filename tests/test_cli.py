@@ -370,7 +370,7 @@ class InstallationTest(InFolder):
         missing = ModuleNotFoundError("No module named 'pandas'", name="pandas")
         with (
             patch("importlib.metadata.requires", return_value=found),
-            patch.object(cli, "_run", side_effect=missing),
+            patch.object(cli, "perform", side_effect=missing),
             self.assertRaises(SystemExit),
             redirect_stderr(io.StringIO()) as text,
         ):

@@ -138,7 +138,7 @@ def commands(folder: Path) -> list[Command]:
         Command(
             "export deploy",
             ["export", "deploy", run, "--out", folder / "deploy"],
-            folder / "deploy" / "contract.json",
+            folder / "deploy" / "leapp.yaml",
             once=True,
         ),
         Command(

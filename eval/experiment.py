@@ -244,16 +244,16 @@ def play(
     stopped: Counter[str] = Counter()
     traces: tuple[Trace, ...] = ()
     speed = 0.0
-    actor = None
+    controller = None
     if on_robot:
         from xreset.eval.robot_loop import roll_out_on_robot
         from xreset.live.faults import Faults
-        from xreset.runtime import OnnxActor
+        from xreset.runtime import Controller
 
-        actor = OnnxActor(policy.exported())
+        controller = Controller(policy.graph, policy.name)
     for i, condition in enumerate(conditions):
         changed = replace(trial, task=condition.task)
-        if actor is None:
+        if controller is None:
             rollouts = roll_out(
                 policy.start(trial.motion),
                 engine,
@@ -263,7 +263,7 @@ def play(
             )
         else:
             rollouts = roll_out_on_robot(
-                actor,
+                controller,
                 engine,
                 changed,
                 condition.faults or Faults(),

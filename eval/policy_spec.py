@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Sequence
+from functools import cached_property
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,11 +19,15 @@ from xreset.files.text import Brief, shown
 from xreset.geometry.description import load_robot
 from xreset.learning.exported import read_policy
 from xreset.learning.run import read_choice, read_run
+from xreset.live.deploy import deployed_graph, is_deployed, task_of
+from xreset.live.engine import GraphPolicy
 from xreset.objects.catalogue import object_names
 from xreset.policy.onnx_policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_contract
 from xreset.policy.shipped import results_folder
 from xreset.resets.bank import ResetBank
 from xreset.retarget.file import Retargeted
+from xreset.runtime import Controller
+from xreset.runtime.contract import POLICY
 from xreset.spec import ObjectSpec, RobotSpec
 from xreset.task.config import TaskConfig, evaluation_task
 
@@ -145,6 +151,22 @@ class PolicySpec(Brief, Checked):
             )
         return self.content
 
+    @cached_property
+    def graph(self) -> bytes:
+        """Content of the deployed policy, from readings to joint targets; its contract lists no objects.
+
+        Raises:
+            PolicyError: a baseline, a policy with cameras, or one that observes something that no robot measures.
+        """
+        return self.deployed(())
+
+    def deployed(self, objects: Sequence[ObjectSpec]) -> bytes:
+        """Return :attr:`graph`, whose contract lists these objects, unless the policy was loaded as a graph."""
+        content = self.exported()
+        if is_deployed(content):
+            return content
+        return deployed_graph(content, self.robot, self.task, objects)
+
     def check_seed(self, seed: int) -> None:
         """Refuse the seed whose starts chose this checkpoint, because a result on them is biased.
 
@@ -163,8 +185,9 @@ def load_policy(
     """Load the policy that a name means. A file or folder comes before a shipped policy of the same name.
 
     Args:
-        policy: run folder, exported policy (.onnx), name of a policy that ships with xreset, or one of
-            :data:`BASELINES`. A loaded policy is returned as it is; ``robot`` must be its own then.
+        policy: run folder, exported or deployed policy (.onnx), folder of a deployed one (``docs/live.md``), name of a
+            policy that ships with xreset, or one of :data:`BASELINES`. A loaded policy is returned as it is; ``robot``
+            must be its own then.
         robot: name or folder of the robot; default: the policy's own. Baselines need it.
         seed: seed of the baseline ``random``.
 
@@ -187,6 +210,11 @@ def load_policy(
     if name in BASELINES:
         return _baseline(name, robot, seed)
     path = Path(policy)
+    if os.path.isdir(path / "runtime"):  # of xreset export deploy
+        path = path / POLICY
+        policy = path
+    if path.suffix == ".onnx" and path.is_file() and is_deployed(path.read_bytes()):
+        return _deployed(path, robot)
     run = read_run(path) if os.path.isdir(path) else None
     loaded = read_policy(policy, also=BASELINES)
     file = loaded.path
@@ -215,6 +243,30 @@ def load_policy(
         hash=loaded.hash,
         content=loaded.content,
         selection_seed=choice.seed if is_chosen else None,
+    )
+
+
+def _deployed(file: Path, robot: str | Path | None) -> PolicySpec:
+    """Return a policy whose file is a graph from readings to joint targets, whoever trained it."""
+    content = file.read_bytes()
+    controller = Controller(content, str(file))
+    contract = controller.contract
+    spec = load_robot(robot or contract["robot"])
+    names = tuple(joint["name"] for joint in contract["joints"])
+    if names != spec.joint_names:
+        raise PolicyError(
+            f"{file} has the joints {', '.join(names)}, but the robot {spec.name!r} has {', '.join(spec.joint_names)}."
+        )
+    name = file.parent.resolve().name if file.name == POLICY else file.stem
+    return PolicySpec(
+        name=name,
+        start=lambda motion: GraphPolicy(Controller(content, str(file))),
+        robot=spec,
+        task=task_of(controller, str(file)),
+        folder=file.parent / "eval",
+        objects=tuple(contract.get("objects", ())),
+        hash=sha256(content).hexdigest(),
+        content=content,
     )
 
 

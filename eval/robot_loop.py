@@ -13,9 +13,9 @@ from collections import Counter
 from xreset.eval.results import Rollouts
 from xreset.eval.rollout import Engine, Round, Trial, play_rounds
 from xreset.files.progress import Progress, unseen
-from xreset.live.engine import make_controller
+from xreset.live.engine import begin_episodes
 from xreset.live.faults import Faults, FaultyDriver
-from xreset.runtime import OnnxActor, Runner
+from xreset.runtime import Controller, Runner
 
 
 class SimulatedRunner(Runner):
@@ -26,7 +26,7 @@ class SimulatedRunner(Runner):
 
 
 def roll_out_on_robot(
-    actor: OnnxActor,
+    controller: Controller,
     engine: Engine,
     trial: Trial,
     faults: Faults,
@@ -37,7 +37,7 @@ def roll_out_on_robot(
     """Play demonstrations ``episodes`` times each through the loop. Nothing is recorded.
 
     Args:
-        actor: the policy.
+        controller: the policy.
         engine: the engine.
         trial: what is played.
         faults: faults of every robot.
@@ -51,7 +51,7 @@ def roll_out_on_robot(
     def play(played: Round) -> None:
         nonlocal steps
         env = played.env
-        controller = make_controller(env, actor)
+        begin_episodes(controller, env)
         seeds = [
             (trial.seed, int(sequence), int(repetition))
             for sequence, repetition in zip(played.sequence, played.repetition, strict=True)

@@ -61,15 +61,15 @@ from xreset.learning.checkpoint import Checkpoint, read_checkpoint, write_checkp
 from xreset.learning.clock import Lift, read_lift, write_lift
 from xreset.learning.recipes import read_recipe
 from xreset.learning.run import RunInfo, read_run, write_run
-from xreset.live.deploy import deploy_contract, write_deployed
-from xreset.live.serve import _Episode
+from xreset.live.deploy import deploy_contract, deployed_graph
 from xreset.objects.meshes import read_mesh
 from xreset.objects.properties import properties_of
 from xreset.physics import State
 from xreset.pictures.view.load import load_view
 from xreset.policy.onnx_policy import OnnxPolicy, policy_contract
 from xreset.robot_tools.sources import read_source
-from xreset.runtime import Controller, load_controller
+from xreset.runtime import load_controller
+from xreset.runtime.contract import KEY, parse_contract
 from xreset.spec import SceneSpec
 from xreset.task.config import ObservationConfig, TaskConfig
 
@@ -276,39 +276,15 @@ def add_networks(every):
 
 
 def add_deployed(every):
-    soup = load_object("soup")
-    content = write_policy(every.folder / "deployed.onnx", asdict(every.contract)).read_bytes()
-    contract = deploy_contract(every.toy, every.contract.task, [soup], content)
-    write_deployed(content, contract, every.folder / "deployed")
-    every.add(
-        "contract", "deployed/contract.json", lambda p: load_controller(p.parent).contract, "json"
-    )
-    del contract["contract_sha256"]  # a contract of an earlier version
+    path = every.add("deployed policy", "deployed.onnx", load_controller, "bytes")
+    network = write_policy(path, asdict(every.contract)).read_bytes()
+    path.write_bytes(deployed_graph(network, every.toy, every.contract.task))
 
-    def of_server(path):
-        return Controller(read_json(path), source=str(path)).contract
+    def read(path):
+        return parse_contract({KEY: path.read_text(errors="replace")}, str(path))
 
-    write_json(every.add("contract without a hash", "contract.json", of_server, "json"), contract)
-    home = [joint["home"] for joint in contract["joints"]]
-    goal = {"goal_pos": [0.5, 0.3, 0.2], "goal_quat": [1.0, 0.0, 0.0, 0.0]}
-    begin = json.dumps({"begin": goal | {"object": soup.name, "target": home}})
-    step = {
-        "joint_pos": home, "joint_vel": [0.0] * len(home), "object_pos": [0.5, 0.3, 0.1],
-        "object_quat": [1.0, 0.0, 0.0, 0.0],
-    }  # fmt: skip
-    controller = load_controller(every.folder / "deployed")
-
-    def answer(path):
-        episode = _Episode(controller)
-        episode.answer(begin)
-        reply = episode.answer(path.read_bytes())
-        if "error" in reply:
-            raise XResetError(reply["error"])
-        return reply
-
-    for name, message in (("begin", json.loads(begin)), ("step", {"step": step})):
-        path = every.add(f"message {name}", f"{name}.json", answer, "json")
-        path.write_text(json.dumps(message))
+    contract = deploy_contract(every.toy, every.contract.task, [load_object("soup")])
+    write_json(every.add("contract", "contract.json", read, "json"), contract)
 
 
 def add_robots(every):

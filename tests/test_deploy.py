@@ -1,42 +1,49 @@
-"""A policy leaves xreset: as a folder that runs without it, and over the network."""
+"""A policy leaves xreset: one graph from readings to joint targets, in a folder that runs without xreset."""
 
+import contextlib
+import hashlib
+import importlib
 import json
+import shutil
 import subprocess
 import sys
-import threading
 from dataclasses import asdict, replace
+from functools import cache
 from importlib.util import find_spec
-from queue import Queue
-from unittest import skipUnless
-from unittest.mock import patch
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from unittest import TestCase, mock, skipUnless
 
 import numpy as np
+import onnx
+import onnxruntime
 import torch
+import yaml
+from numpy.testing import assert_allclose
 
-import xreset
 from tests import toy_grasp
 from tests.command import refused, succeeds
 from tests.data import InFolder
-from tests.test_examples import run
+from tests.test_examples import EXAMPLES, run
 from tests.test_live import Scripted
 from tests.toy_bank import SOUP
 from tests.toy_policy import write_policy
-from xreset import CameraConfig, TaskConfig, VisionConfig, load_policy, synthesize
-from xreset.errors import PolicyError, XResetError
-from xreset.eval.rollout import engine, episode_starts, load_trial
-from xreset.live.deploy import deploy_contract, write_deployed
-from xreset.live.engine import EngineDriver
-from xreset.policy.onnx_policy import policy_contract
-from xreset.runtime import (
-    Controller,
-    LiveError,
-    Reading,
-    RemoteController,
-    Runner,
-    load_controller,
-    read_contract,
+from xreset import (
+    CameraConfig,
+    TaskConfig,
+    VisionConfig,
+    load_policy,
+    synthesize,
 )
-from xreset.runtime.contract import digest
+from xreset.errors import PolicyError
+from xreset.eval.rollout import engine, episode_starts, load_trial, roll_out
+from xreset.live.deploy import deployed_graph, write_deployed
+from xreset.live.engine import EngineDriver
+from xreset.live.graph import policy_graph
+from xreset.policy.onnx_policy import OnnxPolicy, policy_contract
+from xreset.runtime import Controller, LiveError, Reading, Runner, load_controller
+from xreset.runtime.contract import KEY
+from xreset.task.config import ObservationConfig, evaluation_task
 
 POLICY = "soup-can"
 STEPS = 30
@@ -44,7 +51,7 @@ REPLAY = """
 import json, sys
 class Absent:
     def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in ("xreset", "torch", "scipy"):
+        if name.partition(".")[0] in ("xreset", "torch", "scipy", "onnx"):
             raise ImportError(name)
 sys.meta_path.insert(0, Absent())
 folder, recording = sys.argv[1:]
@@ -54,54 +61,54 @@ import runtime
 data = np.load(recording)
 controller = runtime.load_controller(folder)
 name = str(data["object"])
-controller.begin(controller.points(name), data["goal_pos"], data["goal_quat"], data["target"], controller.center(name))
+controller.begin(controller.points(name), data["goal_pos"], data["goal_quat"], data["start"], controller.center(name))
 names = ("joint_pos", "joint_vel", "object_pos", "object_quat", "tip_force")
 worst = 0.0
-for k in range(len(data["action"])):
+for k in range(len(data["target"])):
     reading = runtime.Reading(joint_time=0.0, object_time=0.0, **{name: data[name][k] for name in names})
-    controller.step(reading.batched())
-    worst = max(worst, float(np.abs(controller.action - data["action"][k]).max()))
-print(json.dumps({"worst": worst, "modules": sorted({"xreset", "torch", "scipy"} & set(sys.modules))}))
+    worst = max(worst, float(np.abs(controller.step(reading) - data["target"][k]).max()))
+modules = sorted({"xreset", "torch", "scipy", "onnx"} & set(sys.modules))
+print(json.dumps({"worst": worst, "modules": modules}))
 """
+
+
+@cache
+def toy_graph(network):
+    """Return the graph of a policy of the toy gripper."""
+    return deployed_graph(
+        network, toy_grasp.robot(), evaluation_task(TaskConfig()), [toy_grasp.brick()]
+    )
+
+
+def recorded(name, object_name, steps):
+    """Return readings, goals and targets of the first steps of an evaluation's episode in MuJoCo."""
+    spec = load_policy(name)
+    trial = load_trial(spec, synthesize([object_name], 1))
+    zero = np.zeros(1, int)
+    frames = []
+    with trial.worlds(engine("mujoco", workers=0), torch.zeros(1, dtype=torch.long)) as env:
+        env.reset(start=episode_starts(trial.starts(), zero, zero, seed=0))
+        policy = spec.begin(env)
+        values = {"goal_pos": env.goal_pos, "goal_quat": env.goal_quat, "start": env.joint_target}
+        recording = {name: value[0].numpy().copy() for name, value in values.items()}
+        for _ in range(steps):
+            reading = EngineDriver(env).read()
+            env.advance(policy.act(env.get_observations()))
+            frames.append({**vars(reading), "target": env.joint_target.numpy().copy()})
+    names = ("target", "joint_pos", "joint_vel", "object_pos", "object_quat", "tip_force")
+    for name in names:
+        recording[name] = np.stack([frame[name][0] for frame in frames])
+    return recording
 
 
 @skipUnless(find_spec("mujoco"), "mujoco is not installed")
 class RuntimeTest(InFolder):
     def test_it_acts_as_the_evaluation_in_a_process_without_xreset(self):
-        self.assertIn(
-            "28 joints at 60 Hz",
-            succeeds("export", "deploy", POLICY, "--out", f"{self.folder}/can"),
-        )
-        spec = load_policy(POLICY)
-        trial = load_trial(spec, synthesize([SOUP], 1))
-        zero = np.zeros(1, int)
-        frames = []
-        with trial.worlds(engine("mujoco", workers=0), torch.zeros(1, dtype=torch.long)) as env:
-            env.reset(start=episode_starts(trial.starts(), zero, zero, seed=0))
-            policy = spec.begin(env)
-            values = {
-                "goal_pos": env.goal_pos,
-                "goal_quat": env.goal_quat,
-                "target": env.joint_target,
-            }
-            recording = {name: value[0].numpy().copy() for name, value in values.items()}
-            for _ in range(STEPS):
-                reading = EngineDriver(env).read()
-                action = policy.act(env.get_observations())
-                frames.append({"action": action.numpy(), **vars(reading)})
-                env.advance(action)
-        names = ("action", "joint_pos", "joint_vel", "object_pos", "object_quat", "tip_force")
-        for name in names:
-            recording[name] = np.stack([frame[name][0] for frame in frames])
-        np.savez(f"{self.folder}/recording.npz", object=SOUP, **recording)
-        command = [
-            sys.executable,
-            "-I",
-            "-c",
-            REPLAY,
-            f"{self.folder}/can",
-            f"{self.folder}/recording.npz",
-        ]
+        said = succeeds("export", "deploy", POLICY, "--out", f"{self.folder}/can")
+        self.assertIn("28 joints at 60 Hz", said)
+        np.savez(f"{self.folder}/recording.npz", object=SOUP, **recorded(POLICY, SOUP, STEPS))
+        command = [sys.executable, "-I", "-c", REPLAY]
+        command += [f"{self.folder}/can", f"{self.folder}/recording.npz"]
         found = json.loads(
             subprocess.run(command, check=True, capture_output=True, text=True).stdout
         )
@@ -116,37 +123,60 @@ class RuntimeTest(InFolder):
         self.assertIn("a step takes", measured.stdout)
 
 
-class ContractTest(InFolder):
+class ToyTest(InFolder):
+    """The graph of a toy policy of one matrix, for the gripper of the conformance suite."""
+
+    @classmethod
+    def setUpClass(cls):
+        super().setUpClass()
+        cls.robot = toy_grasp.robot()
+        cls.task = evaluation_task(TaskConfig())
+
     def setUp(self):
         super().setUp()
-        self.task = TaskConfig()
-        robot = toy_grasp.robot()
-        trained = asdict(policy_contract(robot, self.task, ("brick",)))
-        file = write_policy(self.folder / "toy.onnx", trained, value=0.01)
+        trained = asdict(policy_contract(self.robot, self.task, ("brick",)))
+        self.network = write_policy(self.folder / "toy.onnx", trained, value=0.01)
+        self.graph = toy_graph(self.network.read_bytes())
         self.out = self.folder / "out"
-        self.contract = deploy_contract(robot, self.task, [toy_grasp.brick()], file.read_bytes())
-        write_deployed(file.read_bytes(), self.contract, self.out)
+        write_deployed(self.graph, self.out)
+        self.controller = load_controller(self.out)
+        self.contract = self.controller.contract
         self.home = [joint["home"] for joint in self.contract["joints"]]
 
-    def test_it_says_what_goes_in_and_out(self):
-        self.assertEqual(read_contract(self.out), self.contract)
-        self.assertEqual(
-            [joint["name"] for joint in self.contract["joints"]],
-            list(toy_grasp.robot().joint_names),
-        )
-        self.assertEqual(np.shape(self.contract["objects"]["brick"]["points"]), (64, 3))
-        with self.assertRaisesRegex(PolicyError, "exists already"):
-            write_deployed(b"", self.contract, self.out)
-        with self.assertRaisesRegex(LiveError, "has no object 'hat'. Choose from: brick"):
-            load_controller(self.out).points("hat")
-
-    def test_an_episode_that_does_not_fit_is_refused(self):
-        controller = load_controller(self.out)
+    def begin(self, **changes):
         brick = self.contract["objects"]["brick"]
         good = {
             "object_points": brick["points"], "center": brick["center"], "target": self.home,
             "goal_pos": [0.5, 0.3, 0.2], "goal_quat": [1, 0, 0, 0],
         }  # fmt: skip
+        self.controller.begin(**good | changes)
+        return Reading(
+            joint_pos=self.home, joint_vel=[0.0] * 5, joint_time=0.0,
+            object_pos=[0.5, 0.3, 0.1], object_quat=[1, 0, 0, 0], object_time=0.0,
+        )  # fmt: skip
+
+    def test_the_graph_says_what_goes_in_and_out(self):
+        model = onnx.load_from_string(self.graph)
+        onnx.checker.check_model(model)
+        self.assertEqual({node.domain for node in model.graph.node}, {""})
+        self.assertEqual(
+            [value.name for value in model.graph.output], ["target", "memory_out", "links"]
+        )
+        shapes = self.controller.shapes
+        self.assertNotIn("object_center", shapes, "the draft's observations do not need it")
+        self.assertEqual((shapes["joint_pos"], shapes["tip_force"]), ((5,), (2, 3)))
+        self.assertEqual(
+            [joint["name"] for joint in self.contract["joints"]], list(self.robot.joint_names)
+        )
+        self.assertEqual(np.shape(self.contract["objects"]["brick"]["points"]), (64, 3))
+        self.assertTrue(set(shapes) <= set(self.contract["values"]))
+        with self.assertRaisesRegex(PolicyError, "exists already"):
+            write_deployed(b"", self.out)
+        with self.assertRaisesRegex(LiveError, "has no object 'hat'. Choose from: brick"):
+            self.controller.points("hat")
+
+    def test_an_episode_that_does_not_fit_is_refused(self):
+        points = np.array(self.contract["objects"]["brick"]["points"])
         for name, value, words in (
             ("target", self.home[1:], r"target has shape \(4,\), expected \(5,\)"),
             ("goal_pos", [0.5, 0.3], r"shape \(2,\), expected \(3,\)"),
@@ -156,232 +186,111 @@ class ContractTest(InFolder):
             ("target", [float("nan")] * 5, "target of .* is nan"),
             ("goal_pos", [500.0, 300.0, 200.0], "expected at most 10 m. Are these millimetres"),
             ("goal_pos", [float("nan")] * 3, "expected at most 10 m"),
-            ("object_points", 1000 * np.array(brick["points"]), "The object .* at most 10 m. Are these millimetres"),
-        ):  # fmt: skip
-            with self.subTest(name), self.assertRaisesRegex(LiveError, words):
-                controller.begin(**good | {name: value})
-        controller.begin(**good)
-        reading = Reading(
-            joint_pos=self.home, joint_vel=[0.0] * 5, joint_time=0.0,
-            object_pos=[0.5, 0.3, 0.1], object_quat=[1, 0, 0, 0], object_time=0.0,
-        )  # fmt: skip
-        controller.step(reading)
-        for name, value in (("goal_pos", [500.0] * 3), ("target", [90.0] * 5)):
-            controller.begin(**good)
-            with self.subTest(f"no episode after a wrong {name}"):
-                self.assertRaises(LiveError, controller.begin, **good | {name: value})
-                self.assertRaisesRegex(LiveError, "No episode has begun", controller.step, reading)
+            ("object_points", 1000 * points, "The object .* at most 10 m. Are these millimetres"),
+            ("object_points", points[1:], r"points of shape \(63, 3\), expected \(64, 3\)"),
+        ):
+            reading = self.begin()
+            self.controller.step(reading)
+            with self.subTest(name, value=np.shape(value)):
+                self.assertRaisesRegex(LiveError, words, self.begin, **{name: value})
+                self.assertRaisesRegex(LiveError, "has begun", self.controller.step, reading)
 
     def test_a_reading_that_does_not_fit_is_refused(self):
-        controller = load_controller(self.out)
-        brick = self.contract["objects"]["brick"]
-        reading = Reading(
-            joint_pos=self.home, joint_vel=[0.0] * 5, joint_time=0.0,
-            object_pos=[0.5, 0.3, 0.1], object_quat=[1, 0, 0, 0], object_time=0.0,
-        )  # fmt: skip
-        self.assertRaisesRegex(LiveError, "No episode has begun", controller.step, reading)
+        controller = self.controller
         goal = ([0.5, 0.3, 0.2], [1, 0, 0, 0])
         self.assertRaisesRegex(LiveError, "No episode has begun", controller.set_goal, *goal)
-        controller.begin(brick["points"], *goal, self.home, brick["center"])
+        reading = self.begin()
         self.assertEqual(controller.step(reading).shape, (1, 5))
         for changes, words in (
             ({"joint_pos": self.home[1:]}, r"joint_pos has shape \(1, 4\), expected \(1, 5\)"),
             ({"object_quat": [1, 0, 0]}, r"object_quat has shape \(1, 3\), expected \(1, 4\)"),
             ({"tip_force": [0, 0, 0]}, r"tip_force has shape \(1, 3\), expected \(1, 2, 3\)"),
+            ({"joint_vel": None}, "needs joint_vel, which the reading does not have"),
         ):
             with self.subTest(words), self.assertRaisesRegex(LiveError, words):
                 controller.step(replace(reading, **changes))
+        for name, value, words in (
+            ("joint_pos", [90.0] * 5, "joint_pos of .* is 90, expected .*degrees"),
+            ("joint_vel", [3e38] * 5, r"joint_vel holds 3e\+38, expected at most 100 rad/s"),
+            ("object_pos", [500.0, 0, 0], "The object has the coordinate 500.*millimetres"),
+            ("tip_force", [[1e6, 0, 0]] * 2, "tip_force holds 1e.06"),
+        ):
+            with self.subTest(name), self.assertRaisesRegex(LiveError, words):
+                controller.check_reading(replace(reading, **{name: value}))
+
+    def test_controller_and_runner_judge_quaternions_alike(self):
+        self.begin()
+        long = [1.3, 0, 0, 0]
+        driver = Robot(
+            self.home, lambda time, reading: replace(reading, object_quat=np.array(long))
+        )
+        with self.assertRaisesRegex(LiveError, "expected a unit quaternion"):
+            self.controller.set_goal([0.5, 0.3, 0.2], long)
+        self.assertTrue(Runner(self.controller, driver).run(0.05).refused.all())
 
     def changed(self, place, value):
-        """The contract with another value at a place, of a version that stated no hash."""
+        """The graph, whose contract has another value at a place."""
         contract = json.loads(json.dumps(self.contract))
-        del contract["contract_sha256"]
         entry = contract
         for name in place[:-1]:
             entry = entry[name]
         entry[place[-1]] = value
-        return contract
+        return self.with_metadata(json.dumps(contract))
+
+    def with_metadata(self, text):
+        model = onnx.load_from_string(self.graph)
+        onnx.helper.set_model_props(model, {KEY: text})
+        return model.SerializeToString()
 
     def test_a_contract_that_no_robot_may_follow_is_refused(self):
-        load = {"source": "It"}
-        Controller(self.changed(("rate",), 60), **load)
+        Controller(self.changed(("rate",), 60))
         joint = ("joints", 1)
-        step = ("kinematics", "steps", 1)
-        mirrored = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
         for place, values in (
             (("control_dt",), (1e-30, -0.016, True, 50.0, None)),
             (("joints",), ([], [{}] * 5, [3])),
-            ((*joint, "step"), (50.0, -0.01, None, "x", float("nan"))),
-            ((*joint, "lead"), (50.0, -1.0)),
-            ((*joint, "above"), (float("nan"), -1.0)),
+            ((*joint, "step"), (50.0, -0.01, "x", float("nan"))),
             ((*joint, "home"), ("0",)),
             ((*joint, "lower"), (None, 1e9, float("-inf"))),
             ((*joint, "upper"), (None, -50.0)),
-            ((*joint, "group"), ("leg",)),
-            (("observation", "rotation"), ("euler", None)),
-            (("observation", "joint_target"), (1,)),
-            (("observation", "cloud_points"), (0, 64.0, 10**400)),
-            (("observation", "cloud_scale"), ("x", -1.0)),
-            (("observation",), ({},)),
-            (("action", "hand"), ("quick",)),
-            (("object_frame",), ("table",)),
-            (("kinematics",), ({},)),
-            (("kinematics", "base"), (mirrored, np.eye(3).tolist())),
-            (("kinematics", "palm"), (-1, 99, 1.0)),
-            (("kinematics", "tips"), ([0], [-1, 0], 0)),
-            ((*step, "parent"), (-1, 2)),
-            ((*step, "joint"), (-1, 5, None)),
-            ((*step, "axis"), ([5, 0, 0], [0, 0, 0], [1, 0])),
-            ((*step, "origin"), (mirrored, (1000 * np.eye(4)).tolist())),
-            ((*step, "multiplier"), (float("inf"),)),
+            ((*joint, "velocity"), (-1.0, "x")),
+            (("fingertips",), (3,)),
             (("objects", "brick"), ({}, 3)),
-            (("objects", "brick", "points"), ([[0, 0, float("nan")]] * 64, [])),
+            (("objects", "brick", "points"), ([[0, 0, float("nan")]] * 64, [], [[0, 0, 0]] * 63)),
+            (("schema",), ("xreset-deploy/9",)),
         ):
             *_, last = (part for part in place if isinstance(part, str))
             for value in values:
                 with self.subTest(place, value=value), self.assertRaisesRegex(LiveError, last):
-                    Controller(self.changed(place, value), **load)
-
-    @skipUnless(find_spec("websockets"), "websockets is not installed")
-    def test_controller_server_and_runner_judge_quaternions_alike(self):
-        from xreset.live.serve import _Episode
-
-        episode = _Episode(load_controller(self.out))
-        controller = episode._controller
-        goal = {"goal_pos": [0.5, 0.3, 0.2], "goal_quat": [1, 0, 0, 0]}
-        begin = {"begin": goal | {"object": "brick", "target": self.home}}
-        self.assertEqual(episode.answer(json.dumps(begin)), {"begun": True})
-        long = [1.3, 0, 0, 0]
-        message = json.dumps({"goal": goal | {"goal_quat": long}})
-        driver = Robot(
-            self.home, lambda time, reading: replace(reading, object_quat=np.array(long))
-        )
-        self.assertIn("expected a unit quaternion", episode.answer(message)["error"])
-        with self.assertRaisesRegex(LiveError, "expected a unit quaternion"):
-            controller.set_goal(goal["goal_pos"], long)
-        self.assertTrue(Runner(controller, driver).run(0.05).refused.all())
-        with patch("xreset.runtime.rotations.UNIT_TOLERANCE", 0.5):
-            self.assertEqual(episode.answer(message), {"goal": True})
-            controller.set_goal(goal["goal_pos"], long)
-            self.assertFalse(Runner(controller, driver).run(0.05).refused.any())
+                    Controller(self.changed(place, value), "It")
 
     def test_another_version_and_damage_are_refused(self):
-        file = self.out / "contract.json"
-        original = file.read_text()
-        for change, words in (
+        for content, words in (
+            (self.network.read_bytes(), "no metadata entry 'xreset-deploy': it is not a deployed"),
             (
-                {"schema": "xreset-deploy/9"},
-                "has schema 'xreset-deploy/9', this runtime reads 'xreset-deploy/1'",
+                self.with_metadata("[]"),
+                "It has schema 'None', this runtime reads 'xreset-deploy/2'",
             ),
-            ({"policy_sha256": "0" * 64}, "has SHA-256 .* the contract names 000000000000"),
-            (
-                {"observation": {"smell": 1}},
-                "observation options that this runtime does not know: smell",
-            ),
-            ({"observation": None}, "contract.json lacks observation, or has another type"),
-            ({"policy_sha256": None}, "contract.json lacks policy_sha256"),
-            ({"joints": {}}, "contract.json lacks joints"),
-            ({"rate": 30.0}, "contract.json was changed after its export"),
+            (self.with_metadata("{" * 50_000), "has a contract that is not JSON"),
+            (self.graph[:5000], "It cannot be read as ONNX"),
+            (b"", "It cannot be read as ONNX"),
+            (self.changed(("joints",), self.contract["joints"][1:]), "has the input 'joint_pos'"),
         ):
-            file.write_text(json.dumps(self.contract | change))
             with self.subTest(words), self.assertRaisesRegex(LiveError, words):
-                load_controller(self.out)
-            self.assertRaisesRegex(LiveError, words, read_contract, self.out)
-        file.write_text('{"a": ' * 200_000)
-        self.assertRaisesRegex(LiveError, "is not an exported policy", load_controller, self.out)
-        other = self.changed(("observation", "cloud_history"), 3)
-        file.write_text(json.dumps(other | {"contract_sha256": digest(other)}))
-        words = "contract.json is damaged, or does not fit its policy"
-        self.assertRaisesRegex(LiveError, words, load_controller, self.out)
-        file.write_text("[]")
-        self.assertRaisesRegex(LiveError, "has schema 'None', this", load_controller, self.out)
-        file.write_text(original[:100])
-        self.assertRaisesRegex(LiveError, "is not an exported policy", load_controller, self.out)
-        self.assertRaisesRegex(LiveError, "None is not an exported policy", load_controller, None)
-        self.assertRaisesRegex(LiveError, "^The contract has schema", Controller, str(self.out))
+                Controller(content, "It")
+        for folder in (None, self.folder / "nothing", "\0"):
+            self.assertRaisesRegex(LiveError, "is not an exported policy", load_controller, folder)
+        (self.out / "contract.json").write_text("{}")
+        with self.assertRaisesRegex(LiveError, "of xreset 0.3 or earlier. Use the runtime in this"):
+            load_controller(self.out)
 
-    @skipUnless(find_spec("websockets"), "websockets is not installed")
-    def test_served_it_acts_alike_and_a_lost_server_stops_the_robot(self):
-        from websockets.exceptions import WebSocketException
-        from websockets.sync.client import connect
-
-        from xreset.live.serve import PolicyServer
-
-        with self.assertRaisesRegex(XResetError, "port is 65536, expected"):
-            PolicyServer(self.contract, b"", port=65536)
-        server = PolicyServer(self.contract, (self.out / "policy.onnx").read_bytes(), port=0)
-        thread = threading.Thread(target=server.serve)
-        thread.start()
-        self.addCleanup(thread.join)
-        self.addCleanup(server.close)
-        brick = self.contract["objects"]["brick"]
-        start = (brick["points"], [0.5, 0.3, 0.2], [1, 0, 0, 0], self.home, brick["center"])
-        local = load_controller(self.out)
-        remote = RemoteController(server.url, timeout=20)
-        driver = Robot(self.home)
-        targets = []
-        for controller in (local, remote):
-            controller.begin(*start)
-            targets.append([controller.step(driver.read()).copy() for _ in range(3)])
-        np.testing.assert_array_equal(*targets)
-        self.assertIn("brick: 5 joint targets", run("12_served_policy", server.url, 3))
-        remote.set_goal([0.5, 0.3, 0.3], [0, 1, 0, 0])
-        with (
-            patch("xreset.live.serve._MOST_CLIENTS", 1),
-            connect(server.url) as another,
-            self.assertRaisesRegex(WebSocketException, "1 clients are connected"),
-        ):
-            another.recv(timeout=5)
-        with self.assertRaises(WebSocketException):  # a page in a browser
-            connect(server.url, origin="http://elsewhere.example")  # type: ignore[arg-type]
-
-        def close_after_a_second(time, reading):
-            if 1 < time < 1.03:
-                server.close()
-            return reading
-
-        driver = Robot(self.home, close_after_a_second)
-        with self.assertLogs("xreset"):
-            outcome = Runner(remote, driver).run(10)
-        self.assertEqual(
-            (outcome.reason, driver.stops), ("The policy could not act: the server has gone.", 1)
-        )
-        words = rf"No policy is served at {server.url} \(.*\). Start it: xreset serve POLICY"
-        with self.assertRaisesRegex(SystemExit, words):
-            run("12_served_policy", server.url)
-
-    @skipUnless(find_spec("websockets"), "websockets is not installed")
-    def test_an_answer_that_comes_late_is_not_used(self):
-        hello = {"schema": "xreset-live/1", "contract": self.contract}
-        begin = {"begun": True}
-        target = {"target": self.home}
-        start = (np.zeros((64, 3)), [0.5, 0.3, 0.2], [1, 0, 0, 0], self.home)
-        for answers, words in (
-            ((hello, begin, TimeoutError, target), "has not answered for 0.5 s"),
-            ((hello, begin, KeyboardInterrupt, target), ""),
-            ((hello, begin, [], target), "is a list, expected an object"),
-            ((hello, begin, ConnectionError, target), "has gone"),
-        ):
-            with self.subTest(words), patch("websockets.sync.client.connect") as connect:
-                socket = connect.return_value
-                socket.recv.side_effect = [
-                    answer if isinstance(answer, type) else json.dumps(answer) for answer in answers
-                ]
-                remote = RemoteController("ws://127.0.0.1:9")
-                remote.begin(*start)
-                with self.assertRaisesRegex(BaseException, words):
-                    remote.step(Robot(self.home).read())
-                again = "Make a new RemoteController"
-                self.assertRaisesRegex(LiveError, again, remote.begin, *start)
-                self.assertRaisesRegex(LiveError, again, remote.step, Robot(self.home).read())
-                self.assertEqual(socket.recv.call_count, 3)
-        for answer in (begin, {"target": [0.0]}, {"target": ["x"]}):
-            with self.subTest(answer), patch("websockets.sync.client.connect") as connect:
-                connect.return_value.recv.side_effect = map(json.dumps, (hello, begin, answer))
-                remote = RemoteController("ws://127.0.0.1:9")
-                remote.begin(*start)
-                with self.assertRaisesRegex(LiveError, "the server's (answer holds no )?target"):
-                    remote.step(Robot(self.home).read())
+    def test_a_folder_of_xreset_0_3_is_read(self):
+        old = self.folder / "old"
+        (old / "runtime").mkdir(parents=True)
+        (old / "policy.onnx").write_bytes(self.network.read_bytes())
+        spec = load_policy(old, robot=self.robot)
+        self.assertIsInstance(spec.start(None), OnnxPolicy)
+        contract = Controller(spec.deployed([toy_grasp.brick()])).contract
+        self.assertEqual(contract, self.contract)
 
     def test_the_example_of_a_driver(self):
         rows = 11
@@ -402,95 +311,133 @@ class ContractTest(InFolder):
         self.assertIn("30 steps; stopped because: the recording is over", said)
         self.assertIn("the robot holds still", said)
 
-    @skipUnless(find_spec("websockets"), "websockets is not installed")
-    def test_a_wrong_message_gets_a_sentence(self):
-        from xreset.live.serve import _Episode
+    def readings(self, steps):
+        """Return numbers [steps, ...] for every input of the graph but the memory, by name."""
+        rng = np.random.default_rng(0)
+        upright = np.array([1.0, 0, 0, 0])
+        inputs = {}
+        for name, shape in self.controller.shapes.items():
+            values = rng.normal(0.3, 0.02, (steps, *shape))
+            inputs[name] = (
+                np.where(np.ones(shape), values, 0) if shape != (4,) else [upright] * steps
+            )
+        inputs.pop("memory_in")
+        return {name: np.asarray(value, np.float32) for name, value in inputs.items()}
 
-        episode = _Episode(load_controller(self.out))
-        begin = {
-            "object": "brick",
-            "goal_pos": [0, 0, 1],
-            "goal_quat": [1, 0, 0, 0],
-            "target": self.home,
-        }
-        for message, words in (
-            ('{"a":' * 5000, "is not JSON"),
-            ("[]", "exactly one key. Choose from: begin, goal, step"),
-            ({"step": {}}, "no episode yet. Send begin first"),
-            ({"begin": 3}, "begin is not an object"),
-            ({"begin": begin | {"object": ["hat"]}}, "no object"),
-            ({"begin": begin | {"goal_pos": [0, 0, float("nan")]}}, "goal_pos has shape"),
-            (
-                {"begin": begin | {"goal_pos": [0, 0, 10**400]}},
-                "goal_pos holds something that is not a number",
-            ),
-            (
-                {"begin": begin | {"goal_quat": [1, 1, 0, 0]}},
-                "length 1.414, expected a unit quaternion",
-            ),
+    @skipUnless(shutil.which("g++"), "there is no compiler of C++")
+    def test_cpp_gives_the_targets_of_python(self):
+        library = next(Path(onnxruntime.__file__).parent.glob("capi/libonnxruntime.so.*"), None)
+        if library is None:
+            self.skipTest("onnxruntime has no library of its own")
+        linked = self.folder / "libonnxruntime.so.1"
+        linked.symlink_to(library)
+        program = self.folder / "policy"
+        stand_in = Path(__file__).parent / "stand_ins"
+        command = ["g++", "-std=c++17", "-Wall", "-Werror", "-I", stand_in, "-o", program]
+        command += [EXAMPLES / "deploy_cpp" / "policy.cpp", linked, f"-Wl,-rpath,{self.folder}"]
+        subprocess.run(command, check=True)
+        steps = 4
+        readings = self.readings(steps)
+        lines = []
+        for k in range(steps):
+            row = np.concatenate([value[k].ravel() for value in readings.values()])
+            lines.append(" ".join(map("{:.9g}".format, row)))
+        found = subprocess.run(
+            [program, self.out / "policy.onnx", str(steps)],
+            input="\n".join(lines), capture_output=True, text=True, check=True,
+        ).stdout  # fmt: skip
+        found = np.array([line.split() for line in found.splitlines()], float)
+        assert_allclose(found, self.expected(readings, steps), atol=1e-6)
+
+    def expected(self, readings, steps):
+        """Return the graph's targets [steps, J], by onnxruntime."""
+        session = onnxruntime.InferenceSession(self.graph, providers=["CPUExecutionProvider"])
+        memory = np.zeros((1, *self.controller.shapes["memory_in"]), np.float32)
+        targets = []
+        for k in range(steps):
+            feed = {name: value[k][None] for name, value in readings.items()}
+            target, memory = session.run(["target", "memory_out"], feed | {"memory_in": memory})
+            targets.append(target[0])
+        return np.array(targets)
+
+    @skipUnless(find_spec("leapp"), "leapp is not installed")
+    def test_leapp_gives_the_targets_of_the_graph(self):
+        from leapp.inference_manager import InferenceManager
+
+        manager = InferenceManager(str(self.out / "leapp.yaml"))
+        steps = 4
+        readings = self.readings(steps)
+        found = []
+        for k in range(steps):
+            given = {f"policy/{name}": torch.tensor(readings[name][k][None]) for name in readings}
+            found.append(manager.run_policy(given)["policy/target"][0].numpy())
+        assert_allclose(found, self.expected(readings, steps), atol=1e-6)
+
+    def test_the_description_for_leapp_names_every_value(self):
+        described = yaml.safe_load((self.out / "leapp.yaml").read_text())
+        (node,) = described["models"].values()
+        for part, names in (
+            ("inputs", self.controller.shapes),
+            ("outputs", self.controller.outputs),
         ):
-            text = message if isinstance(message, str) else json.dumps(message)
-            with self.subTest(text[:60]):
-                self.assertRegex(episode.answer(text)["error"], words)
-        self.assertEqual(episode.answer(json.dumps({"begin": begin})), {"begun": True})
-        self.assertIn("joint_pos is missing", episode.answer('{"step": {}}')["error"])
-        told = episode.answer(json.dumps({"begin": begin | {"object": "x" * 500_000}}))
-        self.assertLess(len(told["error"]), 500)
-        self.assertEqual(episode.answer(json.dumps({"begin": begin})), {"begun": True})
-        reading = {
-            "joint_pos": self.home, "joint_vel": [0] * 5, "object_pos": [0.5, 0.3, 0.1],
-            "object_quat": [1, 0, 0, 0], "tip_force": [[0, 0, 0]] * 2,
-        }  # fmt: skip
-        self.assertIn("target", episode.answer(json.dumps({"step": reading})))
-        for name, value, words in (
-            ("joint_pos", [1e30] * 5, "joint_pos of .* is 1e.30, expected .*degrees"),
-            ("joint_pos", [90.0] * 5, "degrees"),
-            ("joint_vel", [3e38] * 5, r"joint_vel holds 3e\+38, expected at most 100 rad/s"),
-            ("object_pos", [500.0, 0, 0], "The object has the coordinate 500.*millimetres"),
-            ("tip_force", [[1e6, 0, 0]] * 2, "tip_force holds 1e.06"),
-        ):
-            answer = episode.answer(json.dumps({"step": reading | {name: value}}))
-            with self.subTest(name):
-                self.assertRegex(answer.get("error", ""), words)
-
-    @skipUnless(find_spec("websockets"), "websockets is not installed")
-    def test_the_command_serves_where_it_is_told_to(self):
-        with (
-            patch("xreset.live.serve.PolicyServer") as server,
-            patch("xreset.pictures.view.server.serve_until_interrupted") as served,
-        ):
-            server.return_value.url = "ws://0.0.0.0:9"
-            options = ("--host", "0.0.0.0", "--port", 9, "--object", "banana")
-            said = succeeds("serve", "nine-objects", *options)
-        contract, network = server.call_args.args
-        self.assertEqual(list(contract["objects"]), ["011_banana"])
-        self.assertEqual(network, load_policy("nine-objects").exported())
-        self.assertEqual(server.call_args.kwargs, {"host": "0.0.0.0", "port": 9})
-        served.assert_called_once_with(server.return_value)
-        self.assertIn("nine-objects for ur7e-sharpa at ws://0.0.0.0:9, 60 steps per second", said)
-        self.assertIn("There is no password", said)
-
-    @skipUnless(find_spec("websockets"), "websockets is not installed")
-    def test_a_policy_is_served_from_a_thread_of_a_notebook(self):
-        said: Queue[str] = Queue()
-        with patch("builtins.print", said.put):
-            arguments = {"port": 0, "only": ["banana"]}
-            threading.Thread(
-                target=xreset.serve, args=["nine-objects"], kwargs=arguments, daemon=True
-            ).start()
-            url = said.get(timeout=60).split()[4].rstrip(",")
-        controller = RemoteController(url)
-        self.assertEqual(list(controller.contract["objects"]), ["011_banana"])
-        controller.close()
-
-    def test_a_baseline_and_cameras_are_refused(self):
-        self.assertIn(
-            "The baseline 'zero' is not an exported policy",
-            refused("export", "deploy", "zero", "--robot", "openarm", "--out", f"{self.folder}/x"),
+            self.assertEqual([value["name"] for value in node[part]], list(names))
+        self.assertEqual(
+            described["pipeline"]["feedback_flow"], {"policy/memory_out": ["policy/memory_in"]}
         )
-        seeing = replace(self.task, vision=VisionConfig(cameras=(CameraConfig(),)))
+        digest = hashlib.sha256((self.out / "policy.onnx").read_bytes()).hexdigest()
+        self.assertEqual(node["parameters"]["sha256sum"], digest)
+
+    def test_the_ros_2_node(self):
+        with ros(self.contract, self.home) as published:
+            importlib.import_module("12_ros2_node").main(str(self.out), "brick", 0.5)
+        self.assertEqual(len(published), 30)
+        self.assertEqual(np.shape(published), (30, 5))
+        self.begin()
+        joints = self.controller.contract["joints"]
+        for target in published:
+            for value, joint in zip(target, joints, strict=True):
+                self.assertTrue(joint["lower"] - 1e-6 <= value <= joint["upper"] + 1e-6)
+
+    @skipUnless(find_spec("mujoco"), "mujoco is not installed")
+    def test_an_evaluation_plays_the_graph_as_it_plays_the_network(self):
+        trial = toy_grasp.trial(self.task)
+        played = []
+        for file in (self.network, self.out / "policy.onnx"):
+            spec = load_policy(file, robot=self.robot)
+            found = roll_out(spec.start(None), engine("mujoco", workers=0), trial, episodes=1)
+            played.append(found)
+        first, second = (rollouts.traces for rollouts in played)
+        for a, b in zip(first, second, strict=True):
+            assert_allclose(a.joint_target, b.joint_target, atol=1e-5)
+            assert_allclose(a.object_pos, b.object_pos, atol=1e-4)
+
+
+class RefusedTest(TestCase):
+    def test_what_cannot_be_deployed(self):
+        said = refused("export", "deploy", "zero", "--robot", "openarm", "--out", "x")
+        self.assertIn("The baseline 'zero' is not an exported policy", said)
+        robot = toy_grasp.robot()
+        seeing = TaskConfig(vision=VisionConfig(cameras=(CameraConfig(),)))
         with self.assertRaisesRegex(PolicyError, "The policy has cameras"):
-            deploy_contract(toy_grasp.robot(), seeing, [])
+            policy_graph(b"", robot, seeing)
+        network = torch.nn.Linear(1, 1)
+        for name in ("object_linvel", "reward", "least_tip_distance"):
+            draft = ObservationConfig()
+            task = TaskConfig(observation=replace(draft, policy=draft.policy | {name: {}}))
+            with (
+                self.subTest(name),
+                self.assertRaisesRegex(PolicyError, f"{name}', which no robot"),
+            ):
+                policy_graph(network, robot, task)
+        with self.assertRaisesRegex(PolicyError, r"The network gives \(2, 5, 64, 1\) .* expected"):
+            policy_graph(OfCloud(), robot, TaskConfig())
+
+
+class OfCloud(torch.nn.Module):
+    """A network whose outputs have a wrong shape."""
+
+    def forward(self, flat, cloud):
+        return cloud[..., :1]
 
 
 class Robot(Scripted):
@@ -504,3 +451,59 @@ class Robot(Scripted):
         return replace(
             super().read(), joint_pos=self.home, joint_vel=0 * self.home, tip_force=np.zeros((2, 3))
         )
+
+
+@contextlib.contextmanager
+def ros(contract, home):
+    """A small stand-in for ROS 2: one node, whose topics send a robot at home; yields the published targets."""
+    published = []
+    clock = SimpleNamespace(time=5.0)
+    pose = SimpleNamespace(
+        position=SimpleNamespace(x=0.5, y=0.3, z=0.1),
+        orientation=SimpleNamespace(w=1.0, x=0.0, y=0.0, z=0.0),
+    )
+    callbacks = []
+
+    def stamp():
+        return SimpleNamespace(
+            stamp=SimpleNamespace(sec=int(clock.time), nanosec=int(clock.time % 1 * 1e9))
+        )
+
+    def message(kind):
+        if kind == "PoseStamped":
+            return SimpleNamespace(header=stamp(), pose=pose)
+        names = [joint["name"] for joint in contract["joints"]][::-1]
+        return SimpleNamespace(
+            header=stamp(), name=names, position=home[::-1], velocity=[0.0] * len(home)
+        )
+
+    def spin_once(node, timeout_sec=0.01):
+        clock.time += timeout_sec
+        for kind, callback in callbacks:
+            callback(message(kind))
+
+    node = SimpleNamespace(
+        create_subscription=lambda kind, topic, callback, depth: callbacks.append((kind, callback)),
+        create_publisher=lambda kind, topic, depth: SimpleNamespace(
+            publish=lambda sent: published.append(sent.data)
+        ),
+        get_clock=lambda: SimpleNamespace(
+            now=lambda: SimpleNamespace(nanoseconds=clock.time * 1e9)
+        ),
+        get_logger=lambda: SimpleNamespace(warning=lambda text: None),
+    )
+    modules = {
+        name: ModuleType(name) for name in ("rclpy", "geometry_msgs", "sensor_msgs", "std_msgs")
+    }
+    modules |= {f"{name}.msg": ModuleType(name) for name in list(modules)[1:]}
+    vars(modules["rclpy"]).update(
+        init=lambda: None, ok=lambda: True, spin_once=spin_once, create_node=lambda name: node
+    )
+    modules["geometry_msgs.msg"].PoseStamped = "PoseStamped"
+    modules["sensor_msgs.msg"].JointState = "JointState"
+    modules["std_msgs.msg"].Float64MultiArray = SimpleNamespace
+    with (
+        mock.patch.dict(sys.modules, modules),
+        mock.patch.object(sys, "path", [str(EXAMPLES), *sys.path]),
+    ):
+        yield published

@@ -13,9 +13,13 @@ from tests import toy_grasp
 from xreset.eval.robot_loop import SimulatedRunner
 from xreset.eval.rollout import engine, episode_starts
 from xreset.learning.recipes import RECIPES
-from xreset.live.engine import EngineDriver, make_controller
-from xreset.runtime import Driver, Reading, Runner
-from xreset.task.config import evaluation_task
+from xreset.live.deploy import deploy_contract
+from xreset.live.engine import EngineDriver, centers
+from xreset.live.graph import Act, Observe
+from xreset.objects.sampling import surface_points
+from xreset.runtime import Driver, Limits, LiveError, Reading, Runner
+from xreset.runtime.contract import joint_values
+from xreset.task.config import TaskConfig, evaluation_task
 
 STEPS = 12
 
@@ -62,6 +66,9 @@ class Steady:
     lower = np.array([-1.0, -1.0], np.float32)
     upper = np.array([9.0, 9.0], np.float32)
     step_size = np.array([0.01, 0.0], np.float32)
+    speed = np.array([0.6, np.inf], np.float32)
+    links = None
+    outputs = ("target",)
 
     def __init__(self, act=lambda target: target + 0.01):
         self.target = np.zeros((1, 2), np.float32)
@@ -116,6 +123,7 @@ class FaultTest(TestCase):
             ("NaN joint", after(1, joint_pos=np.array([0, np.nan])), "joint positions are 0.1. s old, or not finite"),
             ("old joints", after(1, joint_time=0.99), "joint positions are 0.1. s old"),
             ("NaN force", after(1, tip_force=np.full((2, 3), np.nan)), "joint positions are 0.1. s old, or not finite"),
+            ("too fast", after(1, joint_vel=np.array([-1.3, 0])), "Joint shoulder moves at 1.30, faster than its limit 1.20"),
             ("limit", after(1, joint_pos=np.array([0, 9.11])), "Joint finger is at 9.11, beyond its limit 9.00"),
             ("lower limit", after(1, joint_pos=np.array([-1.11, 0])), "Joint shoulder is at -1.11, beyond its limit -1.00"),
             ("no pose", after(1, object_pos=None), "object_pos is None. Without a new value, give the last one"),
@@ -133,6 +141,58 @@ class FaultTest(TestCase):
     def test_joints_slightly_beyond_their_limits_are_tolerated(self):
         driver = Scripted(after(0, joint_pos=np.array([-1.09, 9.09])))
         self.assertIsNone(Runner(Steady(), driver).run(1).reason)
+
+    def test_targets_are_no_faster_than_their_limit(self):
+        driver = Scripted()
+        controller = Steady()
+        limits = Limits(target_speed=0.5)
+        self.assertIsNone(Runner(controller, driver, limits).run(1).reason)
+        moves = np.diff(driver.sent, axis=0)
+        assert_allclose(moves[:, 0], 0.5 * 0.6 * 0.02, rtol=1e-4)
+        assert_allclose(moves[:, 1], 0.01, rtol=1e-4)
+        self.assertEqual(driver.sent[-1][0], controller.target[0, 0])
+
+    def test_a_workspace(self):
+        controller = Steady()
+        with self.assertRaisesRegex(LiveError, "no output 'links', which a workspace needs"):
+            Runner(controller, Scripted(), Limits(workspace=((0, 0, 0), (1, 1, 1))))
+        with self.assertRaisesRegex(LiveError, "expected the lowest and the highest corner"):
+            Limits(workspace=((0, 0, 0), (1, 1, 0)))
+        controller.outputs = ("target", "links")
+        controller.contract = {**Steady.contract, "links": ["palm", "tip"]}
+
+        def act(target):
+            controller.links = np.array([[[0.5, 0.5, 0.5], [target[0, 0], 0.5, 0.5]]])
+            return target + 0.01
+
+        controller.act = act
+        driver = Scripted()
+        with self.assertLogs("xreset"):
+            outcome = Runner(controller, driver, Limits(workspace=((-1, 0, 0), (0.4, 1, 1)))).run(
+                30
+            )
+        self.assertEqual(
+            outcome.reason, "Link palm is at (0.50, 0.50, 0.50), outside the workspace."
+        )
+        driver = Scripted()
+        controller.target *= 0
+        with self.assertLogs("xreset"):
+            outcome = Runner(controller, driver, Limits(workspace=((-1, 0, 0), (0.6, 1, 1)))).run(
+                30
+            )
+        self.assertEqual(
+            outcome.reason, "Link tip is at (0.61, 0.50, 0.50), outside the workspace."
+        )
+        self.assertLess(driver.sent[-1][0], 0.7)
+
+    def test_resting_targets_are_sent_as_long_as_the_robot_holds(self):
+        driver = Scripted(after(1, object_time=0.99))
+        with self.assertLogs("xreset"):
+            outcome = Runner(Steady(), driver, Limits(hold=3.0)).run(30)
+        self.assertIn("pose of the object", outcome.reason or "")
+        moves = np.diff(driver.sent, axis=0)
+        assert_array_equal(moves[-150:], 0)
+        self.assertGreater(driver.time, 5.2)
 
     def test_a_policy_that_fails(self):
         calls = []
@@ -225,7 +285,7 @@ class FaultTest(TestCase):
 
 @skipUnless(find_spec("mujoco"), "mujoco is not installed")
 class EngineTest(TestCase):
-    def test_it_observes_and_acts_as_the_environment_bit_for_bit(self):
+    def test_the_graph_observes_what_the_environment_observes(self):
         for name in ("paper", "robust", "live", "published"):
             with self.subTest(name):
                 self._check(evaluation_task(RECIPES[name].config.task))
@@ -234,47 +294,115 @@ class EngineTest(TestCase):
         played = toy_grasp.trial(task)
         sequences = np.arange(2)
         start = episode_starts(played.starts(), sequences, sequences, seed=0)
-        actions = np.random.default_rng(0).uniform(-1.2, 1.2, (STEPS, 2, len(played.robot.joints)))
-        actor = Recorded(actions.astype(np.float32))
-        recorded = []
+        robot = played.robot
+        actions = np.random.default_rng(0).uniform(-1.2, 1.2, (STEPS, 2, len(robot.joints)))
+        observe = Observe(robot, task, ())
+        act = Act(robot, task)
+        memory = torch.zeros(2, observe.memory)
+        points = torch.as_tensor(surface_points(toy_grasp.brick(), 64), dtype=torch.float32)
         with played.worlds(engine("mujoco", workers=0), torch.zeros(2, dtype=torch.long)) as env:
             env.reset(start=start)
-            for action in actor.actions:
-                seen = env.get_observations()
-                flat = torch.cat((seen["policy"], seen["proprio"]), dim=1)
-                recorded.append((flat.numpy(), seen["perception"].numpy().copy()))
-                env.advance(torch.from_numpy(action))
-            moving = EngineDriver(env).read()
-            found = make_controller(env, actor).kinematics.links(moving.joint_pos, moving.joint_vel)
-            for name in ("palm_pos", "palm_linvel", "palm_angvel"):
-                assert_allclose(
-                    getattr(found, name), getattr(moving.links, name), atol=2e-4, err_msg=name
-                )
-            env.reset(start=start)
-            controller = make_controller(env, actor)
             driver = EngineDriver(env)
-            links = controller.observe(replace(driver.read(), links=None))[0]
-            assert_allclose(links, recorded[0][0], atol=1e-6)  # forward kinematics
-            controller = make_controller(env, actor)
-            outcome = Runner(controller, driver).run(STEPS * controller.dt)
-        self.assertEqual(
-            (outcome.reasons, outcome.steps, len(actor.seen)), ([None, None], STEPS, STEPS)
+            center = torch.as_tensor(centers(env))
+            tolerance = 1e-5
+            for action in torch.from_numpy(actions.astype(np.float32)):
+                reading = {k: torch.as_tensor(v) for k, v in vars(driver.read()).items()}
+                flat, cloud, kept, links = observe(
+                    reading["joint_pos"], reading["joint_vel"], env.joint_target.clone(),
+                    reading["object_pos"], reading["object_quat"], reading["tip_force"],
+                    env.goal_pos, env.goal_quat, points.expand(2, -1, -1), center, memory,
+                )  # fmt: skip
+                seen = env.get_observations()
+                expected = torch.cat((seen["policy"], seen["proprio"]), dim=1)
+                assert_allclose(flat, expected, atol=tolerance)
+                assert_allclose(cloud, seen["perception"], atol=1e-5)
+                assert_allclose(links, env.backend.links().pos, atol=tolerance)
+                tolerance = 2e-3  # while the robot moves, the engine's mimic joint gives way
+                before = env.joint_target.clone()
+                target, memory = act(action, reading["joint_pos"], before, kept)
+                env.advance(action)
+                assert_allclose(target, env.joint_target, atol=1e-6)
+
+
+@skipUnless(find_spec("mujoco"), "mujoco is not installed")
+class SafetyTest(TestCase):
+    """Limits of the loop stop a robot in an engine: a gripper that lifts a brick at 1.2 m/s."""
+
+    def lift(self, limits, fault=lambda time, reading: reading):
+        """Return the outcome, and lift, its velocity, the palm's and the brick's height at the end of every step [steps, 4]."""
+        played = toy_grasp.trial(evaluation_task(TaskConfig()))
+        rows = []
+        with played.worlds(engine("mujoco", workers=0), torch.zeros(1, dtype=torch.long)) as env:
+            env.backend.set_state(toy_grasp.start())
+            backend = env.backend
+
+            def look():
+                state = backend.state()
+                palm = backend.links().pos[0, 0, 2]
+                row = (state.joint_pos[0, 0], state.joint_vel[0, 0], palm, state.object_pos[0, 2])
+                rows.append([float(value) for value in row])  # the engine writes into its tensors
+
+            driver = EngineDriver(env, look)
+            driver.read = lambda read=driver.read: fault(driver.now(), read())
+            outcome = Runner(Lifting(env), driver, limits).run(3)
+        return outcome, np.array(rows)
+
+    def test_a_joint_that_is_too_fast_stops_the_robot(self):
+        with self.assertLogs("xreset"):
+            outcome, rows = self.lift(Limits(joint_speed=0.3, hold=1.0))
+        self.assertRegex(
+            outcome.reason or "", r"Joint lift moves at 0\.\d\d, faster than its limit 0\.60"
         )
-        for expected, found in zip(recorded, actor.seen, strict=True):
-            assert_array_equal(found[0], expected[0])
-            assert_array_equal(found[1], expected[1])
+        self.assertLess(abs(rows[-1, 1]), 0.01)
+        self.assertLess(rows[-1, 0], 0.25)
+
+    def test_targets_are_slowed_to_their_limit(self):
+        outcome, rows = self.lift(Limits(target_speed=0.05))
+        self.assertIsNone(outcome.reason)
+        self.assertLess(rows[30:, 1].max(), 0.15)
+        self.assertGreater(rows[60, 0], 0.05)
+
+    def test_a_link_that_leaves_the_workspace_stops_the_robot(self):
+        _, free = self.lift(Limits(target_speed=0.1))
+        top = float(free[0, 2]) + 0.05
+        limits = Limits(target_speed=0.1, hold=0.5, workspace=((-9, -9, -9), (9, 9, top)))
+        with self.assertLogs("xreset"):
+            outcome, rows = self.lift(limits)
+        self.assertRegex(outcome.reason or "", "Link palm is at .*, outside the workspace")
+        self.assertGreater(free[:, 2].max(), top + 0.1)
+        self.assertLess(rows[:, 2].max(), top + 0.04)
+
+    def test_a_stopped_robot_holds_position_and_grip(self):
+        with self.assertLogs("xreset"):
+            limits = Limits(target_speed=0.1, pose_age=0.2, hold=2.0)
+            outcome, rows = self.lift(limits, after(0.5, object_time=np.array([0.5])))
+        self.assertIn("pose of the object is", outcome.reason or "")
+        held = rows[-90:]
+        assert_allclose(held[:, 0], held[0, 0], atol=1e-3)
+        assert_allclose(held[:, 3], held[0, 3], atol=2e-3)
+        self.assertGreater(held[0, 3], rows[0, 3] + 0.05)
 
 
-class Recorded:
-    """In place of a network: actions, and what it saw."""
+class Lifting:
+    """In place of a controller: the gripper closes, and lifts as fast as it is allowed to."""
 
-    def __init__(self, actions):
-        self.actions = actions
-        self.seen = []
+    outputs = ("target", "links")
 
-    def begin(self, robots):
-        self.seen = []
+    def __init__(self, env):
+        self.env = env
+        robot = env.backend.scene.robot
+        self.contract = deploy_contract(robot, env.task)
+        self.dt = env.task.control_dt
+        self.target = robot.home[None].astype(np.float32)
+        self.lower = joint_values(self.contract, "lower", -np.inf)
+        self.upper = joint_values(self.contract, "upper", np.inf)
+        self.speed = joint_values(self.contract, "velocity", np.inf)
+        self.step_size = joint_values(self.contract, "step", 0.0)
 
-    def act(self, flat, cloud):
-        self.seen.append((flat, cloud))
-        return np.clip(self.actions[len(self.seen) - 1], -1, 1)
+    def step(self, reading):
+        self.links = self.env.backend.links().pos.numpy()
+        target = self.target.copy()
+        target[0, -1] = toy_grasp.CLOSED
+        target[0, 0] += 0.02
+        self.target = np.clip(target, self.lower, self.upper)
+        return self.target

@@ -5,9 +5,13 @@ import warnings
 from dataclasses import replace
 
 import numpy as np
+import torch
 
 from tests.test_env import TASK, BreakableBackend, N, WithEnv
-from xreset.task.config import TerminationConfig
+from xreset.live.deploy import deployed_graph
+from xreset.live.engine import GraphPolicy
+from xreset.runtime import Controller
+from xreset.task.config import TerminationConfig, evaluation_task
 
 try:
     from stable_baselines3 import PPO
@@ -95,3 +99,37 @@ class StableBaselinesTest(WithEnv):
         learner.learn(16 * N)
         actions, _ = learner.predict(env.reset())
         self.assertEqual(actions.shape, (N, env.env.num_actions))
+
+    def test_a_learned_policy_becomes_a_graph(self):
+        env = StableBaselinesEnv(self.make(evaluation_task(TASK)))
+        self.addCleanup(env.close)
+        self.assertNotIn("privileged", env.observation_space)
+        model = PPO("MultiInputPolicy", env, n_steps=2, device="cpu", seed=0)
+        content = deployed_graph(Network(model), self.robot, env.env.task)
+        graph = GraphPolicy(Controller(content))
+        world = env.env
+        world.reset()
+        graph.begin(world)
+        for _ in range(5):
+            seen = {name: world.get_observations()[name].numpy() for name in env.observation_space}
+            action = torch.as_tensor(model.predict(seen, deterministic=True)[0])
+            joints = world.backend.state().joint_pos
+            expected = world.actions.targets(action, world.joint_target, joints)
+            world.advance(graph.act(world.get_observations()))
+            np.testing.assert_allclose(world.joint_target, expected, atol=1e-5)
+
+
+class Network(torch.nn.Module):
+    """The actor, as docs/live.md wraps it."""
+
+    def __init__(self, model):
+        super().__init__()
+        self.policy = model.policy.cpu()
+        space = model.observation_space
+        self.widths = [space["policy"].shape[0], space["proprio"].shape[0]]
+
+    def forward(self, flat, cloud):
+        policy, proprio = flat.split(self.widths, dim=1)
+        observations = {"policy": policy, "proprio": proprio, "perception": cloud}
+        features = self.policy.extract_features(observations)
+        return self.policy.action_net(self.policy.mlp_extractor.forward_actor(features))

@@ -15,7 +15,6 @@ from xreset.errors import XResetError as XResetError
 from xreset.eval.experiment import evaluate as evaluate
 from xreset.eval.experiment import stress as stress
 from xreset.eval.export.deploy import export_deploy as export_deploy
-from xreset.eval.export.deploy import serve as serve
 from xreset.eval.export.lerobot import export_lerobot as export_lerobot
 from xreset.eval.export.recorded import export_npz as export_npz
 from xreset.eval.film import film as film
@@ -33,6 +32,7 @@ from xreset.learning.export import export_checkpoint as export_checkpoint
 from xreset.learning.train import distill as distill
 from xreset.learning.train import resume as resume
 from xreset.learning.train import train as train
+from xreset.live.deploy import deployed_graph as deployed_graph
 from xreset.objects.catalogue import load_object as load_object
 from xreset.physics import Backend as Backend
 from xreset.physics.plugins import make_backend as make_backend

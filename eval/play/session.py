@@ -23,6 +23,7 @@ from xreset.files.checks import frozen
 from xreset.geometry.dynamics import drive_values
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_angle, quat_rotate, quat_rotate_inverse
+from xreset.live.engine import GraphPolicy
 from xreset.objects.catalogue import ALIASES, canonical_name, object_names
 from xreset.objects.rest import rest_height
 from xreset.physics import State
@@ -170,6 +171,8 @@ class Session:
         self.env.close()
         self.env = env
         self.engine = name
+        if isinstance(self._player, GraphPolicy):
+            self._player.move(env)
         self._set_gravity()
 
     @property

@@ -33,7 +33,6 @@ COMMANDS = {
     "policies": "List the policies that ship with xreset.",
     "eval": "Evaluate a policy or a baseline in one or several engines.",
     "stress": "Measure robustness: change stiffness, latency, friction or a robot's faults, one at a time.",
-    "serve": "Serve a policy to a robot's computer over the network.",
     "select": "Choose the checkpoint that is best in its worst engine.",
     "study": "Run a study: trainings by object and seed, evaluations, and tables next to the paper's.",
     "export": "Write a policy for a robot, or recorded episodes as a LeRobot data set or as plain arrays.",

@@ -84,7 +84,7 @@ def deploy(
     meshes: TrainedMeshes = None,
     object: Several = (),
 ) -> None:
-    """Write a policy for a robot: the network, a contract that says what goes in and out, and a runtime.
+    """Write a policy for a robot: one ONNX graph from readings to joint targets, and a runtime.
 
     The runtime needs Python, numpy and onnxruntime (docs/live.md).
 
@@ -95,7 +95,7 @@ def deploy(
     from xreset.eval.export import deploy as deployment
 
     spec = deployment.export_deploy(policy, out, robot=robot, meshes=meshes, only=object)
-    contract = runtime.read_contract(out)
+    contract = runtime.load_controller(out).contract
     named = []
     for name, entry in contract["objects"].items():
         named.append(f"{name} ({'stand-in' if entry['source'] == 'stand-in' else 'mesh'})")

@@ -123,6 +123,7 @@ class ManipulationEnv:
         overflow_count: [] number of episodes that ended because the engine dropped contacts.
         worlds: everything that lasts from step to step, in addition to the engine's state.
         variation: differences between the worlds, such as masses and delays.
+        tracked_pose: position [N, 3] and orientation [N, 4] of the object, as the tracker reports them in this step.
         vision: the cameras; None: the task has none.
     """
 
@@ -609,6 +610,7 @@ class ManipulationEnv:
         observed_pos, observed_quat = self.variation.tracker.observe(
             state.object_pos, state.object_quat, self._reset_mask, self.generator
         )
+        self.tracked_pose = (observed_pos, observed_quat)
         return obs.ObservationInput(
             state=state,
             links=reading.links,

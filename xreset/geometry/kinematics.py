@@ -136,7 +136,7 @@ class Kinematics:
         row = {joint.name: i for i, joint in enumerate(moving)}
         self._moving = moving
         self._steps: list[_Step] = []
-        self._above = torch.eye(len(self.link_names), dtype=torch.bool)
+        self._above = np.eye(len(self.link_names), dtype=bool)
         """[L, L] whether the first link is the second one, or is carried by it."""
         for i, joint in enumerate(joints, start=1):
             parent = self._link_index[joint.parent]
@@ -161,9 +161,9 @@ class Kinematics:
         """Return the moving joints that move any of the links, each with the positions of these links in ``links``."""
         moved = []
         for row, joint in enumerate(self._moving):
-            rows = self._above[links, self._link_index[joint.child]].nonzero()[:, 0]
+            rows = self._above[links, self._link_index[joint.child]].nonzero()[0]
             if len(rows):
-                moved.append((row, rows.to(self.device)))
+                moved.append((row, torch.as_tensor(rows, device=self.device)))
         return moved
 
     def link_index(self, name: str) -> int:
@@ -256,6 +256,45 @@ class Kinematics:
             angular=(angular @ coupling).view(*shape, 3, coupling.shape[1]),
         )
 
+    def motion(
+        self, q: Tensor, qd: Tensor, links: Sequence[str]
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Compute poses and velocities of links, for joint positions and velocities [B, J].
+
+        Returns:
+            positions [B, n, 3], rotations [B, n, 3, 3], velocities of the links' origins [B, n, 3] and angular
+            velocities [B, n, 3], all in the frame of :attr:`base`.
+        """
+        indices = [self.link_index(name) for name in links]
+        rot, pos, axes, origins = self._forward(q, None, indices)
+        speed = qd @ self._coupling.T
+        linear = []
+        angular = []
+        for k, index in enumerate(indices):
+            v = torch.zeros_like(pos[:, k])
+            w = v
+            for kind in ("revolute", "prismatic"):
+                rows = self._carriers(index, kind)
+                if not rows:
+                    continue
+                motion = torch.stack([axes[row] for row in rows], dim=1) * speed[:, rows, None]
+                if kind == "revolute":
+                    w = motion.sum(dim=1)
+                    origin = torch.stack([origins[row] for row in rows], dim=1)
+                    motion = torch.linalg.cross(motion, pos[:, k, None] - origin)
+                v = v + motion.sum(dim=1)
+            linear.append(v)
+            angular.append(w)
+        return pos, rot, torch.stack(linear, dim=1), torch.stack(angular, dim=1)
+
+    def _carriers(self, link: int, kind: str) -> list[int]:
+        """Return the rows, among the moving joints, of the joints of a type that carry a link."""
+        rows = []
+        for row, joint in enumerate(self._moving):
+            if joint.type == kind and self._above[link, self._link_index[joint.child]]:
+                rows.append(row)
+        return rows
+
     def clamp(self, q: Tensor) -> Tensor:
         """[..., J] the nearest joint positions within the limits."""
         return torch.minimum(torch.maximum(q, self.lower), self.upper)
@@ -282,7 +321,7 @@ class Kinematics:
         positions = {0: base[:, :3, 3]}
         axes: dict[int, Tensor] = {}
         origins: dict[int, Tensor] = {}
-        needed = self._above[list(wanted)].any(dim=0).tolist()
+        needed = self._above[list(wanted)].any(axis=0)
         for i, step in enumerate(self._steps, start=1):
             if not needed[i]:
                 continue

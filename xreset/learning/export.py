@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import json
-import logging
-import warnings
-from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 from tensordict import TensorDict
@@ -29,9 +23,7 @@ from xreset.policy.onnx_policy import (
     observation_shapes,
     picture_shape,
 )
-
-if TYPE_CHECKING:
-    from onnx import ModelProto
+from xreset.policy.to_onnx import exported_module
 
 
 def exported(
@@ -49,26 +41,14 @@ def exported(
     policy = ExportedPolicy(actor)
     n = 2  # an example batch that is not 1, so that the exporter keeps the world dimension free
     state = torch.zeros(1, n, policy.lstm_dim)
-    example = (
+    values = (
         torch.zeros(n, policy.flat_dim),
         torch.zeros(n, *picture_shape(contract.task)),
         state,
         state.clone(),
     )
-    worlds = torch.export.Dim("worlds", min=1, max=65536)
-    with _quiet(), torch.no_grad():
-        program = torch.onnx.export(
-            policy,
-            example,
-            input_names=list(INPUTS),
-            output_names=list(OUTPUTS),
-            dynamic_shapes=({0: worlds}, {0: worlds}, {1: worlds}, {1: worlds}),
-            dynamo=True,
-            verbose=False,
-        )
-    assert program is not None, "dynamo returns the graph"
-    model = program.model_proto
-    _drop_exporter_notes(model)
+    example: dict[str, torch.Tensor] = dict(zip(INPUTS, values, strict=True))
+    model = exported_module(policy, example, OUTPUTS, state=INPUTS[2:])
     entries = {
         METADATA_KEY: json.dumps(asdict(contract)),  # in order: that of the terms is the policy's
         VERSION_KEY: code_version(),
@@ -77,35 +57,6 @@ def exported(
         entries[CHECKPOINT_KEY] = file_hash(checkpoint)
     onnx.helper.set_model_props(model, entries)
     return model.SerializeToString()
-
-
-def _drop_exporter_notes(model: ModelProto) -> None:
-    """Remove, in place, the exporter's notes on nodes and values: lines of source code with paths of its machine."""
-    graph = model.graph
-    for noted in (
-        graph,
-        *graph.node,
-        *graph.input,
-        *graph.output,
-        *graph.value_info,
-        *graph.initializer,
-    ):
-        del noted.metadata_props[:]
-        noted.doc_string = ""
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep the exporter's warnings and progress from the terminal."""
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logger.setLevel(level)
 
 
 def export_checkpoint(checkpoint: str | Path, policy: str | Path) -> None:

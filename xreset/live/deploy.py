@@ -1,136 +1,109 @@
-"""Write a policy with its contract and the runtime, for computers without xreset."""
+"""Write a policy for a robot: one ONNX graph with its contract, and the runtime, for computers without xreset."""
 
 from __future__ import annotations
 
-import hashlib
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
-from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
+from xreset import runtime
 from xreset.errors import PolicyError
-from xreset.files.storage import atomic_folder, code_version, is_occupied, write_json
-from xreset.geometry.kinematics import Kinematics
+from xreset.files.storage import atomic_folder, code_version, is_occupied
 from xreset.geometry.urdf import robot_tree
+from xreset.live import leapp
+from xreset.live.graph import policy_graph
 from xreset.objects.sampling import center, surface_points
-from xreset.policy.onnx_policy import policy_contract
-from xreset.runtime import check_contract
-from xreset.runtime import contract as files
-from xreset.spec import MimicSpec, ObjectSpec, RobotSpec
+from xreset.policy.onnx_policy import (
+    METADATA_KEY,
+    VERSION_KEY,
+    parsed_contract,
+    policy_contract,
+)
+from xreset.runtime import Controller
+from xreset.runtime.contract import KEY, POLICY, SCHEMA, check_contract
+from xreset.spec import ObjectSpec, RobotSpec
 from xreset.task.actions import ActionSpace
-from xreset.task.config import ObservationConfig, TaskConfig
-from xreset.task.legacy import ObservationOptions
+from xreset.task.config import EVALUATION_TIMESTEP, ActionConfig, TaskConfig
 
+if TYPE_CHECKING:
+    from torch import nn
+
+_ANY = 10.0
+"""A move of a target in one step that no joint makes [rad]."""
 FRAMES = {
-    "world": "z up; the top of the table is at z = 0; the root link of the robot is at kinematics.base",
-    "object": "the frame of its mesh; its points are in this frame",
+    "world": "z up; the top of the table is at z = 0; the root link of the robot is at base_pos, base_quat",
+    "object": "the frame of its mesh; its points and its center are in this frame",
     "quaternion": "w, x, y, z",
-    "tip_force": "force of a fingertip on the object, along the axes of the world",
 }
-UNITS = {
-    "position": "m",
-    "revolute joint": "rad",
-    "prismatic joint": "m",
-    "time": "s",
-    "force": "N",
-    "angular velocity": "rad/s",
+MEANINGS = {
+    "joint_pos": "joint positions, in the order of joints [rad, m]",
+    "joint_vel": "joint velocities [rad/s, m/s]",
+    "joint_target": "joint targets of the last step; in the first step those that the drives have [rad, m]",
+    "object_pos": "origin of the object's mesh frame, world [m]",
+    "object_quat": "orientation of the object, world",
+    "tip_force": "force of each fingertip on the object, along the axes of the world [N]; zeros if unknown",
+    "goal_pos": "goal position of the object's mesh frame, world [m]",
+    "goal_quat": "goal orientation, world",
+    "object_points": "points on the object's surface, in its frame [m]: an entry of objects",
+    "object_center": "center of the object, in its frame [m]: an entry of objects",
+    "memory_in": "zeros in the first step, then memory_out of the step before",
+    "target": "joint targets for position drives, within the joints' limits [rad, m]",
+    "memory_out": "memory_in of the next step",
+    "links": "positions of the links, world [m]: palm, then fingertips",
 }
+"""Meaning of every input and output that a graph may have."""
 
 
 def deploy_contract(
-    robot: RobotSpec, task: TaskConfig, objects: Sequence[ObjectSpec], policy: bytes | None = None
+    robot: RobotSpec, task: TaskConfig, objects: Sequence[ObjectSpec] = ()
 ) -> dict[str, Any]:
-    """Return everything that :mod:`xreset.runtime` needs to know about a policy, as JSON.
+    """Return the contract of a deployed policy, as JSON.
 
     Args:
         robot: robot of the policy.
         task: task of the policy's training.
         objects: objects whose points the contract lists.
-        policy: content of the exported policy, whose hash the contract states; None: the contract stays in this
-            process.
-
-    Raises:
-        PolicyError: the policy has cameras, or observes something that the runtime cannot compute.
-        LiveError: the task has options that the runtime does not support.
     """
-    if task.vision.cameras:
-        raise PolicyError(
-            "The policy has cameras, which the runtime does not support. Use a policy without cameras."
-        )
-    trained = policy_contract(robot, task, tuple(o.name for o in objects))
     listed = {}
     for each in objects:
         points = surface_points(each, task.observation.cloud_points)
         listed[each.name] = {
             "source": each.source,
-            "points": points.astype(np.float32).tolist(),
-            "center": center(each).astype(np.float32).tolist(),
+            "points": _rounded(points),
+            "center": _rounded(center(each)),
         }
     contract = {
-        "schema": files.SCHEMA,
+        "schema": SCHEMA,
         "xreset": code_version(),
-        "policy_sha256": hashlib.sha256(policy).hexdigest() if policy else "",
         "robot": robot.name,
         "robot_fingerprint": robot.fingerprint,
-        "control_dt": trained.control_dt,
-        "rate": 1.0 / trained.control_dt,
+        "base_pos": list(robot.base_pos),
+        "base_quat": list(robot.base_quat),
+        "control_dt": task.control_dt,
+        "rate": 1.0 / task.control_dt,
         "frames": FRAMES,
-        "units": UNITS,
+        "values": MEANINGS,
         "joints": _joints(robot, task),
         "fingertips": list(robot.fingertip_names),
-        "observation": _observation_options(task.observation),
-        "observation_layout": trained.observation_layout,
-        "action": asdict(task.action),
-        "kinematics": _chain(robot),
-        "object_frame": task.object_frame,
+        "links": list(robot.tracked_links),
         "objects": listed,
     }
     check_contract(contract, f"The task of {robot.name}")
-    return contract | {files.DIGEST: files.digest(contract)}
+    return contract
 
 
-def _observation_options(c: ObservationConfig) -> dict[str, Any]:
-    """Return the options of :mod:`xreset.runtime` that mean these observations."""
-    (cloud,) = c.perception.values()
-    given = {
-        "cloud_points": c.cloud_points,
-        "cloud_history": cloud.get("frames", 5),
-        "cloud_scale": cloud["scale"],
-        "contact_force_scale": c.proprio.get("tip_force", {}).get("scale", 0.1),
-        "joint_vel_scale": c.proprio.get("joint_vel", {}).get("scale", 0.1),
-    }
-    wanted = _flat_terms(c)
-    for content, rotation, form, joint_target in product(
-        ("draft", "published"),
-        ("quaternion", "matrix", "to_goal"),
-        ("history", "paired"),
-        (False, True),
-    ):
-        options = ObservationOptions(
-            content=content, rotation=rotation, cloud=form, joint_target=joint_target, **given
-        )
-        if _flat_terms(ObservationConfig(**options.entries())) == wanted:
-            found = asdict(options)
-            del found["noise"]
-            return found
-    raise PolicyError(
-        "The policy observes terms that the runtime cannot compute. Use the observations of a recipe."
-    )
-
-
-def _flat_terms(c: ObservationConfig) -> list[tuple[str, dict[str, Any]]]:
-    """Return what a policy without cameras observes, in order."""
-    quiet = c.without_noise()
-    return [*quiet.policy.items(), *quiet.proprio.items(), *quiet.perception.items()]
+def _rounded(values: np.ndarray) -> list[Any]:
+    """Return numbers in single precision, as JSON."""
+    return values.astype(np.float32).tolist()
 
 
 def _joints(robot: RobotSpec, task: TaskConfig) -> list[dict[str, Any]]:
-    """Return name, limits and action mapping of every joint, in joint order."""
+    """Return name, limits and step of every joint, in joint order."""
     space = ActionSpace(robot, task.action)
     tree = robot_tree(robot)
     rows = []
@@ -143,7 +116,7 @@ def _joints(robot: RobotSpec, task: TaskConfig) -> list[dict[str, Any]]:
             "velocity": in_tree.velocity,
             "home": joint.home,
         }
-        for name in ("lower", "upper", "step", "lead", "zero", "below", "above"):
+        for name in ("lower", "upper", "step"):
             row[name] = float(getattr(space, name)[i])
         for name, value in row.items():
             if value in (-math.inf, math.inf):
@@ -152,40 +125,71 @@ def _joints(robot: RobotSpec, task: TaskConfig) -> list[dict[str, Any]]:
     return rows
 
 
-def _chain(robot: RobotSpec) -> dict[str, Any]:
-    """Return the joints from the root to the palm and the fingertips, each after its parent."""
-    tree = robot_tree(robot)
-    mimics = {mimic.joint: mimic for mimic in robot.mimics}
-    index = {tree.root: 0}
-    steps = []
-    for joint in tree.joints:
-        if set(robot.tracked_links).isdisjoint(tree.below(joint.child)):
-            continue
-        index[joint.child] = len(index)
-        # A joint without a source follows itself, with multiplier 1 and offset 0.
-        mimic = mimics.get(joint.name, MimicSpec(joint=joint.name, source=joint.name))
-        step = {
-            "link": joint.child,
-            "parent": index[joint.parent],
-            "type": joint.type,
-            "joint": None if joint.type == "fixed" else robot.joint_names.index(mimic.source),
-            "multiplier": mimic.multiplier,
-            "offset": mimic.offset,
-            "origin": joint.T_parent_joint.tolist(),
-            "axis": np.asarray(joint.axis, dtype=float).tolist(),
-        }
-        steps.append(step)
-    tracked = [index[name] for name in robot.tracked_links]
-    base = Kinematics(robot).base.to(torch.float64).tolist()
-    return {"base": base, "palm": tracked[0], "tips": tracked[1:], "steps": steps}
-
-
-def write_deployed(policy: bytes, contract: dict[str, Any], out: Path) -> None:
-    """Write ``policy.onnx``, ``contract.json`` and the package ``runtime`` into a new folder.
+def deployed_graph(
+    network: bytes | nn.Module,
+    robot: RobotSpec,
+    task: TaskConfig,
+    objects: Sequence[ObjectSpec] = (),
+) -> bytes:
+    """Return the content of a deployed policy: one ONNX graph from readings to joint targets.
 
     Args:
-        policy: content of the exported policy (.onnx).
-        contract: what :func:`deploy_contract` returns for it.
+        network: an exported policy's content (.onnx); or a module of any learner, from the flat observations [N, D] and
+            the clouds [N, H, P, K] of the task to actions [N, J] in [-1, 1].
+        robot: robot of the policy.
+        task: task of the policy's training.
+        objects: objects whose points the contract lists.
+
+    Raises:
+        PolicyError: the policy has cameras, it observes something that no robot measures, or onnx is missing.
+    """
+    import onnx
+
+    model = policy_graph(network, robot, task)
+    trained = policy_contract(robot, task, tuple(o.name for o in objects))
+    entries = {
+        KEY: json.dumps(deploy_contract(robot, task, objects)),
+        METADATA_KEY: json.dumps(asdict(trained)),  # in order: that of the terms is the policy's
+        VERSION_KEY: code_version(),
+    }
+    onnx.helper.set_model_props(model, entries)
+    return model.SerializeToString()
+
+
+def is_deployed(content: bytes) -> bool:
+    """Return whether the content of an ONNX file is a deployed policy, and not only its network."""
+    return KEY.encode() in content
+
+
+def task_of(controller: Controller, source: str) -> TaskConfig:
+    """Return the task of a deployed policy's training.
+
+    A policy that was not trained by xreset states none. Its task has the policy's rate, and actions that reach every
+    target.
+
+    Args:
+        controller: the policy.
+        source: its name in messages.
+
+    Raises:
+        PolicyError: the stated task is damaged.
+    """
+    trained = controller.metadata.get(METADATA_KEY)
+    if trained is not None:
+        version = controller.metadata.get(VERSION_KEY)
+        return parsed_contract(source, json.loads(trained), version).task
+    substeps = max(1, round(controller.dt / EVALUATION_TIMESTEP))
+    action = ActionConfig(
+        arm_step=_ANY, arm_lead=_ANY, hand="relative", hand_step=_ANY, hand_lead=_ANY
+    )
+    return TaskConfig(action=action, timestep=controller.dt / substeps, substeps=substeps)
+
+
+def write_deployed(graph: bytes, out: Path) -> None:
+    """Write ``policy.onnx``, ``leapp.yaml`` and the package ``runtime`` into a new folder.
+
+    Args:
+        graph: what :func:`deployed_graph` returns.
         out: folder to write; must not exist, or be empty.
 
     Raises:
@@ -194,9 +198,9 @@ def write_deployed(policy: bytes, contract: dict[str, Any], out: Path) -> None:
     if is_occupied(out):
         raise PolicyError(f"{out} exists already. Choose another folder, or remove it.")
     with atomic_folder(out) as folder:
-        (folder / files.POLICY).write_bytes(policy)
-        runtime = folder / "runtime"
-        runtime.mkdir()
-        for module in Path(files.__file__).parent.glob("*.py"):
-            (runtime / module.name).write_bytes(module.read_bytes())
-        write_json(folder / files.CONTRACT, contract)
+        (folder / POLICY).write_bytes(graph)
+        (folder / leapp.FILE).write_text(leapp.leapp_description(graph))
+        package = folder / "runtime"
+        package.mkdir()
+        for module in Path(runtime.__file__).parent.glob("*.py"):
+            (package / module.name).write_bytes(module.read_bytes())

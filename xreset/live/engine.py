@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,9 @@ import torch
 from torch import Tensor
 
 from xreset.env.manipulation import ManipulationEnv
-from xreset.live.deploy import deploy_contract
-from xreset.runtime import Controller, Driver, Links, OnnxActor, Reading
+from xreset.geometry.rotations import quat_rotate
+from xreset.objects.sampling import center, surface_points
+from xreset.runtime import Controller, Driver, Reading
 
 
 class EngineDriver(Driver):
@@ -67,7 +69,6 @@ class EngineDriver(Driver):
         """Return the present state of every world."""
         backend = self.env.backend
         state = backend.state()
-        links = backend.links()
         force = backend.contacts().tip_force * self.env.variation.force_gain
         now = np.full(backend.num_worlds, self.now())
         return Reading(
@@ -78,13 +79,6 @@ class EngineDriver(Driver):
             object_quat=_array(state.object_quat),
             object_time=now,
             tip_force=_array(force),
-            links=Links(
-                palm_pos=_array(links.pos[:, 0]),
-                palm_quat=_array(links.quat[:, 0]),
-                palm_linvel=_array(links.linvel[:, 0]),
-                palm_angvel=_array(links.angvel[:, 0]),
-                tip_pos=_array(links.pos[:, 1:]),
-            ),
         )
 
     def send(self, target: np.ndarray) -> None:
@@ -99,18 +93,54 @@ def _array(value: Tensor) -> np.ndarray:
     return value.cpu().numpy().copy()
 
 
-def make_controller(env: ManipulationEnv, actor: OnnxActor | Any) -> Controller:
-    """Return a controller whose episode begins in the worlds of an environment, with their objects, goals and targets.
+def begin_episodes(controller: Controller, env: ManipulationEnv) -> None:
+    """Begin an episode in every world of an environment, with its object, goal and targets.
 
     Args:
-        env: the worlds, just reset, of the policy's own task.
-        actor: the policy's network.
+        controller: the policy.
+        env: the worlds, just reset.
     """
-    scene = env.backend.scene
-    controller = Controller(deploy_contract(scene.robot, env.task, scene.objects), actor)
-    names = [scene.objects[i].name for i in env.backend.object_index.tolist()]
-    points = np.stack([controller.points(name) for name in names])
-    centers = np.stack([controller.center(name) for name in names])
+    objects = env.backend.scene.objects
+    index = env.backend.object_index.tolist()
+    count = controller.shapes.get("object_points", (1, 3))[0]
+    points = np.stack([surface_points(each, count) for each in objects])[index]
     goal = (_array(env.goal_pos), _array(env.goal_quat))
-    controller.begin(points, *goal, _array(env.joint_target), centers)
-    return controller
+    controller.begin(points, *goal, _array(env.joint_target), centers(env))
+
+
+def centers(env: ManipulationEnv) -> np.ndarray:
+    """[N, 3] center of each world's object, in its frame [m]."""
+    each = np.stack([center(spec) for spec in env.backend.scene.objects])
+    return each[env.backend.object_index.tolist()].astype(np.float32)
+
+
+class GraphPolicy:
+    """A deployed policy in an environment: the graph takes readings, and its targets become actions."""
+
+    def __init__(self, controller: Controller) -> None:
+        """Take a policy."""
+        self._controller = controller
+
+    def begin(self, env: ManipulationEnv) -> None:
+        """Begin an episode in every world."""
+        self.move(env)
+        begin_episodes(self._controller, env)
+
+    def move(self, env: ManipulationEnv) -> None:
+        """Go on in other worlds with the same objects."""
+        self._env = env
+        self._driver = EngineDriver(env)
+        self._center = torch.as_tensor(centers(env), device=env.device)
+
+    def act(self, observations: Any) -> Tensor:
+        """[N, J] actions whose targets are those of the graph. The tracker of the environment reports the object."""
+        env = self._env
+        reading = self._driver.read()
+        pos, quat = env.tracked_pose
+        if env.task.object_frame == "center":
+            pos = pos - quat_rotate(quat, self._center)
+        reading = replace(reading, object_pos=_array(pos), object_quat=_array(quat))
+        self._controller.set_goal(_array(env.goal_pos), _array(env.goal_quat))
+        self._controller.target = _array(env.joint_target)
+        target = torch.as_tensor(self._controller.step(reading), device=env.device)
+        return env.actions.action_for(target, env.joint_target)

@@ -24,9 +24,8 @@ def main() -> None:
     home = np.array([joint["home"] for joint in contract["joints"]])
     pos = np.array([0.5, 0.0, 0.1])
     quat = np.array([1.0, 0.0, 0.0, 0.0])
-    controller.begin(
-        np.zeros((contract["observation"]["cloud_points"], 3)), pos, quat, home, np.zeros(3)
-    )
+    points = np.zeros(controller.shapes.get("object_points", (1, 3)))
+    controller.begin(points, pos, quat, home, np.zeros(3))
     reading = Reading(
         joint_pos=home,
         joint_vel=0.0 * home,

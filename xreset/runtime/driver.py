@@ -17,45 +17,27 @@ Array = np.ndarray
 
 
 @dataclass(frozen=True, kw_only=True)
-class Links:
-    """Palm and fingertips in the world frame."""
-
-    palm_pos: Array
-    """[N, 3] m"""
-    palm_quat: Array
-    """[N, 4]"""
-    palm_linvel: Array
-    """[N, 3] m/s"""
-    palm_angvel: Array
-    """[N, 3] rad/s"""
-    tip_pos: Array
-    """[N, E, 3] m"""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Reading:
     """The newest data of a robot and of an object tracker. A driver of one robot leaves out the axis N.
 
     Attributes:
         joint_pos: [N, J] in the order of the contract's joints.
-        joint_vel: [N, J]
+        joint_vel: [N, J]; None: only for policies whose graph has no input of that name.
         joint_time: [N] when the joints were measured, on the driver's clock [s].
         object_pos: [N, 3] origin of the object's mesh frame.
         object_quat: [N, 4] (w, x, y, z)
         object_time: [N] when the image was taken, not when the pose arrived, on the driver's clock [s].
         tip_force: [N, E, 3] force of each fingertip on the object, world frame [N]; None: the robot does not measure
             it.
-        links: measured links, which only engines have; None: they are computed from the joints.
     """
 
     joint_pos: Array
-    joint_vel: Array
+    joint_vel: Array | None = None
     joint_time: float | Array
     object_pos: Array
     object_quat: Array
     object_time: float | Array
     tip_force: Array | None = None
-    links: Links | None = None
 
     def batched(self) -> Reading:
         """Return the reading with the axis N, in float32 (times: float64).
@@ -67,7 +49,7 @@ class Reading:
             return self
         rows = {}
         for name, value in vars(self).items():
-            if value is None and name not in ("tip_force", "links"):
+            if value is None and name not in ("joint_vel", "tip_force"):
                 raise ValueError(
                     f"{name} is None. Without a new value, give the last one and its time"
                 )

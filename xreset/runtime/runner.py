@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from .controller import Controller
-from .driver import Array, Driver, Links, Reading
-from .rotations import is_unit
+from .contract import LiveError
+from .controller import Controller, is_unit
+from .driver import Array, Driver, Reading
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,15 +21,32 @@ class Limits:
         pose_age: oldest pose of the object that the policy may act on [s].
         joint_age: oldest joint positions that the policy may act on [s].
         joint_margin: how far a joint may be beyond its limit [rad, m].
+        joint_speed: largest speed of a joint, as a share of the speed limit in its URDF.
+        target_speed: largest speed of a target, as a share of the same limit. Faster targets do not stop the robot:
+            they are slowed down, and the policy continues from the slower ones.
+        workspace: lowest and highest corner [m] of the box that palm and fingertips must not leave, world frame; None:
+            no box.
         late: how late a control step may end, and how long the clock may stand still [s].
         slow_down: time in which targets come to rest [s].
+        hold: time for which resting targets are still sent before the driver's ``stop`` is called [s], for robots that
+            fall back to their own watchdog without new targets.
     """
 
     pose_age: float = 1.0
     joint_age: float = 0.1
     joint_margin: float = 0.1
+    joint_speed: float = 2.0
+    target_speed: float = float("inf")
+    workspace: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
     late: float = 0.5
     slow_down: float = 0.25
+    hold: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.workspace is not None and not np.less(*self.workspace).all():
+            raise LiveError(
+                f"workspace is {self.workspace}, expected the lowest and the highest corner of a box [m]."
+            )
 
 
 @dataclass(kw_only=True)
@@ -73,7 +90,18 @@ class Runner:
             controller: what acts; its episode has begun.
             driver: where it acts.
             limits: when to stop; None: the defaults.
+
+        Raises:
+            LiveError: there is a workspace, and the policy's graph does not say where palm and fingertips are.
         """
+        if (
+            limits is not None
+            and limits.workspace is not None
+            and "links" not in controller.outputs
+        ):
+            raise LiveError(
+                "The policy's graph has no output 'links', which a workspace needs. Leave out Limits.workspace."
+            )
         self.controller = controller
         self.driver = driver
         self.limits = limits or Limits()
@@ -112,7 +140,8 @@ class Runner:
         due = self.driver.now()
         last_end = due
         stalled = 0.0  # time for which the clock has stood still
-        while self.driver.now() < min(end, self._stopped_at.max() + self.limits.slow_down):
+        rest = self.limits.slow_down + self.limits.hold
+        while self.driver.now() < min(end, self._stopped_at.max() + rest):
             if not self._tick():
                 return
             due += self.controller.dt
@@ -183,11 +212,29 @@ class Runner:
         sound = np.isfinite(target).all(axis=1)
         for robot in np.flatnonzero(running & ~sound):
             self._stop(int(robot), "The policy gave numbers that are not finite.")
+        self._check_workspace()
+        farthest = self.limits.target_speed * self.controller.speed * self.controller.dt
+        target = np.clip(target, self._sent - farthest, self._sent + farthest)
+        self.controller.target = target
         return np.where(sound[:, None], target, self._sent)
+
+    def _check_workspace(self) -> None:
+        """Stop the robots whose palm or fingertips have left the workspace."""
+        box = self.limits.workspace
+        links = self.controller.links
+        if box is None or links is None:
+            return
+        outside = ((links < box[0]) | (links > box[1])).any(axis=2)
+        for robot, link in np.argwhere(outside):
+            name = self.controller.contract["links"][link]
+            place = ", ".join(f"{value:.2f}" for value in links[robot, link])
+            self._stop(int(robot), f"Link {name} is at ({place}), outside the workspace.")
 
     def _merged(self, new: Reading, now: float) -> Reading:
         """Return a reading with the last sound values in place of its faulty ones."""
-        joints_sound = _finite(new.joint_pos) & _finite(new.joint_vel)
+        joints_sound = _finite(new.joint_pos)
+        if new.joint_vel is not None:
+            joints_sound &= _finite(new.joint_vel)
         if new.tip_force is not None:
             joints_sound &= _finite(new.tip_force.reshape(len(joints_sound), -1))
         pose_sound = _finite(new.object_pos) & is_unit(new.object_quat)
@@ -231,6 +278,19 @@ class Runner:
             name = self.controller.contract["joints"][joint]["name"]
             found = reading.joint_pos[robot, joint]
             self._stop(int(robot), f"Joint {name} is at {found:.2f}, beyond its limit {bound:.2f}.")
+        if reading.joint_vel is not None:
+            self._check_speed(reading.joint_vel)
+
+    def _check_speed(self, joint_vel: Array) -> None:
+        """Stop the robots with a joint that is too fast, given the joints' velocities [N, J]."""
+        fastest = self.limits.joint_speed * self.controller.speed
+        for robot, joint in np.argwhere(np.abs(joint_vel) > fastest):
+            name = self.controller.contract["joints"][joint]["name"]
+            found = abs(joint_vel[robot, joint])
+            self._stop(
+                int(robot),
+                f"Joint {name} moves at {found:.2f}, faster than its limit {fastest[joint]:.2f}.",
+            )
 
     def _stop_all(self, reason: str) -> None:
         for robot in range(len(self._stopped_at)):
@@ -253,9 +313,4 @@ def _rows(chosen: Array, new: Any, old: Any) -> Any:
     """Return the chosen rows [N] of new values, and the other rows of old ones."""
     if new is None or chosen.all():
         return new
-    if isinstance(new, Links):
-        parts = {}
-        for name, value in vars(new).items():
-            parts[name] = _rows(chosen, value, getattr(old, name))
-        return Links(**parts)
     return np.where(chosen.reshape(-1, *[1] * (new.ndim - 1)), new, old)

@@ -8,6 +8,7 @@ Shape letters: N worlds, J joints, E fingertips, P points, K numbers per point, 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from math import prod
 
@@ -344,6 +345,10 @@ class Observer:
             group: TERMS.bound(f"task.observation.{group}", getattr(config, group))
             for group in GROUPS
         }
+
+    def functions(self, group: str) -> dict[str, Callable[[ObservationInput], Tensor]]:
+        """Return a group's terms as functions, by name."""
+        return self._groups[group]
 
     def terms(self, group: str, x: ObservationInput) -> dict[str, Tensor]:
         """Return the values [N, ...] of a group's terms, by name."""

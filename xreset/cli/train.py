@@ -102,9 +102,11 @@ def train(
         )
     options: dict[str, Any] = {"out": out, "goals": goals, "config": config, **started, **length}
     if teacher is None:
-        training.train(resets, **options | {"num_envs": num_envs or 4096, "weights": weights})
+        options["num_envs"] = num_envs or 4096
+        training.train(resets, **options, weights=weights)
     else:
-        training.distill(teacher, resets, **options | {"num_envs": num_envs or 1024})
+        options["num_envs"] = num_envs or 1024
+        training.distill(teacher, resets, **options)
 
 
 def _refuse_new_start(out: Path) -> None:

@@ -67,8 +67,6 @@ class Episodes(Case):
             self.assertIn("object_pos=array[5, 3]", repr(read))
         with self.assertRaisesRegex(FileFormatError, "is a trace of the joints"):
             read_training(folder).recorded("openarm")
-        with self.assertRaisesRegex(XResetError, "robot is 3, expected"):
-            read_training(folder).recorded(3)
         with self.assertRaisesRegex(RunError, "no evaluation results. Make them first"):
             replace(read_training(folder), results={}).recorded()
 

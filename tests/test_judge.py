@@ -79,6 +79,8 @@ class Judge(InFolder):
     def test_a_weak_grip_drops_in_the_command(self):
         self.enterContext(mock.patch("xreset.resets.inputs.load_robot", return_value=robot()))
         self.enterContext(mock.patch("xreset.resets.inputs.load_objects", return_value=(brick(),)))
+        source = mock.patch("xreset.resets.inputs.object_source", return_value=brick().source)
+        self.enterContext(source)
         write_bank(f"{self.folder}/bank.npz", bank())
         words = f"--robot gripper --engine mujoco --squeeze.force 0.2 --json {self.folder}/judge.json --picture {self.folder}/judge.png"
         with redirect_stdout(io.StringIO()) as output:

@@ -41,9 +41,9 @@ from xreset.eval.report.make import collect, count_failures, headline, make_repo
 from xreset.eval.report.read import read_trainings
 from xreset.eval.results import read_evaluation, recorded, write_result
 from xreset.eval.table import table_text
-from xreset.files.storage import claim_folder, write_json
+from xreset.files.storage import claim_folder
 from xreset.geometry.shapes import pose_matrix
-from xreset.learning.clock import Lift, write_lift
+from xreset.learning.clock import Lift, Passing, write_lift
 from xreset.learning.run import write_choice
 
 VOID = {"meta", "br", "link", "img", "input", "hr"}
@@ -143,13 +143,9 @@ class CollectTest(Reported):
         self.write_soup()
         for passed, expected in (((), True), ((0.01,), False)):
             passings = [
-                {"share": share, "iteration": 9, "env_steps": 90, "minutes": 0.5}
-                for share in passed
+                Passing(share=share, iteration=9, env_steps=90, minutes=0.5) for share in passed
             ]
-            write_json(
-                self.folder / "lift.json",
-                {"schema": "xreset-lift/1", "iteration": 10, "minutes": 0.6, "passed": passings},
-            )
+            write_lift(self.folder, Lift(passed=tuple(passings), iteration=10, minutes=0.6))
             notes = self.collect().notes
             with self.subTest(passed):
                 self.assertEqual(len(notes), int(expected))

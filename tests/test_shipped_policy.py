@@ -67,5 +67,5 @@ class ShippedPolicyTest(unittest.TestCase):
                 with tempfile.TemporaryDirectory() as folder:
                     (result,) = evaluate(name, demos, num_envs=2, out=folder, episodes=1)
                 self.assertEqual(list(result.inputs), ["policy"])
-                self.assertEqual(result.episodes, 2)
+                self.assertEqual(len(result.episodes), 2)
                 self.assertGreaterEqual(result.mean("task_progress"), FLOOR)

@@ -354,7 +354,9 @@ class BankTest(InFolder):
 
     def test_the_viewer_names_them(self):
         write_bank(self.folder / "b.npz", self.found)
+        sources = {obj.name: obj.source for obj in OBJECTS}
         with (
+            patch("xreset.resets.inputs.object_source", lambda name, _: sources[name]),
             patch("xreset.resets.inputs.load_robot", return_value=ROBOT),
             patch("xreset.resets.inputs.load_objects", return_value=OBJECTS),
         ):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
 import torch
@@ -310,22 +310,16 @@ class ResetDistribution:
 
     def _crossed_goal(self, sequence: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
         """Return goals [M, 3], [M, 4] of demonstrations [M], with the place, lift and turn of others [M]."""
-        own_start = self._pivot_at(sequence, "start")
-        other_start = self._pivot_at(other, "start")
-        place = self._pivot_at(other, "goal")
-        lift = (place - other_start)[:, 2].clamp_min(0.0)
-        place[:, 2] = own_start[:, 2] + lift
-        demos = self._demos[other]
-        turn = quat_multiply(demos.goal_quat, quat_conjugate(demos.start_quat))
-        quat = quat_multiply(turn, self._demos.start_quat[sequence])
-        return place - quat_rotate(quat, self._demos.pivot[sequence]), quat
-
-    def _pivot_at(self, sequence: Tensor, time: Literal["start", "goal"]) -> Tensor:
-        """Return the places [M, 3] of the objects' pivots at the start or goal of demonstrations [M]."""
-        demos = self._demos[sequence]
-        pos = demos.start_pos if time == "start" else demos.goal_pos
-        quat = demos.start_quat if time == "start" else demos.goal_quat
-        return pos + quat_rotate(quat, demos.pivot)
+        own = self._demos[sequence]
+        given = self._demos[other]
+        own_start = _place(own.start_pos, own.start_quat, own.pivot)
+        start = _place(given.start_pos, given.start_quat, given.pivot)
+        goal = _place(given.goal_pos, given.goal_quat, given.pivot)
+        lift = (goal - start)[:, 2].clamp_min(0.0)
+        goal[:, 2] = own_start[:, 2] + lift
+        turn = quat_multiply(given.goal_quat, quat_conjugate(given.start_quat))
+        quat = quat_multiply(turn, own.start_quat)
+        return goal - quat_rotate(quat, own.pivot), quat
 
     def _moved_goal(
         self, demos: _Demonstrations, generator: torch.Generator
@@ -357,4 +351,9 @@ def _turned_about_z(
 
 def _turned(pos: Tensor, quat: Tensor, new_quat: Tensor, pivot: Tensor) -> Tensor:
     """Return positions [M, 3] of objects that turn about their pivots, from orientations [M, 4] to new ones."""
-    return pos + quat_rotate(quat, pivot) - quat_rotate(new_quat, pivot)
+    return _place(pos, quat, pivot) - quat_rotate(new_quat, pivot)
+
+
+def _place(pos: Tensor, quat: Tensor, pivot: Tensor) -> Tensor:
+    """Return the places [M, 3] of the pivots of objects with poses [M, 3], [M, 4] in the world [m]."""
+    return pos + quat_rotate(quat, pivot)

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict
 from pathlib import Path
 
 import torch
 from tensordict import TensorDict
 
-from xreset.files.storage import check_suffix, code_version, file_hash, must_exist, write_whole
+from xreset.files.storage import check_suffix, file_hash, must_exist, write_whole
 from xreset.learning.checkpoint import must_fit, read_checkpoint
 from xreset.learning.model import ExportedPolicy, PointNetLstmModel, make_actor
 from xreset.learning.run import read_run
 from xreset.policy.onnx_policy import (
     CHECKPOINT_KEY,
     INPUTS,
-    METADATA_KEY,
     OUTPUTS,
-    VERSION_KEY,
     Contract,
+    contract_metadata,
     observation_shapes,
     picture_shape,
 )
@@ -49,10 +46,7 @@ def exported(
     )
     example: dict[str, torch.Tensor] = dict(zip(INPUTS, values, strict=True))
     model = exported_module(policy, example, OUTPUTS, state=INPUTS[2:])
-    entries = {
-        METADATA_KEY: json.dumps(asdict(contract)),  # in order: that of the terms is the policy's
-        VERSION_KEY: code_version(),
-    }
+    entries = contract_metadata(contract)
     if checkpoint is not None:
         entries[CHECKPOINT_KEY] = file_hash(checkpoint)
     onnx.helper.set_model_props(model, entries)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +20,7 @@ from xreset.objects.sampling import center, surface_points
 from xreset.policy.onnx_policy import (
     METADATA_KEY,
     VERSION_KEY,
+    contract_metadata,
     parsed_contract,
     policy_contract,
 )
@@ -147,11 +147,7 @@ def deployed_graph(
 
     model = policy_graph(network, robot, task)
     trained = policy_contract(robot, task, tuple(o.name for o in objects))
-    entries = {
-        KEY: json.dumps(deploy_contract(robot, task, objects)),
-        METADATA_KEY: json.dumps(asdict(trained)),  # in order: that of the terms is the policy's
-        VERSION_KEY: code_version(),
-    }
+    entries = {KEY: json.dumps(deploy_contract(robot, task, objects)), **contract_metadata(trained)}
     onnx.helper.set_model_props(model, entries)
     return model.SerializeToString()
 

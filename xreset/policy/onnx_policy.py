@@ -6,6 +6,7 @@ rate. Running a policy needs neither warp nor rsl-rl.
 
 from __future__ import annotations
 
+import json
 from copy import copy
 from dataclasses import asdict, replace
 from hashlib import sha256
@@ -18,7 +19,7 @@ from torch import Tensor
 
 from xreset.errors import PolicyError, WrongValueError, needs
 from xreset.files.checks import parsed
-from xreset.files.storage import max_bytes, parse_json
+from xreset.files.storage import code_version, max_bytes, parse_json
 from xreset.files.text import shown
 from xreset.spec import RobotSpec
 from xreset.task.config import TaskConfig
@@ -69,6 +70,14 @@ def policy_contract(robot: RobotSpec, task: TaskConfig, objects: tuple[str, ...]
         control_dt=task.control_dt,
         task=task,
     )
+
+
+def contract_metadata(contract: Contract) -> dict[str, str]:
+    """Return the entries of ONNX metadata that state a contract and the version of xreset.
+
+    Keys keep their order: the order of the observations' terms is that of the policy's columns.
+    """
+    return {METADATA_KEY: json.dumps(asdict(contract)), VERSION_KEY: code_version()}
 
 
 def check_contract(source: str, contract: Contract, robot: RobotSpec, task: TaskConfig) -> None:

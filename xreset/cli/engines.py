@@ -107,14 +107,20 @@ def check(
 
 
 def _maker(name: str, device: str) -> conformance.MakeBackend:
-    """Return the function that makes worlds on a device. A few worlds run in this process, which is faster than in new
-    ones."""
-    from xreset.backends import conformance, pool
+    """Return the function that makes worlds on a device.
+
+    The worlds that it makes first, which all checks share, run in processes of their own. Most others run in this one:
+    a new process takes longer to start than their check takes.
+    """
+    from xreset.backends import pool
 
     pooled = issubclass(backend_class(name), pool.PoolBackend)
+    shared = True
 
     def make(scene: SceneSpec, num_worlds: int, **chosen: Any) -> Any:
-        here = pooled and num_worlds != conformance.Bench.NUM_WORLDS and num_worlds <= 24
+        nonlocal shared
+        here = pooled and not shared and num_worlds <= 24
+        shared = False
         options = {"workers": 0} if here else {}
         return make_backend(name, scene, num_worlds, device=device, **chosen, **options)
 

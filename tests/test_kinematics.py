@@ -239,6 +239,20 @@ class KinematicsTest(InOneFolder):
             omega = torch.stack((spin[..., 2, 1], spin[..., 0, 2], spin[..., 1, 0]), dim=-1)
             assert_close(jacobian.angular[..., j], omega, atol=1e-8, rtol=0)
 
+    def test_motion_agrees_with_poses_and_jacobian(self):
+        for robot in (self.robot, gripper(), robots.load("openarm")):
+            kinematics = Kinematics(robot)
+            q = self.drawn(kinematics, 4)
+            qd = self.drawn(kinematics, 4).flip(0)
+            for links in (robot.tracked_links, kinematics.link_names):
+                pos, rot, linear, angular = kinematics.motion(q, qd, links)
+                jacobian = kinematics.jacobian(q, links)
+                assert_close(pos, jacobian.pos, atol=1e-12, rtol=0)
+                assert_close(rot, jacobian.rot, atol=1e-12, rtol=0)
+                for found, columns in ((linear, jacobian.linear), (angular, jacobian.angular)):
+                    expected = (columns @ qd[:, None, :, None])[..., 0]
+                    assert_close(found, expected, atol=1e-12, rtol=0)
+
     def test_base_places_the_robot_in_the_world(self):
         poses = self.kinematics.link_poses(self.q)
         root = poses[0, 0, self.kinematics.link_index(self.kinematics.root)]

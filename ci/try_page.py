@@ -7,7 +7,7 @@ FOLDER then has everything that the page needs, as static files:
 - ``robot.json``: the robot's drawn meshes by MuJoCo body, the table, colors, and the names of all objects;
 - ``scenes/OBJECT.json``: MJCF of the robot with the object (:func:`~xreset.backends.mjcf.scene_xml`), the arrays of the
   compiled model that the text does not give exactly, addresses of joints and sensors, and starts and goals;
-- ``policy.onnx`` and ``policy.json``: the policy, and what docs/try/policy.js must know about it.
+- ``policy.onnx``: the policy, from readings to joint targets (:mod:`xreset.live.graph`).
 """
 
 from __future__ import annotations
@@ -24,8 +24,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-import onnx
-from torch import Tensor
 
 from xreset.backends.mjcf import compile_scene, scene_xml
 from xreset.backends.mjcf_model import MOST_BRAKING, SceneModel, body_name
@@ -50,7 +48,6 @@ from xreset.pictures.meshes import (
 from xreset.resets.bank import ResetBank
 from xreset.resets.inputs import load_inputs
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
-from xreset.task.actions import ActionSpace
 
 POLICY = "many-objects"
 STARTS = 4
@@ -269,36 +266,8 @@ def write_data(folder: Path, names: Sequence[str]) -> None:
 
 
 def write_policy(folder: Path) -> None:
-    """Write the policy, and what docs/try/policy.js needs to know about its observations and actions."""
-    policy = load_policy(POLICY)
-    assert policy.content is not None, "a trained policy has a file"
-    model = onnx.load_from_string(policy.content)
-    del model.graph.value_info[:]  # of the exporter; onnxruntime-web refuses one of its shapes
-    for output in model.graph.output:
-        output.type.tensor_type.ClearField("shape")
-    (folder / "policy.onnx").write_bytes(model.SerializeToString())
-    observation = policy.task.observation.without_noise()
-    (cloud,) = observation.perception.values()
-    space = ActionSpace(policy.robot, policy.task.action)
-    contract = {
-        "joints": len(policy.robot.joints),
-        "units": model.graph.input[2].type.tensor_type.shape.dim[2].dim_value,
-        "terms": [*observation.policy.items(), *observation.proprio.items()],
-        "scale": cloud["scale"],
-        "scaledLower": space.lower.nan_to_num(neginf=-np.pi).tolist(),
-        "scaledUpper": space.upper.nan_to_num(posinf=np.pi).tolist(),
-        "lower": finite(space.lower),
-        "upper": finite(space.upper),
-        "absolute": [policy.task.action.hand == "absolute" and not arm for arm in space.is_arm],
-    }
-    for name in ("step", "lead", "zero", "below", "above"):
-        contract[name] = getattr(space, name).tolist()
-    (folder / "policy.json").write_text(json.dumps(contract))
-
-
-def finite(values: Tensor) -> list[float | None]:
-    """Return numbers for JSON, which has no infinite ones."""
-    return [value if np.isfinite(value) else None for value in values.tolist()]
+    """Write the policy as one graph from readings to joint targets."""
+    (folder / "policy.onnx").write_bytes(load_policy(POLICY).graph)
 
 
 def build(folder: Path, names: Sequence[str]) -> None:

@@ -107,7 +107,6 @@ class PolicyTest(unittest.TestCase):
         ask(do="load", folder=str(folder), object=try_page.object_part(obj, 64))
         for _ in range(45):
             reading = env.reading()
-            links = {name: value.flatten().tolist() for name, value in vars(reading.links).items()}
             state = reading.state
             target = ask(
                 do="act",
@@ -117,7 +116,6 @@ class PolicyTest(unittest.TestCase):
                     "objectPos": state.object_pos[0].tolist(),
                     "objectQuat": state.object_quat[0].tolist(),
                     "tipForce": reading.contacts.tip_force.flatten().tolist(),
-                    "links": links,
                 },
                 target=env.joint_target[0].tolist(),
                 goalPos=env.goal_pos[0].tolist(),

@@ -35,8 +35,7 @@ const commands = {
     return worlds[world].reading();
   },
   async load({ folder, object }) {
-    const contract = JSON.parse(readFileSync(`${folder}/policy.json`));
-    policy = await Policy.load(ort, readFileSync(`${folder}/policy.onnx`), contract);
+    policy = await Policy.load(ort, readFileSync(`${folder}/policy.onnx`));
     policy.begin(object);
   },
   act({ reading, target, goalPos, goalQuat }) {

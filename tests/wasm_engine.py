@@ -77,7 +77,7 @@ class WasmWorld(World):
         )
 
     def get_state(self):
-        read = self._read(self._reading)
+        read = {name: np.array(value, dtype=float) for name, value in self._reading.items()}
         return {
             "joint_pos": read["jointPos"],
             "joint_vel": read["jointVel"],
@@ -86,18 +86,6 @@ class WasmWorld(World):
             "object_quat": read["objectQuat"],
             "object_linvel": read["objectLinvel"],
             "object_angvel": read["objectAngvel"],
-        }
-
-    def links(self):
-        read = self._read(self._reading["links"])
-        return tuple(
-            read[name].reshape(-1, width)
-            for name, width in (("pos", 3), ("quat", 4), ("linvel", 3), ("angvel", 3))
-        )
-
-    def _read(self, values):
-        return {
-            name: np.array(value, dtype=float) for name, value in values.items() if name != "links"
         }
 
     def set_joint_targets(self, targets):

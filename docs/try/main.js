@@ -65,13 +65,12 @@ async function loadMujoco() {
 
 async function loadPolicy() {
   const content = fetched("policy.onnx");
-  const contract = fetched("policy.json");
   const ort = await import("onnxruntime");
   ort.env.wasm.wasmPaths = new URL("lib/", document.baseURI).href;
   ort.env.wasm.numThreads = 1; // more need headers that a static site lacks
   ort.env.wasm.proxy = true; // in a worker: the picture goes on meanwhile
   const bytes = new Uint8Array(await (await content).arrayBuffer());
-  return Policy.load(ort, bytes, await (await contract).json());
+  return Policy.load(ort, bytes);
 }
 
 function mark(name) {

@@ -104,7 +104,7 @@ export class Physics {
     return torque;
   }
 
-  /** Return joints, the object's pose and velocity, the fingertips' forces [E, 3] on it, and palm and fingertips. */
+  /** Return joints, the object's pose and velocity, and the fingertips' forces [E, 3] on it. */
   reading() {
     const { mujoco, model, data, scene } = this;
     const { addresses } = scene;
@@ -128,19 +128,7 @@ export class Physics {
       objectLinvel: Array.from(data.qvel.subarray(object.dof, object.dof + 3)),
       objectAngvel: rotate(objectQuat, data.qvel.subarray(object.dof + 3, object.dof + 6)),
       tipForce,
-      links: this.#links(),
     };
-  }
-
-  /** Return positions, orientations, velocities and angular velocities of the palm and the fingertips. */
-  #links() {
-    const count = 1 + this.scene.fingertips.length;
-    let first = 0;
-    const next = (width) => {
-      first += width * count;
-      return Array.from(this.data.sensordata.subarray(first - width * count, first));
-    };
-    return { pos: next(3), quat: next(4), linvel: next(3), angvel: next(3) };
   }
 
   /** Return the pose of a body: position and quaternion. */

@@ -1,14 +1,15 @@
 """A policy leaves xreset: one graph from readings to joint targets, in a folder that runs without xreset."""
 
 import contextlib
+import functools
 import hashlib
 import importlib
 import json
+import os
 import shutil
 import subprocess
 import sys
 from dataclasses import asdict, replace
-from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -37,6 +38,7 @@ from xreset import (
 )
 from xreset.errors import PolicyError
 from xreset.eval.rollout import engine, episode_starts, load_trial, roll_out
+from xreset.live import cache
 from xreset.live.deploy import deployed_graph, write_deployed
 from xreset.live.engine import EngineDriver
 from xreset.live.graph import policy_graph
@@ -72,7 +74,7 @@ print(json.dumps({"worst": worst, "modules": modules}))
 """
 
 
-@cache
+@functools.cache
 def toy_graph(network):
     """Return the graph of a policy of the toy gripper."""
     return deployed_graph(
@@ -282,6 +284,37 @@ class ToyTest(InFolder):
         (self.out / "contract.json").write_text("{}")
         with self.assertRaisesRegex(LiveError, "of xreset 0.3 or earlier. Use the runtime in this"):
             load_controller(self.out)
+
+    def test_a_graph_is_exported_once(self):
+        network = self.network.read_bytes()
+        made = []
+
+        def graph(*arguments):
+            made.append(arguments)
+            return onnx.load_from_string(network)
+
+        folder = self.folder / "cache"
+        self.enterContext(mock.patch.dict(os.environ, {"XRESET_CACHE": str(folder)}))
+        self.enterContext(mock.patch.object(cache, "policy_graph", graph))
+        for _ in range(2):
+            cache.cached_graph(network, self.robot, self.task)
+        self.assertEqual(len(made), 1)
+        (file,) = folder.rglob("*.onnx")
+        file.write_bytes(file.read_bytes()[:-100])
+        found = cache.cached_graph(network, self.robot, self.task)
+        self.assertEqual(found.SerializeToString(), file.read_bytes())
+        self.assertEqual(len(made), 2)
+        other = replace(self.task, substeps=self.task.substeps + 1)
+        for i, changed in enumerate(((network + b" ", self.task), (network, other))):
+            cache.cached_graph(changed[0], self.robot, changed[1])
+            self.assertEqual(len(made), 3 + i)
+        with mock.patch.object(cache, "_MOST", 2):
+            cache.cached_graph(network + b"  ", self.robot, self.task)
+        self.assertEqual(len(list(folder.rglob("*.onnx"))), 2)
+        file.parent.rename(folder / "moved")
+        (folder / "graphs").write_bytes(b"")  # no folder can be made there
+        cache.cached_graph(network, self.robot, self.task)
+        self.assertEqual(len(made), 6)
 
     def test_a_folder_of_xreset_0_3_is_read(self):
         old = self.folder / "old"

@@ -15,6 +15,7 @@ from xreset.errors import PolicyError
 from xreset.files.storage import atomic_folder, code_version, is_occupied
 from xreset.geometry.urdf import robot_tree
 from xreset.live import leapp
+from xreset.live.cache import cached_graph
 from xreset.live.graph import policy_graph
 from xreset.objects.sampling import center, surface_points
 from xreset.policy.onnx_policy import (
@@ -145,7 +146,10 @@ def deployed_graph(
     """
     import onnx
 
-    model = policy_graph(network, robot, task)
+    if isinstance(network, bytes):
+        model = cached_graph(network, robot, task)
+    else:
+        model = policy_graph(network, robot, task)
     trained = policy_contract(robot, task, tuple(o.name for o in objects))
     entries = {KEY: json.dumps(deploy_contract(robot, task, objects)), **contract_metadata(trained)}
     onnx.helper.set_model_props(model, entries)

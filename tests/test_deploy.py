@@ -4,6 +4,7 @@ import contextlib
 import functools
 import hashlib
 import importlib
+import io
 import json
 import os
 import shutil
@@ -425,11 +426,27 @@ class ToyTest(InFolder):
             importlib.import_module("12_ros2_node").main(str(self.out), "brick", 0.5)
         self.assertEqual(len(published), 30)
         self.assertEqual(np.shape(published), (30, 5))
-        self.begin()
         joints = self.controller.contract["joints"]
         for target in published:
             for value, joint in zip(target, joints, strict=True):
                 self.assertTrue(joint["lower"] - 1e-6 <= value <= joint["upper"] + 1e-6)
+
+    def test_a_ros_2_node_that_nobody_sends_to_any_more_stops(self):
+        for kind, words in (
+            ("PoseStamped", "The pose of the object is 1.0"),
+            ("JointState", "The joint positions are 0.1"),
+        ):
+            said = io.StringIO()
+            with (
+                self.subTest(kind),
+                ros(self.contract, self.home, vanishing=kind) as published,
+                contextlib.redirect_stdout(said),
+                self.assertLogs("xreset"),
+            ):
+                importlib.import_module("12_ros2_node").main(str(self.out), "brick", 30)
+            self.assertIn(words, said.getvalue())
+            self.assertLess(len(published), 120)
+            assert_allclose(np.diff(published[-3:], axis=0), 0, atol=1e-3)
 
     @skipUnless(find_spec("mujoco"), "mujoco is not installed")
     def test_an_evaluation_plays_the_graph_as_it_plays_the_network(self):
@@ -487,8 +504,11 @@ class Robot(Scripted):
 
 
 @contextlib.contextmanager
-def ros(contract, home):
-    """A small stand-in for ROS 2: one node, whose topics send a robot at home; yields the published targets."""
+def ros(contract, home, vanishing=None):
+    """A small stand-in for ROS 2: one node, whose topics send a robot at home; yields the published targets.
+
+    After half a second, nobody sends messages of the kind ``vanishing`` any more.
+    """
     published = []
     clock = SimpleNamespace(time=5.0)
     pose = SimpleNamespace(
@@ -513,7 +533,8 @@ def ros(contract, home):
     def spin_once(node, timeout_sec=0.01):
         clock.time += timeout_sec
         for kind, callback in callbacks:
-            callback(message(kind))
+            if kind != vanishing or clock.time < 5.5:
+                callback(message(kind))
 
     node = SimpleNamespace(
         create_subscription=lambda kind, topic, callback, depth: callbacks.append((kind, callback)),

@@ -72,13 +72,15 @@ class Outcome:
 
 
 _NO_NEWER = "no newer one has come"
+_CLOCKS_DIFFER = 0.1
+"""How far a time stamp may be ahead of the driver's clock [s]."""
 
 
 class Runner:
     """Keeps a policy's rate on a driver, and stops softly when it cannot go on.
 
-    A pose that is late is used until it is ``pose_age`` old. A pose that is not finite, or older than the last one, is
-    ignored. After a fault the targets slow down within ``slow_down``, and then stay.
+    A pose that is late is used until it is ``pose_age`` old. Data that are not finite, older than the last ones, or
+    ahead of the driver's clock are ignored. After a fault the targets slow down within ``slow_down``, and then stay.
     """
 
     def __init__(
@@ -242,7 +244,9 @@ class Runner:
         if old is None:
             nothing = np.full(len(joints_sound), -np.inf)
             old = replace(new, joint_time=nothing, object_time=nothing)
-        not_ahead = new.object_time <= now + 0.1
+        latest = now + _CLOCKS_DIFFER
+        joints_sound &= (new.joint_time >= old.joint_time) & (new.joint_time <= latest)
+        not_ahead = new.object_time <= latest
         in_order = new.object_time >= old.object_time
         self._refusals[~not_ahead] = "newer ones have time stamps ahead of the robot's clock"
         self._refusals[~in_order] = "the time stamps of newer ones run backwards"
@@ -269,8 +273,11 @@ class Runner:
             self._stop(int(robot), f"The pose of the object is {age[robot]:.2f} s old: {refusal}.")
         age = now - np.maximum(reading.joint_time, self._begun)
         for robot in np.flatnonzero(age > limits.joint_age):
-            reason = f"The joint positions are {age[robot]:.2f} s old, or not finite."
-            self._stop(int(robot), reason)
+            self._stop(
+                int(robot),
+                f"The joint positions are {age[robot]:.2f} s old: newer ones have not come, are not finite, or have "
+                "wrong time stamps.",
+            )
         below = reading.joint_pos < lower - limits.joint_margin
         above = reading.joint_pos > upper + limits.joint_margin
         for robot, joint in np.argwhere(below | above):

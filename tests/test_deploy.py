@@ -246,7 +246,7 @@ class ToyTest(InFolder):
         return model.SerializeToString()
 
     def test_a_contract_that_no_robot_may_follow_is_refused(self):
-        Controller(self.changed(("rate",), 60))
+        Controller(self.changed(("about",), "an entry of one's own"))
         joint = ("joints", 1)
         for place, values in (
             (("control_dt",), (1e-30, -0.016, True, 50.0, None)),

@@ -9,6 +9,7 @@ from xreset.errors import FileFormatError, XResetError
 from xreset.files.storage import write_json
 from xreset.learning.clock import Lift, read_lift, write_lift
 from xreset.learning.log import TrainingLog
+from xreset.learning.run import training_left
 
 
 class LiftTest(InFolder):
@@ -35,6 +36,18 @@ class LiftTest(InFolder):
         self.assertEqual([(p.share, p.iteration) for p in at_checkpoint.passed], [(0.01, 2)])
         again = self.after(again, [0.0, 0.4], begin=3)
         self.assertEqual([(p.share, p.iteration) for p in again.passed], [(0.01, 2), (0.1, 5)])
+
+    def test_what_is_left_counts_iterations_and_minutes_of_the_whole_training(self):
+        self.assertEqual(training_left(self.folder, 10), "not begun")
+        write_lift(self.folder, self.after(Lift(), [0.0] * 4))  # 2 minutes
+        self.assertEqual(training_left(self.folder, 10), "4 of 10 iterations")
+        left = training_left(self.folder, 10, 3.0)
+        self.assertEqual(left, "4 of 10 iterations, 2.0 of 3 minutes")
+        self.assertEqual(training_left(self.folder, 10, 2.05), "", "a start would take longer")
+        self.assertEqual(training_left(self.folder, 4), "")
+        (self.folder / "checkpoints").mkdir()
+        (self.folder / "checkpoints/000003.pt").touch()
+        self.assertEqual(training_left(self.folder, 4), "3 of 4 iterations")
 
     def test_earlier_runs_and_damaged_files(self):
         self.assertEqual(read_lift(self.folder), Lift())

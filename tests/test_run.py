@@ -21,6 +21,8 @@ class Run(InFolder, TestCase):
 
         def step(words):
             verbs.append(words[0])
+            if words[0] == "train":
+                self.assertIn("--resets", words)
             if words[0] in ("retarget", "resets"):
                 perform(words)
 

@@ -164,9 +164,7 @@ class TrainingTest(WithBank):
         self.changed_run(out, resets="bank.npz")
         said = self.resume(out)
         self.assertEqual(read_run(out, as_stated=True).resets, "bank.npz", "not the path from here")
-        self.assertIn(
-            "continuing after iteration 2, the last one: --iterations asks for more", said
-        )
+        self.assertIn(f"{out} is trained. To prolong the training, give more --iterations", said)
         said = self.resume(out, iterations=3)
         self.assertIn(f"policy after 3 iterations in {out / 'policy.onnx'}", said)
         after = newest(out)
@@ -225,10 +223,12 @@ class TrainingTest(WithBank):
         stopped = newest(out).iteration
         self.assertGreater(stopped, 0)
         self.assertEqual(latest_checkpoint(out).name, f"{stopped:06d}.pt")
-        said = self.resume(out, minutes=0.1 / 60)
+        said = self.resume(out, minutes=(newest(out).elapsed * 1.1 + 0.1) / 60)
         self.assertIn(f"To continue: xreset train --out {out} --resume", said)
         done = newest(out).iteration
         self.assertGreater(done, stopped)
+        said = self.resume(out, minutes=newest(out).elapsed / 60)
+        self.assertIn("is trained", said, "minutes are those of the whole training")
         self.resume(out, iterations=done + 1)
         self.assertEqual(newest(out).iteration, done + 1)
 
@@ -243,11 +243,11 @@ class TrainingTest(WithBank):
 
         again()
         first = latest_checkpoint(out).read_bytes()
-        self.assertIn("continuing after iteration 1, the last one", again())
+        self.assertIn("is trained", again())
         self.assertIn("continuing after iteration 1\n", again(config=CONFIG))
         self.assertEqual([c.name for c in checkpoints(out)], ["000001.pt", "000002.pt"])
         self.assertEqual((out / "checkpoints" / "000001.pt").read_bytes(), first)
-        self.assertIn("iteration 2, the last one", again(iterations=2))
+        self.assertIn("policy after 2 iterations", again(iterations=2))
         other = self.folder / "other_bank.npz"
         write_bank(other, toy_bank(self.robot))
         slower = replace(ONE, ppo=replace(ONE.ppo, learning_rate=1e-5))
@@ -389,7 +389,7 @@ class TrainingTest(WithBank):
         out = self.train("scheduled")
         progress = []
         with patch.object(TrainingRunner, "_follow_schedule", lambda _, x: progress.append(x)):
-            self.resume(out, iterations=1000, minutes=newest(out).elapsed / 60)
+            self.resume(out, iterations=1000, minutes=2 * newest(out).elapsed / 60)
         self.assertGreaterEqual(progress[0], 0.5)
         self.assertEqual(progress, sorted(progress))
 
@@ -473,7 +473,7 @@ class TrainingTest(WithBank):
 
     def test_a_number_of_iterations_that_has_passed_does_not_shorten_a_run(self):
         out = self.train("long")
-        self.assertIn("the last one", self.resume(out, iterations=1))
+        self.assertIn("policy after 2 iterations", self.resume(out, iterations=1))
         self.assertEqual(read_run(out).config, CONFIG)
 
     def test_a_schedule_without_effect_is_refused(self):

@@ -10,6 +10,7 @@ Studies with the same OUT share its content: a run of the same name and configur
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -29,14 +30,11 @@ from xreset.files.checks import frozen
 from xreset.files.records import read_meta
 from xreset.files.storage import file_hash
 from xreset.files.text import shown
-from xreset.learning.clock import Lift, read_lift
 from xreset.learning.config import TrainConfig
-from xreset.learning.run import checkpoints, flat, read_run
+from xreset.learning.run import checkpoints, flat, read_run, training_left
 
 XRESET = (sys.executable, "-P", "-m", "xreset")
 """Command line of ``xreset``. ``-P``: Python files in the current folder, which may be a download, are not imported."""
-_ENOUGH = 0.97
-"""Share of the minutes from which a training counts as done, because a new start would take longer than the rest."""
 
 Todo = tuple[str, list[list[str]]]
 """What is left to do, in words, and the commands to run next, in order; both are empty if nothing is left."""
@@ -213,26 +211,15 @@ def bank_todo(subset: Subset, robot: str) -> Todo:
     return "to do", [*commands, [*resets, *subset.data.resets]]
 
 
-def is_trained(done: Lift, iterations: int, minutes: float | None) -> bool:
-    """Return whether a training has done its iterations, or nearly all of its minutes where they are limited."""
-    is_over = minutes is not None and done.minutes >= _ENOUGH * minutes
-    return is_over or done.iteration >= iterations
-
-
 def train_todo(run: Run) -> Todo:
     """Return what is left to do of a training: start it, or continue from its newest checkpoint."""
     spec = run.spec
-    now = read_lift(run.folder)
     assert run.config is not None
     iterations = run.config.iterations
-    if is_trained(now, iterations, spec.minutes):
+    left = training_left(run.folder, iterations, spec.minutes or math.inf)
+    if not left:
         return "", []
-    left = f"{now.iteration} of {iterations} iterations" if now.iteration else "not begun"
-    length = {"out": run.folder, "iterations": iterations}
-    if spec.minutes is not None:
-        length["minutes"] = f"{spec.minutes - now.minutes:.4g}"
-        if now.iteration:
-            left += f", {now.minutes:.1f} of {spec.minutes:g} minutes"
+    length = {"out": run.folder, "iterations": iterations, "minutes": spec.minutes}
     if checkpoints(run.folder):
         return left, [_xreset("train", **length, resume=True)]
     command = _xreset(

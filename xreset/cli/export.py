@@ -99,8 +99,9 @@ def deploy(
     named = []
     for name, entry in contract["objects"].items():
         named.append(f"{name} ({'stand-in' if entry['source'] == 'stand-in' else 'mesh'})")
+    rate = 1.0 / contract["control_dt"]
     console.print(
-        f"{out}: {spec.name} for {contract['robot']}, {len(contract['joints'])} joints at {contract['rate']:g} Hz"
+        f"{out}: {spec.name} for {contract['robot']}, {len(contract['joints'])} joints at {rate:g} Hz"
     )
     console.print(f"objects: {', '.join(named)}")
     console.print(f"Try it: cd {out} && python -m runtime")

@@ -54,7 +54,7 @@ def run(
         recipe: Recipe of the training, or another run's folder.
         device: Where to train: cpu or cuda; default: cuda where there is a GPU.
         num_envs: Worlds of the training.
-        minutes: Time of the training, without compiling kernels.
+        minutes: Time of the whole training, without compiling kernels.
         iterations: Most iterations of the training; default: the recipe's.
         seed: Seed of the training and of the evaluations' starts.
         episodes: Episodes of each demonstration in each engine.
@@ -65,7 +65,6 @@ def run(
     from xreset.demos.archive import read_demos
     from xreset.eval.study import steps
     from xreset.geometry.description import load_robot
-    from xreset.learning.run import checkpoints
 
     demos = Path(demos)
     out = Path(out)
@@ -81,22 +80,19 @@ def run(
     if not _made_from(bank, retargeted=file_hash(motion)):
         own = robot if os.path.isdir(robot) else None
         _step("resets", motion, out=bank, robot=own, meshes=meshes)
-    if checkpoints(out):
-        _continue_training(out, bank, minutes, iterations)
-    else:
-        _step(
-            "train",
-            out=out,
-            resets=bank,
-            robot=robot,
-            meshes=meshes,
-            recipe=recipe,
-            device=device,
-            num_envs=num_envs,
-            minutes=minutes,
-            iterations=iterations,
-            seed=seed,
-        )
+    _step(
+        "train",
+        out=out,
+        resets=bank,
+        robot=robot,
+        meshes=meshes,
+        recipe=recipe,
+        device=device,
+        num_envs=num_envs,
+        minutes=minutes,
+        iterations=iterations,
+        seed=seed,
+    )
     files = {"demos": demos, "policy": out / "policy.onnx"}
     missing = []
     for name in engines:
@@ -146,22 +142,6 @@ def _made_from(path: Path, **sources: str) -> bool:
 
 
 _NAMES = {"demos": "archive of demonstrations", "robot": "robot", "retargeted": "motion"}
-
-
-def _continue_training(out: Path, bank: Path, minutes: float, iterations: int | None) -> None:
-    """Continue a training for what is left of its minutes and iterations."""
-    from xreset.eval.study.steps import is_trained
-    from xreset.learning.run import read_run
-
-    info = read_run(out)
-    if info.resets_hash != file_hash(bank):
-        raise RunError(f"The run in {out} was made with another bank. Choose another --out.")
-    done = info.lift
-    if is_trained(done, iterations or info.config.iterations, minutes):
-        console.print(f"{out} is trained: {done.iteration} iterations, {done.minutes:.1f} minutes")
-        return
-    left = round(minutes - done.minutes, 2)
-    _step("train", out=out, resume=True, minutes=left, iterations=iterations)
 
 
 def _step(verb: str, *words: object, **options: object) -> None:

@@ -60,8 +60,7 @@ def train(
         device: cpu or cuda; default: cuda where there is a GPU and the engine can use it.
         num_envs: Worlds to simulate (per GPU). Default: 4096; for a student 1024.
         iterations: Total number of iterations; default: the configuration's.
-        minutes: Longest time to train now. Then the run stops with a checkpoint, and the same command continues it.
-            Compiling kernels is not counted.
+        minutes: Longest time of the whole training, without compiling kernels: a run that continues has the rest of it.
         seed: Seed of every random number.
         resume: Continue the run in --out as it was started: its other options need not be given. Name reward terms of
             your own again.

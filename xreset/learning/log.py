@@ -112,10 +112,8 @@ class TrainingLog:
         from_home = means["task/success_from_home"]
         before = self.lift
         # while a teacher acts in some worlds, their success is not the student's
-        if not scalars.get("policy/teacher_share"):
-            self.lift = before.after(
-                from_home, iteration=iteration, env_steps=env_steps, seconds=elapsed
-            )
+        own = 0.0 if scalars.get("policy/teacher_share") else from_home
+        self.lift = before.after(own, iteration=iteration, env_steps=env_steps, seconds=elapsed)
         if self.lift.passed != before.passed:
             self.write_lift()
         if time.monotonic() - self._last_line > _LINE_SECONDS or iteration == self._total:

@@ -11,6 +11,7 @@ RUN/eval/, RUN/report/       made by ``xreset eval`` and ``xreset report``
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator
 from dataclasses import asdict, replace
@@ -21,7 +22,7 @@ from xreset.errors import RunError, WrongValueError
 from xreset.files.checks import Checked, NonNegativeInt, PositiveInt, Rule, Share, from_dict, frozen
 from xreset.files.storage import read_json, read_typed, write_json
 from xreset.files.text import shown
-from xreset.learning.clock import Lift
+from xreset.learning.clock import Lift, read_lift
 from xreset.learning.config import TrainConfig
 from xreset.physics.plugins import robot_names
 from xreset.task.contract import Contract
@@ -29,6 +30,8 @@ from xreset.task.contract import Contract
 SCHEMA = "xreset-run/1"
 TEACHER = "teacher.onnx"
 """File of the teacher's policy in the run folder of a distillation."""
+ENOUGH = 0.97
+"""Share of the minutes from which a training counts as done, because a new start would take longer than the rest."""
 
 
 @frozen
@@ -126,6 +129,25 @@ def latest_checkpoint(folder: Path) -> Path:
             f"{folder} has no checkpoint yet. Give a run folder, or train it: xreset train --out {folder} --resume"
         )
     return found[-1]
+
+
+def training_left(folder: Path, iterations: int, minutes: float = math.inf) -> str:
+    """Return what is left to do of a training, in words; empty if it is done.
+
+    Args:
+        folder: run folder, which need not exist.
+        iterations: iterations in all.
+        minutes: time of the training in all, without compiling.
+    """
+    done = read_lift(folder)
+    found = checkpoints(folder)
+    iteration = int(found[-1].stem) if found else done.iteration
+    if iteration >= iterations or done.minutes >= ENOUGH * minutes:
+        return ""
+    if not iteration:
+        return "not begun"
+    left = f"{iteration} of {iterations} iterations"
+    return left if minutes == math.inf else f"{left}, {done.minutes:.1f} of {minutes:g} minutes"
 
 
 # The checkpoint that ``xreset select`` chose --------------------------------------------------------------------------

@@ -101,7 +101,7 @@ class TrainingRunner:
 
         Args:
             total: iterations in all, those of a resumed run included.
-            seconds: most time to spend here; the present iteration is completed.
+            seconds: most time of training in all, those of a resumed run included; the present iteration is completed.
 
         Returns:
             The signal that ended the training before its last iteration; None: it ended by itself.
@@ -120,15 +120,11 @@ class TrainingRunner:
                 self.folder, env.num_envs, self.device, total, self.wandb, done=self.iteration
             )
         saved_at = self.iteration
-        earlier = self.elapsed
-        begin = time.perf_counter()
         with _stop_on_interrupt(say=self.processes.is_main) as requests:
             while self.iteration < total:
-                over = time.perf_counter() - begin > seconds
-                if self._agreed(bool(requests) or over):
+                if self._agreed(bool(requests) or self.elapsed >= seconds):
                     break
-                share_of_time = (earlier + time.perf_counter() - begin) / (earlier + seconds)
-                self._follow_schedule(max(self.iteration / total, share_of_time))
+                self._follow_schedule(max(self.iteration / total, self.elapsed / seconds))
                 obs = self._iterate(obs, log)
                 if self.iteration % self.config.save_interval == 0:
                     self.save_checkpoint()

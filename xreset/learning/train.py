@@ -45,6 +45,7 @@ from xreset.learning.run import (
     flat,
     latest_checkpoint,
     read_run,
+    training_left,
     write_run,
 )
 from xreset.learning.runner import TrainingRunner
@@ -100,7 +101,7 @@ def train(
         device: cpu or cuda; default: cuda if there is a GPU that the engine can use.
         num_envs: number of worlds, in each process.
         iterations: number of iterations; default: as configured.
-        minutes: most time to train now; the same call continues the run.
+        minutes: most time of the whole training, without compiling kernels; a run that continues has the rest of it.
         seed: seed of every random number.
         weights: another run's folder, whose networks are the start; default: new networks.
         teacher: policy whose actions the new one learns instead of learning from rewards; see :func:`distill`.
@@ -126,7 +127,10 @@ def train(
         _, config = default_config(goals, weights)
     if iterations is not None:
         config = replace(config, iterations=iterations)
-    device = device or device_for(engine, "cuda" if torch.cuda.is_available() else "cpu")
+    present = read_run(out) if checkpoints(out) else None
+    if device is None:
+        here = device_for(engine, "cuda" if torch.cuda.is_available() else "cpu")
+        device = here if present is None else present.device
     if num_envs < 1:
         raise RunError(f"num_envs is {num_envs}, expected at least 1.")
     _check_minutes(minutes)
@@ -163,10 +167,10 @@ def train(
         weights_hash=file_hash(start) if start else None,
         teacher=str(teacher) if teacher else None,
     )
-    if checkpoints(out):
+    if present is not None:
         if not isinstance(data, str | Path):
             info = replace(info, resets_hash=_hash_of(data))
-        _refuse_another_training(out, info, teacher_policy)
+        _refuse_another_training(out, present, info, teacher_policy)
         own = config.task.reward.own
         return resume(out, iterations=config.iterations, minutes=minutes, own=own, wandb=wandb)
     with _new_run(out):
@@ -198,9 +202,10 @@ def _hash_of(data: ResetBank | GoalSet) -> str:
         return file_hash(path)
 
 
-def _refuse_another_training(out: Path, wanted: RunInfo, teacher: OnnxPolicy | None) -> None:
-    """Refuse to continue the run in a folder as a training that it is not. The number of iterations may differ."""
-    present = read_run(out)
+def _refuse_another_training(
+    out: Path, present: RunInfo, wanted: RunInfo, teacher: OnnxPolicy | None
+) -> None:
+    """Refuse to continue the run in a folder as a training that it is not. Its length may differ."""
     before = _identity(present, file_hash(out / TEACHER) if present.teacher else None)
     now = _identity(wanted, teacher.hash if teacher else None)
     for name, value in before.items():
@@ -214,7 +219,7 @@ def _refuse_another_training(out: Path, wanted: RunInfo, teacher: OnnxPolicy | N
 def _identity(info: RunInfo, teacher: str | None) -> dict[str, Any]:
     """Return what makes a training the same one, by name; ``teacher`` is the hash of its teacher's policy."""
     config = dict(flat(asdict(info.config)))
-    del config["iterations"]
+    del config["iterations"], config["save_interval"]
     return {
         "robot": str(Path(info.robot).resolve()),
         "hash of the reset bank": info.resets_hash,
@@ -241,7 +246,7 @@ def resume(
     Args:
         out: the run's folder.
         iterations: number of iterations in all; default: as the run was started.
-        minutes: most time to train now.
+        minutes: most time of the whole training, as for :func:`train`.
         own: the user's own reward terms with which the run was started: name -> parameters. They name code to import,
             which a file must not decide.
         wandb: as for :func:`train`.
@@ -264,6 +269,14 @@ def resume(
         )
     if iterations is not None:
         info = replace(info, config=replace(info.config, iterations=iterations))
+    if checkpoints(out) and not training_left(out, info.config.iterations, minutes):
+        print(
+            f"{out} is trained. To prolong the training, give more --iterations (or --minutes).",
+            flush=True,
+        )
+        with _claimed(out):
+            _export(out)
+        return out
     inputs = load_inputs(
         info.resets, robot=info.robot, meshes=info.meshes, accept=("bank", "goals")
     )
@@ -518,12 +531,18 @@ def _train(
         if processes.is_main:
             _write_start(out, info, runner.iteration, is_new=newest is None, resumed=resumed)
         stopped_by = runner.learn(info.config.iterations, seconds=60 * minutes)
-    if processes.is_main:
-        policy = out / "policy.onnx"
-        export_checkpoint(latest_checkpoint(out), policy)
-        print(f"policy after {runner.iteration} iterations in {policy}", flush=True)
+    _export(out)
     if stopped_by is not None:
         raise Stopped(stopped_by)
+
+
+def _export(out: Path) -> None:
+    """Export the policy of the newest checkpoint, in the main process."""
+    if Processes.of_environment().is_main:
+        newest = latest_checkpoint(out)
+        policy = out / "policy.onnx"
+        export_checkpoint(newest, policy)
+        print(f"policy after {int(newest.stem)} iterations in {policy}", flush=True)
 
 
 def _write_start(out: Path, info: RunInfo, iteration: int, *, is_new: bool, resumed: bool) -> None:
@@ -533,15 +552,10 @@ def _write_start(out: Path, info: RunInfo, iteration: int, *, is_new: bool, resu
     if is_new and (out / "run.json").is_file():
         for events in out.glob("events.out.tfevents.*"):
             events.unlink()
-    is_over = iteration >= info.config.iterations
     stated = read_run(out, as_stated=True) if resumed else info
-    if not is_over:  # a number that has passed already must not shorten the run
-        stated = replace(stated, config=info.config)
-    write_run(out, stated)
+    write_run(out, replace(stated, config=info.config))
     if resumed:
         done = f"continuing after iteration {iteration}"
         if is_new:
             done = "there is no checkpoint yet: starting from the beginning"
-        elif is_over:
-            done += ", the last one: --iterations asks for more"
         print(done, flush=True)

@@ -86,7 +86,6 @@ def deploy_contract(
         "base_pos": list(robot.base_pos),
         "base_quat": list(robot.base_quat),
         "control_dt": task.control_dt,
-        "rate": 1.0 / task.control_dt,
         "frames": FRAMES,
         "values": MEANINGS,
         "joints": _joints(robot, task),

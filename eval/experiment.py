@@ -74,10 +74,10 @@ def evaluate(
         each episode.
 
     Raises:
-        PolicyError: the policy is unknown, or the seed chose this checkpoint.
+        PolicyError: the policy is unknown.
         XResetError: another process is writing the folder, or a number is out of range.
     """
-    spec = _checked(policy, robot, seed, episodes)
+    spec = load_policy(policy, robot=robot, seed=seed)
     chosen_ones = chosen_engines(engines, device)
     trial = load_trial(
         spec,
@@ -148,12 +148,12 @@ def stress(
         :mod:`xreset.eval.effects` compares them.
 
     Raises:
-        PolicyError: the seed chose this checkpoint, or a baseline shall have faults.
+        PolicyError: the policy is unknown, or a baseline shall have faults.
         XResetError: a property is unknown or cannot have a value; nothing was played then.
     """
     wanted = chosen(properties, FAULTS if faults else SWEPT)
     on_robot = faults or any(prop.is_fault for prop in wanted)
-    spec = _checked(policy, robot, seed, episodes)
+    spec = load_policy(policy, robot=robot, seed=seed)
     if on_robot:
         spec.exported()  # refuses a baseline
     if demos is None:
@@ -199,17 +199,6 @@ def stress(
     return found
 
 
-def _checked(
-    policy: str | Path | PolicySpec, robot: str | Path | None, seed: int, episodes: int
-) -> PolicySpec:
-    """Return the policy, if it may play starts of the seed and the number of episodes is possible."""
-    if episodes < 1:
-        raise XResetError(f"episodes is {episodes}, expected at least 1.")
-    spec = load_policy(policy, robot=robot, seed=seed)
-    spec.check_seed(seed)
-    return spec
-
-
 def can_set(engine: Engine, prop: Property) -> bool:
     """Return whether an engine can set a property."""
     return prop.needs is None or prop.needs in backend_class(engine.name).capabilities
@@ -228,7 +217,7 @@ def play(
     """Play every demonstration under every condition in one engine.
 
     Args:
-        policy: the policy; its seed is not checked.
+        policy: the policy.
         trial: what is played; conditions replace its task.
         engine: the engine.
         conditions: the first one is recorded.

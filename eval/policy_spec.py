@@ -18,7 +18,7 @@ from xreset.files.checks import Checked, Seed, frozen, obeys_rules
 from xreset.files.text import Brief, shown
 from xreset.geometry.description import load_robot
 from xreset.learning.exported import read_policy
-from xreset.learning.run import read_choice, read_run
+from xreset.learning.run import read_run
 from xreset.live.deploy import deployed_graph, is_deployed, task_of
 from xreset.live.engine import GraphPolicy
 from xreset.objects.catalogue import object_names
@@ -60,8 +60,6 @@ class PolicySpec(Brief, Checked):
     """SHA-256 of the policy's file; None: a baseline."""
     content: bytes | None = None
     """Content of the exported policy's file; None: a baseline."""
-    selection_seed: int | None = None
-    """Seed of the starts that chose this checkpoint (``xreset select``); None: it was not chosen."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.folder, str | Path):
@@ -167,17 +165,6 @@ class PolicySpec(Brief, Checked):
             return content
         return deployed_graph(content, self.robot, self.task, objects)
 
-    def check_seed(self, seed: int) -> None:
-        """Refuse the seed whose starts chose this checkpoint, because a result on them is biased.
-
-        Raises:
-            PolicyError: ``xreset select`` used the seed.
-        """
-        if self.selection_seed is not None and seed == self.selection_seed:
-            raise PolicyError(
-                f"Seed {seed} chose this checkpoint (xreset select). Use another seed."
-            )
-
 
 def load_policy(
     policy: str | Path | PolicySpec, *, robot: str | Path | None = None, seed: Seed = 0
@@ -185,15 +172,15 @@ def load_policy(
     """Load the policy that a name means. A file or folder comes before a shipped policy of the same name.
 
     Args:
-        policy: run folder, exported or deployed policy (.onnx), folder of a deployed one (``docs/live.md``), name of a
-            policy that ships with xreset, or one of :data:`BASELINES`. A loaded policy is returned as it is; ``robot``
-            must be its own then.
+        policy: run folder, one of its checkpoints (.pt), exported or deployed policy (.onnx), folder of a deployed one
+            (``docs/live.md``), name of a policy that ships with xreset, or one of :data:`BASELINES`. A loaded policy is
+            returned as it is; ``robot`` must be its own then.
         robot: name or folder of the robot; default: the policy's own. Baselines need it.
         seed: seed of the baseline ``random``.
 
     Raises:
         PolicyError: the policy is unknown, or does not fit the robot.
-        FileFormatError: ``run.json`` or ``choice.json`` next to it is damaged.
+        FileFormatError: ``run.json`` next to it is damaged.
     """
     if isinstance(policy, PolicySpec):
         if robot is not None and load_robot(robot).fingerprint != policy.robot.fingerprint:
@@ -215,23 +202,27 @@ def load_policy(
         policy = path
     if path.suffix == ".onnx" and path.is_file() and is_deployed(path.read_bytes()):
         return _deployed(path, robot)
-    run = read_run(path) if os.path.isdir(path) else None
+    run = None
+    if os.path.isdir(path):
+        run = read_run(path)
+    elif path.suffix == ".pt" and path.is_file():
+        run = read_run(path.parent.parent)
     loaded = read_policy(policy, also=BASELINES)
     file = loaded.path
     folder = file.parent
     if run is not None:
         name = path.name
         robot = robot or run.robot
+        if file == path:
+            name = f"{path.parent.parent.name}-{path.stem}"
+            folder = path.with_suffix("")
     elif file == path:
         name = path.stem
     else:
         folder = results_folder(name)
-    choice = read_choice(folder)
     contract = loaded.contract
     spec = load_robot(robot or contract.robot)
     check_contract(str(file), contract, spec, contract.task)
-
-    is_chosen = choice is not None and choice.policy_hash == loaded.hash
     return PolicySpec(
         name=name,
         start=lambda motion: loaded.another(),
@@ -242,7 +233,6 @@ def load_policy(
         objects=contract.objects,
         hash=loaded.hash,
         content=loaded.content,
-        selection_seed=choice.seed if is_chosen else None,
     )
 
 

@@ -507,7 +507,7 @@ class Commands(InFolder):
         out = succeeds(*synth)
         first = file.read_bytes()
         self.assertEqual(read_demos(file).hand_side.tolist(), ["right", "left"])
-        info = succeeds("demos", "info", file)
+        info = succeeds("demos", "select", file)
         self.assertIn(info, out)
         self.assertRegex(info, r"005_tomato_soup_can\W+1\W+1\W+\d+\W+100%")
         succeeds(*synth)

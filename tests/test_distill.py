@@ -128,17 +128,6 @@ class DistillTest(WithBank):
             steps.append(max(int(state["step"]) for state in states))
         self.assertEqual(20 * steps[0], 15 * steps[1], "the optimizer went on")
 
-    def test_the_lift_clock_starts_when_the_student_acts_alone(self):
-        clocked = []
-
-        def note(lift, _share, *, iteration, **_now):
-            clocked.append(iteration)
-            return lift
-
-        with quickly(), patch("xreset.learning.clock.Lift.after", note):
-            self.distill("clock")  # the teacher acts in the first of two iterations
-        self.assertEqual(clocked, [2])
-
     def test_students_see_points_and_the_goal_by_default(self):
         with patch("xreset.learning.train.train") as train:
             distill("many-objects", self.bank, out=self.folder / "unused")

@@ -128,7 +128,7 @@ class Wrong(InFolder):
         self.assertFalse(out.exists())
         for said in (
             succeeds(*take, *given, "--trust-recordings"),
-            succeeds("demos", "info", out, *given),
+            succeeds("demos", "select", out, *given),
             succeeds("view", out, "--png", self.folder / "a.png"),
             refused("retarget", out, "--robot", "ur7e-sharpa", "--out", self.folder / "r.npz"),
         ):

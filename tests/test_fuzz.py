@@ -77,7 +77,7 @@ class CommandLines(TestCase):
             ("engines", "page", "--from", "x" * 5000),
             ("demos", "select", "demos.npz", "--mirror", "--out", "null.npz"),
             ("demos", "select", "demos.npz", "--out", "null.npz"),
-            ("demos", "info", "\udcff\n.npz"),
+            ("demos", "select", "\udcff\n.npz"),
         ):
             with self.subTest(line[:4]):
                 self.assertEqual(outcome_of_command(list(line)), "refused")

@@ -72,20 +72,33 @@ class LiftTest(InFolder):
         self.assertEqual(read_lift(self.folder).iteration, 4)
 
 
+LOG = {
+    "task/success_from_home": torch.tensor(0.5),
+    "task/grasped": torch.ones(()),
+    "task/success": torch.ones(()),
+}
+
+
 class CurvesTest(InFolder):
+    def test_while_a_teacher_acts_success_is_not_the_students(self):
+        curves = TrainingLog(self.folder, 2, "cpu", 5)
+        for iteration, share in ((1, 0.5), (2, 0.0)):
+            curves.add(torch.ones(2), torch.zeros(2), LOG)
+            numbers = {"speed/env_steps_per_second": 2.0, "policy/teacher_share": share}
+            curves.write(iteration, 10, 60.0, numbers)
+            found = (curves.lift.iteration, curves.lift.minutes, curves.lift.success_from_home)
+            self.assertEqual(found, (iteration, 1.0, 0.0 if share else 0.5))
+            self.assertEqual({p.iteration for p in curves.lift.passed}, set() if share else {2})
+        curves.close()
+
     def test_curves_are_sent_only_if_a_project_is_named(self):
         online = mock.Mock()
-        log = {
-            "task/success_from_home": torch.tensor(0.5),
-            "task/grasped": torch.ones(()),
-            "task/success": torch.ones(()),
-        }
         folder = self.folder
         with mock.patch.dict("sys.modules", {"wandb": online}):
             for project in (None, "project"):
                 write_json(f"{folder}/run.json", {"a": 1})
                 curves = TrainingLog(folder, 2, "cpu", 5, project)
-                curves.add(torch.ones(2), torch.zeros(2), log)
+                curves.add(torch.ones(2), torch.zeros(2), LOG)
                 curves.write(3, 10, 1.0, {"speed/env_steps_per_second": 2.0})
                 self.assertEqual(len(read_lift(folder).passed), 3, "a passing is on disk at once")
                 curves.close()

@@ -17,10 +17,8 @@ from tests.command import refused, succeeds
 from tests.data import InOneFolder
 from tests.toy_bank import SOUP
 from tests.toy_policy import write_policy
-from tests.toy_results import toy_choice
 from xreset import load_policy, robots, synthesize, write_demos
 from xreset.errors import PolicyError
-from xreset.learning.run import write_choice
 from xreset.policy import shipped
 from xreset.policy.onnx_policy import OnnxPolicy, observation_shapes, policy_contract
 from xreset.task.config import ObservationConfig, TaskConfig, TerminationConfig
@@ -150,14 +148,6 @@ class ShippedTest(WithPolicy):
         )
         self.assertEqual(subject.task, TASK)
         self.assertEqual(subject.hash, load_policy(self.file).hash)
-
-    def test_a_policy_knows_the_seed_that_chose_it(self):
-        own_hash = load_policy("skilled").hash
-        folder = Path("runs/skilled")
-        folder.mkdir(parents=True)
-        for policy_hash, seed in ((own_hash, 7), ("another", None)):
-            write_choice(folder, toy_choice(policy_hash=policy_hash))
-            self.assertEqual(load_policy("skilled").selection_seed, seed)
 
     def test_the_list_shows_the_cards(self):
         self.assertIn("the card of skilled.onnx", refused("policies", "list"))

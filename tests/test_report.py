@@ -18,7 +18,6 @@ from tests.toy_results import (
     InFolder,
     rollouts_with,
     swept,
-    toy_choice,
     toy_result,
     toy_rollouts,
 )
@@ -44,7 +43,6 @@ from xreset.eval.table import table_text
 from xreset.files.storage import claim_folder
 from xreset.geometry.shapes import pose_matrix
 from xreset.learning.clock import Lift, Passing, write_lift
-from xreset.learning.run import write_choice
 
 VOID = {"meta", "br", "link", "img", "input", "hr"}
 
@@ -212,7 +210,7 @@ class CollectTest(Reported):
             words = f"not comparable: not the same {what} .*: soup in mujoco; .*: soup in sapien"
             self.assertRegex(note, words)
 
-    def test_the_page_has_tolerances_and_the_choice_of_the_checkpoint(self):
+    def test_the_page_has_what_it_tolerates(self):
         policy = {"policy": "ab12"}
         self.write(inputs=policy)
         sweep = {("force-gain", 2.0): [0.2, 0.2, 1.0, 1.0]}
@@ -223,8 +221,6 @@ class CollectTest(Reported):
             write_result(self.folder / name, found, (), ())
         # cards of 0.1 to 0.3 had no episodes
         (self.folder / "stress" / "sapien.json").write_text('{"schema": "xreset-stress/1"}')
-        choice = toy_choice()
-        write_choice(self.folder, choice)
         html = page(self.collect())
         text = Outline(html).text
         for words in (
@@ -235,14 +231,12 @@ class CollectTest(Reported):
             "The pose is old.",
             "not tried on hardware",
             "sapien.json is of an earlier version, without episodes",
-            choice.sentence(),
         ):
             self.assertIn(words, text)
         self.assertEqual(html.count("<svg"), 2)
-        write_choice(self.folder, replace(choice, policy_hash="another"))
         self.write(inputs={"policy": "retrained"})
         (training,) = self.read()
-        self.assertEqual((training.choice, training.sweeps), (None, ()))
+        self.assertEqual(training.sweeps, ())
 
 
 class ClipTest(Reported):

@@ -11,7 +11,7 @@ from tests.toy_bank import SOUP, SPAM
 from xreset import TrainConfig
 from xreset.eval.metrics import Episode
 from xreset.eval.results import EvalResult, Rollouts, Trace, episode_table, write_result
-from xreset.learning.run import Candidate, Choice, RunInfo, write_run
+from xreset.learning.run import RunInfo, write_run
 from xreset.task.config import TaskConfig
 from xreset.task.contract import Contract
 
@@ -128,15 +128,6 @@ def swept(base, sweep, engine="mujoco", **changes):
     rollouts = Rollouts(episodes=episodes(base), traces=(), control_steps_per_second=1.0)
     own = {condition: episodes(scores) for condition, scores in sweep.items()}
     return toy_result(engine, rollouts, own, **changes)
-
-
-def toy_choice(**changes):
-    """Return the choice of the older of two checkpoints; ``changes`` replace its fields."""
-    fields = {"chosen": "1.pt", "policy_hash": "ab12", "engines": {"mujoco": "4"}, "seed": 7}
-    fields |= {"episodes_per_demo": 2, "demos": "cd"}
-    scores = {"2.pt": 0.5, "1.pt": 0.7}
-    tried = [Candidate(name=n, task_progress={"mujoco": x}) for n, x in scores.items()]
-    return Choice(**({"candidates": tuple(tried)} | fields | changes))
 
 
 class InFolder(data.InFolder):

@@ -116,9 +116,8 @@ def attribute(
         progress: called with (name of the engine, conditions done, conditions in all).
 
     Raises:
-        XResetError: a property is unknown, an engine cannot be measured, or the seed chose this checkpoint.
+        XResetError: a property is unknown, or an engine cannot be measured.
     """
-    policy.check_seed(trial.seed)
     if unknown := sorted(set(only) - set(COMPARED)):
         raise XResetError(
             f"Unknown property {', '.join(unknown)}. Choose from: {', '.join(COMPARED)}."

@@ -31,7 +31,7 @@ from xreset.files.text import Brief, short_name, shown
 from xreset.geometry.description import load_robot
 from xreset.learning.clock import Lift, read_lift
 from xreset.learning.run import SCHEMA as RUN_SCHEMA
-from xreset.learning.run import TEACHER, Choice, RunInfo, flat, read_choice, read_run
+from xreset.learning.run import TEACHER, RunInfo, flat, read_run
 from xreset.policy.shipped import run_folder
 from xreset.spec import RobotSpec
 
@@ -58,8 +58,6 @@ class Training(Brief):
     """When the training first succeeded from home; empty for runs that have no clock."""
     run: RunInfo | None = None
     """The training's configuration; None for baselines, and where this version cannot read ``run.json``."""
-    choice: Choice | None = None
-    """How the evaluated policy was chosen among the run's checkpoints."""
     sweeps: tuple[Evaluation, ...] = ()
     """Results of ``xreset stress`` of the same policy."""
     notes: tuple[str, ...] = ()
@@ -294,22 +292,16 @@ def _with_run(training: Training) -> Training:
         except FileFormatError as error:
             # results are shown even if an older configuration is unreadable
             notes.append(f"The training is not described here: {error}")
-    choice = None
     sweeps = []
     if training.results:
         policies = {result.inputs.get("policy") for result in training.results.values()}
         own = training.results_folder.parent
-        choice = read_choice(own)
-        if choice is not None and choice.policy_hash not in policies:
-            choice = None
         places = [training.results_folder, own / "stress", own / "faults"]
         for place in {place.resolve(): place for place in places}.values():
             if sweep := _sweep(place, policies, notes):
                 sweeps.append(sweep)
         notes += _about_teacher(training, run)
-    return replace(
-        training, facts=facts, run=run, choice=choice, sweeps=tuple(sweeps), notes=tuple(notes)
-    )
+    return replace(training, facts=facts, run=run, sweeps=tuple(sweeps), notes=tuple(notes))
 
 
 def _sweep(folder: Path, policies: set[str | None], notes: list[str]) -> Evaluation:

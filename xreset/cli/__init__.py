@@ -20,7 +20,7 @@ from typing import NoReturn
 
 COMMANDS = {
     "run": "Take demonstrations to a trained, evaluated policy: all steps with one command.",
-    "demos": "Import, synthesize, select and describe human demonstrations.",
+    "demos": "Import, synthesize, describe and select human demonstrations.",
     "objects": "Import meshes, and make random shapes.",
     "robots": "Check, import, place and judge robots.",
     "engines": "Check and compare physics engines, and trace where they diverge.",
@@ -33,7 +33,6 @@ COMMANDS = {
     "policies": "List the policies that ship with xreset.",
     "eval": "Evaluate a policy or a baseline in one or several engines.",
     "stress": "Measure robustness: change stiffness, latency, friction or a robot's faults, one at a time.",
-    "select": "Choose the checkpoint that is best in its worst engine.",
     "study": "Run a study: trainings by object and seed, evaluations, and tables next to the paper's.",
     "export": "Write a policy for a robot, or recorded episodes as a LeRobot data set or as plain arrays.",
     "report": "Make an HTML page of a run, or of several side by side.",
@@ -102,27 +101,37 @@ _RENAMED = {
 }
 """Flag of earlier versions -> its present name."""
 _MOVED = {
-    "rehearse": ["stress", "--faults"],
-    "compare": ["report"],
-    "distill": ["train", "--teacher"],
+    "rehearse": "stress --faults",
+    "compare": "report",
+    "distill": "train --teacher",
+    "demos info": "demos select",
+    "export lerobot": "export episodes",
+    "export npz": "export episodes",
 }
 """Command of earlier versions -> its present words."""
+_GONE = {
+    "select": "evaluate checkpoints, xreset eval RUN/checkpoints/NUMBER.pt, and compare them with xreset report",
+}
+"""Command of earlier versions -> what to do in place of it."""
 _NAME_OBJECTS = (["demos", "synth"], ["demos", "select"])
 """Commands whose ``--objects`` are names of objects, and always were."""
 
 
 def _with_present_flags(argv: list[str]) -> list[str]:
     """Return the arguments with the present names of commands and flags, and print what was renamed."""
-    if argv and argv[0] in _MOVED:
-        earlier = argv[0]
+    for count in (1, 2):
+        earlier = " ".join(argv[:count])
+        if earlier not in _MOVED:
+            continue
         present = _MOVED[earlier]
         print(
-            f"xreset: {earlier} is now {' '.join(present)}. The next release removes {earlier}.",
+            f"xreset: {earlier} is now {present}. The next release removes {earlier}.",
             file=sys.stderr,
         )
         if earlier == "distill" and argv[1:2] and argv[1].startswith("-"):
-            present = ["train"]  # continues a run, and names no teacher
-        argv = [*present, *argv[1:]]
+            present = "train"  # continues a run, and names no teacher
+        argv = [*present.split(), *argv[count:]]
+        break
     changed = dict(_RENAMED)
     if argv[:2] in _NAME_OBJECTS:
         del changed["--objects"]
@@ -168,6 +177,9 @@ def perform(argv: list[str]) -> None:
         return
     name = argv[0]
     arguments = argv[1:]
+    if name in _GONE:
+        print(f"xreset: {name} is gone: {_GONE[name]}.", file=sys.stderr)
+        raise SystemExit(2)
     if name not in COMMANDS:
         print(f"xreset: Unknown command {name!r}.\n\n{_usage()}", file=sys.stderr)
         raise SystemExit(2)

@@ -38,7 +38,10 @@ Flat = Annotated[_T, arg(name="")]
 
 # Options that several commands share, with their help -----------------------------------------------------------------
 
-_POLICY = "Run folder, exported policy (.onnx), or name of a policy that ships with xreset (xreset policies)"
+_POLICY = (
+    "Run folder, one of its checkpoints (.pt), exported policy (.onnx), or name of a policy that ships with xreset "
+    "(xreset policies)"
+)
 Policy = Annotated[Name, arg(help=f"{_POLICY}.")]
 PolicyOrBaseline = Annotated[
     Name, arg(help=f"{_POLICY}; or a baseline: zero, random, ik (open-loop kinematic retargeting).")

@@ -1,4 +1,4 @@
-"""``xreset demos``: import, synth, select, info."""
+"""``xreset demos``: import, synth, select."""
 
 from __future__ import annotations
 
@@ -182,27 +182,30 @@ class Selection(Options):
 def select(
     files: Sources,
     *,
-    out: Output,
+    out: Output | None = None,
     rest: Output | None = None,
     selection: Flat[Selection] = Selection(),
     mirror: bool = False,
     meshes: Meshes = None,
 ) -> None:
-    """Take sequences out of one or several archives, which have the same frame rate; without conditions, all of them.
+    """Describe archives of demonstrations, object by object, and take sequences out of them.
+
+    Implausible sequences are listed. Without conditions, all sequences are taken; archives have the same frame rate.
 
     Args:
         files: Archives of demonstrations, whose sequences have different names.
-        out: Archive to write.
+        out: Archive to write; default: nothing is written.
         rest: Archive to write: the sequences that do not meet the conditions, such as those of a test.
         selection: Conditions.
         mirror: Take left hands only, and mirror them, so that a right-handed robot can train on them. Objects that are
             not their own mirror image are listed and left out.
-        meshes: Folder of real meshes, whose symmetry --mirror needs; default: the built-in stand-ins.
+        meshes: Folder of real meshes, to examine the recordings with, and whose symmetry --mirror needs; default: the
+            built-in stand-ins.
     """
-    from xreset.demos.archive import merge_demos
+    from xreset.demos.archive import merge_demos, read_demos
 
     inputs = {f"demos {i}": file for i, file in enumerate(files)}
-    demos = merge_demos([*map(_read, files)])
+    demos = merge_demos([*map(read_demos, files)])
     if rest is None:
         kept = demos.select(**selection.conditions())
     else:
@@ -210,7 +213,7 @@ def select(
         _save(others, rest, {"select_others": asdict(selection)}, **inputs)
     if mirror:
         kept = _mirrored(kept.select(sides=["left"]), meshes)
-    _save(kept, out, {"select": asdict(selection), "mirrored": mirror}, **inputs)
+    _save(kept, out, {"select": asdict(selection), "mirrored": mirror}, meshes, **inputs)
 
 
 def _mirrored(demos: Demos, meshes: Path | None) -> Demos:
@@ -225,38 +228,21 @@ def _mirrored(demos: Demos, meshes: Path | None) -> Demos:
     return mirrored(demos, symmetries)
 
 
-def describe(file: Source, *, meshes: Path | None = None) -> None:
-    """Describe an archive of demonstrations, object by object, and warn of implausible sequences.
-
-    Args:
-        file: The archive.
-        meshes: Folder of the objects' meshes, to examine the recordings with.
-    """
-    _print_summary(_read(file), file, meshes)
-
-
-def _read(file: Path) -> Demos:
-    from xreset.demos.archive import read_demos
-
-    return read_demos(file)
-
-
 def _save(
-    made: Demos, out: Path, config: dict[str, Any], meshes: Path | None = None, **inputs: Path
+    demos: Demos,
+    out: Path | None,
+    config: dict[str, Any],
+    meshes: Path | None = None,
+    **inputs: Path,
 ) -> None:
-    """Write demonstrations and print their summary; meshes: what to examine them with; inputs: the files that they
-    were made from, by kind."""
-    from xreset.demos.archive import write_demos
-
-    write_demos(
-        out, made, config=config, inputs={name: file_hash(path) for name, path in inputs.items()}
-    )
-    _print_summary(made, out, meshes)
-
-
-def _print_summary(demos: Demos, path: Path, meshes: Path | None) -> None:
-    from xreset.demos.archive import start_to_goal
+    """Write demonstrations, if there is a file for them, and print their summary; meshes: what to examine them with;
+    inputs: the files that they were made from, by kind."""
+    from xreset.demos.archive import start_to_goal, write_demos
     from xreset.demos.examine import examine, surfaces_of
+
+    if out is not None:
+        hashes = {name: file_hash(path) for name, path in inputs.items()}
+        write_demos(out, demos, config=config, inputs=hashes)
 
     table = [("object", "right", "left", "frames", "hand", "lift, cm", "goal, cm", "goal, deg")]
     for name in demos.object_names:
@@ -281,8 +267,9 @@ def _print_summary(demos: Demos, path: Path, meshes: Path | None) -> None:
         table,
         caption="right, left: sequences. hand: frames with a hand. lift, goal: medians, from the start",
     )
+    what = out or ", ".join(map(str, inputs.values()))
     console.print(
-        f"{path}: {demos.num_sequences} sequences, {demos.num_frames} frames at {demos.fps:g} per second"
+        f"{what}: {demos.num_sequences} sequences, {demos.num_frames} frames at {demos.fps:g} per second"
     )
     show_notes(map(str, examine(demos, surfaces_of(demos, meshes))))
 
@@ -292,5 +279,4 @@ COMMAND = {
     "import keypoints": import_keypoints,
     "synth": synth,
     "select": select,
-    "info": describe,
 }

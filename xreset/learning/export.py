@@ -56,8 +56,7 @@ def exported(
 def export_checkpoint(checkpoint: str | Path, policy: str | Path) -> None:
     """Write the policy of one checkpoint of a training as an ONNX file.
 
-    :func:`~xreset.eval.policy_spec.load_policy` with a run folder takes the newest one, or the one that
-    ``xreset select`` chose.
+    :func:`~xreset.eval.policy_spec.load_policy` takes a checkpoint as well, and the newest one of a run folder.
 
     Args:
         checkpoint: file ``RUN/checkpoints/NUMBER.pt`` in the training's run folder.

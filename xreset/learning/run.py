@@ -4,7 +4,6 @@ RUN/run.json                 everything that the training was started with
 RUN/checkpoints/000050.pt    model, optimizer and counters after 50 iterations
 RUN/policy.onnx              the policy, with its contract
 RUN/teacher.onnx             the policy that a distillation learned from
-RUN/choice.json              the checkpoint whose policy this is, if ``xreset select`` chose one
 RUN/events.out.tfevents.*    TensorBoard
 RUN/eval/, RUN/report/       made by ``xreset eval`` and ``xreset report``
 """
@@ -16,11 +15,11 @@ import os
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
-from xreset.errors import RunError, WrongValueError
-from xreset.files.checks import Checked, NonNegativeInt, PositiveInt, Rule, Share, from_dict, frozen
-from xreset.files.storage import read_json, read_typed, write_json
+from xreset.errors import RunError
+from xreset.files.checks import Checked, NonNegativeInt, PositiveInt, from_dict, frozen
+from xreset.files.storage import read_json, write_json
 from xreset.files.text import shown
 from xreset.learning.clock import Lift, read_lift
 from xreset.learning.config import TrainConfig
@@ -148,81 +147,3 @@ def training_left(folder: Path, iterations: int, minutes: float = math.inf) -> s
         return "not begun"
     left = f"{iteration} of {iterations} iterations"
     return left if minutes == math.inf else f"{left}, {done.minutes:.1f} of {minutes:g} minutes"
-
-
-# The checkpoint that ``xreset select`` chose --------------------------------------------------------------------------
-
-CHOICE_FILE = "choice.json"
-CHOICE_SCHEMA = "xreset-choice/1"
-
-
-@frozen
-class Candidate(Checked):
-    """One checkpoint."""
-
-    name: str
-    """File name of the checkpoint or policy."""
-    task_progress: Annotated[dict[str, Share], Rule("an engine at least", bool)]
-    """Engine -> mean over the episodes. Engines are missing once the candidate could no longer be chosen."""
-
-    @property
-    def worst(self) -> float:
-        """Task progress in the worst engine."""
-        return min(self.task_progress.values())
-
-
-@frozen
-class Choice(Checked):
-    """The candidates that were played, and the one that is best in its worst engine."""
-
-    chosen: str
-    """Name of the candidate."""
-    policy_hash: str
-    """SHA-256 of the chosen candidate as an ONNX file."""
-    candidates: tuple[Candidate, ...]
-    """The newest first."""
-    engines: dict[str, str]
-    """Name -> version."""
-    seed: NonNegativeInt
-    """Seed of the starts that were played; results with another seed are of other starts."""
-    episodes_per_demo: PositiveInt
-    demos: str
-    """SHA-256 of the demonstrations."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.chosen not in [c.name for c in self.candidates]:
-            raise WrongValueError(f"chosen is {self.chosen!r}, expected one of the candidates")
-
-    @property
-    def candidate(self) -> Candidate:
-        """The chosen candidate."""
-        return next(c for c in self.candidates if c.name == self.chosen)
-
-    def sentence(self) -> str:
-        """Return what was chosen and why, in one line."""
-        newest = self.candidates[0]
-        own = self.candidate
-        engine = min(own.task_progress, key=own.task_progress.__getitem__)
-        against = f"the newest, {newest.name}, has {100 * newest.worst:.1f} %"
-        if newest is own:
-            against = "it is the newest"
-        return (
-            f"{self.chosen}, {100 * own.worst:.1f} % in its worst engine ({engine}), of {len(self.candidates)} "
-            f"checkpoints in {len(self.engines)} engines; {against}."
-        )
-
-
-def write_choice(folder: Path, choice: Choice) -> None:
-    """Write a run's ``choice.json``."""
-    write_json(folder / CHOICE_FILE, {"schema": CHOICE_SCHEMA} | asdict(choice))
-
-
-def read_choice(folder: Path) -> Choice | None:
-    """Return the choice that was made in a folder, or None.
-
-    Raises:
-        FileFormatError: the file is damaged, or of another version.
-    """
-    path = folder / CHOICE_FILE
-    return read_typed(Choice, path, CHOICE_SCHEMA) if path.is_file() else None

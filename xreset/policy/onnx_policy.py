@@ -318,9 +318,8 @@ def _why_unreadable(path: Path, error: Exception) -> str:
     run = path.parent.parent
     named = f" ({run})" if (run / "run.json").is_file() else ""
     return (
-        f"{path} is a training checkpoint, expected {expected}. Give the checkpoint's run folder{named}: "
-        "its policy is exported from its newest checkpoint, or from the one that xreset select chose. "
-        "xreset.export_checkpoint exports any other one."
+        f"{path} is a training checkpoint, expected {expected}. Give the checkpoint's run folder{named}, or export it "
+        "with xreset.export_checkpoint."
     )
 
 

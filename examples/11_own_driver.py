@@ -10,7 +10,7 @@ import numpy as np
 
 
 def main(folder: Path, recording: Path, episode: int = 0) -> None:
-    """Run a policy on an episode of `xreset export npz`; print how far its targets are from the recorded ones."""
+    """Run a policy on an episode of `xreset export episodes`; print how far its targets are from the recorded ones."""
     sys.path.insert(0, str(folder))
     import runtime
 

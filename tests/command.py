@@ -1,7 +1,10 @@
 """The command line in a test."""
 
 import contextlib
+import functools
+import inspect
 import io
+from unittest.mock import patch
 
 from rich.console import Console
 
@@ -33,6 +36,23 @@ def refused(*arguments):
     code, out, err = xreset(*arguments)
     assert code == 1, f"exit status {code}: {err}"
     return out + err
+
+
+@contextlib.contextmanager
+def calls_of(module, name):
+    """Take the place of a function of the library, whose signature is that of a command, and yield the arguments of its
+    calls: dictionaries by name."""
+    original = getattr(module, name)
+    calls = []
+
+    @functools.wraps(original)
+    def record(*positional, **named):
+        bound = inspect.signature(original).bind(*positional, **named)
+        bound.apply_defaults()
+        calls.append(bound.arguments)
+
+    with patch.object(module, name, record):
+        yield calls
 
 
 def printed(table):

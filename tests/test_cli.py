@@ -12,7 +12,7 @@ from pathlib import Path
 from unittest import TestCase
 from unittest.mock import patch
 
-from tests.command import refused
+from tests.command import calls_of, refused
 from tests.command import xreset as run
 from tests.data import InFolder
 from xreset.cameras.config import WRIST
@@ -20,6 +20,7 @@ from xreset.cli import COMMANDS, _terminal
 from xreset.cli._options import checked
 from xreset.errors import XResetError
 from xreset.files.storage import claim_folder
+from xreset.learning import verbs
 
 HEAVY = {
     "torch",
@@ -176,19 +177,19 @@ class UsageTest(TestCase):
     def test_a_student_has_the_task_of_its_teacher_and_no_recipe(self):
         student = "train --teacher many-objects --out x --resets x.npz"
         for words, told in (
-            ("--recipe paper", "follows from its teacher. Omit --recipe"),
-            ("--weights x", "Omit --weights"),
+            ("--recipe paper", "follows from its teacher. Omit recipe"),
+            ("--weights x", "Omit weights"),
             ("--camera rear", "Unknown camera 'rear'"),
         ):
             self.assertIn(told, refused(*student.split(), *words.split()))
-        with patch("xreset.learning.train.distill") as started:
+        with calls_of(verbs, "train") as calls:
             for flag in ("--config.task.vision.width", "--vision.width"):
                 run(*student.split(), "--camera", "wrist", flag, "32")
-                vision = started.call_args.kwargs["config"].task.vision
+                vision = calls[-1]["config"].task.vision
                 self.assertEqual((vision.width, vision.cameras), (32, (WRIST,)))
-                self.assertEqual(started.call_args.kwargs["num_envs"], 1024)
             run("distill", *student.split()[2:])
-        self.assertEqual(started.call_args.args, ("many-objects", Path("x.npz")))
+        given = (calls[-1]["teacher"], calls[-1]["bank"])
+        self.assertEqual(given, (Path("many-objects"), Path("x.npz")))
 
     def test_a_wrong_value_of_a_verb_names_the_option_and_the_help(self):
         code, out, err = run(
@@ -287,17 +288,16 @@ class UsageTest(TestCase):
 
     def test_naming_engines_replaces_the_default(self):
         for given, expected in (
-            ((), ["mujoco"]),
-            (("sapien", "pybullet", "sapien"), ["sapien", "pybullet"]),
+            ((), "mujoco"),
+            (("sapien", "pybullet"), ("sapien", "pybullet")),
         ):
             argv = ["eval", "zero", "--robot", "openarm", "--demos", "x.npz"]
             for name in given:
                 argv += ["--engine", name]
-            with patch(
-                "xreset.eval.experiment.evaluate", side_effect=KeyboardInterrupt
-            ) as evaluate:
+            chosen = "xreset.eval.rollout.chosen_engines"
+            with patch(chosen, side_effect=KeyboardInterrupt) as engines:
                 self.assertEqual(run(*argv)[0], 130)
-            self.assertEqual(list(evaluate.call_args.args[2]), expected)
+            self.assertEqual(engines.call_args.args[0], expected)
 
 
 class OutputTest(InFolder):

@@ -12,7 +12,7 @@ import pandas as pd
 import torch
 
 from tests.toy_training import CONFIG, OPTIONS, WithBank, quickly
-from xreset import distill, make_backend, make_env, resume, train
+from xreset import make_backend, make_env, resume, train
 from xreset.cameras.config import FRONT, STUDENT_VISION, WRIST, VisionConfig
 from xreset.errors import PolicyError, XResetError
 from xreset.eval.report.fairness import missed_by_student
@@ -21,6 +21,7 @@ from xreset.learning.config import PpoConfig, TrainConfig
 from xreset.learning.recipes import student_config
 from xreset.learning.run import TEACHER, latest_checkpoint, read_run
 from xreset.learning.teacher import load_teacher
+from xreset.learning.train import config_of_student
 from xreset.objects.catalogue import load_objects
 from xreset.policy.onnx_policy import OnnxPolicy, check_contract
 from xreset.policy.shipped import shipped
@@ -65,7 +66,8 @@ class DistillTest(WithBank):
             config.ppo, horizon=8, sequence_length=4, minibatch_size=16, learning_rate=3e-3
         )
         config = replace(config, **({"model": SMALL, "ppo": ppo, "iterations": 2} | changes))
-        return distill(cls.teacher, cls.bank, out=cls.folder / name, config=config, **OPTIONS)
+        out = cls.folder / name
+        return train(cls.bank, teacher=cls.teacher, out=out, config=config, **OPTIONS)
 
     def env(self, vision):
         objects = load_objects(list(self.states.object_names), None)
@@ -129,15 +131,12 @@ class DistillTest(WithBank):
         self.assertEqual(20 * steps[0], 15 * steps[1], "the optimizer went on")
 
     def test_students_see_points_and_the_goal_by_default(self):
-        with patch("xreset.learning.train.train") as train:
-            distill("many-objects", self.bank, out=self.folder / "unused")
-        vision = train.call_args.kwargs["config"].task.vision
+        vision = config_of_student("many-objects").task.vision
         self.assertEqual((vision.view, vision.goal_image), ("points", True))
         self.assertEqual(vision.cameras, (FRONT,))
         for cameras in ("wrist", WRIST, ("wrist",)):
-            with patch("xreset.learning.train.train") as train:
-                distill("many-objects", self.bank, out=self.folder / "unused", cameras=cameras)
-            self.assertEqual(train.call_args.kwargs["config"].task.vision.cameras, (WRIST,))
+            vision = config_of_student("many-objects", cameras).task.vision
+            self.assertEqual(vision.cameras, (WRIST,))
 
     def test_refusals(self):
         away = replace(IMAGES, cameras=(replace(FRONT, target=(3.0, 0.2, 0.5)),))
@@ -150,11 +149,6 @@ class DistillTest(WithBank):
             ),
             (XResetError, "'front' is given twice. Give each", {"cameras": ("front", FRONT)}),
             (XResetError, "Unknown camera 3", {"cameras": (FRONT, 3)}),
-            (
-                XResetError,
-                "^vision.points is 128, expected at most 64, .* Give fewer points, or a larger width",
-                {"vision": replace(STUDENT_VISION, width=8, height=8)},
-            ),
             (PolicyError, "Unknown policy 'nobody'", {"teacher": "nobody"}),
             (
                 PolicyError,
@@ -163,8 +157,14 @@ class DistillTest(WithBank):
             ),
         ):
             with self.subTest(words), quickly(), self.assertRaisesRegex(error, words):
-                distill(**(two | options))
+                train(**(two | options))
             self.assertFalse((self.folder / "refused").exists(), words)
+        small = replace(STUDENT_VISION, width=8, height=8)
+        words = (
+            "^vision.points is 128, expected at most 64, .* Give fewer points, or a larger width"
+        )
+        with self.assertRaisesRegex(XResetError, words):
+            config_of_student(self.teacher, vision=small)
         with self.assertRaisesRegex(XResetError, r"no critic.* another run .--weights.*--resume"):
             train(
                 self.bank,
@@ -187,11 +187,11 @@ class DistillTest(WithBank):
     def test_a_student_is_resumed_as_it_was_started(self):
         for options, problem in (
             (f"--teacher {self.teacher} --resets {self.bank}", ""),
-            ("--camera front", "the run's own networks and configuration. Omit --camera"),
-            ("--config.task.vision.view points", "Omit --config"),
+            ("--camera front", "the run's own networks and configuration. Omit cameras"),
+            ("--config.task.vision.view points", "Omit config"),
             # the default, which is not what the run was started with
-            ("--num-envs 1024", "--num-envs is 1024, but .* was started with"),
-            ("--teacher many-objects", "--teacher is many-objects, but .* was started with"),
+            ("--num-envs 1024", "num_envs is '1024', but .* was started with"),
+            ("--teacher many-objects", "teacher is 'many-objects', but .* was started with"),
         ):
             with self.subTest(options):
                 self.assert_resumed(f"train --resume --out {self.run_folder} {options}", problem)

@@ -159,17 +159,17 @@ class Arrays(Case):
         out = self.folder / "out.npz"
         options = ("--engine", "sapien", "--task", "Lift the {object}.", "--out", out)
         self.assertIn(
-            "2 episodes of ur7e-sharpa", succeeds("export", "npz", self.evaluate(), *options)
+            "2 episodes of ur7e-sharpa", succeeds("export", "episodes", self.evaluate(), *options)
         )
         with np.load(out) as file:
             self.assertEqual(file["engine"].tolist(), ["sapien", "sapien"])
             self.assertEqual(file["task"][0], "Lift the tomato soup can.")
         again = self.folder / "again.npz"
-        xreset.export_npz(str(self.folder), again, engines="sapien", task="Lift the {object}.")
+        xreset.export_episodes(str(self.folder), again, engines="sapien", task="Lift the {object}.")
         self.assertEqual(again.read_bytes(), out.read_bytes())
         words = f"^{self.folder}: there are no recorded episodes of not-sapien. Make"
         with self.assertRaisesRegex(RunError, words):
-            xreset.export_npz(str(self.folder), again, engines="not-sapien")
+            xreset.export_episodes(str(self.folder), again, engines="not-sapien")
 
 
 @skipUnless(PARQUET, "pyarrow is not installed")
@@ -187,10 +187,10 @@ class LeRobot(Case):
         folder = self.evaluate()
         recording = read_recorded([folder])
         root = self.folder / "set"
-        succeeds("export", "lerobot", folder, "--out", root, "--no-video")
+        succeeds("export", "episodes", folder, "--out", root, "--no-video")
         done = []
         again = self.folder / "again"
-        xreset.export_lerobot(folder, again, video=False, progress=lambda *n: done.append(n))
+        xreset.export_episodes(folder, again, video=False, progress=lambda *n: done.append(n))
         self.assertEqual(done, [(1, 4), (2, 4), (3, 4), (4, 4)])
         for file in ("data/chunk-000/file-000.parquet", "meta/info.json", "meta/stats.json"):
             self.assertEqual((again / file).read_bytes(), (root / file).read_bytes(), file)

@@ -13,7 +13,7 @@ from unittest.mock import Mock, patch
 
 import numpy as np
 
-from tests.command import succeeds
+from tests.command import calls_of, succeeds
 from tests.data import InFolder, InOneFolder
 from tests.toy_bank import SOUP
 from tests.toy_results import toy_result, toy_rollouts
@@ -28,6 +28,7 @@ from xreset.eval.study.plan import Plan, make_plan
 from xreset.eval.study.report import write_page
 from xreset.eval.study.steps import XRESET, Step, flags
 from xreset.eval.study.tables import fill
+from xreset.learning import verbs
 from xreset.learning.config import TrainConfig
 from xreset.learning.run import checkpoints, latest_checkpoint
 
@@ -194,9 +195,9 @@ class PlanTest(Studied):
         changed = replace(reset, random_gravity=False, demo_probability=0.25, object_share=shares)
         self.assertEqual(planned.config.task.reset, changed)
         (command,) = train.todo()[1]
-        with patch("xreset.learning.train.train") as start:
+        with calls_of(verbs, "train") as calls:
             main(command[len(XRESET) :])
-        given = start.call_args.kwargs
+        (given,) = calls
         self.assertEqual(replace(given["config"], iterations=given["iterations"]), planned.config)
         self.assertEqual(list(flags({"config": {"a": {"b_c": True}}})), ["--config.a.b-c"])
 

@@ -24,6 +24,7 @@ import torch
 from onnx import numpy_helper
 from torch.testing import assert_close
 
+from tests.command import calls_of
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_goals import toy_goals
 from tests.toy_training import CONFIG, OPTIONS, WithBank, quickly
@@ -41,6 +42,7 @@ from xreset.cli import main
 from xreset.errors import FileFormatError, PolicyError, RunError, Stopped, XResetError
 from xreset.eval.policy_spec import load_policy
 from xreset.files.storage import claim, file_hash, write_json
+from xreset.learning import verbs
 from xreset.learning.checkpoint import load_moments, read_checkpoint
 from xreset.learning.config import ModelConfig, PpoConfig, ScheduleConfig, TrainConfig
 from xreset.learning.exported import read_policy
@@ -394,10 +396,10 @@ class TrainingTest(WithBank):
 
     def test_a_configuration_starts_from_a_recipe_or_from_another_run(self):
         def parsed(*arguments):
-            with patch("xreset.learning.train.train") as started:
+            with calls_of(verbs, "train") as calls:
                 new = "train --robot openarm --resets bank.npz --out run"
                 main([*new.split(), *arguments])
-            return started.call_args.kwargs["config"]
+            return calls[0]["config"]
 
         self.assertEqual(parsed(), TrainConfig())
         self.assertEqual(RECIPES["default"].config, TrainConfig())
@@ -428,10 +430,6 @@ class TrainingTest(WithBank):
                 "no recipe, no file and no run folder 'nothing'. Recipes: default, .*; paper, the paper's tables",
             ),
             (("--recipe", str(self.folder)), "is not a run folder"),
-            (("--recipe", "minutes", "--resume"), "Omit --recipe"),
-            (("--weights", str(self.out), "--resume"), "Omit --weights"),
-            (("--resume", "--config.ppo.entropy", "0.001"), "Omit --config, or start another run"),
-            (("--resume",), "run is not a run folder"),
         ):
             with (
                 self.subTest(arguments),
@@ -453,19 +451,19 @@ class TrainingTest(WithBank):
             ),
             (
                 "--num-envs 8",
-                "--num-envs is 8, but .* was started with 4, and .* Omit --num-envs, or start",
+                "num_envs is '8', but .* was started with 4, and .* Omit num_envs, or start",
             ),
-            ("--seed 5", "--seed is 5, but"),
-            ("--seed=0", "--seed is 0, but .* was started with 3"),
-            ("--num_envs 4096", "--num-envs is 4096, but .* was started with 4"),
-            ("--recipe paper", "Omit --recipe"),
-            ("--config.ppo.horizon 16", "Omit --config"),
-            ("--resets None", "--resets is None, but"),
-            ("--engine pybullet", "--engine is pybullet, but .* was started with mujoco"),
-            ("--robot ur7e-sharpa", "--robot is ur7e-sharpa, but .* was started with openarm"),
-            (f"--resets {other}", "--resets is .*other.npz, but .* was started with .*bank.npz"),
-            (f"--meshes {self.folder}", "--meshes is .*, but .* was started with None"),
-            (f"--resets {self.bank} --goals {other}", "--goals is .*other.npz, but .* was started"),
+            ("--seed 5", "seed is '5', but"),
+            ("--seed=0", "seed is '0', but .* was started with 3"),
+            ("--num_envs 4096", "num_envs is '4096', but .* was started with 4"),
+            ("--recipe paper", "Omit recipe"),
+            (f"--weights {self.out}", "Omit weights"),
+            ("--config.ppo.horizon 16", "Omit config, or start another run"),
+            ("--engine pybullet", "engine is 'pybullet', but .* was started with mujoco"),
+            ("--robot ur7e-sharpa", "robot is 'ur7e-sharpa', but .* was started with openarm"),
+            (f"--resets {other}", "resets is .*other.npz', but .* was started with .*bank.npz"),
+            (f"--meshes {self.folder}", "meshes is .*, but .* was started with None"),
+            (f"--resets {self.bank} --goals {other}", "goals is .*other.npz', but .* was started"),
         ):
             with self.subTest(options):
                 self.assert_resumed(f"train --resume --out {self.out} {options}", problem)

@@ -18,7 +18,7 @@ import pandas as pd
 
 from xreset.cameras.config import CAMERAS, VisionConfig, check_each_once
 from xreset.errors import XResetError, needs
-from xreset.eval.export.recorded import RecordedEpisodes, read_recorded
+from xreset.eval.export.recorded import SCHEMA, RecordedEpisodes
 from xreset.eval.report.clips import draw_state, draw_view, encode_mp4, policy_cameras
 from xreset.eval.results import Trace
 from xreset.files.progress import unseen
@@ -27,7 +27,6 @@ from xreset.objects.catalogue import load_object
 from xreset.pictures.render import Renderer, Size
 from xreset.spec import RobotSpec, SceneSpec
 
-SCHEMA = "xreset-lerobot/1"
 _FORMAT = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
 _IMAGES = "observation.images."
 VIDEO = _IMAGES + "front"
@@ -40,41 +39,6 @@ _KEYFRAMES = 2
 """Every second frame can be shown without the frames before it, as in films of LeRobot: training draws frames at
 random."""
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
-
-
-def export_lerobot(
-    folders: str | Path | Sequence[str | Path],
-    out: str | Path,
-    *,
-    engines: str | Sequence[str] = (),
-    robot: str | Path | None = None,
-    meshes: str | Path | None = None,
-    task: str | None = None,
-    video: bool = True,
-    size: tuple[int, int] = (320, 240),
-    cameras: Sequence[str] = (),
-    progress: Callable[[float, int], None] = unseen,
-) -> None:
-    """Write recorded evaluation episodes as a LeRobot data set (v3.0); ``docs/rollouts.md`` has its features.
-
-    Args:
-        folders: run folders, or folders of evaluations; the first episode of each demonstration and engine is recorded.
-        out: folder to write; must not exist, or be empty.
-        engines: only this engine, or these; empty: all.
-        robot: name or folder of the robot; default: as the results name it.
-        meshes: folder of meshes; default: as the results name it.
-        task: the task in words; ``{object}`` is replaced by the object's name.
-        video: whether a film of each episode is drawn.
-        size: width and height of the films [pixels], even.
-        cameras: depth cameras of which films are drawn, too: ``front``, ``side`` or ``wrist``.
-        progress: called with (episodes written, episodes in all).
-
-    Raises:
-        RunError: a folder does not exist, none holds episodes of the engines, or robots or rates differ.
-        XResetError: pyarrow or the encoder of films is missing, or the folder is not empty.
-    """
-    recording = read_recorded(folders, engines=engines, robot=robot, meshes=meshes, task=task)
-    write_lerobot(Path(out), recording, video=video, size=size, cameras=cameras, progress=progress)
 
 
 def write_lerobot(

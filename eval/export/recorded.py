@@ -60,29 +60,6 @@ class RecordedEpisodes:
         return np.cumsum([0, *map(len, self.episodes["action"])])
 
 
-def export_npz(
-    folders: str | Path | Sequence[str | Path],
-    out: str | Path,
-    *,
-    engines: str | Sequence[str] = (),
-    robot: str | Path | None = None,
-    task: str | None = None,
-) -> None:
-    """Write recorded evaluation episodes as plain arrays in one npz file; ``docs/rollouts.md`` has the schema.
-
-    Args:
-        folders: run folders, or folders of evaluations; the first episode of each demonstration and engine is recorded.
-        out: file to write.
-        engines: only this engine, or these; empty: all.
-        robot: name or folder of the robot; default: as the results name it.
-        task: the task in words; ``{object}`` is replaced by the object's name.
-
-    Raises:
-        RunError: a folder does not exist, none holds episodes of the engines, or robots or rates differ.
-    """
-    write_arrays(out, read_recorded(folders, engines=engines, robot=robot, task=task))
-
-
 def read_recorded(
     folders: str | Path | Sequence[str | Path],
     *,

@@ -20,7 +20,6 @@ from xreset.eval.play.record import draw_film, last_moments, write_trace
 from xreset.eval.play.session import Session
 from xreset.eval.plots import COLORS
 from xreset.eval.policy_spec import PolicySpec
-from xreset.files.checks import Seed, obeys_rules
 from xreset.files.text import short_name
 from xreset.physics.plugins import backend_names, robot_names
 from xreset.physics.tensors import one_thread
@@ -62,46 +61,11 @@ GROWTH = 1.03
 """Size of the goal next to the object, so that a pointer meets the goal first where both are in one place."""
 
 
-@obeys_rules
-def play(
-    policy: str | Path | PolicySpec = "many-objects",
-    *,
-    object_name: str | None = None,
-    engine: str = "mujoco",
-    robot: str | Path | None = None,
-    demos: str | Path | None = None,
-    meshes: str | Path | None = None,
-    seed: Seed = 0,
-    host: str = "127.0.0.1",
-    port: int = 8080,
-) -> None:
-    """Serve a live episode as a web page until Ctrl-C. Its visitors drag the goal and disturb the robot.
-
-    Args:
-        policy: as for :func:`~xreset.eval.policy_spec.load_policy`.
-        object_name: name of the object to begin with; None: the soup can, or else the first object.
-        engine: name of the engine to begin with.
-        robot: default: the policy's.
-        demos: starts and goals, from a file of demonstrations, motion or reset states; None: synthetic ones.
-        meshes: folder of object meshes; None: the folder of the policy's training, or the stand-ins.
-        seed: chooses starts and goals.
-        host: address to serve at; 0.0.0.0 allows other machines.
-        port: port to serve at; if it is taken, the next free one.
-
-    Raises:
-        XResetError: something cannot be loaded, or the server does not start.
-    """
+def serve(policy: str | Path | PolicySpec, *, host: str, port: int, **options: Any) -> None:
+    """Serve a live episode until Ctrl-C; ``options`` are those of :class:`~xreset.eval.play.session.Session`."""
     print("Loading the policy, the object and the engine ...", flush=True)
     with one_thread():
-        session = Session(
-            policy,
-            object_name=object_name,
-            engine=engine,
-            robot=robot,
-            demos=Path(demos) if demos else None,
-            meshes=Path(meshes) if meshes else None,
-            seed=seed,
-        )
+        session = Session(policy, **options)
         try:
             page = Page(session, host=host, port=port)
             print(f"{session.policy.name} plays at {page.url}. Ctrl-C ends.", flush=True)

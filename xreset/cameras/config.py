@@ -114,7 +114,7 @@ class VisionConfig(Checked):
 
 
 STUDENT_VISION = VisionConfig(view="points", goal_image=True)
-"""What a student of :func:`xreset.distill` sees unless it is told otherwise, but for its cameras."""
+"""What a student of :func:`xreset.train` sees unless it is told otherwise, but for its cameras."""
 FRONT = CameraConfig()
 """A camera in front of the table, opposite the robot."""
 SIDE = CameraConfig(pos=(0.55, -0.45, 0.55), target=(0.55, 0.22, 0.18))

@@ -11,9 +11,8 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from xreset.cli import INVOCATION
 from xreset.cli._terminal import console, show_table
-from xreset.errors import RunError
 from xreset.files import checks
-from xreset.files.storage import code_version, file_hash, write_json
+from xreset.files.storage import code_version, write_json
 from xreset.physics.plugins import Device as DeviceName
 from xreset.physics.plugins import backend_names, backend_status
 from xreset.retarget.accounts import Account, described
@@ -42,7 +41,6 @@ _POLICY = (
     "Run folder, one of its checkpoints (.pt), exported policy (.onnx), or name of a policy that ships with xreset "
     "(xreset policies)"
 )
-Policy = Annotated[Name, arg(help=f"{_POLICY}.")]
 PolicyOrBaseline = Annotated[
     Name, arg(help=f"{_POLICY}; or a baseline: zero, random, ik (open-loop kinematic retargeting).")
 ]
@@ -55,11 +53,6 @@ MotionMeshes = Annotated[
     Path | None,
     arg(help="Folder of real meshes; default: that of the motion, else the stand-ins."),
 ]
-TrainedMeshes = Annotated[
-    Path | None,
-    arg(help="Folder of real meshes; default: that of the training, else the stand-ins."),
-]
-Engines = Annotated[Several, arg(help="Physics engine; give it again for more. Default: mujoco.")]
 AllEngines = Annotated[
     Several,
     arg(help="Physics engine; give it again for more. Default: all that can be used here."),
@@ -87,47 +80,6 @@ def quick_engines(names: Sequence[str], device: str) -> list[rollout.Engine]:
 
     engines = rollout.chosen_engines(names or usable_engines(), device)
     return [each for each in engines if names or not each.slow]
-
-
-def given_flags() -> list[str]:
-    """Return the flags that the user gave to the running command, such as ``--num-envs``."""
-    return [word.partition("=")[0].replace("_", "-") for word in INVOCATION]
-
-
-def refuse_changes(out: Path, **options: Any) -> None:
-    """Refuse to resume a run with other options than it was started with. Options that the user did not give are
-    ignored.
-
-    Args:
-        out: the run's folder.
-        options: values by name of the option. ``resets`` and ``goals`` are files.
-
-    Raises:
-        RunError: an option differs; the message names the first.
-    """
-    from xreset.learning import run
-
-    info = run.read_run(out)
-    files = ("resets", "goals")
-    # A run with both a bank and a goal set has joined them in a file of its own with another hash.
-    is_joined = Path(info.resets).resolve().parent == out.resolve()
-    joined = is_joined and None not in [options.get(name) for name in files]
-    for name, value in options.items():
-        flag = f"--{name.replace('_', '-')}"
-        if flag not in given_flags() or (joined and name in files):
-            continue
-        if name in files:
-            found = info.resets
-            is_same = value is not None and file_hash(value) == info.resets_hash
-        else:
-            found = getattr(info, name)
-            # compares folders by their absolute path, and names and numbers by their text
-            is_same = Path(str(value)).resolve() == Path(str(found)).resolve()
-        if not is_same:
-            raise RunError(
-                f"{flag} is {value}, but {out} was started with {found}, and --resume continues it as it was. "
-                f"Omit {flag}, or start another run with its networks: --weights {out} --recipe {out}"
-            )
 
 
 def measured(content: dict[str, Any]) -> dict[str, Any]:

@@ -25,19 +25,11 @@ from tyro.constructors import (
 )
 
 from xreset.errors import XResetError
-from xreset.files.checks import Options, check_value, marks_in, marks_of
+from xreset.files.checks import Options, Written, check_value, marks_in, marks_of
 from xreset.files.storage import check_suffix, claim
 
 _LONGEST = 1000
 """Largest number of characters of a text or a file name, because messages repeat them."""
-
-
-@dataclass(frozen=True)
-class Written:
-    """Marks the path of a file or folder that a command writes, in its annotation."""
-
-    suffix: str = ""
-    """How the name of a file must end; empty: any way."""
 
 
 Output = Annotated[Path, Written()]

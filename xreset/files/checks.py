@@ -16,6 +16,7 @@ from functools import cache, wraps
 from inspect import Parameter, signature
 from math import inf, isfinite
 from numbers import Integral
+from pathlib import Path
 from types import SimpleNamespace
 from typing import (
     Annotated,
@@ -67,6 +68,23 @@ class Check:
     refuse: Callable[[Any], Any]
 
 
+@dataclass(frozen=True)
+class Written:
+    """Marks the path of a file or folder that a function writes, in its annotation."""
+
+    suffix: str = ""
+    """How the name of a file must end; empty: any way."""
+
+
+@dataclass(frozen=True)
+class Option:
+    """Name of an argument as an option of the command, in its annotation, if it is another."""
+
+    name: str
+
+
+Output = Annotated[str | Path, Written()]
+"""File or folder that a function writes."""
 Positive = Annotated[T, Rule("a number above 0 and finite", lambda x: 0 < x < inf)]
 """JSON, and so a run's configuration, has no infinity."""
 NotNegative = Annotated[T, Rule("a number from 0 to 1e15", lambda x: 0 <= x <= 1e15)]

@@ -1,4 +1,4 @@
-"""Train a policy: reset bank or goal set in, run folder out."""
+"""Train a policy: its parts, from the data to the run folder."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -24,18 +23,14 @@ from xreset.cameras.config import (
 )
 from xreset.env.manipulation import make_env
 from xreset.errors import PolicyError, RunError, Stopped, XResetError
-from xreset.files.checks import Seed, obeys_rules
-from xreset.files.storage import claim_folder, file_hash, write_whole
+from xreset.files.storage import claim_folder, file_hash
 from xreset.files.text import shown
 from xreset.learning.config import TrainConfig
 from xreset.learning.distributed import Processes, leave
 from xreset.learning.export import export_checkpoint
 from xreset.learning.exported import read_policy
 from xreset.learning.recipes import (
-    default_config,
-    from_home,
     own_terms_flags,
-    starting_config,
     student_config,
 )
 from xreset.learning.run import (
@@ -49,8 +44,8 @@ from xreset.learning.run import (
     write_run,
 )
 from xreset.learning.runner import TrainingRunner
-from xreset.physics.plugins import backend_class, device_for
-from xreset.policy.onnx_policy import OnnxPolicy, check_contract, policy_contract
+from xreset.physics.plugins import device_for
+from xreset.policy.onnx_policy import OnnxPolicy, check_contract
 from xreset.policy.shipped import shipped
 from xreset.resets.bank import ResetBank, read_bank, write_bank
 from xreset.resets.goals import GoalSet, read_goals, with_goals, write_goals
@@ -58,151 +53,86 @@ from xreset.resets.inputs import Inputs, load_inputs
 from xreset.task.rewards import RewardFunction
 
 
-@obeys_rules
-def train(
-    bank: str | Path | ResetBank | None = None,
-    *,
-    out: str | Path,
-    goals: str | Path | GoalSet | None = None,
-    recipe: str | None = None,
-    config: TrainConfig | None = None,
-    robot: str | Path | None = None,
-    meshes: str | Path | None = None,
-    engine: str = "mujoco-warp",
-    device: str | None = None,
-    num_envs: int = 4096,
-    iterations: int | None = None,
-    minutes: float = math.inf,
-    seed: Seed = 0,
-    weights: str | Path | None = None,
-    teacher: str | Path | None = None,
-    wandb: str | None = None,
-) -> Path:
-    """Train a policy, and export it as ``policy.onnx`` in the run folder.
-
-    If the folder holds this very training already, stopped or killed, the training goes on from its newest checkpoint;
-    if it is finished, nothing is trained. So a job may give the same command, or call, again and again.
-
-    With ``torchrun``, every process simulates ``num_envs`` worlds of its own, each on its own GPU, or all on the CPU.
-
-    Args:
-        bank: reset bank, or its file. A bank without a file is written to ``resets.npz`` in the run folder. None: there
-            are no demonstrated states, and every episode begins at home.
-        out: run folder to make, or to continue.
-        goals: goal set, or its file. With a bank, its starts and goals are added to the demonstrated ones.
-        recipe: where the configuration comes from: a recipe such as ``paper``, a TOML file of the user's own, or
-            another run's folder. Reward terms of the user's own are not taken from a file or a run: name them in
-            ``config``. Default: the recipe of the headline results; with ``weights`` and ``goals``, the run of
-            ``weights``.
-        config: the whole configuration, instead of a recipe.
-        robot: name or folder of the robot; default: the robot that the bank names.
-        meshes: folder of object meshes; default: the built-in stand-ins.
-        engine: name of the physics engine.
-        device: cpu or cuda; default: cuda if there is a GPU that the engine can use.
-        num_envs: number of worlds, in each process.
-        iterations: number of iterations; default: as configured.
-        minutes: most time of the whole training, without compiling kernels; a run that continues has the rest of it.
-        seed: seed of every random number.
-        weights: another run's folder, whose networks are the start; default: new networks.
-        teacher: policy whose actions the new one learns instead of learning from rewards; see :func:`distill`.
-        wandb: project of Weights & Biases to which learning curves and configuration are sent; default: nothing is
-            sent.
-
-    Returns:
-        The run folder, which ``xreset.load_policy`` reads.
-
-    Raises:
-        Stopped: a signal ended the training early; a checkpoint and the policy are written.
-        RunError: the folder holds another training, there is no state to reset to, ``weights`` has no checkpoint of
-            networks like these, or there is too little memory.
-        PolicyError: ``weights`` is of another robot, or its policy observes something else.
-        XResetError: bank, robot, objects and configuration do not fit together.
-    """
-    out = Path(out)
-    if config is not None and recipe is not None:
-        raise XResetError("Both recipe and config are given. Give one of them.")
-    if recipe is not None:
-        config = starting_config(recipe)
-    elif config is None:
-        _, config = default_config(goals, weights)
-    if iterations is not None:
-        config = replace(config, iterations=iterations)
-    present = read_run(out) if checkpoints(out) else None
-    if device is None:
-        here = device_for(engine, "cuda" if torch.cuda.is_available() else "cpu")
-        device = here if present is None else present.device
-    if num_envs < 1:
-        raise RunError(f"num_envs is {num_envs}, expected at least 1.")
-    _check_minutes(minutes)
-    if device_for(engine, device) != device:
-        raise RunError(
-            f"The engine {engine!r} does not run on {device!r}. Omit the device, or choose another engine."
-        )
-    data = _bank_or_goals(bank, goals)
-    load = partial(load_inputs, robot=robot, meshes=meshes, accept=("bank", "goals"))
-    inputs = load(data)
-    if isinstance(inputs.data, GoalSet):
-        config = from_home(config)
-    _check_config(config, inputs, has_teacher=teacher is not None)
-    version = backend_class(engine).engine_version()  # fails where the engine is missing
-    start = None
-    if weights is not None:
-        start = _checkpoint_to_start_from(Path(weights), inputs, config)
-    teacher_policy = None if teacher is None else read_policy(teacher)
-    if teacher_policy is not None:
-        _check_teacher(teacher_policy, inputs, config)
-    info = RunInfo(
-        robot=str(inputs.robot_name),
-        resets=str(inputs.path),
-        resets_hash=str(inputs.hash),
-        meshes=str(inputs.meshes) if inputs.meshes else None,
-        engine=engine,
-        engine_version=version,
-        device=device,
-        num_envs=num_envs,
-        seed=seed,
-        config=config,
-        contract=policy_contract(inputs.robot, config.task, tuple(o.name for o in inputs.objects)),
-        weights=str(start) if start else None,
-        weights_hash=file_hash(start) if start else None,
-        teacher=str(teacher) if teacher else None,
-    )
-    if present is not None:
-        if not isinstance(data, str | Path):
-            info = replace(info, resets_hash=_hash_of(data))
-        _refuse_another_training(out, present, info, teacher_policy)
-        own = config.task.reward.own
-        return resume(out, iterations=config.iterations, minutes=minutes, own=own, wandb=wandb)
-    with _new_run(out):
-        if teacher_policy is not None:
-            write_whole(out / TEACHER, teacher_policy.content)
-        # the training reads its own file, so that it has the same data as a resumed one, and values are checked
-        if not isinstance(data, str | Path):
-            path = out / ("goals.npz" if isinstance(data, GoalSet) else "resets.npz")
-            _write_data(path, data)
-            inputs = load(path)
-            info = replace(info, resets=str(inputs.path), resets_hash=str(inputs.hash))
-        with _cleanly(out, info):
-            _train(out, info, inputs, minutes=minutes, resumed=False, wandb=wandb)
-    return out
+def default_device(engine: str) -> str:
+    """Return cuda if there is a GPU that the engine can use, else cpu."""
+    return device_for(engine, "cuda" if torch.cuda.is_available() else "cpu")
 
 
-def _write_data(path: Path, data: ResetBank | GoalSet) -> None:
+def write_data(folder: Path, data: ResetBank | GoalSet) -> Path:
+    """Write a bank or a goal set into a run folder, and return its file."""
     if isinstance(data, GoalSet):
+        path = folder / "goals.npz"
         write_goals(path, data)
     else:
+        path = folder / "resets.npz"
         write_bank(path, data)
+    return path
 
 
-def _hash_of(data: ResetBank | GoalSet) -> str:
+def hash_of(data: ResetBank | GoalSet) -> str:
     """Return the hash that the file of a bank or a goal set has in a run folder."""
     with TemporaryDirectory() as folder:
-        path = Path(folder, "data.npz")
-        _write_data(path, data)
-        return file_hash(path)
+        return file_hash(write_data(Path(folder), data))
 
 
-def _refuse_another_training(
+def refuse_changes(
+    out: Path,
+    started: Mapping[str, Any],
+    new: Mapping[str, Any],
+    config: TrainConfig | None,
+    bank: str | Path | ResetBank | None,
+    goals: str | Path | GoalSet | None,
+) -> None:
+    """Refuse to resume a run with other options than it was started with.
+
+    Args:
+        out: the run's folder.
+        started: values by name of what the run states too; None: not given.
+        new: values by name of what only a new run can have.
+        config: configuration, of which only the user's own reward terms may differ from the default or the run's.
+        bank: reset bank.
+        goals: goal set.
+
+    Raises:
+        RunError: an option differs; the message names the first.
+    """
+    info = read_run(out)
+    another = f"start another run with this run's networks: --weights {out} --recipe {out}"
+    own = config is not None and _without_own(config) not in (
+        TrainConfig(),
+        _without_own(info.config),
+    )
+    for name, value in {**new, "config": own or None}.items():
+        if value is not None:
+            raise RunError(
+                f"--resume continues with the run's own networks and configuration. Omit {name}, or {another}"
+            )
+    given: dict[str, tuple[Any, Any]] = {}
+    for name, value in started.items():
+        given[name] = (value, getattr(info, name))
+    # A run with both a bank and a goal set has joined them in a file of its own with another hash.
+    is_joined = Path(info.resets).resolve().parent == out.resolve()
+    if not (is_joined and bank is not None and goals is not None):
+        for name, data in (("resets", bank), ("goals", goals)):
+            if data is None:
+                continue
+            found = file_hash(data) if isinstance(data, str | Path) else hash_of(data)
+            given[name] = (data, data if found == info.resets_hash else info.resets)
+    for name, (value, found) in given.items():
+        # compares folders by their absolute path, and names and numbers by their text
+        if value is not None and Path(str(value)).resolve() != Path(str(found)).resolve():
+            raise RunError(
+                f"{name} is {shown(str(value))}, but {out} was started with {found}, and --resume continues it as it "
+                f"was. Omit {name}, or {another}"
+            )
+
+
+def _without_own(config: TrainConfig) -> TrainConfig:
+    reward = config.task.reward.without_own()
+    return replace(config, task=replace(config.task, reward=reward))
+
+
+def refuse_another_training(
     out: Path, present: RunInfo, wanted: RunInfo, teacher: OnnxPolicy | None
 ) -> None:
     """Refuse to continue the run in a folder as a training that it is not. Its length may differ."""
@@ -257,7 +187,7 @@ def resume(
             does not fit, another process is training here, or there is too little memory.
         PolicyError: the robot has changed, or the policy observed something else in an earlier version of xreset.
     """
-    _check_minutes(minutes)
+    check_minutes(minutes)
     out = Path(out)
     info = read_run(out)
     expected = info.config.task.reward.own
@@ -285,51 +215,9 @@ def resume(
             f"{info.resets} is not the file that this run was started with. Put it back, or start a new run."
         )
     check_contract(str(out), info.contract, inputs.robot, info.config.task)
-    with _claimed(out), _cleanly(out, info):
-        _train(out, info, inputs, minutes=minutes, resumed=True, wandb=wandb)
+    with _claimed(out), cleanly(out, info):
+        run_training(out, info, inputs, minutes=minutes, resumed=True, wandb=wandb)
     return out
-
-
-def distill(
-    teacher: str | Path,
-    bank: str | Path | ResetBank | None,
-    *,
-    out: str | Path,
-    cameras: str | CameraConfig | Sequence[str | CameraConfig] = "front",
-    vision: VisionConfig | None = None,
-    config: TrainConfig | None = None,
-    **options: Any,
-) -> Path:
-    """Train a policy that sees, by imitating one that is told the object's pose and shape (DAgger).
-
-    The student gets what its cameras show, the joints and the goal. It learns in the teacher's own task, with cameras.
-
-    Args:
-        teacher: run folder, exported policy (.onnx) or name of a policy that ships with xreset.
-        bank: reset bank, or its file; None: with ``goals``, as for :func:`train`.
-        out: run folder to make.
-        cameras: name of one of :data:`xreset.cameras.config.CAMERAS`, or a camera; or several.
-        vision: images, their timing and what the student gets of them; its cameras are replaced by ``cameras``.
-            Default: points, and the object at its goal.
-        config: the whole configuration, cameras included; default: :func:`xreset.learning.recipes.student_config`.
-        options: keywords of :func:`train`: robot, objects, engine, device, num_envs, iterations, minutes and seed.
-
-    Returns:
-        The run folder, which ``xreset.load_policy`` reads; the teacher is in it as ``teacher.onnx``.
-
-    Raises:
-        PolicyError: the teacher is unknown, sees itself, or is for another robot.
-        XResetError: a camera is unknown, given twice or inside a body, no camera ever shows some object, the images
-            have fewer pixels than points, or the renderer cannot start.
-    """
-    if config is None:
-        config = config_of_student(teacher, cameras, vision)
-    if not config.task.vision.cameras:
-        raise XResetError(
-            "A student needs a camera. Give one or two of: " + ", ".join(CAMERAS) + "."
-        )
-    check_each_once(config.task.vision.cameras)
-    return train(bank, out=out, config=config, teacher=teacher, **options)
 
 
 def config_of_student(
@@ -337,7 +225,18 @@ def config_of_student(
     cameras: str | CameraConfig | Sequence[str | CameraConfig] = "front",
     vision: VisionConfig | None = None,
 ) -> TrainConfig:
-    """Return the configuration of a distillation; arguments and errors as of :func:`distill`."""
+    """Return the configuration of a student of a teacher.
+
+    Args:
+        teacher: as for :func:`xreset.train`.
+        cameras: name of one of :data:`xreset.cameras.config.CAMERAS`, or a camera; or several.
+        vision: images, their timing and what the student gets of them; its cameras are replaced by ``cameras``.
+            Default: points, and the object at its goal.
+
+    Raises:
+        PolicyError: the teacher is unknown.
+        XResetError: a camera is unknown, or the images have fewer pixels than points.
+    """
     wanted = [cameras] if isinstance(cameras, str | CameraConfig) else cameras
     chosen = tuple(_camera(each) for each in wanted)
     try:
@@ -349,7 +248,7 @@ def config_of_student(
     return student_config(read_policy(teacher).contract.task, vision)
 
 
-def _bank_or_goals(
+def bank_or_goals(
     bank: str | Path | ResetBank | None, goals: str | Path | GoalSet | None
 ) -> str | Path | ResetBank:
     """Return a bank or a goal set, as they were given, or a bank with the goals of both."""
@@ -358,18 +257,27 @@ def _bank_or_goals(
         bank = with_goals(bank, goals if isinstance(goals, GoalSet) else read_goals(goals))
     given = goals if bank is None else bank
     if given is None:
-        raise RunError("A training needs a reset bank (--resets), a goal set (--goals), or both.")
+        raise RunError(
+            "A training needs a reset bank (--resets), a goal set (--goals), or both. To continue the run in the "
+            "folder, add --resume (resume=True)."
+        )
     return given
 
 
-def _check_minutes(minutes: float) -> None:
+def check_minutes(minutes: float) -> None:
+    """Refuse, with ``RunError``, a length that is no time."""
     if not minutes > 0:
         raise RunError(f"minutes is {minutes}, expected more than 0.")
 
 
-def _check_config(config: TrainConfig, inputs: Inputs, *, has_teacher: bool) -> None:
-    """Refuse, with ``XResetError``, a schedule without effect, bank states where there are none, and unknown terms of
-    the reward."""
+def check_config(config: TrainConfig, inputs: Inputs, *, has_teacher: bool) -> None:
+    """Refuse, with ``XResetError``, a schedule without effect, bank states where there are none, unknown terms of the
+    reward, and a student without cameras."""
+    if has_teacher and not config.task.vision.cameras:
+        raise XResetError(
+            "A student needs a camera. Give one or two of: " + ", ".join(CAMERAS) + "."
+        )
+    check_each_once(config.task.vision.cameras)
     RewardFunction(config.task.reward)
     if config.schedule.teacher and not has_teacher:
         raise RunError(
@@ -383,7 +291,7 @@ def _check_config(config: TrainConfig, inputs: Inputs, *, has_teacher: bool) -> 
         )
 
 
-def _checkpoint_to_start_from(run: Path, inputs: Inputs, config: TrainConfig) -> Path:
+def checkpoint_to_start_from(run: Path, inputs: Inputs, config: TrainConfig) -> Path:
     """Return the newest checkpoint of another run, whose networks must be like those of this run."""
     if run.suffix == ".onnx" or (not run.exists() and str(run) in shipped()):
         raise RunError(
@@ -413,8 +321,9 @@ def _checkpoint_to_start_from(run: Path, inputs: Inputs, config: TrainConfig) ->
     return latest_checkpoint(run)
 
 
-def _check_teacher(teacher: OnnxPolicy, inputs: Inputs, config: TrainConfig) -> None:
-    """Refuse the policy of a teacher that does not fit the robot and the task."""
+def read_teacher(name: str | Path, inputs: Inputs, config: TrainConfig) -> OnnxPolicy:
+    """Read the policy of a teacher, which must fit the robot and the task."""
+    teacher = read_policy(name)
     contract = teacher.contract
     if contract.task.vision.cameras:
         raise PolicyError(
@@ -423,6 +332,7 @@ def _check_teacher(teacher: OnnxPolicy, inputs: Inputs, config: TrainConfig) -> 
     check_contract(
         str(teacher.path), contract, inputs.robot, replace(config.task, vision=VisionConfig())
     )
+    return teacher
 
 
 def _camera(camera: str | CameraConfig) -> CameraConfig:
@@ -445,7 +355,7 @@ def _claimed(out: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _new_run(out: Path) -> Iterator[None]:
+def new_run(out: Path) -> Iterator[None]:
     """Like :func:`_claimed`; leave nothing new in the folder if the run does not get its ``run.json``."""
     written = (out / TEACHER, out / "goals.npz", out / "resets.npz", out / "checkpoints", out)
     new = [path for path in written if not path.exists()]
@@ -466,7 +376,7 @@ _NO_MEMORY = re.compile("Failed to allocate|out of memory")
 
 
 @contextmanager
-def _cleanly(out: Path, info: RunInfo) -> Iterator[None]:
+def cleanly(out: Path, info: RunInfo) -> Iterator[None]:
     """Say what to do if there is too little memory, and leave the process's global state as it was."""
     if info.device == "cpu" and info.num_envs > _MANY_ON_A_CPU:
         print(
@@ -492,7 +402,7 @@ def _cleanly(out: Path, info: RunInfo) -> Iterator[None]:
             ) from error
 
 
-def _train(
+def run_training(
     out: Path,
     info: RunInfo,
     inputs: Inputs,

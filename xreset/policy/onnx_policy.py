@@ -311,16 +311,14 @@ def _read_contract(path: Path, metadata: dict[str, str]) -> Contract:
 def _why_unreadable(path: Path, error: Exception) -> str:
     """Return what is wrong with a file that onnxruntime cannot read, and what to give instead."""
     expected = "a run folder, a .onnx file or the name of a policy that ships with xreset"
-    if path.suffix not in (".pt", ".onnx"):
+    if path.suffix == ".pt":
+        return (
+            f"{path} is a training checkpoint, expected {expected}. Give it in its run folder "
+            "(RUN/checkpoints/NUMBER.pt), or export it with xreset.export_checkpoint."
+        )
+    if path.suffix != ".onnx":
         return f"{path} is not an exported policy, expected {expected}."
-    if path.suffix != ".pt":
-        return f"{path} cannot be read as an ONNX policy: {shown(str(error))}. Is it damaged?"
-    run = path.parent.parent
-    named = f" ({run})" if (run / "run.json").is_file() else ""
-    return (
-        f"{path} is a training checkpoint, expected {expected}. Give the checkpoint's run folder{named}, or export it "
-        "with xreset.export_checkpoint."
-    )
+    return f"{path} cannot be read as an ONNX policy: {shown(str(error))}. Is it damaged?"
 
 
 class ZeroPolicy(Policy):

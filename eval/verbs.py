@@ -1,0 +1,344 @@
+"""Functions that are commands as well: their signatures are the options, and their docstrings the help.
+
+They import most of what they need when they are called, because the help of a command is shown at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from xreset.errors import XResetError
+from xreset.eval.conditions import FAULTS, SWEPT, Condition, Property, chosen, nominal_task
+from xreset.files.checks import Option, Output, Port, PositiveInt, Seed, obeys_rules
+from xreset.files.progress import unseen
+from xreset.files.storage import claim_folder
+from xreset.physics.plugins import Device
+
+if TYPE_CHECKING:
+    from xreset.eval.export.recorded import RecordedEpisodes
+    from xreset.eval.policy_spec import PolicySpec
+    from xreset.eval.results import Evaluation
+    from xreset.eval.rollout import Engine
+    from xreset.resets.inputs import Data
+else:  # a command has texts in place of these
+    RecordedEpisodes = PolicySpec = Evaluation = Engine = Data = Any
+
+
+@obeys_rules
+def evaluate(
+    policy: str | Path | PolicySpec,
+    demos: str | Path | Data,
+    engines: Annotated[str | Engine | Sequence[str | Engine], Option("engine")] = "mujoco",
+    *,
+    episodes: PositiveInt = 5,
+    settle: bool = False,
+    episode_seconds: float | None = None,
+    robot: str | Path | None = None,
+    meshes: str | Path | None = None,
+    seed: Seed = 0,
+    device: Device = "cpu",
+    num_envs: PositiveInt = 64,
+    out: Output | None = None,
+    progress: Callable[[str, float, int], None] = unseen,
+) -> Evaluation:
+    """Evaluate a policy or a baseline in one or several engines, from the same starts.
+
+    A task progress of the baseline ik near 33 % means that the hand gets to the object and does not grasp it.
+
+    Args:
+        policy: run folder, one of its checkpoints (.pt), exported or deployed policy (.onnx), or name of a policy that
+            ships with xreset (xreset policies); or a baseline: zero, random, ik (open-loop kinematic retargeting).
+        demos: starts and goals, and the path of ik: demonstrations (xreset demos), retargeted motion (xreset retarget)
+            or a goal set (xreset goals).
+        engines: physics engine to play in; several are played from the same starts.
+        episodes: episodes of each demonstration, each with another perturbation of robot and object.
+        settle: let objects come to rest before episodes begin. Default: the recorded poses, as in the paper, from which
+            one object in eleven turns by more than 10 degrees.
+        episode_seconds: length of an episode [s], such as 12, as in the published paper; default: as in the policy's
+            training.
+        robot: name or folder of the robot; default: the policy's own. Baselines need it.
+        meshes: folder of real meshes; default: what the policy was trained with, else the stand-ins.
+        seed: seed of the perturbations, which are the same in every engine.
+        device: where engines run that can use a GPU: cpu or cuda.
+        num_envs: worlds that run at the same time.
+        out: folder for the results; default: eval/ in the run folder or next to the policy, runs/NAME/eval for a policy
+            that ships with xreset, runs/BASELINE-ROBOT/eval for a baseline.
+        progress: called with (engine, control steps done, control steps in all).
+
+    Returns:
+        The results that were written, in the order of the engines. They print as a table; ``to_frame()`` has a row for
+        each episode.
+
+    Raises:
+        PolicyError: the policy is unknown.
+        XResetError: another process is writing the folder, or a number is out of range.
+    """
+    from xreset.eval.experiment import play, warn_of_replaced
+    from xreset.eval.policy_spec import load_policy
+    from xreset.eval.results import Evaluation, write_result
+    from xreset.eval.rollout import chosen_engines, load_trial
+
+    spec = load_policy(policy, robot=robot, seed=seed)
+    played_engines = chosen_engines(engines, device)
+    trial = load_trial(
+        spec,
+        demos,
+        meshes=meshes,
+        seed=seed,
+        num_envs=num_envs,
+        settle=settle,
+        episode_seconds=episode_seconds,
+    )
+    folder = Path(out) if out else spec.folder
+    found = Evaluation()
+    found.folder = folder
+    with claim_folder(folder):
+        warn_of_replaced([folder / f"{each.name}.json" for each in played_engines], trial)
+        for each in played_engines:
+            nominal = [Condition(task=trial.task)]
+            result, traces = play(
+                spec, trial, each, nominal, episodes=episodes, progress=partial(progress, each.name)
+            )
+            write_result(folder, result, traces, trial.robot.joint_names)
+            found.append(result)
+    return found
+
+
+@obeys_rules
+def stress(
+    policy: str | Path | PolicySpec,
+    demos: str | Path | Data | None = None,
+    engines: Annotated[str | Engine | Sequence[str | Engine], Option("engine")] = "mujoco",
+    *,
+    properties: Annotated[str | Sequence[str], Option("property")] = (),
+    faults: bool = False,
+    episodes: PositiveInt = 2,
+    robot: str | Path | None = None,
+    meshes: str | Path | None = None,
+    seed: Seed = 0,
+    device: Device = "cpu",
+    num_envs: PositiveInt = 64,
+    out: Output | None = None,
+    progress: Callable[[str, float, int], None] = unseen,
+) -> Evaluation:
+    """Measure robustness: the same episodes with changed stiffness, latency, friction, mass and more, one at a time.
+
+    With faults, a robot's control loop plays, also the unchanged episodes: late and wrong poses, late actions, lost
+    frames, pushes. The result says whether the policy may be tried on a robot. xreset report draws every curve.
+
+    Args:
+        policy: run folder, one of its checkpoints (.pt), exported policy (.onnx), name of a policy that ships with
+            xreset (xreset policies), or a baseline, which has no faults.
+        demos: demonstrations whose starts and goals are played; default: two synthetic demonstrations of each of the
+            policy's objects.
+        engines: physics engine to play in, or several.
+        properties: property or fault to change, or NAME=VALUE,VALUE... for values of your own (factors, s, m, rad; the
+            table shows each unit). Default: all physical properties.
+        faults: change the faults of a robot by default, in place of physics.
+        episodes: episodes of each demonstration, the same for every value.
+        robot: name or folder of the robot; default: the policy's own. Baselines need it.
+        meshes: folder of real meshes; default: what the policy was trained with, else the stand-ins.
+        seed: seed of starts and faults, which are the same in every engine.
+        device: where engines run that can use a GPU: cpu or cuda.
+        num_envs: worlds that run at the same time.
+        out: folder for the results; default: stress/ in the run folder or next to the policy, faults/ if there are
+            faults.
+        progress: called with (engine, conditions done, conditions in all).
+
+    Returns:
+        The results that were written, in the order of the engines: the unchanged episodes, and those of every value.
+        :mod:`xreset.eval.effects` compares them.
+
+    Raises:
+        PolicyError: the policy is unknown, or a baseline shall have faults.
+        XResetError: a property is unknown or cannot have a value; nothing was played then.
+    """
+    wanted = chosen(properties, FAULTS if faults else SWEPT)
+    from xreset.demos.synth import synthesize
+    from xreset.eval.experiment import can_set, play
+    from xreset.eval.policy_spec import load_policy
+    from xreset.eval.results import Evaluation, write_result
+    from xreset.eval.rollout import chosen_engines, load_trial
+
+    on_robot = faults or any(prop.is_fault for prop in wanted)
+    spec = load_policy(policy, robot=robot, seed=seed)
+    if on_robot:
+        spec.exported()  # refuses a baseline
+    if demos is None:
+        own_meshes = spec.meshes_folder(meshes)
+        demos = synthesize(spec.objects_of(own_meshes), 2, meshes=own_meshes)
+    trial = load_trial(spec, demos, meshes=meshes, seed=seed, num_envs=num_envs)
+    if not trial.task.vision.cameras:
+        wanted = tuple(prop for prop in wanted if not prop.of_cameras)
+        if not wanted:
+            raise XResetError(
+                f"The policy {spec.name!r} has no cameras to change. Choose other properties."
+            )
+    task = nominal_task(trial.task)
+    conditions: list[tuple[Property, list[Condition]]] = []
+    for prop in wanted:
+        conditions.append((prop, [prop.at(value, task) for value in prop.values]))
+    default = "faults" if on_robot else "stress"
+    folder = Path(out) if out else spec.folder.parent / default
+    found = Evaluation()
+    found.folder = folder
+    played_engines = chosen_engines(engines, device)
+    with claim_folder(folder):
+        for each in played_engines:
+            usable = [Condition(task=task)]
+            left_out = {}
+            for prop, own in conditions:
+                if can_set(each, prop):
+                    usable += own
+                else:
+                    left_out[prop.option] = f"{each.name} cannot set it"
+            result, traces = play(
+                spec,
+                trial,
+                each,
+                usable,
+                episodes=episodes,
+                on_robot=on_robot,
+                progress=partial(progress, each.name),
+            )
+            result = replace(result, left_out=left_out)
+            write_result(folder, result, traces, trial.robot.joint_names)
+            found.append(result)
+    return found
+
+
+@obeys_rules
+def export_deploy(
+    policy: str | Path | PolicySpec,
+    out: Output,
+    *,
+    robot: str | Path | None = None,
+    meshes: str | Path | None = None,
+    only: Annotated[Sequence[str], Option("object")] = (),
+) -> PolicySpec:
+    """Write a policy for a robot: one ONNX graph from readings to joint targets, and a runtime.
+
+    The runtime needs Python, numpy and onnxruntime (docs/live.md).
+
+    Args:
+        policy: run folder, one of its checkpoints (.pt), exported policy (.onnx), or name of a policy that ships with
+            xreset (xreset policies).
+        out: folder to write; must not exist, or be empty.
+        robot: name or folder of the robot; default: the policy's own.
+        meshes: folder of real meshes; default: what the policy was trained with, else the stand-ins.
+        only: object whose points the contract lists, or several; default: the objects of the training.
+
+    Returns:
+        The policy.
+
+    Raises:
+        PolicyError: the policy is a baseline or looks through cameras, or the folder is not empty.
+        ObjectError: there is neither a stand-in nor a mesh of an object.
+    """
+    from xreset.eval.policy_spec import load_policy
+    from xreset.live.deploy import write_deployed
+    from xreset.objects.catalogue import load_objects
+
+    spec = load_policy(policy, robot=robot)
+    folder = spec.meshes_folder(meshes)
+    write_deployed(spec.deployed(load_objects(only or spec.objects_of(folder), folder)), Path(out))
+    return spec
+
+
+@obeys_rules
+def export_episodes(
+    folders: str | Path | Sequence[str | Path],
+    out: Output,
+    *,
+    engines: Annotated[str | Sequence[str], Option("engine")] = (),
+    robot: str | Path | None = None,
+    meshes: str | Path | None = None,
+    task: str | None = None,
+    video: bool = True,
+    size: tuple[int, int] = (320, 240),
+    cameras: Annotated[Sequence[str], Option("camera")] = (),
+    progress: Callable[[float, int], None] = unseen,
+) -> RecordedEpisodes:
+    """Write recorded evaluation episodes as a LeRobot data set (v3.0), or as plain arrays in an npz file.
+
+    The first episode of each demonstration and engine is recorded; docs/rollouts.md has both formats.
+
+    Args:
+        folders: run folders, or folders that xreset eval wrote into.
+        out: folder of the data set, which must not exist or be empty; or a file FILE.npz of plain arrays.
+        engines: only episodes of this engine, or of several; default: all.
+        robot: name or folder of the robot; default: as the results name it.
+        meshes: folder of meshes; default: as the results name it.
+        task: the task in words; {object} is replaced by the object's name.
+        video: draw a film of each episode, in a data set.
+        size: width and height of the films, pixels, even.
+        cameras: also draw films of this depth camera: front, side or wrist.
+        progress: called with (episodes written, episodes in all).
+
+    Returns:
+        What was written.
+
+    Raises:
+        RunError: a folder does not exist, none holds episodes of the engines, or robots or rates differ.
+        XResetError: pyarrow or the encoder of films is missing, the folder is not empty, or it cannot be written.
+    """
+    from xreset.eval.export.lerobot import write_lerobot
+    from xreset.eval.export.recorded import read_recorded, write_arrays
+
+    recording = read_recorded(folders, engines=engines, robot=robot, meshes=meshes, task=task)
+    out = Path(out)
+    if out.suffix == ".npz":
+        write_arrays(out, recording)
+    else:
+        write_lerobot(out, recording, video=video, size=size, cameras=cameras, progress=progress)
+    return recording
+
+
+@obeys_rules
+def play(
+    policy: str | Path | PolicySpec = "many-objects",
+    *,
+    object_name: Annotated[str | None, Option("object")] = None,
+    engine: str = "mujoco",
+    robot: str | Path | None = None,
+    demos: str | Path | None = None,
+    meshes: str | Path | None = None,
+    seed: Seed = 0,
+    host: str = "127.0.0.1",
+    port: Port = 8080,
+) -> None:
+    """Play with a policy in a browser: drag the goal, push the object or the robot, change the engine. Ctrl-C ends.
+
+    Args:
+        policy: run folder, one of its checkpoints (.pt), exported policy (.onnx), or name of a policy that ships with
+            xreset (xreset policies).
+        object_name: object to begin with; default: the soup can, or else the first one.
+        engine: physics engine to begin with.
+        robot: name or folder of the robot; default: the policy's own.
+        demos: starts and goals: demonstrations, robot motion, reset states or a goal set; default: synthetic
+            demonstrations.
+        meshes: folder of real meshes; default: what the policy was trained with, else the stand-ins.
+        seed: seed of starts and goals.
+        host: address to serve at; 0.0.0.0 allows other machines.
+        port: port to serve at; if it is taken, the next free one.
+
+    Raises:
+        XResetError: something cannot be loaded, or the server does not start.
+    """
+    from xreset.eval.play.page import serve
+
+    serve(
+        policy,
+        object_name=object_name,
+        engine=engine,
+        robot=robot,
+        demos=Path(demos) if demos else None,
+        meshes=Path(meshes) if meshes else None,
+        seed=seed,
+        host=host,
+        port=port,
+    )

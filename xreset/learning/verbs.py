@@ -1,0 +1,185 @@
+"""``train``, a function and a command: its signature has the options, its docstring the help.
+
+It imports most of what it needs when it is called, because the help of a command is shown at once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from xreset.cameras.config import CameraConfig
+from xreset.errors import RunError, XResetError
+from xreset.files.checks import Option, Output, PositiveInt, Seed, obeys_rules
+from xreset.files.storage import file_hash, write_whole
+from xreset.learning.config import TrainConfig
+from xreset.learning.recipes import default_config, from_home, starting_config
+from xreset.learning.run import TEACHER, RunInfo, checkpoints, read_run
+from xreset.physics.plugins import Device, backend_class, device_for
+
+if TYPE_CHECKING:
+    from xreset.resets.bank import ResetBank
+    from xreset.resets.goals import GoalSet
+else:  # a command has files in place of these
+    ResetBank = GoalSet = Any
+
+_WORLDS = 4096
+_WORLDS_OF_STUDENT = 1024
+
+
+@obeys_rules
+def train(
+    bank: Annotated[str | Path | ResetBank | None, Option("resets")] = None,
+    *,
+    out: Output,
+    robot: str | Path | None = None,
+    goals: str | Path | GoalSet | None = None,
+    meshes: str | Path | None = None,
+    engine: str | None = None,
+    device: Device | None = None,
+    num_envs: PositiveInt | None = None,
+    iterations: PositiveInt | None = None,
+    minutes: float = math.inf,
+    seed: Seed | None = None,
+    resume: bool = False,
+    recipe: str | Path | None = None,
+    weights: str | Path | None = None,
+    teacher: str | Path | None = None,
+    cameras: Annotated[str | CameraConfig | Sequence[str | CameraConfig], Option("camera")] = (),
+    wandb: str | None = None,
+    config: TrainConfig | None = None,
+) -> Path:
+    """Train a policy by its rewards; or a student that sees the object, which imitates a teacher that is told its pose.
+
+    The same command continues a training that was stopped or killed, and does nothing if it is finished. After a
+    signal, it writes a checkpoint and exits with 128 and the signal's number: 130 after Ctrl-C, 143 after SIGTERM.
+
+    Args:
+        bank: reset bank, made by xreset resets. Without a bank, every episode begins at home.
+        out: run folder to make, or to continue.
+        robot: name or folder of the robot; default: that of the bank or of the goal set.
+        goals: goal set, made by xreset goals. With a bank, its starts and goals are added to the demonstrated ones.
+        meshes: folder of real meshes; default: that of the bank, else the stand-ins.
+        engine: physics engine to train on; default: mujoco-warp.
+        device: where to train: cpu or cuda; default: cuda where there is a GPU and the engine can use it.
+        num_envs: worlds to simulate (per GPU); default: 4096, for a student 1024.
+        iterations: total number of iterations; default: the configuration's.
+        minutes: longest time of the whole training, without compiling kernels: a run that continues has the rest of it.
+        seed: seed of every random number; default: 0.
+        resume: continue the run in the folder as it was started: its other options need not be given. Name reward terms
+            of your own again.
+        recipe: where the configuration starts from: a recipe (default, robust, live, paper, published), a TOML file of
+            your own with the tables that it changes (docs/clusters.md), or another run's folder. Options --config.*
+            change it; see them with xreset train --help-config [PART]. Reward terms of your own are not taken from a
+            file or a run; name them again. Default: the recipe of the headline results; with weights and goals, the run
+            of the weights.
+        weights: another run's folder: start with the networks of its newest checkpoint, including the standard
+            deviation of the actions and the learning rate.
+        teacher: run folder, exported policy (.onnx), or name of a policy that ships with xreset: a student learns its
+            actions, in its task, from what cameras show (DAgger). Images and their timing: --help-config task.vision.
+        cameras: camera of a student: front, side, or wrist, or two of them; default: front.
+        wandb: project of Weights & Biases to which learning curves are sent as well. Needs the package wandb, and a
+            login. Its variables, such as WANDB_RUN_GROUP and WANDB_MODE=offline, say the rest.
+        config: task, model and algorithm. The defaults shown are those of the recipe. Terms of rewards and
+            observations: --config.task.reward.terms.reach.width 0.4.
+
+    Returns:
+        The run folder, which ``xreset.load_policy`` reads. The policy is in it as ``policy.onnx``, a bank without a
+        file as ``resets.npz``, a student's teacher as ``teacher.onnx``.
+
+    Raises:
+        Stopped: a signal ended the training early; a checkpoint and the policy are written.
+        RunError: the folder holds another training, there is no state to reset to, ``weights`` has no checkpoint of
+            networks like these, or there is too little memory.
+        PolicyError: ``weights`` is of another robot, or its policy observes something else; or the teacher is unknown,
+            sees itself, or is for another robot.
+        XResetError: bank, robot, objects and configuration do not fit together; or a camera is unknown, given twice or
+            inside a body, or never shows some object.
+    """
+    from xreset.learning import train as training
+    from xreset.policy.onnx_policy import policy_contract
+    from xreset.resets.goals import GoalSet
+    from xreset.resets.inputs import load_inputs
+
+    out = Path(out)
+    length = {"iterations": iterations, "minutes": minutes, "wandb": wandb}
+    if resume:
+        started = {"robot": robot, "meshes": meshes, "engine": engine, "device": device}
+        started |= {"num_envs": num_envs, "seed": seed, "teacher": teacher}
+        new = {"recipe": recipe, "weights": weights, "cameras": cameras or None}
+        training.refuse_changes(out, started, new, config, bank, goals)
+        own = config.task.reward.own if config else None
+        return training.resume(out, own=own, **length)
+    if teacher is not None and (recipe is not None or weights is not None):
+        given = "weights" if recipe is None else "recipe"
+        raise RunError(f"The configuration of a student follows from its teacher. Omit {given}.")
+    if config is not None and recipe is not None:
+        raise XResetError("Both recipe and config are given. Give one of them.")
+    if teacher is not None and config is None:
+        config = training.config_of_student(teacher, cameras or "front")
+    elif recipe is not None:
+        config = starting_config(str(recipe))
+    elif config is None:
+        _, config = default_config(goals, weights)
+    if iterations is not None:
+        config = replace(config, iterations=iterations)
+    engine = engine or "mujoco-warp"
+    present = read_run(out) if checkpoints(out) else None
+    if device is None:
+        device = training.default_device(engine) if present is None else present.device
+    training.check_minutes(minutes)
+    if device_for(engine, device) != device:
+        raise RunError(
+            f"The engine {engine!r} does not run on {device!r}. Omit the device, or choose another engine."
+        )
+    data = training.bank_or_goals(bank, goals)
+    load = partial(load_inputs, robot=robot, meshes=meshes, accept=("bank", "goals"))
+    inputs = load(data)
+    if isinstance(inputs.data, GoalSet):
+        config = from_home(config)
+    training.check_config(config, inputs, has_teacher=teacher is not None)
+    version = backend_class(engine).engine_version()  # fails where the engine is missing
+    start = None
+    if weights is not None:
+        start = training.checkpoint_to_start_from(Path(weights), inputs, config)
+    teacher_policy = None
+    if teacher is not None:
+        teacher_policy = training.read_teacher(teacher, inputs, config)
+    default_worlds = _WORLDS if teacher is None else _WORLDS_OF_STUDENT
+    info = RunInfo(
+        robot=str(inputs.robot_name),
+        resets=str(inputs.path),
+        resets_hash=str(inputs.hash),
+        meshes=str(inputs.meshes) if inputs.meshes else None,
+        engine=engine,
+        engine_version=version,
+        device=device,
+        num_envs=num_envs or default_worlds,
+        seed=seed or 0,
+        config=config,
+        contract=policy_contract(inputs.robot, config.task, tuple(o.name for o in inputs.objects)),
+        weights=str(start) if start else None,
+        weights_hash=file_hash(start) if start else None,
+        teacher=str(teacher) if teacher else None,
+    )
+    if present is not None:
+        if not isinstance(data, str | Path):
+            info = replace(info, resets_hash=training.hash_of(data))
+        training.refuse_another_training(out, present, info, teacher_policy)
+        length["iterations"] = config.iterations
+        return training.resume(out, own=config.task.reward.own, **length)
+    with training.new_run(out):
+        if teacher_policy is not None:
+            write_whole(out / TEACHER, teacher_policy.content)
+        # the training reads its own file, so that it has the same data as a resumed one, and values are checked
+        if not isinstance(data, str | Path):
+            path = training.write_data(out, data)
+            inputs = load(path)
+            info = replace(info, resets=str(inputs.path), resets_hash=str(inputs.hash))
+        with training.cleanly(out, info):
+            training.run_training(out, info, inputs, minutes=minutes, resumed=False, wandb=wandb)
+    return out

@@ -362,7 +362,7 @@ class Comparing(InFolder):
             self.assertIn("press, fingertip", text)
             self.assertIn("missed: heavy: hold, outcome" if code else "all targets met", text)
             data = json.loads((self.folder / "parity.json").read_text())
-            self.assertEqual((data["schema"], data["ok"]), ("xreset-parity/1", not code))
+            self.assertEqual((data["schema"], data["ok"]), ("xreset-measured/1", not code))
         self.assertEqual(len(data["grasps"]["hold"]), len(data["reference"]["carried"]["hold 0.5"]))
         self.assertIn(
             "for the robot 'ur7e-sharpa'", refused("engines", "compare", path, "--robot", "openarm")

@@ -35,7 +35,6 @@ from xreset.retarget.file import Retargeted
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 
 REFERENCE = "mujoco"
-SCHEMA = "xreset-parity/1"
 SURFACE_POINTS = 64
 """Points on an object's surface for the distance between two poses."""
 FRICTIONS = (0.5, 0.8)
@@ -173,7 +172,6 @@ class EngineParity:
 class Parity:
     """Results of a comparison, as they are written."""
 
-    schema: str = SCHEMA
     robot: str
     robot_fingerprint: str
     objects: list[dict[str, str]]

@@ -29,7 +29,6 @@ from xreset.geometry.urdf import prismatic_joints
 from xreset.physics import State
 from xreset.spec import SceneSpec
 
-SCHEMA = "xreset-divergence/1"
 PERTURBED = 4
 """Number of perturbed starts in the reference. Long contact is chaotic, so an engine that diverges no more than the
 reference from such a start is not at fault."""
@@ -225,7 +224,6 @@ class TraceResult:
                 }
             )
         return {
-            "schema": SCHEMA,
             "label": actions.label,
             "robot": actions.robot.name,
             "object": actions.object.name,

@@ -20,6 +20,8 @@ from xreset.retarget.accounts import Account, described
 if TYPE_CHECKING:
     from xreset.eval import rollout
 
+MEASURED = "xreset-measured/1"
+"""Schema of results that a command writes for its user, and that xreset does not read."""
 _T = TypeVar("_T")
 Source = Annotated[Path, Positional]
 """A file or folder, given without a flag."""
@@ -83,8 +85,9 @@ def quick_engines(names: Sequence[str], device: str) -> list[rollout.Engine]:
 
 
 def measured(content: dict[str, Any]) -> dict[str, Any]:
-    """Return results with the version and the command that measured them."""
-    return content | {"xreset_version": code_version(), "command": this_command()}
+    """Return results with the version and the command that measured them, which tells what they are."""
+    about = {"xreset_version": code_version(), "command": this_command()}
+    return {"schema": MEASURED} | content | about
 
 
 def write_measured(path: Path | None, content: dict[str, Any]) -> None:

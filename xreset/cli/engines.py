@@ -285,7 +285,7 @@ def trace(
         result = replay.trace(played, base, engines, seed=place.seed, progress=move)
         replays = {e.engine.name: e.recording for e in (result.reference, *result.engines)}
         actions.write_actions(out / "actions.npz", played, replays)
-        write_json(out / "trace.json", result.as_dict())
+        write_json(out / "trace.json", measured(result.as_dict()))
     console.print(replay.rich_table(result))
     for sentence in replay.sentences(result):
         console.print(sentence)

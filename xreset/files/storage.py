@@ -22,7 +22,6 @@ from typing import IO, Any, TypeVar
 
 from xreset import __version__
 from xreset.errors import FileFormatError, XResetError
-from xreset.files.checks import from_dict
 from xreset.files.text import is_plain, shown
 
 T = TypeVar("T")
@@ -299,17 +298,6 @@ def read_json(
         if not keep_version:
             data.pop("xreset", None)
     return data
-
-
-def read_typed(cls: type[T], path: Path, schema: str) -> T:
-    """Read a JSON file of a schema as a dataclass.
-
-    Raises:
-        FileFormatError: the file is damaged, of another schema, or an entry does not fit; the message names the entry.
-    """
-    data = read_json(path, schema, keep_version=True)
-    version = data.pop("xreset", None)
-    return from_dict(cls, data, str(path), version)
 
 
 def read_toml(

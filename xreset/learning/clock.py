@@ -10,10 +10,10 @@ from dataclasses import asdict
 from pathlib import Path
 
 from xreset.files.checks import NonNegativeFloat, NonNegativeInt, Share, from_dict, frozen
-from xreset.files.storage import read_json, read_typed, write_json
+from xreset.files.storage import read_json, write_json
 
-EARLIER = ("lift.json", "xreset-lift/1")
-"""File of earlier versions in the run folder, and its schema."""
+EARLIER = "lift.json"
+"""File of earlier versions in the run folder."""
 SHARES = (0.01, 0.1, 0.5)
 """Shares of success from home whose first passing is recorded."""
 
@@ -68,12 +68,11 @@ def read_lift(folder: Path) -> Lift:
     Raises:
         FileFormatError: the file is damaged.
     """
-    file, schema = EARLIER
     path = folder / "run.json"
-    if path.is_file():
-        entry = read_json(path).get("lift")
-        if entry is not None:
-            return from_dict(Lift, entry, f"{path}: lift")
-    if (folder / file).is_file():
-        return read_typed(Lift, folder / file, schema)
-    return Lift()
+    entry = read_json(path).get("lift") if path.is_file() else None
+    where = f"{path}: lift"
+    if entry is None and (folder / EARLIER).is_file():
+        entry = read_json(folder / EARLIER)
+        entry = {name: x for name, x in entry.items() if name not in ("schema", "xreset")}
+        where = str(folder / EARLIER)
+    return Lift() if entry is None else from_dict(Lift, entry, where)

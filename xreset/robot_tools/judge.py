@@ -40,7 +40,6 @@ from xreset.resets.fingers import Fingers, fingers_of, squeeze_targets
 from xreset.resets.probe import probe
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, checked_objects, objects_named
 
-SCHEMA = "xreset-judge/1"
 PHASES = ("hold", "lift", "turn")
 LIFT = 0.01
 """Height of the object's origin above the demonstration's start from which a state is lifted [m]."""
@@ -106,7 +105,6 @@ class Judgement:
     def as_dict(self) -> dict[str, Any]:
         """Return what a JSON file holds."""
         return {
-            "schema": SCHEMA,
             "robot": self.robot,
             "rows": [asdict(row) for row in self.rows],
             "without_lifted_grasp": list(self.without),

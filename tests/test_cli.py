@@ -178,7 +178,7 @@ class UsageTest(TestCase):
         student = "train --teacher many-objects --out x --resets x.npz"
         for words, told in (
             ("--recipe paper", "follows from its teacher. Omit recipe"),
-            ("--weights x", "Omit weights"),
+            ("--weights y", "Omit weights"),
             ("--camera rear", "Unknown camera 'rear'"),
         ):
             self.assertIn(told, refused(*student.split(), *words.split()))

@@ -520,8 +520,8 @@ class ResultsTest(InFolder):
 
     def test_two_evaluations_are_not_written_into_one_folder(self):
         with (
-            patch("xreset.eval.experiment.load_trial"),
-            patch("xreset.eval.experiment.chosen_engines", return_value=[]),
+            patch("xreset.eval.rollout.load_trial"),
+            patch("xreset.eval.rollout.chosen_engines", return_value=[]),
         ):
             with claim_folder(self.folder), self.assertRaisesRegex(XResetError, "writing"):
                 evaluate(self.policy, "demos.npz")
@@ -588,7 +588,7 @@ class ResultsTest(InFolder):
             logged = self.assertLogs if told else self.assertNoLogs
             with (
                 self.subTest(demos),
-                patch("xreset.eval.experiment.load_trial") as load_trial,
+                patch("xreset.eval.rollout.load_trial") as load_trial,
                 patch("xreset.eval.experiment.play", side_effect=KeyboardInterrupt),
                 logged("xreset.eval.experiment") as logs,
                 self.assertRaises(KeyboardInterrupt),

@@ -203,5 +203,5 @@ class InputsTest(InOneFolder):
             self.assertIs(pickle.loads(pickle.dumps(function)), function)
 
     def test_errors_of_right_arguments_are_not_changed(self):
-        with patch("xreset.eval.experiment.load_policy", side_effect=TypeError("defect")):
+        with patch("xreset.eval.policy_spec.load_policy", side_effect=TypeError("defect")):
             self.assertRaisesRegex(TypeError, "defect", evaluate, "zero", self.demos)

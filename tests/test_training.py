@@ -661,7 +661,7 @@ class TrainingTest(WithBank):
             ("^num_envs is 0", {"num_envs": 0}),
             ("^minutes is 0", {"minutes": 0.0, "bank": toy_bank(self.robot)}),
             ("Unknown device 'quantum'", {"device": "quantum"}),
-            ("'mujoco' does not run on 'cuda'", {"device": "cuda"}),
+            ("'mujoco' does not run on 'cuda'|can use 0 GPUs", {"device": "cuda"}),
             ("needs a reset bank .--resets., a goal set .--goals., or both", {"bank": None}),
             ("the goal set for 'ur7e-sharpa'", {"goals": toy_goals(robots.load("ur7e-sharpa"))}),
             (
@@ -768,7 +768,7 @@ class TrainingTest(WithBank):
                 self.train("memory")
 
     def test_many_worlds_on_a_cpu_are_warned_of(self):
-        stopped = patch("xreset.learning.train._train", side_effect=RunError("stopped"))
+        stopped = patch("xreset.learning.train.run_training", side_effect=RunError("stopped"))
         for worlds, warned in ((300, True), (4, False)):
             said = io.StringIO()
             with stopped, redirect_stderr(said), self.assertRaisesRegex(RunError, "stopped"):

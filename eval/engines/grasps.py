@@ -20,13 +20,13 @@ from torch import Tensor
 
 from xreset.errors import DemoError
 from xreset.files.checks import frozen
-from xreset.geometry.dynamics import drive_values
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.rotations import quat_rotate_inverse
+from xreset.geometry.rotations import matrix_to_quat, quat_rotate_inverse
 from xreset.geometry.shapes import turn_of
 from xreset.geometry.surface import Surface
 from xreset.physics import State
 from xreset.physics.tensors import Tensors
+from xreset.resets.programs import least_squares, palm_path, pressing_targets
 from xreset.retarget.file import Retargeted
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, lowest_point
 
@@ -234,11 +234,6 @@ def _carried(kinematics: Kinematics, closed: Tensor, dt: float) -> Tensor:
 _FINGER_STEPS = 4
 _FINGER_DAMPING = 0.02
 """Damping of a finger step [m]: small against a finger's length, by which one radian moves its tip."""
-_ARM_ITERATIONS = 2
-_ARM_DAMPING = 0.01
-"""Damping of an arm step [m]."""
-_TURN_LENGTH = 0.3
-"""Length that makes turns of the palm comparable to shifts [m]."""
 
 
 def moved_fingertips(kinematics: Kinematics, joint_pos: Tensor, distance: float) -> Tensor:
@@ -256,7 +251,7 @@ def moved_fingertips(kinematics: Kinematics, joint_pos: Tensor, distance: float)
     hand = torch.as_tensor(kinematics.robot.hand_indices)
     step = (_closing_direction(kinematics, q) * distance / _FINGER_STEPS).flatten(-2)
     for _ in range(_FINGER_STEPS):
-        dq = _least_squares(_tip_jacobian(kinematics, q), step, _FINGER_DAMPING)
+        dq = least_squares(_tip_jacobian(kinematics, q), step, _FINGER_DAMPING)
         q = kinematics.clamp(q.index_add(-1, hand, dq))
     return q
 
@@ -274,13 +269,12 @@ def squeezed(kinematics: Kinematics, joint_pos: Tensor) -> Tensor:
     """
     robot = kinematics.robot
     hand = torch.as_tensor(robot.hand_indices)
-    stiffness = torch.as_tensor(drive_values(robot, "kp"))[hand]
     q = moved_fingertips(kinematics, joint_pos, REACH)
     share = torch.full((len(robot.fingertips), 1), 1.0 / (len(robot.fingertips) - 1), dtype=q.dtype)
     share[0] = 1.0
     force = (_closing_direction(kinematics, joint_pos) * share * SQUEEZE).flatten(-2)
     torque = (_tip_jacobian(kinematics, q).mT @ force[..., None])[..., 0]
-    return kinematics.clamp(q.index_add(-1, hand, torque / stiffness))
+    return pressing_targets(kinematics, q, torch.zeros_like(q).index_add(-1, hand, torque))
 
 
 def _closing_direction(kinematics: Kinematics, q: Tensor) -> Tensor:
@@ -297,38 +291,15 @@ def _tip_jacobian(kinematics: Kinematics, q: Tensor) -> Tensor:
 
 
 def carried_palm(kinematics: Kinematics, joint_pos: Tensor, offset: Tensor) -> Tensor:
-    """Return joint positions [T, G, J] that move the palm without turning it. The inverse kinematics of a step starts
-    from the joints of the step before.
+    """Return joint positions [T, G, J] that move the palm without turning it.
 
     Args:
         kinematics: of the robot.
         joint_pos: [G, J] first joint positions (rad, m); the hand's joints stay.
         offset: [T, 3] shift of the palm from its first position, world frame [m].
     """
-    robot = kinematics.robot
-    q = joint_pos
-    arm = torch.as_tensor(robot.arm_indices)
-    start = kinematics.link_poses(q, [robot.palm])[:, 0]
-    path = []
-    for here in offset.to(q):
-        for _ in range(_ARM_ITERATIONS):
-            palm = kinematics.jacobian(q, [robot.palm])
-            # For small angles, the rotation vector back to the start.
-            turn = 0.5 * torch.linalg.cross(palm.rot[:, 0], start[:, :3, :3], dim=-2).sum(-1)
-            error = torch.cat(
-                (start[:, :3, 3] + here - palm.pos[:, 0], _TURN_LENGTH * turn), dim=-1
-            )
-            jacobian = torch.cat((palm.linear[:, 0], _TURN_LENGTH * palm.angular[:, 0]), dim=-2)[
-                ..., arm
-            ]
-            q = kinematics.clamp(
-                q.index_add(-1, arm, _least_squares(jacobian, error, _ARM_DAMPING))
-            )
-        path.append(q)
-    return torch.stack(path)
-
-
-def _least_squares(jacobian: Tensor, step: Tensor, damping: float) -> Tensor:
-    """[..., J] damped joint step for a step [..., R] with the Jacobian [..., R, J]."""
-    square = jacobian @ jacobian.mT + damping**2 * torch.eye(jacobian.shape[-2]).to(jacobian)
-    return (jacobian.mT @ torch.linalg.solve(square, step[..., None]))[..., 0]
+    start = kinematics.link_poses(joint_pos, [kinematics.robot.palm])[:, 0]
+    pos = start[:, :3, 3] + offset.to(joint_pos)[:, None]
+    quat = matrix_to_quat(start[:, :3, :3]).expand(len(offset), -1, -1)
+    path, _ = palm_path(kinematics, joint_pos, pos, quat, iterations=2, turn_length=0.3)
+    return path

@@ -33,6 +33,7 @@ def command_for(arguments: list[str]) -> Callable[..., None]:
     parser.add_argument(_HELP_CONFIG, nargs="?", const="")
     given = parser.parse_known_args(arguments)[0]
     recipe = given.recipe
+    changes = any(word.startswith("--config.") for word in arguments)
     if given.resume:
         config = TrainConfig()
     elif given.teacher and not recipe and not given.weights:
@@ -53,8 +54,10 @@ def command_for(arguments: list[str]) -> Callable[..., None]:
         )  # the configuration has a help of its own
 
     def prepare(options: dict[str, Any]) -> None:
-        """Leave out what the configuration holds already."""
-        if not given.resume:
+        """Leave out what the configuration holds already, and a configuration that nobody gave."""
+        if given.resume:
+            options["config"] = options["config"] if changes else None
+        else:
             options["cameras"] = ()
             if not given.teacher:
                 options["recipe"] = None

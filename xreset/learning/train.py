@@ -98,11 +98,12 @@ def refuse_changes(
     """
     info = read_run(out)
     another = f"start another run with this run's networks: --weights {out} --recipe {out}"
-    own = config is not None and _without_own(config) not in (
-        TrainConfig(),
-        _without_own(info.config),
-    )
-    for name, value in {**new, "config": own or None}.items():
+    if config is not None:
+        rest = _without_own(config)
+        only_own = rest == TrainConfig() and config.task.reward.own
+        if not only_own and rest != _without_own(info.config):
+            new = {**new, "config": config}
+    for name, value in new.items():
         if value is not None:
             raise RunError(
                 f"--resume continues with the run's own networks and configuration. Omit {name}, or {another}"

@@ -20,6 +20,7 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matvec, quat_rotate, quat_rotate_inverse
 from xreset.geometry.surface import Surface
 from xreset.resets.config import SqueezeConfig
+from xreset.resets.programs import pressing_targets
 from xreset.spec import GRAVITY, ObjectSpec, RobotSpec
 
 
@@ -151,10 +152,7 @@ def squeeze_targets(
         force = force * _balance(fingers, pressing)
     torque = torch.einsum("mgi,mgij->mj", force[..., None] * fingers.inward, jacobian)
     effort = torch.as_tensor(drive_values(robot, "effort"))
-    kp = torch.as_tensor(drive_values(robot, "kp"))
-    presses = torch.tensor(~robot.is_arm) & (kp > 0)
-    beyond = torch.where(presses, torque.clamp(-effort, effort) / kp.clamp_min(1e-9), 0.0)
-    return torch.where(beyond != 0, kinematics.clamp(q + beyond), q).numpy()
+    return pressing_targets(kinematics, q, torque.clamp(-effort, effort)).numpy()
 
 
 _LEVER = 0.05

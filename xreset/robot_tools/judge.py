@@ -25,11 +25,8 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import (
     matrix_to_quat,
     quat_angle,
-    quat_conjugate,
     quat_from_axis_angle,
     quat_multiply,
-    quat_normalize,
-    quat_to_axis_angle,
     relative_pose,
 )
 from xreset.physics import Backend, State
@@ -38,6 +35,7 @@ from xreset.resets.bank import ResetBank, check_states
 from xreset.resets.config import JUDGE_SQUEEZE, SqueezeConfig
 from xreset.resets.fingers import Fingers, fingers_of, squeeze_targets
 from xreset.resets.probe import probe
+from xreset.resets.programs import palm_path
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, checked_objects, objects_named
 
 PHASES = ("hold", "lift", "turn")
@@ -294,33 +292,20 @@ def arm_path(
     Returns:
         Joints [1 + waypoints, N, J], and the error at the end as a share of what is allowed [N].
     """
-    arm = torch.as_tensor(kinematics.robot.arm_indices)
-    links = [kinematics.robot.palm]
-    quat = matrix_to_quat(palm[:, :3, :3])
-    risen = (kinematics.link_poses(joints, links)[:, 0, 2, 3] - palm[:, 2, 3])[:, None]
-    waypoints = [joints]
-    error = joints
-    for number in range(1, _WAYPOINTS + 1):
-        share = number / _WAYPOINTS
-        goal = palm[:, :3, 3].clone()
-        goal[:, 2:] += risen + share * (rise - risen)
-        axis = goal.new_tensor([share * turn, 0.0, 0.0]).expand_as(goal)
-        goal_quat = quat_multiply(quat, quat_from_axis_angle(axis))
-        for _ in range(_ITERATIONS):
-            at = kinematics.jacobian(joints, links)
-            away = quat_multiply(goal_quat, quat_conjugate(matrix_to_quat(at.rot[:, 0])))
-            error = torch.cat(
-                (goal - at.pos[:, 0], quat_to_axis_angle(quat_normalize(away))), dim=1
-            )
-            J = torch.cat((at.linear[:, 0], at.angular[:, 0]), dim=1)[..., arm]
-            damping = 1e-4 * torch.eye(len(arm), dtype=J.dtype)
-            step = torch.linalg.solve(J.mT @ J + damping, J.mT @ error[..., None])[..., 0]
-            joints = joints.clone()
-            joints[:, arm] += step.clamp(-0.2, 0.2)
-            joints = kinematics.clamp(joints)
-        waypoints.append(joints)
-    position = error[:, :3].norm(dim=1) / _REACHED[0]
-    return torch.stack(waypoints), torch.maximum(position, error[:, 3:].norm(dim=1) / _REACHED[1])
+    risen = kinematics.link_poses(joints, [kinematics.robot.palm])[:, 0, 2, 3] - palm[:, 2, 3]
+    share = torch.linspace(0.0, 1.0, 1 + _WAYPOINTS, dtype=joints.dtype)[1:, None]
+    pos = palm[:, :3, 3].repeat(_WAYPOINTS, 1, 1)
+    pos[..., 2] += risen + share * (rise - risen)
+    axis = torch.nn.functional.pad(share * turn, (0, 2))  # about x
+    start = matrix_to_quat(palm[:, :3, :3]).expand(_WAYPOINTS, -1, -1)
+    turned = quat_multiply(start, quat_from_axis_angle(axis)[:, None].expand_as(start))
+    path, missing = palm_path(
+        kinematics, joints, pos, turned, iterations=_ITERATIONS, turn_length=1.0
+    )
+    error = torch.maximum(
+        missing[:, :3].norm(dim=1) / _REACHED[0], missing[:, 3:].norm(dim=1) / _REACHED[1]
+    )
+    return torch.cat((joints[None], path)), error
 
 
 def _move(backend: Backend, targets: Tensor, path: Tensor, arm: np.ndarray) -> None:

@@ -7,7 +7,12 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from tests.command import succeeds
+from tests.data import InFolder
 from tests.test_env import TASK, BreakableBackend, N, WithEnv
+from tests.toy_bank import SOUP, toy_bank
+from xreset import load_object, load_robot, make_env
+from xreset.eval.results import read_evaluation
 from xreset.live.deploy import deployed_graph
 from xreset.live.engine import GraphPolicy
 from xreset.runtime import Controller
@@ -117,6 +122,29 @@ class StableBaselinesTest(WithEnv):
             expected = world.actions.targets(action, world.joint_target, joints)
             world.advance(graph.act(world.get_observations()))
             np.testing.assert_allclose(world.joint_target, expected, atol=1e-5)
+
+
+class PlayedTest(InFolder):
+    def test_commands_play_what_another_learner_trained(self):
+        robot = load_robot("openarm")
+        soup = load_object(SOUP)
+        task = evaluation_task(TASK)
+        bank = toy_bank(robot, object_name=np.full(6, SOUP), sequence_object=np.full(3, SOUP))
+        env = StableBaselinesEnv(make_env(robot, (soup,), bank, task, num_envs=1))
+        self.addCleanup(env.close)
+        model = PPO("MultiInputPolicy", env, n_steps=2, batch_size=2, device="cpu", seed=0)
+        file = self.folder / "mine.onnx"
+        file.write_bytes(deployed_graph(Network(model), robot, task, (soup,)))
+        demos = self.folder / "demos.npz"
+        succeeds("demos", "synth", "--objects", SOUP, "--per-object", 1, "--out", demos)
+        options = ("--demos", demos, "--engine", "mujoco", "--episodes", 1)
+        succeeds("eval", file, *options, "--out", self.folder / "eval")
+        (found,) = read_evaluation(self.folder / "eval")
+        self.assertEqual((found.policy, found.robot, len(found.episodes)), ("mine", "openarm", 1))
+        said = succeeds("stress", file, "--faults", *options, "--out", self.folder / "stress")
+        self.assertIn("Not ready for a robot.", said)
+        (found,) = read_evaluation(self.folder / "stress")
+        self.assertGreater(found.changed["property"].nunique(), 10)
 
 
 class Network(torch.nn.Module):

@@ -347,6 +347,11 @@ class InstallationTest(InFolder):
             f"assert xreset.__file__.startswith({str(site)!r}), xreset.__file__\n"
             "policy = xreset.load_policy('many-objects')\n"
             "print(policy.robot.name, len(xreset.load_robot('openarm').joints))\n"
+            "from xreset.eval.play.session import Session\n"
+            "session = Session(policy)\n"
+            "for _ in range(3):\n"
+            "    session.step()\n"
+            "session.close()\n"
             "from xreset.eval import pages\n"
             "assert 'report.html.j2' in pages._environment().list_templates()\n"
         )

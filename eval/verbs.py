@@ -77,7 +77,7 @@ def evaluate(
         PolicyError: the policy is unknown.
         XResetError: another process is writing the folder, or a number is out of range.
     """
-    from xreset.eval.experiment import play, warn_of_replaced
+    from xreset.eval import experiment
     from xreset.eval.policy_spec import load_policy
     from xreset.eval.results import Evaluation, write_result
     from xreset.eval.rollout import chosen_engines, load_trial
@@ -97,10 +97,12 @@ def evaluate(
     found = Evaluation()
     found.folder = folder
     with claim_folder(folder):
-        warn_of_replaced([folder / f"{each.name}.json" for each in played_engines], trial)
+        experiment.warn_of_replaced(
+            [folder / f"{each.name}.json" for each in played_engines], trial
+        )
         for each in played_engines:
             nominal = [Condition(task=trial.task)]
-            result, traces = play(
+            result, traces = experiment.play(
                 spec, trial, each, nominal, episodes=episodes, progress=partial(progress, each.name)
             )
             write_result(folder, result, traces, trial.robot.joint_names)
@@ -159,7 +161,7 @@ def stress(
     """
     wanted = chosen(properties, FAULTS if faults else SWEPT)
     from xreset.demos.synth import synthesize
-    from xreset.eval.experiment import can_set, play
+    from xreset.eval import experiment
     from xreset.eval.policy_spec import load_policy
     from xreset.eval.results import Evaluation, write_result
     from xreset.eval.rollout import chosen_engines, load_trial
@@ -192,11 +194,11 @@ def stress(
             usable = [Condition(task=task)]
             left_out = {}
             for prop, own in conditions:
-                if can_set(each, prop):
+                if experiment.can_set(each, prop):
                     usable += own
                 else:
                     left_out[prop.option] = f"{each.name} cannot set it"
-            result, traces = play(
+            result, traces = experiment.play(
                 spec,
                 trial,
                 each,

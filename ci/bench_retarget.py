@@ -140,7 +140,8 @@ def errors(
     parts: list[tuple[np.ndarray, ...]] = []
     beyond = 0.0
     hands = HandMotions(demos, robot, specs, RetargetConfig(hand=config), device=options.device)
-    for batch, _, _, motion in hands.batches():
+    for part in hands.batches():
+        motion = part.motion
         followed = hand.keypoints(**vars(motion)).numpy()
         beyond = max(
             beyond,
@@ -150,7 +151,7 @@ def errors(
                 ).max()
             ),
         )
-        for slot, i in enumerate(np.unique(on_table.sequence_of_frame[batch])):
+        for slot, i in enumerate(np.unique(on_table.sequence_of_frame[part.rows])):
             rows = on_table.frames(i)
             seen = on_table.hand_valid[rows]
             robot_points = followed[slot, : len(seen)]

@@ -89,9 +89,9 @@ class PadsTest(TestCase):
         objects = list(demo_objects(demos).values())
         config = HandWeights(clearance_weight=0.0, iterations=0)
         hands = HandMotions(demos, self.model.robot, objects, RetargetConfig(hand=config))
-        [(*_, targets, _)] = hands.batches()
-        self.assertFalse(targets.held[0, 0])
-        self.assertTrue(targets.held[0, -1])
+        [batch] = hands.batches()
+        self.assertFalse(batch.targets.held[0, 0])
+        self.assertTrue(batch.targets.held[0, -1])
 
 
 class AnalyticMapTest(TestCase):

@@ -343,7 +343,7 @@ class PipelineTest(InOneFolder):
         seen = self.result.annotated[self.first]
         self.assertGreater(self.result.valid[self.first].sum() / seen.sum(), 0.8)
         self.assertLess(self.result.hand_error[self.first][seen].mean(), 0.015)
-        self.assertEqual(self.ticks, [(1, 1)])
+        self.assertEqual(self.ticks, [(0.5, 1), (1.0, 1)])
         first = self.result.first_contact[0]
         self.assertEqual(np.flatnonzero(self.result.contact[self.first])[0], first)
         self.assertGreater(first, 0)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -20,6 +21,7 @@ from torch import Tensor
 
 from xreset.errors import DemoError
 from xreset.files.checks import PositiveInt, frozen, obeys_rules
+from xreset.files.processes import in_processes
 from xreset.files.progress import unseen
 from xreset.geometry.rotations import matrix_to_quat, quat_angle
 from xreset.geometry.shapes import turn_of
@@ -208,7 +210,20 @@ def _candidates(
     return np.array(pose, dtype=int), np.array(grasp, dtype=int)
 
 
-@one_thread()
+class _ArmJob(NamedTuple):
+    """The inverse kinematics of M hands, each a path of one frame."""
+
+    robot: RobotSpec
+    targets: ArmTargets
+
+
+def _solve_arm(job: _ArmJob) -> tuple[np.ndarray, np.ndarray]:
+    """Return the arm's joints [M, n] and whether the arm reaches each pose [M]."""
+    with one_thread():
+        arm, measures = track(ArmModel(job.robot), job.targets, _THRESHOLDS, QUICK)
+    return arm[:, 0].numpy(), (classify(measures, _THRESHOLDS) == 0)[:, 0].numpy()
+
+
 def _carried(
     bank: ResetBank,
     grasp: np.ndarray,
@@ -238,16 +253,21 @@ def _carried(
     root_turn = turn * Rotation.from_matrix(root[:, :3, :3])
     root_quat = matrix_to_quat(torch.as_tensor(root_turn.as_matrix()))
     hand_joints = torch.as_tensor(joint_pos[:, model.hand.joint_indices])
-    is_reached = np.zeros(len(grasp), dtype=bool)
-    for first in range(0, len(grasp), _BATCH):
-        rows = slice(first, first + _BATCH)
-        targets = ArmTargets.of_poses(
-            torch.as_tensor(root_pos[rows]), root_quat[rows], hand_joints[rows, None]
+    batches = [slice(first, first + _BATCH) for first in range(0, len(grasp), _BATCH)]
+    jobs = [
+        _ArmJob(
+            robot,
+            ArmTargets.of_poses(
+                torch.as_tensor(root_pos[rows]), root_quat[rows], hand_joints[rows, None]
+            ),
         )
-        arm, measures = track(model, targets, _THRESHOLDS, QUICK)
-        joint_pos[rows, robot.arm_indices] = arm[:, 0].numpy()
-        is_reached[rows] = (classify(measures, _THRESHOLDS) == 0)[:, 0].numpy()
-        progress(min(first + _BATCH, len(grasp)))
+        for rows in batches
+    ]
+    is_reached = np.zeros(len(grasp), dtype=bool)
+    for rows, (arm, reached) in zip(batches, in_processes(_solve_arm, jobs), strict=True):
+        joint_pos[rows, robot.arm_indices] = arm
+        is_reached[rows] = reached
+        progress(min(rows.stop, len(grasp)))
     joint_target = joint_pos.copy()
     joint_target[:, robot.hand_indices] = bank.targets[grasp][:, robot.hand_indices]
     arrays = (joint_pos, poses.pos[pose], poses.quat[pose], joint_target)

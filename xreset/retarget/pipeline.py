@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from torch import Tensor
 from xreset.demos.archive import Demos, grounded, levelled
 from xreset.demos.examine import examine, refuse_wrong
 from xreset.files.checks import Checked, frozen
+from xreset.files.processes import in_processes
 from xreset.files.progress import Progress, unseen
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.rotations import matrix_to_quat
@@ -29,7 +31,7 @@ from xreset.retarget.hand.config import HandWeights, Jaw
 from xreset.retarget.hand.jaw import jaw_keypoints
 from xreset.retarget.hand.model import HandModel, HandState, HandTargets
 from xreset.retarget.hand.solve import retarget_hand
-from xreset.retarget.validity import REASONS, Thresholds, classify
+from xreset.retarget.validity import REASONS, Measures, Thresholds, classify
 from xreset.spec import ObjectSpec, RobotSpec, checked_objects, objects_named
 
 _log = logging.getLogger(__name__)
@@ -97,10 +99,18 @@ def retarget_demos(
     joint_pos = np.tile(robot.home, (demos.num_frames, 1))
     reason = np.full(demos.num_frames, REASONS.index("not annotated"), dtype=np.int32)
     hand_error, wrist_error = np.full((2, demos.num_frames), np.inf)
-    for rows, is_frame, targets, motion in hands.batches(progress):
-        path = _arm_targets(hands.model, arm, targets, motion)
-        with one_thread():
-            joints, measures = track(arm, path, _THRESHOLDS, config.arm)
+    batches = list(hands.batches(lambda done, count: progress(done / 2, count)))
+    paths = [_arm_targets(hands.model, arm, batch.targets, batch.motion) for batch in batches]
+    jobs = [_ArmJob(robot, path, config.arm) for path in paths]
+    count = sum(len(path.annotated) for path in paths)
+    done = count / 2
+    for batch, path, (joints, measures) in zip(
+        batches, paths, in_processes(_follow, jobs), strict=True
+    ):
+        rows = batch.rows
+        is_frame = batch.is_frame
+        done += len(path.annotated) / 2
+        progress(done, count)
         joint_pos[rows] = arm.full(joints, path.hand_joints)[is_frame]
         reason[rows] = classify(measures, _THRESHOLDS)[is_frame]
         hand_error[rows] = path.hand_error[is_frame]
@@ -162,8 +172,8 @@ def wrist_paths(
     hands = HandMotions(demos, robot, objects)
     arm = ArmModel(robot)
     return [
-        _arm_targets(hands.model, arm, targets, motion)
-        for *_, targets, motion in hands.batches(progress)
+        _arm_targets(hands.model, arm, batch.targets, batch.motion)
+        for batch in hands.batches(progress)
     ]
 
 
@@ -194,27 +204,29 @@ class HandMotions:
         """Contact points [F, 21, 3] of the human keypoints, and whether each keypoint [F, 21] touches the object."""
         self._keypoints = np.where(demos.hand_valid[:, None, None], demos.hand_keypoints, 0.0)
 
-    def batches(
-        self, progress: Progress = unseen
-    ) -> Iterator[tuple[np.ndarray, np.ndarray, HandTargets, HandState]]:
-        """Retarget the hand alone, in batches of sequences with an annotated hand.
-
-        Yields:
-            For each batch of S sequences, padded to T frames: the indices [B] of its frames among all frames; whether
-            each element [S, T] of the batch is one of these frames; the hand's targets; the hand's motion.
-        """
+    def batches(self, progress: Progress = unseen) -> Iterator[HandBatch]:
+        """Retarget the hand alone, in batches of sequences with an annotated hand; on the CPU, on all cores."""
         owner = self.demos.sequence_of_frame
         lengths = np.diff(self.demos.frame_offsets)
         todo = np.unique(owner[self.demos.hand_valid])
+        robot = self.model.robot
+        parts = []
+        jobs = []
         for begin in range(0, len(todo), _SEQUENCES_PER_BATCH):
             sequences = todo[begin : begin + _SEQUENCES_PER_BATCH]
             rows = np.flatnonzero(np.isin(owner, sequences))
             is_frame = np.arange(lengths[sequences].max()) < lengths[sequences, None]
             targets = self._targets(sequences, rows, is_frame)
-            with one_thread():
-                motion = retarget_hand(self.model, targets, self._config.hand, jaw=self._config.jaw)
-            yield rows, is_frame, targets, motion
-            progress(begin + len(sequences), len(todo))
+            parts.append((rows, is_frame))
+            jobs.append(_HandJob(robot, str(self.model.device), targets, self._config))
+        compute = in_processes if self.model.device.type == "cpu" else map
+        done = 0
+        for (rows, is_frame), job, motion in zip(
+            parts, jobs, compute(_hand_motion, jobs), strict=True
+        ):
+            yield HandBatch(rows, is_frame, job.targets, motion)
+            done += len(is_frame)
+            progress(done, len(todo))
 
     def _targets(
         self, sequences: np.ndarray, rows: np.ndarray, is_frame: np.ndarray
@@ -282,6 +294,50 @@ def rest_on_table(demos: Demos, objects: Sequence[ObjectSpec]) -> Demos:
     demos = grounded(levelled(demos), objects_named(objects, demos.object_names))
     names = ("hand_keypoints", "object_pos", "object_quat_wxyz")
     return replace(demos, **{name: getattr(demos, name).astype(np.float64) for name in names})
+
+
+@dataclass(frozen=True)
+class HandBatch:
+    """S sequences, padded to T frames, of which B are frames of the demonstrations."""
+
+    rows: np.ndarray
+    """[B] indices of the frames among all frames."""
+    is_frame: np.ndarray
+    """[S, T] bool: whether an element of the batch is one of these frames."""
+    targets: HandTargets
+    """What the hand follows."""
+    motion: HandState
+    """The hand's motion."""
+
+
+class _HandJob(NamedTuple):
+    """The retargeting of one batch of hands."""
+
+    robot: RobotSpec
+    device: str
+    targets: HandTargets
+    config: RetargetConfig
+
+
+class _ArmJob(NamedTuple):
+    """The inverse kinematics along one batch of paths."""
+
+    robot: RobotSpec
+    path: ArmTargets
+    config: ArmSearch
+
+
+def _hand_motion(job: _HandJob) -> HandState:
+    """Return the hand's motion."""
+    model = HandModel(job.robot, device=job.device)
+    with one_thread():
+        return retarget_hand(model, job.targets, job.config.hand, jaw=job.config.jaw)
+
+
+def _follow(job: _ArmJob) -> tuple[Tensor, Measures]:
+    """Return the arm's joints and their measures: see :func:`track`."""
+    with one_thread():
+        return track(ArmModel(job.robot), job.path, _THRESHOLDS, job.config)
 
 
 def _arm_targets(

@@ -1,0 +1,59 @@
+"""Independent pieces of work on all cores."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from unittest import TestCase
+from unittest.mock import patch
+
+from xreset.errors import DemoError, XResetError
+from xreset.files.processes import in_processes
+
+SCRIPT = """
+from math import sqrt
+from xreset.files.processes import in_processes
+print(list(in_processes(sqrt, [1.0, 4.0, 9.0])))
+"""
+
+
+def process_of(job: int) -> tuple[int, int]:
+    return job, os.getpid()
+
+
+def refuse(job: int) -> None:
+    raise DemoError(f"job {job} is wrong")
+
+
+def die(job: int) -> None:
+    if job:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+class ProcessesTest(TestCase):
+    def setUp(self):
+        self.enterContext(patch("joblib.cpu_count", return_value=2))
+
+    def test_results_come_in_order_from_other_processes(self):
+        jobs, processes = zip(*in_processes(process_of, range(6)), strict=True)
+        self.assertEqual(jobs, tuple(range(6)))
+        self.assertNotIn(os.getpid(), processes)
+
+    def test_one_job_stays_in_this_process(self):
+        self.assertEqual(list(in_processes(process_of, [7])), [(7, os.getpid())])
+
+    def test_errors_arrive_as_they_are(self):
+        with self.assertRaisesRegex(DemoError, "job 0 is wrong"):
+            list(in_processes(refuse, range(3)))
+
+    def test_a_killed_process_is_said(self):
+        with self.assertRaisesRegex(XResetError, "was killed.*LOKY_MAX_CPU_COUNT=1"):
+            list(in_processes(die, range(3)))
+
+    def test_a_script_needs_no_main_guard(self):
+        script = Path(self.enterContext(TemporaryDirectory())) / "script.py"
+        script.write_text(SCRIPT)
+        run = subprocess.run([sys.executable, script], capture_output=True, text=True)
+        self.assertEqual(run.stdout, "[1.0, 2.0, 3.0]\n", run.stderr)

@@ -1,0 +1,43 @@
+"""Independent pieces of work on all cores."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from typing import TypeVar, cast
+
+from xreset.errors import XResetError
+
+_Job = TypeVar("_Job")
+_Result = TypeVar("_Result")
+
+
+def in_processes(function: Callable[[_Job], _Result], jobs: Sequence[_Job]) -> Iterator[_Result]:
+    """Yield ``function(job)`` for each job, in their order, computed in one process for each core.
+
+    One job, or one core, is computed in this process. Each process uses one thread: for tensors of this size a second
+    thread gains nothing, and waits in a busy loop.
+
+    Args:
+        function: of a module, so that other processes can import it; job and result are pickled.
+        jobs: of about equal length.
+
+    Raises:
+        XResetError: a process was killed. Errors of ``function`` are raised as they are.
+    """
+    import joblib  # when it is needed, because its import takes a while
+
+    count = min(joblib.cpu_count(), len(jobs))
+    if count <= 1:
+        yield from map(function, jobs)
+        return
+    with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+        pool = joblib.Parallel(n_jobs=count, return_as="generator")
+        results = pool(joblib.delayed(function)(job) for job in jobs)
+        try:
+            yield from cast("Iterator[_Result]", results)
+        except BrokenProcessPool as error:
+            raise XResetError(
+                "A process of this command was killed, perhaps because the memory is full. Close other programs, or "
+                "use fewer processes (LOKY_MAX_CPU_COUNT=1), and repeat the command."
+            ) from error

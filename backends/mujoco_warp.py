@@ -14,18 +14,13 @@ from torch import Tensor
 
 from xreset.geometry.rotations import quat_to_matrix
 from xreset.physics import (
-    Backend,
     Capability,
     Health,
     KnownDifference,
     MassProperties,
     Parameter,
-    Parameters,
-    State,
-    no_readings,
     unavailable,
 )
-from xreset.physics.plugins import existing_device
 from xreset.spec import SceneSpec
 
 try:
@@ -35,6 +30,7 @@ except ImportError as error:
     raise unavailable("mujoco_warp", "'xreset[mujoco-warp]'", error) from error
 
 from xreset.backends import mujoco_warp_kernels as kernels
+from xreset.backends.batch import BatchBackend
 from xreset.backends.mjcf import KNOWN_DIFFERENCES, compile_scene
 from xreset.backends.mjcf_model import MIN_FRICTION
 from xreset.backends.mujoco_warp_setup import (
@@ -95,7 +91,7 @@ _OVERFLOW = int(
 """Overflows that lose a contact or a constraint."""
 
 
-class MujocoWarpBackend(Backend):
+class MujocoWarpBackend(BatchBackend):
     """MuJoCo-Warp.
 
     The worlds share one model; what differs between worlds (the object's shapes, masses, friction) is a batched field
@@ -129,9 +125,7 @@ class MujocoWarpBackend(Backend):
         Raises:
             BackendUnavailableError: the device does not exist.
         """
-        super().__init__(
-            scene, num_worlds, object_index=object_index, device=existing_device(device)
-        )
+        super().__init__(scene, num_worlds, object_index=object_index, device=device)
         held = self.object_index.unique().tolist()
         scenes = {i: compile_scene(scene, i, slots_for=held) for i in held}
         self._at = at = next(iter(scenes.values()))
@@ -154,7 +148,7 @@ class MujocoWarpBackend(Backend):
                 self._allocate()
                 with announced(self._warp_device):
                     self._prepare()
-            self.set_state(State.initial(scene, self.object_index).to(self.device))
+            self.begin()
 
     @classmethod
     def engine_version(cls) -> str:
@@ -164,23 +158,13 @@ class MujocoWarpBackend(Backend):
     def devices(cls) -> list[str]:
         return ["cuda", "cpu"] if torch.cuda.is_available() else ["cpu"]
 
-    def set_state(self, state: State, worlds: Tensor | None = None) -> None:
-        self._must_be_open()
-        index = self._choose(worlds)
-        self._coming[index] = self._checked_state(state, len(index))
+    def begin(self) -> None:
         with self._on_stream():
             self._run("begin")
 
-    def set_where(self, mask: Tensor, state: State, parameters: Parameters) -> None:
-        self._must_be_open()
-        self._mask.copy_(mask)
-        for name, value in parameters.given().items():
-            present = self._parameters[name]
-            mine = self._mask.view(-1, *[1] * (present.ndim - 1))
-            torch.where(mine, self._checked(name, value, present.shape), present, out=present)
-        self._coming.map(Tensor.copy_, self._checked_state(state, self.num_worlds))
+    def apply_parameters(self) -> None:
         with self._on_stream():
-            self._run("begin")
+            self._run("parameters")
 
     def step(self, substeps: int | None = None) -> None:
         self._must_be_open()
@@ -210,16 +194,6 @@ class MujocoWarpBackend(Backend):
         return MassProperties(
             mass=of_bodies("body_mass"), com=of_bodies("body_ipos"), inertia=inertia
         )
-
-    # Physical parameters ----------------------------------------------------------------------------------------------
-
-    def _set(self, name: Parameter, value: Tensor, worlds: Tensor | None) -> None:
-        self._must_be_open()
-        index = self._choose(worlds)
-        present = self._parameters[name]
-        present[index] = self._checked(name, value, (len(index), *present.shape[1:]))
-        with self._on_stream():
-            self._run("parameters")
 
     def close(self) -> None:
         """Free the worlds' memory once nobody else holds a view of it."""
@@ -255,20 +229,12 @@ class MujocoWarpBackend(Backend):
 
         self._wrench = wp.to_torch(self._data.xfrc_applied)[:, at.object_body]
         self._overflow = wp.to_torch(self._data.overflow)
-        self._coming = State.initial(self.scene, self.object_index).to(self.device)
-        """State that the worlds of the mask get when the graph ``begin`` runs."""
-        self._state = replace(self._coming.clone(), joint_target=wp.to_torch(self._data.ctrl))
-        readings = no_readings(self.scene.robot, self.num_worlds)
-        links, contacts, health = (reading.to(self.device) for reading in readings)
-        self._links = links
-        self._contacts = contacts
-        self._nonfinite = health.nonfinite
-        self._every_world = torch.arange(self.num_worlds, device=self.device)
-        self._mask = torch.zeros_like(self._nonfinite)
+        self._state = replace(self._state, joint_target=wp.to_torch(self._data.ctrl))
+        self._nonfinite = self._health.nonfinite
         self._name_parameters()
 
     def _name_parameters(self) -> None:
-        """Name the values that the parameters of the worlds start from, and the present values."""
+        """Name the values that the parameters of the worlds start from."""
         body = self._at.object_body
         field = {name: wp.to_torch(getattr(self._model, name)) for name in _SET_PER_WORLD}
         self._drive_fields = [wp.from_torch(field[name]) for name in _DRIVE_FIELDS]
@@ -283,8 +249,6 @@ class MujocoWarpBackend(Backend):
             "drive": torch.stack((gain[:, 0], -bias[:, 2], force_range[:, 1], bias[:, 0]), dim=1),
         }
         self._nominal = {name: value.clone() for name, value in nominal.items()}
-        self._parameters = Parameters.nominal(self.scene, self.object_index).to(self.device).given()
-        """The present values of each world."""
 
     def _prepare(self) -> None:
         """Run each sequence of kernels once, which compiles it, then capture it as a graph.
@@ -362,12 +326,12 @@ class MujocoWarpBackend(Backend):
     def _write_parameters(self) -> None:
         """Write the parameters of the worlds of the mask into the engine's model."""
         m = self._model
-        values = {name: self._parameters[name] for name in get_args(Parameter)} | self._nominal
+        values = {name: self.parameters[name] for name in get_args(Parameter)} | self._nominal
         wp.launch(
             kernels.write_parameters,
             dim=self.num_worlds,
             inputs=[
-                wp.from_torch(self._mask),
+                wp.from_torch(self.chosen),
                 *_arrays(values),
                 self._friction_columns,
                 MIN_FRICTION,
@@ -393,8 +357,8 @@ class MujocoWarpBackend(Backend):
             kernels.write_state,
             dim=self.num_worlds,
             inputs=[
-                wp.from_torch(self._mask),
-                *_arrays(vars(self._coming)),
+                wp.from_torch(self.chosen),
+                *_arrays(vars(self.coming)),
                 *self._addresses,
                 *self._mimic,
                 at.object_qpos,
@@ -414,17 +378,6 @@ class MujocoWarpBackend(Backend):
 
     def _run(self, name: str) -> None:
         wp.capture_launch(self._graphs[name])
-
-    # Checking ---------------------------------------------------------------------------------------------------------
-
-    def _choose(self, worlds: Tensor | None) -> Tensor:
-        """Set the mask of the worlds to change, and return their indices [M]."""
-        index = self._every_world
-        if worlds is not None:
-            index = self._indices(worlds)
-        self._mask.zero_()
-        self._mask[index] = True
-        return index
 
 
 def _arrays(values: Mapping[str, Tensor]) -> list[Any]:

@@ -221,7 +221,8 @@ class TrackedFrames:
         """[K, 4]"""
         inertias = [robot.bodies[body].inertia for body in self.bodies]
         com = [np.zeros(3) if inertia is None else inertia.com for inertia in inertias]
-        self._lever = self.pos - np.array(com)
+        self.lever = self.pos - np.array(com)
+        """[K, 3] the same from that body's centre of mass."""
 
     def locate(
         self, pos: np.ndarray, quat: np.ndarray, com_velocity: np.ndarray, angvel: np.ndarray
@@ -234,7 +235,7 @@ class TrackedFrames:
             com_velocity: [K, 3] velocity of their bodies' centres of mass.
             angvel: [K, 3] angular velocity of their bodies.
         """
-        velocity = com_velocity + cross(angvel, rotate(quat, self._lever))
+        velocity = com_velocity + cross(angvel, rotate(quat, self.lever))
         return pos + rotate(quat, self.pos), multiply(quat, self.quat), velocity, angvel
 
 
@@ -324,6 +325,18 @@ class MovingJoints:
         self.armature = drive_values(robot, "armature")
         self.friction_loss = drive_values(robot, "friction_loss")
         self.has_dry_friction = bool(self.friction_loss.any())
+
+    @cached_property
+    def couplings(self) -> tuple[np.ndarray, np.ndarray]:
+        """[D, J] and [D]: positions of all moving joints are the first, times those of the actuated ones, plus the
+        second; velocities are the first times theirs."""
+        count = len(self.driven)
+        matrix = np.zeros((self.count, count))
+        matrix[self.driven, range(count)] = 1.0
+        matrix[self.mimic, self.source] = self.multiplier
+        offset = np.zeros(self.count)
+        offset[self.mimic] = self.offset
+        return matrix, offset
 
     def spread(self, position: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return positions and velocities [D] of all moving joints, given those [J] of the actuated joints."""

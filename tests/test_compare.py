@@ -15,7 +15,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from tests.command import refused, succeeds
 from tests.toy_bank import SOUP, SPAM
-from tests.toy_results import ENGINES, InFolder, rollouts_with, toy_rollouts
+from tests.toy_results import ENGINES, InFolder, rollouts_with, toy_episode, toy_rollouts
 from xreset import TrainConfig
 from xreset.errors import FileFormatError, RunError, XResetError
 from xreset.eval.metrics import METRICS
@@ -26,7 +26,13 @@ from xreset.eval.report.groups import grouped, scores
 from xreset.eval.report.make import collect, make_report, page
 from xreset.eval.report.read import read_curves, read_training, read_trainings
 from xreset.eval.results import read_evaluation
-from xreset.eval.stats import bootstrap_ci95, crossed_bootstrap_ci95, difference_ci95
+from xreset.eval.stats import (
+    bootstrap_ci95,
+    crossed_bootstrap_ci95,
+    difference_ci95,
+    difference_p,
+    holm,
+)
 from xreset.learning.clock import Lift, Passing, write_lift
 from xreset.task.config import ResetConfig, TaskConfig, TerminationConfig
 
@@ -371,6 +377,38 @@ class ScoreTest(Compared):
         few = [x[:3] for x in (both[0], runs, demos)]
         more = [x[:41] for x in (both[0], runs, demos)]
         self.assertRaisesRegex(ValueError, "every training needs", difference_ci95, few, more)
+
+    def test_chance_among_many_comparisons_is_not_claimed(self):
+        self.assertEqual(holm([0.01, 0.04, 0.03]), [True, False, False])
+        self.assertEqual(holm([0.04, 0.001, 0.02]), [True, True, True])
+        self.assertEqual(holm([]), [])
+        rng = default_rng(0)
+        demos = np.arange(60)
+        runs = np.zeros(60, int)
+        p_values = []
+        for gain in (*np.zeros(200), 0.5):
+            one, other = rng.normal(size=(2, 60))
+            p_values.append(difference_p([one, runs, demos], [other + one + gain, runs, demos]))
+        chance = np.array(p_values[:200])
+        self.assertTrue(0.02 < (chance < 0.05).mean() < 0.10, (chance < 0.05).mean())
+        self.assertTrue(holm(p_values[191:])[-1], "a true difference among nine that are none")
+
+    def test_the_page_marks_differences_that_are_certain(self):
+        def progress(gain):
+            found = []
+            for i, share in enumerate(np.linspace(0.2, 0.5, 12)):
+                score = share + gain * (1 + i % 3)
+                found.append(toy_episode(i, 0, object_name=SOUP, task_progress=score))
+            return replace(toy_rollouts(), episodes=tuple(found), traces=())
+
+        for name, gain in (("a", 0.0), ("better", 0.1), ("same", 0.0)):
+            self.write_run(name, reset_config(demo_probability=0.3 + gain))
+            self.write_results(name, progress(gain), inputs={"demos": "ab", "policy": name})
+        self.compare("a", "better", "same")
+        cells = re.findall(r'<td class="wrap">(<b>)?([^<]+)', page(self.report))
+        marked = {text: bool(bold) for bold, text in cells}
+        expected = {"-": False, "+20.0 (+15.0 to +25.0)": True, "+0.0 (+0.0 to +0.0)": False}
+        self.assertEqual(marked, expected)
 
     def test_the_difference_of_two_evaluations(self):
         base = toy_rollouts()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from math import nan
 from os.path import commonprefix
 from typing import Any
@@ -13,7 +13,8 @@ import pandas as pd
 from xreset.eval.metrics import METRICS
 from xreset.eval.report.fairness import uneven
 from xreset.eval.report.read import Training
-from xreset.eval.results import Table, ci95, difference, mean
+from xreset.eval.results import Table, ci95, crossed, difference, mean
+from xreset.eval.stats import difference_p, holm
 
 Groups = dict[str, Sequence[Training]]
 """Label -> one training, or several that differ only in their seed. A group is a line of the picture."""
@@ -126,16 +127,40 @@ def differences(groups: Groups) -> Table:
     """Return a row for each group after the first, engine and metric, where both were evaluated alike: by how much the
     group's mean is above the first group's. Columns as of :func:`scores`; the metric is named ``METRIC minus FIRST``.
     """
+    first = next(iter(groups), None)
     rows = []
+    for label, engine, reference, own in _compared(groups):
+        for metric in METRICS:
+            values = difference(reference, own, metric)
+            rows.append((label, engine, EVERY, f"{metric} minus {first}", *values))
+    return pd.DataFrame(rows, columns=COLUMNS)
+
+
+def certain_differences(groups: Groups) -> set[tuple[str, str]]:
+    """Return the groups and engines with a task progress that differs from the first group's at the 5 % level, after
+    Holm's correction for all that are compared."""
+    compared = list(_compared(groups))
+    p_values = []
+    for _, _, *tables in compared:
+        one, other = (crossed(table, "task_progress") for table in tables)
+        p_values.append(difference_p(one, other))
+    found = set()
+    for (label, engine, *_), is_certain in zip(compared, holm(p_values), strict=True):
+        if is_certain:
+            found.add((label, engine))
+    return found
+
+
+def _compared(groups: Groups) -> Iterator[tuple[str, str, Table, Table]]:
+    """Yield each group after the first, each engine in which both were evaluated alike, and the first group's and the
+    group's episodes there."""
     if not groups:
-        return pd.DataFrame(rows, columns=COLUMNS)
+        return
     first, *others = groups
     reference = dict(by_engine(groups[first]))
     for label in others:
         if uneven([*groups[first], *groups[label]]):
             continue
         for engine, own in by_engine(groups[label]):
-            for metric in METRICS if engine in reference else ():
-                values = difference(reference[engine], own, metric)
-                rows.append((label, engine, EVERY, f"{metric} minus {first}", *values))
-    return pd.DataFrame(rows, columns=COLUMNS)
+            if engine in reference:
+                yield label, engine, reference[engine], own

@@ -10,7 +10,7 @@ from scipy.stats import binomtest
 from xreset.errors import RunError
 from xreset.eval.metrics import METRICS
 from xreset.eval.report.curves import AXES, X, amounts
-from xreset.eval.report.groups import EVERY, Groups, by_engine, counted
+from xreset.eval.report.groups import EVERY, Groups, by_engine, certain_differences, counted
 from xreset.eval.report.read import Training, versions
 from xreset.eval.results import Table
 from xreset.eval.table import Rows
@@ -45,6 +45,8 @@ class Row:
     """A number for each of :data:`xreset.eval.metrics.METRICS`."""
     difference: str
     """Points of task progress above the first group; empty: not comparable."""
+    certain: bool
+    """Whether that is a difference (:func:`xreset.eval.report.groups.certain_differences`)."""
 
 
 def results(groups: Groups, found: Table, above: Table) -> list[Row]:
@@ -59,6 +61,7 @@ def results(groups: Groups, found: Table, above: Table) -> list[Row]:
     progress = f"task_progress minus {next(iter(groups), None)}"
     every = found[found["object"] == EVERY].set_index(["group", "engine", "metric"])
     more = above[above["metric"] == progress].set_index(["group", "engine"])
+    certain = certain_differences(groups)
     for label, members in groups.items():
         for engine, episodes in by_engine(members):
             cells = []
@@ -86,6 +89,7 @@ def results(groups: Groups, found: Table, above: Table) -> list[Row]:
                 counts=counted(episodes),
                 cells=tuple(cells),
                 difference=difference,
+                certain=(label, engine) in certain,
             )
             rows.append(row)
     return rows

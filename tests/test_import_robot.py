@@ -355,7 +355,8 @@ class Toy(Robots):
     def test_what_an_mjcf_has_and_a_robot_has_not_is_used_or_named(self):
         spring = 'name="f1_1" stiffness="2" frictionloss="0.1"'
         slack = '<tendon><fixed name="slack"><joint joint="f3_1" coef="1"/></fixed></tendon>'
-        scene = '<body name="cube"><freejoint/><geom size="0.1"/></body></worldbody>'
+        floor = '<geom type="plane" size="0 0 1"/>'
+        scene = f'{floor}<body name="cube"><freejoint/><geom size="0.1"/></body></worldbody>'
         off = '<default><geom contype="0" conaffinity="0" group="{}"/></default><worldbody>'
         pair = '<contact><pair geom1="p" geom2="q"/></contact></mujoco>'
         pairs = MJCF.replace("<geom", '<geom name="p"', 1).replace("</mujoco>", pair)

@@ -46,6 +46,8 @@ _LARGEST = 1e10
 """Larger numbers are errors."""
 _PARTS = ("actuator_", "body_", "dof_", "eq_", "geom_", "jnt_", "qpos", "tendon_", "wrap_")
 """Beginnings of the names of the arrays that are read."""
+_DERIVED = ("geom_aabb", "geom_rbound")
+"""Arrays that follow from others; a plane without a size has a box of 1e10 m."""
 _COLLISION_GROUP = 3
 """Makers put collision shapes into this group or a later one, and visual ones into earlier groups."""
 _MOST_SHAPES = 5000
@@ -132,9 +134,8 @@ def _refuse_pointers(files: list[Path]) -> None:
 def _check_numbers(path: Path, model: mujoco.MjModel) -> None:
     """Raise ``RobotError`` for numbers that are not finite or far too large, and for directions without a length."""
     for name in dir(model):
-        is_stated = name.startswith(_PARTS) and not name.endswith(
-            "0"
-        )  # the others follow from them
+        is_stated = name.startswith(_PARTS) and name not in _DERIVED
+        is_stated = is_stated and not name.endswith("0")  # those follow from others, too
         values = getattr(model, name) if is_stated else None
         if isinstance(values, np.ndarray) and values.dtype.kind == "f":
             wrong = ~(np.abs(values) < _LARGEST)

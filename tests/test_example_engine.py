@@ -132,8 +132,11 @@ class ExampleTest(Unavailable):
     def test_they_use_the_public_interface_only(self):
         public = {
             "xreset.physics",
+            "xreset.physics.torch_warp",
             "xreset.backends.pool",
+            "xreset.backends.batch",
             "xreset.backends.rigid",
+            "xreset.geometry.rotations",
             "xreset.spec",
             "xreset.errors",
         }
@@ -151,6 +154,7 @@ class EngineTest:
 
     engine: ClassVar[str]
     checks: ClassVar[str]
+    options: ClassVar[dict[str, Any]] = {}
 
     @classmethod
     def setUpClass(cls):
@@ -164,7 +168,7 @@ class EngineTest:
         cls.backend = declared(cls.engine).load()
 
     def make(self, scene, num_worlds, *, object_index=None):
-        return self.backend(scene, num_worlds, object_index=object_index, workers=0)
+        return self.backend(scene, num_worlds, object_index=object_index, **self.options)
 
     def test_checks_of_the_suite(self):  # pyright: ignore[reportGeneralTypeIssues]
         for result in run(self.make, only=self.checks.split()):
@@ -177,8 +181,8 @@ class EngineTest:
 class NewtonTest(EngineTest, unittest.TestCase):
     engine = "newton"
     checks = """
-        state_round_trip links_after_set nothing_stays mass_properties free_spin object_gravity object_wrench
-        resting_weight held_object tip_friction broken_world
+        state_round_trip links_after_set nothing_stays selected_worlds twins masked_set mass_properties free_spin
+        object_gravity object_wrench resting_weight held_object tip_friction broken_world
     """
 
     def test_what_it_lacks_is_refused(self):
@@ -190,6 +194,7 @@ class NewtonTest(EngineTest, unittest.TestCase):
 
 class DrakeTest(EngineTest, unittest.TestCase):
     engine = "drake"
+    options: ClassVar[dict[str, Any]] = {"workers": 0}
     checks = """
         state_round_trip links_after_set nothing_stays masked_set mass_properties drive_equation free_spin
         object_gravity object_wrench resting_weight set_as_built held_object tip_friction broken_world

@@ -1,7 +1,8 @@
-"""A scene as a Newton model.
+"""The worlds of a scene as a Newton model.
 
-Newton leaves gravity to the world: it is off, and weights are forces on bodies. Friction of a pair is the *mean* of its two coefficients;
-the object's own is zero, so that the other's is twice the pair's.
+Newton leaves gravity to its worlds: it is off, and weights are forces on bodies. Friction of a pair is the *mean* of its two
+coefficients. The object's own is zero, so that the other's is twice the pair's; where the robot touches the table or itself, copies of its
+links and of the table collide, with their friction against the object.
 """
 
 from __future__ import annotations
@@ -9,15 +10,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Literal
+from typing import Literal, get_args
 
 import newton
 import numpy as np
 import warp as wp
 
-from xreset.backends.rigid import Inertia, Mechanism, matrix_to_quat
+from xreset.backends.rigid import (
+    OTHER_LINK,
+    TABLE,
+    Inertia,
+    Mechanism,
+    matrix_to_quat,
+    object_inertia,
+)
 from xreset.errors import CapabilityError
 from xreset.spec import Geometry, ObjectSpec, SceneSpec, Shape
+
+Role = Literal["tip", "link", "table", "object"]
+"""What a shape is; the first three are the columns of a scene's frictions."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,32 +49,51 @@ class NewtonSettings:
 
 @dataclass(frozen=True)
 class Surface:
-    """What a shape is to the object."""
+    """What a shape is to the object, and what it may touch."""
 
-    role: Literal["tip", "link", "table", "object"]
-    tip: int = -1
-    """Index of its fingertip; -1: none."""
+    role: Role
+    owner: int = OTHER_LINK
+    """Index of its fingertip, or TABLE."""
+    link: str = ""
+    """The robot's link that it belongs to."""
+    copy: bool = False
+    """Whether it touches the robot and the table instead of the object."""
+
+    @property
+    def friction_scale(self) -> float:
+        """Its coefficient as a multiple of the pair's friction with the object."""
+        return {"object": 0.0}.get(self.role, 1.0 if self.copy else 2.0)
+
+    @property
+    def friction_column(self) -> int:
+        """Which of a world's three frictions it takes."""
+        return get_args(Role).index(self.role) % 3
 
 
 @dataclass(frozen=True, kw_only=True)
 class NewtonModel:
-    """A finished model, and where the scene's parts are in it. Its bodies are those of the mechanism without the base, then the object."""
+    """A finished model of N worlds, and where their parts are in it.
+
+    In each world, the bodies are those of the mechanism without the base, then the object; so are the joints.
+    """
 
     model: newton.Model
     pairs: np.ndarray
     """[P, 2] shapes that collide with one another."""
     surfaces: Sequence[Surface]
     """Of each shape."""
+    worlds: np.ndarray
+    """World of each shape."""
 
 
 def build_model(
     scene: SceneSpec,
     robot: Mechanism,
-    obj: ObjectSpec,
-    inertia: Inertia,
+    object_index: Sequence[int],
     settings: NewtonSettings,
+    device: str,
 ) -> NewtonModel:
-    """Build the model of one world.
+    """Build the worlds, of which each holds one of the scene's objects.
 
     Raises:
         CapabilityError: a joint of the robot has dry friction.
@@ -72,127 +102,129 @@ def build_model(
         raise CapabilityError(
             "Newton has no dry friction of joints on the CPU: give the robot's drives a friction_loss of 0."
         )
+    kinds = {i: _World(scene, robot, scene.objects[i], settings) for i in set(object_index)}
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     newton.solvers.SolverSteel.register_custom_attributes(builder)
     builder.balance_inertia = False
-    shapes = _Shapes(builder, settings)
-    corner = np.eye(4)
-    corner[:3, 3] = *scene.table.center, -scene.table.half_size[2]
-    shapes.add(
-        -1,
-        Shape(geometry=Geometry(kind="box", size=scene.table.half_size), T_body_shape=corner),
-        Surface("table"),
-    )
-    _add_robot(builder, shapes, robot)
-    body = builder.add_body(**_mass(inertia), label="object")
-    for piece in obj.pieces:
-        shapes.add(body, piece, Surface("object"))
-    model = builder.finalize(device="cpu")
+    pairs = []
+    surfaces: list[Surface] = []
+    worlds: list[int] = []
+    for i, kind in enumerate(object_index):
+        world = kinds[kind]
+        pairs.append(world.pairs + len(surfaces))
+        builder.add_world(world.builder)
+        surfaces += world.surfaces
+        worlds += [i] * len(world.surfaces)
+    model = builder.finalize(device=device)
     model.steel.rigid_body_angular_damping.zero_()  # by default Newton brakes what spins, by 5 % a second
-    return NewtonModel(model=model, pairs=shapes.colliding(robot), surfaces=shapes.surfaces)
+    return NewtonModel(
+        model=model, pairs=np.concatenate(pairs), surfaces=surfaces, worlds=np.array(worlds)
+    )
 
 
-class _Shapes:
-    """The shapes that have been added to a builder."""
+class _World:
+    """One world with one object, as a builder."""
 
-    def __init__(self, builder: newton.ModelBuilder, settings: NewtonSettings) -> None:
-        self._builder = builder
+    def __init__(
+        self, scene: SceneSpec, robot: Mechanism, obj: ObjectSpec, settings: NewtonSettings
+    ) -> None:
+        self.builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+        newton.solvers.SolverSteel.register_custom_attributes(self.builder)
+        self.builder.balance_inertia = False
+        self.surfaces: list[Surface] = []
         self._config = newton.ModelBuilder.ShapeConfig(
             density=0.0, mu=0.0, gap=settings.contact_gap
         )
-        self.surfaces: list[Surface] = []
-        self._links: list[str] = []
+        corner = np.eye(4)
+        corner[:3, 3] = *scene.table.center, -scene.table.half_size[2]
+        slab = Geometry(kind="box", size=scene.table.half_size)
+        self._add(-1, Shape(geometry=slab, T_body_shape=corner), "table", TABLE)
+        self._add_robot(robot)
+        body = self.builder.add_body(**_mass(object_inertia(obj)), label="object")
+        for piece in obj.pieces:
+            self._add(body, piece, "object")
+        shapes = combinations(range(len(self.surfaces)), 2)
+        colliding = [pair for pair in shapes if self._collide(robot, *pair)]
+        self.pairs = np.array(colliding, dtype=np.int32)
+        """[P, 2] pairs of shapes that the scene lets collide."""
 
-    def add(self, body: int, shape: Shape, surface: Surface, link: str = "") -> None:
-        """Add a collision shape to a body; -1 is the world."""
+    def _add(
+        self, body: int, shape: Shape, role: Role, owner: int = OTHER_LINK, link: str = ""
+    ) -> None:
+        """Add a collision shape to a body, and its copy; -1 is the world."""
+        for copy in (False,) if role == "object" else (False, True):
+            self._add_shape(body, shape)
+            self.surfaces.append(Surface(role, owner, link, copy))
+
+    def _add_shape(self, body: int, shape: Shape) -> None:
         where = {"body": body, "xform": transform(shape.T_body_shape), "cfg": self._config}
         kind = shape.geometry.kind
         size = shape.geometry.size
         if kind == "box":
-            self._builder.add_shape_box(hx=size[0], hy=size[1], hz=size[2], **where)
+            self.builder.add_shape_box(hx=size[0], hy=size[1], hz=size[2], **where)
         elif kind == "sphere":
-            self._builder.add_shape_sphere(radius=size[0], **where)
+            self.builder.add_shape_sphere(radius=size[0], **where)
         elif kind == "hull":
-            mesh = newton.Mesh(
-                shape.geometry.vertices, shape.geometry.faces.flatten(), compute_inertia=False
-            )
-            self._builder.add_shape_convex_hull(mesh=mesh, **where)
+            corners, faces = shape.geometry.vertices, shape.geometry.faces
+            mesh = newton.Mesh(corners, faces.flatten(), compute_inertia=False)
+            self.builder.add_shape_convex_hull(mesh=mesh, **where)
+        elif kind == "capsule":
+            self.builder.add_shape_capsule(radius=size[0], half_height=size[1], **where)
         else:
-            add = (
-                self._builder.add_shape_capsule
-                if kind == "capsule"
-                else self._builder.add_shape_cylinder
-            )
-            add(radius=size[0], half_height=size[1], **where)
-        self.surfaces.append(surface)
-        self._links.append(link)
+            self.builder.add_shape_cylinder(radius=size[0], half_height=size[1], **where)
 
-    def colliding(self, robot: Mechanism) -> np.ndarray:
-        """[P, 2] pairs of shapes that the scene lets collide."""
-        return np.array(
-            [
-                pair
-                for pair in combinations(range(len(self.surfaces)), 2)
-                if self._collide(robot, *pair)
-            ],
-            dtype=np.int32,
-        )
-
-    def _collide(self, robot: Mechanism, a: int, b: int) -> bool:
-        roles = {self.surfaces[a].role, self.surfaces[b].role}
+    def _collide(self, robot: Mechanism, i: int, j: int) -> bool:
+        a, b = self.surfaces[i], self.surfaces[j]
+        roles = {a.role, b.role}
         if "object" in roles:
-            return roles != {"object"}
+            return roles != {"object"} and not (a.copy or b.copy)
+        if not (a.copy and b.copy):
+            return False
         if "table" in roles:
-            return (self._links[a] or self._links[b]) not in robot.robot.table_exclude
-        return robot.may_collide(self._links[a], self._links[b])
+            return roles != {"table"} and (a.link or b.link) not in robot.robot.table_exclude
+        return robot.may_collide(a.link, b.link)
 
-
-def _add_robot(builder: newton.ModelBuilder, shapes: _Shapes, robot: Mechanism) -> None:
-    spec = robot.robot
-    base = wp.transform(spec.base_pos, xyzw(np.asarray(spec.base_quat)))
-    drives = {joint.name: joint.drive for joint in spec.joints}
-    joints: dict[str, int] = {}
-    for index, item in enumerate(robot.bodies):
-        body = index - 1  # the base is the world
-        if item.joint is not None and item.inertia is not None:
-            body = builder.add_link(**_mass(item.inertia), label=item.name)
-            drive = drives.get(item.joint.name)
-            place = transform(item.T_parent_body)
-            add = (
-                builder.add_joint_prismatic
-                if item.joint.type == "prismatic"
-                else builder.add_joint_revolute
-            )
-            joints[item.joint.name] = add(
-                item.parent - 1,
-                body,
-                parent_xform=base * place if item.parent == 0 else place,
-                axis=wp.vec3(*item.joint.axis),
-                target_ke=drive.kp if drive else 0.0,
-                target_kd=drive.kd if drive else 0.0,
-                effort_limit=drive.effort if drive else 0.0,
-                armature=drive.armature if drive else 0.0,
-                limit_lower=item.joint.lower,
-                limit_upper=item.joint.upper,
-                friction=0.0,
-                label=item.joint.name,
-            )
-        for part in item.shapes:
-            tip = robot.tip_of.get(part.link, -1)
-            placed = (
-                Shape(
-                    geometry=part.shape.geometry,
-                    T_body_shape=matrix(base) @ part.shape.T_body_shape,
+    def _add_robot(self, robot: Mechanism) -> None:
+        spec = robot.robot
+        base = wp.transform(spec.base_pos, xyzw(np.asarray(spec.base_quat)))
+        drives = {joint.name: joint.drive for joint in spec.joints}
+        joints: dict[str, int] = {}
+        for index, item in enumerate(robot.bodies):
+            body = index - 1  # the base is the world
+            if item.joint is not None and item.inertia is not None:
+                body = self.builder.add_link(**_mass(item.inertia), label=item.name)
+                drive = drives.get(item.joint.name)
+                place = transform(item.T_parent_body)
+                slides = item.joint.type == "prismatic"
+                add = (
+                    self.builder.add_joint_prismatic if slides else self.builder.add_joint_revolute
                 )
-                if body < 0
-                else part.shape
+                joints[item.joint.name] = add(
+                    item.parent - 1,
+                    body,
+                    parent_xform=base * place if item.parent == 0 else place,
+                    axis=wp.vec3(*item.joint.axis),
+                    target_ke=drive.kp if drive else 0.0,
+                    target_kd=drive.kd if drive else 0.0,
+                    effort_limit=drive.effort if drive else 0.0,
+                    armature=drive.armature if drive else 0.0,
+                    limit_lower=item.joint.lower,
+                    limit_upper=item.joint.upper,
+                    friction=0.0,
+                    label=item.joint.name,
+                )
+            for part in item.shapes:
+                tip = robot.tip_of.get(part.link, OTHER_LINK)
+                placed = part.shape
+                if body < 0:
+                    pose = matrix(base) @ placed.T_body_shape
+                    placed = Shape(geometry=placed.geometry, T_body_shape=pose)
+                self._add(body, placed, "link" if tip < 0 else "tip", tip, part.link)
+        for mimic in spec.mimics:
+            self.builder.set_joint_mimic(
+                joints[mimic.joint], joints[mimic.source], coeffs=(mimic.offset, mimic.multiplier)
             )
-            shapes.add(body, placed, Surface("link" if tip < 0 else "tip", tip), part.link)
-    for mimic in spec.mimics:
-        builder.set_joint_mimic(
-            joints[mimic.joint], joints[mimic.source], coeffs=(mimic.offset, mimic.multiplier)
-        )
-    builder.add_articulation(list(joints.values()))
+        self.builder.add_articulation(list(joints.values()))
 
 
 def _mass(inertia: Inertia) -> dict[str, object]:

@@ -191,6 +191,14 @@ class FingersTest(TestCase):
         assert_allclose(by_weight, by_force, atol=1e-9)
         self.assertTrue(SqueezeConfig(weight=1.0).presses)
 
+    def test_two_fingertips_press_harder(self):
+        fingers, joints = self.fingers(0.0201)
+        by_default = squeeze_targets(ROBOT, fingers, joints, SqueezeConfig())
+        stated = squeeze_targets(ROBOT, fingers, joints, SqueezeConfig(force=20.0))
+        assert_array_equal(by_default, stated)
+        self.assertEqual([SqueezeConfig().for_hand(n).force for n in (2, 3, 5)], [20.0, 5.0, 5.0])
+        self.assertEqual(SqueezeConfig(force=1.0).for_hand(2).force, 1.0)
+
     def test_levers_lead_from_the_centre_of_mass_to_the_finger(self):
         fingers, joints = self.fingers(0.0201)
         wrist = self.wrist_axis(joints)[0]

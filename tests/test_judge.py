@@ -43,6 +43,9 @@ class Judge(InFolder):
         # its arm cannot turn that way
         self.assertEqual((sum_row.arm_fails, sum_row.turn), (3, 0))
         self.assertEqual(found.kept, [])
+        # the toy bank's targets are the joints' positions, and its hand is no jaw
+        reached = [(row.object_name, row.reached, row.lost) for row in found.reach]
+        self.assertEqual(reached, [(name, 0, {"no grasp": 3}) for name in ("brick", "all")])
         rise = np.diff(found.shots["brick"][:, -5])  # of the object's z
         self.assertGreater(rise[1], 0.08)
 

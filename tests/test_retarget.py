@@ -23,6 +23,7 @@ from xreset.geometry.collision import table_clearance
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_angle, quat_from_axis_angle, quat_to_matrix
 from xreset.geometry.surface import Surface
+from xreset.resets.fingers import fingers_of
 from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmModel
 from xreset.retarget.arm.solve import track
@@ -380,6 +381,23 @@ class PipelineTest(InOneFolder):
         # They differ by the wrist's error at most.
         assert_allclose(gap[seen], result.hand_error[seen], atol=0.011)
 
+    def test_the_file_says_how_deep_the_hand_is_and_how_far_from_its_contacts(self):
+        result = self.result
+        poses = (result.joint_pos, result.object_pos, result.object_quat_wxyz)
+        object_name = result.object_name[result.sequence_of_frame]
+        fingers = fingers_of(self.robot, self.objects, object_name, *poses)
+        deepest_finger = -fingers.gap.amin(dim=1).numpy()
+        seen = result.annotated
+        assert_array_equal(np.isfinite(result.object_depth), seen)
+        self.assertTrue((result.object_depth[seen] >= deepest_finger[seen] - 1e-9).all())
+        self.assertLess(result.object_depth[seen].max(), 0.004)
+        touching = np.isfinite(result.contact_error)
+        self.assertTrue(result.contact[touching].all())
+        self.assertGreater(touching.sum(), 10)
+        # The link's origin is inside the finger, and retargeting allows 1 cm.
+        mean = result.contact_error[touching].mean()
+        self.assertTrue(0.003 < mean < 0.025, mean)
+
     def test_a_sequence_without_a_hand_stays_at_home(self):
         joints = self.result.joint_pos[self.second]
         assert_array_equal(joints, np.tile(self.robot.home, (len(joints), 1)))
@@ -420,7 +438,9 @@ class PipelineTest(InOneFolder):
 
     def test_the_command_writes_a_file_for_a_gripper(self):
         write_demos(f"{self.folder}/demos.npz", self.demos.select(indices=[0]))
-        self.assertIn("005_toma", self.commanded("demos", "openarm"))
+        said = self.commanded("demos", "openarm")
+        self.assertIn("005_toma", said)
+        self.assertRegex(said, r"fingertips are [\d.]+ mm .* touch; in valid frames .* deep")
         with np.load(f"{self.folder}/demos-robot.npz") as file:
             used = json.loads(str(file["meta"]))["config"]["retarget"]
         self.assertEqual((used["jaw"], used["arm"]["restarts"]), ("fingertips", 8))

@@ -17,6 +17,7 @@ from torch.testing import assert_close
 
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_robot
+from xreset import robots
 from xreset.cameras.config import FRONT, VisionConfig
 from xreset.cli._terms import take_terms
 from xreset.errors import DemoError, FileFormatError, PolicyError, RunError, XResetError
@@ -190,6 +191,14 @@ class RewardTest(TestCase):
                 self.assertEqual(reward.gate, "position" in expected)
                 self.assertEqual(reward.success, "success" in expected)
                 self.assertEqual(reward.grasped, "tip_force" in changes)
+
+    def test_two_fingertips_grasp_only_between_them(self):
+        """A closed jaw that pushes with both tips is paid nothing."""
+        for pushing, expected in ((self.PRESS[[0, 2]], 0.0), (self.SQUEEZE[[0, 2]], 1.0)):
+            changes = {"tip_distance": [0.2, 0.2], "tip_force": pushing}
+            reward = self.reward(RewardConfig(), **FAR, **changes)
+            self.assertEqual(reward.terms["grasp"], expected)
+            self.assertTrue(reward.grasped)
 
     def test_the_published_reward(self):
         """Numbers from the published paper: -2.5 min(P, 3) - 2.5 min(M, 0.5) + G (3 (1.4 - 3 d) + [d <= 0.02] 15 / (1 + 10 d))."""
@@ -491,6 +500,17 @@ class ActionTest(TestCase):
         for away in (-9.0, 9.0):
             found = space.action_for(target + away, target)
             assert_close(found, torch.full((1, 7), away).sign())
+
+    def test_a_step_of_a_jaw_is_limited_by_force(self):
+        """The OpenArm's pads press with 1,000 N for each metre by which the jaws' target is beyond them."""
+        robot = robots.load("openarm")
+        jaw = robot.hand_indices[0]
+        for force, expected in ((None, 0.004), (8.0, 0.004), (2.0, 0.002)):
+            config = ActionConfig(hand="relative", hand_step=0.1, jaw_step=force)
+            self.assertAlmostEqual(float(ActionSpace(robot, config).step[jaw]), expected)
+        limited = self.space(hand="relative", hand_step=0.1, jaw_step=1e-3)
+        free = self.space(hand="relative", hand_step=0.1)
+        assert_close(limited.step, free.step, msg="more than one joint moves this hand")
 
     def test_arm_targets_stay_near_the_joint_and_within_its_limits(self):
         space = self.space(arm_step=0.05, arm_lead=0.15)

@@ -60,6 +60,7 @@ def resets(
     doubts = stated_doubts(retargeted)
     show_notes(doubts)
     scene = (inputs.robot, inputs.objects)
+    squeeze = squeeze.for_hand(len(inputs.robot.fingertips))
     where = {"num_envs": num_envs, "device": device}
     title = f"states stable in {', '.join(engines)}"
     with Progress() as bar:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from time import process_time
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +14,9 @@ from xreset.cli._terminal import Progress, console, show_notes
 from xreset.files.storage import file_hash
 from xreset.physics.plugins import Device
 from xreset.retarget.hand.config import Jaw
+
+if TYPE_CHECKING:
+    from xreset.retarget.file import Retargeted
 
 
 def retarget(
@@ -56,6 +61,7 @@ def retarget(
         doubts.append(doubt)
         show_notes([doubt])
 
+    begun = process_time()
     with Progress() as bar:
         result = retarget_demos(
             chosen,
@@ -83,10 +89,26 @@ def retarget(
         [row.without("not annotated") for row in result.accounts()],
         f"annotated frames retargeted to {result.robot}: those that are valid",
     )
-    tips = result.hand_error[result.annotated]
-    if len(tips):
-        console.print(f"fingertips are {1e3 * tips.mean():.1f} mm from the human's on average")
+    if result.annotated.any():
+        console.print(_distances(result))
+        took = 1e3 * (process_time() - begun) / result.annotated.sum()
+        console.print(f"{took:.0f} ms of CPU time a frame, with all preparation")
     console.print(f"{int(result.valid.sum())} valid frames of {len(result.valid)} in {out}")
+
+
+def _distances(result: Retargeted) -> str:
+    """Return how near a motion comes to the human's hand and to the object."""
+    text = f"fingertips are {1e3 * result.hand_error[result.annotated].mean():.1f} mm from the human's on average"
+    if result.contact_error is not None and np.isfinite(result.contact_error).any():
+        touching = np.isfinite(result.contact_error)
+        text += f", links {1e3 * result.contact_error[touching].mean():.1f} mm from the points that they touch"
+    if result.object_depth is not None and result.valid.any():
+        depth = 1e3 * result.object_depth[result.valid]
+        text += (
+            f"; in valid frames the hand is at most {depth.max():.1f} mm deep in the object, over 2 mm in "
+            f"{(depth > 2.0).mean():.1%}"
+        )
+    return text
 
 
 COMMAND = retarget

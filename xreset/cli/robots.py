@@ -26,6 +26,7 @@ from xreset.errors import RobotError
 from xreset.files.checks import PositiveInt
 from xreset.physics.plugins import robot_names
 from xreset.resets.config import JUDGE_SQUEEZE, SqueezeConfig
+from xreset.retarget.accounts import described
 from xreset.robot_tools import placement
 from xreset.robot_tools.placement import PlaceConfig
 
@@ -203,6 +204,10 @@ def judge(
     weight for a second, the arm raises the hand by 10 cm, and turns it by 45 degrees about the fingers' direction. The
     object must stay within 3 cm and 45 degrees of where it was in the hand.
 
+    Also counts the demonstrations that the robot can follow with a grasp that stays rigid: the hand gets to the object
+    clear of the table, and the arm brings it to the goal. For a jaw, grasps are planned on the object's shape; other
+    hands use the grasps of the bank.
+
     Args:
         bank: File made by `xreset resets`.
         states: Number of states of each object: those that grasp most tightly.
@@ -233,6 +238,14 @@ def judge(
         console.print(
             f"the arm cannot raise or turn the hand that far in {fails} of {found.rows[-1].tried} states"
         )
+    table = [("object", "demonstrations", "in reach", "why the others are not")]
+    for row in found.reach:
+        table.append(
+            (row.object_name, str(row.demonstrations), str(row.reached), described(row.lost))
+        )
+    show_table(
+        table, title="demonstrations that a rigid grasp can follow, from the start to the goal"
+    )
     if found.without:
         absent = ", ".join(found.without)
         console.print(

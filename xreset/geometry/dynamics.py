@@ -78,6 +78,25 @@ def damping_ratio(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
     return drive_values(robot, "kd") / (2 * np.sqrt(stiffness))
 
 
+def jaw_stiffness(robot: RobotSpec) -> float | None:
+    """Return the force on each fingertip of a jaw for each unit by which its drive's target is beyond the joint [N/rad
+    or N/m], at home; None for a hand with more than one joint or other than two fingertips.
+
+    With the drive's work kp (target - q) dq = f d(opening), f is the same on both fingertips.
+    """
+    hand = robot.hand_indices
+    if len(hand) != 1 or len(robot.fingertips) != 2:
+        return None
+    kinematics = Kinematics(robot)
+    home = torch.as_tensor(robot.home)
+    links = [tip.link for tip in robot.fingertips]
+    first, second = kinematics.points(home, links)
+    across = torch.nn.functional.normalize(second - first, dim=-1)
+    moves = kinematics.jacobian(home, links).linear[..., hand[0]]
+    closing = abs(float((moves[1] - moves[0]) @ across))
+    return float(drive_values(robot, "kp")[hand[0]]) / max(closing, 1e-6)
+
+
 def drive_values(robot: RobotSpec, name: str) -> np.ndarray:
     """[J] an entry of each joint's :class:`~xreset.spec.DriveSpec`."""
     return np.array([getattr(joint.drive, name) for joint in robot.joints])

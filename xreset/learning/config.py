@@ -157,7 +157,7 @@ TASK = TaskConfig(
     # with joint targets that move as fast (docs/lab-book.md).
     timestep=1 / 120,
     substeps=4,
-    action=ActionConfig(hand="relative", arm_step=0.06, hand_step=0.1),
+    action=ActionConfig(hand="relative", arm_step=0.06, hand_step=0.1, jaw_step=8.0),
     observation=ObservationConfig(
         policy=Terms(
             object_pos={"noise": 0.003},  # m

@@ -4,6 +4,8 @@ The defaults are those of the headline results (docs/results.md)."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from xreset.files.checks import (
     Checked,
     Length,
@@ -41,8 +43,10 @@ class ClosingConfig(Checked):
 class SqueezeConfig(Checked):
     """Drive targets that press (:func:`xreset.resets.fingers.squeeze_targets`)."""
 
-    force: NonNegativeFloat = 5.0
-    """Normal force of each finger that presses [N]. If ``weight`` is 0 as well, targets are the joints' positions."""
+    force: NonNegativeFloat | None = None
+    """Normal force of each finger that presses [N]; None: 5, or 20 for a hand with two fingertips, whose two contacts
+    alone carry the object's weight and its torque about the line between them. If this and ``weight`` are 0, targets
+    are the joints' positions."""
     weight: NonNegativeFloat = 1.0
     """Further force, as a share of the object's weight. With one force for all objects, heavy ones slip and light ones
     tilt."""
@@ -55,10 +59,17 @@ class SqueezeConfig(Checked):
     @property
     def presses(self) -> bool:
         """Whether there is any force."""
-        return self.force > 0 or self.weight > 0
+        return self.force is None or self.force > 0 or self.weight > 0
+
+    def for_hand(self, fingertips: int) -> SqueezeConfig:
+        """Return the configuration with the force for a hand with this number of fingertips."""
+        if self.force is not None:
+            return self
+        # With 5 N and the weight 55 % of the Robotiq's lifted states hold the object for a second, with 20 N 98 %.
+        return replace(self, force=20.0 if fingertips == 2 else 5.0)
 
 
-JUDGE_SQUEEZE = SqueezeConfig(force=5.0, weight=0.0, balanced=False, reach=0.01)
+JUDGE_SQUEEZE = SqueezeConfig(weight=0.0, balanced=False, reach=0.01)
 """How fingers press when a robot is judged (``xreset robots judge``): with the same force on every object."""
 
 

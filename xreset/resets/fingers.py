@@ -141,11 +141,12 @@ def squeeze_targets(
         joint_pos: [M, J]
         config: which fingers press, and how hard.
     """
+    config = config.for_hand(len(robot.fingertips))
     q = torch.as_tensor(joint_pos, dtype=torch.float64)
     kinematics = Kinematics(robot)
     jacobian = kinematics.jacobian(q, fingers.links, fingers.point).linear
     pressing = fingers.leading & (fingers.gap < config.reach)
-    force = config.force * pressing
+    force = (config.force or 0.0) * pressing
     if config.weight:
         force = force + config.weight * fingers.weight[:, None] * pressing
     if config.balanced:

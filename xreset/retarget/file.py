@@ -92,6 +92,14 @@ class Retargeted(ObjectMotions):
     wrist_error: FrameDistances
     """[F] distance of the hand root from its target of hand retargeting [m]; infinite where not annotated."""
 
+    # What files of earlier versions do not have
+    contact_error: FrameDistances | None = None
+    """[F] mean distance of the robot's links that follow touching keypoints from the points of the object's surface
+    that these touch [m], from the links' origins; infinite where none touches."""
+    object_depth: FrameDistances | None = None
+    """[F] largest depth of the hand in the object's collision pieces [m], 0 outside them; infinite where not
+    annotated."""
+
     @property
     def post_contact(self) -> np.ndarray:
         """[F] bool: whether the human has touched the object by that frame."""
@@ -159,8 +167,8 @@ def _check(arrays: Arrays) -> str | None:
         return "array 'reason' points beyond 'reason_names'."
     if (arrays["valid"] != (arrays["reason"] == 0)).any():
         return "'valid' and 'reason' contradict each other."
-    for name in ("hand_error", "wrist_error"):
-        if not (arrays[name] >= 0).all():
+    for name in ("hand_error", "wrist_error", "contact_error", "object_depth"):
+        if name in arrays and not (arrays[name] >= 0).all():
             return f"array {name!r} contains negative or NaN distances, expected 0 or more."
     if ((arrays["first_contact"] < -1) | (arrays["first_contact"] >= np.diff(offsets))).any():
         return "array 'first_contact' points beyond its sequence."

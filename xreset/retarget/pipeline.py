@@ -20,13 +20,14 @@ from xreset.files.checks import Checked, frozen
 from xreset.files.processes import in_processes
 from xreset.files.progress import Progress, unseen
 from xreset.geometry.fields import DistanceFields
-from xreset.geometry.rotations import matrix_to_quat
+from xreset.geometry.rotations import matrix_to_quat, quat_to_matrix
 from xreset.geometry.surface import Surface, prepared_surface
 from xreset.physics.tensors import one_thread
 from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track
 from xreset.retarget.file import Retargeted
+from xreset.retarget.hand.clearance import Objects, object_depth
 from xreset.retarget.hand.config import HandWeights, Jaw
 from xreset.retarget.hand.jaw import jaw_keypoints
 from xreset.retarget.hand.model import HandModel, HandState, HandTargets
@@ -37,6 +38,8 @@ from xreset.spec import ObjectSpec, RobotSpec, checked_objects, objects_named
 _log = logging.getLogger(__name__)
 _SEQUENCES_PER_BATCH = 24
 """Enough to use the processor well; few enough to keep memory below about 1 GB and to show progress."""
+_FRAMES_AT_ONCE = 512
+"""Frames whose measures are taken at a time; limits the memory that this takes."""
 CONTACT_DISTANCE = 0.020
 """A human keypoint nearer than this to the object's surface touches it [m]."""
 _THRESHOLDS = Thresholds()
@@ -119,6 +122,7 @@ def retarget_demos(
     wrist_error[~demos.hand_valid] = np.inf
 
     links = arm.kinematics.link_poses(torch.as_tensor(joint_pos), robot.tracked_links)
+    contact_error, object_depth = hands.measures(arm, joint_pos)
     contact = np.asarray(hands.touching.any(axis=1))
     goal_pos, goal_quat = demos.goal_pose
     return Retargeted(
@@ -147,6 +151,8 @@ def retarget_demos(
         first_contact=_first_contact(demos, contact),
         hand_error=hand_error,
         wrist_error=wrist_error,
+        contact_error=contact_error,
+        object_depth=object_depth,
     )
 
 
@@ -227,6 +233,48 @@ class HandMotions:
             yield HandBatch(rows, is_frame, job.targets, motion)
             done += len(is_frame)
             progress(done, len(todo))
+
+    @one_thread()
+    def measures(self, arm: ArmModel, joint_pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Measure a robot with this hand along all frames of the demonstrations.
+
+        Args:
+            arm: the robot.
+            joint_pos: [F, J] its joints.
+
+        Returns:
+            Mean distance of the links that follow touching keypoints from the points that these touch [F], infinite
+            where none touches; largest depth of the hand in the object [F], infinite where no hand is annotated [m].
+        """
+        contact_error, depth = np.full((2, len(joint_pos)), np.inf)
+        model = self.model
+        index = torch.as_tensor(self._object_index[self.demos.sequence_of_frame])
+        seen = np.flatnonzero(self.demos.hand_valid)
+        fields = self._fields.to(model.device)
+        for first in range(0, len(seen), _FRAMES_AT_ONCE):
+            rows = seen[first : first + _FRAMES_AT_ONCE]
+            joints = torch.as_tensor(joint_pos[rows])
+            root = arm.kinematics.link_poses(joints, [model.robot.hand_root])[:, 0]
+            state = HandState(
+                joints=joints[:, torch.as_tensor(model.kinematics.joint_indices)],
+                root_pos=root[:, :3, 3],
+                root_quat=matrix_to_quat(root[:, :3, :3]),
+            ).to(model.device)
+            objects = Objects(
+                pos=torch.as_tensor(self.demos.object_pos[rows]).to(model.device),
+                rot=quat_to_matrix(torch.as_tensor(self.demos.object_quat_wxyz[rows])).to(
+                    model.device
+                ),
+                object_index=index[rows].to(model.device),
+                fields=fields,
+            )
+            depth[rows] = object_depth(model, model.bodies(state), objects).cpu().numpy()
+            touching = self.touching[rows][:, model.keypoint_indices]
+            touched = self._contact_points[rows][:, model.keypoint_indices]
+            gap = np.linalg.norm(model.keypoints(state).cpu().numpy() - touched, axis=-1)
+            some = touching.any(axis=1)
+            contact_error[rows[some]] = gap[some].mean(axis=1, where=touching[some])
+        return contact_error, depth
 
     def _targets(
         self, sequences: np.ndarray, rows: np.ndarray, is_frame: np.ndarray

@@ -4,11 +4,15 @@ Each state starts a program of open-loop targets. The targets press on the objec
 fingers close; then it has all of it for a second; then the arm raises the hand by 10 cm; then it turns the hand by 45
 degrees about the palm's x axis. The object must stay where it was in the hand.
 
+Apart from physics, it counts the demonstrations that the robot can follow at all with a rigid grasp: what no training
+can improve.
+
 Shape letters: M states, N worlds, J joints, n arm joints, P phases.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
@@ -34,6 +38,7 @@ from xreset.pictures.render import Camera, Renderer, add_caption
 from xreset.resets.bank import ResetBank, check_states
 from xreset.resets.config import JUDGE_SQUEEZE, SqueezeConfig
 from xreset.resets.fingers import Fingers, fingers_of, squeeze_targets
+from xreset.resets.grasps import losses
 from xreset.resets.probe import probe
 from xreset.resets.programs import palm_path
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, checked_objects, objects_named
@@ -82,6 +87,20 @@ class Judged:
 
 
 @frozen
+class Reached:
+    """How many demonstrations of an object the robot can follow with a rigid grasp
+    (:func:`xreset.resets.grasps.losses`)."""
+
+    object_name: str
+    """``all`` in a sum over objects."""
+    demonstrations: int
+    reached: int
+    """Demonstrations with a grasp that is clear of the table at the start, and that the arm carries to the goal."""
+    lost: dict[str, int]
+    """Reason -> number of the others, the most frequent first."""
+
+
+@frozen
 class Judgement:
     """Result of :func:`judge`."""
 
@@ -90,6 +109,8 @@ class Judgement:
     """For each engine one for each object, and their sum."""
     without: tuple[str, ...]
     """Objects for which the bank has no lifted grasp."""
+    reach: tuple[Reached, ...]
+    """One for each object of the bank's demonstrations, and their sum."""
     shots: dict[str, np.ndarray]
     """Object -> [1 + P, J + 7] joint positions, position and orientation of the object in its best state, at the start
     and after each phase in the first engine."""
@@ -106,6 +127,7 @@ class Judgement:
             "robot": self.robot,
             "rows": [asdict(row) for row in self.rows],
             "without_lifted_grasp": list(self.without),
+            "reach": [asdict(row) for row in self.reach],
             "kept_in_every_engine": self.kept,
         }
 
@@ -136,7 +158,7 @@ def judge(
         squeeze: how hard fingers press, and which.
         num_envs: worlds at a time.
         device: where engines run that can use it; the others run on the CPU.
-        progress: called with (states done, states in all).
+        progress: called with (states done, states in all); then again with demonstrations.
 
     Raises:
         RobotError: the bank has no lifted grasp of any object.
@@ -179,7 +201,38 @@ def judge(
                 later = table[best, 1 + len(PHASES) :].reshape(len(PHASES), -1)
                 shots[name] = np.vstack((_shot(start[[best]]).numpy(), later))
     without = sorted({*bank.object_names} - set(names))
-    return Judgement(robot=robot.name, rows=tuple(rows), without=tuple(without), shots=shots)
+    return Judgement(
+        robot=robot.name,
+        rows=tuple(rows),
+        without=tuple(without),
+        reach=reach_of(bank, robot, objects, progress),
+        shots=shots,
+    )
+
+
+def reach_of(
+    bank: ResetBank,
+    robot: RobotSpec,
+    objects: Sequence[ObjectSpec],
+    progress: Callable[[float, int], None] = unseen,
+) -> tuple[Reached, ...]:
+    """Count the demonstrations that a robot can follow with a rigid grasp, for each object and in all; arguments as of
+    :func:`judge`."""
+    reasons = losses(bank, robot, objects, progress=progress)
+    groups = {name: bank.sequence_object == name for name in bank.object_names}
+    groups["all"] = np.ones(len(reasons), dtype=bool)
+    rows = []
+    for name, mine in groups.items():
+        counts = Counter(reasons[mine].tolist())
+        reached = counts.pop("", 0)
+        row = Reached(
+            object_name=name,
+            demonstrations=int(mine.sum()),
+            reached=reached,
+            lost=dict(counts.most_common()),
+        )
+        rows.append(row)
+    return tuple(rows)
 
 
 def _grasps(

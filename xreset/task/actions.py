@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from xreset.geometry.dynamics import jaw_stiffness
 from xreset.geometry.urdf import joint_limits, prismatic_joints
 from xreset.spec import RobotSpec
 from xreset.task.config import ActionConfig
@@ -41,6 +42,10 @@ class ActionSpace:
         slides = torch.tensor(prismatic_joints(robot), device=device)
         unit = torch.where(slides & ~is_arm, FINGER_LEVER, 1.0)
         hand_step = config.hand_step if config.hand == "relative" else 0.0
+        stiffness = jaw_stiffness(robot)
+        if config.jaw_step is not None and stiffness is not None:
+            (own,) = unit[~is_arm].tolist()
+            hand_step = min(hand_step, config.jaw_step / (stiffness * own))
         zero = (lower + upper) / 2
         below = (upper - lower) / 2
         above = below

@@ -59,6 +59,10 @@ class ActionConfig(Checked):
     hand_step: PositiveFloat = 0.05
     """Largest change of a hand joint's target per control step [rad]: 3 rad/s at 60 Hz. Joints that slide move 4 cm
     for every radian."""
+    jaw_step: PositiveFloat | None = None
+    """Largest change of the force of a jaw's fingertips per control step [N], if ``hand_step`` would give more; None:
+    no limit. One drive moves a jaw, which may be so stiff that exploration opens it at once. Hands with more joints
+    ignore this."""
     hand_lead: PositiveFloat = 0.4
     """Largest distance from a hand joint to its target [rad]. It limits how hard the joint presses: drives of the
     Sharpa hand reach their effort limits at 0.3 to 0.7."""

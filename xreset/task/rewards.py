@@ -169,8 +169,12 @@ def best_reach(x: RewardInput, *, width: PositiveFloat) -> Tensor:
 
 @TERMS.add
 def grasp(x: RewardInput, *, force: NonNegativeFloat) -> Tensor:
-    """1 while the thumb and another finger press with this force [N] at least."""
-    return contact_gate(x.tip_force, force)
+    """1 while the thumb and another finger press with this force [N] at least.
+
+    Two fingertips that are all that a hand has must also oppose each other, as in the gate ``opposing``: a closed jaw
+    that pushes an object with both tips has no more to gain, and policies stayed with that (docs/lab-book.md).
+    """
+    return contact_gate(x.tip_force, force, opposing=x.tip_force.shape[1] == 2)
 
 
 @TERMS.add

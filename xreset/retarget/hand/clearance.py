@@ -91,10 +91,6 @@ def too_near(
     bounds = bodies.pos[:, model.group_body] + matvec(
         bodies.rot[:, model.group_body], balls.bound_centers
     )
-    every = torch.arange(len(bounds), device=bounds.device)[:, None].expand(bounds.shape[:2])
-    from_box = objects.fields.box_distance(
-        objects.local(bounds, every), objects.object_index[every]
-    )
 
     def below_table(centers: Tensor, frame: Tensor, radii: Tensor) -> tuple[Tensor, ...]:
         height = height_above_table(centers, radii, model.table)
@@ -102,20 +98,49 @@ def too_near(
         up = centers.new_tensor([0.0, 0.0, 1.0]).expand(len(near), 3)
         return near, height[near], up
 
-    def in_object(centers: Tensor, frame: Tensor, radii: Tensor) -> tuple[Tensor, ...]:
-        near, distance, direction = objects.nearer(centers, frame, radii + object_clearance)
-        return near, distance - radii[near] - object_clearance, direction
-
     over_table = considered[:, None] & (bounds[..., 2] < balls.bound_radii)
-    at_object = considered[:, None] & (from_box < balls.bound_radii + object_clearance)
     found = (
         *_outside(model, bodies, over_table, below_table, 0),
-        *_outside(model, bodies, at_object, in_object, len(balls.radii)),
+        *_at_object(model, bodies, objects, considered, object_clearance),
         *_in_each_other(model, bodies, bounds, considered, self_depth),
     )
     together = Distances.cat(found)
     order = together.number.argsort(stable=True)
     return together[order[together.frame[order].argsort(stable=True)]]
+
+
+def object_depth(model: HandModel, bodies: PointJacobian, objects: Objects) -> Tensor:
+    """[B] largest depth of the hand's balls in the object [m], 0 outside it; arguments as of :func:`too_near`."""
+    every = torch.ones(len(bodies.pos), dtype=torch.bool, device=bodies.pos.device)
+    depth = bodies.pos.new_zeros(len(every))
+    for found in _at_object(model, bodies, objects, every, 0.0):
+        depth = depth.scatter_reduce(0, found.frame, -found.value, "amax")
+    return depth
+
+
+def _at_object(
+    model: HandModel,
+    bodies: PointJacobian,
+    objects: Objects,
+    considered: Tensor,
+    clearance: float,
+) -> Iterator[Distances]:
+    """Yield the distances of each link's balls that are nearer to the object than ``clearance`` [m]."""
+    balls = model.balls
+    bounds = bodies.pos[:, model.group_body] + matvec(
+        bodies.rot[:, model.group_body], balls.bound_centers
+    )
+    every = torch.arange(len(bounds), device=bounds.device)[:, None].expand(bounds.shape[:2])
+    from_box = objects.fields.box_distance(
+        objects.local(bounds, every), objects.object_index[every]
+    )
+
+    def in_object(centers: Tensor, frame: Tensor, radii: Tensor) -> tuple[Tensor, ...]:
+        near, distance, direction = objects.nearer(centers, frame, radii + clearance)
+        return near, distance - radii[near] - clearance, direction
+
+    candidates = considered[:, None] & (from_box < balls.bound_radii + clearance)
+    yield from _outside(model, bodies, candidates, in_object, len(balls.radii))
 
 
 def _moved(rot: Tensor, pos: Tensor, points: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """Grasps of a jaw on an object's shape, and the demonstrations that a rigid grasp can follow."""
 
 from unittest import TestCase
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -76,6 +77,7 @@ class GraspsTest(TestCase):
         )
         return losses(bank, self.robot, (obj,), progress=lambda *_: None).tolist()
 
+    @patch("xreset.resets.grasps._MOST", 60)
     def test_reasons(self):
         post = block(0.05, 0.06, 0.14)
         lift = ABOVE + np.array([0, 0, 0.07])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from time import process_time
+from time import monotonic
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -61,7 +61,7 @@ def retarget(
         doubts.append(doubt)
         show_notes([doubt])
 
-    begun = process_time()
+    begun = monotonic()
     with Progress() as bar:
         result = retarget_demos(
             chosen,
@@ -91,8 +91,8 @@ def retarget(
     )
     if result.annotated.any():
         console.print(_distances(result))
-        took = 1e3 * (process_time() - begun) / result.annotated.sum()
-        console.print(f"{took:.0f} ms of CPU time a frame, with all preparation")
+        took = 1e3 * (monotonic() - begun) / result.annotated.sum()
+        console.print(f"{took:.0f} ms a frame, with all preparation")
     console.print(f"{int(result.valid.sum())} valid frames of {len(result.valid)} in {out}")
 
 

@@ -6,19 +6,26 @@ import os
 import subprocess
 import sys
 import zipfile
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr
 from importlib import import_module
 from pathlib import Path
+from typing import Annotated
 from unittest import TestCase
-from unittest.mock import patch
+from unittest.mock import Mock, patch
+
+import tyro
 
 from tests.command import calls_of, refused
 from tests.command import xreset as run
 from tests.data import InFolder
 from xreset.cameras.config import WRIST
 from xreset.cli import COMMANDS, _terminal
-from xreset.cli._options import checked
+from xreset.cli._options import RULES, checked
+from xreset.cli._verbs import verb
 from xreset.errors import XResetError
+from xreset.files.checks import Option, Output, PositiveInt
+from xreset.files.progress import unseen
 from xreset.files.storage import claim_folder
 from xreset.learning import verbs
 
@@ -298,6 +305,54 @@ class UsageTest(TestCase):
             with patch(chosen, side_effect=KeyboardInterrupt) as engines:
                 self.assertEqual(run(*argv)[0], 130)
             self.assertEqual(engines.call_args.args[0], expected)
+
+
+def sample(
+    source: str | Path | Mock,
+    names: Annotated[str | Sequence[str], Option("name")] = "everything",
+    *,
+    thing: Mock | None = None,
+    count: PositiveInt = 1,
+    out: Output | None = None,
+    progress: Callable[[float, int], None] = unseen,
+) -> str:
+    """Do something.
+
+    Args:
+        source: a file, as for :func:`~xreset.somewhere.load`; or
+            a name.
+        names: what to do; ``all`` by default
+        thing: an object of the library.
+        count: how often.
+        out: file to write.
+
+    Raises:
+        XResetError: never.
+    """
+    progress(1, 2)
+    return f"{source!r} {names!r} {count} {out!r} {thing}"
+
+
+class VerbTest(TestCase):
+    def ran(self, *words):
+        shown = []
+        command = verb(sample, lambda found, options: shown.append((found, options["out"])))
+        tyro.cli(checked(command), args=list(map(str, words)), registry=RULES)
+        return shown[0]
+
+    def test_the_signature_has_the_options_and_the_defaults(self):
+        file = Path("d.npz")
+        self.assertEqual(self.ran("d.npz"), (f"{file!r} 'everything' 1 None None", None))
+        words = ("d.npz", "--name", "a", "--name", "b", "--count", 2, "--out", "o")
+        out = Path("o")
+        self.assertEqual(self.ran(*words), (f"{file!r} ('a', 'b') 2 {out!r} None", out))
+
+    def test_the_docstring_is_the_help(self):
+        command = verb(sample)
+        entries = (command.__doc__ or "").split("Args:\n")[1].splitlines()
+        self.assertEqual(entries[0], "    source: A file, as for load; or")
+        self.assertEqual(entries[2], "    name: What to do; `all` by default.")
+        self.assertEqual(len(entries), 5, "no thing, no errors")
 
 
 class OutputTest(InFolder):

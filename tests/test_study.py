@@ -398,7 +398,9 @@ class WholeTest(InOneFolder):
     def setUpClass(cls):
         super().setUpClass()
         cls.out = cls.folder / "out"
-        with redirect_stdout(io.StringIO()) as said:
+        # another interpreter for each command takes longer than most commands; LaunchTest starts some
+        here = patch("xreset.eval.study.launch._run", lambda command: main(command[len(XRESET) :]))
+        with here, redirect_stdout(io.StringIO()) as said:
             main(["study", "seconds", "--out", str(cls.out)])
         cls.said = said.getvalue()
         cls.text = study_path("seconds").read_text()

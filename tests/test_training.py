@@ -247,7 +247,7 @@ class TrainingTest(WithBank):
         self.assertIn("continuing after iteration 1\n", again(config=CONFIG))
         self.assertEqual([c.name for c in checkpoints(out)], ["000001.pt", "000002.pt"])
         self.assertEqual((out / "checkpoints" / "000001.pt").read_bytes(), first)
-        self.assertIn("policy after 2 iterations", again(iterations=2))
+        self.assertIn("is trained", again(iterations=2))
         other = self.folder / "other_bank.npz"
         write_bank(other, toy_bank(self.robot))
         slower = replace(ONE, ppo=replace(ONE.ppo, learning_rate=1e-5))
@@ -470,7 +470,7 @@ class TrainingTest(WithBank):
 
     def test_a_number_of_iterations_that_has_passed_does_not_shorten_a_run(self):
         out = self.train("long")
-        self.assertIn("policy after 2 iterations", self.resume(out, iterations=1))
+        self.assertIn("is trained", self.resume(out, iterations=1))
         self.assertEqual(read_run(out).config, CONFIG)
 
     def test_a_schedule_without_effect_is_refused(self):

@@ -23,7 +23,7 @@ from xreset.cameras.config import (
 )
 from xreset.env.manipulation import make_env
 from xreset.errors import PolicyError, RunError, Stopped, XResetError
-from xreset.files.storage import claim_folder, file_hash
+from xreset.files.storage import claim_folder, file_hash, write_whole
 from xreset.files.text import shown
 from xreset.learning.config import TrainConfig
 from xreset.learning.distributed import Processes, leave
@@ -205,8 +205,9 @@ def resume(
             f"{out} is trained. To prolong the training, give more --iterations (or --minutes).",
             flush=True,
         )
-        with _claimed(out):
-            _export(out)
+        if Processes.of_environment().is_main:
+            with _claimed(out):
+                _export_if_missing(out)
         return out
     inputs = load_inputs(
         info.resets, robot=info.robot, meshes=info.meshes, accept=("bank", "goals")
@@ -442,18 +443,20 @@ def run_training(
         if processes.is_main:
             _write_start(out, info, runner.iteration, is_new=newest is None, resumed=resumed)
         stopped_by = runner.learn(info.config.iterations, seconds=60 * minutes)
-    _export(out)
+    if processes.is_main:
+        policy = out / "policy.onnx"
+        export_checkpoint(latest_checkpoint(out), policy)
+        print(f"policy after {runner.iteration} iterations in {policy}", flush=True)
     if stopped_by is not None:
         raise Stopped(stopped_by)
 
 
-def _export(out: Path) -> None:
-    """Export the policy of the newest checkpoint, in the main process."""
-    if Processes.of_environment().is_main:
-        newest = latest_checkpoint(out)
-        policy = out / "policy.onnx"
-        export_checkpoint(newest, policy)
-        print(f"policy after {int(newest.stem)} iterations in {policy}", flush=True)
+def _export_if_missing(out: Path) -> None:
+    """Write the run's policy, unless the file is the policy already, whose hash results state."""
+    path = out / "policy.onnx"
+    content = read_policy(out).content
+    if not path.is_file() or path.read_bytes() != content:
+        write_whole(path, content)
 
 
 def _write_start(out: Path, info: RunInfo, iteration: int, *, is_new: bool, resumed: bool) -> None:

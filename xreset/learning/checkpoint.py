@@ -13,7 +13,7 @@ import torch
 
 from xreset.errors import FileFormatError, RunError
 from xreset.files.checks import NonNegativeFloat, NonNegativeInt, Rule, from_dict, frozen
-from xreset.files.storage import atomic_write
+from xreset.files.storage import atomic_write, must_exist
 from xreset.files.text import shown
 
 
@@ -82,8 +82,9 @@ def read_checkpoint(path: Path, device: str | torch.device = "cpu") -> Checkpoin
     """Read a checkpoint.
 
     Raises:
-        FileFormatError: the file is damaged or not a checkpoint.
+        FileFormatError: there is no such file, or it is damaged or not a checkpoint.
     """
+    must_exist(path, "checkpoint")
     try:
         content = torch.load(path, map_location=device, weights_only=True)
     except torch.OutOfMemoryError:

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from tensordict import TensorDict
 
-from xreset.files.storage import check_suffix, file_hash, must_exist, write_whole
+from xreset.files.storage import check_suffix, file_hash, write_whole
 from xreset.learning.checkpoint import must_fit, read_checkpoint
 from xreset.learning.model import ExportedPolicy, PointNetLstmModel, make_actor
 from xreset.learning.run import read_run
@@ -73,7 +73,7 @@ def export_checkpoint(checkpoint: str | Path, policy: str | Path) -> None:
 
 def exported_checkpoint(checkpoint: Path) -> bytes:
     """Return the content of the file that :func:`export_checkpoint` writes; errors as there."""
-    must_exist(checkpoint, "checkpoint")
+    weights = read_checkpoint(checkpoint).policy_state_dict
     folder = checkpoint.parent.parent
     run = read_run(folder)
     shapes = observation_shapes(run.contract, str(folder))
@@ -82,5 +82,5 @@ def exported_checkpoint(checkpoint: Path) -> bytes:
     )
     actor = make_actor(example, len(run.contract.joint_names), run.config)
     with must_fit(checkpoint):
-        actor.load_state_dict(read_checkpoint(checkpoint).policy_state_dict)
+        actor.load_state_dict(weights)
     return exported(actor, run.contract, checkpoint=checkpoint)

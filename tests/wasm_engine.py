@@ -18,9 +18,9 @@ from unittest import SkipTest
 import numpy as np
 
 from ci import try_page
+from xreset import evaluate
 from xreset.backends.pool import PoolBackend, World
 from xreset.demos.synth import synthesize
-from xreset.eval.experiment import evaluate
 from xreset.eval.rollout import Engine
 
 

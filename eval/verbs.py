@@ -291,8 +291,12 @@ def export_episodes(
     from xreset.eval.export.lerobot import write_lerobot
     from xreset.eval.export.recorded import read_recorded, write_arrays
 
-    recording = read_recorded(folders, engines=engines, robot=robot, meshes=meshes, task=task)
     out = Path(out)
+    if out.suffix == ".npz" and cameras:
+        raise XResetError(
+            f"{out} cannot hold films of cameras. Omit the cameras, or name a folder."
+        )
+    recording = read_recorded(folders, engines=engines, robot=robot, meshes=meshes, task=task)
     if out.suffix == ".npz":
         write_arrays(out, recording)
     else:

@@ -170,6 +170,8 @@ class Arrays(Case):
         words = f"^{self.folder}: there are no recorded episodes of not-sapien. Make"
         with self.assertRaisesRegex(RunError, words):
             xreset.export_episodes(str(self.folder), again, engines="not-sapien")
+        with self.assertRaisesRegex(XResetError, "again.npz cannot hold films of cameras"):
+            xreset.export_episodes(str(self.folder), again, cameras=["front"])
 
 
 @skipUnless(PARQUET, "pyarrow is not installed")

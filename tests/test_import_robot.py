@@ -497,14 +497,30 @@ class Toy(Robots):
             self.assertEqual(errors(out), [])
             self.assertEqual(load_robot(out).fingertips[0].contact_links, (f"{finger}_b",))
 
-    def test_of_two_hands_the_thumb_chooses_one(self):
-        hands = []
-        for side, y in (("left", 0.4), ("right", -0.4)):
+    def two_hands(self, y, joints=0, thumb="thumb"):
+        """A URDF of two hands that are 2 ``y`` apart, on arms of some joints."""
+        parts = []
+        for side, at in (("left", y), ("right", -y)):
             hand = HAND.partition(">")[2].replace("</robot>", "")
             hand = re.sub(r'"(base|(?:f\d|thumb)_\w)"', rf'"{side}_\1"', hand)
-            mount = f'<joint name="{side}" type="fixed"><parent link="torso"/><child link="{side}_base"/>'
-            hands.append(f'{hand}{mount}<origin xyz="0 {y} 0"/></joint>')
-        both = f'<robot name="both"><link name="torso"/>{"".join(hands)}</robot>'
+            parts.append(hand.replace("thumb_", f"{thumb}_"))
+            link = "torso"
+            for i in range(joints):
+                ends = f'<parent link="{link}"/><child link="{side}_arm{i}"/>'
+                moves = '<axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="9" velocity="1"/>'
+                parts.append(
+                    f'<link name="{side}_arm{i}"/><joint name="{side}_{i}" type="revolute">{ends}{moves}</joint>'
+                )
+                link = f"{side}_arm{i}"
+            ends = f'<parent link="{link}"/><child link="{side}_base"/><origin xyz="0 {at} 0"/>'
+            parts.append(f'<joint name="{side}" type="fixed">{ends}</joint>')
+        return f'<robot name="both"><link name="torso"/>{"".join(parts)}</robot>'
+
+    def test_of_two_hands_the_thumb_chooses_one(self):
+        words = "has 2 hands, with the fingers left_f1_b, .*Choose one with --thumb"
+        nameless = self.two_hands(0.08, joints=3, thumb="f4")
+        self.assertRaisesRegex(RobotError, words, self.imported, nameless)
+        both = self.two_hands(0.4)
         words = "has 2 hands, with the fingers left_f1_b, .*; right_f1_b, .*Choose one with --thumb"
         self.assertRaisesRegex(RobotError, words, self.imported, both)
         spec = load_robot(self.imported(both, thumb="right_thumb_a"))

@@ -52,6 +52,8 @@ _SPREAD = 0.01
 """Spread of the directions of parallel fingers: 1 - length of the mean of the unit vectors."""
 _HANDS_APART = 0.2
 """[m] Distance of the fingers of two hands."""
+_ARM_JOINTS = 3
+"""Joints that move all fingers of a hand but not those of the other one: the hand has an arm of its own."""
 _SHORTEST = 1e-6
 """[m] Length of a finger from which its direction is known."""
 _BEND = 0.15
@@ -197,13 +199,17 @@ class Hand:
         tips = []
         drives = []
         begins = []
+        arms = []
         for own in hands.values():
             tips.append(", ".join(finger.links[-1] for finger in own))
             drives.append(set.union(*map(self._drives_of, own)))
-            begins.append([self._at[finger.links[0]][:3, 3] for finger in own])
+            arm = set.intersection(*(set(finger.joints) for finger in own))
+            arms.append(len(arm))
+            begins.append([self._at[finger.links[len(arm)]][:3, 3] for finger in own])
         gaps = [cdist(a, b).min() for a, b in combinations(begins, 2)]
         thumbs = [one for one in self._chains() if one.name == "thumb"]
-        is_one = not gaps or (min(gaps) < _HANDS_APART and len(thumbs) < 2)
+        is_near = not gaps or (min(gaps) < _HANDS_APART and len(thumbs) < 2)
+        is_one = is_near and (not gaps or min(arms) < _ARM_JOINTS)
         if is_one or any(a & b for a, b in combinations(drives, 2)):
             return self.tree
         tree = self.tree

@@ -67,11 +67,11 @@ def commands(folder: Path) -> list[Command]:
         bank,
         "--iterations",
         60,
-        "--vision.width",
+        "--config.task.vision.width",
         8,
-        "--vision.height",
+        "--config.task.vision.height",
         8,
-        "--vision.points",
+        "--config.task.vision.points",
         16,
     ]
     return [

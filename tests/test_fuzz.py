@@ -1,17 +1,22 @@
 """Every reader, with damaged files: a small budget here, a large one by ``ci/fuzz``."""
 
 import re
+from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from unittest import SkipTest, TestCase
 
 if not find_spec("hypothesis"):
     raise SkipTest("hypothesis is not installed (pip install 'xreset[dev]')")
 
+import tyro
 from hypothesis import HealthCheck, given, settings
 
+from ci import kills
 from tests.damage import damages
 from tests.fuzzing import outcome, readers
 from tests.fuzzing_commands import outcome_of_command
+from xreset.cli._options import checked
 
 EXAMPLES = 40
 
@@ -81,3 +86,18 @@ class CommandLines(TestCase):
         ):
             with self.subTest(line[:4]):
                 self.assertEqual(outcome_of_command(list(line)), "refused")
+
+    def test_the_lines_of_the_kills_are_commands(self):
+        """``ci/kills`` runs for an hour; a line that the command no longer takes is seen here."""
+        for killed in kills.commands(Path("none")):
+            name, *words = map(str, killed.arguments)
+            if "--teacher" in words:  # whose observations have options
+                words[words.index("--teacher") + 1] = "many-objects"
+            module = import_module(f"xreset.cli.{name}")
+            command = (
+                module.command_for(words) if hasattr(module, "command_for") else module.COMMAND
+            )
+            if isinstance(command, dict):
+                command = command[words.pop(0)]
+            with self.subTest(killed.name):
+                tyro.extras.get_parser(checked(command)).parse_args(words)

@@ -133,6 +133,18 @@ class Geometry(TestCase):
         self.assertEqual((len(mesh.vertices), mesh.is_volume), (64, True))
         self.assertGreater(mesh.volume / sphere.volume, 0.9)
 
+    def test_limited_hull_adds_the_farthest_of_all_vertices(self):
+        directions = np.random.default_rng(0).normal(size=(5000, 3))
+        points = directions / np.linalg.norm(directions, axis=1, keepdims=True) * (0.03, 0.02, 0.01)
+        limited = limited_hull(points).geometry.vertices
+        chosen = np.flatnonzero((points[:, None] == limited).all(axis=-1).any(axis=1))
+        along = points @ np.vstack((np.eye(3), [(1, 1, 1), (1, 1, -1), (1, -1, 1), (-1, 1, 1)])).T
+        expected = {*along.argmin(axis=0).tolist(), *along.argmax(axis=0).tolist()}
+        while len(expected) < 64:
+            planes = ConvexHull(points[sorted(expected)]).equations
+            expected.add(int(plane_heights(points, planes).max(axis=1).argmax()))
+        self.assertEqual(chosen.tolist(), sorted(expected))
+
 
 class Sampling(TestCase):
     def test_well_spread_on_the_outer_surface(self):
@@ -534,6 +546,10 @@ class ThinWalls(InFolder):
         pieces = decompose(plate)
         self.assertEqual(len(pieces.shapes), 1)
         self.assertAlmostEqual(pieces.deviation, 0.004, delta=1e-4)
+        diagonal = np.linalg.norm(plate.extents)
+        for depth, is_whole in ((0.0039, False), (0.0041, True)):
+            pieces = decompose(plate, Settings(hull_depth=depth / diagonal))
+            self.assertEqual(len(pieces.shapes) == 1, is_whole)
 
     def test_an_open_sheet_becomes_a_thin_wall(self):
         angle = np.linspace(0, 1.0, 6)

@@ -65,7 +65,9 @@ _OUTSIDE = 5e-4
 _NEAREST = 8
 """Triangles of a surface that the distance of a point is computed from."""
 _BATCH = 2000
-"""Triangles whose distance is computed together."""
+"""Triangles or vertices whose distance is computed together."""
+_JOGGLE = 1e-6
+"""More than qhull moves vertices to make them span a volume [m]."""
 _LEAST_EFFORT = 2000
 """Triangles that the measure of a pair of pieces counts for at least: its points take time in any case."""
 _TOUCH = 2e-4
@@ -129,7 +131,7 @@ def decompose(mesh: trimesh.Trimesh, settings: Settings = Settings()) -> Pieces:
         around = mesh.convex_hull
     finished = True
     depth = settings.hull_depth * np.linalg.norm(mesh.extents) or settings.tolerance
-    if surface.deviation(around.vertices, around.faces) <= depth:
+    if surface.deviation(around.vertices, around.faces, limit=depth) <= depth:
         shapes = [limited_hull(points)]
         piece = shape_mesh(shapes[0])
         deviation = surface.deviation(piece.vertices, piece.faces)
@@ -303,12 +305,20 @@ class _Surface:
         points, _, _ = sample_surface(vertices, faces, 400)
         return float(self._tree.query(np.concatenate((vertices, points)))[0].max())
 
-    def deviation(self, vertices: np.ndarray, faces: np.ndarray) -> float:
+    def deviation(
+        self, vertices: np.ndarray, faces: np.ndarray, *, limit: float | None = None
+    ) -> float:
         """Return the largest distance of a point of another surface to this one, to ``_EXACT`` [m].
 
         The distance to a triangle is convex: over another triangle, it is greatest at a corner. So no point of that
         triangle is farther from this surface than its corners are from the nearest triangle; it is quartered while that
         exceeds what its middles have shown.
+
+        Args:
+            vertices: [V, 3]
+            faces: [F, 3]
+            limit: the search ends as soon as the deviation is known to exceed this or not to exceed it [m]. The
+                returned number is then on the same side of the limit as the deviation.
         """
         farthest = 0.0
         pool = vertices[faces]
@@ -316,6 +326,8 @@ class _Surface:
         radius = np.linalg.norm(pool - middle[:, None], axis=2).max(axis=1)
         bound = np.asarray(self._tree.query(middle)[0]) + radius
         while bound.size and bound.max() > farthest + _EXACT:
+            if limit is not None and (farthest > limit or bound.max() <= limit):
+                break
             first, rest = np.split(np.argsort(-bound, kind="stable"), [_BATCH])
             corners = pool[first]
             middle, *ends = self._distances(corners)
@@ -364,13 +376,14 @@ class _Solid(_Surface):
         super().__init__(*_arrays(solid))
         self.solid = solid
 
-    def excess(self, piece: Manifold, *, quick: bool) -> float:
-        """Return how far a piece reaches out of the solid [m]."""
+    def excess(self, piece: Manifold, *, quick: bool, limit: float | None = None) -> float:
+        """Return how far a piece reaches out of the solid [m]; see :meth:`deviation` for the limit."""
         outside = piece - self.solid
         if outside.volume() < _SPECK / 100:
             return 0.0
-        measure = self.quick_deviation if quick else self.deviation
-        return measure(*_arrays(outside))
+        if quick:
+            return self.quick_deviation(*_arrays(outside))
+        return self.deviation(*_arrays(outside), limit=limit)
 
 
 # Cutting and joining --------------------------------------------------------------------------------------------------
@@ -516,12 +529,13 @@ class _Cutter:
         for number, piece in enumerate(hulls):
             add(number, piece)
         number = len(hulls)
+        limit = tolerance / _QUICK
         while queue:
             _, one, other, both = heapq.heappop(queue)
             if (
                 one in alive
                 and other in alive
-                and self._solid.excess(both, quick=False) <= tolerance / _QUICK
+                and self._solid.excess(both, quick=False, limit=limit) <= limit
             ):
                 del alive[one], alive[other]
                 add(number, both)
@@ -587,10 +601,19 @@ def limited_hull(points: np.ndarray) -> Shape:
         return full
     along = vertices @ np.vstack((np.eye(3), _DIAGONALS)).T
     chosen = np.unique((along.argmin(axis=0), along.argmax(axis=0))).tolist()
+    outside = np.full(len(vertices), np.inf)
     while len(chosen) < _MAX_VERTICES:
         # joggled: the first few may be coplanar
-        inner = ConvexHull(vertices[chosen], qhull_options="QJ")
-        outside = plane_heights(vertices, inner.equations).max(axis=1)
+        planes = ConvexHull(vertices[chosen], qhull_options="QJ").equations
         outside[chosen] = -np.inf
+        order = np.argsort(-outside, kind="stable")[: len(vertices) - len(chosen)]
+        farthest = -np.inf
+        for begin in range(0, len(order), _BATCH):
+            part = order[begin : begin + _BATCH]
+            # the hull grows, so the heights above an earlier hull bound those above this one
+            if outside[part[0]] < farthest - _JOGGLE:
+                break
+            outside[part] = plane_heights(vertices[part], planes).max(axis=1)
+            farthest = max(farthest, float(outside[part].max()))
         chosen.append(outside.argmax())
     return hull(vertices[chosen])

@@ -402,6 +402,22 @@ class Toy(Robots):
         self.assertEqual(len(load_robot(made.folder).joint_names), 10)
         self.assertIn(("f1_a", "f2_a"), load_robot(made.folder).collision_exclude)
 
+    def test_an_object_next_to_the_hand_is_no_part_of_it(self):
+        slides = [
+            f'<joint name="pen{i}" type="slide" axis="{axis}"/>' for i, axis in enumerate(_AXES)
+        ]
+        shape = '<geom type="capsule" size="0.01 0.05" pos="0 0 0.1"/>'
+        pen = f'<body name="pen" pos="0.3 0 0.1">{"".join(slides)}{shape}</body></worldbody>'
+        made = import_robot(
+            self.arm,
+            self.file("hand.xml", MJCF.replace("</worldbody>", pen)),
+            self.folder / "mine",
+        )
+        self.assertRegex(" ".join(made.guessed), "left out: what moves next to the hand: pen")
+        spec = load_robot(made.folder)
+        self.assertEqual(len(spec.joint_names), 10)
+        self.assertFalse([name for name in load_urdf(spec.urdf).link_names if "pen" in name])
+
     def test_numbers_that_no_robot_has(self):
         fixed = re.sub(
             r'<mimic joint="f1_1"[^>]*>', "", HAND

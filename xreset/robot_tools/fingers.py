@@ -4,7 +4,7 @@ which human keypoint."""
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -17,7 +17,7 @@ from xreset.files.checks import frozen
 from xreset.geometry.collision import bounding_ball
 from xreset.geometry.shapes import surface_of, transform, transformed
 from xreset.geometry.urdf import RobotTree
-from xreset.geometry.urdf_writer import axes, fixed, frame
+from xreset.geometry.urdf_writer import FRAME_MASS, axes, fixed, frame
 from xreset.robot_tools.draft import draft_spec, link_places
 from xreset.robot_tools.opposition import closing_range, opposition
 from xreset.robot_tools.sources import with_fixed
@@ -99,6 +99,12 @@ class Hand:
         while True:  # a hand of several hands, and its fingers of several limbs
             tree = self._one_hand(thumb)
             still = [] if tree is not self.tree else self._joints_of_other_parts()
+            loose = self._loose_bodies(still)
+            if loose:
+                notes.append(f"left out: what moves next to the hand: {', '.join(loose)}")
+                tree = _without(tree, loose)
+                names = [joint.name for joint in tree.joints]
+                still = [joint for joint in still if joint in names]
             if still:
                 notes.append(f"joints that move no finger are fixed at 0: {', '.join(still)}")
                 tree = with_fixed(tree, still)
@@ -164,11 +170,15 @@ class Hand:
     def _joints_of_other_parts(self) -> list[str]:
         """Return the joints that move no finger, such as that of a camera on the arm.
 
-        If chains can meet below one child of the root only, they are the hand, and other chains move no finger. But if
-        the names of another chain state a finger, or a drive of the hand moves it, nothing is certain: no joint is
-        returned.
+        If chains can meet below one child of the root only, they are the hand, and other chains move no finger. Below a
+        root that is only a frame, chains with a thumb are the hand, too. But if the names of another chain state a
+        finger, or a drive of the hand moves it, nothing is certain: no joint is returned.
         """
-        hands = [own for own in self._hands().values() if self._can_meet(own)]
+        hands = []
+        for own in self._hands().values():
+            has_thumb = any(finger.name == "thumb" for finger in own)
+            if (has_thumb and self._is_scene()) or self._can_meet(own):
+                hands.append(own)
         if len(hands) != 1:
             return []
         drives = set.union(*map(self._drives_of, hands[0]))
@@ -180,6 +190,19 @@ class Hand:
                 return []
             still += [joint for joint in chain.joints if joint not in still]
         return still
+
+    def _is_scene(self) -> bool:
+        """Return whether the tree's root is only a frame, such as the world of a scene, from which the hand and other
+        things branch off."""
+        root = self.tree.link(self.tree.root)
+        return self.root == root.name and not root.collisions and root.mass <= FRAME_MASS
+
+    def _loose_bodies(self, still: Sequence[str]) -> list[str]:
+        """Return the objects of a scene: what is connected to its root by one of some joints that move no finger."""
+        if not self._is_scene():
+            return []
+        joints = [joint for joint in self.tree.joints if joint.parent == self.root]
+        return [joint.child for joint in joints if joint.name in still]
 
     def _hands(self) -> dict[str, list[Finger]]:
         """Return the fingers below each child of the root that has several."""
@@ -219,10 +242,7 @@ class Hand:
                 self._notes.append(
                     f"left out, because {thumb} is of another hand: {', '.join(others)}"
                 )
-                removed = set().union(*map(tree.below, others))
-                links = tuple(link for link in tree.links if link.name not in removed)
-                joints = tuple(joint for joint in tree.joints if joint.child not in removed)
-                return replace(tree, links=links, joints=joints)
+                return _without(tree, others)
         raise RobotError(
             f"the file has {len(hands)} hands, with the fingers {'; '.join(tips)}. Choose one with --thumb, the name "
             "of a link of its thumb."
@@ -570,6 +590,14 @@ def _stated_finger(names: str) -> str:
         if re.search(rf"(?<![a-z])({words}|{code}{_BONE})", text):
             return finger
     return ""
+
+
+def _without(tree: RobotTree, children: Sequence[str]) -> RobotTree:
+    """Return a tree without some links and what they carry."""
+    removed = set().union(*map(tree.below, children))
+    links = tuple(link for link in tree.links if link.name not in removed)
+    joints = tuple(joint for joint in tree.joints if joint.child not in removed)
+    return replace(tree, links=links, joints=joints)
 
 
 def _keypoint_joints(finger: Finger) -> dict[str, int]:

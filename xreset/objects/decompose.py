@@ -130,7 +130,7 @@ def decompose(mesh: trimesh.Trimesh, settings: Settings = Settings()) -> Pieces:
     else:
         around = mesh.convex_hull
     finished = True
-    depth = settings.hull_depth * np.linalg.norm(mesh.extents) or settings.tolerance
+    depth = float(settings.hull_depth * np.linalg.norm(mesh.extents)) or settings.tolerance
     if surface.deviation(around.vertices, around.faces, limit=depth) <= depth:
         shapes = [limited_hull(points)]
         piece = shape_mesh(shapes[0])

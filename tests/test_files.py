@@ -326,6 +326,18 @@ class NpzTest(InFolder):
                 with self.refused("cannot be read as a test file", "damaged or truncated"):
                     self.read()
 
+    def test_a_file_that_cannot_be_opened_is_not_called_damaged(self):
+        self.write()
+        for number, words in ((EACCES, "Permission denied"), (EMFILE, "Too many open")):
+            problem = OSError(number, os.strerror(number), str(self.file))
+            with (
+                patch("zipfile.ZipFile", side_effect=problem),
+                self.assertRaises(FileFormatError) as caught,
+            ):
+                self.read()
+            self.assertIn(words, str(caught.exception))
+            self.assertNotIn("damaged", str(caught.exception))
+
     def test_toml(self):
         file = self.folder / "file.toml"
         with self.refused("cannot be read", "Make one"):

@@ -7,6 +7,7 @@ same bytes.
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -33,6 +34,8 @@ from xreset.files.storage import (
 from xreset.files.text import is_plain, plain, shown
 
 T = TypeVar("T")
+_NOT_OPENED = (errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE)
+"""Errors of the system that say nothing about a file's content: no right to read, too many open files."""
 
 
 @dataclass(frozen=True)
@@ -206,6 +209,8 @@ def _opened(
     except XResetError:
         raise
     except Exception as error:
+        if isinstance(error, OSError) and error.errno in _NOT_OPENED:
+            raise FileFormatError(f"{path} {failure}: {error.strerror}.") from error
         if str(error).startswith("Object arrays"):  # numpy's refusal
             raise FileFormatError(
                 f"{path} {failure}: it holds Python objects, and objects are never read."

@@ -12,6 +12,7 @@ from xreset.env.manipulation import make_env as make_env
 from xreset.env.stable_baselines import StableBaselinesEnv as StableBaselinesEnv
 from xreset.env.vector_env import VectorEnv as VectorEnv
 from xreset.errors import XResetError as XResetError
+from xreset.eval.export.recorded import RecordedEpisodes as RecordedEpisodes
 from xreset.eval.film import film as film
 from xreset.eval.policy_spec import PolicySpec as PolicySpec
 from xreset.eval.policy_spec import load_policy as load_policy

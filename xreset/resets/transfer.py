@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,18 +20,16 @@ from torch import Tensor
 
 from xreset.errors import DemoError
 from xreset.files.checks import PositiveInt, frozen, obeys_rules
-from xreset.files.processes import in_processes
 from xreset.files.progress import unseen
 from xreset.geometry.rotations import matrix_to_quat, quat_angle
 from xreset.geometry.shapes import turn_of
 from xreset.physics import Backend, State
-from xreset.physics.tensors import one_thread
 from xreset.resets.bank import ResetBank, check_states
 from xreset.resets.config import TransferConfig
 from xreset.resets.probe import probe
 from xreset.retarget.arm.config import QUICK
 from xreset.retarget.arm.model import ArmModel, ArmTargets
-from xreset.retarget.arm.solve import track
+from xreset.retarget.arm.solve import track_each
 from xreset.retarget.file import Retargeted
 from xreset.retarget.validity import Thresholds, classify
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, checked_objects, objects_named
@@ -210,20 +207,6 @@ def _candidates(
     return np.array(pose, dtype=int), np.array(grasp, dtype=int)
 
 
-class _ArmJob(NamedTuple):
-    """The inverse kinematics of M hands, each a path of one frame."""
-
-    robot: RobotSpec
-    targets: ArmTargets
-
-
-def _solve_arm(job: _ArmJob) -> tuple[np.ndarray, np.ndarray]:
-    """Return the arm's joints [M, n] and whether the arm reaches each pose [M]."""
-    with one_thread():
-        arm, measures = track(ArmModel(job.robot), job.targets, _THRESHOLDS, QUICK)
-    return arm[:, 0].numpy(), (classify(measures, _THRESHOLDS) == 0)[:, 0].numpy()
-
-
 def _carried(
     bank: ResetBank,
     grasp: np.ndarray,
@@ -254,19 +237,17 @@ def _carried(
     root_quat = matrix_to_quat(torch.as_tensor(root_turn.as_matrix()))
     hand_joints = torch.as_tensor(joint_pos[:, model.hand.joint_indices])
     batches = [slice(first, first + _BATCH) for first in range(0, len(grasp), _BATCH)]
-    jobs = [
-        _ArmJob(
-            robot,
-            ArmTargets.of_poses(
-                torch.as_tensor(root_pos[rows]), root_quat[rows], hand_joints[rows, None]
-            ),
+    paths = [
+        ArmTargets.of_poses(
+            torch.as_tensor(root_pos[rows]), root_quat[rows], hand_joints[rows, None]
         )
         for rows in batches
     ]
+    solved = track_each(robot, paths, _THRESHOLDS, QUICK)
     is_reached = np.zeros(len(grasp), dtype=bool)
-    for rows, (arm, reached) in zip(batches, in_processes(_solve_arm, jobs), strict=True):
-        joint_pos[rows, robot.arm_indices] = arm
-        is_reached[rows] = reached
+    for rows, (arm, measures) in zip(batches, solved, strict=True):
+        joint_pos[rows, robot.arm_indices] = arm[:, 0].numpy()
+        is_reached[rows] = (classify(measures, _THRESHOLDS) == 0)[:, 0].numpy()
         progress(min(rows.stop, len(grasp)))
     joint_target = joint_pos.copy()
     joint_target[:, robot.hand_indices] = bank.targets[grasp][:, robot.hand_indices]

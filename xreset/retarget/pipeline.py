@@ -25,14 +25,14 @@ from xreset.geometry.surface import Surface, prepared_surface
 from xreset.physics.tensors import one_thread
 from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmModel, ArmTargets
-from xreset.retarget.arm.solve import track
+from xreset.retarget.arm.solve import track_each
 from xreset.retarget.file import Retargeted
 from xreset.retarget.hand.clearance import Objects, object_depth
 from xreset.retarget.hand.config import HandWeights, Jaw
 from xreset.retarget.hand.jaw import jaw_keypoints
 from xreset.retarget.hand.model import HandModel, HandState, HandTargets
 from xreset.retarget.hand.solve import retarget_hand
-from xreset.retarget.validity import REASONS, Measures, Thresholds, classify
+from xreset.retarget.validity import REASONS, Thresholds, classify
 from xreset.spec import ObjectSpec, RobotSpec, checked_objects, objects_named
 
 _log = logging.getLogger(__name__)
@@ -104,12 +104,10 @@ def retarget_demos(
     hand_error, wrist_error = np.full((2, demos.num_frames), np.inf)
     batches = list(hands.batches(lambda done, count: progress(done / 2, count)))
     paths = [_arm_targets(hands.model, arm, batch.targets, batch.motion) for batch in batches]
-    jobs = [_ArmJob(robot, path, config.arm) for path in paths]
+    followed = track_each(robot, paths, _THRESHOLDS, config.arm)
     count = sum(len(path.annotated) for path in paths)
     done = count / 2
-    for batch, path, (joints, measures) in zip(
-        batches, paths, in_processes(_follow, jobs), strict=True
-    ):
+    for batch, path, (joints, measures) in zip(batches, paths, followed, strict=True):
         rows = batch.rows
         is_frame = batch.is_frame
         done += len(path.annotated) / 2
@@ -367,25 +365,11 @@ class _HandJob(NamedTuple):
     config: RetargetConfig
 
 
-class _ArmJob(NamedTuple):
-    """The inverse kinematics along one batch of paths."""
-
-    robot: RobotSpec
-    path: ArmTargets
-    config: ArmSearch
-
-
 def _hand_motion(job: _HandJob) -> HandState:
     """Return the hand's motion."""
     model = HandModel(job.robot, device=job.device)
     with one_thread():
         return retarget_hand(model, job.targets, job.config.hand, jaw=job.config.jaw)
-
-
-def _follow(job: _ArmJob) -> tuple[Tensor, Measures]:
-    """Return the arm's joints and their measures: see :func:`track`."""
-    with one_thread():
-        return track(ArmModel(job.robot), job.path, _THRESHOLDS, job.config)
 
 
 def _arm_targets(

@@ -17,22 +17,26 @@ support points.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from xreset.files.processes import in_processes
 from xreset.geometry.rotations import (
     matrix_to_quat,
     quat_conjugate,
     quat_multiply,
     quat_to_axis_angle,
 )
-from xreset.physics.tensors import Tensors
+from xreset.physics.tensors import Tensors, one_thread
 from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmModel, ArmProblem, ArmTargets, arm_jump
 from xreset.retarget.least_squares import Quadratic, damped, free_to_move, minimize
 from xreset.retarget.validity import REASONS, Measures, Thresholds, classify
+from xreset.spec import RobotSpec
 
 _CONVERGED = 1e-5
 """Steps smaller than this end the iteration [rad or m]."""
@@ -85,6 +89,27 @@ def track(
             problem[failing], forwards[failing], joints[failing], worth[failing]
         )
     return joints, problem.measures(joints)
+
+
+class _Job(NamedTuple):
+    """Arguments of :func:`track`."""
+
+    robot: RobotSpec
+    path: ArmTargets
+    thresholds: Thresholds
+    config: ArmSearch
+
+
+def track_each(
+    robot: RobotSpec, paths: Sequence[ArmTargets], thresholds: Thresholds, config: ArmSearch
+) -> Iterator[tuple[Tensor, Measures]]:
+    """Yield what :func:`track` returns for each path, computed on all cores."""
+    yield from in_processes(_track, [_Job(robot, path, thresholds, config) for path in paths])
+
+
+def _track(job: _Job) -> tuple[Tensor, Measures]:
+    with one_thread():
+        return track(ArmModel(job.robot), job.path, job.thresholds, job.config)
 
 
 def _better_paths(problem: ArmProblem, paths: Paths, joints: Tensor, worth: Tensor) -> Tensor:

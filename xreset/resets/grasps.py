@@ -4,7 +4,7 @@ A grasp is a pair of surface points that face away from each other, nearer to ea
 angle of approach about the line between them. The hand must be clear of the object, closed and open, there and on the
 way to it. No force is computed: friction of the stated cone is assumed.
 
-Shape letters: K grasps, J hand joints, N tried grasps, S demonstrations.
+Shape letters: L states of a bank, K grasps, J hand joints, N tried grasps, S demonstrations.
 """
 
 from __future__ import annotations
@@ -55,6 +55,8 @@ _DEPTHS = (0.0, 0.45, 0.85)
 _TABLE_DEPTH = Thresholds().table_depth
 _THRESHOLDS = Thresholds(wrist_position=0.01, wrist_orientation=float(np.radians(5.0)))
 """How exactly the arm must carry a grasp; a success allows 2 cm and 15 degrees."""
+_CARRIED = 0.02
+"""A bank's object is in the air if it is raised by more than this [m]."""
 _AT_ONCE = 24
 """Grasps whose inverse kinematics is solved at a time for each demonstration."""
 
@@ -91,13 +93,19 @@ class Grasps(Tensors):
     """Why there is no grasp, if there is none."""
 
 
-def grasps_of_bank(bank: ResetBank, robot: RobotSpec, name: str) -> Grasps:
-    """Return the grasps of an object in which a bank's hand presses on it in the air."""
-    start = bank.start_pos[bank.sequence_index]
+def carried(bank: ResetBank, robot: RobotSpec, start_height: np.ndarray) -> np.ndarray:
+    """[L] bool: whether a state's hand presses on an object in the air, for the objects' heights at the start of the
+    demonstrations [S] [m]."""
     hand = robot.hand_indices
     presses = (bank.targets[:, hand] != bank.joint_pos[:, hand]).any(axis=1)
-    raised = bank.object_pos[:, 2] - start[:, 2] > _CARRIED
-    rows = np.flatnonzero((bank.object_name == name) & bank.own_grasp & presses & raised)
+    raised = bank.object_pos[:, 2] - start_height[bank.sequence_index]
+    return presses & (raised > _CARRIED)
+
+
+def grasps_of_bank(bank: ResetBank, robot: RobotSpec, name: str) -> Grasps:
+    """Return the grasps of an object in which a bank's hand presses on it in the air."""
+    is_carried = carried(bank, robot, bank.start_pos[:, 2])
+    rows = np.flatnonzero((bank.object_name == name) & bank.own_grasp & is_carried)
     model = ArmModel(robot)
     joints = torch.as_tensor(bank.joint_pos[rows], dtype=torch.float64)
     root = model.kinematics.link_poses(joints, [robot.hand_root])[:, 0]
@@ -111,10 +119,6 @@ def grasps_of_bank(bank: ResetBank, robot: RobotSpec, name: str) -> Grasps:
         missing="no grasp",
     )
     return found[_shuffled(len(rows))[:_MOST]]
-
-
-_CARRIED = 0.02
-"""A bank's object is in the air if it is raised by more than this [m]."""
 
 
 @one_thread()

@@ -26,6 +26,7 @@ from xreset.geometry.shapes import turn_of
 from xreset.physics import Backend, State
 from xreset.resets.bank import ResetBank, check_states
 from xreset.resets.config import TransferConfig
+from xreset.resets.grasps import carried
 from xreset.resets.probe import probe
 from xreset.retarget.arm.config import QUICK
 from xreset.retarget.arm.model import ArmModel, ArmTargets
@@ -35,8 +36,6 @@ from xreset.retarget.validity import Thresholds, classify
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, checked_objects, objects_named
 
 # These limits were measured together (docs/lab-book.md, "Grasps of other demonstrations"), and none was varied.
-_CARRIED = 0.02
-"""Grasps are those of states in which the object is raised by more than this [m]."""
 _RAISED = 0.03
 """Poses are those of frames in which the object is raised by more than this [m]."""
 _THRESHOLDS = Thresholds(wrist_position=0.005, wrist_orientation=float(np.radians(3.0)))
@@ -161,11 +160,8 @@ def _grasps(bank: ResetBank, retargeted: Retargeted, robot: RobotSpec) -> np.nda
             f"The bank already has {(~bank.own_grasp).sum()} states in grasps of other demonstrations. Give the bank "
             "that xreset.make_bank returned."
         )
-    hand = robot.hand_indices
-    presses = (bank.targets[:, hand] != bank.joint_pos[:, hand]).any(axis=1)
     start_pos, _ = retargeted.start_pose
-    raised = bank.object_pos[:, 2] - start_pos[bank.sequence_index, 2]
-    return np.flatnonzero(presses & (raised > _CARRIED))
+    return np.flatnonzero(carried(bank, robot, start_pos[:, 2]))
 
 
 def _raised_poses(retargeted: Retargeted, count: int) -> _Poses:

@@ -168,13 +168,18 @@ def best_reach(x: RewardInput, *, width: PositiveFloat) -> Tensor:
 
 
 @TERMS.add
-def grasp(x: RewardInput, *, force: NonNegativeFloat) -> Tensor:
+def grasp(x: RewardInput, *, force: NonNegativeFloat, opposing_jaw: bool = False) -> Tensor:
     """1 while the thumb and another finger press with this force [N] at least.
 
-    Two fingertips that are all that a hand has must also oppose each other, as in the gate ``opposing``: a closed jaw
-    that pushes an object with both tips has no more to gain, and policies stayed with that (docs/lab-book.md).
+    Args:
+        x: the step.
+        force: smallest force of a finger [N].
+        opposing_jaw: the two fingertips of a jaw must also oppose each other, as in the gate ``opposing``. Else a
+            closed jaw that pushes an object with both tips has no more to gain, and policies stayed with that
+            (docs/lab-book.md). This changes nothing for hands with more fingertips. Not in the paper.
     """
-    return contact_gate(x.tip_force, force, opposing=x.tip_force.shape[1] == 2)
+    is_jaw = x.tip_force.shape[1] == 2
+    return contact_gate(x.tip_force, force, opposing=opposing_jaw and is_jaw)
 
 
 @TERMS.add

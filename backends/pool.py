@@ -12,11 +12,9 @@ import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import fields
-from typing import Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from xreset.backends.rigid import ContactArrays, Inertia, LinkArrays, StateArrays
 from xreset.backends.workers import (
@@ -32,6 +30,9 @@ from xreset.physics import Backend, Contacts, Health, Links, MassProperties, Par
 from xreset.physics.plugins import refuse_unknown_options
 from xreset.physics.tensors import Tensors
 from xreset.spec import SceneSpec
+
+if TYPE_CHECKING:  # functions import torch, because one world plays without it
+    from torch import Tensor
 
 _Bundle = TypeVar("_Bundle", bound=Tensors)
 
@@ -189,6 +190,8 @@ class PoolBackend(Backend):
             CapabilityError: the device is not the CPU.
             XResetError: the world class has no such keyword.
         """
+        import torch
+
         if torch.device(device).type != "cpu":
             raise CapabilityError(
                 f"The engine {self.name!r} runs on the CPU only, found device {device!r}. "
@@ -231,7 +234,7 @@ class PoolBackend(Backend):
         self._contacts = self._views(Contacts)
         self._health = self._views(Health)
         self._wrench = torch.from_numpy(self._arrays["wrench"])
-        self._state.map(Tensor.copy_, State.initial(scene, self.object_index))
+        self._state.map(torch.Tensor.copy_, State.initial(scene, self.object_index))
         try:
             self._command("build")
         except BaseException:
@@ -265,6 +268,8 @@ class PoolBackend(Backend):
 
     def _views(self, bundle: type[_Bundle], prefix: str = "") -> _Bundle:
         """Return views of the shared arrays of a bundle's fields."""
+        import torch
+
         names = [field.name for field in fields(bundle)]
         return bundle(**{name: torch.from_numpy(self._arrays[prefix + name]) for name in names})
 

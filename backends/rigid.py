@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from xreset.errors import ObjectError, RobotError, WrongValueError, XResetError
 from xreset.files.checks import frozen
 from xreset.geometry.dynamics import drive_shares, drive_values
-from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.kinematics import on_host
 from xreset.geometry.shapes import pose_matrix, shape_mesh, transformed
 from xreset.geometry.urdf import Joint, Link, robot_tree
 from xreset.spec import ObjectSpec, RobotSpec, Shape
@@ -128,8 +128,8 @@ class Mechanism:
     def limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper limits [J] of the actuated joints, within which the joints that follow them keep theirs too;
         infinite where there is none."""
-        kinematics = Kinematics(self.robot)
-        return kinematics.lower.numpy(), kinematics.upper.numpy()
+        kinematics = on_host(self.robot)
+        return kinematics.lower, kinematics.upper
 
     @cached_property
     def colliding_links(self) -> tuple[tuple[str, str], ...]:

@@ -23,7 +23,6 @@ from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from torch import Tensor
 
 from xreset.backends.rigid import (
     Inertia,
@@ -39,6 +38,8 @@ from xreset.physics import Contacts, Links, Parameter, Parameters, State, no_rea
 from xreset.spec import GRAVITY, SceneSpec
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from xreset.backends.pool import World
 
 # Shared arrays --------------------------------------------------------------------------------------------------------

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from xreset.geometry.kinematics import Kinematics, PointJacobian
+from xreset.geometry.kinematics import Kinematics, PointJacobian, on_host
 from xreset.geometry.urdf import Link
 from xreset.spec import DriveSpec, JointSpec, RobotSpec
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 def com_jacobian(kinematics: Kinematics, q: Tensor) -> tuple[list[Link], PointJacobian]:
     """Return the L links, and the Jacobian of their centers of mass at joint positions [..., J]."""
     links = [kinematics.tree.link(name) for name in kinematics.link_names]
-    com = torch.tensor(np.stack([link.com for link in links]))
+    com = kinematics.array([link.com for link in links])
     return links, kinematics.jacobian(q, kinematics.link_names, com)
 
 
@@ -30,10 +32,9 @@ def mass_matrix(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
         robot: the robot.
         joint_pos: [J] position [rad or m].
     """
-    links, jacobian = com_jacobian(
-        Kinematics(robot), torch.as_tensor(joint_pos, dtype=torch.float64)
-    )
-    _, rot, linear, angular = (x.numpy() for x in jacobian)
+    kinematics = on_host(robot)
+    links, jacobian = com_jacobian(kinematics, kinematics.array(joint_pos))
+    _, rot, linear, angular = map(np.asarray, jacobian)
     mass = np.array([link.mass for link in links])
     inertia = rot @ np.stack([link.inertia for link in links]) @ rot.transpose(0, 2, 1)
     return np.einsum("l,lai,laj->ij", mass, linear, linear) + np.einsum(
@@ -87,12 +88,11 @@ def jaw_stiffness(robot: RobotSpec) -> float | None:
     hand = robot.hand_indices
     if len(hand) != 1 or len(robot.fingertips) != 2:
         return None
-    kinematics = Kinematics(robot)
-    home = torch.as_tensor(robot.home)
+    kinematics = on_host(robot)
     links = [tip.link for tip in robot.fingertips]
-    first, second = kinematics.points(home, links)
-    across = torch.nn.functional.normalize(second - first, dim=-1)
-    moves = kinematics.jacobian(home, links).linear[..., hand[0]]
+    first, second = kinematics.points(kinematics.home, links)
+    across = (second - first) / max(np.linalg.norm(second - first), 1e-12)
+    moves = kinematics.jacobian(kinematics.home, links).linear[..., hand[0]]
     closing = abs(float((moves[1] - moves[0]) @ across))
     return float(drive_values(robot, "kp")[hand[0]]) / max(closing, 1e-6)
 

@@ -1,5 +1,7 @@
 """Batched kinematics of any robot in torch: link poses, points and their Jacobians, mimic joints included.
 
+The same code computes with numpy, where a few poses are needed and torch need not be installed: :func:`on_host`.
+
 Shape letters: J joints of this kinematics, L links, P points, M moving joints of the URDF (the actuated ones and their
 mimics), B configurations. Poses are 4x4 matrices ``T_a_b`` (b in a). Lengths in m, angles in rad.
 """
@@ -8,16 +10,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
+from numpy.typing import ArrayLike
 
 from xreset.errors import RobotError
-from xreset.geometry.rotations import homogeneous, matvec, quat_to_matrix
+from xreset.geometry.shapes import pose_matrix
 from xreset.geometry.urdf import Joint, robot_tree
 from xreset.spec import MimicSpec, RobotSpec
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
 
 
 class PointJacobian(NamedTuple):
@@ -76,6 +81,11 @@ class _Chain(NamedTuple):
     """[links, m] 1: the joint moves the link; 0: it does not."""
 
 
+def on_host(robot: RobotSpec) -> Any:
+    """Return the :class:`Kinematics` of a robot with numpy arrays in double precision in place of tensors."""
+    return Kinematics(robot, numpy=True)
+
+
 class Kinematics:
     """Kinematics of a robot, or of the part of it below one link.
 
@@ -89,16 +99,18 @@ class Kinematics:
         robot: RobotSpec,
         *,
         root: str | None = None,
-        dtype: torch.dtype = torch.float64,
+        dtype: torch.dtype | None = None,
         device: torch.device | str = "cpu",
+        numpy: bool = False,
     ) -> None:
         """Prepare the tree.
 
         Args:
             robot: the robot.
             root: link to start from; default: the URDF's root.
-            dtype: dtype of all results.
+            dtype: dtype of all results; default: double precision.
             device: device of all results.
+            numpy: compute with numpy arrays, on the CPU and in double precision; :meth:`motion` needs torch.
 
         Raises:
             RobotError: see :func:`~xreset.geometry.urdf.robot_tree`.
@@ -107,13 +119,22 @@ class Kinematics:
         self.robot = robot
         self.tree = tree
         self.root = tree.link(root or tree.root).name
-        self.dtype = dtype
-        self.device = torch.device(device)
-        self.base = torch.eye(4, dtype=dtype, device=self.device)
+        self._library: Any = np
+        """numpy or torch: the code uses what both have."""
+        self._cross: Any = np.cross
+        self.device: Any = "cpu"
+        self.dtype: Any = np.float64
+        if not numpy:
+            import torch
+
+            self._library = torch
+            self._cross = torch.linalg.cross
+            self.device = torch.device(device)
+            self.dtype = dtype or torch.float64
+        at_root = self.root == tree.root
+        base = pose_matrix(robot.base_pos, robot.base_quat) if at_root else np.eye(4)
+        self.base = self.array(base)
         """[4, 4] default pose of the root: the robot's base in the world, or the identity below another root."""
-        if self.root == tree.root:
-            rot = quat_to_matrix(self._tensor(robot.base_quat))
-            self.base = homogeneous(rot, self._tensor(robot.base_pos))
         self.link_names = tuple(tree.below(self.root))
         """Links from the root down, parents before children (length L)."""
         joints = [tree.above[name] for name in self.link_names[1:]]
@@ -129,7 +150,7 @@ class Kinematics:
         URDF's."""
         self.joint_names = tuple(robot.joint_names[i] for i in indices)
         """Names of the joints, in the robot's joint order."""
-        self.home = self._tensor(robot.home[indices])
+        self.home = self.array(robot.home[indices])
         """[J] joint positions at home."""
         self._set_coupling(moving, mimics)
         self._set_steps(joints, moving)
@@ -151,11 +172,11 @@ class Kinematics:
                 ]
                 lower[source] = max(lower[source], min(ends))
                 upper[source] = min(upper[source], max(ends))
-        self._coupling = self._tensor(coupling)
-        self._constant = self._tensor(constant)
-        self.lower = self._tensor(lower)
+        self._coupling = self.array(coupling)
+        self._constant = self.array(constant)
+        self.lower = self.array(lower)
         """[J] lower position limits, mimic joints' limits included; -inf where there is none."""
-        self.upper = self._tensor(upper)
+        self.upper = self.array(upper)
         """[J] upper position limits, mimic joints' limits included; inf where there is none."""
 
     def _set_steps(self, joints: Sequence[Joint], moving: Sequence[Joint]) -> None:
@@ -177,9 +198,9 @@ class Kinematics:
                 parent=parent,
                 moving=row.get(joint.name, -1),
                 prismatic=joint.type == "prismatic",
-                offset=self._tensor(joint.T_parent_joint[:3, 3]),
-                rotations=self._tensor(rotations),
-                axis=self._tensor(R @ joint.axis),
+                offset=self.array(joint.T_parent_joint[:3, 3]),
+                rotations=self.array(rotations),
+                axis=self.array(R @ joint.axis),
             )
             self._steps.append(step)
         self._moved = cache(self._moved_by_joints)
@@ -191,7 +212,7 @@ class Kinematics:
         for row, joint in enumerate(self._moving):
             rows = self._above[links, self._link_index[joint.child]].nonzero()[0]
             if len(rows):
-                moved.append((row, torch.as_tensor(rows, device=self.device)))
+                moved.append((row, self._indices(rows)))
         return moved
 
     def link_index(self, name: str) -> int:
@@ -226,8 +247,11 @@ class Kinematics:
         """
         indices = [self.link_index(name) for name in (self.link_names if links is None else links)]
         rot, pos, _, _ = self._forward(q, base, indices)
-        shape = (*q.shape[:-1], len(indices))
-        return homogeneous(rot.view(*shape, 3, 3), pos.view(*shape, 3))
+        T = self._zeros(*pos.shape[:-1], 4, 4)
+        T[..., :3, :3] = rot
+        T[..., :3, 3] = pos
+        T[..., 3, 3] = 1.0
+        return T.reshape(*q.shape[:-1], len(indices), 4, 4)
 
     def points(
         self,
@@ -247,7 +271,9 @@ class Kinematics:
         """
         poses = self.link_poses(q, links, base=base)
         points = poses[..., :3, 3]
-        return points if offsets is None else points + matvec(poses[..., :3, :3], offsets)
+        if offsets is None:
+            return points
+        return points + (poses[..., :3, :3] @ offsets[..., None])[..., 0]
 
     def jacobian(
         self,
@@ -266,22 +292,24 @@ class Kinematics:
         rot, pos, axes, origins = self._forward(q, base, indices)
         shape = (*q.shape[:-1], len(indices))
         if offsets is not None:
-            pos = pos + matvec(rot, offsets.expand(*shape, 3).reshape(pos.shape))
+            given: Any = self._library.broadcast_to(offsets, (*shape, 3)).reshape(pos.shape)
+            pos = pos + (rot @ given[..., None])[..., 0]
         moved = self._moved(tuple(indices))
-        linear = q.new_zeros(*pos.shape, len(moved))
-        angular = torch.zeros_like(linear)
+        linear = self._zeros(*pos.shape, len(moved))
+        angular = self._zeros(*pos.shape, len(moved))
         for column, (joint, rows) in enumerate(moved):
-            motion = axes[joint][:, None].expand(-1, len(rows), -1)
+            axis = axes[joint][:, None]
+            motion = self._library.broadcast_to(axis, (len(axis), len(rows), 3))
             if self._moving[joint].type == "revolute":
                 angular[..., column][:, rows] = motion
-                motion = torch.linalg.cross(motion, pos[:, rows] - origins[joint][:, None])
+                motion = self._cross(motion, pos[:, rows] - origins[joint][:, None])
             linear[..., column][:, rows] = motion
         coupling = self._coupling[[joint for joint, _ in moved]]
         return PointJacobian(
-            pos=pos.view(*shape, 3),
-            rot=rot.view(*shape, 3, 3),
-            linear=(linear @ coupling).view(*shape, 3, coupling.shape[1]),
-            angular=(angular @ coupling).view(*shape, 3, coupling.shape[1]),
+            pos=pos.reshape(*shape, 3),
+            rot=rot.reshape(*shape, 3, 3),
+            linear=(linear @ coupling).reshape(*shape, 3, coupling.shape[1]),
+            angular=(angular @ coupling).reshape(*shape, 3, coupling.shape[1]),
         )
 
     def motion(
@@ -296,6 +324,8 @@ class Kinematics:
             positions [B, n, 3], rotations [B, n, 3, 3], velocities of the links' origins [B, n, 3] and angular
             velocities [B, n, 3], all in the frame of :attr:`base`.
         """
+        import torch
+
         chain = self._chain(tuple(self.link_index(name) for name in links))
         values = q @ chain.coupling.T + chain.constant
         factors = torch.stack((torch.sin(values), 1.0 - torch.cos(values), values), dim=-1)
@@ -347,26 +377,35 @@ class Kinematics:
         return _Chain(
             coupling=coupling,
             constant=constant,
-            fixed=self._tensor(fixed),
-            moving=self._tensor((fixed[:, None] @ change).reshape(len(chain), 3, 16)),
+            fixed=self.array(fixed),
+            moving=self.array((fixed[:, None] @ change).reshape(len(chain), 3, 16)),
             ancestors=ancestors,
             links=self._indices([row_of[link] for link in links]),
             joints=self._indices([row_of[link] for link in joints]),
-            axes=self._tensor([joint.axis for joint in types])[..., None],
-            turns=self._tensor([[joint.type == "revolute"] for joint in types]),
+            axes=self.array([joint.axis for joint in types])[..., None],
+            turns=self.array([[joint.type == "revolute"] for joint in types]),
             speeds=self._coupling[[moving[link] for link in joints]],
-            carried=self._tensor(self._above[np.ix_(links, joints)]),
+            carried=self.array(self._above[np.ix_(links, joints)]),
         )
 
     def _indices(self, values) -> Tensor:
-        return torch.as_tensor(np.asarray(values, dtype=np.int64), device=self.device)
+        array: Any = np.asarray(values, dtype=np.int64)
+        return array if self._library is np else self._library.as_tensor(array, device=self.device)
 
     def clamp(self, q: Tensor) -> Tensor:
         """[..., J] the nearest joint positions within the limits."""
-        return torch.minimum(torch.maximum(q, self.lower), self.upper)
+        return self._library.minimum(self._library.maximum(q, self.lower), self.upper)
 
-    def _tensor(self, values) -> Tensor:
-        return torch.as_tensor(np.asarray(values), dtype=self.dtype).to(self.device)
+    def array(self, values: ArrayLike) -> Tensor:
+        """Return values as an array of the library, dtype and device of all results."""
+        array: Any = np.asarray(values)
+        if self._library is np:
+            return array.astype(self.dtype)
+        return self._library.as_tensor(array, dtype=self.dtype).to(self.device)
+
+    def _zeros(self, *shape: int) -> Tensor:
+        zeros = self._library.zeros(shape, dtype=self.dtype)
+        return zeros if self._library is np else zeros.to(self.device)
 
     def _forward(self, q: Tensor, base: Tensor | None, wanted: Sequence[int]):
         """Compute the wanted links, and the joints above them.
@@ -380,11 +419,12 @@ class Kinematics:
                 f"q has {q.shape[-1]} joint positions, expected {len(self.joint_names)}: {self.joint_names}"
             )
         values = q.reshape(-1, q.shape[-1]) @ self._coupling.T + self._constant  # [B, M]
-        sines = torch.sin(values)
-        versines = 1.0 - torch.cos(values)
-        base = (self.base if base is None else base).expand(*q.shape[:-1], 4, 4).reshape(-1, 4, 4)
-        rotations = {0: base[:, :3, :3]}
-        positions = {0: base[:, :3, 3]}
+        sines = self._library.sin(values)
+        versines = 1.0 - self._library.cos(values)
+        root = self.base if base is None else base
+        root: Any = self._library.broadcast_to(root, (*q.shape[:-1], 4, 4)).reshape(-1, 4, 4)
+        rotations = {0: root[:, :3, :3]}
+        positions = {0: root[:, :3, 3]}
         axes: dict[int, Tensor] = {}
         origins: dict[int, Tensor] = {}
         needed = self._above[list(wanted)].any(axis=0)
@@ -402,11 +442,12 @@ class Kinematics:
                 if step.prismatic:
                     origin = origin + axis * values[:, joint, None]
                 else:
-                    R, RK, RKK = rotation.split(3, dim=-1)
+                    R, RK, RKK = (rotation[..., i : i + 3] for i in (0, 3, 6))
                     rotation = (
                         R + sines[:, joint, None, None] * RK + versines[:, joint, None, None] * RKK
                     )
             rotations[i] = rotation
             positions[i] = origin
-        rot = torch.stack([rotations[i] for i in wanted], dim=1)
-        return rot, torch.stack([positions[i] for i in wanted], dim=1), axes, origins
+        stack = self._library.stack
+        rot = stack([rotations[i] for i in wanted], axis=1)
+        return rot, stack([positions[i] for i in wanted], axis=1), axes, origins

@@ -8,16 +8,16 @@ of ``scene.robot.joints``.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar, Literal, Self, get_args
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, get_args
 
 from xreset.errors import BackendUnavailableError, CapabilityError, WrongValueError, XResetError
 from xreset.files.checks import frozen
 from xreset.files.text import shown
 from xreset.physics.tensors import Tensors
 from xreset.spec import RobotSpec, SceneSpec, lowest_point
+
+if TYPE_CHECKING:  # functions import torch, because engines with one world play without it
+    from torch import Tensor
 
 Parameter = Literal[
     "friction",
@@ -62,6 +62,8 @@ class State(Tensors):
         joint_target: Tensor | None = None,
     ) -> Self:
         """Return a state in which nothing moves. ``joint_target`` [N, J] defaults to the joint positions [N, J]."""
+        import torch
+
         q = joint_pos.float()
         pos = object_pos.float()
         if joint_target is None:
@@ -80,6 +82,8 @@ class State(Tensors):
     def initial(cls, scene: SceneSpec, object_index: Tensor) -> Self:
         """Return the first state of worlds with these objects [N]: nothing moves, the robot at home, the object upright
         in the table's middle."""
+        import torch
+
         places = torch.tensor(
             [(*scene.table.center, -lowest_point(spec.pieces)) for spec in scene.objects]
         )
@@ -110,6 +114,8 @@ class Parameters(Tensors):
     @classmethod
     def nominal(cls, scene: SceneSpec, object_index: Tensor) -> Self:
         """Return the parameters that the scene states for worlds with these objects [N]."""
+        import torch
+
         n = len(object_index)
         friction = scene.friction
         # The dtype is stated because whole numbers would give integer tensors.
@@ -175,6 +181,8 @@ class Health(Tensors):
 
 def no_readings(robot: RobotSpec, num_worlds: int) -> tuple[Links, Contacts, Health]:
     """Return readings of N worlds that are all zero."""
+    import torch
+
     links = torch.zeros(num_worlds, len(robot.tracked_links), 3)
     tips = torch.zeros(num_worlds, len(robot.fingertips), 3)
     none = torch.zeros(num_worlds, dtype=torch.bool)
@@ -274,6 +282,8 @@ class Backend(ABC):
         Raises:
             WrongValueError: there is no world or no object, an index is not one of an object, or ``scene`` is no scene.
         """
+        import torch
+
         if not isinstance(scene, SceneSpec):
             raise WrongValueError(f"scene is {shown(scene)}, expected a SceneSpec")
         if num_worlds < 1:
@@ -402,6 +412,8 @@ class Backend(ABC):
 
         It stays until it is replaced, or the world's state is set.
         """
+        import torch
+
         self._require("object_wrench")
         self._must_be_open()
         wrench = torch.cat((torch.as_tensor(force), torch.as_tensor(torque)), dim=-1)
@@ -458,6 +470,8 @@ class Backend(ABC):
     def _indices(self, worlds: Tensor) -> Tensor:
         """Return indices of worlds [M] on the backend's device; ``WrongValueError`` for a mask, or numbers of another
         type or shape. Their range is not checked: a GPU would have to be waited for."""
+        import torch
+
         index = torch.as_tensor(worlds, device=self.device)
         if index.ndim != 1 or (
             len(index) and (index.dtype == torch.bool or index.is_floating_point())
@@ -477,6 +491,8 @@ class Backend(ABC):
 
     def _checked(self, name: str, value: Tensor, shape: tuple[int, ...]) -> Tensor:
         """Return values on the backend's device; ``WrongValueError`` if they have another shape."""
+        import torch
+
         value = torch.as_tensor(value, dtype=torch.float32, device=self.device).detach()
         if value.shape != shape:
             raise WrongValueError(f"{name} has shape {tuple(value.shape)}, expected {tuple(shape)}")

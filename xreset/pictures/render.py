@@ -13,14 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 import trimesh
 from PIL import Image, ImageDraw, ImageFont
 
 from xreset.errors import XResetError
 from xreset.files.checks import frozen
 from xreset.files.storage import write_whole
-from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.kinematics import on_host
 from xreset.geometry.shapes import look_at, pose_matrix
 from xreset.geometry.urdf import link_meshes
 from xreset.pictures.meshes import (
@@ -136,7 +135,7 @@ class Renderer:
         self.size = size
         self.camera = camera or Camera()
         self._smooth = smooth
-        self._kinematics = Kinematics(scene.robot)
+        self._kinematics = on_host(scene.robot)
         meshes = link_meshes(scene.robot)
         self._links = {name: shade_smoothly(mesh) for name, mesh in meshes.items()}
         self._colors = link_colors(scene.robot)
@@ -198,8 +197,7 @@ class Renderer:
         return lines
 
     def _link_poses(self, joint_pos: np.ndarray, links: Sequence[str]) -> np.ndarray:
-        joints = torch.as_tensor(np.asarray(joint_pos), dtype=torch.float64)
-        return self._kinematics.link_poses(joints, links).numpy()
+        return self._kinematics.link_poses(np.asarray(joint_pos, dtype=float), links)
 
     def _robot(self, joint_pos: np.ndarray, robot_tint: Color | None) -> list[Triangles]:
         poses = self._link_poses(joint_pos, list(self._links))

@@ -13,13 +13,13 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
-import torch
+from scipy.spatial.transform import Rotation
 
 from xreset.errors import XResetError, needs
 from xreset.files.checks import check_port
 from xreset.files.text import plain
-from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.rotations import matrix_to_quat
+from xreset.geometry.kinematics import on_host
+from xreset.geometry.shapes import quat_of
 from xreset.geometry.urdf import link_meshes
 from xreset.pictures.meshes import TABLE_COLORS, Color, link_colors, rgb, tint
 from xreset.pictures.render import Camera
@@ -155,7 +155,7 @@ class RobotMeshes:
 
     def __init__(self, scene: Any, robot: RobotSpec) -> None:
         """Add the meshes to a viser scene."""
-        self._kinematics = Kinematics(robot)
+        self._kinematics = on_host(robot)
         self._tint: Color | None = None
         self._colors = link_colors(robot)
         self.links: dict[str, Any] = {}
@@ -170,11 +170,9 @@ class RobotMeshes:
 
     def place(self, joint_pos: np.ndarray, color: Color | None = None) -> None:
         """Show joint positions [J] [rad, m], with a color mixed into the robot's own."""
-        poses = self._kinematics.link_poses(
-            torch.as_tensor(joint_pos, dtype=torch.float64), tuple(self.links)
-        )
-        quats = matrix_to_quat(poses[:, :3, :3]).numpy()
-        for (name, link), pose, quat in zip(self.links.items(), poses.numpy(), quats, strict=True):
+        poses = self._kinematics.link_poses(np.asarray(joint_pos, dtype=float), tuple(self.links))
+        quats = quat_of(Rotation.from_matrix(poses[:, :3, :3]))
+        for (name, link), pose, quat in zip(self.links.items(), poses, quats, strict=True):
             link.position = pose[:3, 3]
             link.wxyz = quat
             if color != self._tint:

@@ -83,7 +83,8 @@ def held_grasp(robot: RobotSpec, objects: Sequence[ObjectSpec]) -> State:
     """
     from xreset.demos.synth import synthesize
     from xreset.geometry.kinematics import Kinematics
-    from xreset.retarget.pipeline import rest_on_table, retarget_demos
+    from xreset.retarget.pipeline import rest_on_table
+    from xreset.retarget.verbs import retarget_demos
 
     moved = retarget_demos(
         rest_on_table(synthesize([objects[0].name], 1, seed=0), objects), robot, objects

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from xreset.errors import XResetError
 from xreset.eval.conditions import FAULTS, SWEPT, Condition, Property, chosen, nominal_task
-from xreset.files.checks import Option, Output, Port, PositiveInt, Seed, obeys_rules
+from xreset.eval.report import X
+from xreset.files.checks import Mp4, Option, Output, Port, PositiveInt, Seed, obeys_rules
 from xreset.files.progress import unseen
 from xreset.files.storage import claim_folder
 from xreset.physics.plugins import Device
@@ -21,11 +22,12 @@ from xreset.physics.plugins import Device
 if TYPE_CHECKING:
     from xreset.eval.export.recorded import RecordedEpisodes
     from xreset.eval.policy_spec import PolicySpec
+    from xreset.eval.report.make import Report
     from xreset.eval.results import Evaluation
     from xreset.eval.rollout import Engine
     from xreset.resets.inputs import Data
 else:  # a command has texts in place of these
-    RecordedEpisodes = PolicySpec = Evaluation = Engine = Data = Any
+    RecordedEpisodes = PolicySpec = Report = Evaluation = Engine = Data = Any
 
 
 @obeys_rules
@@ -210,6 +212,65 @@ def stress(
             result = replace(result, left_out=left_out)
             write_result(folder, result, traces, trial.robot.joint_names)
             found.append(result)
+    return found
+
+
+@obeys_rules
+def make_report(
+    runs: str | Path | Sequence[str | Path],
+    out: Output | None = None,
+    *,
+    robot: str | Path | None = None,
+    meshes: str | Path | None = None,
+    x: X | None = None,
+    curves: Annotated[Sequence[str], Option("curve")] = (),
+    apart: bool = False,
+    film: Mp4 | None = None,
+    progress: Callable[[str, float, int], None] = unseen,
+) -> Report:
+    """Make a self-contained HTML page of a run's evaluations, or of several runs side by side, and its figures as CSV.
+
+    Runs that differ only in their seed share a row of the table and a curve, with a band from the lowest to the highest
+    run. Notes say what makes runs incomparable, such as different demonstrations or versions of an engine.
+
+    Args:
+        runs: run folders, folders of results (of a baseline, for example) or names of policies that ship with xreset
+            (then runs/NAME); LABEL=FOLDER gives one a name.
+        out: folder for index.html and results.csv; default: report/ in the folder of a single run, runs/report for
+            several.
+        robot: name or folder of the robot, for the films; default: as the run and the results name it.
+        meshes: folder of real meshes, for the films; default: as the results name it.
+        x: horizontal axis of the learning curves; default: minutes as measured, or iterations if they are not known.
+        curves: learning curve to draw, as TensorBoard names it (task/grasped_from_home, episode/length, ...), or
+            several; default: success, success from home, grasps and return.
+        apart: show runs that differ only in their seed separately.
+        film: MP4 to write as well: every object in every run and engine, next to each other.
+        progress: called with the name of what is drawn.
+
+    Returns:
+        What the page shows.
+
+    Raises:
+        RunError: there is nothing to report, labels are not unique, a curve is unknown, or nothing can be filmed.
+        FileFormatError: a file is damaged.
+        XResetError: the page cannot be written, another command is writing it, or a package for plots is missing.
+    """
+    from xreset.eval.report import clips, make
+    from xreset.eval.report.read import read_trainings
+
+    trainings = read_trainings(
+        [str(run) for run in ([runs] if isinstance(runs, str | Path) else runs)]
+    )
+    if out is None:
+        out = trainings[0].folder / "report" if len(trainings) == 1 else "runs/report"
+    films = {"robot": str(robot) if robot else None, "meshes": Path(meshes) if meshes else None}
+    with claim_folder(Path(out)):
+        found = make.collect(trainings, x=x, curves=curves, apart=apart)
+        progress("drawing films", 0, 0)
+        found = make.write_report(found, Path(out), **films)
+    if film is not None:
+        progress("drawing the film", 0, 0)
+        found = replace(found, filmed=clips.make_film(found.evaluated, Path(film), **films))
     return found
 
 

@@ -23,7 +23,7 @@ from xreset.eval.plots import COLORS, figure_style
 from xreset.eval.report.curves import amounts, line
 from xreset.eval.report.figures import draw_lines
 from xreset.eval.report.groups import grouped, scores
-from xreset.eval.report.make import collect, make_report, page
+from xreset.eval.report.make import collect, page
 from xreset.eval.report.read import read_curves, read_training, read_trainings
 from xreset.eval.results import read_evaluation
 from xreset.eval.stats import (
@@ -33,6 +33,7 @@ from xreset.eval.stats import (
     difference_p,
     holm,
 )
+from xreset.eval.verbs import make_report
 from xreset.learning.clock import Lift, Passing, write_lift
 from xreset.task.config import ResetConfig, TaskConfig, TerminationConfig
 

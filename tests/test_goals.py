@@ -16,8 +16,9 @@ from xreset.eval.rollout import engine, load_trial, roll_out
 from xreset.files.records import npz_schema
 from xreset.geometry.shapes import turn_of
 from xreset.objects.rest import rest_height
-from xreset.resets.goals import FAMILIES, SCHEMA, make_goals, read_goals, write_goals
+from xreset.resets.goals import FAMILIES, SCHEMA, read_goals, write_goals
 from xreset.resets.inputs import load_inputs
+from xreset.resets.verbs import make_goals
 
 BANANA = "011_banana"
 

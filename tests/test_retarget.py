@@ -35,8 +35,9 @@ from xreset.retarget.hand.cost import system
 from xreset.retarget.hand.model import HandModel, keypoint_pairs
 from xreset.retarget.hand.solve import retarget_hand
 from xreset.retarget.least_squares import solve_chain
-from xreset.retarget.pipeline import RetargetConfig, rest_on_table, retarget_demos
+from xreset.retarget.pipeline import RetargetConfig, rest_on_table
 from xreset.retarget.validity import REASONS, Measures, Thresholds, classify
+from xreset.retarget.verbs import retarget_demos
 from xreset.spec import KEYPOINTS
 
 assert_close = torch.testing.assert_close

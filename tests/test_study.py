@@ -309,8 +309,9 @@ class TablesTest(Studied):
         )
         self.assertEqual(len(paper_tables()["II"].objects), 9)
         self.assertEqual(grasps.engines["mujoco"][1][0], "X-RESET")
-        page, notes = write_page(plan, self.folder / "page")
-        text = page.read_text()
+        report = write_page(plan, self.folder / "page")
+        notes = report.notes
+        text = report.page.read_text()
         self.assertIn("<h2>Table I", text)
         self.assertIn("83.0 (66-100), paper 90.8", text)
         self.assertIn("Episodes / demonstrations / seeds: ik 4 / 2 / 1, ours 8 / 2 / 2.", text)
@@ -339,7 +340,7 @@ class TablesTest(Studied):
         rows = fill(plan, plan.study.tables[0]).engines["mujoco"]
         self.assertRegex(rows[1][3], r"^66\.5 \(24-92\)", "one demonstration is little")
         self.assertRegex(rows[3][3], r"^49\.8 ", "seed 1 alone")
-        _, notes = write_page(plan, self.folder / "page")
+        notes = write_page(plan, self.folder / "page").notes
         self.assertFalse(
             [note for note in notes if "comparable" in note], "objects alone are not compared"
         )
@@ -351,7 +352,7 @@ class TablesTest(Studied):
             plan = self.plan(self.TEXT)
         rows = fill(plan, plan.study.tables[1]).engines["mujoco"]
         self.assertEqual(rows[0][1:], ("tomato soup can", "potted meat can", "all of them"))
-        _, notes = write_page(plan, self.folder / "page")
+        notes = write_page(plan, self.folder / "page").notes
         self.assertIn("Not evaluated in mujoco on this machine: not installed", notes)
 
     def test_results_that_no_run_plays_any_more_fill_no_table(self):
@@ -359,8 +360,8 @@ class TablesTest(Studied):
         other = "[evaluations.eval]\nobjects = ['mustard']\n"
         plan = self.plan(self.TEXT.replace("[evaluations.eval]\n", other))
         self.assertEqual(fill(plan, plan.study.tables[1]).engines, {})
-        page, _ = write_page(plan, self.folder / "page")
-        self.assertIn("nothing is evaluated yet", page.read_text())
+        report = write_page(plan, self.folder / "page")
+        self.assertIn("nothing is evaluated yet", report.page.read_text())
 
     def test_results_of_other_episodes_do_not_count(self):
         self.write("ik", 0.33, 0.33, 0.33, 0.33)

@@ -1,5 +1,10 @@
 """The report of an evaluation: one self-contained HTML page.
 
-from xreset.eval.report.make import make_report
-make_report(Path("runs/soup"))          # runs/soup/report/index.html
+from xreset.eval.verbs import make_report
+make_report("runs/soup")          # runs/soup/report/index.html
 """
+
+from typing import Literal
+
+X = Literal["minutes", "steps", "iterations"]
+"""Horizontal axis of a learning curve."""

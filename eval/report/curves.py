@@ -9,17 +9,15 @@ next one with a log.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
 
 import numpy as np
 import pandas as pd
 
 from xreset.errors import RunError
+from xreset.eval.report import X
 from xreset.eval.report.read import Training
 from xreset.eval.results import Table
 
-X = Literal["minutes", "steps", "iterations"]
-"""Horizontal axis of a learning curve."""
 AXES: dict[X, tuple[str, int, str, float]] = {
     "minutes": ("minutes of training", 1, "minutes", 1.0),
     "steps": ("million environment steps", 1, "env_steps", 1e-6),

@@ -18,9 +18,9 @@ from xreset.eval import effects
 from xreset.eval.metrics import METRICS
 from xreset.eval.pages import percent, render
 from xreset.eval.plots import COLORS, svg
-from xreset.eval.report import fairness, tables
+from xreset.eval.report import X, fairness, tables
 from xreset.eval.report.clips import Clip, draw_report, encode_mp4
-from xreset.eval.report.curves import AXES, X, amounts
+from xreset.eval.report.curves import AXES, amounts
 from xreset.eval.report.figures import DEFAULT_CURVES, draw_training
 from xreset.eval.report.groups import (
     COUNTED,
@@ -31,11 +31,11 @@ from xreset.eval.report.groups import (
     scores,
     singles,
 )
-from xreset.eval.report.read import Training, how_to_evaluate, read_trainings
+from xreset.eval.report.read import Training, how_to_evaluate
 from xreset.eval.results import Evaluation, Table
 from xreset.eval.table import Rows, caption
 from xreset.files.checks import frozen
-from xreset.files.storage import claim_folder, write_whole
+from xreset.files.storage import write_whole
 from xreset.files.text import Brief
 from xreset.pictures.render import encode_png
 
@@ -68,46 +68,15 @@ class Report(Brief):
     strips: Sequence[Clip] = ()
     """Failures."""
     tables: Sequence[PageTable] = field(default_factory=tuple)
+    page: Path | None = None
+    """File of the page; None: it is not written."""
+    filmed: tuple[str, ...] = ()
+    """Objects of the film that goes with the page, from the left."""
 
     @property
     def evaluated(self) -> list[Training]:
         """The runs with results."""
         return [training for training in self.trainings if training.results]
-
-
-def make_report(
-    runs: Sequence[str],
-    out: Path | None = None,
-    *,
-    robot: str | None = None,
-    meshes: Path | None = None,
-    x: X | None = None,
-    curves: Sequence[str] = (),
-    apart: bool = False,
-) -> tuple[Path, Report]:
-    """Write ``index.html`` and ``results.csv`` of one run, or of several side by side; return the page's path, and what
-    it shows.
-
-    Args:
-        runs: run folders, folders of results or names of shipped policies, as ``FOLDER`` or ``LABEL=FOLDER``.
-        out: folder of the report; default: ``report`` in the folder of a single run, ``runs/report`` for several.
-        robot: name or folder of the robot, for the films; default: as the run and the results name it.
-        meshes: folder of meshes, for the films; default: as the results name it.
-        x: horizontal axis of the learning curves; default: minutes, if all runs logged their speed, or else iterations.
-        curves: names of curves as in TensorBoard; default: :data:`~xreset.eval.report.figures.DEFAULT_CURVES`.
-        apart: show runs that differ only in their seed separately, not as a group.
-
-    Raises:
-        RunError: there is nothing to report, labels are not unique, or a curve is unknown.
-        FileFormatError: a file is damaged.
-        XResetError: the page cannot be written, another command is writing it, or a package for plots is missing.
-    """
-    trainings = read_trainings(runs)
-    if out is None:
-        out = trainings[0].folder / "report" if len(trainings) == 1 else Path("runs/report")
-    with claim_folder(out):
-        report = collect(trainings, x=x, curves=curves, apart=apart)
-        return write_report(report, out, robot=robot, meshes=meshes)
 
 
 def collect(
@@ -124,9 +93,9 @@ def collect(
 
     Args:
         trainings: the runs.
-        x: as of :func:`make_report`.
-        curves: as of :func:`make_report`.
-        apart: as of :func:`make_report`.
+        x: as of :func:`~xreset.eval.verbs.make_report`, and so are the next two.
+        curves: names of curves.
+        apart: whether seeds are shown separately.
         title: title of the page; default: the policy, or the runs.
         notes: sentences about what is unfair; None: they are found here.
         page_tables: tables to show first.
@@ -163,8 +132,8 @@ def collect(
 
 def write_report(
     report: Report, out: Path, *, robot: str | None = None, meshes: Path | None = None
-) -> tuple[Path, Report]:
-    """Draw the films and write the page and its figures; return the page's path, and what it shows."""
+) -> Report:
+    """Draw the films and write ``index.html`` and ``results.csv``; return what the page shows."""
     evaluated = report.evaluated
     if evaluated:
         try:
@@ -177,7 +146,7 @@ def write_report(
             report = replace(report, notes=(*report.notes, f"There are no films: {error}"))
     write_whole(out / "results.csv", report.scores.map(_without_formula).to_csv(index=False))
     write_whole(out / "index.html", page(report))
-    return out / "index.html", report
+    return replace(report, page=out / "index.html")
 
 
 def _axis(trainings: Sequence[Training]) -> X:

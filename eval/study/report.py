@@ -8,7 +8,7 @@ from itertools import chain
 from pathlib import Path
 
 from xreset.eval.report import fairness
-from xreset.eval.report.make import PageTable, collect, write_report
+from xreset.eval.report.make import PageTable, Report, collect, write_report
 from xreset.eval.report.read import Training, read_training
 from xreset.eval.results import has_results
 from xreset.eval.study.paper import TRAINING
@@ -20,12 +20,9 @@ _ALIKE = 0.05
 """Trainings whose lengths differ by a smaller share are of equal length."""
 
 
-def write_page(plan: Plan, out: Path) -> tuple[Path, list[str]]:
-    """Write the report of a study's runs, with the study's tables first.
-
-    Returns:
-        The page, and its notes: what makes figures incomparable, doubtful or incomplete.
-    """
+def write_page(plan: Plan, out: Path) -> Report:
+    """Write the report of a study's runs, with the study's tables first. Its notes say what makes figures incomparable,
+    doubtful or incomplete."""
     notes = list(_incomplete(plan))
     page_tables = []
     for spec in plan.study.tables:
@@ -44,8 +41,7 @@ def write_page(plan: Plan, out: Path) -> tuple[Path, list[str]]:
         notes=notes,
         page_tables=page_tables,
     )
-    page, report = write_report(report, out)
-    return page, list(report.notes)
+    return write_report(report, out)
 
 
 def _note(table: FilledTable, engine: str) -> str:

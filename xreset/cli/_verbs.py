@@ -9,14 +9,17 @@ from functools import reduce
 from inspect import Parameter, Signature, cleandoc, signature
 from operator import or_
 from pathlib import Path
+from time import monotonic
 from types import NoneType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from xreset.cli._terminal import Progress
+from xreset.cli._terminal import Progress, show_notes
 from xreset.files.checks import Option, marks_in
 
+REQUIRED = Parameter.empty
+"""Default of an argument that a command must have, and a function need not."""
 _TEXTS = (str, Path, bool, int, float, NoneType)
 """Types that an option can have."""
 
@@ -32,11 +35,11 @@ def verb(
 
     Its first argument needs no flag, unless it is marked as an :class:`~xreset.files.checks.Option`. Of a union of
     types, those that a text can be are taken. A sequence is an option that is given again for each item. An argument
-    that no text can be is left out; ``progress`` moves a bar.
+    that no text can be is left out; ``progress`` moves a bar, and ``note`` prints a line.
 
     Args:
         function: the function.
-        show: prints what it returns, and gets the options as well.
+        show: prints what it returns; it also gets the options, and the ``seconds`` that the call took.
         prepare: changes the arguments of the function before the call.
         defaults: other defaults of arguments, by name. A dataclass makes its fields options.
     """
@@ -62,6 +65,9 @@ def verb(
                 arguments[names[name]] = value
         if prepare is not None:
             prepare(arguments)
+        if "note" in hints:
+            arguments["note"] = lambda text: show_notes([text])
+        begun = monotonic()
         if progress is None:
             found = function(**arguments)
         else:
@@ -70,7 +76,7 @@ def verb(
                 moved = bar.stages() if staged else bar.count(function.__name__.replace("_", " "))
                 found = function(**arguments, progress=moved)
         if show is not None:
-            show(found, given)
+            show(found, given | {"seconds": monotonic() - begun})
 
     command.__name__ = function.__name__
     command.__doc__ = _help(function.__doc__ or "", {old: new for new, old in names.items()})
@@ -82,17 +88,23 @@ def verb(
 def _option(argument: Parameter, hint: Any, *, is_positional: bool) -> Parameter | None:
     """Return an argument as a keyword with the type of its option; None if no text can be its value."""
     kinds = list(_kinds(hint))
-    several = [kind for kind in kinds if get_origin(kind) is Sequence]
+    items = []  # of a sequence
+    for kind in kinds:
+        if get_origin(kind) is Sequence:
+            items += filter(_can_be_text, _kinds(get_args(kind)[0]))
     single = [kind for kind in kinds if _can_be_text(kind)]
     marks = [mark for mark in marks_in(hint) if not isinstance(mark, Option)]
     default = argument.default
-    if several:
-        single = [kind for kind in _kinds(get_args(several[0])[0]) if _can_be_text(kind)]
-        option: Any = tuple[reduce(or_, single), ...]
-        text = "" if default in ((), Parameter.empty) else f"(default: {default}; repeatable)"
+    if items:
+        option: Any = tuple[reduce(or_, items), ...]
+        is_stated = default not in ((), None, Parameter.empty)
         if not is_positional:
-            marks += [UseAppendAction, arg(help_behavior_hint=text or "(repeatable)")]
+            text = f"(default: {default}; repeatable)" if is_stated else "(repeatable)"
+            marks += [UseAppendAction, arg(help_behavior_hint=text)]
             default = ()
+        elif not is_stated:
+            marks.append(arg(help_behavior_hint=""))
+            default = () if default is None else default
     elif is_dataclass(default):
         option = type(default)
     elif set(single) - {NoneType}:

@@ -2,65 +2,35 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Literal
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
-from xreset.cli._common import Names, Robot, Several
-from xreset.cli._options import Mp4, Output
 from xreset.cli._terminal import console, show_notes
+from xreset.cli._verbs import verb
+from xreset.eval import verbs
 from xreset.files.text import short_name
 
+if TYPE_CHECKING:
+    from xreset.eval.report.make import Report
 
-def report(
-    runs: Names,
-    *,
-    out: Output | None = None,
-    robot: Robot = None,
-    meshes: Path | None = None,
-    x: Literal["minutes", "steps", "iterations"] | None = None,
-    curve: Several = (),
-    apart: bool = False,
-    film: Mp4 | None = None,
-) -> None:
-    """Make a self-contained HTML page of a run's evaluations, or of several runs side by side.
 
-    Runs that differ only in their seed share a row of the table and a curve, with a band from the lowest to the highest
-    run. Notes say what makes runs incomparable, such as different demonstrations or versions of an engine.
-
-    Args:
-        runs: Run folders, folders of results (of a baseline, for example) or names of policies that ship with xreset
-            (then runs/NAME); LABEL=FOLDER gives one a name.
-        out: Folder for index.html and results.csv; default: report/ in the folder of a single run, runs/report for
-            several.
-        meshes: Folder of real meshes, for the films; default: as the results name it.
-        x: Horizontal axis of the learning curves; default: minutes as measured, or iterations if they are not known.
-        curve: Learning curve to draw, as TensorBoard names it (task/grasped_from_home, episode/length, ...); give it
-            again for more. Default: success, success from home, grasps and return.
-        apart: Show runs that differ only in their seed separately.
-        film: MP4 to write as well: every object in every run and engine, next to each other.
-    """
+def _show(report: Report, options: Mapping[str, Any]) -> None:
     from xreset.eval import table
-    from xreset.eval.report import clips, make
+    from xreset.eval.report.make import headline
 
-    with console.status("drawing films"):
-        page, found = make.make_report(
-            runs, out, robot=robot, meshes=meshes, x=x, curves=curve, apart=apart
-        )
-    for training in found.evaluated:
+    for training in report.evaluated:
         console.print(table.results_table(list(training.results.values())))
-    console.print(make.headline(found.evaluated))
-    show_notes(found.notes)
-    if film is not None:
-        with console.status("drawing the film"):
-            shown = clips.make_film(found.evaluated, film, robot=robot, meshes=meshes)
+    console.print(headline(report.evaluated))
+    show_notes(report.notes)
+    if options["film"]:
         places = []
-        for training in found.evaluated:
+        for training in report.evaluated:
             places += [f"{training.label} in {engine}" for engine in training.results]
-        columns = ", ".join(map(short_name, shown))
+        columns = ", ".join(map(short_name, report.filmed))
         console.print(
-            f"film: {film}\n      from the top: {', '.join(places)}; from the left: {columns}"
+            f"film: {options['film']}\n      from the top: {', '.join(places)}; from the left: {columns}"
         )
-    console.print(f"page: {page}")
+    console.print(f"page: {report.page}")
 
 
-COMMAND = report
+COMMAND = verb(verbs.make_report, _show)

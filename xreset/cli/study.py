@@ -62,9 +62,9 @@ def study(
         undone = [step for step in wanted if step.left()]
         problems = launch.launch(todo, undone, console.print)
     if only in ("all", "tables"):
-        page, notes = report.write_page(planned(), out / "reports" / todo.name)
-        show_notes(notes)
-        console.print(f"page: {page}")
+        written = report.write_page(planned(), out / "reports" / todo.name)
+        show_notes(written.notes)
+        console.print(f"page: {written.page}")
     if problems:
         raise RunError(
             "\n".join([f"{len(problems)} steps failed. Finished steps are kept.", *problems])

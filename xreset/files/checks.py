@@ -85,6 +85,8 @@ class Option:
 
 Output = Annotated[str | Path, Written()]
 """File or folder that a function writes."""
+Png = Annotated[str | Path, Written(".png")]
+Mp4 = Annotated[str | Path, Written(".mp4")]
 Positive = Annotated[T, Rule("a number above 0 and finite", lambda x: 0 < x < inf)]
 """JSON, and so a run's configuration, has no infinity."""
 NotNegative = Annotated[T, Rule("a number from 0 to 1e15", lambda x: 0 <= x <= 1e15)]

@@ -6,7 +6,7 @@ steps pass. It is rejected if it leaves the scene or still moves.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -14,80 +14,47 @@ import numpy as np
 import torch
 
 from xreset.errors import DemoError
-from xreset.files.checks import PositiveInt, obeys_rules
 from xreset.files.progress import Progress, unseen
 from xreset.physics import State
 from xreset.resets.bank import ResetBank, starts_and_goals
 from xreset.resets.closing import closing_states
-from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig, TransferConfig
+from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
 from xreset.resets.fingers import fingers_of, squeeze_targets
 from xreset.resets.probe import REASONS, probe, rejection
-from xreset.resets.transfer import add_transfers
 from xreset.retarget.file import Retargeted
 from xreset.spec import (
     ObjectSpec,
     RobotSpec,
     SceneSpec,
     check_joints,
-    checked_objects,
     objects_named,
 )
 
 
-@obeys_rules
-def make_bank(
+def stable_states(
     retargeted: Retargeted,
     robot: RobotSpec,
     objects: Sequence[ObjectSpec],
-    engine: str | Sequence[str] = "mujoco",
+    engines: tuple[str, ...],
     *,
-    num_envs: PositiveInt = 64,
-    device: str = "cpu",
-    limits: FilterConfig | None = None,
-    closing: ClosingConfig | None = ClosingConfig(),
-    squeeze: SqueezeConfig | None = SqueezeConfig(),
-    transfer: TransferConfig | None = TransferConfig(),
-    progress: Callable[[float, int], None] = unseen,
+    limits: FilterConfig,
+    closing: ClosingConfig,
+    squeeze: SqueezeConfig,
+    num_envs: int,
+    device: str,
+    progress: Progress,
 ) -> ResetBank:
-    """Try every valid frame in every engine and keep those that all engines accept; then add states in grasps of other
-    demonstrations.
-
-    Args:
-        retargeted: robot trajectories.
-        robot: the robot of the trajectories.
-        objects: the objects of the trajectories.
-        engine: name of an engine, or several names, tried in this order; a rejection states the first engine's reason.
-        num_envs: worlds at a time.
-        device: where engines run that can use it; the others run on the CPU.
-        limits: time and speeds by which states are judged; None: the draft paper's.
-        closing: states to add between frames in which the hand closes in on the object; None: none.
-        squeeze: with which force the drive targets of states after contact press on the object; None: targets are the
-            joints' positions. Accepted states are tried once more with the targets, and an engine that rejects this
-            leaves the targets where they were.
-        transfer: states to add in grasps of other demonstrations (:func:`xreset.resets.transfer.add_transfers`); None:
-            none. If no targets press, there are none, either.
-        progress: called with (candidates tried, candidates in all); then again for ``transfer``.
-
-    Raises:
-        DemoError: no frame is valid, or an object of a valid frame is not among ``objects``.
-        FileFormatError: the trajectories are for a robot with other joints.
-    """
-    objects = checked_objects(robot, objects)
+    """Return the bank of the states that all engines accept; see :func:`xreset.resets.verbs.make_bank`."""
     check_joints("The motion is", retargeted, robot)
     owner = retargeted.sequence_of_frame
     used = objects_named(objects, retargeted.object_name[owner[retargeted.valid]])
-    engines = (engine,) if isinstance(engine, str) else tuple(engine)
-    limits = limits or FilterConfig()
-    squeeze = squeeze or SqueezeConfig(force=0.0, weight=0.0)
     if not retargeted.valid.any():
         raise DemoError(
             "no frame of the retargeted trajectories is valid, so there is no state to try. "
             "Look at the reasons of xreset retarget."
         )
     scene = SceneSpec(robot=robot, objects=tuple(used.values()))
-    frame, part, poses = closing_states(
-        retargeted, robot, objects, closing or ClosingConfig(spacing=None)
-    )
+    frame, part, poses = closing_states(retargeted, robot, objects, closing)
     sequence = owner[frame]
     post_contact = retargeted.post_contact[frame]
     object_name = retargeted.object_name[sequence]
@@ -138,7 +105,7 @@ def make_bank(
         columns["frame_part"] = part.astype(np.float32)
     kept = {name: values[keep] for name, values in columns.items()}
     rejected = {f"rejected_{name}": values[~keep] for name, values in columns.items()}
-    bank = replace(
+    return replace(
         starts_and_goals(retargeted, robot, objects),
         engines=engines,
         joint_pos=stable.joint_pos.numpy(),
@@ -150,16 +117,4 @@ def make_bank(
         reason_names=REASONS,
         **kept,
         **rejected,
-    )
-    if transfer is None or not squeeze.presses:
-        return bank
-    return add_transfers(
-        bank,
-        retargeted,
-        robot,
-        objects,
-        transfer,
-        num_envs=num_envs,
-        device=device,
-        progress=progress,
     )

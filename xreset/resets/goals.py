@@ -13,7 +13,7 @@ those of the published paper, and goals drawn at random:
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
@@ -25,11 +25,9 @@ from scipy.spatial.transform import Rotation
 from xreset.demos.synth import LIFT, WORKSPACE
 from xreset.errors import FileFormatError, GoalError
 from xreset.files.checks import frozen
-from xreset.files.progress import unseen
+from xreset.files.progress import Progress
 from xreset.files.records import Field, read_record, schema_of, write_record
-from xreset.geometry.description import load_robot
 from xreset.geometry.shapes import quat_of, turn_of
-from xreset.objects.catalogue import load_objects
 from xreset.objects.rest import rest_height, resting_orientation
 from xreset.resets.bank import ResetBank, bank_problem, check_objects, no_states
 from xreset.resets.config import GoalConfig
@@ -91,52 +89,30 @@ class _Episode:
     goal_turn: Rotation
 
 
-def make_goals(
-    names: Iterable[str] | None = None,
-    *,
-    robot: str | Path | RobotSpec,
-    meshes: str | Path | None = None,
-    families: str | Sequence[str] | None = None,
-    poses: Sequence[Sequence[float]] = (),
-    config: GoalConfig | None = None,
-    progress: Callable[[float, int], None] = unseen,
+def drawn_goals(
+    objects: Sequence[ObjectSpec],
+    robot: RobotSpec,
+    families: str | Sequence[str] | None,
+    poses: Sequence[Sequence[float]],
+    config: GoalConfig,
+    progress: Progress,
 ) -> GoalSet:
-    """Draw starts and goals of objects, without demonstrations.
-
-    Objects come to rest in MuJoCo first, so that every start is at rest. The goals of an object do not depend on the
-    other objects.
-
-    Args:
-        names: names of the objects; None: all.
-        robot: the robot, its name or its folder: its reach decides which goals are kept.
-        meshes: folder of real meshes; None: the built-in stand-ins.
-        families: some of :data:`FAMILIES`; None: all of them, or none if there are ``poses``.
-        poses: goals of your own for every object, each a pose (x, y, z, qw, qx, qy, qz) of its mesh frame.
-        config: number, sizes, offsets and seed.
-        progress: called with (goals found, goals in all).
-
-    Raises:
-        ObjectError: an object is unknown, or has no usable mesh.
-        GoalError: an object does not come to rest, or a goal is inside the table or out of the robot's reach.
-    """
-    config = config or GoalConfig()
+    """Return starts and goals of objects; see :func:`xreset.resets.verbs.make_goals`."""
     if isinstance(families, str):
         families = (families,)
     if families is None:
         families = () if poses else FAMILIES
     if unknown := [family for family in families if family not in FAMILIES]:
         raise GoalError(f"Unknown family {unknown[0]!r}. Choose from: {', '.join(FAMILIES)}.")
-    loaded = load_objects(names, meshes)
-    robot = load_robot(robot)
     own = [_own_pose(pose) for pose in poses]
-    for obj in loaded:
+    for obj in objects:
         for pos, quat in own:
             _check_above_table(obj.name, rest_height(obj, quat) - pos[2])
-    rests = _resting_poses(loaded, robot, upright=config.upright)
+    rests = _resting_poses(objects, robot, upright=config.upright)
     reach = Reach(robot)
     wanted = [*product(families, range(config.per_family)), *product([OWN], range(len(own)))]
     episodes = []
-    for obj in loaded:
+    for obj in objects:
         done = len(episodes)
         found: dict[tuple[str, int], _Episode] = {}
         for attempt in range(_DRAWS):
@@ -145,7 +121,7 @@ def make_goals(
                 if (family, number) not in found:
                     drawn.append(_draw(obj, rests[obj.name], own, config, family, number, attempt))
             found |= {(e.family, e.number): e for e in _reached(reach, drawn)}
-            progress(done + len(found), len(wanted) * len(loaded))
+            progress(done + len(found), len(wanted) * len(objects))
         if missing := [
             f"{family}_{number:03d}" for family, number in wanted if (family, number) not in found
         ]:

@@ -3,7 +3,7 @@ objects."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -32,8 +32,9 @@ from xreset.resets.goals import SCHEMA as GOALS
 from xreset.resets.goals import GoalSet, checked_goals, read_goals
 from xreset.retarget.file import SCHEMA as MOTION
 from xreset.retarget.file import Retargeted, check_retargeted, object_sources, read_retargeted
-from xreset.retarget.pipeline import rest_on_table, retarget_demos
-from xreset.spec import ObjectSpec, RobotSpec, check_robot
+from xreset.retarget.pipeline import rest_on_table
+from xreset.retarget.verbs import retarget_demos
+from xreset.spec import ObjectSpec, RobotSpec, check_robot, checked_objects
 
 Kind = Literal["demos", "motion", "bank", "goals"]
 Data = Demos | Retargeted | ResetBank
@@ -116,6 +117,7 @@ def load_inputs(
     source: str | Path | Data,
     *,
     robot: str | Path | RobotSpec | None = None,
+    objects: Sequence[ObjectSpec] | None = None,
     meshes: str | Path | None = None,
     only: Iterable[str] = (),
     accept: tuple[Kind, ...] = ("demos", "motion", "bank", "goals"),
@@ -125,6 +127,7 @@ def load_inputs(
     Args:
         source: file of ``xreset demos``, ``xreset retarget``, ``xreset resets`` or ``xreset goals``, or its content.
         robot: the robot, its name or its folder; default: the robot that the file names. Demonstrations name none.
+        objects: the objects of robot motion, if they are loaded already.
         meshes: folder of object meshes; default: the folder that the file states, else the built-in stand-ins.
         only: names of the objects to load; demonstrations of other objects are left out. Default: all objects.
         accept: the kinds of data that the caller can use.
@@ -161,11 +164,14 @@ def load_inputs(
             stated = stated_sources(data)
         elif path is not None:
             stated = object_sources(path)
-        # before meshes are cut, which takes minutes
-        sources = {name: object_source(name, folder) for name in names if name in stated}
-        check_sources(str(path or "the data"), stated, sources)
-        loaded = load_objects(names, folder)
         robot = robot or data.robot
+        if objects is None:
+            # before meshes are cut, which takes minutes
+            sources = {name: object_source(name, folder) for name in names if name in stated}
+            check_sources(str(path or "the data"), stated, sources)
+            loaded = load_objects(names, folder)
+        else:
+            loaded = checked_objects(load_robot(robot), objects)
     robot_name = None
     spec = None
     if robot is not None:

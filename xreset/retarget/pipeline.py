@@ -5,8 +5,7 @@ Shape letters: F frames of all sequences, S sequences of a batch padded to T fra
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -15,7 +14,6 @@ import torch
 from torch import Tensor
 
 from xreset.demos.archive import Demos, grounded, levelled
-from xreset.demos.examine import examine, refuse_wrong
 from xreset.files.checks import Checked, frozen
 from xreset.files.processes import in_processes
 from xreset.files.progress import Progress, unseen
@@ -33,9 +31,8 @@ from xreset.retarget.hand.jaw import jaw_keypoints
 from xreset.retarget.hand.model import HandModel, HandState, HandTargets
 from xreset.retarget.hand.solve import retarget_hand
 from xreset.retarget.validity import REASONS, Thresholds, classify
-from xreset.spec import ObjectSpec, RobotSpec, checked_objects, objects_named
+from xreset.spec import ObjectSpec, RobotSpec, objects_named
 
-_log = logging.getLogger(__name__)
 _SEQUENCES_PER_BATCH = 24
 """Enough to use the processor well; few enough to keep memory below about 1 GB and to show progress."""
 _FRAMES_AT_ONCE = 512
@@ -59,43 +56,16 @@ class RetargetConfig(Checked):
     arm: ArmSearch = ArmSearch()
 
 
-def retarget_demos(
+def follow(
     demos: Demos,
     robot: RobotSpec,
     objects: Sequence[ObjectSpec],
-    config: RetargetConfig | None = None,
+    config: RetargetConfig = RetargetConfig(),
     *,
-    progress: Callable[[float, int], None] = unseen,
+    progress: Progress = unseen,
     device: str = "cpu",
-    trust: bool = False,
-    note: Callable[[str], None] = _log.warning,
 ) -> Retargeted:
-    """Retarget demonstrations. Sequences are independent of one another; the same arguments give the same result.
-
-    Args:
-        demos: human demonstrations; they need not rest on the table yet.
-        robot: the robot.
-        objects: geometry of every object that the demonstrations name.
-        config: weights and limits.
-        progress: called with the sequences done and the sequences in all.
-        device: where hand retargeting runs; the arm runs on the CPU.
-        trust: whether demonstrations are taken that are certainly wrong.
-        note: called with each doubt about the demonstrations (:mod:`xreset.demos.examine`).
-
-    Returns:
-        Trajectories of every sequence. In a sequence without an annotated hand the robot stays at home and no frame is
-        valid.
-
-    Raises:
-        DemoError: an object of the demonstrations is not among ``objects``, or demonstrations are certainly wrong.
-        RobotError: the robot's description does not allow retargeting.
-    """
-    config = config or RetargetConfig()
-    objects = checked_objects(robot, objects)
-    named = objects_named(objects, demos.object_names)
-    surfaces = {name: prepared_surface(spec) for name, spec in named.items()}
-    for doubt in refuse_wrong(examine(demos, surfaces), trust=trust):
-        note(doubt)
+    """Return the robot's motion that follows demonstrations; see :func:`xreset.retarget.verbs.retarget_demos`."""
     hands = HandMotions(demos, robot, objects, config, device=device)
     demos = hands.demos
     arm = ArmModel(robot)
@@ -172,7 +142,7 @@ def wrist_paths(
     progress: Progress = unseen,
 ) -> list[ArmTargets]:
     """Return the paths of the hand root that the arm has to follow, in batches. Arguments and errors as in
-    :func:`retarget_demos`."""
+    :func:`follow`."""
     hands = HandMotions(demos, robot, objects)
     arm = ArmModel(robot)
     return [
@@ -193,7 +163,7 @@ class HandMotions:
         *,
         device: str = "cpu",
     ) -> None:
-        """Find the contacts; arguments and errors as of :func:`retarget_demos`."""
+        """Find the contacts; arguments and errors as of :func:`follow`."""
         self.model = HandModel(robot, device=device)
         """The robot's hand."""
         self._config = config

@@ -1,0 +1,197 @@
+"""Functions that are commands as well: their signatures are the options, and their docstrings the help.
+
+They import most of what they need when they are called, because the help of a command is shown at once.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from xreset.files.checks import Option, Output, PositiveInt, obeys_rules
+from xreset.files.progress import unseen
+from xreset.physics.plugins import Device
+from xreset.resets.config import (
+    ClosingConfig,
+    FilterConfig,
+    GoalConfig,
+    SqueezeConfig,
+    TransferConfig,
+)
+
+if TYPE_CHECKING:
+    from xreset.resets.bank import ResetBank
+    from xreset.resets.goals import GoalSet
+    from xreset.retarget.file import Retargeted
+    from xreset.spec import ObjectSpec, RobotSpec
+else:  # a command has files and names in place of these
+    ResetBank = GoalSet = Retargeted = ObjectSpec = RobotSpec = Any
+
+_warn = logging.getLogger(__name__).warning
+Pose = tuple[float, float, float, float, float, float, float]
+
+
+@obeys_rules
+def make_bank(
+    retargeted: str | Path | Retargeted,
+    robot: str | Path | RobotSpec | None = None,
+    objects: Sequence[ObjectSpec] | None = None,
+    engine: str | Sequence[str] = "mujoco",
+    *,
+    out: Output | None = None,
+    meshes: str | Path | None = None,
+    num_envs: PositiveInt = 64,
+    device: Device = "cpu",
+    limits: Annotated[FilterConfig | None, Option("filter")] = FilterConfig(),
+    closing: ClosingConfig | None = ClosingConfig(),
+    squeeze: SqueezeConfig | None = SqueezeConfig(),
+    transfer: TransferConfig | None = TransferConfig(),
+    settle: bool = False,
+    progress: Callable[[str, float, int], None] = unseen,
+    note: Callable[[str], None] = _warn,
+) -> ResetBank:
+    """Test retargeted states in physics and keep the stable ones; then add states in grasps of other demonstrations.
+
+    Args:
+        retargeted: motion made by xreset retarget.
+        robot: name or folder of the robot; default: that of the motion.
+        objects: the objects of the motion; default: those of ``meshes``.
+        engine: physics engine to test the states in, or several: states are kept that are stable in all of them. A
+            rejection states the first engine's reason.
+        out: reset bank to write.
+        meshes: folder of real meshes; default: that of the motion, else the stand-ins.
+        num_envs: worlds at a time.
+        device: where engines run that can use a GPU: cpu or cuda; the others run on the CPU.
+        limits: duration of the test, and the largest speeds of a stable state.
+        closing: extra states between frames in which the hand closes in on the object.
+        squeeze: how hard fingers press in states after contact, and which fingers. Accepted states are tried once more
+            with the targets that press; one that an engine rejects then does not press.
+        transfer: extra states at poses of each demonstration, in grasps of other demonstrations of the same object
+            that hold its full weight in every engine. There are none if no finger presses.
+        settle: let objects come to rest (in the first engine) before episodes begin at home. Default: the recorded
+            poses, as in the paper, from which one object in eleven turns by more than 10 degrees.
+        progress: called with (what is tried, candidates tried, candidates in all).
+        note: called with the doubts that the motion states about its demonstrations.
+
+    Raises:
+        DemoError: no frame is valid, or an object of a valid frame is unknown.
+        FileFormatError: the motion is for a robot with other joints.
+    """
+    from xreset.files.records import stated_doubts
+    from xreset.resets.bank import write_bank
+    from xreset.resets.filter import stable_states
+    from xreset.resets.inputs import load_inputs
+    from xreset.resets.settle import settle_starts
+    from xreset.resets.transfer import add_transfers
+
+    inputs = load_inputs(
+        retargeted, robot=robot, objects=objects, meshes=meshes, accept=("motion",)
+    )
+    doubts = stated_doubts(inputs.path) if inputs.path else []
+    for doubt in doubts:
+        note(doubt)
+    motion = inputs.motion()
+    scene = (inputs.robot, inputs.objects)
+    engines = (engine,) if isinstance(engine, str) else tuple(dict.fromkeys(engine))
+    limits = limits or FilterConfig()
+    closing = closing or ClosingConfig(spacing=None)
+    squeeze = squeeze or SqueezeConfig(force=0.0, weight=0.0)
+    squeeze = squeeze.for_hand(len(inputs.robot.fingertips))
+    transfer = transfer or TransferConfig(per_pose=0)
+    bank = stable_states(
+        motion,
+        *scene,
+        engines,
+        limits=limits,
+        closing=closing,
+        squeeze=squeeze,
+        num_envs=num_envs,
+        device=device,
+        progress=partial(progress, f"states stable in {', '.join(engines)}"),
+    )
+    if transfer.per_pose and squeeze.presses:
+        bank = add_transfers(
+            bank,
+            motion,
+            *scene,
+            transfer,
+            num_envs=num_envs,
+            device=device,
+            progress=partial(progress, "grasps of other demonstrations"),
+        )
+    if settle:
+        bank, at_rest = settle_starts(
+            bank,
+            *scene,
+            engines[0],
+            num_envs=num_envs,
+            device=device,
+            progress=partial(progress, "start poses come to rest"),
+        )
+        if moving := int((~at_rest).sum()):
+            note(f"{moving} of {len(at_rest)} objects do not come to rest and start as recorded")
+    if out is not None:
+        made_with = {
+            "engines": list(engines),
+            "num_envs": num_envs,
+            "filter": asdict(limits),
+            "closing": asdict(closing),
+            "squeeze": asdict(squeeze),
+            "transfer": asdict(transfer),
+            "settle": settle,
+            "meshes": str(inputs.meshes) if inputs.meshes else None,
+            "doubts": doubts,
+        }
+        hashes = {"retargeted": inputs.hash} if inputs.hash else {}
+        write_bank(out, bank, config=made_with, inputs=hashes)
+    return bank
+
+
+@obeys_rules
+def make_goals(
+    names: Sequence[str] | None = None,
+    *,
+    robot: str | Path | RobotSpec,
+    out: Output | None = None,
+    meshes: str | Path | None = None,
+    families: Annotated[str | Sequence[str] | None, Option("family")] = None,
+    poses: Annotated[Sequence[Pose], Option("pose")] = (),
+    config: Annotated[GoalConfig | None, Option("draw")] = GoalConfig(),
+    progress: Callable[[float, int], None] = unseen,
+) -> GoalSet:
+    """Give objects starts and goals without demonstrations, for xreset eval --demos and xreset train --goals.
+
+    Objects come to rest on the table in MuJoCo first, so that every start is at rest. The robot can reach every goal
+    with the grasp that it has at the start. The goals of an object do not depend on the other objects.
+
+    Args:
+        names: objects; default: all.
+        robot: name or folder of the robot.
+        out: goal set to write.
+        meshes: folder of real meshes; default: the built-in stand-ins.
+        families: kind of goal, or several: lift, yaw, tilt-x, tilt-y (lifted, and turned by 60 degrees about an axis of
+            the world) or random; default: all of them, or none if there are poses.
+        poses: goal of your own for every object, a pose of the mesh frame: x y z [m] and quaternion w x y z; or
+            several.
+        config: number, sizes, offsets and seed.
+        progress: called with (goals found, goals in all).
+
+    Raises:
+        ObjectError: an object is unknown, or has no usable mesh.
+        GoalError: an object does not come to rest, or a goal is inside the table or out of the robot's reach.
+    """
+    from xreset.geometry.description import load_robot
+    from xreset.objects.catalogue import load_objects
+    from xreset.resets.goals import drawn_goals, write_goals
+
+    config = config or GoalConfig()
+    found = drawn_goals(
+        load_objects(names, meshes), load_robot(robot), families, poses, config, progress
+    )
+    if out is not None:
+        write_goals(out, found, config, meshes=meshes)
+    return found

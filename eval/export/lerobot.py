@@ -97,73 +97,29 @@ def _write(
     size: Size,
     progress: Callable[[float, int], None],
 ) -> None:
-    import pyarrow as pa
-    from pyarrow import parquet
-
     offsets = recording.offsets
-    features = _features(recording, videos, size)
     task_index, tasks = pd.factorize(recording.episodes["task"])
     samples: dict[str, list[np.ndarray]] = {}
     rows = []
     painter = cache(partial(_painter, recording.robot, size))
     for i, episode in enumerate(recording.episodes.to_dict("records")):
-        length = int(offsets[i + 1] - offsets[i])
         arrays = _arrays(episode, i, int(offsets[i]), int(task_index[i]), recording.fps)
-        distance = episode["least_distance"]  # NaN: an earlier version did not measure it
-        row = {
-            "episode_index": i,
-            "tasks": [episode["task"]],
-            "length": length,
-            "dataset_from_index": int(offsets[i]),
-            "dataset_to_index": int(offsets[i + 1]),
-            "engine": episode["engine"],
-            "policy": episode["policy"],
-            "seed": episode["seed"],
-            "object": episode["object"],
-            "demonstration": episode["sequence_name"],
-            "success": episode["reorient"],
-            "task_progress": episode["task_progress"],
-            "published_success": None if pd.isna(distance) else bool(episode["published_success"]),
-            "least_distance": None if pd.isna(distance) else distance,
-            "data/chunk_index": 0,
-            "data/file_index": 0,
-            "meta/episodes/chunk_index": 0,
-            "meta/episodes/file_index": 0,
-        }
+        row = _row(episode, i, int(offsets[i]), int(offsets[i + 1]))
         for video in videos:
-            chunk, file = divmod(i, _FORMAT["info"]["chunks_size"])
-            trace = episode["trace"]
-            paint = painter(video, trace.object, episode["meshes"])
-            film = np.stack([paint(trace, row) for row in range(length)])
-            path = root / f"videos/{video}/chunk-{chunk:03d}/file-{file:03d}.mp4"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(encode_mp4(film, recording.fps, keyframes=_KEYFRAMES))
+            paint = painter(video, episode["trace"].object, episode["meshes"])
+            film = np.stack([paint(episode["trace"], frame) for frame in range(row["length"])])
+            row |= _write_film(root, video, i, film, recording.fps)
             arrays[video] = film[::10, ::8, ::8].reshape(-1, 3) / 255.0
-            row[f"videos/{video}/chunk_index"] = chunk
-            row[f"videos/{video}/file_index"] = file
-            row[f"videos/{video}/from_timestamp"] = 0.0
-            row[f"videos/{video}/to_timestamp"] = length / recording.fps
         for key, values in arrays.items():
             samples.setdefault(key, []).append(values)
             row |= {f"stats/{key}/{name}": value for name, value in _stats(key, values).items()}
         rows.append(row)
         progress(i + 1, len(offsets) - 1)
-
-    columns = {}
     whole = {key: np.concatenate(parts) for key, parts in samples.items()}
-    for key, values in whole.items():
-        if key not in videos:
-            flat = pa.array(values.reshape(-1).astype(features[key]["dtype"]))
-            columns[key] = (
-                flat
-                if values.shape[1] == 1
-                else pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
-            )
-    columns["engine"] = pa.array(np.repeat(recording.episodes["engine"].tolist(), np.diff(offsets)))
-    for name, table in (("data", pa.table(columns)), ("meta/episodes", pa.Table.from_pylist(rows))):
-        path = root / name / _FIRST
-        path.parent.mkdir(parents=True)
-        parquet.write_table(table, path)
+    features = _features(recording, videos, size)
+    engines = np.repeat(recording.episodes["engine"].tolist(), np.diff(offsets))
+    numbers = {key: values for key, values in whole.items() if key not in videos}
+    _write_tables(root, numbers, features, engines, rows)
     pd.DataFrame({"task_index": range(len(tasks))}, index=pd.Index(tasks, name="task")).to_parquet(
         root / "meta/tasks.parquet"
     )
@@ -172,6 +128,77 @@ def _write(
     )
     write_json(root / "meta/xreset.json", {"schema": SCHEMA})  # with the version of xreset
     write_json(root / "meta/info.json", _info(recording, len(tasks), features))
+
+
+def _row(episode: dict[str, Any], index: int, begin: int, end: int) -> dict[str, Any]:
+    """Return what the table of episodes states about an episode whose frames are ``begin`` to ``end``."""
+    distance = episode["least_distance"]  # NaN: an earlier version did not measure it
+    return {
+        "episode_index": index,
+        "tasks": [episode["task"]],
+        "length": end - begin,
+        "dataset_from_index": begin,
+        "dataset_to_index": end,
+        "engine": episode["engine"],
+        "policy": episode["policy"],
+        "seed": episode["seed"],
+        "object": episode["object"],
+        "demonstration": episode["sequence_name"],
+        "success": episode["reorient"],
+        "task_progress": episode["task_progress"],
+        "published_success": None if pd.isna(distance) else bool(episode["published_success"]),
+        "least_distance": None if pd.isna(distance) else distance,
+        "data/chunk_index": 0,
+        "data/file_index": 0,
+        "meta/episodes/chunk_index": 0,
+        "meta/episodes/file_index": 0,
+    }
+
+
+def _write_film(root: Path, video: str, index: int, film: np.ndarray, fps: float) -> dict[str, Any]:
+    """Write the film [T, H, W, 3] of an episode; return what the table of episodes states about it."""
+    chunk, file = divmod(index, _FORMAT["info"]["chunks_size"])
+    path = root / f"videos/{video}/chunk-{chunk:03d}/file-{file:03d}.mp4"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(encode_mp4(film, fps, keyframes=_KEYFRAMES))
+    return {
+        f"videos/{video}/chunk_index": chunk,
+        f"videos/{video}/file_index": file,
+        f"videos/{video}/from_timestamp": 0.0,
+        f"videos/{video}/to_timestamp": len(film) / fps,
+    }
+
+
+def _write_tables(
+    root: Path,
+    numbers: dict[str, np.ndarray],
+    features: dict[str, Any],
+    engines: np.ndarray,
+    rows: list[dict[str, Any]],
+) -> None:
+    """Write the tables of frames and of episodes.
+
+    Args:
+        root: folder of the data set.
+        numbers: values [frames, .] by feature.
+        features: the data set's features.
+        engines: [frames] name of the engine.
+        rows: what is stated about each episode.
+    """
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    columns = {}
+    for key, values in numbers.items():
+        column = pa.array(values.reshape(-1).astype(features[key]["dtype"]))
+        if values.shape[1] > 1:
+            column = pa.FixedSizeListArray.from_arrays(column, values.shape[1])
+        columns[key] = column
+    columns["engine"] = pa.array(engines)
+    for name, table in (("data", pa.table(columns)), ("meta/episodes", pa.Table.from_pylist(rows))):
+        path = root / name / _FIRST
+        path.parent.mkdir(parents=True)
+        parquet.write_table(table, path)
 
 
 def _info(recording: RecordedEpisodes, tasks: int, features: dict[str, Any]) -> dict[str, Any]:

@@ -51,10 +51,6 @@ Robot = Annotated[
     str | None, arg(help="Name or folder of the robot; default: the policy's, or the file's.")
 ]
 Meshes = Annotated[Path | None, arg(help="Folder of real meshes; default: the built-in stand-ins.")]
-MotionMeshes = Annotated[
-    Path | None,
-    arg(help="Folder of real meshes; default: that of the motion, else the stand-ins."),
-]
 AllEngines = Annotated[
     Several,
     arg(help="Physics engine; give it again for more. Default: all that can be used here."),

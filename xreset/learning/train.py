@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -29,10 +29,7 @@ from xreset.learning.config import TrainConfig
 from xreset.learning.distributed import Processes, leave
 from xreset.learning.export import export_checkpoint
 from xreset.learning.exported import read_policy
-from xreset.learning.recipes import (
-    own_terms_flags,
-    student_config,
-)
+from xreset.learning.recipes import own_terms_flags, student_config
 from xreset.learning.run import (
     TEACHER,
     RunInfo,
@@ -402,6 +399,32 @@ def cleanly(out: Path, info: RunInfo) -> Iterator[None]:
                 f"{info.num_envs} worlds on {info.device} need more memory than there is; {state}. "
                 "Start with fewer (--num-envs), or smaller minibatches (--config.ppo.minibatch-size), in another --out."
             ) from error
+
+
+def start(
+    out: Path,
+    info: RunInfo,
+    data: str | Path | ResetBank,
+    load: Callable[[str | Path | ResetBank], Inputs],
+    teacher: OnnxPolicy | None,
+    *,
+    minutes: float,
+    wandb: str | None,
+) -> None:
+    """Make a run folder and train in it.
+
+    Data that are in no file are written into the folder, and read again: a training that is resumed has the same data,
+    and their values are checked.
+    """
+    with new_run(out):
+        if teacher is not None:
+            write_whole(out / TEACHER, teacher.content)
+        if not isinstance(data, str | Path):
+            data = write_data(out, data)
+        inputs = load(data)
+        info = replace(info, resets=str(inputs.path), resets_hash=str(inputs.hash))
+        with cleanly(out, info):
+            run_training(out, info, inputs, minutes=minutes, resumed=False, wandb=wandb)
 
 
 def run_training(

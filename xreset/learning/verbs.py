@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 from xreset.cameras.config import CameraConfig
 from xreset.errors import RunError, XResetError
 from xreset.files.checks import Option, Output, PositiveInt, Seed, obeys_rules
-from xreset.files.storage import file_hash, write_whole
+from xreset.files.storage import file_hash
 from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import default_config, from_home, starting_config
-from xreset.learning.run import TEACHER, RunInfo, checkpoints, read_run
+from xreset.learning.run import RunInfo, checkpoints, read_run
 from xreset.physics.plugins import Device, backend_class, device_for
 
 if TYPE_CHECKING:
@@ -114,28 +114,13 @@ def train(
         training.refuse_changes(out, started, new, config, bank, goals)
         own = config.task.reward.own if config else None
         return training.resume(out, own=own, **length)
-    if teacher is not None and (recipe is not None or weights is not None):
-        given = "weights" if recipe is None else "recipe"
-        raise RunError(f"The configuration of a student follows from its teacher. Omit {given}.")
-    if config is not None and recipe is not None:
-        raise XResetError("Both recipe and config are given. Give one of them.")
-    if teacher is not None and config is None:
-        config = training.config_of_student(teacher, cameras or "front")
-    elif recipe is not None:
-        config = starting_config(str(recipe))
-    elif config is None:
-        _, config = default_config(goals, weights)
+    config = _configuration(config, recipe, weights, teacher, cameras, goals)
     if iterations is not None:
         config = replace(config, iterations=iterations)
-    engine = engine or "mujoco-warp"
     present = read_run(out) if checkpoints(out) else None
-    if device is None:
-        device = training.default_device(engine) if present is None else present.device
+    engine = engine or "mujoco-warp"
+    device = _device(device, engine, present)
     training.check_minutes(minutes)
-    if device_for(engine, device) != device:
-        raise RunError(
-            f"The engine {engine!r} does not run on {device!r}. Omit the device, or choose another engine."
-        )
     data = training.bank_or_goals(bank, goals)
     load = partial(load_inputs, robot=robot, meshes=meshes, accept=("bank", "goals"))
     inputs = load(data)
@@ -166,20 +151,49 @@ def train(
         weights_hash=file_hash(start) if start else None,
         teacher=str(teacher) if teacher else None,
     )
-    if present is not None:
-        if not isinstance(data, str | Path):
-            info = replace(info, resets_hash=training.hash_of(data))
-        training.refuse_another_training(out, present, info, teacher_policy)
-        length["iterations"] = config.iterations
-        return training.resume(out, own=config.task.reward.own, **length)
-    with training.new_run(out):
-        if teacher_policy is not None:
-            write_whole(out / TEACHER, teacher_policy.content)
-        # the training reads its own file, so that it has the same data as a resumed one, and values are checked
-        if not isinstance(data, str | Path):
-            path = training.write_data(out, data)
-            inputs = load(path)
-            info = replace(info, resets=str(inputs.path), resets_hash=str(inputs.hash))
-        with training.cleanly(out, info):
-            training.run_training(out, info, inputs, minutes=minutes, resumed=False, wandb=wandb)
-    return out
+    if present is None:
+        training.start(out, info, data, load, teacher_policy, minutes=minutes, wandb=wandb)
+        return out
+    if not isinstance(data, str | Path):
+        info = replace(info, resets_hash=training.hash_of(data))
+    training.refuse_another_training(out, present, info, teacher_policy)
+    length["iterations"] = config.iterations
+    return training.resume(out, own=config.task.reward.own, **length)
+
+
+def _configuration(
+    config: TrainConfig | None,
+    recipe: str | Path | None,
+    weights: str | Path | None,
+    teacher: str | Path | None,
+    cameras: str | CameraConfig | Sequence[str | CameraConfig],
+    goals: str | Path | GoalSet | None,
+) -> TrainConfig:
+    """Return the configuration that was given, or the one that the other arguments of :func:`train` decide."""
+    if teacher is not None and (recipe is not None or weights is not None):
+        given = "weights" if recipe is None else "recipe"
+        raise RunError(f"The configuration of a student follows from its teacher. Omit {given}.")
+    if config is not None and recipe is not None:
+        raise XResetError("Both recipe and config are given. Give one of them.")
+    if config is not None:
+        return config
+    if teacher is not None:
+        from xreset.learning.train import config_of_student
+
+        return config_of_student(teacher, cameras or "front")
+    if recipe is not None:
+        return starting_config(str(recipe))
+    return default_config(goals, weights)[1]
+
+
+def _device(device: str | None, engine: str, present: RunInfo | None) -> str:
+    """Return where to train: the given device, that of the run in the folder, or the best for the engine."""
+    from xreset.learning.train import default_device
+
+    if device is None:
+        return default_device(engine) if present is None else present.device
+    if device_for(engine, device) != device:
+        raise RunError(
+            f"The engine {engine!r} does not run on {device!r}. Omit the device, or choose another engine."
+        )
+    return device

@@ -47,7 +47,6 @@ from xreset.backends.conformance import SCHEMA as CONFORMANCE
 from xreset.demos.dexycb import _read_extrinsics, _read_meta, _read_npz
 from xreset.demos.keypoints import read_keypoints, read_transform
 from xreset.eval.effects import curves, verdict
-from xreset.eval.engines.actions import Actions, read_actions, write_actions
 from xreset.eval.engines.page import page
 from xreset.eval.engines.page import read as read_page
 from xreset.eval.report.read import read_curves, run_facts
@@ -64,13 +63,11 @@ from xreset.learning.run import RunInfo, read_run, write_run
 from xreset.live.deploy import deploy_contract, deployed_graph
 from xreset.objects.meshes import read_mesh
 from xreset.objects.properties import properties_of
-from xreset.physics import State
 from xreset.pictures.view.load import load_view
 from xreset.policy.onnx_policy import OnnxPolicy, policy_contract
 from xreset.robot_tools.sources import read_source
 from xreset.runtime import load_controller
 from xreset.runtime.contract import KEY, parse_contract
-from xreset.spec import SceneSpec
 from xreset.task.config import ObservationConfig, TaskConfig
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
@@ -109,7 +106,6 @@ def readers():
         every = Readers(Path(folder))
         for add_some in (
             add_records,
-            add_actions,
             add_evaluation,
             add_run,
             add_curves,
@@ -159,24 +155,6 @@ def add_records(every):
     path = every.add("reset bank", "bank.npz", lambda p: read_bank(p, robot=every.toy), "npz")
     write_bank(path, toy_bank(every.toy), config={"steps": 8}, inputs={"retargeted": "ab"})
     write_goals(every.add("goal set", "goals.npz", read_goals, "npz"), toy_goals(every.toy))
-
-
-def add_actions(every):
-    robot = every.openarm
-    soup = load_object("soup")
-
-    def read(path):
-        return read_actions(path, robot, lambda _: soup)
-
-    home = torch.as_tensor(robot.home, dtype=torch.float32)[None]
-    upright = torch.tensor([[1.0, 0, 0, 0]])
-    actions = Actions(
-        scene=SceneSpec(robot=robot, objects=(soup,)),
-        label="x",
-        start=State.at_rest(home, torch.tensor([[0.5, 0.3, 0.1]]), upright),
-        joint_target=home.repeat(3, 1),
-    )
-    write_actions(every.add("actions", "actions.npz", read, "npz"), actions)
 
 
 def add_evaluation(every):

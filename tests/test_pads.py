@@ -1,4 +1,4 @@
-"""Jaws: their pads, which are drawn to the faces of the object that the human holds, and the analytic map."""
+"""Jaws: their pads, which are drawn to the faces of the object that the human holds."""
 
 import dataclasses
 import math
@@ -6,7 +6,6 @@ from unittest import TestCase
 
 import numpy as np
 import torch
-from torch.testing import assert_close
 
 from tests.toy_retarget import FLOAT, box_object, check_gradient, double, hand_targets
 from xreset import robots, synthesize
@@ -15,11 +14,9 @@ from xreset.geometry.rotations import quat_from_axis_angle, quat_rotate
 from xreset.geometry.surface import Surface
 from xreset.retarget.hand.config import HandWeights
 from xreset.retarget.hand.cost import system
-from xreset.retarget.hand.jaw import jaw_keypoints, jaw_state
 from xreset.retarget.hand.model import HandModel, HandState
 from xreset.retarget.hand.solve import retarget_hand
 from xreset.retarget.pipeline import HandMotions, RetargetConfig
-from xreset.spec import KEYPOINTS
 
 UP = double([0.0, 0.0, 1.0])
 
@@ -92,37 +89,3 @@ class PadsTest(TestCase):
         [batch] = hands.batches()
         self.assertFalse(batch.targets.held[0, 0])
         self.assertTrue(batch.targets.held[0, -1])
-
-
-class AnalyticMapTest(TestCase):
-    def test_a_jaw_s_own_keypoints_give_its_pose_back(self):
-        generator = torch.Generator().manual_seed(0)
-        for name in ("openarm", "ur7e-robotiq"):
-            model = HandModel(robots.load(name))
-            share = torch.rand(1, 5, 1, generator=generator, dtype=FLOAT)
-            joints = model.kinematics.lower + share * (
-                model.kinematics.upper - model.kinematics.lower
-            )
-            pos = torch.randn(1, 5, 3, generator=generator, dtype=FLOAT)
-            quat = quat_from_axis_angle(torch.randn(1, 5, 3, generator=generator, dtype=FLOAT))
-            followed = model.keypoints(HandState(joints, pos, quat))
-            again = model.keypoints(jaw_state(model, followed))
-            assert_close(again, followed, atol=5e-4, rtol=0, msg=name)
-
-    def test_a_span_wider_than_the_jaw_keeps_its_middle_and_the_second_jaw_follows_two_fingers(
-        self,
-    ):
-        model = HandModel(robots.load("ur7e-robotiq"))
-        hand = np.zeros((1, 21, 3))
-        at = {name: hand[0, i] for i, name in enumerate(KEYPOINTS)}
-        at["thumb4"][:] = (-0.1, 0, 0)
-        at["index4"][:] = (0.1, 0, 0.02)
-        at["middle4"][:] = (0.1, 0, -0.02)
-        at["wrist"][:] = (0, 0, 0.2)
-        field = Surface(box_object(((0, 0, 0), (0.05, 0.05, 0.05)))).field
-        targets = hand_targets(torch.as_tensor(jaw_keypoints(model, hand))[None], field)
-        motion = retarget_hand(model, targets, jaw="analytic")
-        tips = model.keypoints(motion)[0, 0, model.is_tip]
-        self.assertAlmostEqual(motion.joints.item(), 0.0)
-        assert_close(tips[:, 0].abs(), torch.full((2,), 0.0425, dtype=FLOAT), atol=1e-3, rtol=0)
-        assert_close(tips[:, 1:], torch.zeros(2, 2, dtype=FLOAT), atol=1e-3, rtol=0)

@@ -18,14 +18,12 @@ from tests.data import InFolder
 from tests.engine_checks import JOINT, with_drive
 from tests.toy_bank import SOUP, SPAM
 from tests.toy_grasp import recording
-from xreset import load_object, robots
+from xreset import robots
 from xreset.errors import DemoError, FileFormatError, XResetError
 from xreset.eval.engines.actions import (
     Actions,
     from_file,
-    read_actions,
     recorded_actions,
-    write_actions,
 )
 from xreset.eval.engines.replay import (
     THRESHOLDS,
@@ -39,7 +37,6 @@ from xreset.eval.rollout import engine, roll_out
 from xreset.eval.setting import Place
 from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.physics import State
-from xreset.spec import PairFriction
 from xreset.task.config import RandomizationConfig, TaskConfig, TerminationConfig
 
 DT = 1 / 60
@@ -288,46 +285,6 @@ class TraceTest(TestCase):
             self.assertIn(expected, text)
 
 
-class ActionsTest(InFolder):
-    def setUp(self):
-        super().setUp()
-        self.path = self.folder / "actions.npz"
-        actions = grasp_actions()
-        self.actions = replace(
-            actions,
-            scene=replace(actions.scene, friction=PairFriction(tip=0.7, link=0.4, table=0.3)),
-        )
-        write_actions(self.path, self.actions, {"mujoco": recording()})
-
-    def test_round_trip(self):
-        with np.load(self.path) as file:
-            self.assertEqual(
-                (file["engine"].tolist(), file["tip_force"].shape), (["mujoco"], (1, 20, 2, 3))
-            )
-        found = read_actions(self.path, self.actions.robot, lambda _: self.actions.object)
-        for name in ("timestep", "substeps", "friction"):
-            self.assertEqual(getattr(found.scene, name), getattr(self.actions.scene, name), name)
-        self.assertEqual(found.label, self.actions.label)
-        assert_close(found.joint_target, self.actions.joint_target, rtol=0, atol=0)
-        for name, value in vars(self.actions.start).items():
-            assert_close(getattr(found.start, name), value, rtol=0, atol=0)
-
-    def test_refusals(self):
-        robot = self.actions.robot
-        thing = self.actions.object
-        with self.assertRaisesRegex(
-            FileFormatError, "for another version of 'conformance-gripper'"
-        ):
-            read_actions(self.path, replace(robot, base_pos=(0.0, 0.0, 0.2)), lambda _: thing)
-        with self.assertRaisesRegex(FileFormatError, "another geometry of brick"):
-            read_actions(self.path, robot, lambda _: replace(thing, source="0" * 64))
-        write_actions(
-            self.path, replace(self.actions, joint_target=self.actions.joint_target * math.nan)
-        )
-        with self.assertRaisesRegex(FileFormatError, "'joint_target' holds non-finite numbers"):
-            read_actions(self.path, robot, lambda _: thing)
-
-
 class EvaluationTest(toy_results.InFolder):
     """Actions that an evaluation has recorded."""
 
@@ -398,10 +355,7 @@ class EvaluationTest(toy_results.InFolder):
         data = json.loads((out / "trace.json").read_text())
         self.assertEqual([e["name"] for e in data["engines"]], ["mujoco", "sapien"])
         self.assertRegex(said, "sapien (stays with mujoco|diverges first)")
-        found = read_actions(out / "actions.npz", robot, load_object)
-        self.assertEqual(found.label, "zero in mujoco, demonstration 1")
-        with np.load(out / "actions.npz") as file:
-            self.assertEqual(file["engine"].tolist(), ["mujoco", "sapien"])
+        self.assertEqual(data["label"], "zero in mujoco, demonstration 1")
 
 
 class CommandTest(InFolder):

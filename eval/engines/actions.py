@@ -6,74 +6,23 @@ Joint targets are stored, not a policy's outputs, because an output means anothe
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import fields
 from pathlib import Path
-from typing import Annotated
 
-import numpy as np
 import torch
 
-from xreset.demos.archive import OneText
 from xreset.errors import DemoError, FileFormatError
 from xreset.eval.engines.grasps import Grasps, closing_episode, find_grasps
-from xreset.eval.engines.recording import Recording
 from xreset.eval.results import TRACE_SCHEMA, Trace, read_result, read_traces
 from xreset.eval.rollout import nominal_scene
 from xreset.eval.setting import Place
 from xreset.files.checks import frozen
-from xreset.files.records import (
-    JOINT,
-    POSITION,
-    Field,
-    arrays_of,
-    npz_schema,
-    read_record,
-    write_npz,
-)
+from xreset.files.records import npz_schema
 from xreset.geometry.description import load_robot
 from xreset.objects.catalogue import load_object
 from xreset.physics import State
 from xreset.resets.inputs import load_inputs
-from xreset.retarget.file import JointNames
-from xreset.spec import ObjectSpec, PairFriction, RobotSpec, SceneSpec, check_robot
+from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 from xreset.task.config import EVALUATION_TIMESTEP, TaskConfig
-
-SCHEMA = "xreset-actions/1"
-
-_STATE_KEYS = {
-    f.name: f"start_{f.name}_wxyz" if f.name == "object_quat" else f"start_{f.name}"
-    for f in fields(State)
-}
-
-_SPEED = (-1e4, 1e4)
-"""Range of velocities [rad/s, m/s]."""
-Joints = Annotated[np.ndarray, Field(("J",), "f", within=JOINT)]
-Velocity = Annotated[np.ndarray, Field((3,), "f", within=_SPEED)]
-
-
-@frozen
-class ActionFile:
-    """Contents of a file of actions, except the recordings of engines. Poses are in the world frame."""
-
-    robot: OneText
-    robot_fingerprint: OneText
-    joint_names: JointNames
-    object_name: OneText
-    object_source: OneText
-    label: OneText
-    timestep: Annotated[float, Field((), "f", within=(1e-6, 1.0))]
-    substeps: Annotated[int, Field((), "i", within=(1, 1e6))]
-    friction: Annotated[np.ndarray, Field((3,), "f", within=(0.0, 100.0))]
-    """Pair friction of the object with fingertips, other links and the table."""
-    joint_target: Annotated[np.ndarray, Field(("T", "J"), "f", within=JOINT)]
-    start_joint_pos: Joints
-    start_joint_vel: Annotated[np.ndarray, Field(("J",), "f", within=_SPEED)]
-    start_joint_target: Joints
-    start_object_pos: Annotated[np.ndarray, Field((3,), "f", within=POSITION)]
-    start_object_quat_wxyz: Annotated[np.ndarray, Field((4,), "f", unit=True)]
-    start_object_linvel: Velocity
-    start_object_angvel: Velocity
 
 
 @frozen
@@ -101,10 +50,10 @@ class Actions:
 
 
 def from_file(source: Path, place: Place, wanted: str | None = None, episode: int = 0) -> Actions:
-    """Load actions from a file: its recorded actions, or an open-loop grasp and lift of one of its grasps.
+    """Load actions from a file: a recorded episode, or an open-loop grasp and lift of one of its grasps.
 
     Args:
-        source: recorded actions, the trace of an evaluation, or demonstrations or motion with grasps.
+        source: the trace of an evaluation, or demonstrations or motion with grasps.
         place: robot and meshes.
         wanted: name of an object of the file; default: its first.
         episode: index among the object's grasps or recorded episodes.
@@ -114,8 +63,6 @@ def from_file(source: Path, place: Place, wanted: str | None = None, episode: in
         DemoError: the file has no such object, grasp or episode.
     """
     schema = npz_schema(source)
-    if schema == SCHEMA:
-        return read_actions(source, place.robot, lambda name: load_object(name, place.meshes))
     if schema == TRACE_SCHEMA:
         return _from_evaluation(source, place, wanted, episode)
     inputs = load_inputs(
@@ -184,72 +131,3 @@ def recorded_actions(robot: RobotSpec, obj: ObjectSpec, trace: Trace, *, label: 
     target = torch.as_tensor(targets).float()
     scene = nominal_scene(robot, (obj,), TaskConfig(substeps=substeps))
     return Actions(scene=scene, label=label, start=State.at_rest(*first), joint_target=target)
-
-
-def write_actions(
-    path: str | Path, actions: Actions, replays: Mapping[str, Recording] | None = None
-) -> None:
-    """Write an action sequence and, for each engine by name, the first world of its recording."""
-    scene = actions.scene
-    friction = scene.friction
-    start = {key: getattr(actions.start, name)[0].numpy() for name, key in _STATE_KEYS.items()}
-    content = ActionFile(
-        robot=actions.robot.name,
-        robot_fingerprint=actions.robot.fingerprint,
-        joint_names=actions.robot.joint_names,
-        object_name=actions.object.name,
-        object_source=actions.object.source,
-        label=actions.label,
-        timestep=scene.timestep,
-        substeps=scene.substeps,
-        friction=np.array([friction.tip, friction.link, friction.table]),
-        joint_target=actions.joint_target.numpy(),
-        **start,
-    )
-    arrays = arrays_of(ActionFile, content)
-    if replays:
-        arrays["engine"] = np.array(list(replays))
-        for name in ("joint_pos", "object_pos", "object_quat", "tip_force"):
-            key = "object_quat_wxyz" if name == "object_quat" else name
-            rows = [getattr(recording, name)[:, 0].numpy() for recording in replays.values()]
-            arrays[key] = np.stack(rows)
-    write_npz(path, SCHEMA, arrays)
-
-
-def read_actions(
-    path: str | Path, robot: RobotSpec | str | None, objects: Callable[[str], ObjectSpec]
-) -> Actions:
-    """Read an action sequence.
-
-    Args:
-        path: the file.
-        robot: the robot, its name or its folder; default: the robot that the file names.
-        objects: gives an object by its name.
-
-    Raises:
-        FileFormatError: the file is damaged, or for another robot or object geometry.
-    """
-    made = read_record(ActionFile, path, SCHEMA, what="an action sequence", check=_check)
-    spec = load_robot(robot or made.robot)
-    check_robot(path, "action sequence", made, spec)
-    obj = objects(made.object_name)
-    if obj.source != made.object_source:
-        raise FileFormatError(
-            f"{path} was made with another geometry of {obj.name} ({made.object_source}, here {obj.source}). "
-            "Give the same folder of meshes."
-        )
-    tip, link, table = made.friction.tolist()
-    scene = SceneSpec(
-        robot=spec,
-        objects=(obj,),
-        friction=PairFriction(tip=tip, link=link, table=table),
-        timestep=made.timestep,
-        substeps=int(made.substeps),
-    )
-    start = {n: torch.as_tensor(getattr(made, key)).float()[None] for n, key in _STATE_KEYS.items()}
-    target = torch.as_tensor(made.joint_target).float()
-    return Actions(scene=scene, label=made.label, start=State(**start), joint_target=target)
-
-
-def _check(arrays: dict[str, np.ndarray]) -> str | None:
-    return None if len(arrays["joint_target"]) else "it has no control step."

@@ -84,7 +84,7 @@ class Data(Checked):
     synthetic_per_object: PositiveInt = 4
     meshes: str | None = None
     """Folder of meshes, relative to ``--data``; None: the stand-ins."""
-    retarget: Annotated[tuple[str, ...], _options("--jaw", "--hand.jaw", "--device")] = ()
+    retarget: Annotated[tuple[str, ...], _options("--device")] = ()
     """Further options of ``xreset retarget``."""
     resets: Annotated[
         tuple[str, ...],

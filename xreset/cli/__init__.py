@@ -96,7 +96,6 @@ _RENAMED = {
     "--backend": "--engine",
     "--objects": "--meshes",
     "--like": "--recipe",
-    "--hand.jaw": "--jaw",
     "--fault": "--property",
 }
 """Flag of earlier versions -> its present name."""

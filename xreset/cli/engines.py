@@ -264,13 +264,13 @@ def trace(
 
     Args:
         source: Source of the actions. Demonstrations or robot motion: an open-loop grasp and lift. The trace of an
-            evaluation (eval/ENGINE.trace.npz): an episode of the policy. An actions.npz of this command.
+            evaluation (eval/ENGINE.trace.npz): an episode of the policy.
         engine: Engine to compare with the reference; give it again for more. Default: all that can be used here.
         reference: Engine that the others are compared with.
         object: Object, if the source has several; default: the first.
         episode: Which of the object's grasps or recorded episodes.
         place: Robot, meshes, seed, device.
-        out: Folder for trace.json, and for actions.npz with the actions and the states of every engine.
+        out: Folder for trace.json.
     """
     from xreset.eval import rollout
     from xreset.eval.engines import actions, replay
@@ -283,8 +283,6 @@ def trace(
         move("actions")
         played = actions.from_file(source, place, object, episode)
         result = replay.trace(played, base, engines, seed=place.seed, progress=move)
-        replays = {e.engine.name: e.recording for e in (result.reference, *result.engines)}
-        actions.write_actions(out / "actions.npz", played, replays)
         write_json(out / "trace.json", measured(result.as_dict()))
     console.print(replay.rich_table(result))
     for sentence in replay.sentences(result):

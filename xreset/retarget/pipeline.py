@@ -26,8 +26,7 @@ from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track_each
 from xreset.retarget.file import Retargeted
 from xreset.retarget.hand.clearance import Objects, object_depth
-from xreset.retarget.hand.config import HandWeights, Jaw
-from xreset.retarget.hand.jaw import jaw_keypoints
+from xreset.retarget.hand.config import HandWeights
 from xreset.retarget.hand.model import HandModel, HandState, HandTargets
 from xreset.retarget.hand.solve import retarget_hand
 from xreset.retarget.validity import REASONS, Thresholds, classify
@@ -51,7 +50,6 @@ _FINGERS = slice(5, None)
 class RetargetConfig(Checked):
     """Options and constants of retargeting. With robot, objects and demonstrations they determine the result."""
 
-    jaw: Jaw = "fingertips"
     hand: HandWeights = HandWeights()
     arm: ArmSearch = ArmSearch()
 
@@ -256,14 +254,11 @@ class HandMotions:
             out[is_frame] = values[rows]
             return torch.as_tensor(out)
 
-        keypoints = self._keypoints[:, hand.keypoint_indices]
-        if hand.is_jaw and self._config.jaw == "analytic":
-            keypoints = jaw_keypoints(hand, self._keypoints)
         held = np.logical_and(
             self.touching[:, _THUMB].any(axis=1), self.touching[:, _FINGERS].any(axis=1)
         )
         return HandTargets(
-            keypoints=padded(keypoints),
+            keypoints=padded(self._keypoints[:, hand.keypoint_indices]),
             annotated=padded(demos.hand_valid),
             contact_points=padded(self._contact_points[:, hand.keypoint_indices]),
             in_contact=padded(self.touching[:, hand.keypoint_indices]),
@@ -339,7 +334,7 @@ def _hand_motion(job: _HandJob) -> HandState:
     """Return the hand's motion."""
     model = HandModel(job.robot, device=job.device)
     with one_thread():
-        return retarget_hand(model, job.targets, job.config.hand, jaw=job.config.jaw)
+        return retarget_hand(model, job.targets, job.config.hand)
 
 
 def _arm_targets(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,7 +15,6 @@ from xreset.files.checks import Option, Output, obeys_rules
 from xreset.files.progress import unseen
 from xreset.files.storage import file_hash
 from xreset.physics.plugins import Device
-from xreset.retarget.hand.config import Jaw
 
 if TYPE_CHECKING:
     from xreset.demos.archive import Demos
@@ -39,7 +38,6 @@ def retarget_demos(
     meshes: str | Path | None = None,
     trust: Annotated[bool, Option("trust_recordings")] = False,
     device: Device = "cpu",
-    jaw: Jaw | None = None,
     progress: Callable[[float, int], None] = unseen,
     note: Callable[[str], None] = _warn,
 ) -> Retargeted:
@@ -56,8 +54,6 @@ def retarget_demos(
         meshes: folder of real meshes; default: the built-in stand-ins.
         trust: use demonstrations that are certainly wrong all the same.
         device: where hand retargeting runs: cpu or cuda. The arm runs on the CPU.
-        jaw: what a parallel jaw follows: the human's fingertips, like every hand, or the published paper's analytic map
-            from thumb tip to fingers. Default: that of ``config``, fingertips.
         progress: called with the sequences done and the sequences in all.
         note: called with each doubt about the demonstrations (:mod:`xreset.demos.examine`).
 
@@ -91,8 +87,6 @@ def retarget_demos(
     for doubt in doubts:
         note(doubt)
     config = config or RetargetConfig()
-    if jaw is not None:
-        config = replace(config, jaw=jaw)
     motion = follow(demos, spec, objects, config, progress=progress, device=device)
     if out is not None:
         made_with = {

@@ -1,14 +1,8 @@
-"""Constants of hand retargeting. This module imports no torch, so the command line can show their user quickly."""
+"""Constants of hand retargeting."""
 
 from __future__ import annotations
 
-from typing import Literal
-
 from xreset.files.checks import frozen
-
-Jaw = Literal["fingertips", "analytic"]
-"""What a parallel jaw follows. ``fingertips``: the human's fingertips, like every hand. ``analytic``: the published
-paper's map, without the costs below. Other hands ignore it."""
 
 
 @frozen

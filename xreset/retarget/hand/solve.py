@@ -22,9 +22,8 @@ from xreset.geometry.rotations import (
     quat_multiply,
     quat_normalize,
 )
-from xreset.retarget.hand.config import HandWeights, Jaw
+from xreset.retarget.hand.config import HandWeights
 from xreset.retarget.hand.cost import HandSystem, system
-from xreset.retarget.hand.jaw import jaw_state
 from xreset.retarget.hand.model import HandModel, HandState, HandTargets
 from xreset.retarget.least_squares import damped, free_to_move, minimize, solve_chain
 
@@ -39,8 +38,6 @@ def retarget_hand(
     model: HandModel,
     targets: HandTargets,
     config: HandWeights | None = None,
-    *,
-    jaw: Jaw = "fingertips",
 ) -> HandState:
     """Find hand motions that minimize the cost; sequences are independent of one another.
 
@@ -48,7 +45,6 @@ def retarget_hand(
         model: the hand.
         targets: human motion to follow; a sequence must have at least one annotated frame.
         config: weights and limits.
-        jaw: what a parallel jaw follows.
 
     Returns:
         The motions, on the targets' device; joints are within their limits.
@@ -57,8 +53,6 @@ def retarget_hand(
     device = targets.keypoints.device
     targets = targets.to(model.device)
     human = _gaps_filled(targets)
-    if model.is_jaw and jaw == "analytic":
-        return jaw_state(model, human).to(device)
     root_pos, root_quat = _align_root(model, human)
     joints = model.kinematics.clamp(model.home).expand(*targets.annotated.shape, -1)
     state = HandState(joints, root_pos, root_quat)

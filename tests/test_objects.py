@@ -153,6 +153,10 @@ class Sampling(TestCase):
         assert_allclose(distance_to_pieces(points, obj.pieces), 0, atol=1e-4)
         assert_array_equal(points, surface_points(obj))
         self.assertFalse(np.array_equal(points, surface_points(obj, seed=1)))
+        larger = replace(obj, vertices=2.0 * obj.vertices)
+        assert_allclose(surface_points(larger), 2.0 * points, atol=1e-3)
+        points[:] = 0.0  # the caller's own
+        self.assertGreater(np.abs(surface_points(obj)).max(), 0.0)
         obj = load_object("soup")
         points = surface_points(obj, 64)
         self.assertGreater(cKDTree(points).query(points, k=2)[0][:, 1].min(), 0.008)

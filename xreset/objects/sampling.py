@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hashlib import blake2b
 from typing import Literal
 
 import numpy as np
@@ -24,8 +25,20 @@ def surface_points(obj: ObjectSpec, count: int = 64, seed: int = 0) -> np.ndarra
     """[count, 3] well spread points of the object's outer surface; the same seed gives the same points.
 
     Uniform samples by area, without those inside the solid (where pieces of a stand-in overlap), thinned by
-    farthest-point selection.
+    farthest-point selection. Found once for each surface in a process.
     """
+    surface = blake2b(obj.vertices.tobytes() + obj.faces.tobytes()).digest()
+    key = (surface, count, seed)
+    if key not in _SURFACE_POINTS:
+        _SURFACE_POINTS[key] = _spread_points(obj, count, seed)
+    return _SURFACE_POINTS[key].copy()
+
+
+_SURFACE_POINTS: dict[tuple[bytes, int, int], np.ndarray] = {}
+"""Points that :func:`surface_points` has found, by surface, count and seed."""
+
+
+def _spread_points(obj: ObjectSpec, count: int, seed: int) -> np.ndarray:
     points, _, normals = sample_surface(
         obj.vertices, obj.faces, max(_CANDIDATES_PER_POINT * count, 256), seed
     )

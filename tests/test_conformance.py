@@ -15,6 +15,7 @@ import torch
 from tests.command import refused, succeeds
 from tests.data import InFolder
 from xreset.backends.conformance import CHECKS, CheckResult, Measure, run
+from xreset.backends.conformance.harness import Worlds
 from xreset.backends.conformance.results import largest
 from xreset.backends.conformance.scene import objects
 from xreset.backends.mjcf_model import OBJECT
@@ -589,6 +590,24 @@ class Harness(InFolder):
         with mock.patch.object(MujocoWorld, "set_object_gravity", lambda *_: None):
             [result] = run(partial(MujocoBackend, workers=0), only=["object_gravity"])
         self.assertIn(result.measures[0].where, {obj.name for obj in objects()})
+
+    def test_a_can_is_not_compared_where_the_last_bits_differ(self):
+        class LastBitsOfAGpu(MujocoWorld):
+            count = 0
+
+            def set_state(self, state):
+                LastBitsOfAGpu.count += 1
+                noise = 1e-10 * np.sin(np.arange(4.0) + LastBitsOfAGpu.count)
+                super().set_state({**state, "object_quat": state["object_quat"] + noise})
+
+        checks = ("set_as_built", "object_inertia_set", "object_com_set")
+        for exact, verdict in ((True, "failed"), (False, "passed")):
+            with mock.patch.object(Worlds, "exact", exact):
+                results = outcome(LastBitsOfAGpu, *checks)
+            for name, result in results.items():
+                self.assertEqual(result.verdict, verdict, name)
+                found = {m.where for m in result.measures if m.verdict == "failed"}
+                self.assertEqual(found, {"can"} if exact else set(), name)
 
     def test_a_backend_that_cannot_be_built_is_not_a_failed_check(self):
         def make(scene, num_worlds, *, object_index=None):

@@ -52,6 +52,11 @@ class Worlds:
         self.altered = False
         """Whether a physical parameter has been set."""
 
+    @property
+    def exact(self) -> bool:
+        """Whether the same input gives the same bits: only CPUs add numbers in the same order every time."""
+        return self.backend.device.type == "cpu"
+
     def set(self, state: State, worlds: Sequence[int] | None = None) -> None:
         """Set the state of all worlds, or of the given ones from their rows."""
         if worlds is not None:

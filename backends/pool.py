@@ -88,8 +88,8 @@ class World(ABC):
         """Return the contacts of the object in the last internal step.
 
         Either a list with a pair for each contact: what touches the object (an index of a fingertip, or ``TABLE`` or
-        ``OTHER_LINK`` of :mod:`~xreset.backends.rigid`), and its force on the object [3]. Or a tuple of their sums: tip
-        force [E, 3], tip touch [E] bool and table force [3].
+        ``OTHER_LINK`` of :mod:`~xreset.backends.rigid`), and its force on the object [3]; with no force it is no touch.
+        Or a tuple of their sums: tip force [E, 3], tip touch [E] bool and table force [3].
         """
 
     def health(self, state: StateArrays) -> tuple[bool, bool]:

@@ -411,16 +411,20 @@ OTHER_LINK = -2
 
 def sum_contacts(tips: int, contacts: Iterable[tuple[int, np.ndarray]]) -> ContactArrays:
     """Return tip force [E, 3], tip touch [E] and table force [3], given what touches the object and with which
-    force."""
+    force [3]. A contact without force is no touch."""
     tip_force = np.zeros((tips, 3))
     tip_touch = np.zeros(tips, dtype=bool)
     table_force = np.zeros(3)
     for owner, force in contacts:
+        if np.shape(force) != (3,):
+            raise WrongValueError(
+                f"the force of a contact has shape {np.shape(force)}, expected (3,)"
+            )
         if owner == TABLE:
             table_force += force
         elif 0 <= owner < tips:
             tip_force[owner] += force
-            tip_touch[owner] = True
+            tip_touch[owner] |= np.any(force)
         elif owner != OTHER_LINK:
             raise WrongValueError(
                 f"a contact has the owner {owner}, expected TABLE ({TABLE}), OTHER_LINK ({OTHER_LINK}) or the index of "

@@ -285,12 +285,12 @@ def check_reading(what: str, wanted: Mapping[str, np.ndarray], found: Any) -> No
         found = dict(zip(wanted, found, strict=True))
     if not isinstance(found, Mapping):
         raise WrongValueError(f"{what} returns {shown(found)}, expected {', '.join(wanted)}")
-    if missing := wanted.keys() - found.keys():
-        raise WrongValueError(f"{what} lacks {', '.join(sorted(missing))}: add it")
     if unknown := found.keys() - wanted.keys():
         raise WrongValueError(
             f"{what} has the unknown field {', '.join(sorted(map(str, unknown)))}, expected {', '.join(wanted)}"
         )
+    if missing := wanted.keys() - found.keys():
+        raise WrongValueError(f"{what} lacks {', '.join(sorted(missing))}: add it")
     for name, value in found.items():
         array = np.asarray(value)
         like = wanted[name]

@@ -135,6 +135,7 @@ class ReadingsTest(unittest.TestCase):
         world = random.integers(0, 3, 40)
         owner = random.choice([*range(tips), TABLE, OTHER_LINK], 40)
         force = random.normal(size=(40, 3)).astype(np.float32)
+        force[owner == 1] = 0.0  # no touch
         _, contacts, _ = no_readings(gripper(), 3)
         contacts.tip_force.fill_(7.0)  # of an earlier step
         contacts.tip_touch.fill_(True)

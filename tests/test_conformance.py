@@ -411,6 +411,24 @@ class FingersThatTouchTogether(MujocoWorld):
 
 
 @breaks("pressing")
+class ContactsWithoutForceThatCountAsATouch(MujocoWorld):
+    """Contacts are found 2 mm before bodies meet."""
+
+    def __init__(self, scene, object_index):
+        super().__init__(scene, object_index)
+        self._model.geom_margin[:] = 2e-3
+        self._model.geom_gap[:] = 2e-3
+
+    def contacts(self):
+        tip_force, touch, table_force = super().contacts()
+        for contact in self._data.contact:
+            roles = self._at.geom_role[contact.geom]
+            if OBJECT in roles and max(roles) >= 0:
+                touch[max(roles)] = True
+        return tip_force, touch, table_force
+
+
+@breaks("pressing")
 class ForceOfOtherLinksBookedAsTheTables(MujocoWorld):
     def contacts(self):
         tip_force, touch, table_force = super().contacts()

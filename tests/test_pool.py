@@ -135,6 +135,7 @@ class Readings(TestCase):
         for method, reading, message in (
             ("get_state", without_quat, r"get_state\(\) lacks object_quat"),
             ("get_state", changed(speed=0.0), "has the unknown field speed"),
+            ("get_state", lambda world: {**without_quat(world), "object_qaut": 0}, "unknown field object_qaut, expected"),
             ("get_state", changed(joint_pos=np.zeros(3)), r"joint_pos has shape \(3,\) and type float64, expected \(2,\)"),
             ("get_state", lambda world: None, r"get_state\(\) returns None, expected joint_pos, "),
             ("links", lambda world: (np.zeros((1, 3)), *ToyWorld.links(world)[1:]), r"links\(\): pos has shape \(1, 3\)"),
@@ -142,6 +143,7 @@ class Readings(TestCase):
             ("contacts", contacts(force, touch.astype(float), force[0]), "tip_touch has .* float64, expected .* bool"),
             ("contacts", contacts(force[0], touch, force[0]), "tip_force has shape"),
             ("contacts", lambda world: [(7, np.zeros(3))], "a contact has the owner 7, expected TABLE"),
+            ("contacts", lambda world: [(0, np.zeros(2))], r"the force of a contact has shape \(2,\), expected \(3,\)"),
             ("health", lambda world, state: (0.0, False), "nonfinite has .* float64, expected .* bool"),
         ):  # fmt: skip
             with (

@@ -22,13 +22,15 @@ _PLACES = {"object": (0.15, 0.04), "table": (0.0, 0.0), "shelf": (-0.15, 0.05)}
 """What the foot presses on -> position of the slide there, and height of the surface [m]."""
 _FOOT = 0.02  # m from the frame of the foot down to its sole
 _DEPTH = 0.01  # m that the target is below the surface: 10 N
+_GAP = 0.001  # m between a foot that does not touch and the object
 _FRICTIONS = ((0.4, 0.7, 0.9), (0.6, 0.3, 0.5))  # each of the three is once the largest of a pair
 _DRAG = 0.01  # m/s
 _PUSH = 0.2  # m/s
 
 
 def pressing(bench: Bench) -> Measured:
-    """Press on an object on the table with a thumb, an index finger and another link; only that one must be reported.
+    """Press on an object on the table with a thumb, an index finger and another link; only that one must be reported,
+    and none from 1 mm above the object.
 
     The drive presses with kp (q - target), and the table carries that and the object's weight.
     """
@@ -36,9 +38,15 @@ def pressing(bench: Bench) -> Measured:
     for role in ("thumb", "index", "other link"):
         scene = _scene(bench, presser(**{role: ("foot",)} if role != "other link" else {}))
         start = _on(scene, ["object"])
+        press_joint = scene.robot.joint_names.index("press")
+        raised = start.joint_pos.clone()
+        raised[:, press_joint] += _GAP
+        above = replace(start, joint_pos=raised, joint_target=raised)
         with bench.other(scene) as worlds:
             end = worlds.advance(start, SETTLE)
             contacts = worlds.contacts()
+            worlds.advance(above, SETTLE)
+            apart = worlds.contacts()
         press = _press(scene, end)
         tips = list(scene.robot.fingertip_names)
         pressing = torch.tensor([tip == role for tip in tips])
@@ -51,6 +59,7 @@ def pressing(bench: Bench) -> Measured:
         errors[f"{role}: force of the table"] = contacts.table_force[0, 2] / carried - 1.0
         wrong = (contacts.tip_touch[0] != pressing).float()
         errors[f"{role}: fingers wrong about a touch"] = zip(tips, wrong)
+        errors[f"{role}: fingers that touch from afar"] = zip(tips, apart.tip_touch[0].float())
     return errors
 
 

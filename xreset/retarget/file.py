@@ -94,8 +94,8 @@ class Retargeted(ObjectMotions):
 
     # What files of earlier versions do not have
     contact_error: FrameDistances | None = None
-    """[F] mean distance of the robot's links that follow touching keypoints from the points of the object's surface
-    that these touch [m], from the links' origins; infinite where none touches."""
+    """[F] mean distance between the points of the object that keypoints touch and the surfaces of the links that follow
+    these [m]; infinite where none touches."""
     object_depth: FrameDistances | None = None
     """[F] largest depth of the hand in the object's collision pieces [m], 0 outside them; infinite where not
     annotated."""

@@ -25,11 +25,11 @@ from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track_each
 from xreset.retarget.file import Retargeted
-from xreset.retarget.hand.clearance import Objects, object_depth
+from xreset.retarget.hand.clearance import Objects, contact_distance, object_depth
 from xreset.retarget.hand.config import HandWeights
 from xreset.retarget.hand.model import HandModel, HandState, HandTargets
 from xreset.retarget.hand.solve import retarget_hand
-from xreset.retarget.validity import REASONS, Thresholds, classify
+from xreset.retarget.validity import REASONS, Thresholds, classify, too_deep
 from xreset.spec import ObjectSpec, RobotSpec, objects_named
 
 _SEQUENCES_PER_BATCH = 24
@@ -89,6 +89,7 @@ def follow(
 
     links = arm.kinematics.link_poses(torch.as_tensor(joint_pos), robot.tracked_links)
     contact_error, object_depth = hands.measures(arm, joint_pos)
+    reason = too_deep(reason, object_depth, _THRESHOLDS)
     contact = np.asarray(hands.touching.any(axis=1))
     goal_pos, goal_quat = demos.goal_pose
     return Retargeted(
@@ -209,8 +210,9 @@ class HandMotions:
             joint_pos: [F, J] its joints.
 
         Returns:
-            Mean distance of the links that follow touching keypoints from the points that these touch [F], infinite
-            where none touches; largest depth of the hand in the object [F], infinite where no hand is annotated [m].
+            Mean distance between the points that keypoints touch and the surfaces of the links that follow them [F],
+            infinite where none touches; largest depth of the hand in the object [F], infinite where no hand is
+            annotated [m].
         """
         contact_error, depth = np.full((2, len(joint_pos)), np.inf)
         model = self.model
@@ -234,10 +236,11 @@ class HandMotions:
                 object_index=index[rows].to(model.device),
                 fields=fields,
             )
-            depth[rows] = object_depth(model, model.bodies(state), objects).cpu().numpy()
+            bodies = model.bodies(state)
+            depth[rows] = object_depth(model, bodies, objects).cpu().numpy()
             touching = self.touching[rows][:, model.keypoint_indices]
-            touched = self._contact_points[rows][:, model.keypoint_indices]
-            gap = np.linalg.norm(model.keypoints(state).cpu().numpy() - touched, axis=-1)
+            touched = torch.as_tensor(self._contact_points[rows][:, model.keypoint_indices])
+            gap = contact_distance(model, bodies, touched.to(model.device)).cpu().numpy()
             some = touching.any(axis=1)
             contact_error[rows[some]] = gap[some].mean(axis=1, where=touching[some])
         return contact_error, depth

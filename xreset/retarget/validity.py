@@ -7,6 +7,7 @@ reason, the first that applies.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,9 +23,10 @@ REASONS = (
     "arm jump",
     "table collision",
     "self collision",
+    "object collision",
 )
 """Reasons why a frame is invalid, in the order of precedence. ``joint limit``: the wrist misses its target, and an arm
-joint is at its limit."""
+joint is at its limit. ``object collision``: see :func:`too_deep`."""
 
 
 @frozen
@@ -43,6 +45,8 @@ class Thresholds:
     """Depth of the robot's shapes in the table [m]."""
     self_depth: float = 0.003
     """Depth of the robot's shapes in one another [m]."""
+    object_depth: float = 0.002
+    """Depth of the hand in the object [m]. Physics pushes them apart, with a jump of the object."""
 
 
 @frozen
@@ -82,5 +86,21 @@ def classify(measures: Measures, thresholds: Thresholds) -> Tensor:
         "table collision": ~(measures.table_clearance >= -thresholds.table_depth),
         "self collision": ~(measures.self_clearance >= -thresholds.self_depth),
     }
+    never = torch.zeros_like(measures.annotated)
     # argmax returns the first reason that applies, and 0 (valid) if none does
-    return torch.stack([applies[reason] for reason in REASONS]).long().argmax(dim=0)
+    return torch.stack([applies.get(reason, never) for reason in REASONS]).long().argmax(dim=0)
+
+
+def too_deep(reason: np.ndarray, object_depth: np.ndarray, thresholds: Thresholds) -> np.ndarray:
+    """Add the reason ``object collision`` to frames that are valid else.
+
+    Args:
+        reason: [F] index into :data:`REASONS`.
+        object_depth: [F] largest depth of the hand in the object [m]; infinite where it is not known.
+        thresholds: limits of a valid frame.
+
+    Returns:
+        [F] index into :data:`REASONS`.
+    """
+    deep = ~(object_depth <= thresholds.object_depth)
+    return np.where((reason == 0) & deep, REASONS.index("object collision"), reason)

@@ -19,6 +19,7 @@ REASON_COLORS: dict[str, Color] = {
     "arm jump": (0.90, 0.75, 0.05),
     "table collision": (0.86, 0.13, 0.13),
     "self collision": (0.95, 0.35, 0.60),
+    "object collision": (0.85, 0.50, 0.25),
 }
 """Reason -> color that is mixed into the robot's in the frames that it makes invalid."""
 

@@ -118,6 +118,33 @@ def object_depth(model: HandModel, bodies: PointJacobian, objects: Objects) -> T
     return depth
 
 
+def contact_distance(model: HandModel, bodies: PointJacobian, points: Tensor) -> Tensor:
+    """Return the distances between the hand and points that its keypoints should touch.
+
+    Args:
+        model: the hand.
+        bodies: its B configurations.
+        points: [B, P, 3] a point for each mapped keypoint.
+
+    Returns:
+        [B, P] distance of the surface of the keypoint's link, with the links fixed to it, from the point [m], on either
+        side of the surface. Of the link's origin where the link has no shapes.
+    """
+    origins = bodies.pos[:, model.keypoint_body]
+    distance = (points - origins).norm(dim=-1)
+    for keypoint, links in enumerate(model.keypoint_groups):
+        if not links:
+            continue
+        gaps = []
+        for link in links:
+            body = model.group_body[link]
+            local = matvec(bodies.rot[:, body].mT, points[:, keypoint] - bodies.pos[:, body])
+            index = torch.full((len(local),), link, device=local.device)
+            gaps.append(model.balls.fields.signed_distance(local, index)[0])
+        distance[:, keypoint] = torch.stack(gaps).amin(dim=0).abs()
+    return distance
+
+
 def _at_object(
     model: HandModel,
     bodies: PointJacobian,

@@ -135,6 +135,13 @@ class HandModel:
         """[P] index among the bodies of each keypoint's link."""
         self.group_body = self._body_indices(self.balls.links)
         """[G] index among the bodies of each link with balls."""
+        self.keypoint_groups = [self._links_with(link) for link in self.keypoint_links]
+        """Links with balls that move together with each keypoint's link, as indices of ``balls.links`` (length P)."""
+
+    def _links_with(self, link: str) -> list[int]:
+        """Return the links with balls of a link's rigid body, as indices of ``balls.links``."""
+        body = self.kinematics.tree.moving_ancestor
+        return [i for i, other in enumerate(self.balls.links) if body(other) == body(link)]
 
     def _body_indices(self, links: Sequence[str]) -> Tensor:
         indices = [self._bodies.index(link) for link in links]

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from xreset.files.checks import frozen
 from xreset.geometry.shapes import transformed
 from xreset.geometry.surface import Surface
+from xreset.objects.rest import resting_faces
 from xreset.spec import TableSpec
 
 MOVED = 0.05
@@ -71,6 +72,10 @@ _SUPPORT = 0.015
 """Vertices this close above the lowest one support an object [m]: poses are tilted by some degrees."""
 _OVERHANG = 0.010
 """An object whose center of mass is farther outside of its support than this would fall over [m]."""
+_NEXT_FACE = np.cos(np.radians(30.0))
+"""Cosine of the largest angle to the face that it would rest on."""
+_THICK = 0.020
+"""Objects whose center of mass rests lower than this, such as scissors, may lean on anything [m]."""
 _BEHIND = -0.10
 """Smallest distance along y from the object to the place where the hand is first seen [m]: 0.05 in DexYCB."""
 
@@ -145,6 +150,15 @@ class Recording:
         return self.surface.signed_distance(local)
 
     @cached_property
+    def nearest(self) -> float:
+        """Least distance of a keypoint from the object's surface, or from its origin if its mesh is unknown, in any
+        frame with a hand [m]."""
+        local = self.in_object[self.seen]
+        if self.surface is None:
+            return float(np.linalg.norm(local, axis=2).min())
+        return float(self.surface.signed_distance(local).min())
+
+    @cached_property
     def matrix(self) -> np.ndarray:
         """[F, 3, 3] rotation matrices of the object."""
         return self.turn.as_matrix()
@@ -203,6 +217,21 @@ class Recording:
         return bool((sides[:, :2] @ com + sides[:, 2]).max() > _OVERHANG)
 
     @cached_property
+    def lean(self) -> float:
+        """How much higher the center of mass is at the start than where the object would rest on its next face, with
+        the same side up [m]; 0 if the mesh is unknown or flat, or no face is near."""
+        if self.surface is None:
+            return 0.0
+        obj = self.surface.obj
+        up = self.matrix[0, 2]
+        tops, heights = resting_faces(obj)
+        near = tops @ up > _NEXT_FACE
+        rests = heights[near].min(initial=np.inf)
+        if not _THICK < rests < np.inf:
+            return 0.0
+        return float((obj.com @ up) - (obj.vertices @ up).min() - rests)
+
+    @cached_property
     def contradictions(self) -> list[Contradiction]:
         """Contradictions between the places of hand, object and table."""
         return [*_of_start(self), *_of_hand(self)]
@@ -248,6 +277,10 @@ def _of_hand(r: Recording) -> Iterator[Contradiction]:
     distance = r.distances
     if len(distance):
         yield from _of_grip(distance, known=r.surface is not None)
+    elif not r.moved.any() and r.seen.any() and r.nearest > (_AWAY if r.surface else _ARM):
+        yield Contradiction(
+            f"the hand comes no nearer to the object than {length_text(r.nearest)}", True
+        )
     if (slip := r.slip()) > _SLIP:
         yield Contradiction(
             f"the hand moves past the object at {slip:.1f} times the object's speed", False

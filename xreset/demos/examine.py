@@ -16,6 +16,7 @@ import numpy as np
 from xreset.demos.archive import Demos, demo_objects, levelled
 from xreset.demos.causes import MOVED, Recording, length_text, likeliest_cause, unnoticed_cause
 from xreset.demos.hand import ORDERS, bone_lengths
+from xreset.demos.offset import constant_offset
 from xreset.errors import DemoError
 from xreset.files.checks import frozen
 from xreset.geometry.shapes import turn_of
@@ -38,6 +39,9 @@ _BONE_SPREAD = 0.3
 are above."""
 _CURL = 0.015
 """Fingers that bend this far to the back of the hand, at the median of a sequence, are those of the other hand [m]."""
+_THUMB = -0.01
+"""Least distance of the thumb's tip from the plane of the palm, to the side to which fingers bend, at the median of a
+sequence [m]: 0.022."""
 _SKELETON = (0.69, 0.95)
 """Length of an adult hand's bones together [m]: 0.74 to 0.84."""
 _ALONG = 0.9
@@ -48,6 +52,9 @@ _ADULT = 0.79
 """Mean length of the bones of DexYCB's people [m]."""
 _ONE_PLACE = 0.01
 """A wrist, or the center of a hand, that moves less than this while the object moves stays at one point [m]."""
+_LEANS = 0.009
+"""An object whose center of mass is this much higher than where it would rest leans [m]: at most 0.0082 in those
+sequences of DexYCB in which it is on the table, but one, in which it leans on another object."""
 _SPEED_TIME = 0.1
 """Time over which the hand's speed is measured [s]."""
 _MOVES = 0.05
@@ -67,7 +74,10 @@ _REACH = 0.2
 _COPIES = 0.3
 """Share of frames in motion that repeat the frame before: 0."""
 _FROZEN = 0.3
-"""Longest time for which a hand may stay exactly where it is while its object moves [s]: 0."""
+"""Longest time for which a hand may stay exactly where it is while its object moves, and an object before it jumps [s]:
+0."""
+_GOES_ON = 0.02
+"""Step of an object's position with which it goes on where its tracker had lost it [m]."""
 _NEVER_TURNS = np.radians(0.1)
 """Smallest angle by which an object that moves turns [rad]: some degrees."""
 _SAME_PLACE = 0.02
@@ -207,6 +217,29 @@ def _of_place(r: Recording) -> Iterator[Finding]:
             found="Hand and object do not move together while the object moves.",
             cause=cause,
         )
+    else:
+        yield from _doubts_of_place(r)
+
+
+def _doubts_of_place(r: Recording) -> Iterator[Finding]:
+    """Yield doubts about places that contradict nothing."""
+    if r.lean > _LEANS:
+        yield _doubt(
+            "lean",
+            f"The object leans at the start, its center of mass {length_text(r.lean)} higher than at rest.",
+            "It may lean on something that is not in the scene. Otherwise the table's frame is tilted, or the object's"
+            " orientations are wrong.",
+        )
+    if offset := constant_offset(r):
+        x, y, z = (100 * offset.shift).round().astype(int).tolist()
+        yield _doubt(
+            "offset",
+            f"Thumb and fingers are off the surface of the moving object, or inside of it, by"
+            f" {length_text(offset.miss)} together, but by {length_text(offset.left)} with the hand shifted by"
+            f" ({x}, {y}, {z}) cm in the object's frame.",
+            "The poses may be those of a mesh with another origin or orientation, or the hand's positions are off. Look"
+            " at it with xreset view.",
+        )
 
 
 def _of_hand(r: Recording) -> Iterator[Finding]:
@@ -264,12 +297,15 @@ def _of_hand(r: Recording) -> Iterator[Finding]:
     if centered := _centered_problem(r):
         yield centered
         return
-    curl = _curl(points, r.side)
-    if curl < -_CURL:
+    curl, thumb = _to_palm(points, r.side)
+    if curl < -_CURL or thumb < _THUMB:
+        does = f"its fingers bend {-1e3 * curl:.0f} mm towards"
+        if curl >= -_CURL:
+            does = f"its thumb's tip is {-1e3 * thumb:.0f} mm to"
         yield Finding(
             name="side",
             wrong=True,
-            found=f"As a {r.side} hand its fingers bend {-1e3 * curl:.0f} mm towards the back of the hand.",
+            found=f"As a {r.side} hand {does} the back of the hand.",
             cause="It is the other hand (--side), or the coordinates are left-handed, as Unity's are: negate one axis"
             " of keypoints and poses.",
         )
@@ -326,14 +362,17 @@ def _centered_problem(r: Recording) -> Finding | None:
     return None
 
 
-def _curl(points: np.ndarray, side: str) -> float:
-    """Return how far fingers bend towards the palm, at the median of keypoints [F, 21, 3] [m]."""
+def _to_palm(points: np.ndarray, side: str) -> tuple[float, float]:
+    """Return how far fingers bend towards the palm, and how far the thumb's tip is on that side, at the median of
+    keypoints [F, 21, 3] [m]."""
     palm_normal = np.cross(points[:, 5] - points[:, 0], points[:, 17] - points[:, 0])
     if side == "left":
         palm_normal *= -1
     palm_normal /= np.linalg.norm(palm_normal, axis=1, keepdims=True).clip(1e-9)
     fingers = points[:, [8, 12, 16, 20]] - points[:, [5, 9, 13, 17]]
-    return float(np.median((fingers * palm_normal[:, None]).sum(axis=-1)))
+    curl = np.median((fingers * palm_normal[:, None]).sum(axis=-1))
+    thumb = np.median(((points[:, 4] - points[:, 5]) * palm_normal).sum(axis=-1))
+    return float(curl), float(thumb)
 
 
 def _doubts_of_hand(r: Recording, bones: np.ndarray) -> Iterator[Finding]:
@@ -433,6 +472,13 @@ def _of_motion(r: Recording) -> Iterator[Finding]:
             "Poses that were not seen may be written as numbers. Repair these frames, or leave the sequence out"
             " (xreset demos select --rest).",
         )
+    elif lost := _lost_frame(r.pos, r.fps):
+        yield _doubt(
+            "frozen",
+            f"The object stays exactly where it is for {_FROZEN:g} s or longer, and then jumps, first in frame {lost}.",
+            "The tracker may have lost it: repair these frames, or leave the sequence out (xreset demos select"
+            " --rest).",
+        )
     if r.moved.any() and (r.turn * r.turn[0].inv()).magnitude().max() < _NEVER_TURNS:
         yield _doubt(
             "turn",
@@ -456,6 +502,21 @@ def _returns(path: np.ndarray) -> np.ndarray:
     step = np.linalg.norm(np.diff(path, axis=0), axis=1)
     across = np.linalg.norm(path[2:] - path[:-2], axis=1)
     return np.minimum(step[1:], step[:-1]) - across
+
+
+def _lost_frame(path: np.ndarray, fps: float) -> int:
+    """Return the first frame in which a path [F, 3] goes on with a jump after it did not move at all for a while; 0 if
+    there is none."""
+    step = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    still = 0
+    for frame, length in enumerate(step.tolist(), start=1):
+        if length == 0.0:
+            still += 1
+        elif length > _GOES_ON and still > _FROZEN * fps:
+            return frame
+        else:
+            still = 0
+    return 0
 
 
 def _step(path: np.ndarray, frame: int) -> float:

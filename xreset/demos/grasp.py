@@ -45,8 +45,6 @@ _FACING_THUMB = 0.75  # the same for the thumb
 _IN_LINE = 0.025  # how far a finger's way may differ from that of the middle fingers [m]
 _DEPTH = (0.004, 0.055)  # range of how deep the hand reaches over the object [m]
 _TOUCH = 1e-4  # pieces of an object that are this close are one part [m]
-_RADII = np.full(40, 0.007)  # of the hand's flesh around joints and middles of bones [m]
-_RADII[np.array(TIPS) - 1] = 0.001
 
 
 @frozen
@@ -311,11 +309,11 @@ def _fit_from(solid: Solid, contacts: Contacts, lean: float, side: str) -> tuple
     def residuals(x: np.ndarray) -> np.ndarray:
         """[n, R], each in units of what is tolerable."""
         points = points_of(x)
-        flesh = _flesh(points)
+        flesh = hand.flesh(points)
         terms = (
             ((points[:, tips] - targets) / 0.002).reshape(len(x), -1),
-            np.maximum(_RADII - solid.distance(flesh), 0.0) / 0.003,
-            np.maximum(_RADII + 0.002 - flesh[..., 2], 0.0) / 0.003,
+            np.maximum(hand.FLESH - solid.distance(flesh), 0.0) / 0.003,
+            np.maximum(hand.FLESH + 0.002 - flesh[..., 2], 0.0) / 0.003,
             x[:, 3:6] / 0.2,
             (x[:, 6:] - _POSTURE) / 0.7,
         )
@@ -336,7 +334,7 @@ def _fit_from(solid: Solid, contacts: Contacts, lean: float, side: str) -> tuple
         max_nfev=60,
     )
     points = points_of(fit.x[None])
-    flesh = _flesh(points)
+    flesh = hand.flesh(points)
     grasp = Grasp(
         solid=solid,
         side=side,
@@ -347,9 +345,3 @@ def _fit_from(solid: Solid, contacts: Contacts, lean: float, side: str) -> tuple
         penetration=float(max(0.0, -solid.distance(flesh).min(), -flesh[..., 2].min())),
     )
     return grasp, float(fit.cost)
-
-
-def _flesh(points: np.ndarray) -> np.ndarray:
-    """[n, 40, 3] points that stand for the hand's flesh: joints, and the middles of bones."""
-    middles = (points[:, 1:] + points[:, hand.PARENTS]) / 2
-    return np.concatenate((points[:, 1:], middles), axis=1)

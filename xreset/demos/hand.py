@@ -26,6 +26,9 @@ middle, little, ring, thumb, base to end), then the tips of thumb, index, middle
 
 PARENTS = np.array([0, 1, 2, 3, 0, 5, 6, 7, 0, 9, 10, 11, 0, 13, 14, 15, 0, 17, 18, 19])
 """[20] the keypoint before each of the keypoints 1 to 20: the other end of its bone."""
+FLESH = np.full(40, 0.007)
+FLESH[[3, 7, 11, 15, 19]] = 0.001
+"""[40] thickness of the flesh around the points of :func:`flesh`, where fingertips are on the skin [m]."""
 FINGER_BASES = np.array([[-90, -4, 22], [-95, -2, 0], [-87, -4, -21], [-77, -9, -40]]) * 1e-3
 """[4, 3] the knuckles of index, middle, ring and little finger [m]."""
 FINGER_LENGTHS = np.array([[38, 23, 23], [42, 26, 24], [38, 25, 24], [29, 19, 21]]) * 1e-3
@@ -106,3 +109,11 @@ def hand_axes(direction: np.ndarray, palm: np.ndarray, side: str) -> np.ndarray:
 def bone_lengths(points: np.ndarray) -> np.ndarray:
     """[F, 20] lengths of the bones between keypoints [F, 21, 3] [m]."""
     return np.linalg.norm(points[:, 1:] - points[:, PARENTS], axis=-1)
+
+
+def flesh(points: np.ndarray) -> np.ndarray:
+    """[..., 40, 3] points that stand for the hand's flesh: the keypoints 1 to 20 of [..., 21, 3], and the middles of
+    their bones."""
+    joints = points[..., 1:, :]
+    middles = (joints + points[..., PARENTS, :]) / 2
+    return np.concatenate((joints, middles), axis=-2)

@@ -28,8 +28,9 @@ def rest_height(obj: ObjectSpec, quat: np.ndarray) -> np.ndarray | float:
     return float(height) if np.ndim(height) == 0 else height
 
 
-def resting_orientation(obj: ObjectSpec, up: np.ndarray) -> np.ndarray:
-    """[4] orientation of a stable pose on a plane: the one in which the mesh direction ``up`` [3] points up the most.
+def resting_faces(obj: ObjectSpec) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mesh directions [N, 3] that point up where an object rests on a plane, and the heights [N] of its
+    center of mass there [m].
 
     An object rests on a face of its convex hull if its center of mass projects into that face.
     """
@@ -41,7 +42,15 @@ def resting_orientation(obj: ObjectSpec, up: np.ndarray) -> np.ndarray:
     # barycentric coordinates of the point below the center of mass, in each face
     coordinates = points_to_barycentric(corners, np.broadcast_to(obj.com, normals.shape))
     stable = (coordinates >= -1e-9).all(axis=1)
-    top = -normals[stable][np.argmin(normals[stable] @ up)]
+    heights = -(normals @ obj.com + convex.equations[:, 3])
+    return -normals[stable], heights[stable]
+
+
+def resting_orientation(obj: ObjectSpec, up: np.ndarray) -> np.ndarray:
+    """[4] orientation of a stable pose on a plane: the one in which the mesh direction ``up`` [3] points up the
+    most."""
+    tops, _ = resting_faces(obj)
+    top = tops[np.argmax(tops @ up)]
     axis = np.cross(top, (0.0, 0.0, 1.0))
     sine = np.linalg.norm(axis)
     if sine < 1e-12:  # no turn, or half a turn about any horizontal axis

@@ -38,7 +38,7 @@ from xreset.files.checks import (
 )
 from xreset.files.records import POSITION, UNIT_TOLERANCE, Field, read_npz, write_npz
 from xreset.files.storage import check_schema, read_json, write_json
-from xreset.files.text import Brief
+from xreset.files.text import Brief, shown
 
 SCHEMA = "xreset-eval/2"
 EARLIER_SCHEMA = "xreset-eval/1"
@@ -415,6 +415,7 @@ def read_result(path: Path) -> EvalResult:
     table = _with_nan(pd.DataFrame({name: every.get(name) for name in names}))
     if not (table["property"] == "").any():
         raise FileFormatError(f"{path} has no unchanged episode. Evaluate again.")
+    _check_same_episodes(path, table)
     result = from_dict(EvalResult, data | {"episodes": table}, str(path), version)
     if path.stem != result.engine:
         raise FileFormatError(
@@ -422,6 +423,18 @@ def read_result(path: Path) -> EvalResult:
             "out of the folder."
         )
     return result
+
+
+def _check_same_episodes(path: Path, table: Table) -> None:
+    """Raise ``FileFormatError`` if a condition was not played with the same episodes as no condition."""
+    unchanged = table[table["property"] == ""]
+    expected = unchanged[["sequence", "repetition"]].to_numpy().tolist()
+    for condition, own in table.groupby(["property", "value"], dropna=False):
+        if own[["sequence", "repetition"]].to_numpy().tolist() != expected:
+            raise FileFormatError(
+                f"{path}: the change {shown(condition)} was not played with the {len(expected)} episodes in which "
+                "nothing was changed. Evaluate again."
+            )
 
 
 @cache
@@ -506,8 +519,8 @@ def recorded(episodes: Table, engine: str, traces: Sequence[Trace]) -> Table:
                 f"{engine}.trace.npz has a trace of demonstration {trace.sequence}, but no episode of it. "
                 "Evaluate again."
             )
-    shown = own.loc[[trace.sequence for trace in traces]]
-    return shown.assign(trace=list(traces)).reset_index(drop=True)
+    traced = own.loc[[trace.sequence for trace in traces]]
+    return traced.assign(trace=list(traces)).reset_index(drop=True)
 
 
 def _trace_problem(arrays: dict[str, np.ndarray]) -> str | None:

@@ -71,6 +71,8 @@ class Controller:
                 content, options, providers=["CPUExecutionProvider"]
             )
             self.metadata: dict[str, str] = self._session.get_modelmeta().custom_metadata_map
+            inputs = {value.name: value.shape for value in self._session.get_inputs()}
+            self.outputs = [output.name for output in self._session.get_outputs()]
         except Exception as error:
             raise LiveError(
                 f"{source} cannot be read as ONNX: {error}. Export it again."
@@ -83,8 +85,7 @@ class Controller:
         self.speed = joint_values(self.contract, "velocity", np.inf)
         self.links: Array | None = None
         self._has_begun = False
-        self.shapes = self._checked_shapes(source)
-        self.outputs = [output.name for output in self._session.get_outputs()]
+        self.shapes = self._checked_shapes(inputs, source)
         try:
             self._try_step()
         except Exception as error:  # whatever a damaged graph leads to
@@ -92,8 +93,9 @@ class Controller:
                 f"{source} does not fit its contract ({type(error).__name__}: {error}). Export the policy again."
             ) from error
 
-    def _checked_shapes(self, source: str) -> dict[str, tuple[int, ...]]:
-        """Return the shapes of the graph's inputs; ``LiveError`` if there is an input that nobody gives."""
+    def _checked_shapes(self, inputs: dict[str, Any], source: str) -> dict[str, tuple[int, ...]]:
+        """Return the shapes of the graph's inputs for each robot; ``LiveError`` if there is an input that nobody
+        gives."""
         joints = len(self.contract["joints"])
         tips = len(self.contract.get("fingertips", ()))
         known: dict[str, tuple[Any, ...]] = {
@@ -110,18 +112,18 @@ class Controller:
             _MEMORY: (None,),
         }
         shapes = {}
-        for value in self._session.get_inputs():
-            shape = tuple(value.shape[1:])
-            expected = known.get(value.name, ())
+        for name, stated in inputs.items():
+            shape = tuple(stated[1:])
+            expected = known.get(name, ())
             fits = len(shape) == len(expected) > 0
             for found, wanted in zip(shape, expected, strict=False):
                 fits = fits and isinstance(found, int) and wanted in (None, found)
             if not fits:
                 raise LiveError(
-                    f"{source} has the input {value.name[:60]!r} {list(shape)} for each robot, expected "
+                    f"{source} has the input {name[:60]!r} {list(shape)} for each robot, expected "
                     f"{list(expected) or ', '.join(known)}. Export it again."
                 )
-            shapes[value.name] = shape
+            shapes[name] = shape
         return shapes
 
     def begin(

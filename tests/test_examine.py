@@ -154,7 +154,13 @@ class Wrong(InFolder):
                 found = examine(replace(demos, **changed), known)
                 self.assertRegex(" ".join(map(str, found)), words)
                 self.assertEqual(any(each.wrong for each in found), wrong, found)
-        self.assertIn("comes no nearer", " ".join(map(str, examine(replace(demos, **still)))))
+        backwards = {
+            name: getattr(demos, name)[::-1]
+            for name in ("object_pos", "object_quat_wxyz", "hand_keypoints", "hand_valid")
+        }
+        for words, changed in (("comes no nearer", still), ("be played backwards", backwards)):
+            found = examine(replace(demos, **changed))
+            self.assertIn(words, " ".join(map(str, found)), "without a mesh")
 
     def test_commands_say_the_same_and_one_option_overrules(self):
         demos = synthesize(["soup"], 1, seed=1, fps=10)

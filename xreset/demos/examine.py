@@ -80,6 +80,8 @@ _GOES_ON = 0.02
 """Step of an object's position with which it goes on where its tracker had lost it [m]."""
 _NEVER_TURNS = np.radians(0.1)
 """Smallest angle by which an object that moves turns [rad]: some degrees."""
+_LOWERED = 0.05
+"""How far an object's origin may get below its start, if its mesh is unknown [m]: 0.011."""
 _SAME_PLACE = 0.02
 """Distance from the start within which the goal counts as reached [m] (:data:`xreset.eval.metrics.GOAL_DISTANCE`)."""
 _SAME_TURN = np.radians(15.0)
@@ -455,6 +457,14 @@ def _of_motion(r: Recording) -> Iterator[Finding]:
             "goal",
             "It begins with the object at its goal already.",
             "A policy that leaves the object untouched solves such a demonstration.",
+        )
+    below = float(r.pos[0, 2] - r.pos[:, 2].min())
+    if r.surface is None and below > _LOWERED:
+        yield _doubt(
+            "lowered",
+            f"The object's origin gets {length_text(below)} below its place at the start, where the object should stand"
+            " on the table.",
+            "The recording may begin after the lift, or be played backwards. With meshes (--meshes) more can be told.",
         )
     if len(r.pos) < 3:
         return

@@ -177,6 +177,11 @@ def import_robot(
                 f"the robot is not written, because it would fail its check: {errors[0].topic}: {errors[0].message}"
                 f"{more}"
             )
+    # the folder has its name only now
+    findings = [
+        replace(finding, message=finding.message.replace(str(work), str(out)))
+        for finding in findings
+    ]
     return Imported(
         folder=out, guessed=tuple(notes), to_say=tuple(to_say), findings=tuple(findings)
     )

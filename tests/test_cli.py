@@ -280,18 +280,16 @@ class UsageTest(TestCase):
     def test_a_missing_engine_is_named_with_the_command_that_installs_it(self):
         code = (
             "import sys; sys.modules['pybullet'] = None; from xreset.backends import pybullet as ours\n"
-            "from xreset.cli import main; ours._NEWEST_PYTHON = {newest}; main(['engines', 'list'])"
+            "from xreset.cli import main\n"
+            "for ours._NEWEST_PYTHON in ((3, 99), (3, 9)): main(['engines', 'list'])"
         )
         here = ".".join(map(str, sys.version_info[:2]))
         without_wheel = (
             rf"no: PyBullet has no wheel for Python {here}\. Use Python 3\.9, or another"
         )
-        for newest, words in (
-            ((3, 99), r"no: .*pip install 'xreset\[pybullet\]'"),
-            ((3, 9), without_wheel),
-        ):
-            with self.subTest(newest):
-                self.assertRegex(output_of(code.format(newest=newest)), f"pybullet .* {words}")
+        said = output_of(code)
+        for words in (r"no: .*pip install 'xreset\[pybullet\]'", without_wheel):
+            self.assertRegex(said, f"pybullet .* {words}")
 
     def test_naming_engines_replaces_the_default(self):
         for given, expected in (

@@ -143,8 +143,10 @@ class ScriptsTest(WithBank):
 
     def test_two_nodes_train_together_stop_in_time_and_go_on(self):
         out = self.folder / "nodes"
-        options = f"--resets {self.bank} --engine mujoco --device cpu --num-envs 4 --iterations 40 {SMALL}"
-        job = self.start("train_many.slurm", out, *options.split())
+        options = (
+            f"--resets {self.bank} --engine mujoco --device cpu --num-envs 4 {SMALL} --iterations"
+        )
+        job = self.start("train_many.slurm", out, *options.split(), 40)
         while len(checkpoints(out)) < 2 and job.poll() is None:
             time.sleep(0.05)
         job.send_signal(signal.SIGTERM)
@@ -154,15 +156,15 @@ class ScriptsTest(WithBank):
         done = int(checkpoints(out)[-1].stem)
         self.assertLess(done, 40)
         self.requeued.unlink()
-        job = self.start("train_many.slurm", out, *options.split())
+        job = self.start("train_many.slurm", out, *options.split(), done + 1)
         said = job.communicate()[0]
         self.assertEqual(job.returncode, 0, said)
         self.assertIn(f"continuing after iteration {done}\n", said)
-        self.assertEqual(checkpoints(out)[-1].name, "000040.pt")
+        self.assertEqual(checkpoints(out)[-1].name, f"{done + 1:06d}.pt")
         self.assertFalse(self.requeued.exists())
         content = read_checkpoint(checkpoints(out)[-1])
         self.assertEqual(
-            content.env_steps, 40 * 2 * 8 * 4
+            content.env_steps, (done + 1) * 2 * 8 * 4
         )  # iterations x processes x horizon x worlds
 
     def test_a_training_that_was_stopped_is_queued_again_and_a_failed_one_is_not(self):

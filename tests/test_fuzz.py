@@ -18,7 +18,7 @@ from tests.fuzzing import outcome, readers
 from tests.fuzzing_commands import outcome_of_command
 from xreset.cli._options import checked
 
-EXAMPLES = 40
+EXAMPLES = 24
 
 
 class EveryReader(TestCase):

@@ -26,7 +26,6 @@ from xreset.spec import (
     ObjectSpec,
     RobotSpec,
     SceneSpec,
-    check_joints,
     objects_named,
 )
 
@@ -45,7 +44,6 @@ def stable_states(
     progress: Progress,
 ) -> ResetBank:
     """Return the bank of the states that all engines accept; see :func:`xreset.resets.verbs.make_bank`."""
-    check_joints("The motion is", retargeted, robot)
     owner = retargeted.sequence_of_frame
     used = objects_named(objects, retargeted.object_name[owner[retargeted.valid]])
     if not retargeted.valid.any():

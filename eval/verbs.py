@@ -258,9 +258,9 @@ def make_report(
     from xreset.eval.report import clips, make
     from xreset.eval.report.read import read_trainings
 
-    trainings = read_trainings(
-        [str(run) for run in ([runs] if isinstance(runs, str | Path) else runs)]
-    )
+    if isinstance(runs, str | Path):
+        runs = [runs]
+    trainings = read_trainings(runs)
     if out is None:
         out = trainings[0].folder / "report" if len(trainings) == 1 else "runs/report"
     films = {"robot": str(robot) if robot else None, "meshes": Path(meshes) if meshes else None}

@@ -35,7 +35,7 @@ from xreset.resets.bank import starts_and_goals
 from xreset.resets.distribution import ResetDistribution
 from xreset.resets.transfer import _is_held
 from xreset.retarget.file import read_retargeted
-from xreset.robot_tools.judge import judge
+from xreset.robot_tools.verbs import judge
 from xreset.task.config import ResetConfig
 
 OBJECTS = objects()[:2]

@@ -56,7 +56,7 @@ from xreset.retarget.file import write_retargeted as write_retargeted
 from xreset.retarget.pipeline import RetargetConfig as RetargetConfig
 from xreset.retarget.verbs import retarget_demos as retarget_demos
 from xreset.robot_tools.judge import Judgement as Judgement
-from xreset.robot_tools.judge import judge as judge
+from xreset.robot_tools.verbs import judge as judge
 from xreset.spec import ObjectSpec as ObjectSpec
 from xreset.spec import RobotSpec as RobotSpec
 from xreset.spec import SceneSpec as SceneSpec

@@ -198,7 +198,7 @@ def _scalars(file: Path) -> Iterator[tuple[str, int, float]]:
 # Runs ----------------------------------------------------------------------------------------------------------------
 
 
-def read_trainings(runs: Sequence[str]) -> tuple[Training, ...]:
+def read_trainings(runs: Sequence[str | Path]) -> tuple[Training, ...]:
     """Read the runs of a report.
 
     Args:
@@ -214,7 +214,7 @@ def read_trainings(runs: Sequence[str]) -> tuple[Training, ...]:
             "there is nothing to report. Give run folders, or folders that xreset eval wrote results into."
         )
     folders: dict[str, Path] = {}
-    for text in runs:
+    for text in map(str, runs):
         label = ""
         name = text
         if "=" in text and not Path(text).is_dir():  # a folder's name may contain an equals sign

@@ -2,36 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.text import Text
 
 from xreset.cli._common import (
-    AllEngines,
-    Device,
     Meshes,
-    Robot,
     RobotName,
-    Source,
     this_command,
     usable_engines,
-    write_measured,
 )
 from xreset.cli._options import Output, Png
 from xreset.cli._terminal import Progress, console, show_table
+from xreset.cli._verbs import verb
 from xreset.errors import RobotError
-from xreset.files.checks import PositiveInt
 from xreset.physics.plugins import robot_names
-from xreset.resets.config import JUDGE_SQUEEZE, SqueezeConfig
 from xreset.retarget.accounts import described
-from xreset.robot_tools import placement
+from xreset.robot_tools import placement, verbs
 from xreset.robot_tools.placement import PlaceConfig
 
 if TYPE_CHECKING:
     from xreset.robot_tools.check import Finding
+    from xreset.robot_tools.judge import Judgement
 
 
 _PER_OBJECT = 2
@@ -184,49 +179,8 @@ def place(
         console.print(f"wrote {file}")
 
 
-def judge(
-    bank: Source,
-    /,
-    *,
-    robot: Robot = None,
-    meshes: Meshes = None,
-    engine: AllEngines = (),
-    states: PositiveInt = 8,
-    squeeze: SqueezeConfig = JUDGE_SQUEEZE,
-    num_envs: PositiveInt = 32,
-    device: Device = "cpu",
-    picture: Png | None = None,
-    json: Output | None = None,
-) -> None:
-    """Judge a robot without training: which objects it holds for a second at full gravity, lifts and turns.
-
-    Accepted states in which the object is in the air start a fixed program: the fingers press, the object gets its
-    weight for a second, the arm raises the hand by 10 cm, and turns it by 45 degrees about the fingers' direction. The
-    object must stay within 3 cm and 45 degrees of where it was in the hand.
-
-    Also counts the demonstrations that the robot can follow with a grasp that stays rigid: the hand gets to the object
-    clear of the table, and the arm brings it to the goal. For a jaw, grasps are planned on the object's shape; other
-    hands use the grasps of the bank.
-
-    Args:
-        bank: File made by `xreset resets`.
-        states: Number of states of each object: those that grasp most tightly.
-        squeeze: How hard fingers press, and which fingers.
-        num_envs: Worlds at a time.
-        picture: PNG to write: the best state of each object at the start and after each phase.
-        json: File to write the counts to.
-    """
-    from xreset.pictures import render
-    from xreset.resets import inputs
-    from xreset.robot_tools import judge as judging
-
-    loaded = inputs.load_inputs(bank, robot=robot, meshes=meshes, accept=("bank",))
-    names = list(dict.fromkeys(engine)) or usable_engines()
-    with Progress() as bar:
-        found = judging.judge(
-            loaded.bank, loaded.robot, loaded.objects, names, states=states, squeeze=squeeze, num_envs=num_envs,
-            device=device, progress=bar.count(f"states in {', '.join(names)}"),
-        )  # fmt: skip
+def _show_judged(found: Judgement, options: Mapping[str, Any]) -> None:
+    names = list(dict.fromkeys(row.engine for row in found.rows))
     table = [("object", "states", *names)]
     for label in dict.fromkeys(row.object_name for row in found.rows):
         mine = [row for row in found.rows if row.object_name == label]
@@ -254,14 +208,23 @@ def judge(
     console.print(
         f"at least half of the states hold, lift and turn these objects in every engine: {', '.join(found.kept) or '-'}"
     )
-    write_measured(json, found.as_dict())
-    if picture is not None:
-        render.write_png(picture, judging.judge_picture(found, loaded.robot, loaded.objects))
-        console.print(f"wrote {picture}")
+    if options["picture"]:
+        console.print(f"wrote {options['picture']}")
+
+
+def _in_all_engines(arguments: dict[str, Any]) -> None:
+    """Let a command without engines use all that can be used here."""
+    arguments["engines"] = arguments.get("engines") or usable_engines()
 
 
 def _digits(values: Iterable[float]) -> str:
     return ", ".join(f"{value:.4f}" for value in values)
 
 
-COMMAND = {"": list_robots, "check": check, "import": import_, "place": place, "judge": judge}
+COMMAND = {
+    "": list_robots,
+    "check": check,
+    "import": import_,
+    "place": place,
+    "judge": verb(verbs.judge, _show_judged, prepare=_in_all_engines, engines=()),
+}

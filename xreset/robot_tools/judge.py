@@ -13,18 +13,16 @@ Shape letters: M states, N worlds, J joints, n arm joints, P phases.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from collections.abc import Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from xreset.errors import RobotError
-from xreset.files.checks import PositiveInt, frozen, obeys_rules
-from xreset.files.progress import unseen
+from xreset.files.checks import frozen
+from xreset.files.progress import Progress
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import (
     matrix_to_quat,
@@ -36,12 +34,12 @@ from xreset.geometry.rotations import (
 from xreset.physics import Backend, State
 from xreset.pictures.render import Camera, Renderer, add_caption
 from xreset.resets.bank import ResetBank, check_states
-from xreset.resets.config import JUDGE_SQUEEZE, SqueezeConfig
+from xreset.resets.config import SqueezeConfig
 from xreset.resets.fingers import Fingers, fingers_of, squeeze_targets
 from xreset.resets.grasps import losses
 from xreset.resets.probe import probe
 from xreset.resets.programs import palm_path
-from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, checked_objects, objects_named
+from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, objects_named
 
 PHASES = ("hold", "lift", "turn")
 LIFT = 0.01
@@ -102,7 +100,7 @@ class Reached:
 
 @frozen
 class Judgement:
-    """Result of :func:`judge`."""
+    """Result of :func:`xreset.robot_tools.verbs.judge`."""
 
     robot: str
     rows: tuple[Judged, ...]
@@ -121,52 +119,21 @@ class Judgement:
         lost = {row.object_name for row in self.rows if row.turn < row.tried / 2}
         return [name for name in self.shots if name not in lost]
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return what a JSON file holds."""
-        return {
-            "robot": self.robot,
-            "rows": [asdict(row) for row in self.rows],
-            "without_lifted_grasp": list(self.without),
-            "reach": [asdict(row) for row in self.reach],
-            "kept_in_every_engine": self.kept,
-        }
 
-
-@obeys_rules
-def judge(
+def try_grasps(
     bank: ResetBank,
     robot: RobotSpec,
     objects: Sequence[ObjectSpec],
-    engines: Sequence[str] = ("mujoco",),
+    engines: Sequence[str],
     *,
-    states: int = 8,
-    squeeze: SqueezeConfig = JUDGE_SQUEEZE,
-    num_envs: PositiveInt = 32,
-    device: str = "cpu",
-    progress: Callable[[float, int], None] = unseen,
+    states: int,
+    squeeze: SqueezeConfig,
+    num_envs: int,
+    device: str,
+    progress: Progress,
 ) -> Judgement:
-    """Judge which objects a robot holds, lifts and turns.
-
-    Args:
-        bank: states that physics accepted.
-        robot: the bank's robot.
-        objects: the bank's objects.
-        engines: names of engines.
-        states: number of states of each object: those in the air in which the thumb and another finger are nearest to
-            the object, as many from each demonstration as possible. States in grasps of other demonstrations are left
-            out: they were chosen because they hold.
-        squeeze: how hard fingers press, and which.
-        num_envs: worlds at a time.
-        device: where engines run that can use it; the others run on the CPU.
-        progress: called with (states done, states in all); then again with demonstrations.
-
-    Raises:
-        RobotError: the bank has no lifted grasp of any object.
-        DemoError: a lifted object of the bank is not among ``objects``.
-        FileFormatError: the bank's states are for a robot with other joints, or for other meshes.
-    """
-    objects = checked_objects(robot, objects)
-    check_states(bank, robot, objects)
+    """Try the states of a bank, and count the demonstrations in reach; see :func:`xreset.robot_tools.verbs.judge`."""
+    check_states(bank, robot, tuple(objects))
     tried, start = _grasps(bank, robot, objects, states, squeeze)
     count = tried.num_states
     used = [spec for spec in objects if spec.name in tried.object_name]
@@ -214,10 +181,9 @@ def reach_of(
     bank: ResetBank,
     robot: RobotSpec,
     objects: Sequence[ObjectSpec],
-    progress: Callable[[float, int], None] = unseen,
+    progress: Progress,
 ) -> tuple[Reached, ...]:
-    """Count the demonstrations that a robot can follow with a rigid grasp, for each object and in all; arguments as of
-    :func:`judge`."""
+    """Count the demonstrations that a robot can follow with a rigid grasp, for each object and in all."""
     reasons = losses(bank, robot, objects, progress=progress)
     groups = {name: bank.sequence_object == name for name in bank.object_names}
     groups["all"] = np.ones(len(reasons), dtype=bool)

@@ -47,7 +47,7 @@ class FaceTest(TestCase):
         elsewhere = {"Path", "Callable", "Sequence", "Iterable", "Mapping"}
         elsewhere |= {"Module", "Literal", "None", "Any", "Self", "Data", "PositiveInt", "Seed"}
         # of functions that are commands, too
-        elsewhere |= {"Annotated", "Device", "Option", "Output", "Port", "Pose"}
+        elsewhere |= {"Annotated", "Device", "Option", "Output", "Port", "Pose", "Png"}
         elsewhere |= {"Positional", "Several"}
         functions = 0
         for name in set(xreset.__all__) - {"VectorEnv"}:  # which needs gymnasium

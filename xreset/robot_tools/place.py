@@ -12,12 +12,14 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
 from xreset.errors import RobotError
+from xreset.files.processes import in_processes
 from xreset.files.progress import Progress, unseen
 from xreset.geometry.collision import table_clearance
 from xreset.geometry.kinematics import Kinematics
@@ -59,7 +61,6 @@ _HOME_CLEAR = 0.02
 """[m] Least height above the table of a home that keeps the old joint positions."""
 
 
-@one_thread()
 def place(
     robot: RobotSpec,
     paths: list[ArmTargets],
@@ -99,10 +100,11 @@ def place(
     for number in range(config.rounds):
         elite = found[:_ELITE]
         least = _rank(elite[-1][0])[0] if len(elite) == _ELITE else 0
-        for candidate in _candidates(
-            robot, avoid, config, random, number, [candidate for _, candidate in elite]
-        ):
-            found.append((reach(candidate, tried, least), candidate))
+        centers = [candidate for _, candidate in elite]
+        candidates = _candidates(robot, avoid, config, random, number, centers)
+        reaching = partial(reach, wrists=tried, least=least)
+        for reached in zip(in_processes(reaching, candidates), candidates, strict=True):
+            found.append(reached)
             done += 1
             progress(done, total)
         found.sort(key=lambda pair: _rank(pair[0]), reverse=True)
@@ -110,8 +112,21 @@ def place(
     if config.rounds:
         chosen += [candidate for _, candidate in found[:_ELITE] if candidate is not robot]
     finalists = []
-    for candidate in chosen:
-        finalists.append(_finalist(candidate, robot, kept, paths))
+    following = partial(_followed, wrists=kept, paths=paths)
+    frames = sum(int(path.annotated.sum()) for path in paths)
+    for candidate, measured in zip(chosen, in_processes(following, chosen), strict=True):
+        reached, dexterity, followed = measured
+        with_home, rule = _with_home(candidate, robot)
+        finalists.append(
+            Finalist(
+                robot=with_home,
+                reached=reached,
+                dexterity=dexterity,
+                followed=followed / frames,
+                frames=frames,
+                home_rule=rule,
+            )
+        )
         progress(done + len(finalists), total)
     return sorted(
         finalists, key=lambda finalist: (finalist.home_rule != "", finalist.followed), reverse=True
@@ -123,28 +138,20 @@ def _rank(reached: tuple[float, float]) -> tuple[int, float]:
     return round(reached[0] * 200), reached[1]
 
 
-def _finalist(
-    placed: RobotSpec, robot: RobotSpec, wrists: ArmTargets, paths: list[ArmTargets]
-) -> Finalist:
-    """Try a placement of a robot on more frames and on whole motions."""
-    reached, dexterity = reach(placed, wrists)
-    model = ArmModel(placed)
+@one_thread()
+def _followed(
+    robot: RobotSpec, wrists: ArmTargets, paths: list[ArmTargets]
+) -> tuple[float, float, int]:
+    """Return what :func:`reach` returns, and the number of the paths' frames that the robot follows."""
+    model = ArmModel(robot)
     valid = 0
     for path in paths:
         _, measures = track(model, path, Thresholds())
         valid += int((classify(measures, Thresholds()) == 0).sum())
-    frames = sum(int(path.annotated.sum()) for path in paths)
-    with_home, rule = _with_home(placed, robot)
-    return Finalist(
-        robot=with_home,
-        reached=reached,
-        dexterity=dexterity,
-        followed=valid / frames,
-        frames=frames,
-        home_rule=rule,
-    )
+    return *reach(robot, wrists), valid
 
 
+@one_thread()
 def reach(robot: RobotSpec, wrists: ArmTargets, least: int = 0) -> tuple[float, float]:
     """Return the share of wrist poses [F, 1, ...] that the robot reaches, and its dexterity: see :class:`Finalist`.
 

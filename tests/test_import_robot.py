@@ -746,6 +746,11 @@ class Published(Robots):
             "\n".join(made.guessed),
             "WRJ2, WRJ1 move the whole hand: they are the last joints of the arm",
         )
+        # Its fingers are side by side: with the usual spread around home they touch in every second episode.
+        usual = replace(spec, home_std=(0.075, 0.1))
+        self.assertGreater(checks.touching_itself(usual), 2 * checks.MOST_TOUCHING)
+        self.assertLess(checks.touching_itself(spec), checks.MOST_TOUCHING)
+        self.assertIn("spread by 0.025 rad or m around home, not 0.1", " ".join(made.guessed))
         for changes, problems, expected in (
             (
                 {"hand_root": "forearm"},

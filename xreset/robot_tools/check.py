@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -29,6 +29,8 @@ Level = Literal["ok", "skipped", "warning", "error"]
 _MIN_CLEARANCE = 0.005
 """Clearance [m] from the table that the home configuration should have."""
 _SAMPLES = 200
+MOST_TOUCHING = 0.2
+"""Share of the joint positions around home at which a robot may touch itself without a warning."""
 _LIMIT_SLACK = 1e-3
 """[rad or m] How far a mimic joint's limits may fall short of its source's: published figures are rounded."""
 _LISTED = 4
@@ -346,6 +348,19 @@ def _above_table(kinematics: Kinematics, q: torch.Tensor) -> Problems:
     yield level, f"{lowest}; {100 * share:.0f} % of the spread below it"
 
 
+def touching_itself(robot: RobotSpec) -> float:
+    """Return the share of the joint positions around home, as at the start of episodes, at which a robot touches
+    itself."""
+    kinematics = Kinematics(robot)
+    q = _around_home(kinematics)
+    return _share(SelfCollision(kinematics).near(kinematics.link_poses(q).numpy(), 0.0), len(q))
+
+
+def _share(near: Iterable[tuple[int, str, str]], count: int) -> float:
+    """Return the share of ``count`` configurations in which two links touch; ``near``: (configuration, link, link)."""
+    return len({configuration for configuration, _, _ in near}) / count
+
+
 def _free_of_itself(kinematics: Kinematics, q: torch.Tensor) -> Problems:
     collision = SelfCollision(kinematics)
     for pair in collision.overlapping_at_home:
@@ -354,8 +369,8 @@ def _free_of_itself(kinematics: Kinematics, q: torch.Tensor) -> Problems:
             f"{' and '.join(pair)} overlap at home: move home, or add the pair to collision.exclude.",
         )
     near = collision.near(kinematics.link_poses(q).numpy(), 0.0)
-    share = 100 * len({configuration for configuration, _, _ in near}) / len(q)
-    if share > 20:
+    share = 100 * _share(near, len(q))
+    if share > 100 * MOST_TOUCHING:
         pairs = Counter(f"{a} and {b}" for _, a, b in near).most_common(_LISTED)
         often = ", ".join(f"{pair} ({100 * count / len(q):.0f} %)" for pair, count in pairs)
         text = "episodes that start so are pushed apart. Move home away, spread less, or exclude what always meets."

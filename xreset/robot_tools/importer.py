@@ -25,7 +25,7 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import roll_pitch_yaw, surface_of
 from xreset.geometry.urdf import Joint, RobotTree
 from xreset.geometry.urdf_writer import axes, pose
-from xreset.robot_tools.check import Finding, check
+from xreset.robot_tools.check import MOST_TOUCHING, Finding, check, touching_itself
 from xreset.robot_tools.draft import description_text, draft_spec
 from xreset.robot_tools.fingers import Hand
 from xreset.robot_tools.homes import hold_near, hold_up
@@ -168,6 +168,7 @@ def import_robot(
                 names = "; ".join(f"{a} and {b}" for a, b in pairs)
                 notes.append(f"never collide, because {why}: {names}")
         spec = replace(spec, collision_exclude=(*spec.collision_exclude, *at_home))
+        spec = _with_free_spread(spec, notes)
         (work / DESCRIPTION).write_text(description_text(spec, notes))
         findings = check(work)
         errors = [finding for finding in findings if finding.level == "error"]
@@ -367,6 +368,21 @@ def _with_arm_home(spec: RobotSpec, T_hand_palm: np.ndarray, notes: list[str]) -
     held, moved = found
     notes.append(f"home: the palm over the table, looking down{moved}; fingers bent a little")
     return held
+
+
+def _with_free_spread(spec: RobotSpec, notes: list[str]) -> RobotSpec:
+    """Return the robot with its hand's spread around home halved, once or twice, until its fingers rarely touch."""
+    arm, hand = spec.home_std
+    for smaller in (hand, hand / 2, hand / 4):
+        spec = replace(spec, home_std=(arm, smaller))
+        if touching_itself(spec) <= MOST_TOUCHING:
+            break
+    if smaller < hand:
+        notes.append(
+            f"joints of the hand are spread by {smaller:g} rad or m around home, not {hand:g}: fingers are so near to "
+            "each other that they would often touch when an episode begins"
+        )
+    return spec
 
 
 def _with_drives(spec: RobotSpec, tree: RobotTree, notes: list[str]) -> RobotSpec:
